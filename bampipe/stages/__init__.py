@@ -1,0 +1,1 @@
+"""The stages: one file is one stage; see :mod:`bampipe.stages.base` for the contract."""
