@@ -1,0 +1,262 @@
+"""From declarations to equations of motion: Lagrange's equation on the model's energies (eqs 9-14).
+
+M(q) qdd + h(q, qd) = Q_applied + Q_other, where Q_applied comes from the measured input (eq 19) and
+Q_other from friction (eq 20), brakes (eq 18), compensators and the effects of kind ``torque``.
+"""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import sympy as sp
+
+from bampipe.errors import InputError
+from bampipe.physics import expression
+from bampipe.physics.effect import BoundEffect, derivative
+from bampipe.physics.model import Model
+
+Symbols = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Equations:
+    """Symbolic equations of a model; lists are in the order of the names they belong to.
+
+    Attributes:
+        q, qd, qdd: coordinates and their rates.
+        z, z_names: internal states of effects.
+        u, inputs: input symbols that the model uses, and their channel names.
+        p, w, noise: parameters; additive process noise and its names.
+        mass: mass matrix, n by n.
+        bias: h(q, qd): Coriolis, centrifugal and potential terms.
+        other: Q_other, process noise included.
+        applied: Q_applied; applied_noise: the same with noise on the measured force.
+        input_map: d applied / d force of the device itself.
+        rates, initial: of the internal states.
+        offset, offset_rate, offset_acceleration: q_true - q_measured and its derivatives.
+        kinetic, potential: energies.
+        linear: for each parameter, whether the residual is linear in it.
+    """
+
+    q: list[Any]
+    qd: list[Any]
+    qdd: list[Any]
+    z: list[Any]
+    z_names: list[str]
+    u: list[Any]
+    inputs: list[str]
+    p: list[Any]
+    w: list[Any]
+    noise: list[str]
+    mass: list[list[Any]]
+    bias: list[Any]
+    other: list[Any]
+    applied: list[Any]
+    applied_noise: list[Any]
+    input_map: list[list[Any]]
+    rates: list[Any]
+    initial: list[Any]
+    offset: list[Any]
+    offset_rate: list[Any]
+    offset_acceleration: list[Any]
+    kinetic: Any
+    potential: Any
+    linear: list[bool]
+
+
+class _Derivation:
+    """Working state while the equations of one model are put together."""
+
+    def __init__(self, model: Model) -> None:
+        self.model = model
+        device = model.device
+        self.axes = [c.name for c in device.coordinates]
+        self.q = [sp.Symbol(a, real=True) for a in self.axes]
+        self.qd = [sp.Symbol(f"qd_{a}", real=True) for a in self.axes]
+        self.qdd = [sp.Symbol(f"qdd_{a}", real=True) for a in self.axes]
+        self.channels = [derivative(f, k) for k in (0, 1, 2) for f in device.forces]
+        self.channels += [*device.brakes.values(), "t"]
+        self.channel = {name: sp.Symbol(name, real=True) for name in self.channels}
+        self.p = {p.name: sp.Symbol(f"p{i}", real=True) for i, p in enumerate(model.parameters)}
+        self.special = {"sgn": self._sgn, "ddt": self.ddt}
+        self.base: Symbols = {a: s for a, s in zip(self.axes, self.q, strict=True)}
+        self.base |= {f"qd_{a}": s for a, s in zip(self.axes, self.qd, strict=True)}
+        self.base |= {name: sp.Float(c.value) for name, c in device.constants.items()}
+        self.base |= {p.name: self.p[p.name] for p in device.parameters if "." not in p.name}
+        self.base |= self.channel
+        for name, tree in device.definitions.items():
+            self.base[name] = self.build(tree, self.base, f"definitions.{name}")
+
+    def build(self, tree: ast.expr, symbols: Mapping[str, Any], what: str) -> Any:
+        where = f"device {self.model.device.name!r}: {what}"
+        return expression.build(tree, symbols, where, self.special)
+
+    def _sgn(self, argument: Any) -> Any:
+        """Sign, smoothed over the axis' width where the argument is a coordinate's rate."""
+        for c, rate in zip(self.model.device.coordinates, self.qd, strict=True):
+            if argument == rate:
+                return sp.tanh(argument / sp.Float(c.sign_width))
+        return sp.sign(argument)
+
+    def ddt(self, expr: Any) -> Any:
+        """Total time derivative by the chain rule over motion and measured channels."""
+        total = sp.S.Zero
+        for a, b in (*zip(self.q, self.qd, strict=True), *zip(self.qd, self.qdd, strict=True)):
+            total += sp.diff(expr, a) * b
+        for force in self.model.device.forces:
+            for k in (0, 1):
+                low, high = self.channel[derivative(force, k)], self.channel[derivative(force, k + 1)]
+                total += sp.diff(expr, low) * high
+        total += sp.diff(expr, self.channel["t"])
+        return total.replace(sp.DiracDelta, lambda *_: sp.S.Zero)
+
+    def table(self, entries: Mapping[str, ast.expr], what: str) -> list[Any]:
+        """One expression an axis, zero where the table has none."""
+        return [
+            self.build(entries[a], self.base, f"{what}.{a}") if a in entries else sp.S.Zero
+            for a in self.axes
+        ]
+
+    def effect_symbols(self, item: BoundEffect, applied: list[Any], side: list[Any]) -> Symbols:
+        """Every name that an expression of ``item`` may use."""
+        device = self.model.device
+        symbols = dict(self.base)
+        for i, a in enumerate(self.axes):
+            symbols |= {f"applied_{a}": applied[i], f"load_{a}": sp.Abs(applied[i])}
+            for term in ("viscous", "coulomb"):
+                symbols[f"{term}_{a}"] = self.p.get(f"{term}.{a}", sp.S.Zero)
+        if item.effect.scope == "axis":
+            i, a = self.axes.index(item.target), item.target
+            symbols |= {"q": self.q[i], "qd": self.qd[i], "side_load": side[i]}
+            symbols |= {n: symbols[f"{n}_{a}"] for n in ("applied", "load", "viscous", "coulomb")}
+            symbols["brake"] = self.channel.get(device.brakes.get(a, ""), sp.S.Zero)
+        elif item.effect.scope in ("force_component", "force_pair"):
+            for letter, component in zip("fg", item.target, strict=False):
+                force = f"force_{component}"
+                if force not in device.forces:
+                    force = f"force_{item.target}"
+                for k, suffix in enumerate(("", "_rate", "_curvature")):
+                    symbols[letter + suffix] = self.channel[derivative(force, k)]
+        symbols |= {s.name: self.z_of(item, s.name) for s in item.effect.states}
+        for p in item.parameters:
+            symbols[p.name.removeprefix(f"{item.prefix}.")] = self.p[p.name]
+        return symbols
+
+    def z_of(self, item: BoundEffect, state: str) -> Any:
+        return sp.Symbol(f"z_{item.prefix.replace('.', '_')}_{state}", real=True)
+
+    def own(self, item: BoundEffect, tree: ast.expr, symbols: Symbols, what: str) -> Any:
+        return expression.build(tree, symbols, f"effect {item.name!r}: {what}", self.special)
+
+
+def derive(model: Model) -> Equations:
+    """Derive the equations of motion of ``model``.
+
+    Raises:
+        InputError: an expression uses a name that does not exist there, or the mass matrix is
+            singular everywhere.
+    """
+    d = _Derivation(model)
+    device, axes = model.device, d.axes
+    n = len(axes)
+    raw_applied = d.table(device.applied, "applied")
+    side = d.table(device.side_load, "side_load")
+    forces = [d.channel[f] for f in device.forces]
+    input_map = [[sp.diff(e, f) for f in forces] for e in raw_applied]
+
+    corrections = dict.fromkeys(device.forces, sp.S.Zero)
+    for item in (e for e in model.effects if e.effect.kind == "input"):
+        symbols = d.effect_symbols(item, raw_applied, side)
+        for key, tree in item.effect.expressions.items():
+            force = key.partition(".")[2]
+            if not force:
+                component = item.target[0] if item.effect.scope == "force_pair" else item.target
+                force = f"force_{component}"
+            if force not in corrections:
+                raise InputError(f"effect {item.name!r}: device has no input {force!r}")
+            corrections[force] += d.own(item, tree, symbols, key) - d.channel[force]
+    true_force = {d.channel[f]: d.channel[f] + c for f, c in corrections.items()}
+    applied = [e.subs(true_force, simultaneous=True) for e in raw_applied]
+
+    noise = [*device.forces, *device.process_noise]
+    w = [sp.Symbol(f"w{i}", real=True) for i in range(len(noise))]
+    noisy = {s: e + w[i] for i, (s, e) in enumerate(true_force.items())}
+    applied_noise = [e.subs(noisy, simultaneous=True) for e in raw_applied]
+
+    kinetic = d.build(device.kinetic, d.base, "energy.kinetic")
+    potential = d.build(device.potential, d.base, "energy.potential")
+    other = d.table(device.torque, "torque")
+    for i, c in enumerate(device.coordinates):
+        sign = d._sgn(d.qd[i])
+        if c.name in device.frictional:
+            other[i] -= d.p[f"viscous.{c.name}"] * d.qd[i] + d.p[f"coulomb.{c.name}"] * sign
+        if c.name in device.brakes:
+            other[i] -= d.channel[device.brakes[c.name]] * sign
+    for k, name in enumerate(device.process_noise):
+        gains = d.table(device.process_noise[name], f"process_noise.{name}")
+        other = [e + g * w[len(device.forces) + k] for e, g in zip(other, gains, strict=True)]
+
+    offset = [sp.S.Zero] * n
+    z, z_names, rates, initial = [], [], [], []
+    for item in model.effects:
+        symbols = d.effect_symbols(item, applied, side)
+        for key, tree in item.effect.expressions.items():
+            place = key.partition(".")[2] or item.target
+            if item.effect.kind == "input":
+                continue
+            value = d.own(item, tree, symbols, key)
+            if key == "kinetic":
+                kinetic += value
+            elif key == "potential":
+                potential += value
+            elif place not in axes:
+                raise InputError(f"effect {item.name!r}: {key}: device has no axis {place!r}")
+            elif item.effect.kind == "torque":
+                other[axes.index(place)] += value
+            else:
+                offset[axes.index(place)] += value
+        for state in item.effect.states:
+            z.append(d.z_of(item, state.name))
+            z_names.append(f"{item.prefix}.{state.name}")
+            rates.append(d.own(item, state.rate, symbols, f"states.{state.name}.rate"))
+            initial.append(d.own(item, state.initial, symbols, f"states.{state.name}.initial"))
+    for label, exprs in (("torque", other), ("states", rates), ("applied", applied)):
+        if any(e.has(*d.qdd) for e in exprs):
+            raise InputError(f"{label}: an acceleration cannot appear here")
+
+    mass = [[sp.expand_trig(sp.simplify(sp.diff(kinetic, a, b))) for b in d.qd] for a in d.qd]
+    if any(entry.has(*d.qd) for row in mass for entry in row):
+        raise InputError("the kinetic energy must be quadratic in the rates")
+    momentum = [sp.diff(kinetic, a) for a in d.qd]
+    bias = []
+    for i in range(n):
+        convective = sum(sp.diff(momentum[i], a) * b for a, b in zip(d.q, d.qd, strict=True))
+        bias.append(sp.simplify(convective - sp.diff(kinetic - potential, d.q[i])))
+
+    offset_rate = [d.ddt(e) for e in offset]
+    offset_acceleration = [d.ddt(e) for e in offset_rate]
+    parts = [*applied_noise, *other, *rates, *initial, *offset, *offset_rate, *offset_acceleration]
+    used = set().union(*(e.free_symbols for e in [*parts, *raw_applied]))
+    inputs = [c for c in d.channels if d.channel[c] in used or c in device.forces]
+    residual = [
+        a + o - h - sum(m * x for m, x in zip(row, d.qdd, strict=True))
+        for a, o, h, row in zip(applied, other, bias, mass, strict=True)
+    ]
+    moved = [*offset, *offset_rate, *offset_acceleration]
+    linear = []
+    for p in model.parameters:
+        symbol = d.p[p.name]
+        curved = any(sp.diff(e, symbol, 2) != 0 for e in residual)
+        linear.append(not curved and not any(e.has(symbol) for e in [*rates, *moved]))
+    return Equations(
+        q=d.q, qd=d.qd, qdd=d.qdd, z=z, z_names=z_names,
+        u=[d.channel[c] for c in inputs], inputs=inputs,
+        p=list(d.p.values()), w=w, noise=noise,
+        mass=mass, bias=bias, other=other, applied=applied, applied_noise=applied_noise,
+        input_map=input_map, rates=rates, initial=initial,
+        offset=offset, offset_rate=offset_rate, offset_acceleration=offset_acceleration,
+        kinetic=kinetic, potential=potential, linear=linear,
+    )  # fmt: skip

@@ -1,0 +1,14 @@
+"""Numba types of the generated functions, so that kernels can take them as arguments."""
+
+from numba import types
+
+_vector = types.float64[::1]
+
+DERIVATIVE = types.FunctionType(types.void(_vector, _vector, _vector, _vector, _vector))
+"""f(x, u, p, w, dx) -> None: state derivative written into dx."""
+
+MEASURE = types.FunctionType(types.void(_vector, _vector, _vector, _vector))
+"""h(x, u, p, y) -> None: what the encoders read, positions then velocities, written into y."""
+
+MEMORY_RATE = types.FunctionType(types.void(_vector, _vector, _vector, _vector, _vector, _vector))
+"""g(q, qd, u, p, z, dz) -> None: rate of the internal states along a known motion."""

@@ -1,0 +1,238 @@
+"""The compiled model: generated functions, loaded from a cache on disk where they exist already."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import sys
+import tempfile
+from collections.abc import Callable
+from functools import cached_property
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.physics.model import Model
+from bampipe.physics.parameter import Parameter
+
+Array = NDArray[np.float64]
+_MEMORY_STEPS = 4
+
+
+class System:
+    """Generated functions of one model. Made by `compile_model`.
+
+    Attributes:
+        model: what it was made from.
+        coordinates, coordinate_units, torque_units: per generalised coordinate.
+        states: names of the full state x: positions, rates, internal states.
+        inputs: names of the columns of u.
+        parameters: what p holds, in order.
+        noise: names of the additive process noise w.
+        linear: per parameter, whether the residual is linear in it.
+    """
+
+    def __init__(self, model: Model, folder: Path, meta: dict[str, Any]) -> None:
+        self.model = model
+        self._folder = folder
+        self._key = str(meta["key"])
+        axes = model.device.coordinates
+        self.coordinates: tuple[str, ...] = tuple(c.name for c in axes)
+        self.coordinate_units: tuple[str, ...] = tuple(c.unit for c in axes)
+        self.torque_units: tuple[str, ...] = tuple(c.torque_unit for c in axes)
+        self.memory_names: tuple[str, ...] = tuple(meta["memory"])
+        self.states: tuple[str, ...] = (
+            *self.coordinates,
+            *(f"{c}_rate" for c in self.coordinates),
+            *self.memory_names,
+        )
+        self.inputs: tuple[str, ...] = tuple(meta["inputs"])
+        self.noise: tuple[str, ...] = tuple(meta["noise"])
+        self.parameters: tuple[Parameter, ...] = model.parameters
+        self.linear: tuple[bool, ...] = tuple(meta["linear"])
+
+    @property
+    def prior(self) -> Array:
+        """Prior values of the parameters, (n_p,)."""
+        return np.array([p.prior for p in self.parameters])
+
+    def index(self, name: str) -> int:
+        """Position of the parameter called ``name``.
+
+        Raises:
+            KeyError: there is none.
+        """
+        for i, parameter in enumerate(self.parameters):
+            if parameter.name == name:
+                return i
+        raise KeyError(name)
+
+    @cached_property
+    def _arrays(self) -> ModuleType:
+        return _load(self._folder / f"columns_{self._key}.py")
+
+    @cached_property
+    def _compiled(self) -> ModuleType:
+        return _load(self._folder / f"compiled_{self._key}.py")
+
+    @property
+    def derivative(self) -> Callable[..., None]:
+        """f(x, u, p, w, dx): numba-compiled state derivative (eq 14)."""
+        return self._compiled.derivative  # type: ignore[no-any-return]
+
+    @property
+    def measure(self) -> Callable[..., None]:
+        """h(x, u, p, y): numba-compiled encoder readings, positions then rates."""
+        return self._compiled.measure  # type: ignore[no-any-return]
+
+    @property
+    def memory_rate(self) -> Callable[..., None]:
+        """g(q, qd, u, p, z, dz): numba-compiled rate of the internal states.
+
+        Raises:
+            AttributeError: the model has no internal state.
+        """
+        return self._compiled.memory_rate  # type: ignore[no-any-return]
+
+    def true_motion(self, q: Array, qd: Array, qdd: Array, u: Array, p: Array) -> tuple[Array, ...]:
+        """Motion of the mechanism from what the encoders read; each (T, n_q)."""
+        n = len(self.coordinates)
+        columns = self._arrays.true_motion(q.T, qd.T, qdd.T, u.T, p)
+        stacked = _stack(columns, len(q))
+        return stacked[:, :n], stacked[:, n : 2 * n], stacked[:, 2 * n :]
+
+    def required(self, q: Array, qd: Array, qdd: Array, z: Array, u: Array, p: Array) -> Array:
+        """Generalised force that the user must supply for this motion.
+
+        Inertia, Coriolis, gravity, friction, brakes and every effect of kind ``torque``; the
+        inverse dynamics of the model.
+
+        Args:
+            q, qd, qdd: measured motion, (T, n_q), rad or m and derivatives.
+            z: internal states, (T, n_z), from `memory`.
+            u: inputs, (T, n_u), columns as in `inputs`.
+            p: parameters, (n_p,).
+
+        Returns:
+            (T, n_q), N.m or N.
+        """
+        a, b, c = self.true_motion(q, qd, qdd, u, p)
+        return _stack(self._arrays.required(a.T, b.T, c.T, z.T, u.T, p), len(q))
+
+    def applied(self, q: Array, qd: Array, qdd: Array, z: Array, u: Array, p: Array) -> Array:
+        """Generalised force of the measured input mapped to the joints (eq 19), (T, n_q).
+
+        Arguments as in `required`; effects of kind ``input`` are included. The model's residual
+        is ``applied - required``.
+        """
+        a, b, c = self.true_motion(q, qd, qdd, u, p)
+        return _stack(self._arrays.applied(a.T, b.T, c.T, z.T, u.T, p), len(q))
+
+    def input_map(self, q: Array) -> Array:
+        """d applied / d force of the device itself, (T, n_q, n_force)."""
+        n = len(self.coordinates)
+        return _stack(self._arrays.input_map(q.T), len(q)).reshape(len(q), n, -1)
+
+    def mass_matrix(self, q: Array, p: Array) -> Array:
+        """Mass matrix (eq 13), (T, n_q, n_q), kg m2, kg m, kg."""
+        n = len(self.coordinates)
+        return _stack(self._arrays.mass_matrix(q.T, p), len(q)).reshape(len(q), n, n)
+
+    def energy(self, q: Array, qd: Array, p: Array) -> tuple[Array, Array]:
+        """Kinetic and potential energy, each (T,), J."""
+        both = _stack(self._arrays.energy(q.T, qd.T, p), len(q))
+        return both[:, 0], both[:, 1]
+
+    def initial_memory(self, q: Array, u: Array, p: Array) -> Array:
+        """Internal states at the start of a trial, (n_z,), from the first q (n_q,) and u (n_u,)."""
+        return np.array([float(v) for v in self._arrays.initial_memory(q, u, p)])
+
+    def memory(self, q: Array, qd: Array, qdd: Array, u: Array, p: Array, t: Array) -> Array:
+        """Internal states along a measured motion of one trial, (T, n_z).
+
+        Integrated by RK4 with inputs interpolated linearly between samples.
+
+        Args:
+            q, qd, qdd, u, p: as in `required`.
+            t: time, (T,), s.
+        """
+        if not self.memory_names:
+            return np.zeros((len(q), 0))
+        from bampipe.physics.memory import integrate
+
+        a, b, _ = self.true_motion(q, qd, qdd, u, p)
+        z0 = self.initial_memory(a[0], u[0], p)
+        arrays = [np.ascontiguousarray(x, dtype=np.float64) for x in (a, b, u, p, t)]
+        return integrate(self.memory_rate, *arrays, z0, _MEMORY_STEPS)
+
+
+def _stack(columns: tuple[Any, ...], rows: int) -> Array:
+    """Columns, some of them constants, as one (rows, n) array."""
+    out = np.empty((rows, len(columns)))
+    for i, column in enumerate(columns):
+        out[:, i] = column
+    return out
+
+
+def compile_model(model: Model) -> System:
+    """The system of ``model``, derived and printed once, then read from the cache.
+
+    Raises:
+        InputError: an expression of the model is wrong.
+    """
+    folder = cache_folder()
+    key = model.key
+    path = folder / f"meta_{key}.json"
+    if path.exists():
+        return System(model, folder, json.loads(path.read_text()))
+    from bampipe.physics.codegen import array_source, scalar_source
+    from bampipe.physics.derivation import derive
+
+    equations = derive(model)
+    meta = {
+        "key": key,
+        "memory": equations.z_names,
+        "inputs": equations.inputs,
+        "noise": equations.noise,
+        "linear": equations.linear,
+    }
+    _write(folder / f"columns_{key}.py", array_source(equations))
+    _write(folder / f"compiled_{key}.py", scalar_source(equations))
+    _write(path, json.dumps(meta))
+    return System(model, folder, meta)
+
+
+def cache_folder() -> Path:
+    """Folder of generated code: ``BAMPIPE_CACHE_DIR``, else the user's cache folder."""
+    root = os.environ.get("BAMPIPE_CACHE_DIR")
+    if not root:
+        base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+        root = str(Path(base) / "bampipe")
+    folder = Path(root) / f"python{sys.version_info.major}.{sys.version_info.minor}"
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+def _write(path: Path, text: str) -> None:
+    """Write whole or not at all: several processes may generate the same model at once."""
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=path.name)
+    with os.fdopen(handle, "w") as file:
+        file.write(text)
+    os.replace(name, path)
+
+
+def _load(path: Path) -> ModuleType:
+    name = f"bampipe_generated_{path.stem}"
+    if name in sys.modules:
+        return sys.modules[name]
+    spec = importlib.util.spec_from_file_location(name, path)
+    if spec is None or spec.loader is None:
+        raise ImportError(f"cannot load generated code {path}")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    spec.loader.exec_module(module)
+    return module
