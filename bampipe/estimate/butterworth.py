@@ -1,0 +1,129 @@
+"""Butterworth filter and central differences: without phase for records, causal for online use."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.signal import butter, periodogram, sosfilt, sosfilt_zi, sosfiltfilt
+
+from bampipe.estimate.differentiation import (
+    Array,
+    Derivatives,
+    extend,
+    linear_noise_gains,
+)
+
+
+def _design(cutoff_hz: float, rate_hz: float, order: int) -> Array:
+    """Return second-order sections.
+
+    Raises:
+        ValueError: the cut-off is not between 0 and half the sampling rate.
+    """
+    if not 0.0 < cutoff_hz < 0.5 * rate_hz:
+        raise ValueError(
+            f"the cut-off {cutoff_hz:g} Hz is not between 0 and half of {rate_hz:g} Hz"
+        )
+    return np.asarray(butter(order, cutoff_hz, fs=rate_hz, output="sos"), dtype=np.float64)
+
+
+def zero_phase(
+    values: Array, rate_hz: float, cutoff_hz: float, order: int = 2
+) -> tuple[Array, Array, Array]:
+    """Return ``values`` (T,) low-passed forwards and backwards, and its two derivatives, each (T,).
+
+    The derivatives are central differences of fourth order, which follow the true derivative to
+    0.1 % up to 6 % of the sampling rate (the common two-point difference loses 2 % there).
+
+    Args:
+        values: samples on a uniform grid.
+        rate_hz: sampling rate, Hz.
+        cutoff_hz: half-power frequency of one pass, Hz; both passes together let 50 % of the
+            amplitude through there.
+        order: order of one pass.
+    """
+    reach = int(np.ceil(2.0 * rate_hz / cutoff_hz)) + 2
+    sections = _design(cutoff_hz, rate_hz, order)
+    longer = extend(values, reach, max(4, int(np.ceil(1.5 * rate_hz / cutoff_hz))))
+    added = (len(longer) - len(values)) // 2
+    x = np.asarray(sosfiltfilt(sections, longer, padtype=None), dtype=np.float64)
+    inner = np.arange(added, added + len(values))
+    ahead, behind = x[np.minimum(inner + 1, len(x) - 1)], x[np.maximum(inner - 1, 0)]
+    ahead2, behind2 = x[np.minimum(inner + 2, len(x) - 1)], x[np.maximum(inner - 2, 0)]
+    velocity = (8.0 * (ahead - behind) - (ahead2 - behind2)) * rate_hz / 12.0
+    acceleration = (16.0 * (ahead + behind) - (ahead2 + behind2) - 30.0 * x[inner]) * (
+        rate_hz**2 / 12.0
+    )
+    return x[inner], velocity, acceleration
+
+
+def smooth(
+    position: Array, rate_hz: float, cutoff_hz: float, noise_sd: float, order: int = 2
+) -> Derivatives:
+    """Return the motion behind ``position`` (T,) by :func:`zero_phase`, with error bands.
+
+    ``noise_sd`` is the standard deviation of the white noise on the samples; motion above the
+    cut-off is lost and is not in the bands.
+    """
+    results = zero_phase(position, rate_hz, cutoff_hz, order)
+    edge = int(np.ceil(1.5 * rate_hz / cutoff_hz))
+    gains = linear_noise_gains(
+        lambda x: zero_phase(x, rate_hz, cutoff_hz, order), len(position), edge
+    )
+    return Derivatives(*results, *(noise_sd * gain for gain in gains))
+
+
+def floor_frequency(position: Array, rate_hz: float, noise_sd: float) -> float:
+    """Return the frequency, Hz, above which the spectrum of ``position`` (T,) is noise only.
+
+    Noise of standard deviation ``noise_sd`` has the density 2 noise_sd² / rate; the answer is the
+    highest frequency up to which the density of the motion, averaged over a third of an octave,
+    stays above twice that (the signal is as strong as the noise). A line through the end points
+    is taken off first and a Blackman window applied, so that leakage stays below the floor.
+    """
+    steps = np.arange(len(position))
+    line = np.interp(steps, (0, len(position) - 1), (position[0], position[-1]))
+    frequency, density = periodogram(position - line, fs=rate_hz, window="blackman", detrend=False)
+    floor = 2.0 * noise_sd**2 / rate_hz
+    band, limit = 2.0 * rate_hz / len(position), float(frequency[-1])
+    lower = 8.0 * band
+    while lower < limit:
+        upper = lower * 2.0 ** (1.0 / 3.0)
+        inside = (frequency >= lower) & (frequency < upper)
+        if not np.any(inside) or float(np.mean(density[inside])) < 2.0 * floor:
+            return lower
+        lower = upper
+    return limit
+
+
+class CausalButterworth:
+    """The same filter sample by sample: low-pass, then backward differences.
+
+    The delay at low frequency is that of the low-pass, about ``delay_s``, and half a sample more
+    for each difference.
+    """
+
+    def __init__(self, rate_hz: float, cutoff_hz: float, order: int = 2) -> None:
+        self._sections = _design(cutoff_hz, rate_hz, order)
+        self._rate = rate_hz
+        self._memory: Array | None = None
+        self._recent: tuple[float, float] = (0.0, 0.0)
+        angle = 1e-3
+        shift = np.exp(-1j * angle)
+        response = np.prod(
+            [(b0 + b1 * shift + b2 * shift**2) / (1.0 + a1 * shift + a2 * shift**2)
+             for b0, b1, b2, _, a1, a2 in self._sections]
+        )
+        self.delay_s = float(-np.angle(response) / angle / rate_hz)
+
+    def step(self, position: float) -> tuple[float, float, float]:
+        """Take one sample; return position, velocity and acceleration as known by now.
+
+        The first sample is taken as a handle at rest there.
+        """
+        if self._memory is None:
+            self._memory = np.asarray(sosfilt_zi(self._sections)) * position
+            self._recent = (position, position)
+        out, self._memory = sosfilt(self._sections, [position], zi=self._memory)
+        now, (last, before) = float(out[0]), self._recent
+        self._recent = (now, last)
+        return now, (now - last) * self._rate, (now - 2.0 * last + before) * self._rate**2

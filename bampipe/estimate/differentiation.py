@@ -1,0 +1,139 @@
+"""What every way to differentiate a sampled motion has in common.
+
+A method takes positions on a uniform grid and returns position, velocity and acceleration with
+their standard deviations. Three are implemented: a zero-phase Butterworth filter followed by
+central differences (:mod:`bampipe.estimate.butterworth`), Savitzky-Golay polynomials
+(:mod:`bampipe.estimate.savitzky_golay`) and a Kalman smoother of an integrated white noise
+(:mod:`bampipe.estimate.kalman_smoother`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import PchipInterpolator
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Derivatives:
+    """A motion and its first two derivatives, each of shape (T,).
+
+    The standard deviations (``*_sd``) cover the measurement noise; those of the Kalman smoother
+    also cover what the motion may do between and beyond the samples.
+    """
+
+    position: Array
+    velocity: Array
+    acceleration: Array
+    position_sd: Array
+    velocity_sd: Array
+    acceleration_sd: Array
+
+
+@dataclass(frozen=True)
+class UniformGrid:
+    """Time stamps put on a uniform grid.
+
+    Attributes:
+        t: the grid, shape (T,), s.
+        bridged: shape (T,), true where no sample lies within one sampling interval of the grid
+            point, so that the value there is a guess across a gap.
+        exact: whether all samples lie on the grid, so that nothing is interpolated.
+        source: time stamps of the samples, shape (N,), s.
+    """
+
+    t: Array
+    bridged: Flags
+    exact: bool
+    source: Array
+
+    def resample(self, values: Array) -> Array:
+        """Return ``values`` (N,) on the grid (T,).
+
+        Between samples by monotone cubic interpolation (Fritsch and Butland 1984), which does
+        not overshoot the steps of a quantised signal.
+        """
+        if self.exact:
+            return np.array(values, dtype=np.float64)
+        inside = np.clip(self.t, self.source[0], self.source[-1])
+        return np.asarray(PchipInterpolator(self.source, values)(inside), dtype=np.float64)
+
+
+def uniform_grid(t: Array, rate_hz: float) -> UniformGrid:
+    """Return the uniform grid of nominal rate for time stamps ``t`` (N,), s, increasing.
+
+    The grid starts at the first sample. Stamps within 2 % of a sampling interval of their grid
+    points, one by one, count as being on the grid.
+
+    Raises:
+        ValueError: fewer than two samples, or stamps that do not increase.
+    """
+    if len(t) < 2 or np.any(np.diff(t) <= 0.0):
+        raise ValueError("time stamps must increase, and there must be two at least")
+    step = 1.0 / rate_hz
+    count = int(np.floor((t[-1] - t[0]) / step + 0.02)) + 1
+    grid = t[0] + step * np.arange(count)
+    exact = count == len(t) and bool(np.all(np.abs(grid - t) < 0.02 * step))
+    if exact:
+        return UniformGrid(grid, np.zeros(count, dtype=bool), True, t)
+    after = np.clip(np.searchsorted(t, grid), 1, len(t) - 1)
+    nearest = np.minimum(np.abs(grid - t[after - 1]), np.abs(t[after] - grid))
+    return UniformGrid(grid, nearest >= step, False, t)
+
+
+def extend(values: Array, reach: int, fit: int) -> Array:
+    """Return ``values`` (T,) with ``reach`` samples added at both ends, shape (T + 2 reach,).
+
+    The signal is reflected in its end point so that position, velocity and acceleration go on
+    without a jump: x(-t) = 2 x0 - x(t) + a t², with x0 and a from a cubic fitted to the ``fit``
+    samples at the end. A plain odd reflection (a = 0) would turn the acceleration round, and the
+    filtered acceleration would run to zero at either end.
+    """
+    reach = min(reach, len(values) - 1)
+    fit = min(fit, len(values))
+    degree = min(3, fit - 1)
+    steps = np.arange(fit, dtype=np.float64)
+    offsets = np.arange(1, reach + 1, dtype=np.float64)
+
+    def beyond(end: Array) -> Array:
+        """Return the samples before ``end[0]``, the nearest first."""
+        curve = np.polynomial.Polynomial.fit(steps, end[:fit], degree)
+        start, bend = curve(0.0), curve.deriv(2)(0.0) if degree >= 2 else 0.0
+        return np.asarray(2.0 * start - end[1 : reach + 1] + bend * offsets**2)
+
+    return np.concatenate((beyond(values)[::-1], values, beyond(values[::-1])))
+
+
+Linear = Callable[[Array], tuple[Array, Array, Array]]
+
+
+def linear_noise_gains(method: Linear, length: int, edge: int) -> tuple[Array, Array, Array]:
+    """Return how much white noise on the positions ``method`` leaves in what it returns.
+
+    Args:
+        method: linear; takes (T,), returns position, velocity, acceleration, each (T,).
+        length: T.
+        edge: number of samples at either end where the gain differs from that in the middle.
+
+    Returns:
+        Standard deviations, each (T,), for noise of standard deviation 1.
+    """
+    edge = min(edge, (length + 1) // 2)
+    window = min(length, 4 * edge + 1)
+    squares = np.zeros((3, window))
+    for sample in range(window):
+        impulse = np.zeros(window)
+        impulse[sample] = 1.0
+        squares += np.square(method(impulse))
+    gains = np.sqrt(squares)
+    full = np.empty((3, length))
+    full[:] = gains[:, window // 2, None]
+    full[:, :edge] = gains[:, :edge]
+    full[:, length - edge :] = gains[:, window - edge :]
+    return full[0], full[1], full[2]

@@ -1,0 +1,416 @@
+"""Kalman filter and fixed-interval smoother of a motion driven by white noise.
+
+The state is position and its derivatives; the highest of them is a random walk. With ``order`` 3
+(position, velocity, acceleration) the jerk is white noise; with ``order`` 4 the jerk is constant
+but for white noise on the snap. The discretisation is exact (Bar-Shalom, Li and Kirubarajan 2001,
+section 6.2). Smoothing is that of Rauch, Tung and Striebel 1965 in the form of Bryson and Frazier
+(Bierman 1977, section X.4), which needs no matrix inverse.
+
+Inside, time is counted in samples and position in standard deviations of the measurement noise,
+so that the one quantity left is the dimensionless ratio of process to measurement noise
+``ratio`` = density * step**(2 order - 1) / noise_sd**2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import factorial
+
+import numba
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from bampipe.estimate.differentiation import Array, Derivatives, Flags
+
+ORDERS = (3, 4)
+_SETTLED = 1e-10
+
+
+def transition(order: int) -> tuple[Array, Array]:
+    """Return transition matrix and process noise (ratio 1) of one sample, (order, order)."""
+    step = np.zeros((order, order))
+    noise = np.zeros((order, order))
+    for i in range(order):
+        for j in range(order):
+            if j >= i:
+                step[i, j] = 1.0 / factorial(j - i)
+            a, b = order - 1 - i, order - 1 - j
+            noise[i, j] = 1.0 / (factorial(a) * factorial(b) * (a + b + 1))
+    return step, noise
+
+
+def bandwidth(ratio: float, order: int, rate_hz: float) -> float:
+    """Return the half-amplitude frequency, Hz, of the steady smoother.
+
+    Its response is 1 / (1 + (w/w0)**(2 order)) with w0 = ratio**(1/(2 order)) rad per sample
+    (the Wiener filter of an order-fold integrated white noise, sampling fast against w0).
+    """
+    return float(rate_hz / (2.0 * np.pi) * ratio ** (1.0 / (2 * order)))
+
+
+def ratio_for(bandwidth_hz: float, order: int, rate_hz: float) -> float:
+    """Return the ratio that gives ``bandwidth_hz``; inverse of :func:`bandwidth`."""
+    return float((2.0 * np.pi * bandwidth_hz / rate_hz) ** (2 * order))
+
+
+@numba.njit(cache=True)
+def _predict(x: Array, p: Array, step: Array, noise: Array, work: Array) -> None:
+    """Advance state ``x`` (n,) and covariance ``p`` (n, n) by one sample, in place."""
+    n = x.shape[0]
+    for i in range(n):
+        total = 0.0
+        for j in range(i, n):
+            total += step[i, j] * x[j]
+        x[i] = total
+    for i in range(n):
+        for j in range(n):
+            total = 0.0
+            for k in range(i, n):
+                total += step[i, k] * p[k, j]
+            work[i, j] = total
+    for i in range(n):
+        for j in range(i + 1):
+            total = noise[i, j]
+            for k in range(j, n):
+                total += work[i, k] * step[j, k]
+            p[i, j] = total
+            p[j, i] = total
+
+
+@numba.njit(cache=True)
+def _update(x: Array, p: Array, y: float, gain: Array) -> tuple[float, float]:
+    """Take in one sample ``y`` of noise 1, in place; return innovation and its variance."""
+    n = x.shape[0]
+    spread = p[0, 0] + 1.0
+    innovation = y - x[0]
+    for i in range(n):
+        gain[i] = p[i, 0] / spread
+    for i in range(n):
+        x[i] += gain[i] * innovation
+    for i in range(n):
+        for j in range(i + 1):
+            value = p[i, j] - gain[i] * gain[j] * spread
+            p[i, j] = value
+            p[j, i] = value
+    return innovation, spread
+
+
+@numba.njit(cache=True)
+def _filter(
+    y: Array,
+    seen: Flags,
+    step: Array,
+    noise: Array,
+    x: Array,
+    p: Array,
+    states: Array,
+    covariances: Array,
+    gains: Array,
+    innovations: Array,
+    spreads: Array,
+) -> None:
+    """Run the filter from prior ``x``, ``p`` for the first sample and keep what it passes."""
+    work = np.empty_like(p)
+    for t in range(y.shape[0]):
+        if t > 0:
+            _predict(x, p, step, noise, work)
+        if seen[t]:
+            innovations[t], spreads[t] = _update(x, p, y[t], gains[t])
+        states[t] = x
+        covariances[t] = p
+
+
+@numba.njit(cache=True)
+def _smooth(
+    seen: Flags,
+    step: Array,
+    states: Array,
+    covariances: Array,
+    gains: Array,
+    innovations: Array,
+    spreads: Array,
+    variances: Array,
+) -> None:
+    """Turn filtered ``states`` (T, n) into smoothed ones, in place; fill ``variances`` (T, n)."""
+    n = states.shape[1]
+    adjoint, weight = np.zeros(n), np.zeros((n, n))
+    pull, left = np.empty(n), np.empty((n, n))
+    for t in range(states.shape[0] - 1, -1, -1):
+        p = covariances[t]
+        for i in range(n):
+            total = 0.0
+            for j in range(n):
+                total += p[i, j] * adjoint[j]
+            states[t, i] -= total
+            variance = p[i, i]
+            for j in range(n):
+                total = 0.0
+                for k in range(n):
+                    total += weight[j, k] * p[k, i]
+                variance -= p[i, j] * total
+            variances[t, i] = max(variance, 0.0)
+        if seen[t]:
+            # adjoint <- C' adjoint - H' v/S, weight <- C' weight C + H' H/S, with C = I - K H
+            share = 0.0
+            for j in range(n):
+                share += gains[t, j] * adjoint[j]
+            adjoint[0] -= share + innovations[t] / spreads[t]
+            for i in range(n):
+                total = 0.0
+                for j in range(n):
+                    total += weight[i, j] * gains[t, j]
+                pull[i] = total
+            share = 0.0
+            for i in range(n):
+                share += gains[t, i] * pull[i]
+            weight[0, 0] += share + 1.0 / spreads[t]
+            for i in range(n):
+                weight[i, 0] -= pull[i]
+                weight[0, i] -= pull[i]
+        # adjoint <- F' adjoint, weight <- F' weight F
+        for i in range(n - 1, -1, -1):
+            total = 0.0
+            for j in range(i + 1):
+                total += step[j, i] * adjoint[j]
+            adjoint[i] = total
+        for i in range(n):
+            for j in range(n):
+                total = 0.0
+                for k in range(j + 1):
+                    total += weight[i, k] * step[k, j]
+                left[i, j] = total
+        for i in range(n):
+            for j in range(i + 1):
+                total = 0.0
+                for k in range(i + 1):
+                    total += step[k, i] * left[k, j]
+                weight[i, j] = total
+                weight[j, i] = total
+
+
+@numba.njit(cache=True)
+def _evidence(
+    y: Array, seen: Flags, step: Array, noise: Array, x: Array, p: Array, skip: int
+) -> tuple[float, float, int]:
+    """Return sums of log S and of v²/S over the innovations but the first ``skip``, and their count.
+
+    Once the covariance has settled it is kept until a sample is missing.
+    """
+    n = x.shape[0]
+    work, gain = np.empty_like(p), np.empty(n)
+    logs, squares, count = 0.0, 0.0, 0
+    settled, spread = False, 1.0
+    for t in range(y.shape[0]):
+        if settled and seen[t]:
+            for i in range(n):
+                total = 0.0
+                for j in range(i, n):
+                    total += step[i, j] * x[j]
+                x[i] = total
+            innovation = y[t] - x[0]
+            for i in range(n):
+                x[i] += gain[i] * innovation
+        else:
+            if t > 0:
+                _predict(x, p, step, noise, work)
+            if not seen[t]:
+                settled = False
+                continue
+            before = spread
+            innovation, spread = _update(x, p, y[t], gain)
+            settled = t > 4 * n and abs(spread - before) < _SETTLED * spread
+        if t >= skip:
+            logs += np.log(spread)
+            squares += innovation * innovation / spread
+            count += 1
+    return logs, squares, count
+
+
+def _prior(y: Array, order: int) -> tuple[Array, Array]:
+    """Return a wide prior for the first state: ten times the largest difference of each order."""
+    spread = [1e2]
+    for k in range(1, order):
+        steps = np.diff(y, n=k)
+        spread.append(10.0 * (float(np.max(np.abs(steps))) if len(steps) else 0.0) + 2.0**k)
+    start = np.zeros(order)
+    start[0] = y[0]
+    return start, np.diag(np.square(spread))
+
+
+@dataclass(frozen=True)
+class MotionModel:
+    """The motion model of one axis.
+
+    Attributes:
+        order: number of states: 3 white jerk, 4 white snap.
+        noise_sd: standard deviation of the measurement noise, position units.
+        ratio: process to measurement noise, dimensionless (see the module docstring).
+        rate_hz: sampling rate, Hz.
+    """
+
+    order: int
+    noise_sd: float
+    ratio: float
+    rate_hz: float
+
+    @property
+    def bandwidth_hz(self) -> float:
+        """Half-amplitude frequency of the smoother, Hz."""
+        return bandwidth(self.ratio, self.order, self.rate_hz)
+
+    @property
+    def density(self) -> float:
+        """Spectral density of the noise on the highest derivative, (unit/s**order)² s."""
+        return self.ratio * self.noise_sd**2 * self.rate_hz ** (2 * self.order - 1)
+
+
+def smooth(position: Array, model: MotionModel, seen: Flags | None = None) -> Derivatives:
+    """Return the motion behind ``position`` (T,), given all its samples.
+
+    Args:
+        position: samples on the uniform grid of ``model.rate_hz``.
+        model: motion and noise.
+        seen: shape (T,), false where there is no sample: ``position`` is then not used, and the
+            bands widen. The first sample must be there. All are, by default.
+    """
+    order, count = model.order, len(position)
+    seen = np.ones(count, dtype=bool) if seen is None else seen
+    step, noise = transition(order)
+    y = (position - position[0]) / model.noise_sd
+    start, spread = _prior(y, order)
+    states, variances = np.empty((count, order)), np.empty((count, order))
+    covariances, gains = np.empty((count, order, order)), np.zeros((count, order))
+    innovations, spreads = np.zeros(count), np.ones(count)
+    _filter(
+        y, seen, step, model.ratio * noise, start, spread,
+        states, covariances, gains, innovations, spreads,
+    )  # fmt: skip
+    _smooth(seen, step, states, covariances, gains, innovations, spreads, variances)
+    scale = model.noise_sd * model.rate_hz ** np.arange(3)
+    x, sd = states[:, :3] * scale, np.sqrt(variances[:, :3]) * scale
+    return Derivatives(x[:, 0] + position[0], x[:, 1], x[:, 2], sd[:, 0], sd[:, 1], sd[:, 2])
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A motion model chosen by maximum likelihood.
+
+    Attributes:
+        model: the chosen model.
+        log_likelihood: of all innovations, up to a constant common to all models of the data.
+        innovation_variance: mean of v²/S; 1 where the model accounts for the data.
+        at_limit: whether the bandwidth was held at one of its limits.
+    """
+
+    model: MotionModel
+    log_likelihood: float
+    innovation_variance: float
+    at_limit: bool
+
+
+def maximum_likelihood(
+    records: Sequence[tuple[Array, Flags]],
+    rate_hz: float,
+    resolution: float,
+    *,
+    order: int,
+    bandwidth_limits_hz: tuple[float, float],
+) -> Fit:
+    """Choose process and measurement noise of one axis by maximum likelihood.
+
+    The measurement noise is at least that of quantisation, resolution²/12 (Widrow 1956), and
+    larger where the innovations ask for it: for each ratio its best value is known in closed
+    form, so that one search over the ratio finds both.
+
+    Args:
+        records: positions (T,) on the uniform grid and flags (T,) of the samples there are, of
+            trials that share sensor and kind of motion.
+        rate_hz: sampling rate, Hz.
+        resolution: step of the encoder, position units; 0 where unknown.
+        order: 3 or 4.
+        bandwidth_limits_hz: range of the smoother's bandwidth that is searched.
+    """
+    step, noise = transition(order)
+    quantum = resolution / np.sqrt(12.0)
+    unit = quantum if quantum > 0.0 else float(np.std(np.diff(records[0][0]))) or 1.0
+    scaled = [((position - position[0]) / unit, seen) for position, seen in records]
+    priors = [_prior(y, order) for y, _ in scaled]
+
+    def score(log_ratio: float) -> tuple[float, float, float]:
+        """Return -log likelihood, measurement noise variance in units, and mean of v²/S."""
+        logs = squares = 0.0
+        count = 0
+        for (y, seen), (start, spread) in zip(scaled, priors, strict=True):
+            part = _evidence(
+                y, seen, step, np.exp(log_ratio) * noise, start.copy(), spread.copy(), 4 * order
+            )
+            logs, squares, count = logs + part[0], squares + part[1], count + part[2]
+        best = squares / max(count, 1)
+        variance = max(best, 1.0) if quantum > 0.0 else max(best, 1e-30)
+        total = 0.5 * (logs + count * np.log(variance) + squares / variance)
+        return total, variance, best / variance
+
+    low, high = (float(np.log(ratio_for(b, order, rate_hz))) for b in bandwidth_limits_hz)
+    grid = np.linspace(low, high, 9)
+    coarse = [score(float(value))[0] for value in grid]
+    best = int(np.argmin(coarse))
+    around = (float(grid[max(best - 1, 0)]), float(grid[min(best + 1, len(grid) - 1)]))
+    found = minimize_scalar(
+        lambda value: score(float(value))[0], bounds=around, method="bounded",
+        options={"xatol": 0.02},
+    )  # fmt: skip
+    log_ratio = float(found.x)
+    total, variance, mean = score(log_ratio)
+    model = MotionModel(order, unit * float(np.sqrt(variance)), float(np.exp(log_ratio)), rate_hz)
+    edge = 0.05 * (high - low) / (len(grid) - 1)
+    at_limit = log_ratio - low < edge or high - log_ratio < edge
+    return Fit(model, -total, mean, at_limit)
+
+
+class CausalKalman:
+    """The same filter sample by sample, for online use.
+
+    Args:
+        model: motion and noise.
+        velocity_sd: standard deviation of the velocity before the first sample, unit/s.
+        acceleration_sd: the same of the acceleration, unit/s²; the jerk's follows from it and
+            the bandwidth of the model.
+    """
+
+    def __init__(self, model: MotionModel, velocity_sd: float, acceleration_sd: float) -> None:
+        self.model = model
+        rate, noise_sd = model.rate_hz, model.noise_sd
+        self._step, noise = transition(model.order)
+        self._noise = model.ratio * noise
+        jerk_sd = acceleration_sd * 2.0 * np.pi * model.bandwidth_hz
+        spread = [1e2, velocity_sd / noise_sd / rate, acceleration_sd / noise_sd / rate**2]
+        spread.append(jerk_sd / noise_sd / rate**3)
+        self._covariance = np.diag(np.square(spread[: model.order]))
+        self._state = np.zeros(model.order)
+        self._gain = np.empty(model.order)
+        self._work = np.empty_like(self._covariance)
+        self._origin: float | None = None
+
+    def step(self, position: float | None) -> tuple[Array, Array]:
+        """Go on by one sample; return position, velocity, acceleration and their sd, each (3,).
+
+        Args:
+            position: the new sample; None where it is missing (the bands widen).
+
+        Raises:
+            ValueError: the first sample is missing.
+        """
+        if self._origin is None:
+            if position is None:
+                raise ValueError("the filter starts with a sample")
+            self._origin = position
+        else:
+            _predict(self._state, self._covariance, self._step, self._noise, self._work)
+        if position is not None:
+            y = (position - self._origin) / self.model.noise_sd
+            _update(self._state, self._covariance, y, self._gain)
+        scale = self.model.noise_sd * self.model.rate_hz ** np.arange(3)
+        x = self._state[:3] * scale
+        x[0] += self._origin
+        return x, np.sqrt(np.diag(self._covariance)[:3]) * scale
