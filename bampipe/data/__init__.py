@@ -1,0 +1,1 @@
+"""Files in and out: the session, the trial readers, the quality rules, the store."""

@@ -1,0 +1,370 @@
+"""Files of a run folder: written whole or not at all, and the same bytes for the same content.
+
+JSON has sorted keys and no NaN; Parquet has fixed options and no metadata that varies. A file
+that cannot be read or written raises :class:`bampipe.errors.InputError` naming it.
+"""
+
+from __future__ import annotations
+
+import datetime
+import hashlib
+import json
+import math
+import os
+import re
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from itertools import pairwise
+from pathlib import Path
+from types import TracebackType
+from typing import Any, BinaryIO, Self
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from bampipe.errors import InputError
+
+LARGEST_TOML_BYTES = 4_000_000
+"""A settings file larger than this is taken for something else, and not parsed."""
+
+Frame = pd.DataFrame | Mapping[str, np.ndarray | pa.Array]
+
+
+@contextmanager
+def atomic_writer(path: Path) -> Iterator[BinaryIO]:
+    """A binary file that takes the place of ``path`` only when the block ends without error.
+
+    Raises:
+        InputError: the folder is read-only, the disk is full, or the like.
+    """
+    path = Path(path)
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with partial.open("wb") as stream:
+            yield stream
+            stream.flush()
+            os.fsync(stream.fileno())
+        partial.replace(path)
+    except OSError as error:
+        _discard(partial)
+        raise _cannot("write", path, error) from error
+    except BaseException:
+        _discard(partial)
+        raise
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write ``text`` as UTF-8 with ``\\n`` line ends, whole or not at all."""
+    with atomic_writer(path) as stream:
+        stream.write(text.encode())
+
+
+def write_json(path: Path, value: object) -> None:
+    """Write ``value`` as JSON: sorted keys, indent 1, shortest exact floats, numpy accepted.
+
+    Raises:
+        ValueError: a number is NaN or infinite (its place is named): write None instead.
+        InputError: the file cannot be written.
+    """
+    place = _non_finite(value, "")
+    if place is not None:
+        raise ValueError(f"{path}: {place} is not a finite number")
+    text = json.dumps(
+        value, sort_keys=True, indent=1, allow_nan=False, ensure_ascii=False, default=_plain
+    )
+    write_text(path, text + "\n")
+
+
+def read_json(path: Path) -> Any:
+    """The value in a JSON file.
+
+    Raises:
+        InputError: no such file, or not JSON (file and line are named).
+    """
+    try:
+        return json.loads(_read_bytes(path))
+    except json.JSONDecodeError as error:
+        raise InputError(f"not JSON: {error.msg}", where=f"{path}, line {error.lineno}") from error
+    except UnicodeDecodeError as error:
+        raise InputError("not JSON: not UTF-8 text", where=str(path)) from error
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """The table in a TOML file.
+
+    Raises:
+        InputError: no such file, not UTF-8, or not TOML (file and line are named).
+    """
+    data = _read_bytes(path, limit=LARGEST_TOML_BYTES)
+    if data.startswith((b"\xff\xfe", b"\xfe\xff")):
+        raise InputError(
+            "UTF-16 text, where TOML is UTF-8", where=str(path), remedy="save it as UTF-8"
+        )
+    try:
+        return tomllib.loads(data.decode("utf-8-sig"))
+    except UnicodeDecodeError as error:
+        line = data[: error.start].count(b"\n") + 1
+        raise InputError(
+            "not UTF-8 text", where=f"{path}, line {line}", remedy="save it as UTF-8"
+        ) from error
+    except tomllib.TOMLDecodeError as error:
+        found = re.search(r"^(.*?) \(at line (\d+), column \d+\)$", str(error), re.DOTALL)
+        what, where = (found[1], f"{path}, line {found[2]}") if found else (str(error), str(path))
+        raise InputError(f"not TOML: {what}", where=where) from error
+    except RecursionError as error:
+        raise InputError("not TOML: nested too deeply", where=str(path)) from error
+
+
+class ParquetAppender:
+    """Parquet file written frame by frame, one row group each; appears whole when closed.
+
+    Use as a context manager; :meth:`append` one frame a trial, all with the same columns. An
+    error inside the block leaves no file. Constant text columns may be dictionary arrays: they
+    are stored, and read back, as text.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = Path(path)
+        self._file = atomic_writer(self._path)
+        self._stream: BinaryIO | None = None
+        self._writer: pq.ParquetWriter | None = None
+
+    def __enter__(self) -> Self:
+        self._stream = self._file.__enter__()
+        return self
+
+    def append(self, frame: Frame) -> None:
+        """Write one row group.
+
+        Args:
+            frame: a DataFrame (its index is dropped) or named columns of equal length.
+
+        Raises:
+            ValueError: columns differ from those of the first frame, or used outside ``with``.
+        """
+        if self._stream is None:
+            raise ValueError("append() outside the with block")
+        table = _table(frame)
+        if self._writer is None:
+            self._writer = _writer(self._stream, table.schema)
+        elif table.schema != self._writer.schema:
+            table = table.cast(self._writer.schema)
+        self._writer.write_table(table, row_group_size=max(table.num_rows, 1))
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._stream = None
+        if self._writer is None and error is None:
+            error = ValueError(f"{self._path}: no frame was written")
+            self._file.__exit__(ValueError, error, None)
+            raise error
+        if self._writer is not None:
+            try:
+                self._writer.close()
+            except OSError as closing:
+                if error is None:
+                    kind, error, trace = type(closing), closing, closing.__traceback__
+        self._file.__exit__(kind, error, trace)
+
+
+def write_parquet(path: Path, frame: Frame) -> None:
+    """Write one DataFrame, or named columns of equal length, as a Parquet file.
+
+    A ``trial_id`` column gives one row group a stretch of equal ids, so that
+    :func:`read_parquet` can fetch one trial without reading the others.
+    """
+    table = _table(frame)
+    with atomic_writer(path) as stream:
+        writer = _writer(stream, table.schema)
+        with writer:
+            bounds = _trial_bounds(table)
+            for start, stop in pairwise(bounds):
+                part = table.slice(start, stop - start)
+                writer.write_table(part, row_group_size=max(part.num_rows, 1))
+
+
+def read_parquet(
+    path: Path, columns: Sequence[str] | None = None, trial: str | None = None
+) -> pd.DataFrame:
+    """Read a Parquet file, or the rows of one trial of it.
+
+    Args:
+        path: the file.
+        columns: which columns, in this order (default all).
+        trial: only rows whose ``trial_id`` is this; other row groups are not read.
+
+    Raises:
+        InputError: no such file, not a sound Parquet file, no such column, no such trial.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError("no such file", where=str(path))
+    try:
+        with pq.ParquetFile(path, memory_map=False) as file:
+            names = file.schema_arrow.names
+            wanted = list(columns) if columns is not None else names
+            for name in [*wanted, *(["trial_id"] if trial is not None else [])]:
+                if name not in names:
+                    raise InputError(
+                        f"no column '{name}'", where=str(path), remedy=f"it has {', '.join(names)}"
+                    )
+            if trial is None:
+                return file.read(columns=wanted).select(wanted).to_pandas()
+            table = _read_trial(file, wanted, trial)
+    except (pa.ArrowException, OSError) as error:
+        raise InputError(
+            "not a sound Parquet file", where=str(path), remedy="make it again (--force)"
+        ) from error
+    if table.num_rows == 0:
+        raise InputError(f"no trial '{trial}'", where=str(path))
+    return table.to_pandas()
+
+
+def sha256_file(path: Path) -> str:
+    """SHA-256 of a file's bytes, hexadecimal.
+
+    Raises:
+        InputError: the file cannot be read.
+    """
+    try:
+        with Path(path).open("rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    except OSError as error:
+        raise _cannot("read", Path(path), error) from error
+
+
+def content_hash(value: object) -> str:
+    """SHA-256 of what a value or a file means, hexadecimal.
+
+    A path to a ``.toml`` or ``.json`` file is parsed first, so white space, comments and the
+    order of keys do not matter; any other file is hashed by its bytes. Other values are hashed
+    by their canonical JSON (dates apart from text, 1 apart from 1.0).
+    """
+    if isinstance(value, Path):
+        if value.suffix == ".toml":
+            value = read_toml(value)
+        elif value.suffix == ".json":
+            value = read_json(value)
+        else:
+            return sha256_file(value)
+    text = json.dumps(value, sort_keys=True, separators=(",", ":"), default=_tagged)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _discard(partial: Path) -> None:
+    if partial.exists():
+        partial.unlink()
+
+
+def _cannot(verb: str, path: Path, error: OSError) -> InputError:
+    reason = (error.strerror or str(error)).lower()
+    remedy = {
+        "no space left on device": "free some space and run again",
+        "permission denied": "check the permissions of the folder",
+        "read-only file system": "choose a folder that can be written",
+    }.get(reason, "")
+    return InputError(f"cannot {verb}: {reason}", where=str(path), remedy=remedy)
+
+
+def _read_bytes(path: Path, limit: int | None = None) -> bytes:
+    path = Path(path)
+    try:
+        if path.is_dir():
+            raise InputError("a folder, where a file is expected", where=str(path))
+        if limit is not None and path.stat().st_size > limit:
+            raise InputError(f"larger than {limit // 1_000_000} MB", where=str(path))
+        return path.read_bytes()
+    except FileNotFoundError as error:
+        raise InputError("no such file", where=str(path)) from error
+    except OSError as error:
+        raise _cannot("read", path, error) from error
+
+
+def _plain(value: object) -> object:
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    if isinstance(value, datetime.date | datetime.datetime | datetime.time):
+        return value.isoformat()
+    if isinstance(value, Path):
+        return value.as_posix()
+    raise TypeError(f"{type(value).__name__} has no JSON form")
+
+
+def _tagged(value: object) -> object:
+    return {f"${type(value).__name__}": _plain(value)}
+
+
+def _non_finite(value: object, place: str) -> str | None:
+    """Dotted place of the first NaN or infinity in nested containers, None if there is none."""
+    if isinstance(value, Mapping):
+        items = [(f"{place}.{key}" if place else str(key), item) for key, item in value.items()]
+    elif isinstance(value, list | tuple):
+        items = [(f"{place}[{number}]", item) for number, item in enumerate(value)]
+    elif isinstance(value, np.ndarray):
+        return _non_finite(value.tolist(), place)
+    elif isinstance(value, float | np.floating):
+        return None if math.isfinite(value) else place or "the value"
+    else:
+        return None
+    return next((hit for key, item in items if (hit := _non_finite(item, key)) is not None), None)
+
+
+def _table(frame: Frame) -> pa.Table:
+    if isinstance(frame, pd.DataFrame):
+        table = pa.Table.from_pandas(frame, preserve_index=False)
+    else:
+        table = pa.table(dict(frame))
+    # A column of nothing but nulls has no type of its own: here only text may be absent.
+    fields = [
+        field.with_type(pa.string())
+        if pa.types.is_null(field.type) or pa.types.is_large_string(field.type)
+        else field
+        for field in table.schema
+    ]
+    return table.cast(pa.schema(fields)).replace_schema_metadata(None)
+
+
+def _writer(stream: BinaryIO, schema: pa.Schema) -> pq.ParquetWriter:
+    return pq.ParquetWriter(
+        stream,
+        schema,
+        version="2.6",
+        data_page_version="1.0",
+        compression="zstd",
+        compression_level=3,
+        use_dictionary=[field.name for field in schema if _is_text(field.type)],
+        write_statistics=True,
+        store_schema=False,
+    )
+
+
+def _is_text(kind: pa.DataType) -> bool:
+    text = (pa.types.is_string, pa.types.is_large_string, pa.types.is_dictionary)
+    return any(check(kind) for check in text)
+
+
+def _trial_bounds(table: pa.Table) -> list[int]:
+    if "trial_id" not in table.column_names or table.num_rows == 0:
+        return [0, table.num_rows]
+    ids = table.column("trial_id").to_pandas().to_numpy()
+    return [0, *(np.flatnonzero(ids[1:] != ids[:-1]) + 1).tolist(), table.num_rows]
+
+
+def _read_trial(file: pq.ParquetFile, wanted: list[str], trial: str) -> pa.Table:
+    column = file.schema_arrow.names.index("trial_id")
+    groups = []
+    for group in range(file.num_row_groups):
+        limits = file.metadata.row_group(group).column(column).statistics
+        if limits is None or not limits.has_min_max or limits.min <= trial <= limits.max:
+            groups.append(group)
+    table = file.read_row_groups(groups, columns=list(dict.fromkeys([*wanted, "trial_id"])))
+    return table.filter(pc.equal(table.column("trial_id"), trial)).select(wanted)

@@ -1,0 +1,169 @@
+import datetime
+import os
+import stat
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from bampipe.data import store
+from bampipe.errors import InputError
+
+
+def frame(trial="t01", rows=5):
+    return pd.DataFrame({"trial_id": [trial] * rows, "t": np.arange(rows) * 0.002})
+
+
+def test_json_is_sorted_exact_and_reads_back(tmp_path):
+    path = tmp_path / "a" / "x.json"
+    value = {"b": np.float64(0.1), "a": [np.int64(3), None, np.array([1.5, 2.0])], "c": True}
+    store.write_json(path, value)
+    assert path.read_text() == '{\n "a": [\n  3,\n  null,\n  [\n   1.5,\n   2.0\n  ]\n ],' + (
+        '\n "b": 0.1,\n "c": true\n}\n'
+    )
+    assert store.read_json(path) == {"a": [3, None, [1.5, 2.0]], "b": 0.1, "c": True}
+
+
+@pytest.mark.parametrize("bad", [float("nan"), np.float64("inf"), np.array([1.0, np.nan])])
+def test_json_names_the_place_of_a_number_that_is_not_finite(tmp_path, bad):
+    with pytest.raises(ValueError, match=r"axes\.yaw\[1\]"):
+        store.write_json(tmp_path / "x.json", {"axes": {"yaw": [1.0, bad]}})
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_json_that_is_broken_is_named_with_its_line(tmp_path):
+    path = tmp_path / "x.json"
+    path.write_text('{"a": 1,\n oops}')
+    with pytest.raises(InputError, match=r"x\.json, line 2"):
+        store.read_json(path)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"a = 1\nb = = 2\n", "line 2"),
+        (b"a = 1\n\xff = 2\n", "line 2: not UTF-8"),
+        ("a = 1\n".encode("utf-16"), "UTF-16"),
+        (b"a = " + b"[" * 50_000, "not TOML"),
+        (b"#" * (store.LARGEST_TOML_BYTES + 1), "larger than 4 MB"),
+    ],
+)
+def test_toml_that_is_broken_is_named_with_its_line(tmp_path, content, message):
+    path = tmp_path / "x.toml"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=message):
+        store.read_toml(path)
+
+
+def test_missing_files_are_named(tmp_path):
+    for read in (store.read_json, store.read_toml, store.read_parquet):
+        with pytest.raises(InputError, match="nowhere.*: no such file"):
+            read(tmp_path / "nowhere")
+
+
+def test_an_error_while_writing_leaves_the_old_file_and_no_other(tmp_path):
+    path = tmp_path / "x.json"
+    store.write_json(path, {"old": 1})
+    with pytest.raises(RuntimeError), store.atomic_writer(path) as stream:
+        stream.write(b"half")
+        raise RuntimeError
+    assert store.read_json(path) == {"old": 1}
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_file_where_a_folder_should_be_is_a_plain_error(tmp_path):
+    (tmp_path / "run").write_text("")
+    with pytest.raises(InputError, match="cannot write"):
+        store.write_json(tmp_path / "run" / "x.json", {})
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root writes everywhere")
+def test_a_read_only_folder_is_a_plain_error(tmp_path):
+    tmp_path.chmod(stat.S_IREAD | stat.S_IEXEC)
+    with pytest.raises(InputError, match="permission denied"):
+        store.write_json(tmp_path / "x.json", {})
+
+
+def test_a_full_disk_is_a_plain_error(tmp_path):
+    if not os.path.exists("/dev/full"):
+        pytest.skip("no /dev/full here")
+    with (
+        pytest.raises(InputError, match="no space left"),
+        store.atomic_writer(tmp_path / "x"),
+        open("/dev/full", "wb", buffering=0) as full,
+    ):
+        full.write(b"x")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_parquet_has_a_row_group_a_trial_and_reads_one_of_them(tmp_path):
+    path = tmp_path / "x.parquet"
+    with store.ParquetAppender(path) as out:
+        out.append(frame("t01", 5))
+        out.append({"trial_id": pa.array(["t02"] * 3).dictionary_encode(), "t": np.arange(3.0)})
+        assert not path.exists()
+    assert pq.ParquetFile(path).num_row_groups == 2
+    assert store.read_parquet(path, trial="t02")["t"].tolist() == [0.0, 1.0, 2.0]
+    assert list(store.read_parquet(path, columns=["t"], trial="t01")) == ["t"]
+    assert store.read_parquet(path)["trial_id"].tolist() == ["t01"] * 5 + ["t02"] * 3
+    with pytest.raises(InputError, match="no trial 't09'"):
+        store.read_parquet(path, trial="t09")
+    with pytest.raises(InputError, match="no column 'q'"):
+        store.read_parquet(path, columns=["q"])
+
+
+def test_a_whole_frame_gets_the_same_bytes_as_its_trials_appended(tmp_path):
+    with store.ParquetAppender(tmp_path / "a") as out:
+        out.append(frame("t01"))
+        out.append(frame("t02"))
+    store.write_parquet(tmp_path / "b", pd.concat([frame("t01"), frame("t02")]))
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
+def test_absent_text_and_empty_frames_survive(tmp_path):
+    table = pd.DataFrame({"trial_id": ["t01"], "locked_axis": [None], "n": [3]})
+    store.write_parquet(tmp_path / "x", table)
+    assert store.read_parquet(tmp_path / "x")["locked_axis"].isna().all()
+    store.write_parquet(tmp_path / "y", table.iloc[:0])
+    assert list(store.read_parquet(tmp_path / "y")) == list(table)
+
+
+def test_an_error_while_appending_leaves_no_file(tmp_path):
+    with pytest.raises(RuntimeError), store.ParquetAppender(tmp_path / "x") as out:
+        out.append(frame())
+        raise RuntimeError
+    with pytest.raises(ValueError, match="no frame"), store.ParquetAppender(tmp_path / "x"):
+        pass
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("damage", [b"", b"garbage" * 40, "cut", "flip"])
+def test_a_damaged_parquet_file_is_named(tmp_path, damage):
+    path = tmp_path / "x.parquet"
+    store.write_parquet(path, frame(rows=4000))
+    whole = path.read_bytes()
+    if damage == "cut":
+        path.write_bytes(whole[: len(whole) // 2])
+    elif damage == "flip":
+        path.write_bytes(whole[:40] + bytes(200) + whole[240:])
+    else:
+        path.write_bytes(damage)
+    with pytest.raises(InputError, match=r"x\.parquet: not a sound Parquet file"):
+        store.read_parquet(path)
+
+
+def test_content_hash_sees_meaning_only(tmp_path):
+    first, second, third = (tmp_path / f"{name}.toml" for name in "abc")
+    first.write_text("a = 1\n[t]\nb = 2026-01-01\n")
+    second.write_text("# note\na  =  1\n t = { b = 2026-01-01 }\n")
+    third.write_text('a = 1\n[t]\nb = "2026-01-01"\n')
+    assert store.content_hash(first) == store.content_hash(second)
+    assert store.content_hash(first) != store.content_hash(third)
+    assert store.content_hash({"a": 1}) != store.content_hash({"a": 1.0})
+    assert store.content_hash({"a": datetime.date(2026, 1, 1)}) != store.content_hash({"a": 1})
+    raw = tmp_path / "x.csv"
+    raw.write_bytes(b"abc")
+    assert store.content_hash(raw) == store.sha256_file(raw)
+    assert store.sha256_file(raw).startswith("ba7816bf")
