@@ -9,6 +9,7 @@ from __future__ import annotations
 import ast
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import sympy as sp
@@ -80,12 +81,17 @@ class _Derivation:
         self.channels = [derivative(f, k) for k in (0, 1, 2) for f in device.forces]
         self.channels += [*device.brakes.values(), "t"]
         self.channel = {name: sp.Symbol(name, real=True) for name in self.channels}
-        self.p = {p.name: sp.Symbol(f"p{i}", real=True) for i, p in enumerate(model.parameters)}
+        self.p = {
+            p.name: sp.Symbol(f"p{i}", real=True)
+            for i, p in enumerate(model.parameters)
+        }
         self.special = {"sgn": self._sgn, "ddt": self.ddt}
         self.base: Symbols = {a: s for a, s in zip(self.axes, self.q, strict=True)}
         self.base |= {f"qd_{a}": s for a, s in zip(self.axes, self.qd, strict=True)}
         self.base |= {name: sp.Float(c.value) for name, c in device.constants.items()}
-        self.base |= {p.name: self.p[p.name] for p in device.parameters if "." not in p.name}
+        self.base |= {
+            p.name: self.p[p.name] for p in device.parameters if "." not in p.name
+        }
         self.base |= self.channel
         for name, tree in device.definitions.items():
             self.base[name] = self.build(tree, self.base, f"definitions.{name}")
@@ -104,11 +110,17 @@ class _Derivation:
     def ddt(self, expr: Any) -> Any:
         """Total time derivative by the chain rule over motion and measured channels."""
         total = sp.S.Zero
-        for a, b in (*zip(self.q, self.qd, strict=True), *zip(self.qd, self.qdd, strict=True)):
+        for a, b in (
+            *zip(self.q, self.qd, strict=True),
+            *zip(self.qd, self.qdd, strict=True),
+        ):
             total += sp.diff(expr, a) * b
         for force in self.model.device.forces:
             for k in (0, 1):
-                low, high = self.channel[derivative(force, k)], self.channel[derivative(force, k + 1)]
+                low, high = (
+                    self.channel[derivative(force, k)],
+                    self.channel[derivative(force, k + 1)],
+                )
                 total += sp.diff(expr, low) * high
         total += sp.diff(expr, self.channel["t"])
         return total.replace(sp.DiracDelta, lambda *_: sp.S.Zero)
@@ -116,11 +128,15 @@ class _Derivation:
     def table(self, entries: Mapping[str, ast.expr], what: str) -> list[Any]:
         """One expression an axis, zero where the table has none."""
         return [
-            self.build(entries[a], self.base, f"{what}.{a}") if a in entries else sp.S.Zero
+            self.build(entries[a], self.base, f"{what}.{a}")
+            if a in entries
+            else sp.S.Zero
             for a in self.axes
         ]
 
-    def effect_symbols(self, item: BoundEffect, applied: list[Any], side: list[Any]) -> Symbols:
+    def effect_symbols(
+        self, item: BoundEffect, applied: list[Any], side: list[Any]
+    ) -> Symbols:
         """Every name that an expression of ``item`` may use."""
         device = self.model.device
         symbols = dict(self.base)
@@ -131,7 +147,10 @@ class _Derivation:
         if item.effect.scope == "axis":
             i, a = self.axes.index(item.target), item.target
             symbols |= {"q": self.q[i], "qd": self.qd[i], "side_load": side[i]}
-            symbols |= {n: symbols[f"{n}_{a}"] for n in ("applied", "load", "viscous", "coulomb")}
+            symbols |= {
+                n: symbols[f"{n}_{a}"]
+                for n in ("applied", "load", "viscous", "coulomb")
+            }
             symbols["brake"] = self.channel.get(device.brakes.get(a, ""), sp.S.Zero)
         elif item.effect.scope in ("force_component", "force_pair"):
             for letter, component in zip("fg", item.target, strict=False):
@@ -148,8 +167,37 @@ class _Derivation:
     def z_of(self, item: BoundEffect, state: str) -> Any:
         return sp.Symbol(f"z_{item.prefix.replace('.', '_')}_{state}", real=True)
 
-    def own(self, item: BoundEffect, tree: ast.expr, symbols: Symbols, what: str) -> Any:
-        return expression.build(tree, symbols, f"effect {item.name!r}: {what}", self.special)
+    def own(
+        self, item: BoundEffect, tree: ast.expr, symbols: Symbols, what: str
+    ) -> Any:
+        return expression.build(
+            tree, symbols, f"effect {item.name!r}: {what}", self.special
+        )
+
+
+@cache
+def _lagrange(
+    kinetic: Any, potential: Any, q: tuple[Any, ...], qd: tuple[Any, ...]
+) -> tuple[list[list[Any]], list[Any]]:
+    """Mass matrix (eq 13) and bias (eq 12 with accelerations zero) of one pair of energies.
+
+    Lagrange's equation is linear in the energies, so each effect's are derived on their own and
+    the device's, which take seconds to simplify, only once.
+
+    Raises:
+        InputError: the kinetic energy is not quadratic in the rates.
+    """
+    mass = [
+        [sp.expand_trig(sp.simplify(sp.diff(kinetic, a, b))) for b in qd] for a in qd
+    ]
+    if any(entry.has(*qd) for row in mass for entry in row):
+        raise InputError("the kinetic energy must be quadratic in the rates")
+    bias = []
+    for i, rate in enumerate(qd):
+        momentum = sp.diff(kinetic, rate)
+        convective = sum(sp.diff(momentum, a) * b for a, b in zip(q, qd, strict=True))
+        bias.append(sp.simplify(convective - sp.diff(kinetic - potential, q[i])))
+    return mass, bias
 
 
 def derive(model: Model) -> Equations:
@@ -173,7 +221,9 @@ def derive(model: Model) -> Equations:
         for key, tree in item.effect.expressions.items():
             force = key.partition(".")[2]
             if not force:
-                component = item.target[0] if item.effect.scope == "force_pair" else item.target
+                component = (
+                    item.target[0] if item.effect.scope == "force_pair" else item.target
+                )
                 force = f"force_{component}"
             if force not in corrections:
                 raise InputError(f"effect {item.name!r}: device has no input {force!r}")
@@ -192,13 +242,18 @@ def derive(model: Model) -> Equations:
     for i, c in enumerate(device.coordinates):
         sign = d._sgn(d.qd[i])
         if c.name in device.frictional:
-            other[i] -= d.p[f"viscous.{c.name}"] * d.qd[i] + d.p[f"coulomb.{c.name}"] * sign
+            other[i] -= (
+                d.p[f"viscous.{c.name}"] * d.qd[i] + d.p[f"coulomb.{c.name}"] * sign
+            )
         if c.name in device.brakes:
             other[i] -= d.channel[device.brakes[c.name]] * sign
     for k, name in enumerate(device.process_noise):
         gains = d.table(device.process_noise[name], f"process_noise.{name}")
-        other = [e + g * w[len(device.forces) + k] for e, g in zip(other, gains, strict=True)]
+        other = [
+            e + g * w[len(device.forces) + k] for e, g in zip(other, gains, strict=True)
+        ]
 
+    energies = [(kinetic, potential)]
     offset = [sp.S.Zero] * n
     z, z_names, rates, initial = [], [], [], []
     for item in model.effects:
@@ -209,11 +264,13 @@ def derive(model: Model) -> Equations:
                 continue
             value = d.own(item, tree, symbols, key)
             if key == "kinetic":
-                kinetic += value
+                energies.append((value, sp.S.Zero))
             elif key == "potential":
-                potential += value
+                energies.append((sp.S.Zero, value))
             elif place not in axes:
-                raise InputError(f"effect {item.name!r}: {key}: device has no axis {place!r}")
+                raise InputError(
+                    f"effect {item.name!r}: {key}: device has no axis {place!r}"
+                )
             elif item.effect.kind == "torque":
                 other[axes.index(place)] += value
             else:
@@ -222,23 +279,29 @@ def derive(model: Model) -> Equations:
             z.append(d.z_of(item, state.name))
             z_names.append(f"{item.prefix}.{state.name}")
             rates.append(d.own(item, state.rate, symbols, f"states.{state.name}.rate"))
-            initial.append(d.own(item, state.initial, symbols, f"states.{state.name}.initial"))
+            initial.append(
+                d.own(item, state.initial, symbols, f"states.{state.name}.initial")
+            )
     for label, exprs in (("torque", other), ("states", rates), ("applied", applied)):
         if any(e.has(*d.qdd) for e in exprs):
             raise InputError(f"{label}: an acceleration cannot appear here")
 
-    mass = [[sp.expand_trig(sp.simplify(sp.diff(kinetic, a, b))) for b in d.qd] for a in d.qd]
-    if any(entry.has(*d.qd) for row in mass for entry in row):
-        raise InputError("the kinetic energy must be quadratic in the rates")
-    momentum = [sp.diff(kinetic, a) for a in d.qd]
-    bias = []
-    for i in range(n):
-        convective = sum(sp.diff(momentum[i], a) * b for a, b in zip(d.q, d.qd, strict=True))
-        bias.append(sp.simplify(convective - sp.diff(kinetic - potential, d.q[i])))
+    terms = [_lagrange(a, b, tuple(d.q), tuple(d.qd)) for a, b in energies]
+    mass = [[sum(t[0][i][j] for t in terms) for j in range(n)] for i in range(n)]
+    bias = [sum(t[1][i] for t in terms) for i in range(n)]
+    kinetic, potential = (sum(parts) for parts in zip(*energies, strict=True))
 
     offset_rate = [d.ddt(e) for e in offset]
     offset_acceleration = [d.ddt(e) for e in offset_rate]
-    parts = [*applied_noise, *other, *rates, *initial, *offset, *offset_rate, *offset_acceleration]
+    parts = [
+        *applied_noise,
+        *other,
+        *rates,
+        *initial,
+        *offset,
+        *offset_rate,
+        *offset_acceleration,
+    ]
     used = set().union(*(e.free_symbols for e in [*parts, *raw_applied]))
     inputs = [c for c in d.channels if d.channel[c] in used or c in device.forces]
     residual = [
@@ -260,3 +323,19 @@ def derive(model: Model) -> Equations:
         offset=offset, offset_rate=offset_rate, offset_acceleration=offset_acceleration,
         kinetic=kinetic, potential=potential, linear=linear,
     )  # fmt: skip
+
+
+def contribution(full: Equations, bare: Equations) -> list[Any]:
+    """What the effects in ``full`` add to the residual of ``bare``, one expression an axis."""
+    quiet = dict.fromkeys(full.w, 0)
+    added = []
+    for i in range(len(full.q)):
+        inertia = sum(
+            (m - n) * a
+            for m, n, a in zip(full.mass[i], bare.mass[i], full.qdd, strict=True)
+        )
+        force = full.applied[i] - bare.applied[i] + full.other[i] - bare.other[i]
+        added.append(
+            sp.sympify(force - (full.bias[i] - bare.bias[i]) - inertia).subs(quiet)
+        )
+    return added

@@ -100,7 +100,9 @@ class Device:
         return tuple(name.removeprefix("force_") for name in self.forces)
 
 
-def _table(declaration: Mapping[str, Any], key: str, where: str, required: bool) -> dict[str, Any]:
+def _table(
+    declaration: Mapping[str, Any], key: str, where: str, required: bool
+) -> dict[str, Any]:
     value = declaration.get(key, {})
     if not isinstance(value, Mapping) or (required and not value):
         raise InputError(f"table [{key}] is missing or not a table", where=where)
@@ -108,7 +110,9 @@ def _table(declaration: Mapping[str, Any], key: str, where: str, required: bool)
 
 
 def _expressions(table: Mapping[str, Any], where: str) -> dict[str, ast.expr]:
-    return {name: expression.parse(text, f"{where}.{name}") for name, text in table.items()}
+    return {
+        name: expression.parse(text, f"{where}.{name}") for name, text in table.items()
+    }
 
 
 def device_from(declaration: Mapping[str, Any], where: str = "device file") -> Device:
@@ -124,7 +128,8 @@ def device_from(declaration: Mapping[str, Any], where: str = "device file") -> D
     unknown = sorted(set(declaration) - _KEYS)
     if unknown:
         raise InputError(
-            f"unknown table {unknown[0]!r}{expression.did_you_mean(unknown[0], _KEYS)}", where=where
+            f"unknown table {unknown[0]!r}{expression.did_you_mean(unknown[0], _KEYS)}",
+            where=where,
         )
     name = declaration.get("name")
     if not isinstance(name, str) or not name:
@@ -147,8 +152,14 @@ def device_from(declaration: Mapping[str, Any], where: str = "device file") -> D
     for key, entry in _table(declaration, "constants", where, False).items():
         at = f"{where}: constants.{key}"
         value = entry.get("value") if isinstance(entry, Mapping) else None
-        if isinstance(value, bool) or not isinstance(value, int | float) or abs(value) > 1e30:
-            raise InputError("expected { value = number, unit = text, source = text }", where=at)
+        if (
+            isinstance(value, bool)
+            or not isinstance(value, int | float)
+            or abs(value) > 1e30
+        ):
+            raise InputError(
+                "expected { value = number, unit = text, source = text }", where=at
+            )
         constants[key] = Constant(
             float(value),
             str(entry.get("unit", "")),
@@ -162,18 +173,26 @@ def device_from(declaration: Mapping[str, Any], where: str = "device file") -> D
     for axis, terms in _table(declaration, "friction", where, False).items():
         at = f"{where}: friction.{axis}"
         if axis not in axes:
-            raise InputError(f"unknown axis{expression.did_you_mean(axis, axes)}", where=at)
+            raise InputError(
+                f"unknown axis{expression.did_you_mean(axis, axes)}", where=at
+            )
         if not isinstance(terms, Mapping) or set(terms) != {"viscous", "coulomb"}:
-            raise InputError("give viscous and coulomb, each with unit, prior, sd", where=at)
+            raise InputError(
+                "give viscous and coulomb, each with unit, prior, sd", where=at
+            )
         frictional.append(axis)
         for term in ("viscous", "coulomb"):
-            parameters.append(parameter_from(f"{term}.{axis}", terms[term], f"{at}.{term}"))
+            parameters.append(
+                parameter_from(f"{term}.{axis}", terms[term], f"{at}.{term}")
+            )
     for key, entry in _table(declaration, "parameters", where, False).items():
         parameters.append(parameter_from(key, entry, f"{where}: parameters.{key}"))
     noise = {}
     for key, entry in _table(declaration, "process_noise", where, False).items():
         at = f"{where}: process_noise.{key}"
-        if not isinstance(entry, Mapping) or not isinstance(entry.get("torque"), Mapping):
+        if not isinstance(entry, Mapping) or not isinstance(
+            entry.get("torque"), Mapping
+        ):
             raise InputError("expected a table with [torque] per axis", where=at)
         noise[key] = _expressions(entry["torque"], at)
     limits = {}
@@ -185,22 +204,37 @@ def device_from(declaration: Mapping[str, Any], where: str = "device file") -> D
         source=str(declaration.get("source", "")),
         coordinates=tuple(coordinates),
         constants=constants,
-        definitions=_expressions(_table(declaration, "definitions", where, False), f"{where}: definitions"),
+        definitions=_expressions(
+            _table(declaration, "definitions", where, False), f"{where}: definitions"
+        ),
         kinetic=expression.parse(energy.get("kinetic"), f"{where}: energy.kinetic"),
-        potential=expression.parse(energy.get("potential", "0"), f"{where}: energy.potential"),
-        torque=_expressions(_table(declaration, "torque", where, False), f"{where}: torque"),
+        potential=expression.parse(
+            energy.get("potential", "0"), f"{where}: energy.potential"
+        ),
+        torque=_expressions(
+            _table(declaration, "torque", where, False), f"{where}: torque"
+        ),
         forces=tuple(inputs.get("force", ())),
         force_unit=str(inputs.get("force_unit", "N")),
         brakes=dict(inputs.get("brakes", {})),
-        applied=_expressions(_table(declaration, "applied", where, True), f"{where}: applied"),
-        side_load=_expressions(_table(declaration, "side_load", where, False), f"{where}: side_load"),
+        applied=_expressions(
+            _table(declaration, "applied", where, True), f"{where}: applied"
+        ),
+        side_load=_expressions(
+            _table(declaration, "side_load", where, False), f"{where}: side_load"
+        ),
         process_noise=noise,
         parameters=tuple(parameters),
         frictional=tuple(frictional),
         limits=limits,
         declaration=declaration,
     )
-    for label, table in (("torque", device.torque), ("applied", device.applied), ("side_load", device.side_load), ("brakes", device.brakes)):
+    for label, table in (
+        ("torque", device.torque),
+        ("applied", device.applied),
+        ("side_load", device.side_load),
+        ("brakes", device.brakes),
+    ):
         for axis in table:
             if axis not in axes:
                 raise InputError(

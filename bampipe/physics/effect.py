@@ -56,18 +56,29 @@ class Effect:
         if self.scope == "force_component":
             return device.components
         if self.scope == "force_pair":
-            return tuple(a + b for a in device.components for b in device.components if a != b)
+            return tuple(
+                a + b for a in device.components for b in device.components if a != b
+            )
         return ("",) if self._fits(device) else ()
 
     def _fits(self, device: Device) -> bool:
         """Whether every name that a device-wide effect uses exists in ``device``."""
         known = set(device.definitions) | set(device.constants) | {"t"}
-        known |= {c.name for c in device.coordinates} | {p.name for p in device.parameters}
+        known |= {c.name for c in device.coordinates} | {
+            p.name for p in device.parameters
+        }
         for force in device.forces:
             known |= {force, derivative(force, 1), derivative(force, 2)}
-        known |= set(device.brakes.values()) | set(self.parameters) | {s.name for s in self.states}
+        known |= (
+            set(device.brakes.values())
+            | set(self.parameters)
+            | {s.name for s in self.states}
+        )
         for c in device.coordinates:
-            known |= {f"{prefix}_{c.name}" for prefix in ("qd", "applied", "viscous", "coulomb", "load")}
+            known |= {
+                f"{prefix}_{c.name}"
+                for prefix in ("qd", "applied", "viscous", "coulomb", "load")
+            }
         trees = [*self.expressions.values()]
         trees += [tree for state in self.states for tree in (state.rate, state.initial)]
         keys = {key.partition(".")[2] for key in self.expressions} - {""}
@@ -117,7 +128,8 @@ def effect_from(declaration: Mapping[str, Any], where: str = "effect file") -> E
     unknown = sorted(set(declaration) - _KEYS)
     if unknown:
         raise InputError(
-            f"unknown key {unknown[0]!r}{expression.did_you_mean(unknown[0], _KEYS)}", where=where
+            f"unknown key {unknown[0]!r}{expression.did_you_mean(unknown[0], _KEYS)}",
+            where=where,
         )
     for key in ("name", "summary", "scope", "kind", "looks_like", "source"):
         if not isinstance(declaration.get(key), str) or not declaration[key]:
@@ -128,18 +140,25 @@ def effect_from(declaration: Mapping[str, Any], where: str = "effect file") -> E
     if kind not in KINDS:
         raise InputError(f"kind {kind!r} is none of {', '.join(KINDS)}", where=where)
     if not declaration["name"].isidentifier():
-        raise InputError("name must be an identifier, such as magnetic_detent", where=where)
+        raise InputError(
+            "name must be an identifier, such as magnetic_detent", where=where
+        )
     main = {"torque": "torque", "input": "input", "measurement": "offset"}
     trees: dict[str, ast.expr] = {}
     for key in [main[kind]] if kind in main else ["kinetic", "potential"]:
         value = declaration.get(key)
         if isinstance(value, Mapping):
             for place, text in value.items():
-                trees[f"{key}.{place}"] = expression.parse(text, f"{where}: {key}.{place}")
+                trees[f"{key}.{place}"] = expression.parse(
+                    text, f"{where}: {key}.{place}"
+                )
         elif value is not None:
             trees[key] = expression.parse(value, f"{where}: {key}")
     if not trees:
-        raise InputError(f"an effect of kind {kind!r} needs {main.get(kind, 'kinetic or potential')!r}", where=where)
+        raise InputError(
+            f"an effect of kind {kind!r} needs {main.get(kind, 'kinetic or potential')!r}",
+            where=where,
+        )
     parameters = declaration.get("parameters")
     if not isinstance(parameters, Mapping) or not parameters:
         raise InputError("[parameters.*] is missing", where=where)
@@ -198,7 +217,9 @@ def bind(effect: Effect, target: str, device: Device) -> BoundEffect:
         chosen = entry
         if isinstance(entry, Mapping) and ("rotary" in entry or "linear" in entry):
             if kind not in entry:
-                raise InputError(f"no entry for a {kind or 'device'} parameter", where=where)
+                raise InputError(
+                    f"no entry for a {kind or 'device'} parameter", where=where
+                )
             chosen = {**entry[kind]}
             if "description" in entry:
                 chosen.setdefault("description", entry["description"])

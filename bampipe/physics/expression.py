@@ -51,12 +51,16 @@ def parse(text: object, where: str) -> ast.expr:
     if not isinstance(text, str):
         raise InputError(f"expected an expression as text, found {text!r}", where=where)
     if len(text) > MAX_LENGTH:
-        raise InputError(f"expression is longer than {MAX_LENGTH} characters", where=where)
+        raise InputError(
+            f"expression is longer than {MAX_LENGTH} characters", where=where
+        )
     try:
         tree = ast.parse(" ".join(text.split()), mode="eval").body
     except (SyntaxError, ValueError, MemoryError, RecursionError) as error:
         reason = getattr(error, "msg", None) or type(error).__name__
-        raise InputError(f"cannot read the expression {text[:60]!r}: {reason}", where=where) from None
+        raise InputError(
+            f"cannot read the expression {text[:60]!r}: {reason}", where=where
+        ) from None
     try:
         nodes = list(ast.walk(tree))
         if len(nodes) > MAX_NODES:
@@ -92,7 +96,8 @@ def _check(node: ast.AST, where: str) -> None:
                 )
             if len(args) != FUNCTIONS[name]:
                 raise InputError(
-                    f"{name}() takes {FUNCTIONS[name]} argument(s), found {len(args)}", where=where
+                    f"{name}() takes {FUNCTIONS[name]} argument(s), found {len(args)}",
+                    where=where,
                 )
             for argument in args:
                 _check(argument, where)
@@ -115,7 +120,11 @@ def _check_power(exponent: ast.AST, where: str) -> None:
 def names(tree: ast.AST) -> set[str]:
     """Names of quantities that an expression uses (function names left out)."""
     functions = {id(n.func) for n in ast.walk(tree) if isinstance(n, ast.Call)}
-    return {n.id for n in ast.walk(tree) if isinstance(n, ast.Name) and id(n) not in functions}
+    return {
+        n.id
+        for n in ast.walk(tree)
+        if isinstance(n, ast.Name) and id(n) not in functions
+    }
 
 
 def did_you_mean(word: str, known: Any) -> str:
@@ -171,7 +180,8 @@ def build(
             case ast.Name(id=name):
                 if name not in symbols:
                     raise InputError(
-                        f"unknown symbol {name!r}{did_you_mean(name, symbols)}", where=where
+                        f"unknown symbol {name!r}{did_you_mean(name, symbols)}",
+                        where=where,
                     )
                 return symbols[name]
             case ast.UnaryOp(op=op, operand=operand):
@@ -190,7 +200,9 @@ def build(
                     return a / b
                 return a ** sp.nsimplify(b) if b.is_number else a**b
             case ast.Call(func=ast.Name(id=name), args=args):
-                return {**_builders(), **special}[name](*[walk(argument) for argument in args])
+                return {**_builders(), **special}[name](
+                    *[walk(argument) for argument in args]
+                )
         raise AssertionError(f"unchecked node {type(node).__name__}")
 
     return walk(tree)

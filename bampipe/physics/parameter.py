@@ -9,7 +9,17 @@ from dataclasses import dataclass
 from bampipe.errors import InputError
 
 _KEYS = frozenset(
-    {"unit", "prior", "sd", "lower", "upper", "strength", "fixed", "typical", "description"}
+    {
+        "unit",
+        "prior",
+        "sd",
+        "lower",
+        "upper",
+        "strength",
+        "fixed",
+        "typical",
+        "description",
+    }
 )
 
 
@@ -59,22 +69,32 @@ def parameter_from(name: str, entry: object, where: str) -> Parameter:
             lies outside the bounds.
     """
     if not isinstance(entry, Mapping):
-        raise InputError("expected a table { unit = ..., prior = ..., sd = ... }", where=where)
+        raise InputError(
+            "expected a table { unit = ..., prior = ..., sd = ... }", where=where
+        )
     unknown = sorted(set(entry) - _KEYS)
     if unknown:
         raise InputError(
-            f"unknown key {unknown[0]!r}", where=where, remedy=f"known keys: {sorted(_KEYS)}"
+            f"unknown key {unknown[0]!r}",
+            where=where,
+            remedy=f"known keys: {sorted(_KEYS)}",
         )
     for key in ("unit", "prior", "sd"):
         if key not in entry:
-            raise InputError(f"{key!r} is missing", where=where, remedy="give unit, prior and sd")
+            raise InputError(
+                f"{key!r} is missing", where=where, remedy="give unit, prior and sd"
+            )
     numbers = {}
     for key in ("prior", "sd", "lower", "upper", "typical"):
         if key in entry:
             value = entry[key]
             if isinstance(value, bool) or not isinstance(value, int | float):
-                raise InputError(f"{key} must be a number, found {value!r}", where=where)
-            if math.isnan(value) or (math.isinf(value) and key in ("prior", "sd", "typical")):
+                raise InputError(
+                    f"{key} must be a number, found {value!r}", where=where
+                )
+            if math.isnan(value) or (
+                math.isinf(value) and key in ("prior", "sd", "typical")
+            ):
                 raise InputError(f"{key} must be finite, found {value!r}", where=where)
             numbers[key] = float(value)
     if not isinstance(entry["unit"], str):

@@ -13,17 +13,30 @@ from bampipe.physics.device import Device, device_from
 from bampipe.physics.effect import Effect, effect_from
 from bampipe.physics.expression import did_you_mean
 
-__all__ = ["device", "device_from", "device_names", "effect", "effect_from", "effect_names"]
+__all__ = [
+    "device",
+    "device_from",
+    "device_names",
+    "effect",
+    "effect_from",
+    "effect_names",
+]
 
 
 def _names(folder: str) -> tuple[str, ...]:
     entries = (files("bampipe.physics") / folder).iterdir()
-    return tuple(sorted(e.name.removesuffix(".toml") for e in entries if e.name.endswith(".toml")))
+    return tuple(
+        sorted(
+            e.name.removesuffix(".toml") for e in entries if e.name.endswith(".toml")
+        )
+    )
 
 
 @cache
 def _declaration(folder: str, name: str) -> Mapping[str, Any]:
-    text = (files("bampipe.physics") / folder / f"{name}.toml").read_text(encoding="utf-8")
+    text = (files("bampipe.physics") / folder / f"{name}.toml").read_text(
+        encoding="utf-8"
+    )
     return tomllib.loads(text)
 
 

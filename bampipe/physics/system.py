@@ -34,6 +34,8 @@ class System:
         parameters: what p holds, in order.
         noise: names of the additive process noise w.
         linear: per parameter, whether the residual is linear in it.
+        touched: axes whose equation the effects change, measurement effects aside.
+        moves_sensors: whether an effect of kind ``measurement`` is present.
     """
 
     def __init__(self, model: Model, folder: Path, meta: dict[str, Any]) -> None:
@@ -54,6 +56,8 @@ class System:
         self.noise: tuple[str, ...] = tuple(meta["noise"])
         self.parameters: tuple[Parameter, ...] = model.parameters
         self.linear: tuple[bool, ...] = tuple(meta["linear"])
+        self.touched: tuple[int, ...] = tuple(meta["touched"])
+        self.moves_sensors: bool = meta["moves_sensors"]
 
     @property
     def prior(self) -> Array:
@@ -98,14 +102,18 @@ class System:
         """
         return self._compiled.memory_rate  # type: ignore[no-any-return]
 
-    def true_motion(self, q: Array, qd: Array, qdd: Array, u: Array, p: Array) -> tuple[Array, ...]:
+    def true_motion(
+        self, q: Array, qd: Array, qdd: Array, u: Array, p: Array
+    ) -> tuple[Array, ...]:
         """Motion of the mechanism from what the encoders read; each (T, n_q)."""
         n = len(self.coordinates)
         columns = self._arrays.true_motion(q.T, qd.T, qdd.T, u.T, p)
         stacked = _stack(columns, len(q))
         return stacked[:, :n], stacked[:, n : 2 * n], stacked[:, 2 * n :]
 
-    def required(self, q: Array, qd: Array, qdd: Array, z: Array, u: Array, p: Array) -> Array:
+    def required(
+        self, q: Array, qd: Array, qdd: Array, z: Array, u: Array, p: Array
+    ) -> Array:
         """Generalised force that the user must supply for this motion.
 
         Inertia, Coriolis, gravity, friction, brakes and every effect of kind ``torque``; the
@@ -123,7 +131,9 @@ class System:
         a, b, c = self.true_motion(q, qd, qdd, u, p)
         return _stack(self._arrays.required(a.T, b.T, c.T, z.T, u.T, p), len(q))
 
-    def applied(self, q: Array, qd: Array, qdd: Array, z: Array, u: Array, p: Array) -> Array:
+    def applied(
+        self, q: Array, qd: Array, qdd: Array, z: Array, u: Array, p: Array
+    ) -> Array:
         """Generalised force of the measured input mapped to the joints (eq 19), (T, n_q).
 
         Arguments as in `required`; effects of kind ``input`` are included. The model's residual
@@ -131,6 +141,34 @@ class System:
         """
         a, b, c = self.true_motion(q, qd, qdd, u, p)
         return _stack(self._arrays.applied(a.T, b.T, c.T, z.T, u.T, p), len(q))
+
+    def residual(
+        self, q: Array, qd: Array, qdd: Array, z: Array, u: Array, p: Array
+    ) -> Array:
+        """``applied - required`` for the mechanism's true motion, compiled; (T, n_q), N.m or N.
+
+        Arguments as in `required`, but q, qd, qdd are already what `true_motion` returns.
+        """
+        from bampipe.physics.loops import residual_rows
+
+        arrays = [
+            np.ascontiguousarray(x, dtype=np.float64) for x in (q, qd, qdd, z, u, p)
+        ]
+        return residual_rows(self._compiled.residual, *arrays)  # type: ignore[no-any-return]
+
+    def contribution(
+        self, q: Array, qd: Array, qdd: Array, z: Array, u: Array, p: Array
+    ) -> Array:
+        """What the model's effects add to the residual of the bare device, (T, n_q).
+
+        Effects of kind ``measurement`` change the motion instead; see `true_motion`. Columns of
+        axes that no effect touches are zero.
+        """
+        out = np.zeros((len(q), len(self.coordinates)))
+        columns = self._arrays.contribution(q.T, qd.T, qdd.T, z.T, u.T, p)
+        for axis, column in zip(self.touched, columns, strict=True):
+            out[:, axis] = column
+        return out
 
     def input_map(self, q: Array) -> Array:
         """d applied / d force of the device itself, (T, n_q, n_force)."""
@@ -151,7 +189,9 @@ class System:
         """Internal states at the start of a trial, (n_z,), from the first q (n_q,) and u (n_u,)."""
         return np.array([float(v) for v in self._arrays.initial_memory(q, u, p)])
 
-    def memory(self, q: Array, qd: Array, qdd: Array, u: Array, p: Array, t: Array) -> Array:
+    def memory(
+        self, q: Array, qd: Array, qdd: Array, u: Array, p: Array, t: Array
+    ) -> Array:
         """Internal states along a measured motion of one trial, (T, n_z).
 
         Integrated by RK4 with inputs interpolated linearly between samples.
@@ -162,12 +202,12 @@ class System:
         """
         if not self.memory_names:
             return np.zeros((len(q), 0))
-        from bampipe.physics.memory import integrate
+        from bampipe.physics.loops import integrate_memory
 
         a, b, _ = self.true_motion(q, qd, qdd, u, p)
         z0 = self.initial_memory(a[0], u[0], p)
         arrays = [np.ascontiguousarray(x, dtype=np.float64) for x in (a, b, u, p, t)]
-        return integrate(self.memory_rate, *arrays, z0, _MEMORY_STEPS)
+        return integrate_memory(self.memory_rate, *arrays, z0, _MEMORY_STEPS)
 
 
 def _stack(columns: tuple[Any, ...], rows: int) -> Array:
@@ -190,17 +230,20 @@ def compile_model(model: Model) -> System:
     if path.exists():
         return System(model, folder, json.loads(path.read_text()))
     from bampipe.physics.codegen import array_source, scalar_source
-    from bampipe.physics.derivation import derive
+    from bampipe.physics.derivation import contribution, derive
 
     equations = derive(model)
+    added = contribution(equations, derive(Model(model.device)))
     meta = {
         "key": key,
         "memory": equations.z_names,
         "inputs": equations.inputs,
         "noise": equations.noise,
         "linear": equations.linear,
+        "touched": [i for i, e in enumerate(added) if e != 0],
+        "moves_sensors": any(e != 0 for e in equations.offset),
     }
-    _write(folder / f"columns_{key}.py", array_source(equations))
+    _write(folder / f"columns_{key}.py", array_source(equations, added))
     _write(folder / f"compiled_{key}.py", scalar_source(equations))
     _write(path, json.dumps(meta))
     return System(model, folder, meta)

@@ -1,16 +1,16 @@
-"""Integration of internal states along a known motion."""
+"""Loops of compiled functions over the samples of a trial."""
 
 import numpy as np
 from numba import njit, types
 
-from bampipe.physics.signatures import MEMORY_RATE
+from bampipe.physics.signatures import MEMORY_RATE, RESIDUAL
 
 _V = types.float64[::1]
 _M = types.float64[:, ::1]
 
 
 @njit(_M(MEMORY_RATE, _M, _M, _M, _V, _V, _V, types.int64), cache=True)
-def integrate(rate, q, qd, u, p, t, z0, steps):  # type: ignore[no-untyped-def]
+def integrate_memory(rate, q, qd, u, p, t, z0, steps):  # type: ignore[no-untyped-def]
     """RK4 with ``steps`` substeps a sample; q (T, n_q), qd, u (T, n_u), t (T,) -> z (T, n_z)."""
     count, n = len(t), len(z0)
     out = np.empty((count, n))
@@ -29,4 +29,13 @@ def integrate(rate, q, qd, u, p, t, z0, steps):  # type: ignore[no-untyped-def]
             rate(q[i] + c * dq, qd[i] + c * dv, u[i] + c * du, p, z + h * k3, k4)
             z = z + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
         out[i + 1] = z
+    return out
+
+
+@njit(_M(RESIDUAL, _M, _M, _M, _M, _M, _V), cache=True)
+def residual_rows(residual, q, qd, qdd, z, u, p):  # type: ignore[no-untyped-def]
+    """Residual of the inverse dynamics, row by row: (T, n_q)."""
+    out = np.empty(q.shape)
+    for i in range(len(q)):
+        residual(q[i], qd[i], qdd[i], z[i], u[i], p, out[i])
     return out
