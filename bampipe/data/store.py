@@ -31,6 +31,9 @@ from bampipe.errors import InputError
 LARGEST_TOML_BYTES = 4_000_000
 """A settings file larger than this is taken for something else, and not parsed."""
 
+DEEPEST_TOML = 40
+"""Settings nested more deeply than this are refused (code that walks them may recurse)."""
+
 Frame = pd.DataFrame | Mapping[str, np.ndarray | pa.Array]
 
 
@@ -106,7 +109,7 @@ def read_toml(path: Path) -> dict[str, Any]:
             "UTF-16 text, where TOML is UTF-8", where=str(path), remedy="save it as UTF-8"
         )
     try:
-        return tomllib.loads(data.decode("utf-8-sig"))
+        table = tomllib.loads(data.decode("utf-8-sig"))
     except UnicodeDecodeError as error:
         line = data[: error.start].count(b"\n") + 1
         raise InputError(
@@ -117,7 +120,10 @@ def read_toml(path: Path) -> dict[str, Any]:
         what, where = (found[1], f"{path}, line {found[2]}") if found else (str(error), str(path))
         raise InputError(f"not TOML: {what}", where=where) from error
     except RecursionError as error:
-        raise InputError("not TOML: nested too deeply", where=str(path)) from error
+        raise InputError("nested too deeply", where=str(path)) from error
+    if _deeper(table, DEEPEST_TOML):
+        raise InputError("nested too deeply", where=str(path))
+    return table
 
 
 class ParquetAppender:
@@ -258,6 +264,15 @@ def content_hash(value: object) -> str:
             return sha256_file(value)
     text = json.dumps(value, sort_keys=True, separators=(",", ":"), default=_tagged)
     return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _deeper(value: object, limit: int) -> bool:
+    """Whether containers are nested more than ``limit`` deep (no recursion beyond that)."""
+    if isinstance(value, Mapping):
+        value = list(value.values())
+    if not isinstance(value, list):
+        return False
+    return limit == 0 or any(_deeper(item, limit - 1) for item in value)
 
 
 def _discard(partial: Path) -> None:

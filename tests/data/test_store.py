@@ -46,7 +46,8 @@ def test_json_that_is_broken_is_named_with_its_line(tmp_path):
         (b"a = 1\nb = = 2\n", "line 2"),
         (b"a = 1\n\xff = 2\n", "line 2: not UTF-8"),
         ("a = 1\n".encode("utf-16"), "UTF-16"),
-        (b"a = " + b"[" * 50_000, "not TOML"),
+        (b"a = " + b"[" * 50_000, "nested too deeply"),
+        (b".".join([b"a"] * 5_000) + b" = 1", "nested too deeply"),
         (b"#" * (store.LARGEST_TOML_BYTES + 1), "larger than 4 MB"),
     ],
 )

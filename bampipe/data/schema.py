@@ -1,0 +1,133 @@
+"""JSON Schemas of the files that people write, and validation in one plain line.
+
+The schemas are ``schemas/*.schema.json`` at the top of the source tree. A wheel carries them as
+the folder ``bampipe/_schemas``, which in the source tree is a link to ``schemas``: setuptools
+follows it, given ``bampipe*`` in ``packages.find`` and ``"bampipe._schemas" = ["*.json"]`` in
+``package-data``.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from bampipe.errors import InputError
+
+_PACKAGE = Path(__file__).resolve().parent.parent
+_FOLDERS = (_PACKAGE / "_schemas", _PACKAGE.parent / "schemas")
+
+_TYPES = {
+    "object": "a table",
+    "array": "a list",
+    "string": "text",
+    "number": "a number",
+    "integer": "a whole number",
+    "boolean": "true or false",
+}
+
+_KEYWORDS = {
+    "additionalProperties": lambda bound: "no such key",
+    "minItems": lambda bound: f"at least {bound} in the list",
+    "minProperties": lambda bound: f"at least {bound} entry",
+    "minLength": lambda bound: "text that is not empty",
+    "maxLength": lambda bound: f"at most {bound} characters",
+    "minimum": lambda bound: f"{bound} or more",
+    "exclusiveMinimum": lambda bound: f"more than {bound}",
+    "maximum": lambda bound: f"{bound} or less",
+    "exclusiveMaximum": lambda bound: f"less than {bound}",
+    "uniqueItems": lambda bound: "no entry twice",
+    "const": lambda bound: _shown(bound),
+    "enum": lambda bound: " or ".join(_shown(choice) for choice in bound),
+    "type": lambda bound: _TYPES.get(bound, str(bound)),
+    "pattern": lambda bound: f"a name that matches {bound}",
+}
+
+
+@cache
+def load(name: str) -> Mapping[str, Any]:
+    """The JSON Schema ``name``, for example ``"session"``."""
+    for folder in _FOLDERS:
+        path = folder / f"{name}.schema.json"
+        if path.is_file():
+            return json.loads(path.read_text(encoding="utf-8"))
+    raise FileNotFoundError(f"{name}.schema.json in {' or '.join(map(str, _FOLDERS))}")
+
+
+def validate(value: object, name: str, where: str) -> None:
+    """Check ``value``, made of what JSON can hold, against the schema ``name``.
+
+    Args:
+        value: the parsed file.
+        name: of the schema.
+        where: the file, for the message.
+
+    Raises:
+        InputError: names the file, the field (dotted), what was found, what is expected, and
+            how many other fields are wrong.
+    """
+    from jsonschema import Draft202012Validator  # heavy: only when a file is checked
+
+    errors = sorted(Draft202012Validator(load(name)).iter_errors(value), key=_order)
+    if not errors:
+        return
+    first = errors[0]
+    others = len(errors) - 1
+    place = dotted(first.absolute_path)
+    if first.validator == "required":
+        missing = next(key for key in first.validator_value if key not in first.instance)
+        what, remedy = f"'{missing}' is missing", _described(first.schema, missing)
+    elif first.validator == "additionalProperties":
+        known = first.schema["properties"]
+        unknown = next(key for key in first.instance if key not in known)
+        what = f"unknown key {_shown(unknown)}{did_you_mean(unknown, known)}"
+        remedy = "" if "did you mean" in what else f"known keys: {', '.join(known)}"
+    else:
+        expected = _KEYWORDS.get(first.validator, lambda bound: first.message)
+        found = f"found {_shown(first.instance)}, expected {expected(first.validator_value)}"
+        what, remedy = found, ""
+        if first.validator == "enum" and isinstance(first.instance, str):
+            what += did_you_mean(first.instance, first.validator_value)
+    raise InputError(
+        what + (f" (and {others} more)" if others else ""),
+        where=f"{where}: {place}" if place else where,
+        remedy=remedy,
+    )
+
+
+def dotted(path: Iterable[str | int]) -> str:
+    """``encoders.yaw.unit`` or ``trials[2].kind``, for the keys and indices in ``path``."""
+    text = ""
+    for part in path:
+        if isinstance(part, int):
+            text += f"[{part}]"
+        else:
+            text += f".{part}" if text else part
+    return text
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """``", did you mean 'x'?"`` for the closest of ``known``, or nothing where none is close."""
+    lowered = {str(key).lower(): key for key in known}
+    close = difflib.get_close_matches(name.lower(), lowered, n=1, cutoff=0.6)
+    return f", did you mean '{lowered[close[0]]}'?" if close else ""
+
+
+def _order(error: Any) -> tuple[list[tuple[bool, object]], bool, str]:
+    path: Sequence[str | int] = list(error.absolute_path)
+    places = [(isinstance(part, str), part) for part in path]
+    return places, error.validator != "additionalProperties", error.message
+
+
+def _described(schema: Mapping[str, Any], key: str) -> str:
+    return schema.get("properties", {}).get(key, {}).get("description", "")
+
+
+def _shown(value: object) -> str:
+    if isinstance(value, Mapping):
+        return "a table"
+    text = json.dumps(value, ensure_ascii=False)
+    return text if len(text) <= 60 else text[:57] + "..."
