@@ -110,8 +110,10 @@ class CausalButterworth:
         angle = 1e-3
         shift = np.exp(-1j * angle)
         response = np.prod(
-            [(b0 + b1 * shift + b2 * shift**2) / (1.0 + a1 * shift + a2 * shift**2)
-             for b0, b1, b2, _, a1, a2 in self._sections]
+            [
+                (b0 + b1 * shift + b2 * shift**2) / (1.0 + a1 * shift + a2 * shift**2)
+                for b0, b1, b2, _, a1, a2 in self._sections
+            ]
         )
         self.delay_s = float(-np.angle(response) / angle / rate_hz)
 

@@ -53,6 +53,13 @@ class UniformGrid:
     exact: bool
     source: Array
 
+    def hold(self, values: Array) -> Array:
+        """Return ``values`` (N,) on the grid (T,): the last one given, as of a command."""
+        if self.exact:
+            return np.array(values, dtype=np.float64)
+        last = np.searchsorted(self.source, self.t + 1e-9, side="right") - 1
+        return np.asarray(values[np.clip(last, 0, len(values) - 1)], dtype=np.float64)
+
     def resample(self, values: Array) -> Array:
         """Return ``values`` (N,) on the grid (T,).
 

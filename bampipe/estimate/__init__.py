@@ -1,0 +1,1 @@
+"""Estimators: they see callables and arrays only, never the physics or the data."""

@@ -1,0 +1,327 @@
+"""Stage filter: velocity and acceleration from encoders, on a uniform grid, with error bands."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from bampipe.data.store import ParquetAppender, read_parquet, write_json
+from bampipe.errors import InputError
+from bampipe.estimate import butterworth, kalman_smoother, savitzky_golay
+from bampipe.estimate.differentiation import (
+    Array,
+    Derivatives,
+    Flags,
+    UniformGrid,
+    uniform_grid,
+)
+from bampipe.stages.base import Progress, RunFolder
+
+NAME = "filter"
+SUMMARY = "Velocity and acceleration from the encoders, with error bands"
+
+METHODS = ("auto", "kalman", "butterworth", "savitzky_golay")
+_MOVING = ("free", "viscous")
+_SHORTEST = 32
+
+
+@dataclass(frozen=True)
+class Config:
+    """What the stage can be told.
+
+    Attributes:
+        method: ``kalman`` (fixed-interval smoother), ``butterworth`` (zero-phase filter and
+            central differences), ``savitzky_golay``, or ``auto``, which is the Kalman smoother:
+            of the three it alone bridges gaps with honest error bands and has its bandwidth
+            set by the likelihood of the samples.
+        cutoff_hz: bandwidth, Hz, for all axes; 0 takes it from the data, axis by axis: for the
+            Kalman smoother the maximum likelihood over order and process noise, for the others
+            the frequency where the encoder spectrum meets the quantisation floor.
+        minimum_bandwidth_hz: a bandwidth taken from the data is held at this or above, Hz:
+            changes of direction must not be smeared, friction is read from them.
+        force_cutoff_hz: half-amplitude frequency, Hz, of the derivatives of the force; the force
+            itself is not filtered.
+        tuning_samples: at most so many samples of each axis are used to choose the bandwidth,
+            in equal parts from all trials.
+    """
+
+    method: str = "auto"
+    cutoff_hz: float = 0.0
+    minimum_bandwidth_hz: float = 20.0
+    force_cutoff_hz: float = 25.0
+    tuning_samples: int = 120_000
+
+
+def inputs(config: Config) -> tuple[str, ...]:
+    """Return the paths the stage reads."""
+    return ("ingest/trials.parquet", "ingest/samples.parquet", "ingest/session.json")
+
+
+def outputs(config: Config) -> tuple[str, ...]:
+    """Return the paths the stage writes."""
+    return ("filter/kinematics.parquet", "filter/filter.json")
+
+
+@dataclass(frozen=True)
+class _Trial:
+    """One trial on its uniform grid."""
+
+    trial_id: str
+    grid: UniformGrid
+    frame: pd.DataFrame
+
+    @property
+    def seen(self) -> Flags:
+        return np.logical_not(self.grid.bridged)
+
+
+@dataclass(frozen=True)
+class _Choice:
+    """How one axis is differentiated, and the words for it."""
+
+    model: kalman_smoother.MotionModel | None
+    cutoff_hz: float
+    report: dict[str, object]
+
+
+def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
+    """Differentiate every free and viscous trial."""
+    _check(config)
+    session = run.read_json("ingest/session.json")
+    axes: dict[str, dict[str, object]] = session["axes"]
+    rate = float(session["sample_rate_hz"])
+    samples = run.require("ingest/samples.parquet", "ingest")
+    trials = read_parquet(run.require("ingest/trials.parquet", "ingest"))
+    wanted = trials[trials["kind"].isin(_MOVING) & (trials["status"] != "set_aside")]
+    ids = [str(name) for name in wanted["trial_id"]]
+    skipped: dict[str, str] = {}
+
+    progress(0.0, "choosing the bandwidth")
+    records = _tuning_records(samples, ids, tuple(axes), rate, config.tuning_samples)
+    if not any(records.values()):
+        raise InputError(
+            "no free or viscous trial to differentiate",
+            where=str(run.root),
+            remedy="look at ingest/trials.parquet for the reasons",
+        )
+    choices = {
+        axis: _choose(records[axis], rate, float(str(axes[axis]["resolution"] or 0.0)), config)
+        for axis in axes
+    }
+    levels: dict[str, list[tuple[float, float, float]]] = {axis: [] for axis in axes}
+    interpolated: dict[str, float] = {}
+    with ParquetAppender(out / "filter/kinematics.parquet") as file:
+        for number, trial_id in enumerate(ids):
+            progress(0.2 + 0.8 * number / len(ids), trial_id)
+            trial = _load(samples, trial_id, rate)
+            if isinstance(trial, str):
+                skipped[trial_id] = trial
+                continue
+            frame, bands = _differentiate(trial, choices, rate, config)
+            file.append(frame)
+            interpolated[trial_id] = float(np.mean(trial.grid.bridged))
+            for axis in axes:
+                levels[axis].append(bands[axis])
+    content = _report(config, axes, choices, levels, interpolated, skipped, rate)
+    write_json(out / "filter/filter.json", content)
+    return content
+
+
+def _check(config: Config) -> None:
+    """Raise :class:`InputError` where a setting makes no sense."""
+    if config.method not in METHODS:
+        raise InputError(
+            f"no method {config.method!r}",
+            where="filter.method",
+            remedy=f"choose from {', '.join(METHODS)}",
+        )
+    for name in ("cutoff_hz", "minimum_bandwidth_hz"):
+        if getattr(config, name) < 0.0:
+            raise InputError("must not be negative", where=f"filter.{name}")
+    if config.force_cutoff_hz <= 0.0:
+        raise InputError("must be positive", where="filter.force_cutoff_hz")
+    if config.tuning_samples < 1000:
+        raise InputError("must be 1000 or more", where="filter.tuning_samples")
+
+
+def _load(samples: Path, trial_id: str, rate: float) -> _Trial | str:
+    """Return the trial on its grid, or why it cannot be differentiated."""
+    frame = read_parquet(samples, trial=trial_id)
+    sound = frame.drop(columns="trial_id").notna().all(axis=1).to_numpy()
+    frame = frame[sound]
+    if len(frame) < _SHORTEST:
+        return f"only {len(frame)} sound samples; {_SHORTEST} are needed"
+    return _Trial(trial_id, uniform_grid(frame["t"].to_numpy(dtype=np.float64), rate), frame)
+
+
+def _tuning_records(
+    samples: Path, ids: Sequence[str], axes: tuple[str, ...], rate: float, budget: int
+) -> dict[str, list[tuple[Array, Flags]]]:
+    """Return, per axis, the first part of every trial as positions and flags of samples seen."""
+    records: dict[str, list[tuple[Array, Flags]]] = {axis: [] for axis in axes}
+    share = max(budget // max(len(ids), 1), _SHORTEST)
+    for trial_id in ids:
+        trial = _load(samples, trial_id, rate)
+        if isinstance(trial, str):
+            continue
+        for axis in axes:
+            position = trial.grid.resample(trial.frame[f"q_{axis}"].to_numpy(dtype=np.float64))
+            records[axis].append((position[:share], trial.seen[:share]))
+    return records
+
+
+def _choose(
+    records: list[tuple[Array, Flags]], rate: float, resolution: float, config: Config
+) -> _Choice:
+    """Return how to differentiate the axis with these ``records``."""
+    fits = {
+        order: kalman_smoother.maximum_likelihood(
+            records,
+            rate,
+            resolution,
+            order=order,
+            bandwidth_limits_hz=(min(3.0, 0.01 * rate), 0.2 * rate),
+        )
+        for order in kalman_smoother.ORDERS
+    }
+    order = max(fits, key=lambda k: fits[k].log_likelihood)
+    best = fits[order].model
+    noise_sd = best.noise_sd
+    floor = float(np.median([butterworth.floor_frequency(x, rate, noise_sd) for x, _ in records]))
+    least, most = min(config.minimum_bandwidth_hz, 0.1 * rate), 0.2 * rate
+    kalman = config.method in ("auto", "kalman")
+    found = best.bandwidth_hz if kalman else floor
+    cutoff = config.cutoff_hz or float(np.clip(found, least, most))
+    if cutoff >= 0.5 * rate:
+        raise InputError(
+            f"{cutoff:g} Hz is not below half the sampling rate of {rate:g} Hz",
+            where="filter.cutoff_hz",
+        )
+    ratio = kalman_smoother.ratio_for(cutoff, order, rate)
+    model = kalman_smoother.MotionModel(order, noise_sd, ratio, rate) if kalman else None
+    if config.cutoff_hz:
+        why = "set by the user"
+    elif found < least:
+        why = f"the data ask for {found:.1f} Hz; held at the minimum bandwidth"
+    elif found > most:
+        why = f"the data ask for {found:.1f} Hz; held at a fifth of the sampling rate"
+    elif kalman:
+        why = "maximum likelihood of the encoder samples"
+    else:
+        why = "encoder spectrum meets the quantisation floor"
+    report: dict[str, object] = {
+        "bandwidth_hz": cutoff,
+        "bandwidth_reason": why,
+        "measurement_noise_sd": noise_sd,
+        "quantisation_sd": resolution / float(np.sqrt(12.0)),
+        "resolution": resolution,
+        "likelihood_bandwidth_hz": {str(k): f.model.bandwidth_hz for k, f in fits.items()},
+        "log_likelihood": {str(k): f.log_likelihood for k, f in fits.items()},
+        "spectrum_floor_hz": floor,
+    }
+    if kalman:
+        report["order"] = order
+    return _Choice(model, cutoff, report)
+
+
+def _differentiate(
+    trial: _Trial, choices: dict[str, _Choice], rate: float, config: Config
+) -> tuple[pd.DataFrame, dict[str, tuple[float, float, float]]]:
+    """Return the rows of one trial and, per axis, the median error bands (position, ...)."""
+    grid, frame = trial.grid, trial.frame
+    columns: dict[str, object] = {"trial_id": trial.trial_id, "t": grid.t}
+    bands: dict[str, tuple[float, float, float]] = {}
+    motions = {
+        axis: _motion(
+            grid.resample(frame[f"q_{axis}"].to_numpy(dtype=np.float64)),
+            trial.seen, choice, rate, config.method,
+        )
+        for axis, choice in choices.items()
+    }  # fmt: skip
+    columns |= {f"q_{axis}": motion.position for axis, motion in motions.items()}
+    columns |= {f"qd_{axis}": motion.velocity for axis, motion in motions.items()}
+    columns |= {f"qdd_{axis}": motion.acceleration for axis, motion in motions.items()}
+    columns |= dict(_forces(grid, frame, rate, config.force_cutoff_hz))
+    for name in _named(frame, "brake_"):
+        columns[name] = grid.hold(frame[name].to_numpy(dtype=np.float64))
+    for axis, motion in motions.items():
+        columns[f"q_sd_{axis}"] = motion.position_sd
+        columns[f"qd_sd_{axis}"] = motion.velocity_sd
+        columns[f"qdd_sd_{axis}"] = motion.acceleration_sd
+        bands[axis] = (
+            float(np.median(motion.position_sd)),
+            float(np.median(motion.velocity_sd)),
+            float(np.median(motion.acceleration_sd)),
+        )
+    columns["bridged"] = grid.bridged
+    return pd.DataFrame(columns), bands
+
+
+def _motion(position: Array, seen: Flags, choice: _Choice, rate: float, method: str) -> Derivatives:
+    """Return the motion of one axis of one trial."""
+    if choice.model is not None:
+        return kalman_smoother.smooth(position, choice.model, seen)
+    noise_sd = float(str(choice.report["measurement_noise_sd"]))
+    if method == "butterworth":
+        return butterworth.smooth(position, rate, choice.cutoff_hz, noise_sd)
+    return savitzky_golay.smooth(position, rate, choice.cutoff_hz, noise_sd)
+
+
+def _named(frame: pd.DataFrame, prefix: str) -> tuple[str, ...]:
+    """Return the columns whose names start with ``prefix``."""
+    return tuple(str(name) for name in frame.columns if str(name).startswith(prefix))
+
+
+def _forces(
+    grid: UniformGrid, frame: pd.DataFrame, rate: float, cutoff_hz: float
+) -> Iterator[tuple[str, Array]]:
+    """Yield the force channels and their band-limited derivatives."""
+    names = _named(frame, "force_")
+    forces = {name: grid.resample(frame[name].to_numpy(dtype=np.float64)) for name in names}
+    cutoff = min(cutoff_hz, 0.2 * rate)
+    slopes = {name: butterworth.zero_phase(force, rate, cutoff) for name, force in forces.items()}
+    yield from forces.items()
+    for name, (_, slope, _) in slopes.items():
+        yield name.replace("force_", "force_rate_", 1), slope
+    for name, (_, _, curvature) in slopes.items():
+        yield name.replace("force_", "force_curvature_", 1), curvature
+
+
+def _report(
+    config: Config,
+    axes: dict[str, dict[str, object]],
+    choices: dict[str, _Choice],
+    levels: dict[str, list[tuple[float, float, float]]],
+    interpolated: dict[str, float],
+    skipped: dict[str, str],
+    rate: float,
+) -> dict[str, object]:
+    """Return what filter.json holds."""
+    method = "kalman" if config.method == "auto" else config.method
+    entries: dict[str, object] = {}
+    for axis, choice in choices.items():
+        typical = np.median(np.array(levels[axis]), axis=0)
+        unit = str(axes[axis]["unit"])
+        entries[axis] = choice.report | {
+            "unit": unit,
+            "position_sd": float(typical[0]),
+            "velocity_sd": float(typical[1]),
+            "acceleration_sd": float(typical[2]),
+        }
+    widest = ", ".join(f"{axis} {choice.cutoff_hz:.1f} Hz" for axis, choice in choices.items())
+    return {
+        "method": method,
+        "method_reason": "chosen by the user" if config.method != "auto" else (
+            "default: bandwidth and order by maximum likelihood, gaps bridged with error bands"
+        ),
+        "sample_rate_hz": rate,
+        "axes": entries,
+        "force": {"derivative_cutoff_hz": min(config.force_cutoff_hz, 0.2 * rate)},
+        "bridged_fraction": interpolated,
+        "skipped": skipped,
+        "headline": f"{method}, {len(interpolated)} trials; bandwidth {widest}",
+    }  # fmt: skip
