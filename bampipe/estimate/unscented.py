@@ -1,0 +1,308 @@
+"""Augmented unscented Kalman filter: state and parameters together (section III-B).
+
+The estimated vector is ``[x, theta]``: the state of the equations of motion and the parameters
+that are estimated, which follow a random walk. Process noise ``w`` enters the equations of
+motion and gets sigma points of its own; measurement noise is additive.
+
+Physical range. A parameter whose lower bound is above zero (a mass, a speed) is estimated as its
+logarithm: a sigma point can then not come near zero, where the motion would explode, and starts
+five times too small and five times too large are alike. Any other parameter is estimated as it
+is, because a damping, a Coulomb friction or the strength of an effect may properly be zero,
+where a logarithm has no end. What leaves its range is clamped in every sigma point before the
+model sees it, and the mean is clamped after every update; inside the range this changes nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.estimate.filter_signature import (
+    DONE,
+    INNOVATION_NOT_POSITIVE,
+    NOT_FINITE,
+    STATE_NOT_POSITIVE,
+)
+from bampipe.estimate.sigma_points import SigmaPoints
+
+Array = NDArray[np.float64]
+
+_REASONS = {
+    NOT_FINITE: "the predicted motion grew without bound",
+    STATE_NOT_POSITIVE: "the covariance of the state lost positive definiteness",
+    INNOVATION_NOT_POSITIVE: "the covariance of the innovation lost positive definiteness",
+}
+
+
+class FilterFailure(ArithmeticError):
+    """The filter lost the trial.
+
+    Attributes:
+        trial: index of the trial; sample: index of the sample; reason: what happened.
+    """
+
+    def __init__(self, trial: int, sample: int, reason: str) -> None:
+        self.trial = trial
+        self.sample = sample
+        self.reason = reason
+        super().__init__(f"trial {trial}, sample {sample}: {reason}")
+
+
+@dataclass(frozen=True)
+class FilterModel:
+    """What the filter must know of a model.
+
+    Attributes:
+        derivative: compiled f(x, u, p, w, dx), of type ``signatures.DERIVATIVE``.
+        measure: compiled h(x, u, p, y), of type ``signatures.MEASURE``.
+        n_states: length of x.
+        parameters: (np,) values of all parameters; those not estimated stay as given.
+        free: (nt,) places of the estimated parameters in ``parameters``.
+        lower, upper: (nt,) physical range of the estimated parameters; infinite where none.
+    """
+
+    derivative: Callable[..., Any]
+    measure: Callable[..., Any]
+    n_states: int
+    parameters: Array
+    free: NDArray[np.int64]
+    lower: Array
+    upper: Array
+
+    @property
+    def logarithmic(self) -> NDArray[np.bool_]:
+        """(nt,) which parameters are estimated as logarithms."""
+        return np.asarray(self.lower > 0.0)
+
+    @property
+    def range(self) -> tuple[Array, Array]:
+        """(nt,) and (nt,): the physical range on the scale of estimation."""
+        log = self.logarithmic
+        lower, upper = self.lower.astype(float), self.upper.astype(float)
+        lower[log], upper[log] = np.log(lower[log]), np.log(upper[log])
+        return lower, upper
+
+    def to_estimated(self, value: Array, sd: Array) -> tuple[Array, Array]:
+        """Put physical parameters (nt,) and their sd (nt,) on the scale of estimation.
+
+        A logarithm gets the sd of the log-normal distribution with that mean and sd.
+        """
+        log = self.logarithmic
+        value = np.clip(np.asarray(value, dtype=float), self.lower, self.upper)
+        sd = np.array(sd, dtype=float)
+        sd[log] = np.sqrt(np.log1p(np.square(sd[log] / value[log])))
+        value[log] = np.log(value[log])
+        return value, sd
+
+    def to_physical(self, mean: Array) -> tuple[Array, Array]:
+        """Return physical parameters and their slope for ``mean`` (..., nt) as estimated."""
+        value, slope = np.array(mean, dtype=float), np.ones_like(mean)
+        log = self.logarithmic
+        value[..., log] = np.exp(value[..., log])
+        slope[..., log] = value[..., log]
+        return value, slope
+
+
+@dataclass(frozen=True)
+class FilterSettings:
+    """Noise and numerical settings.
+
+    Attributes:
+        observed: (ny,) which elements of the model's measurement are in ``Trial.y``.
+        reading_sd: (ny,) standard deviation of the measurement noise.
+        noise_sd: (nw,) standard deviation of the process noise of one sample.
+        walk_sd: (nt,) random walk of the parameters, per square root of a second.
+        points: spread and weights of the sigma points.
+        longest_step: longest Runge-Kutta step, s.
+        square_root: propagate the root of the covariance in place of the covariance.
+        stride: store the distribution of every so many samples.
+    """
+
+    observed: NDArray[np.int64]
+    reading_sd: Array
+    noise_sd: Array
+    walk_sd: Array
+    points: SigmaPoints = field(default_factory=SigmaPoints)
+    longest_step: float = 1e-3
+    square_root: bool = True
+    stride: int = 1
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One continuous recording.
+
+    Attributes:
+        t: (T,) time, s, increasing.
+        u: (T, nu) inputs of the model.
+        y: (T, ny) readings, NaN where one is missing.
+        x: (nx,) state at the first sample; x_sd: (nx,) its standard deviation.
+    """
+
+    t: Array
+    u: Array
+    y: Array
+    x: Array
+    x_sd: Array
+
+
+@dataclass(frozen=True)
+class FilteredTrial:
+    """What the filter found in one trial.
+
+    Attributes:
+        t: (R,) times of the stored distributions, s: every ``stride``-th sample.
+        mean: (R, n) state and parameters on the scale of estimation; covariance: (R, n, n).
+        innovation: (T, ny) reading minus prediction, NaN at the first sample and at gaps.
+        innovation_sd: (T, ny) what the filter expects of it.
+        nis: (T,) squared innovation in its own covariance (mean ny if the filter is consistent).
+        log_likelihood: (T,) of each reading given those before.
+    """
+
+    t: Array
+    mean: Array
+    covariance: Array
+    innovation: Array
+    innovation_sd: Array
+    nis: Array
+    log_likelihood: Array
+
+
+@dataclass(frozen=True)
+class FilterResult:
+    """What the filter found in all trials.
+
+    Attributes:
+        theta: (nt,) parameters on the scale of estimation; covariance: (nt, nt) as the filter
+            believes.
+        trials: one entry for each trial, in order.
+    """
+
+    theta: Array
+    covariance: Array
+    trials: tuple[FilteredTrial, ...]
+
+
+def filter_trials(
+    model: FilterModel,
+    trials: Sequence[Trial],
+    theta: Array,
+    covariance: Array,
+    settings: FilterSettings,
+    progress: Callable[[int], None] | None = None,
+) -> FilterResult:
+    """Filter trials in sequence: each starts with its own state, the parameters carry over.
+
+    Args:
+        model: the compiled model.
+        trials: at least one.
+        theta: (nt,) parameters before the first trial, on the scale of estimation
+            (`FilterModel.to_estimated`); covariance: (nt, nt).
+        settings: noise and numerical settings.
+        progress: called with the number of trials done.
+
+    Raises:
+        FilterFailure: the covariance lost positive definiteness or a number is not finite.
+    """
+    nx, nt = model.n_states, model.free.size
+    n, ny = nx + nt, settings.observed.size
+    lower, upper = model.range
+    theta = np.clip(np.asarray(theta, dtype=float), lower, upper)
+    covariance = np.array(covariance, dtype=float)
+    weights = np.array(settings.points.weights(n + settings.noise_sd.size))
+    kernel = _kernel(settings.square_root)
+    parameters = np.array(model.parameters, dtype=float)
+    found = []
+    for index, trial in enumerate(trials):
+        mean = np.concatenate([trial.x, theta])
+        joint = np.zeros((n, n))
+        joint[:nx, :nx] = np.diag(np.square(trial.x_sd))
+        joint[nx:, nx:] = covariance
+        if settings.square_root:
+            joint = lower_root(joint)
+        size = trial.t.size
+        rows = -(-size // settings.stride)
+        means = np.empty((rows, n))
+        covariances = np.empty((rows, n, n))
+        innovation = np.full((size, ny), np.nan)
+        innovation_sd = np.full((size, ny), np.nan)
+        consistency = np.full((size, 2), np.nan)
+        reason = np.zeros(1, dtype=np.int64)
+        failed = kernel(
+            model.derivative,
+            model.measure,
+            np.ascontiguousarray(trial.t, dtype=float),
+            np.ascontiguousarray(trial.u, dtype=float),
+            np.ascontiguousarray(trial.y, dtype=float),
+            np.ascontiguousarray(settings.observed, dtype=np.int64),
+            nx,
+            mean,
+            joint,
+            parameters,
+            np.ascontiguousarray(model.free, dtype=np.int64),
+            np.ascontiguousarray(model.logarithmic),
+            lower,
+            upper,
+            np.ascontiguousarray(settings.noise_sd, dtype=float),
+            np.ascontiguousarray(settings.walk_sd, dtype=float),
+            np.ascontiguousarray(settings.reading_sd, dtype=float),
+            weights,
+            float(settings.longest_step),
+            int(settings.stride),
+            means,
+            covariances,
+            innovation,
+            innovation_sd,
+            consistency,
+            reason,
+        )
+        if failed != DONE:
+            raise FilterFailure(index, int(failed), _REASONS[int(reason[0])])
+        if settings.square_root:
+            joint = joint @ joint.T
+        theta, covariance = mean[nx:].copy(), joint[nx:, nx:].copy()
+        found.append(
+            FilteredTrial(
+                t=np.asarray(trial.t, dtype=float)[:: settings.stride],
+                mean=means,
+                covariance=covariances,
+                innovation=innovation,
+                innovation_sd=innovation_sd,
+                nis=consistency[:, 0],
+                log_likelihood=consistency[:, 1],
+            )
+        )
+        if progress is not None:
+            progress(index + 1)
+    return FilterResult(theta, covariance, tuple(found))
+
+
+def _kernel(square_root: bool) -> Callable[..., int]:
+    """Return one form of the filter; the other is then neither compiled nor loaded."""
+    if square_root:
+        from bampipe.estimate.square_root import filter_square_root
+
+        return filter_square_root
+    from bampipe.estimate.covariance_form import filter_covariance
+
+    return filter_covariance
+
+
+def lower_root(covariance: Array) -> Array:
+    """Return the lower L with L L^T = covariance (n, n); zero variances give zero columns.
+
+    Raises:
+        ValueError: the matrix is not positive semidefinite.
+    """
+    known = np.diag(covariance) == 0.0
+    root = np.zeros_like(covariance)
+    keep = np.flatnonzero(~known)
+    try:
+        root[np.ix_(keep, keep)] = np.linalg.cholesky(covariance[np.ix_(keep, keep)])
+    except np.linalg.LinAlgError as error:
+        raise ValueError("the starting covariance is not positive definite") from error
+    return root
