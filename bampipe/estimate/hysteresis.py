@@ -1,0 +1,307 @@
+"""Stiffness of a locked axis from its hysteresis loops.
+
+Model of the loop: an elastic transmission of stiffness K in parallel with friction that follows
+the deflection x only after some slip (a Jenkins or Iwan element, or Bouc and Wen's smooth one):
+torque = K x + F z, z in [-1, 1]. After every reversal z turns round and the loop is stiffer than
+K; once z has come to rest at its other limit (post-yield) the slope of the loop is K. So K is
+read from that part of every branch, and the transition is never assumed to have a certain shape:
+an exponential approach is fitted only to find where it has died away.
+
+The encoder is the coarse channel. It is used where it is exact, at the changes from one count to
+the next, and deflection is regressed on torque; the torque's own noise is taken out of the
+regression (Fuller 1987, eq. 1.2.3), else it would make the axis look stiff.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
+from scipy.signal import butter, find_peaks, sosfiltfilt
+
+Array = NDArray[np.float64]
+
+_PROMINENCE = 0.3
+"""A reversal stands out by this share of the range of the torque."""
+_LEFTOVER = 0.01
+"""Post-yield: the fitted transition changes the slope by less than this share."""
+_LONGEST_TRANSITION = 0.6
+"""Share of a branch that the transition may take; the rest is needed for the slope."""
+
+
+@dataclass(frozen=True)
+class Branch:
+    """One monotone part of the loading, from one reversal to the next.
+
+    Attributes:
+        start, stop: samples of the two reversals.
+        direction: +1 torque rising, -1 torque falling.
+        torque, deflection: at the changes of the encoder count, (n,).
+        travel: torque since the reversal, positive, (n,).
+    """
+
+    start: int
+    stop: int
+    direction: int
+    torque: Array
+    deflection: Array
+    travel: Array
+
+
+@dataclass(frozen=True)
+class Cycle:
+    """One load cycle: two branches, one each way.
+
+    Attributes:
+        start, stop: its first and last sample.
+        stiffness: N.m/rad or N/m.
+        width_torque: height of the loop between its two straight sides, N.m or N.
+        width_deflection: the same across, rad or m.
+        energy: lost in the cycle, J.
+        amplitude: half the range of the torque, N.m or N.
+        centre: deflection in the middle of the loop at no torque, rad or m: its drift from cycle
+            to cycle says whether the brake slips.
+    """
+
+    start: int
+    stop: int
+    stiffness: float
+    width_torque: float
+    width_deflection: float
+    energy: float
+    amplitude: float
+    centre: float
+
+
+@dataclass(frozen=True)
+class Hysteresis:
+    """What the loops of one axis give.
+
+    Attributes:
+        stiffness: of all post-yield parts together, N.m/rad or N/m.
+        sd: standard deviation over the cycles; with one cycle, that of its regression.
+        standard_error: of the regression over all branches.
+        cycles: cycle by cycle.
+        branches: all whole branches.
+        transition: torque after a reversal until the loop is post-yield, N.m or N.
+        yielded: whether the transition ends early enough to be left out; if not, the fitted
+            transition is part of the regression and the stiffness is less certain.
+    """
+
+    stiffness: float
+    sd: float
+    standard_error: float
+    cycles: tuple[Cycle, ...]
+    branches: tuple[Branch, ...]
+    transition: float
+    yielded: bool
+
+
+def noise_of(signal: Array) -> float:
+    """Return the standard deviation of the white noise on a slow ``signal`` (T,).
+
+    From third differences, which a slow signal hardly has; their median resists spikes.
+    """
+    differences = np.abs(np.diff(signal, n=3))
+    return float(np.median(differences) / 0.6744897501960817 / np.sqrt(20.0))
+
+
+def reversals(torque: Array, rate_hz: float, smoothing_hz: float = 5.0) -> NDArray[np.intp]:
+    """Return the samples at which the loading turns round, in order.
+
+    The torque (T,) is low-passed at ``smoothing_hz`` first; a turn stands out by 30 % of its
+    range, so that pauses and tremor are none.
+    """
+    cutoff = min(smoothing_hz, 0.2 * rate_hz)
+    sections = butter(2, cutoff, fs=rate_hz, output="sos")
+    smooth = sosfiltfilt(sections, torque, padlen=min(len(torque) - 1, int(2 * rate_hz / cutoff)))
+    least = _PROMINENCE * float(np.ptp(smooth))
+    peaks = find_peaks(smooth, prominence=least)[0]
+    valleys = find_peaks(-smooth, prominence=least)[0]
+    turns = np.sort(np.concatenate((peaks, valleys)))
+    # Two peaks in a row can only be shoulders of one: the higher is the turn.
+    kept: list[int] = []
+    for turn in turns:
+        top = turn in peaks
+        if kept and (kept[-1] in peaks) == top:
+            if (smooth[turn] > smooth[kept[-1]]) == top:
+                kept[-1] = int(turn)
+        else:
+            kept.append(int(turn))
+    return np.array(kept, dtype=np.intp)
+
+
+def count_changes(torque: Array, deflection: Array) -> tuple[Array, Array]:
+    """Return torque and deflection where the encoder count changes, each (n,).
+
+    Half way between two samples that differ, the deflection is half way between their counts:
+    exact for a step of one count, and as good as any for more.
+    """
+    at = np.flatnonzero(np.diff(deflection))
+    return 0.5 * (torque[at] + torque[at + 1]), 0.5 * (deflection[at] + deflection[at + 1])
+
+
+def branches_of(torque: Array, deflection: Array, rate_hz: float) -> tuple[Branch, ...]:
+    """Return the whole branches of a loading record: those between two reversals."""
+    turns = reversals(torque, rate_hz)
+    branches = []
+    for start, stop in zip(turns[:-1], turns[1:], strict=True):
+        load, travel_to = torque[start : stop + 1], deflection[start : stop + 1]
+        direction = 1 if load[-1] > load[0] else -1
+        at_torque, at_deflection = count_changes(load, travel_to)
+        travel = direction * (at_torque - load[0])
+        branches.append(
+            Branch(int(start), int(stop), direction, at_torque, at_deflection, travel)
+        )
+    return tuple(branches)
+
+
+def _regression(
+    branches: Sequence[Branch], noise_sd: float, first: float, transition: float | None
+) -> tuple[float, float, Array]:
+    """Regress deflection on torque, an intercept to each branch.
+
+    Args:
+        branches: what to fit.
+        noise_sd: of the torque at a count change.
+        first: travel from which points are used.
+        transition: decay length, in torque, of an exponential approach to the straight line that
+            is fitted besides, one amplitude for all branches; None for none.
+
+    Returns:
+        Compliance, its standard error, and the coefficients: compliance, (amplitude of the
+        approach,) intercepts.
+    """
+    rows = [branch.travel >= first for branch in branches]
+    torque = np.concatenate([b.torque[r] for b, r in zip(branches, rows, strict=True)])
+    deflection = np.concatenate([b.deflection[r] for b, r in zip(branches, rows, strict=True)])
+    columns = [torque]
+    if transition is not None:
+        approach = [
+            -b.direction * np.exp(-b.travel[r] / transition)
+            for b, r in zip(branches, rows, strict=True)
+        ]
+        columns.append(np.concatenate(approach))
+    owner = np.repeat(np.arange(len(branches)), [int(np.sum(r)) for r in rows])
+    columns += [(owner == number).astype(np.float64) for number in range(len(branches))]
+    design = np.stack(columns, axis=1)
+    moments = design.T @ design
+    moments[0, 0] -= len(torque) * noise_sd**2
+    inverse = np.linalg.inv(moments)
+    coefficients = inverse @ (design.T @ deflection)
+    residual = deflection - design @ coefficients
+    spare = max(len(torque) - design.shape[1], 1)
+    error = float(np.sqrt(max(inverse[0, 0], 0.0) * (residual @ residual) / spare))
+    return float(coefficients[0]), error, np.asarray(coefficients)
+
+
+def transition_of(branches: Sequence[Branch], noise_sd: float) -> tuple[float, float]:
+    """Return decay length and end of the transition after a reversal, both in torque.
+
+    The end is where the slope of the fitted approach has fallen to 1 % of the compliance.
+    """
+    span = float(np.median([branch.travel[-1] for branch in branches]))
+
+    def misfit(log_length: float) -> float:
+        length = float(np.exp(log_length))
+        _, _, coefficients = _regression(branches, noise_sd, 0.0, length)
+        return _sum_of_squares(branches, coefficients, length)
+
+    grid = np.log(np.geomspace(0.005 * span, 0.5 * span, 15))
+    best = int(np.argmin([misfit(float(value)) for value in grid]))
+    around = (float(grid[max(best - 1, 0)]), float(grid[min(best + 1, len(grid) - 1)]))
+    found = minimize_scalar(misfit, bounds=around, method="bounded", options={"xatol": 1e-3})
+    length = float(np.exp(found.x))
+    _, _, coefficients = _regression(branches, noise_sd, 0.0, length)
+    steepness = abs(float(coefficients[1])) / length / abs(float(coefficients[0]))
+    return length, length * float(np.log(max(steepness / _LEFTOVER, 1.0)))
+
+
+def _sum_of_squares(branches: Sequence[Branch], coefficients: Array, length: float) -> float:
+    """Return the misfit of line and approach to all points of ``branches``."""
+    total = 0.0
+    for number, b in enumerate(branches):
+        line = coefficients[0] * b.torque + coefficients[2 + number]
+        bend = -b.direction * coefficients[1] * np.exp(-b.travel / length)
+        total += float(np.sum((b.deflection - line - bend) ** 2))
+    return total
+
+
+def energy_lost(torque: Array, deflection: Array, stiffness: float) -> float:
+    """Return the area, J, of one loop (T,), also where it does not quite close.
+
+    The work of a spring of ``stiffness`` is taken off first: around a closed loop it is none, and
+    else it is what was stored rather than lost.
+    """
+    x = deflection - 0.5 * (float(np.min(deflection)) + float(np.max(deflection)))
+    level = 0.5 * (float(np.min(torque)) + float(np.max(torque)))
+    rest = torque - level - stiffness * x
+    return float(np.sum(0.5 * (rest[1:] + rest[:-1]) * np.diff(x)))
+
+
+def hysteresis(
+    torque: Array, deflection: Array, rate_hz: float, noise_sd: float | None = None
+) -> Hysteresis:
+    """Return the stiffness of a locked axis from its load cycles.
+
+    Args:
+        torque: generalised force on the axis, (T,), N.m or N.
+        deflection: encoder reading, (T,), rad or m.
+        rate_hz: sampling rate, Hz.
+        noise_sd: of the torque; by default from the record itself.
+
+    Raises:
+        ValueError: fewer than two whole branches, or too few encoder counts to fit a line.
+    """
+    branches = branches_of(torque, deflection, rate_hz)
+    if len(branches) < 2:
+        raise ValueError("no whole load cycle: the load must turn round three times at least")
+    if min(len(branch.torque) for branch in branches) < 8:
+        raise ValueError("the deflection changes by fewer than 8 encoder counts on a branch")
+    noise = noise_of(torque) if noise_sd is None else noise_sd
+    noise /= np.sqrt(2.0)  # a count change takes the mean of two samples
+    length, end = transition_of(branches, noise)
+    span = float(np.median([branch.travel[-1] for branch in branches]))
+    yielded = end <= _LONGEST_TRANSITION * span
+    first, bend = (end, None) if yielded else (0.0, length)
+    compliance, error, _ = _regression(branches, noise, first, bend)
+    if compliance <= 0.0:
+        raise ValueError("the deflection does not follow the torque")
+    cycles = tuple(
+        _cycle(torque, deflection, branches[k : k + 2], noise, first, bend)
+        for k in range(0, len(branches) - 1, 2)
+    )
+    stiffness = 1.0 / compliance
+    standard_error = error * stiffness**2
+    values = [cycle.stiffness for cycle in cycles]
+    sd = float(np.std(values, ddof=1)) if len(values) > 1 else standard_error
+    return Hysteresis(stiffness, sd, standard_error, cycles, branches, end, yielded)
+
+
+def _cycle(
+    torque: Array,
+    deflection: Array,
+    pair: Sequence[Branch],
+    noise_sd: float,
+    first: float,
+    transition: float | None,
+) -> Cycle:
+    """Return the numbers of one cycle."""
+    compliance, _, coefficients = _regression(pair, noise_sd, first, transition)
+    intercepts = {b.direction: float(c) for b, c in zip(pair, coefficients[-2:], strict=True)}
+    across = intercepts[-1] - intercepts[1]
+    start, stop = pair[0].start, pair[1].stop
+    load, moved = torque[start : stop + 1], deflection[start : stop + 1]
+    return Cycle(
+        start=start,
+        stop=stop,
+        stiffness=1.0 / compliance,
+        width_torque=across / compliance,
+        width_deflection=across,
+        energy=energy_lost(load, moved, 1.0 / compliance),
+        amplitude=0.5 * float(np.ptp(load)),
+        centre=0.5 * (intercepts[-1] + intercepts[1]),
+    )
