@@ -1,0 +1,296 @@
+"""Forward simulation of a compiled model: open loop, or held near a given motion by an arm.
+
+Friction changes sign over a velocity as small as 1e-3 rad/s, so an axis near standstill is stiff:
+its rate is (Coulomb + brake torque) / (inertia * width), 1e3 /s in free motion and 5e4 /s under a
+60 N.m brake. Instead of an implicit method, which would need the model's Jacobian, each sampling
+interval is divided as finely as this rate demands, and only while an axis is close enough to
+standstill to stop within the interval: the rate is probed on the model itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numba import float64, int64, njit, void
+from numpy.typing import NDArray
+
+from bampipe.errors import InputError
+from bampipe.estimate.propagation import runge_kutta
+from bampipe.estimate.signatures import DERIVATIVE
+
+Array = NDArray[np.float64]
+
+_V = float64[::1]
+_M = float64[:, ::1]
+_I = int64[::1]
+_MOST_STEPS = 4000
+
+
+@dataclass(frozen=True)
+class Impedance:
+    """The arm that pulls the mechanism towards a reference motion.
+
+    The arm demands the acceleration ``natural_frequency**2 * (q_ref - q) + 2 * damping_ratio *
+    natural_frequency * (qd_ref - qd)`` of every coordinate; the handle force that would give it
+    passes a critically damped second-order low-pass, as muscle does, so that the force has
+    continuous derivatives.
+
+    Attributes:
+        natural_frequency: rad/s; 0 leaves the mechanism to the given force alone.
+        damping_ratio: 1 is critical.
+        bandwidth: of the low-pass on the force, rad/s.
+    """
+
+    natural_frequency: float = 12.0
+    damping_ratio: float = 1.0
+    bandwidth: float = 120.0
+
+
+@njit(int64(DERIVATIVE, _V, _V, _V, _V, int64, _V, float64, float64, _M), cache=True)
+def stable_steps(derivative, x, u, p, w, n, width, dt, max_step, work):  # type: ignore[no-untyped-def]
+    """Number of Runge-Kutta steps that ``dt`` needs from state ``x`` on.
+
+    At most ``max_step`` long, and no longer than the time constant of any axis that may come to
+    rest within ``dt``: the derivative is probed at both sides of standstill.
+
+    Args:
+        derivative: f(x, u, p, w, dx).
+        x: (nx,) positions (n), rates (n), internal states.
+        u, p, w: inputs, parameters, process noise.
+        n: number of coordinates.
+        width: (n,) velocity over which friction changes sign, rad/s or m/s.
+        dt, max_step: s.
+        work: (8, >= nx) scratch; rows 6 and 7 are used.
+    """
+    nx = x.shape[0]
+    dx = work[6, :nx]
+    probe = work[7, :nx]
+    fastest = 1.0 / max_step
+    derivative(x, u, p, w, dx)
+    for i in range(nx):
+        probe[i] = x[i]
+    for i in range(n):
+        if abs(x[n + i]) > 3.0 * abs(dx[n + i]) * dt + 5.0 * width[i]:
+            continue
+        probe[n + i] = 0.1 * width[i]
+        derivative(probe, u, p, w, dx)
+        above = dx[n + i]
+        probe[n + i] = -0.1 * width[i]
+        derivative(probe, u, p, w, dx)
+        fastest = max(fastest, (dx[n + i] - above) / (0.2 * width[i]))
+        probe[n + i] = x[n + i]
+        derivative(x, u, p, w, dx)
+    return min(int(np.ceil(dt * fastest)), _MOST_STEPS)
+
+
+@njit(void(DERIVATIVE, _M, _M, _V, _V, int64, _V, float64, float64, int64, _M), cache=True)
+def _run(derivative, x, u, p, w, n, width, dt, max_step, hold, work):  # type: ignore[no-untyped-def]
+    """Fill the rows of ``x`` after the first."""
+    for k in range(x.shape[0] - 1):
+        x[k + 1] = x[k]
+        end = u[k] if hold else u[k + 1]
+        steps = stable_steps(derivative, x[k], u[k], p, w, n, width, dt, max_step, work)
+        runge_kutta(derivative, x[k + 1], u[k], end, p, w, dt, steps, work)
+
+
+@njit(
+    void(
+        DERIVATIVE, _V, _V, _V, _V, int64, _V, _V, _I, float64, float64, _M, _M, _V
+    ),
+    cache=True,
+)  # fmt: skip
+def _demand(  # type: ignore[no-untyped-def]
+    derivative, x, u, p, w, n, q_ref, qd_ref, force, frequency, damping, work, response, out
+):
+    """Handle force that alone would give the acceleration which the arm demands."""
+    nx = x.shape[0]
+    nf = force.shape[0]
+    still = work[6, :nx]
+    moved = work[7, :nx]
+    derivative(x, u, p, w, still)
+    for j in range(nf):
+        u[force[j]] += 1.0
+        derivative(x, u, p, w, moved)
+        u[force[j]] -= 1.0
+        for i in range(n):
+            response[i, j] = moved[n + i] - still[n + i]
+    normal = response.T @ response
+    side = np.zeros(nf)
+    for i in range(n):
+        error = frequency * frequency * (q_ref[i] - x[i])
+        error += 2.0 * damping * frequency * (qd_ref[i] - x[n + i])
+        for j in range(nf):
+            side[j] += response[i, j] * error
+    trace = 0.0
+    for j in range(nf):
+        trace += normal[j, j]
+    for j in range(nf):  # keeps the solution finite where a force moves nothing
+        normal[j, j] += 1e-12 * trace + 1e-300
+    out[:] = np.linalg.solve(normal, side)
+
+
+@njit(
+    void(
+        DERIVATIVE, _M, _M, _V, _V, _M, _M, _V, float64, float64,
+        _I, _I, _I, _I, _M, float64, _V, _M,
+    ),
+    cache=True,
+)  # fmt: skip
+def _track(  # type: ignore[no-untyped-def]
+    derivative, x, u, p, w, q_ref, qd_ref, width, dt, max_step,
+    force, rate, curvature, brake, brake_gain, brake_time, arm, work,
+):  # fmt: skip
+    """Fill the rows of ``x`` after the first and add arm force and brake commands to ``u``."""
+    n = q_ref.shape[1]
+    nf = force.shape[0]
+    frequency, damping, bandwidth = arm[0], arm[1], arm[2]
+    pull = np.zeros(nf)
+    pull_rate = np.zeros(nf)
+    goal = np.zeros(nf)
+    response = np.zeros((n, nf))
+    speed = np.zeros(n)
+    fade = np.exp(-bandwidth * dt)
+    follow = 1.0 - np.exp(-dt / brake_time)
+    for k in range(x.shape[0] - 1):
+        _demand(
+            derivative, x[k], u[k], p, w, n, q_ref[k], qd_ref[k], force, frequency, damping,
+            work, response, goal,
+        )  # fmt: skip
+        for j in range(nf):  # the low-pass, exact for a goal that is constant over dt
+            gap = pull[j] - goal[j]
+            slope = pull_rate[j] + bandwidth * gap
+            pull[j] = goal[j] + (gap + slope * dt) * fade
+            pull_rate[j] = (pull_rate[j] - bandwidth * slope * dt) * fade
+            u[k + 1, force[j]] += pull[j]
+            if rate.shape[0] > 0:
+                u[k + 1, rate[j]] += pull_rate[j]
+            if curvature.shape[0] > 0:
+                bend = bandwidth * (goal[j] - pull[j]) - 2.0 * pull_rate[j]
+                u[k + 1, curvature[j]] += bandwidth * bend
+        for i in range(brake.shape[0]):
+            speed[i] += follow * (x[k, n + i] - speed[i])
+            u[k + 1, brake[i]] += brake_gain[k, i] * abs(speed[i])
+        x[k + 1] = x[k]
+        steps = stable_steps(derivative, x[k], u[k], p, w, n, width, dt, max_step, work)
+        runge_kutta(derivative, x[k + 1], u[k], u[k + 1], p, w, dt, steps, work)
+
+
+def simulate(
+    derivative: Any,
+    x0: Array,
+    u: Array,
+    p: Array,
+    dt: float,
+    *,
+    width: Array,
+    n_noise: int,
+    hold: bool = False,
+    max_step: float = 2.5e-4,
+) -> Array:
+    """Integrate the model from ``x0`` under given inputs, without process noise.
+
+    Args:
+        derivative: compiled f(x, u, p, w, dx), positions first in x, then rates, then states.
+        x0: (nx,) state at the first sample.
+        u: (T, nu) inputs at the samples, interpolated linearly in between.
+        p: (np,) parameters.
+        dt: sampling interval, s.
+        width: (n_q,) velocity over which friction changes sign, rad/s or m/s.
+        n_noise: length of the model's process noise w.
+        hold: keep each input constant over its interval instead.
+        max_step: longest integration step, s.
+
+    Returns:
+        (T, nx) states at the samples.
+
+    Raises:
+        InputError: the motion grows without bounds.
+    """
+    x = np.zeros((len(u), len(x0)))
+    x[0] = x0
+    inputs = np.array(u, dtype=np.float64, order="C")
+    work = np.zeros((8, max(len(x0), inputs.shape[1])))
+    width = np.ascontiguousarray(width, dtype=np.float64)
+    p = np.ascontiguousarray(p, dtype=np.float64)
+    _run(
+        derivative, x, inputs, p, np.zeros(n_noise), len(width), width,
+        dt, max_step, int(hold), work,
+    )  # fmt: skip
+    _require_finite(x, dt)
+    return x
+
+
+def simulate_tracking(
+    derivative: Any,
+    x0: Array,
+    u: Array,
+    p: Array,
+    dt: float,
+    q_ref: Array,
+    qd_ref: Array,
+    *,
+    width: Array,
+    n_noise: int,
+    force: Sequence[int],
+    rate: Sequence[int] = (),
+    curvature: Sequence[int] = (),
+    impedance: Impedance | None = None,
+    brake: Sequence[int] = (),
+    brake_gain: Array | None = None,
+    brake_time: float = 0.01,
+    max_step: float = 2.5e-4,
+) -> tuple[Array, Array]:
+    """Integrate the model under given inputs plus an arm that holds it near a given motion.
+
+    Replays a recording with the friction, sticking included, of a fitted model: the recorded
+    forces act, and the arm adds what keeps the motion from drifting away. The arm's share is in
+    the returned inputs, so these with the returned motion are one consistent recording.
+
+    Args:
+        derivative, x0, p, dt, width, n_noise, max_step: as in `simulate`.
+        u: (T, nu) inputs without the arm's share; copied, interpolated linearly.
+        q_ref, qd_ref: (T, n_q) motion that the arm wants.
+        force: columns of ``u`` with the handle force, N. They may be fewer than coordinates; the
+            arm's force is then the least-squares one.
+        rate, curvature: columns with its first and second derivative, where the model has them;
+            they receive those of the arm's force. In the order of ``force``.
+        impedance: of the arm; by default 12 rad/s, critically damped.
+        brake: columns with the brake command of each coordinate, in their order, or none.
+        brake_gain: (T, n_q) damping that the brakes render: each command is this times the
+            speed, low-passed over ``brake_time`` (s) as a controller sees it. N.m.s/rad or N.s/m.
+
+    Returns:
+        states (T, nx) and inputs (T, nu) with the total handle force and the brake commands.
+
+    Raises:
+        InputError: the motion grows without bounds.
+    """
+    arm = impedance or Impedance()
+    x = np.zeros((len(u), len(x0)))
+    x[0] = x0
+    total = np.array(u, dtype=np.float64, order="C")
+    gain = np.zeros((0, 0)) if brake_gain is None else np.ascontiguousarray(brake_gain)
+    work = np.zeros((8, max(len(x0), total.shape[1])))
+    columns = [np.array(c, dtype=np.int64) for c in (force, rate, curvature)]
+    columns.append(np.array(brake if brake_gain is not None else (), dtype=np.int64))
+    _track(
+        derivative, x, total, np.ascontiguousarray(p, dtype=np.float64), np.zeros(n_noise),
+        np.ascontiguousarray(q_ref, dtype=np.float64),
+        np.ascontiguousarray(qd_ref, dtype=np.float64),
+        np.ascontiguousarray(width, dtype=np.float64), dt, max_step, *columns, gain, brake_time,
+        np.array([arm.natural_frequency, arm.damping_ratio, arm.bandwidth]), work,
+    )  # fmt: skip
+    _require_finite(x, dt)
+    return x, total
+
+
+def _require_finite(x: Array, dt: float) -> None:
+    bad = np.flatnonzero(~np.isfinite(x).all(axis=1))
+    if len(bad):
+        raise InputError(
+            f"the simulated motion grows without bounds after {bad[0] * dt:.3f} s",
+            remedy="check the sizes of the parameters",
+        )
