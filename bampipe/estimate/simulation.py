@@ -165,9 +165,9 @@ def _track(  # type: ignore[no-untyped-def]
             pull[j] = goal[j] + (gap + slope * dt) * fade
             pull_rate[j] = (pull_rate[j] - bandwidth * slope * dt) * fade
             u[k + 1, force[j]] += pull[j]
-            if rate.shape[0] > 0:
+            if rate.shape[0] > 0 and rate[j] >= 0:
                 u[k + 1, rate[j]] += pull_rate[j]
-            if curvature.shape[0] > 0:
+            if curvature.shape[0] > 0 and curvature[j] >= 0:
                 bend = bandwidth * (goal[j] - pull[j]) - 2.0 * pull_rate[j]
                 u[k + 1, curvature[j]] += bandwidth * bend
         for i in range(brake.shape[0]):
@@ -256,7 +256,8 @@ def simulate_tracking(
         force: columns of ``u`` with the handle force, N. They may be fewer than coordinates; the
             arm's force is then the least-squares one.
         rate, curvature: columns with its first and second derivative, where the model has them;
-            they receive those of the arm's force. In the order of ``force``.
+            they receive those of the arm's force. In the order of ``force``, -1 for one
+            that the model does not use.
         impedance: of the arm; by default 12 rad/s, critically damped.
         brake: columns with the brake command of each coordinate, in their order, or none.
         brake_gain: (T, n_q) damping that the brakes render: each command is this times the
@@ -274,13 +275,14 @@ def simulate_tracking(
     total = np.array(u, dtype=np.float64, order="C")
     gain = np.zeros((0, 0)) if brake_gain is None else np.ascontiguousarray(brake_gain)
     work = np.zeros((8, max(len(x0), total.shape[1])))
-    columns = [np.array(c, dtype=np.int64) for c in (force, rate, curvature)]
-    columns.append(np.array(brake if brake_gain is not None else (), dtype=np.int64))
+    brakes = brake if brake_gain is not None else ()
     _track(
         derivative, x, total, np.ascontiguousarray(p, dtype=np.float64), np.zeros(n_noise),
         np.ascontiguousarray(q_ref, dtype=np.float64),
         np.ascontiguousarray(qd_ref, dtype=np.float64),
-        np.ascontiguousarray(width, dtype=np.float64), dt, max_step, *columns, gain, brake_time,
+        np.ascontiguousarray(width, dtype=np.float64), dt, max_step,
+        np.array(force, dtype=np.int64), np.array(rate, dtype=np.int64),
+        np.array(curvature, dtype=np.int64), np.array(brakes, dtype=np.int64), gain, brake_time,
         np.array([arm.natural_frequency, arm.damping_ratio, arm.bandwidth]), work,
     )  # fmt: skip
     _require_finite(x, dt)
