@@ -232,18 +232,15 @@ def scalar_source(e: Equations) -> str:
     body += lines + [f"y[{i}] = {v}" for i, v in enumerate(values)]
     parts.append(_compiled("measure", "x, u, p, y", body))
 
-    if e.z:
-        used = set().union(*(sp.sympify(x).free_symbols for x in e.rates))
-        lines, values = _block(e.rates)
-        body = []
-        for group, symbols in {
-            "q": e.q,
-            "qd": e.qd,
-            "u": e.u,
-            "p": e.p,
-            "z": e.z,
-        }.items():
-            body += _unpack(group, symbols, used)
-        body += lines + [f"dz[{i}] = {v}" for i, v in enumerate(values)]
-        parts.append(_compiled("memory_rate", "q, qd, u, p, z, dz", body))
     return "".join(parts)
+
+
+def memory_source(e: Equations) -> str:
+    """Source of the compiled rate of the internal states."""
+    used = set().union(*(sp.sympify(x).free_symbols for x in e.rates))
+    lines, values = _block(e.rates)
+    body = []
+    for group, symbols in {"q": e.q, "qd": e.qd, "u": e.u, "p": e.p, "z": e.z}.items():
+        body += _unpack(group, symbols, used)
+    body += lines + [f"dz[{i}] = {v}" for i, v in enumerate(values)]
+    return SCALAR_HEADER + _compiled("memory_rate", "q, qd, u, p, z, dz", body)

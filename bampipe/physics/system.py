@@ -20,7 +20,7 @@ from bampipe.physics.model import Model
 from bampipe.physics.parameter import Parameter
 
 Array = NDArray[np.float64]
-_MEMORY_STEPS = 4
+_MEMORY_STEPS = 3
 
 
 class System:
@@ -98,9 +98,10 @@ class System:
         """g(q, qd, u, p, z, dz): numba-compiled rate of the internal states.
 
         Raises:
-            AttributeError: the model has no internal state.
+            FileNotFoundError: the model has no internal state.
         """
-        return self._compiled.memory_rate  # type: ignore[no-any-return]
+        module = _load(self._folder / f"memory_{self._key}.py")
+        return module.memory_rate  # type: ignore[no-any-return]
 
     def true_motion(
         self, q: Array, qd: Array, qdd: Array, u: Array, p: Array
@@ -229,7 +230,7 @@ def compile_model(model: Model) -> System:
     path = folder / f"meta_{key}.json"
     if path.exists():
         return System(model, folder, json.loads(path.read_text()))
-    from bampipe.physics.codegen import array_source, scalar_source
+    from bampipe.physics.codegen import array_source, memory_source, scalar_source
     from bampipe.physics.derivation import contribution, derive
 
     equations = derive(model)
@@ -245,6 +246,8 @@ def compile_model(model: Model) -> System:
     }
     _write(folder / f"columns_{key}.py", array_source(equations, added))
     _write(folder / f"compiled_{key}.py", scalar_source(equations))
+    if equations.z:
+        _write(folder / f"memory_{key}.py", memory_source(equations))
     _write(path, json.dumps(meta))
     return System(model, folder, meta)
 
