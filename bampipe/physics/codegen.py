@@ -41,6 +41,47 @@ V = types.float64[::1]
 '''
 
 
+MEMORY_LOOP = '''
+
+M = types.float64[:, ::1]
+
+
+@njit(types.void(M, M, M, V, V, V, types.int64, M), cache=True, error_model='numpy')
+def memory(q, qd, u, p, t, z0, steps, out):
+    """RK4 along the samples of a motion, everything linear between samples; fills out (T, n_z)."""
+    n = len(z0)
+    k1, k2, k3, k4 = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+    z, at = z0.copy(), np.empty(n)
+    a, b, c = q[0].copy(), qd[0].copy(), u[0].copy()
+    out[0] = z
+    for i in range(len(t) - 1):
+        h = (t[i + 1] - t[i]) / steps
+        for s in range(2 * steps):
+            share = (s + 1) / (2 * steps)
+            if s % 2 == 0:
+                memory_rate(a, b, c, p, z, k1)
+                for j in range(n):
+                    at[j] = z[j] + 0.5 * h * k1[j]
+            for j in range(len(a)):
+                a[j] = q[i, j] + share * (q[i + 1, j] - q[i, j])
+                b[j] = qd[i, j] + share * (qd[i + 1, j] - qd[i, j])
+            for j in range(len(c)):
+                c[j] = u[i, j] + share * (u[i + 1, j] - u[i, j])
+            if s % 2 == 0:
+                memory_rate(a, b, c, p, at, k2)
+                for j in range(n):
+                    at[j] = z[j] + 0.5 * h * k2[j]
+                memory_rate(a, b, c, p, at, k3)
+                for j in range(n):
+                    at[j] = z[j] + h * k3[j]
+            else:
+                memory_rate(a, b, c, p, at, k4)
+                for j in range(n):
+                    z[j] += h / 6.0 * (k1[j] + 2.0 * k2[j] + 2.0 * k3[j] + k4[j])
+        out[i + 1] = z
+'''
+
+
 class _Printer(PythonCodePrinter):  # type: ignore[misc]
     """Prints with bare function names that each header defines in its own way."""
 
@@ -236,11 +277,12 @@ def scalar_source(e: Equations) -> str:
 
 
 def memory_source(e: Equations) -> str:
-    """Source of the compiled rate of the internal states."""
+    """Source of the compiled internal states along a motion."""
     used = set().union(*(sp.sympify(x).free_symbols for x in e.rates))
     lines, values = _block(e.rates)
     body = []
     for group, symbols in {"q": e.q, "qd": e.qd, "u": e.u, "p": e.p, "z": e.z}.items():
         body += _unpack(group, symbols, used)
     body += lines + [f"dz[{i}] = {v}" for i, v in enumerate(values)]
-    return SCALAR_HEADER + _compiled("memory_rate", "q, qd, u, p, z, dz", body)
+    rate = _compiled("memory_rate", "q, qd, u, p, z, dz", body)
+    return SCALAR_HEADER + "import numpy as np\n" + rate + MEMORY_LOOP

@@ -10,10 +10,5 @@ DERIVATIVE = types.FunctionType(types.void(_vector, _vector, _vector, _vector, _
 MEASURE = types.FunctionType(types.void(_vector, _vector, _vector, _vector))
 """h(x, u, p, y) -> None: what the encoders read, positions then velocities, written into y."""
 
-MEMORY_RATE = types.FunctionType(
-    types.void(_vector, _vector, _vector, _vector, _vector, _vector)
-)
-"""g(q, qd, u, p, z, dz) -> None: rate of the internal states along a known motion."""
-
 RESIDUAL = types.FunctionType(types.void(*[_vector] * 7))
 """e(q, qd, qdd, z, u, p, out) -> None: applied minus required generalised force."""

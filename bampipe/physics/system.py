@@ -93,16 +93,6 @@ class System:
         """h(x, u, p, y): numba-compiled encoder readings, positions then rates."""
         return self._compiled.measure  # type: ignore[no-any-return]
 
-    @property
-    def memory_rate(self) -> Callable[..., None]:
-        """g(q, qd, u, p, z, dz): numba-compiled rate of the internal states.
-
-        Raises:
-            FileNotFoundError: the model has no internal state.
-        """
-        module = _load(self._folder / f"memory_{self._key}.py")
-        return module.memory_rate  # type: ignore[no-any-return]
-
     def true_motion(
         self, q: Array, qd: Array, qdd: Array, u: Array, p: Array
     ) -> tuple[Array, ...]:
@@ -203,12 +193,13 @@ class System:
         """
         if not self.memory_names:
             return np.zeros((len(q), 0))
-        from bampipe.physics.loops import integrate_memory
-
         a, b, _ = self.true_motion(q, qd, qdd, u, p)
         z0 = self.initial_memory(a[0], u[0], p)
         arrays = [np.ascontiguousarray(x, dtype=np.float64) for x in (a, b, u, p, t)]
-        return integrate_memory(self.memory_rate, *arrays, z0, _MEMORY_STEPS)
+        out = np.empty((len(q), len(z0)))
+        module = _load(self._folder / f"memory_{self._key}.py")
+        module.memory(*arrays, z0, _MEMORY_STEPS, out)
+        return out
 
 
 def _stack(columns: tuple[Any, ...], rows: int) -> Array:
