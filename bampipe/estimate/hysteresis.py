@@ -28,8 +28,11 @@ _PROMINENCE = 0.3
 """A reversal stands out by this share of the range of the torque."""
 _LEFTOVER = 0.01
 """Post-yield: the fitted transition changes the slope by less than this share."""
-_LONGEST_TRANSITION = 0.6
-"""Share of a branch that the transition may take; the rest is needed for the slope."""
+_LATEST_START = 0.6
+"""Share of a branch after which the rest is taken as post-yield at the latest: the exponential
+is a poor likeness of a long transition with a sharp end, and the slope needs a range."""
+_LARGEST_BEND = 0.02
+"""Post-yield at all: the slopes of the first and second half of what is used differ by less."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +43,7 @@ class Branch:
         start, stop: samples of the two reversals.
         direction: +1 torque rising, -1 torque falling.
         torque, deflection: at the changes of the encoder count, (n,).
-        travel: torque since the reversal, positive, (n,).
+        travel: smoothed torque since the reversal, positive, (n,).
     """
 
     start: int
@@ -86,9 +89,11 @@ class Hysteresis:
         standard_error: of the regression over all branches.
         cycles: cycle by cycle.
         branches: all whole branches.
-        transition: torque after a reversal until the loop is post-yield, N.m or N.
-        yielded: whether the transition ends early enough to be left out; if not, the fitted
-            transition is part of the regression and the stiffness is less certain.
+        transition: torque after a reversal from which the loop is taken as post-yield, N.m or N.
+        bend: by how much the slope still changes in what is taken as post-yield: stiffness of its
+            first half over that of its second, less one.
+        yielded: whether ``bend`` is small (2 %, or three of its standard errors): if not, the
+            load was too small to overcome the friction, and the stiffness is too high.
     """
 
     stiffness: float
@@ -97,6 +102,7 @@ class Hysteresis:
     cycles: tuple[Cycle, ...]
     branches: tuple[Branch, ...]
     transition: float
+    bend: float
     yielded: bool
 
 
@@ -109,15 +115,20 @@ def noise_of(signal: Array) -> float:
     return float(np.median(differences) / 0.6744897501960817 / np.sqrt(20.0))
 
 
-def reversals(torque: Array, rate_hz: float, smoothing_hz: float = 5.0) -> NDArray[np.intp]:
+def smoothed(torque: Array, rate_hz: float, cutoff_hz: float = 5.0) -> Array:
+    """Return the torque (T,) without noise and tremor: low-passed forwards and backwards."""
+    cutoff = min(cutoff_hz, 0.2 * rate_hz)
+    sections = butter(2, cutoff, fs=rate_hz, output="sos")
+    padding = min(len(torque) - 1, int(2 * rate_hz / cutoff))
+    return np.asarray(sosfiltfilt(sections, torque, padlen=padding))
+
+
+def reversals(smooth: Array) -> NDArray[np.intp]:
     """Return the samples at which the loading turns round, in order.
 
-    The torque (T,) is low-passed at ``smoothing_hz`` first; a turn stands out by 30 % of its
-    range, so that pauses and tremor are none.
+    A turn of the torque ``smooth`` (T,), from :func:`smoothed`, stands out by 30 % of its range,
+    so that pauses are none.
     """
-    cutoff = min(smoothing_hz, 0.2 * rate_hz)
-    sections = butter(2, cutoff, fs=rate_hz, output="sos")
-    smooth = sosfiltfilt(sections, torque, padlen=min(len(torque) - 1, int(2 * rate_hz / cutoff)))
     least = _PROMINENCE * float(np.ptp(smooth))
     peaks = find_peaks(smooth, prominence=least)[0]
     valleys = find_peaks(-smooth, prominence=least)[0]
@@ -134,55 +145,59 @@ def reversals(torque: Array, rate_hz: float, smoothing_hz: float = 5.0) -> NDArr
     return np.array(kept, dtype=np.intp)
 
 
-def count_changes(torque: Array, deflection: Array) -> tuple[Array, Array]:
-    """Return torque and deflection where the encoder count changes, each (n,).
-
-    Half way between two samples that differ, the deflection is half way between their counts:
-    exact for a step of one count, and as good as any for more.
-    """
-    at = np.flatnonzero(np.diff(deflection))
-    return 0.5 * (torque[at] + torque[at + 1]), 0.5 * (deflection[at] + deflection[at + 1])
-
-
 def branches_of(torque: Array, deflection: Array, rate_hz: float) -> tuple[Branch, ...]:
-    """Return the whole branches of a loading record: those between two reversals."""
-    turns = reversals(torque, rate_hz)
+    """Return the whole branches of a loading record: those between two reversals.
+
+    They hold the record where the encoder count changes: half way between two samples that
+    differ the deflection is half way between their counts, exactly so for a step of one count.
+    How far a point is from the reversal is read from the smoothed torque: to choose points by
+    the noisy torque would prefer noise of one sign.
+    """
+    smooth = smoothed(torque, rate_hz)
+    turns = reversals(smooth)
     branches = []
     for start, stop in zip(turns[:-1], turns[1:], strict=True):
-        load, travel_to = torque[start : stop + 1], deflection[start : stop + 1]
-        direction = 1 if load[-1] > load[0] else -1
-        at_torque, at_deflection = count_changes(load, travel_to)
-        travel = direction * (at_torque - load[0])
+        at = start + np.flatnonzero(np.diff(deflection[start : stop + 1]))
+        direction = 1 if smooth[stop] > smooth[start] else -1
         branches.append(
-            Branch(int(start), int(stop), direction, at_torque, at_deflection, travel)
+            Branch(
+                int(start),
+                int(stop),
+                direction,
+                torque=0.5 * (torque[at] + torque[at + 1]),
+                deflection=0.5 * (deflection[at] + deflection[at + 1]),
+                travel=direction * (0.5 * (smooth[at] + smooth[at + 1]) - smooth[start]),
+            )
         )
     return tuple(branches)
 
 
 def _regression(
-    branches: Sequence[Branch], noise_sd: float, first: float, transition: float | None
+    branches: Sequence[Branch],
+    noise_sd: float,
+    window: tuple[float, float],
+    decay: float | None = None,
 ) -> tuple[float, float, Array]:
     """Regress deflection on torque, an intercept to each branch.
 
     Args:
         branches: what to fit.
         noise_sd: of the torque at a count change.
-        first: travel from which points are used.
-        transition: decay length, in torque, of an exponential approach to the straight line that
-            is fitted besides, one amplitude for all branches; None for none.
+        window: first and last travel of the points used.
+        decay: length, in torque, of an exponential approach to the straight line that is fitted
+            besides, one amplitude for all branches; None for none.
 
     Returns:
         Compliance, its standard error, and the coefficients: compliance, (amplitude of the
         approach,) intercepts.
     """
-    rows = [branch.travel >= first for branch in branches]
+    rows = [(branch.travel >= window[0]) & (branch.travel <= window[1]) for branch in branches]
     torque = np.concatenate([b.torque[r] for b, r in zip(branches, rows, strict=True)])
     deflection = np.concatenate([b.deflection[r] for b, r in zip(branches, rows, strict=True)])
     columns = [torque]
-    if transition is not None:
+    if decay is not None:
         approach = [
-            -b.direction * np.exp(-b.travel[r] / transition)
-            for b, r in zip(branches, rows, strict=True)
+            -b.direction * np.exp(-b.travel[r] / decay) for b, r in zip(branches, rows, strict=True)
         ]
         columns.append(np.concatenate(approach))
     owner = np.repeat(np.arange(len(branches)), [int(np.sum(r)) for r in rows])
@@ -190,7 +205,7 @@ def _regression(
     design = np.stack(columns, axis=1)
     moments = design.T @ design
     moments[0, 0] -= len(torque) * noise_sd**2
-    inverse = np.linalg.inv(moments)
+    inverse = np.linalg.pinv(moments, hermitian=True)
     coefficients = inverse @ (design.T @ deflection)
     residual = deflection - design @ coefficients
     spare = max(len(torque) - design.shape[1], 1)
@@ -198,26 +213,30 @@ def _regression(
     return float(coefficients[0]), error, np.asarray(coefficients)
 
 
-def transition_of(branches: Sequence[Branch], noise_sd: float) -> tuple[float, float]:
-    """Return decay length and end of the transition after a reversal, both in torque.
+def transition_of(branches: Sequence[Branch], noise_sd: float) -> float:
+    """Return the torque after a reversal from which the branches are taken as post-yield.
 
-    The end is where the slope of the fitted approach has fallen to 1 % of the compliance.
+    There the slope of the fitted exponential approach has fallen to 1 % of the compliance; at the
+    latest it is at 60 % of a branch.
     """
     span = float(np.median([branch.travel[-1] for branch in branches]))
 
-    def misfit(log_length: float) -> float:
+    def fit(log_length: float) -> tuple[float, Array]:
         length = float(np.exp(log_length))
-        _, _, coefficients = _regression(branches, noise_sd, 0.0, length)
-        return _sum_of_squares(branches, coefficients, length)
+        _, _, coefficients = _regression(branches, noise_sd, (0.0, np.inf), length)
+        return _sum_of_squares(branches, coefficients, length), coefficients
 
     grid = np.log(np.geomspace(0.005 * span, 0.5 * span, 15))
-    best = int(np.argmin([misfit(float(value)) for value in grid]))
+    best = int(np.argmin([fit(float(value))[0] for value in grid]))
     around = (float(grid[max(best - 1, 0)]), float(grid[min(best + 1, len(grid) - 1)]))
-    found = minimize_scalar(misfit, bounds=around, method="bounded", options={"xatol": 1e-3})
-    length = float(np.exp(found.x))
-    _, _, coefficients = _regression(branches, noise_sd, 0.0, length)
+    found = minimize_scalar(
+        lambda value: fit(float(value))[0], bounds=around, method="bounded",
+        options={"xatol": 1e-3},
+    )  # fmt: skip
+    length, coefficients = float(np.exp(found.x)), fit(float(found.x))[1]
     steepness = abs(float(coefficients[1])) / length / abs(float(coefficients[0]))
-    return length, length * float(np.log(max(steepness / _LEFTOVER, 1.0)))
+    end = length * float(np.log(max(steepness / _LEFTOVER, 1.0)))
+    return min(end, _LATEST_START * span)
 
 
 def _sum_of_squares(branches: Sequence[Branch], coefficients: Array, length: float) -> float:
@@ -263,22 +282,32 @@ def hysteresis(
         raise ValueError("the deflection changes by fewer than 8 encoder counts on a branch")
     noise = noise_of(torque) if noise_sd is None else noise_sd
     noise /= np.sqrt(2.0)  # a count change takes the mean of two samples
-    length, end = transition_of(branches, noise)
-    span = float(np.median([branch.travel[-1] for branch in branches]))
-    yielded = end <= _LONGEST_TRANSITION * span
-    first, bend = (end, None) if yielded else (0.0, length)
-    compliance, error, _ = _regression(branches, noise, first, bend)
+    start = transition_of(branches, noise)
+    window = (start, np.inf)
+    compliance, error, _ = _regression(branches, noise, window)
     if compliance <= 0.0:
         raise ValueError("the deflection does not follow the torque")
+    middle = 0.5 * (start + float(np.median([branch.travel[-1] for branch in branches])))
+    early, early_error, _ = _regression(branches, noise, (start, middle))
+    late, late_error, _ = _regression(branches, noise, (middle, np.inf))
+    bend, bend_error = late / early - 1.0, float(np.hypot(early_error, late_error)) / compliance
     cycles = tuple(
-        _cycle(torque, deflection, branches[k : k + 2], noise, first, bend)
+        _cycle(torque, deflection, branches[k : k + 2], noise, window)
         for k in range(0, len(branches) - 1, 2)
     )
     stiffness = 1.0 / compliance
     standard_error = error * stiffness**2
     values = [cycle.stiffness for cycle in cycles]
-    sd = float(np.std(values, ddof=1)) if len(values) > 1 else standard_error
-    return Hysteresis(stiffness, sd, standard_error, cycles, branches, end, yielded)
+    return Hysteresis(
+        stiffness=stiffness,
+        sd=float(np.std(values, ddof=1)) if len(values) > 1 else standard_error,
+        standard_error=standard_error,
+        cycles=cycles,
+        branches=branches,
+        transition=start,
+        bend=bend,
+        yielded=abs(bend) < max(_LARGEST_BEND, 3.0 * bend_error),
+    )
 
 
 def _cycle(
@@ -286,11 +315,10 @@ def _cycle(
     deflection: Array,
     pair: Sequence[Branch],
     noise_sd: float,
-    first: float,
-    transition: float | None,
+    window: tuple[float, float],
 ) -> Cycle:
     """Return the numbers of one cycle."""
-    compliance, _, coefficients = _regression(pair, noise_sd, first, transition)
+    compliance, _, coefficients = _regression(pair, noise_sd, window)
     intercepts = {b.direction: float(c) for b, c in zip(pair, coefficients[-2:], strict=True)}
     across = intercepts[-1] - intercepts[1]
     start, stop = pair[0].start, pair[1].stop

@@ -1,0 +1,323 @@
+"""Stage stiffness: transmission stiffness of every axis that was locked and loaded (Fig. 3)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from bampipe.data.store import ParquetAppender, read_parquet, read_toml, write_json
+from bampipe.errors import InputError
+from bampipe.estimate.differentiation import uniform_grid
+from bampipe.estimate.hysteresis import Branch, Cycle, Hysteresis, hysteresis
+from bampipe.physics import Model, System, compile_model, registry
+from bampipe.stages.base import Progress, RunFolder
+
+NAME = "stiffness"
+SUMMARY = "Stiffness, loop width and bandwidth of the locked axes"
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Config:
+    """What the stage can be told.
+
+    Attributes:
+        largest_drift: a locked trial whose loops drift from the first to the last cycle by more
+            than this share of their range is reported as a slipping brake.
+    """
+
+    largest_drift: float = 0.05
+
+
+def inputs(config: Config) -> tuple[str, ...]:
+    """Return the paths the stage reads."""
+    return (
+        "ingest/trials.parquet",
+        "ingest/samples.parquet",
+        "ingest/session.json",
+        "ingest/device.toml?",
+    )
+
+
+def outputs(config: Config) -> tuple[str, ...]:
+    """Return the paths the stage writes."""
+    return ("stiffness/stiffness.json", "stiffness/loops.parquet")
+
+
+@dataclass(frozen=True)
+class _Loops:
+    """The loops of one locked trial.
+
+    ``pose`` is the median reading of every axis (n_q,), ``torque`` and ``deflection`` (T,) are
+    the whole record of the locked axis.
+    """
+
+    trial_id: str
+    pose: Array
+    torque: Array
+    deflection: Array
+    rate: float
+    found: Hysteresis
+
+
+def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
+    """Find the stiffness of every axis that has a locked trial."""
+    if not 0.0 < config.largest_drift:
+        raise InputError("must be positive", where="stiffness.largest_drift")
+    session = run.read_json("ingest/session.json")
+    system = _system(run, session)
+    samples = run.require("ingest/samples.parquet", "ingest")
+    trials = read_parquet(run.require("ingest/trials.parquet", "ingest"))
+    locked = trials[(trials["kind"] == "locked") & (trials["status"] != "set_aside")]
+
+    loops: dict[str, list[_Loops]] = {}
+    notes: list[str] = []
+    for number, row in enumerate(locked.itertuples()):
+        progress(number / len(locked), str(row.trial_id))
+        axis = str(row.locked_axis)
+        if axis not in system.coordinates:
+            raise InputError(
+                f"the device has no axis {axis!r}",
+                where=f"trial {row.trial_id}: locked_axis",
+                remedy=f"its axes are {', '.join(system.coordinates)}",
+            )
+        result = _loops_of(samples, str(row.trial_id), axis, system, session)
+        if isinstance(result, str):
+            notes.append(f"{row.trial_id}: {result}")
+        else:
+            loops.setdefault(axis, []).append(result)
+    if locked.empty:
+        notes.append("No locked trials in this session: no stiffness to report.")
+    axes: dict[str, object] = {
+        axis: _axis(axis, loops[axis], system, config, notes)
+        for axis in system.coordinates
+        if axis in loops
+    }
+    _write_loops(out / "stiffness/loops.parquet", loops)
+    content: dict[str, object] = {
+        "axes": axes,
+        "notes": notes,
+        "headline": _headline(axes) if axes else notes[-1],
+    }
+    write_json(out / "stiffness/stiffness.json", content)
+    return content
+
+
+def _system(run: RunFolder, session: Mapping[str, Any]) -> System:
+    """Return the bare device of the session, compiled."""
+    if run.exists("ingest/device.toml"):
+        path = run.path("ingest/device.toml")
+        return compile_model(Model(registry.device_from(read_toml(path), str(path))))
+    return compile_model(Model(registry.device(str(session["device"]))))
+
+
+def _loops_of(
+    samples: Path, trial_id: str, axis: str, system: System, session: Mapping[str, Any]
+) -> _Loops | str:
+    """Return the loops of one trial, or why there are none."""
+    rate = float(session["sample_rate_hz"])
+    frame = read_parquet(samples, trial=trial_id)
+    frame = frame[frame.drop(columns="trial_id").notna().all(axis=1)]
+    t = frame["t"].to_numpy(dtype=np.float64)
+    if len(t) < 2:
+        return "no sound samples"
+    # Encoder counts must stay counts: where a sample is missing the one before stands.
+    grid = uniform_grid(t, rate)
+    held = {
+        name: grid.hold(frame[name].to_numpy(dtype=np.float64))
+        for name in frame.columns
+        if name not in ("trial_id", "t")
+    } | {"t": grid.t}
+    for name in system.inputs:
+        if name.startswith("brake_"):  # a session without brake channels has its brakes off
+            held.setdefault(name, np.zeros_like(grid.t))
+    absent = [name for name in system.inputs if name not in held]
+    if absent:
+        raise InputError(
+            f"no channel {absent[0]!r}, which the device needs", where=f"trial {trial_id}"
+        )
+    q = np.stack([held[f"q_{name}"] for name in system.coordinates], axis=1)
+    u = np.stack([held[name] for name in system.inputs], axis=1)
+    still = np.zeros_like(q)
+    p = system.prior
+    z = system.memory(q, still, still, u, p, grid.t)
+    number = system.coordinates.index(axis)
+    torque = np.ascontiguousarray(system.applied(q, still, still, z, u, p)[:, number])
+    deflection = np.ascontiguousarray(q[:, number])
+    try:
+        found = hysteresis(torque, deflection, rate)
+    except ValueError as error:
+        return str(error)
+    return _Loops(trial_id, np.median(q, axis=0), torque, deflection, rate, found)
+
+
+def _axis(
+    axis: str, trials: list[_Loops], system: System, config: Config, notes: list[str]
+) -> dict[str, object]:
+    """Return the entry of one axis; add to ``notes`` what a reader must know."""
+    number = system.coordinates.index(axis)
+    unit = f"{system.torque_units[number]}/{system.coordinate_units[number]}"
+    cycles = [(trial, cycle) for trial in trials for cycle in trial.found.cycles]
+    values = np.array([cycle.stiffness for _, cycle in cycles])
+    weights = np.array([len(trial.found.cycles) for trial in trials]) / len(cycles)
+    stiffness = float(weights @ [trial.found.stiffness for trial in trials])
+    error = float(np.linalg.norm(weights * [trial.found.standard_error for trial in trials]))
+    sd = float(np.std(values, ddof=1)) if len(values) > 1 else float(trials[0].found.sd)
+    for trial in trials:
+        if not trial.found.yielded:
+            notes.append(
+                f"{trial.trial_id}: the slope of the loops still changes by "
+                f"{100.0 * trial.found.bend:.1f} % where they should be straight: load the axis "
+                "further; the stiffness is too high."
+            )
+        drift = _drift(trial)
+        if abs(drift) > config.largest_drift:
+            notes.append(
+                f"{trial.trial_id}: the loops drift by {100.0 * drift:.1f} % of their range: the "
+                "brake slips."
+            )
+    poses = _poses(system, trials[0].pose)
+    bandwidths = {name: _bandwidth(system, number, stiffness, pose) for name, pose in poses.items()}
+    stated = "maximum_extension" if "maximum_extension" in bandwidths else "recorded"
+    return {
+        "stiffness": stiffness,
+        "sd": sd,
+        "standard_error": error,
+        "unit": unit,
+        "n_cycles": len(cycles),
+        "bandwidth_rad_s": bandwidths[stated]["rad_s"],
+        "bandwidth_hz": bandwidths[stated]["hz"],
+        "bandwidth_pose": stated,
+        "bandwidths": bandwidths,
+        "poses": {
+            name: dict(zip(system.coordinates, map(float, pose), strict=True))
+            for name, pose in poses.items()
+        },
+        "loop_width": float(np.mean([cycle.width_torque for _, cycle in cycles])),
+        "loop_width_unit": system.torque_units[number],
+        "loop_width_deflection": float(np.mean([cycle.width_deflection for _, cycle in cycles])),
+        "loop_width_deflection_unit": system.coordinate_units[number],
+        "energy_per_cycle": float(np.mean([cycle.energy for _, cycle in cycles])),
+        "energy_unit": "J",
+        "yielded": all(trial.found.yielded for trial in trials),
+        "cycles": [_cycle(trial, cycle) for trial, cycle in cycles],
+        "trials": {
+            trial.trial_id: {
+                "stiffness": trial.found.stiffness,
+                "standard_error": trial.found.standard_error,
+                "transition": trial.found.transition,
+                "bend": trial.found.bend,
+                "drift": _drift(trial),
+            }
+            for trial in trials
+        },
+    }
+
+
+def _drift(trial: _Loops) -> float:
+    """Return how far the loops wander from first to last cycle, as a share of their range."""
+    cycles = trial.found.cycles
+    reach = 2.0 * max(cycle.amplitude for cycle in cycles) / trial.found.stiffness
+    return (cycles[-1].centre - cycles[0].centre) / reach
+
+
+def _cycle(trial: _Loops, cycle: Cycle) -> dict[str, object]:
+    """Return what is stored of one cycle."""
+    return {
+        "trial_id": trial.trial_id,
+        "duration_s": (cycle.stop - cycle.start) / trial.rate,
+        "stiffness": cycle.stiffness,
+        "loop_width": cycle.width_torque,
+        "loop_width_deflection": cycle.width_deflection,
+        "energy": cycle.energy,
+        "amplitude": cycle.amplitude,
+        "centre": cycle.centre,
+    }
+
+
+def _poses(system: System, recorded: Array) -> dict[str, Array]:
+    """Return the poses at which the bandwidth is stated, each (n_q,).
+
+    ``recorded`` is that of the locked trial. Where the device has linear axes with limits,
+    ``maximum_extension`` has them at their upper limits and the rotary axes at zero, where the
+    inertia about them is largest.
+    """
+    device = system.model.device
+    poses = {"recorded": recorded}
+    linear = [c.name for c in device.coordinates if c.kind == "linear" and c.name in device.limits]
+    if linear and len(linear) < len(device.coordinates):
+        poses["maximum_extension"] = np.array(
+            [device.limits[c.name][1] if c.name in linear else 0.0 for c in device.coordinates]
+        )
+    return poses
+
+
+def _bandwidth(system: System, number: int, stiffness: float, pose: Array) -> dict[str, float]:
+    """Return sqrt(K / M_ii) at ``pose`` in both units, and M_ii."""
+    inertia = float(system.mass_matrix(pose[None, :], system.prior)[0, number, number])
+    speed = float(np.sqrt(stiffness / inertia))
+    return {"rad_s": speed, "hz": speed / (2.0 * np.pi), "inertia": inertia}
+
+
+def _write_loops(path: Path, loops: Mapping[str, list[_Loops]]) -> None:
+    """Write every sample of the whole cycles; an empty table where there are none."""
+    with ParquetAppender(path) as file:
+        for axis, trials in loops.items():
+            for trial in trials:
+                file.append(_loop_rows(axis, trial))
+        if not loops:
+            file.append(_no_rows())
+
+
+def _no_rows() -> pd.DataFrame:
+    """Return the table without rows."""
+    kinds = {
+        "trial_id": "str", "axis": "str", "cycle": "int64", "branch": "str",
+        "t": "float64", "torque": "float64", "deflection": "float64", "post_yield": "bool",
+    }  # fmt: skip
+    return pd.DataFrame({name: pd.Series(dtype=kind) for name, kind in kinds.items()})
+
+
+def _loop_rows(axis: str, trial: _Loops) -> pd.DataFrame:
+    """Return the samples of one trial, branch by branch; deflection from the recorded pose."""
+    parts = []
+    for number, branch in enumerate(trial.found.branches):
+        rows = np.arange(branch.start, branch.stop)
+        torque = trial.torque[rows]
+        parts.append(
+            pd.DataFrame(
+                {
+                    "trial_id": trial.trial_id,
+                    "axis": axis,
+                    "cycle": np.int64(number // 2),
+                    "branch": _side(branch),
+                    "t": rows / trial.rate,
+                    "torque": torque,
+                    "deflection": trial.deflection[rows],
+                    "post_yield": branch.direction * (torque - trial.torque[branch.start])
+                    >= trial.found.transition,
+                }
+            )
+        )
+    return pd.concat(parts, ignore_index=True)
+
+
+def _side(branch: Branch) -> str:
+    """Return the name of the branch."""
+    return "rising" if branch.direction > 0 else "falling"
+
+
+def _headline(axes: Mapping[str, Any]) -> str:
+    """Return one sentence with the stiffness of every axis."""
+    return "; ".join(
+        f"{axis} {entry['stiffness']:.4g} ± {entry['sd']:.2g} {entry['unit']} "
+        f"({entry['bandwidth_rad_s']:.3g} rad/s, {entry['bandwidth_hz']:.3g} Hz)"
+        for axis, entry in axes.items()
+    )

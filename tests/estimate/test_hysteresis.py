@@ -1,0 +1,107 @@
+"""Stiffness recovered from loops of known stiffness, whatever the friction looks like."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from loops import Array, bouc_wen, elements, load_cycles, measure
+
+from bampipe.estimate import hysteresis as hy
+
+RATE = 500.0
+K, AMPLITUDE = 2300.0, 50.0
+
+
+def simulate(kind: str, torque: Array, stiffness: float, friction: float, slip: float) -> Array:
+    """Return the deflection under ``torque`` of the loop model ``kind``."""
+    if kind == "jenkins":
+        return elements(torque, stiffness, friction, np.array([slip]))
+    if kind == "iwan":
+        return elements(torque, stiffness, friction, slip * np.linspace(0.1, 2.0, 8))
+    return bouc_wen(torque, stiffness, friction, slip, float(kind.removeprefix("bouc_wen_")))
+
+
+@pytest.mark.parametrize("kind", ["jenkins", "iwan", "bouc_wen_1", "bouc_wen_2", "bouc_wen_0.5"])
+@pytest.mark.parametrize(("friction", "slip"), [(0.01, 0.03), (0.06, 0.03), (0.06, 0.1)])
+def test_stiffness_within_a_percent(kind: str, friction: float, slip: float) -> None:
+    load = load_cycles(4, AMPLITUDE, seed=3)
+    true = simulate(kind, load, K, friction * AMPLITUDE, slip * AMPLITUDE / K)
+    for resolution, noise_sd in ((4.7e-5, 0.05), (6e-4, 0.05), (6e-4, 0.3)):
+        found = hy.hysteresis(*measure(load, true, resolution, noise_sd), RATE)
+        assert found.yielded
+        assert found.stiffness == pytest.approx(K, rel=0.01)
+        assert len(found.cycles) == 3
+        widths = [cycle.width_torque for cycle in found.cycles]
+        assert np.mean(widths) == pytest.approx(2 * friction * AMPLITUDE, rel=0.1)
+
+
+def test_a_loop_of_seventy_counts() -> None:
+    """The extension of the BAM: 109 kN/m under 120 N is 73 counts of 30 um."""
+    stiffness, errors = 109e3, []
+    for seed in range(4):
+        load = load_cycles(4, 120.0, seed=seed)
+        true = bouc_wen(load, stiffness, 7.0, 1.2e-4, 1.0)
+        found = hy.hysteresis(*measure(load, true, 3e-5, 0.05, seed), RATE)
+        errors.append(found.stiffness / stiffness - 1.0)
+    assert np.max(np.abs(errors)) < 0.003
+
+
+def test_noise_of_the_torque_does_not_stiffen_the_axis() -> None:
+    load = load_cycles(6, AMPLITUDE, seed=5)
+    true = simulate("bouc_wen_1", load, K, 3.0, 0.03 * AMPLITUDE / K)
+    found = hy.hysteresis(*measure(load, true, 4.7e-5, 6.0), RATE)
+    assert found.stiffness == pytest.approx(K, rel=0.01)
+
+
+def test_energy_is_the_area_of_the_loop() -> None:
+    """Rigid-plastic friction F: a loop of range X loses 2 F (X - slip range), a rectangle."""
+    friction, slip = 3.0, 1e-4
+    load = load_cycles(4, AMPLITUDE, seed=2)
+    true = elements(load, K, friction, np.array([slip]))
+    found = hy.hysteresis(*measure(load, true, 4.7e-5, 0.02), RATE)
+    for cycle in found.cycles:
+        part = true[cycle.start : cycle.stop + 1]
+        assert cycle.energy == pytest.approx(2 * friction * (np.ptp(part) - 2 * slip), rel=0.05)
+
+
+def test_a_load_that_does_not_overcome_friction_is_said() -> None:
+    load = load_cycles(4, AMPLITUDE, seed=2)
+    true = simulate("bouc_wen_1", load, K, 15.0, 0.6 * AMPLITUDE / K)
+    found = hy.hysteresis(*measure(load, true, 4.7e-5, 0.05), RATE)
+    assert not found.yielded
+    assert found.bend > 0.02
+
+
+def test_standard_deviation_is_that_of_the_cycles() -> None:
+    load = load_cycles(6, 120.0, seed=1)
+    true = bouc_wen(load, 109e3, 7.0, 1.2e-4, 1.0)
+    found = hy.hysteresis(*measure(load, true, 3e-5, 0.05), RATE)
+    assert found.sd == pytest.approx(np.std([c.stiffness for c in found.cycles], ddof=1))
+    assert 1e-5 < found.sd / found.stiffness < 0.01
+
+
+def test_pauses_and_tremor_are_no_reversals() -> None:
+    t = np.arange(0.0, 16.0, 1.0 / RATE)
+    phase = t + 0.6 * np.sin(2 * np.pi * t / 4.0 * 3.0) / 3.0
+    load = AMPLITUDE * np.sin(2 * np.pi * phase / 4.0) + 0.6 * np.sin(2 * np.pi * 9.0 * t)
+    assert len(hy.reversals(hy.smoothed(load, RATE))) == 8
+
+
+def test_noise_is_read_from_the_record() -> None:
+    rng = np.random.default_rng(0)
+    signal = load_cycles(3, AMPLITUDE) + 0.2 * rng.standard_normal(6000)
+    signal[100] += 40.0
+    assert hy.noise_of(signal) == pytest.approx(0.2, rel=0.05)
+
+
+@pytest.mark.parametrize("cycles", [0.2, 0.6])
+def test_no_whole_cycle(cycles: float) -> None:
+    load = AMPLITUDE * np.sin(2 * np.pi * np.linspace(0.0, cycles, 1000))
+    with pytest.raises(ValueError, match="no whole load cycle"):
+        hy.hysteresis(load, load / K, RATE)
+
+
+def test_a_deflection_of_a_few_counts() -> None:
+    load = load_cycles(4, AMPLITUDE)
+    with pytest.raises(ValueError, match="fewer than 8 encoder counts"):
+        hy.hysteresis(load, np.round(load / K / 0.02) * 0.02, RATE)

@@ -1,0 +1,135 @@
+"""The stiffness stage on simulated and shared sessions."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from run_folders import SESSIONS, ingested_session, write_ingested
+
+from bampipe.data.schema import validate
+from bampipe.data.store import read_json, read_parquet, sha256_file
+from bampipe.errors import InputError
+from bampipe.stages import stiffness
+from bampipe.stages.base import RunFolder, silent
+
+AXES = {
+    "yaw": {"unit": "rad", "resolution": 4.6875e-5},
+    "pitch": {"unit": "rad", "resolution": 9.8125e-5},
+    "extension": {"unit": "m", "resolution": 3.0e-5},
+}
+
+
+def locked_trial(axis: str, stiffness: float, *, creep: float = 0.0, seed: int = 0) -> pd.DataFrame:
+    """Return 20 s of loading a locked axis; bilinear loop with little friction."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(0.0, 20.0, 0.002)
+    pose = {"yaw": 0.1, "pitch": 0.3, "extension": 1.2}
+    arm = {"yaw": 1.2 * np.cos(0.3), "pitch": 1.2, "extension": 1.0}[axis]
+    amplitude = 100.0 if axis == "extension" else 45.0
+    torque = amplitude * np.sin(2 * np.pi * t / 4.0)
+    frame = pd.DataFrame({"t": t})
+    for name, entry in AXES.items():
+        deflection = (torque / stiffness + creep * t) if name == axis else 0.0 * t
+        counts = np.floor((pose[name] + deflection) / entry["resolution"])
+        frame[f"q_{name}"] = counts * entry["resolution"]
+    for component, name in zip("xyz", AXES, strict=True):
+        push = torque / arm if name == axis else 0.0
+        frame[f"force_{component}"] = push + 0.05 * rng.standard_normal(len(t))
+    for name in AXES:
+        frame[f"brake_{name}"] = 200.0 if name == axis else 0.0
+    return frame
+
+
+def run_stage(run: RunFolder) -> dict:
+    """Execute the stage in the run folder; return stiffness.json, checked."""
+    stiffness.execute(run, run.root, stiffness.Config(), silent)
+    content = read_json(run.path("stiffness/stiffness.json"))
+    validate(content, "stiffness", "stiffness.json")
+    return content
+
+
+def test_every_axis_through_the_device(tmp_path: Path) -> None:
+    truth = {"yaw": 2000.0, "pitch": 1800.0, "extension": 90e3}
+    frames = {f"locked_{axis}": locked_trial(axis, k) for axis, k in truth.items()}
+    kinds = {f"locked_{axis}": ("locked", axis) for axis in truth}
+    content = run_stage(write_ingested(tmp_path / "run", frames, kinds, AXES))
+    for axis, k in truth.items():
+        entry = content["axes"][axis]
+        assert entry["stiffness"] == pytest.approx(k, rel=0.005)
+        assert entry["unit"] == ("N/m" if axis == "extension" else "N.m/rad")
+        assert entry["n_cycles"] == len(entry["cycles"]) == 4
+        here = entry["bandwidths"]["recorded"]
+        assert here["rad_s"] == pytest.approx(np.sqrt(entry["stiffness"] / here["inertia"]))
+        assert entry["bandwidth_hz"] == pytest.approx(entry["bandwidth_rad_s"] / (2 * np.pi))
+        assert entry["poses"]["recorded"]["pitch"] == pytest.approx(0.3, abs=1e-3)
+    assert content["axes"]["extension"]["bandwidths"]["recorded"]["inertia"] == pytest.approx(3.56)
+    assert content["notes"] == []
+    loops = read_parquet(tmp_path / "run/stiffness/loops.parquet")
+    assert set(loops["branch"]) == {"rising", "falling"}
+    assert loops.groupby("axis").size().min() > 5000
+    assert loops["post_yield"].mean() > 0.3
+
+
+def test_a_slipping_brake_is_said(tmp_path: Path) -> None:
+    frames = {"a": locked_trial("yaw", 2000.0, creep=5e-4)}
+    content = run_stage(write_ingested(tmp_path / "run", frames, {"a": ("locked", "yaw")}, AXES))
+    assert any("brake slips" in note for note in content["notes"])
+
+
+def test_two_trials_of_one_axis(tmp_path: Path) -> None:
+    frames = {name: locked_trial("yaw", 2000.0, seed=k) for k, name in enumerate("ab")}
+    kinds = {name: ("locked", "yaw") for name in "ab"}
+    entry = run_stage(write_ingested(tmp_path / "run", frames, kinds, AXES))["axes"]["yaw"]
+    assert entry["n_cycles"] == 8
+    assert set(entry["trials"]) == {"a", "b"}
+
+
+def test_no_locked_trial(tmp_path: Path) -> None:
+    frames = {"a": locked_trial("yaw", 2000.0)}
+    content = run_stage(write_ingested(tmp_path / "run", frames, {"a": ("free", None)}, AXES))
+    assert content["axes"] == {}
+    assert "No locked trials" in content["headline"]
+    assert len(read_parquet(tmp_path / "run/stiffness/loops.parquet")) == 0
+
+
+def test_a_trial_without_load(tmp_path: Path) -> None:
+    frame = locked_trial("yaw", 2000.0)
+    frame["q_yaw"] = 0.1
+    content = run_stage(
+        write_ingested(tmp_path / "run", {"a": frame}, {"a": ("locked", "yaw")}, AXES)
+    )
+    assert content["axes"] == {}
+    assert content["notes"][0].startswith("a: ")
+
+
+def test_an_axis_that_is_not_there(tmp_path: Path) -> None:
+    frames = {"a": locked_trial("yaw", 2000.0)}
+    run = write_ingested(tmp_path / "run", frames, {"a": ("locked", "roll")}, AXES)
+    with pytest.raises(InputError, match="roll"):
+        run_stage(run)
+
+
+def test_same_bytes(tmp_path: Path) -> None:
+    frames = {"a": locked_trial("pitch", 2000.0)}
+    run = write_ingested(tmp_path / "run", frames, {"a": ("locked", "pitch")}, AXES)
+    hashes = []
+    for _ in range(2):
+        run_stage(run)
+        names = stiffness.outputs(stiffness.Config())
+        hashes.append([sha256_file(run.path(name)) for name in names])
+    assert hashes[0] == hashes[1]
+
+
+@pytest.mark.parametrize("name", ["open-01", "open-09"])
+def test_shared_sessions_within_a_percent(name: str, tmp_path: Path) -> None:
+    run = ingested_session(tmp_path / name, name)
+    truth = json.loads((SESSIONS / f"{name}.truth.json").read_text())["stiffness"]
+    content = run_stage(run)
+    for axis, k in zip(AXES, truth, strict=True):
+        entry = content["axes"][axis]
+        assert entry["stiffness"] == pytest.approx(k, rel=0.01)
+        assert entry["yielded"]
