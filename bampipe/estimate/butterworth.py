@@ -41,7 +41,7 @@ def zero_phase(
             amplitude through there.
         order: order of one pass.
     """
-    reach = int(np.ceil(2.0 * rate_hz / cutoff_hz)) + 2
+    reach = int(np.ceil(4.0 * rate_hz / cutoff_hz)) + 2
     sections = _design(cutoff_hz, rate_hz, order)
     longer = extend(values, reach, max(4, int(np.ceil(1.5 * rate_hz / cutoff_hz))))
     added = (len(longer) - len(values)) // 2

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -156,7 +157,7 @@ def branches_of(torque: Array, deflection: Array, rate_hz: float) -> tuple[Branc
     smooth = smoothed(torque, rate_hz)
     turns = reversals(smooth)
     branches = []
-    for start, stop in zip(turns[:-1], turns[1:], strict=True):
+    for start, stop in pairwise(turns):
         at = start + np.flatnonzero(np.diff(deflection[start : stop + 1]))
         direction = 1 if smooth[stop] > smooth[start] else -1
         branches.append(

@@ -238,6 +238,25 @@ def _prior(y: Array, order: int) -> tuple[Array, Array]:
     return start, np.diag(np.square(spread))
 
 
+def _informed_prior(y: Array, seen: Flags, step: Array, noise: Array) -> tuple[Array, Array]:
+    """Return a prior for the first state from the samples themselves, ten times too wide.
+
+    The filter is run backwards in time (odd derivatives change sign). Against a prior that says
+    nothing, this costs one per cent of double use and keeps the smoothed variances from being
+    small differences of large numbers.
+    """
+    count, order = len(y), len(step)
+    signs = (-1.0) ** np.arange(order)
+    reverse = np.ascontiguousarray(y[::-1])
+    start, spread = _prior(reverse, order)
+    states, covariances = np.empty((count, order)), np.empty((count, order, order))
+    _filter(
+        reverse, np.ascontiguousarray(seen[::-1]), step, noise, start, spread, states,
+        covariances, np.zeros((count, order)), np.zeros(count), np.ones(count),
+    )  # fmt: skip
+    return states[-1] * signs, 100.0 * covariances[-1] * np.outer(signs, signs)
+
+
 @dataclass(frozen=True)
 class MotionModel:
     """The motion model of one axis.
@@ -278,7 +297,7 @@ def smooth(position: Array, model: MotionModel, seen: Flags | None = None) -> De
     seen = np.ones(count, dtype=bool) if seen is None else seen
     step, noise = transition(order)
     y = (position - position[0]) / model.noise_sd
-    start, spread = _prior(y, order)
+    start, spread = _informed_prior(y, seen, step, model.ratio * noise)
     states, variances = np.empty((count, order)), np.empty((count, order))
     covariances, gains = np.empty((count, order, order)), np.zeros((count, order))
     innovations, spreads = np.zeros(count), np.ones(count)

@@ -15,7 +15,7 @@ def window_length(cutoff_hz: float, rate_hz: float, degree: int = 4) -> int:
     sampling rate is (degree + 1) / (3.2 M - 4.6).
     """
     half = ((degree + 1) * 0.5 * rate_hz / cutoff_hz + 4.6) / 3.2
-    return 2 * max(int(round(half)), degree // 2 + 1) + 1
+    return 2 * max(round(half), degree // 2 + 1) + 1
 
 
 def polynomial(

@@ -1,0 +1,231 @@
+"""Derivatives of quantised motions: right, within their error bands, and sound at the ends."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from bampipe.estimate import butterworth, kalman_smoother, savitzky_golay
+from bampipe.estimate.differentiation import Derivatives, extend, uniform_grid
+
+Array = NDArray[np.float64]
+RATE = 500.0
+RESOLUTION = 5e-5
+NOISE_SD = RESOLUTION / np.sqrt(12.0)
+METHODS = ("kalman", "butterworth", "savitzky_golay")
+
+
+def motion(seed: int, seconds: float = 8.0) -> tuple[Array, Array, Array]:
+    """Return position, velocity and acceleration of a sum of sines up to 4 Hz, cut anywhere."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(int(seconds * RATE)) / RATE
+    x = np.zeros((3, len(t)))
+    for frequency in rng.uniform(0.1, 4.0, 8):
+        w, phase = 2 * np.pi * frequency, rng.uniform(0, 2 * np.pi)
+        size = 0.3 / (1.0 + frequency**2)
+        x[0] += size * np.sin(w * t + phase)
+        x[1] += size * w * np.cos(w * t + phase)
+        x[2] -= size * w**2 * np.sin(w * t + phase)
+    return x[0], x[1], x[2]
+
+
+def quantised(position: Array) -> Array:
+    """Return what the encoder reads."""
+    return np.round(position / RESOLUTION) * RESOLUTION
+
+
+def differentiate(method: str, position: Array, cutoff_hz: float = 40.0) -> Derivatives:
+    """Return the motion by ``method``, all with the same bandwidth."""
+    if method == "butterworth":
+        return butterworth.smooth(position, RATE, cutoff_hz, NOISE_SD)
+    if method == "savitzky_golay":
+        return savitzky_golay.smooth(position, RATE, cutoff_hz, NOISE_SD)
+    ratio = kalman_smoother.ratio_for(cutoff_hz, 3, RATE)
+    return kalman_smoother.smooth(position, kalman_smoother.MotionModel(3, NOISE_SD, ratio, RATE))
+
+
+def fitted(position: Array) -> Derivatives:
+    """Return the motion by the Kalman smoother of the greater likelihood."""
+    seen = np.ones(len(position), dtype=bool)
+    fits = [
+        kalman_smoother.maximum_likelihood(
+            [(position, seen)], RATE, RESOLUTION, order=order, bandwidth_limits_hz=(3.0, 100.0)
+        )
+        for order in kalman_smoother.ORDERS
+    ]
+    best = max(fits, key=lambda fit: fit.log_likelihood)
+    return kalman_smoother.smooth(position, best.model)
+
+
+def coverage(found: Derivatives, truth: tuple[Array, Array, Array]) -> list[float]:
+    """Return the share of samples within 2 sd, for position, velocity and acceleration."""
+    values = (found.position, found.velocity, found.acceleration)
+    bands = (found.position_sd, found.velocity_sd, found.acceleration_sd)
+    return [
+        float(np.mean(np.abs(value - true) < 2.0 * band))
+        for value, true, band in zip(values, truth, bands, strict=True)
+    ]
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_errors_are_within_their_bands(method: str) -> None:
+    """With a bandwidth that leaves the motion whole: the bands know the noise only."""
+    shares = []
+    for seed in range(6):
+        truth = motion(seed)
+        shares.append(coverage(differentiate(method, quantised(truth[0])), truth))
+    assert np.all(np.mean(shares, axis=0) > 0.92)
+
+
+def test_bands_of_the_fitted_smoother_are_neither_too_narrow_nor_too_wide() -> None:
+    shares, spread = [], []
+    for seed in range(6):
+        truth = motion(seed)
+        found = fitted(quantised(truth[0]))
+        shares.append(coverage(found, truth))
+        error = found.velocity - truth[1]
+        spread.append(np.sqrt(np.mean(error**2) / np.mean(found.velocity_sd**2)))
+    assert np.all(np.mean(shares, axis=0) > 0.92)
+    assert 0.5 < np.mean(spread) < 1.2
+
+
+@pytest.mark.parametrize("method", ["fitted", *METHODS])
+def test_ends_are_not_wild(method: str) -> None:
+    """In the first and last 0.1 s the errors are a few bands, and small against the motion."""
+    ends = np.r_[0:50, -50:0]
+    for seed in range(6):
+        truth = motion(seed)
+        position = quantised(truth[0])
+        found = fitted(position) if method == "fitted" else differentiate(method, position)
+        for value, true, band in (
+            (found.velocity, truth[1], found.velocity_sd),
+            (found.acceleration, truth[2], found.acceleration_sd),
+        ):
+            error = np.abs(value - true)[ends]
+            assert np.max(error / band[ends]) < 6.0
+            assert np.max(error) < 0.3 * np.std(true)
+            assert np.max(band) < 20.0 * np.median(band)
+
+
+def test_methods_agree() -> None:
+    truth = motion(1)
+    found = [differentiate(method, quantised(truth[0]), 25.0) for method in METHODS]
+    inner = slice(50, -50)
+    for other in found[1:]:
+        assert np.std((found[0].velocity - other.velocity)[inner]) < 2e-3
+        assert np.std((found[0].acceleration - other.acceleration)[inner]) < 0.15
+    assert np.std(truth[2]) > 5.0
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_parabola_is_kept_to_its_ends(method: str) -> None:
+    t = np.arange(1500) / RATE
+    found = differentiate(method, 0.3 - 0.4 * t + 1.5 * t**2)
+    np.testing.assert_allclose(found.velocity, -0.4 + 3.0 * t, atol=2e-3)
+    np.testing.assert_allclose(found.acceleration, 3.0, atol=0.1)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_half_of_the_amplitude_at_the_cut_off(method: str) -> None:
+    """The bandwidth means the same for all three (Savitzky-Golay: half the power)."""
+    t = np.arange(4000) / RATE
+    found = differentiate(method, np.sin(2 * np.pi * 25.0 * t), 25.0)
+    gain = np.sqrt(2.0) * np.std(found.position[500:-500])
+    expected = np.sqrt(0.5) if method == "savitzky_golay" else 0.5
+    assert gain == pytest.approx(expected, abs=0.05)
+
+
+def test_noise_gains_are_those_of_white_noise() -> None:
+    rng = np.random.default_rng(0)
+    found = butterworth.smooth(np.zeros(400), RATE, 25.0, 1.0)
+    draws = [butterworth.zero_phase(rng.standard_normal(400), RATE, 25.0) for _ in range(800)]
+    measured = np.std(np.array(draws), axis=0)
+    for value, band in zip(
+        measured, (found.position_sd, found.velocity_sd, found.acceleration_sd), strict=True
+    ):
+        np.testing.assert_allclose(value, band, rtol=0.15)
+
+
+def test_causal_butterworth_is_the_recursive_filter() -> None:
+    from scipy.signal import butter, lfilter
+
+    position = quantised(motion(2)[0])
+    position -= position[0]
+    causal = butterworth.CausalButterworth(RATE, 20.0)
+    out = np.array([causal.step(x) for x in position])
+    b, a = butter(2, 20.0, fs=RATE)
+    expected = lfilter(b, a, position)
+    np.testing.assert_allclose(out[:, 0], expected, atol=1e-12)
+    np.testing.assert_allclose(out[1:, 1], np.diff(expected) * RATE, atol=1e-8)
+    np.testing.assert_allclose(out[2:, 2], np.diff(expected, n=2) * RATE**2, atol=1e-5)
+
+
+def test_causal_butterworth_lags_by_its_delay() -> None:
+    t = np.arange(2000) / RATE
+    causal = butterworth.CausalButterworth(RATE, 20.0)
+    out = np.array([causal.step(x) for x in 0.7 + 0.5 * t])
+    assert out[0] == pytest.approx((0.7, 0.0, 0.0), abs=1e-6)
+    assert out[-1, 0] == pytest.approx(0.7 + 0.5 * (t[-1] - causal.delay_s), abs=1e-4)
+    assert out[-1, 1] == pytest.approx(0.5)
+
+
+def test_floor_frequency_rises_as_the_noise_falls() -> None:
+    rng = np.random.default_rng(0)
+    true = np.cumsum(np.cumsum(rng.standard_normal(8000))) * 1e-6
+    found = [
+        butterworth.floor_frequency(true + sd * rng.standard_normal(8000), RATE, sd)
+        for sd in (1e-3, 1e-4, 1e-5)
+    ]
+    assert found == sorted(found) and found[0] < found[-1]
+    # Density of the motion, (1e-6)² 2/RATE / w⁴ with w in rad a sample, meets 2 sd²/RATE.
+    assert found[1] == pytest.approx(RATE / (2 * np.pi) * np.sqrt(1e-6 / 1e-4), rel=0.5)
+
+
+def test_extension_keeps_value_slope_and_bend() -> None:
+    t = np.arange(200) / RATE
+    longer = extend(0.2 + t - 3.0 * t**2, 50, 30)
+    s = np.arange(-50, 250) / RATE
+    np.testing.assert_allclose(longer, 0.2 + s - 3.0 * s**2, atol=1e-9)
+
+
+class TestUniformGrid:
+    """Time stamps as they come."""
+
+    def test_exact_stamps_are_left_alone(self) -> None:
+        t = np.arange(100) / RATE + 3.0
+        grid = uniform_grid(t, RATE)
+        assert grid.exact and not grid.bridged.any()
+        np.testing.assert_array_equal(grid.resample(np.sin(t)), np.sin(t))
+
+    def test_jitter_and_a_gap(self) -> None:
+        rng = np.random.default_rng(0)
+        t = np.arange(1000) / RATE + rng.uniform(-3e-4, 3e-4, 1000)
+        t = np.delete(t, np.arange(400, 440))
+        grid = uniform_grid(t, RATE)
+        np.testing.assert_allclose(np.diff(grid.t), 1.0 / RATE)
+        assert grid.t[0] == t[0]
+        assert 37 <= grid.bridged.sum() <= 40
+        signal = np.sin(2 * np.pi * 2.0 * t)
+        error = np.abs(grid.resample(signal) - np.sin(2 * np.pi * 2.0 * grid.t))
+        assert np.max(error[~grid.bridged]) < 5e-4
+
+    def test_a_command_is_held(self) -> None:
+        t = np.array([0.0, 0.002, 0.0041, 0.008, 0.010])
+        held = uniform_grid(t, RATE).hold(np.array([0.0, 1.0, 2.0, 3.0, 4.0]))
+        np.testing.assert_array_equal(held, [0.0, 1.0, 1.0, 2.0, 3.0, 4.0])
+
+    def test_stamps_must_increase(self) -> None:
+        with pytest.raises(ValueError, match="increase"):
+            uniform_grid(np.array([0.0, 0.002, 0.002]), RATE)
+
+
+@pytest.mark.parametrize("cutoff", [0.0, 250.0])
+def test_cut_off_out_of_range(cutoff: float) -> None:
+    with pytest.raises(ValueError, match="cut-off"):
+        butterworth.CausalButterworth(RATE, cutoff)
+
+
+def test_window_that_does_not_fit() -> None:
+    with pytest.raises(ValueError, match="window"):
+        savitzky_golay.polynomial(np.zeros(10), RATE, 11)

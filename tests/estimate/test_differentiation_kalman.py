@@ -1,0 +1,155 @@
+"""The Kalman smoother against its textbook form, and its choice by likelihood."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from bampipe.estimate import kalman_smoother as ks
+
+Array = NDArray[np.float64]
+RATE = 500.0
+
+
+def walk(order: int, density: float, count: int, seed: int) -> Array:
+    """Return the states (count, order) of an integrated white noise."""
+    rng = np.random.default_rng(seed)
+    step, noise = ks.transition(order)
+    scale = RATE ** np.arange(order)
+    step = step * scale[:, None] / scale[None, :]
+    noise = noise * density * np.outer(scale, scale) / RATE ** (2 * order - 1)
+    kicks = rng.multivariate_normal(np.zeros(order), noise, count, method="cholesky")
+    x = np.zeros((count, order))
+    for k in range(1, count):
+        x[k] = step @ x[k - 1] + kicks[k]
+    return x
+
+
+def textbook(y: Array, seen: NDArray[np.bool_], model: ks.MotionModel) -> tuple[Array, Array]:
+    """Return smoothed states and covariances by Rauch, Tung and Striebel's recursion."""
+    step, noise = ks.transition(model.order)
+    noise = noise * model.ratio
+    mean, cov = ks._informed_prior(y, seen, step, noise)
+    means, covs, ahead = [], [], []
+    for k, value in enumerate(y):
+        if k:
+            mean, cov = step @ mean, step @ cov @ step.T + noise
+        ahead.append((mean, cov))
+        if seen[k]:
+            gain = cov[:, 0] / (cov[0, 0] + 1.0)
+            mean = mean + gain * (value - mean[0])
+            cov = cov - np.outer(gain, cov[0])
+        means.append(mean)
+        covs.append(cov)
+    for k in range(len(y) - 2, -1, -1):
+        gain = covs[k] @ step.T @ np.linalg.inv(ahead[k + 1][1])
+        means[k] = means[k] + gain @ (means[k + 1] - ahead[k + 1][0])
+        covs[k] = covs[k] + gain @ (covs[k + 1] - ahead[k + 1][1]) @ gain.T
+    return np.array(means), np.array(covs)
+
+
+@pytest.mark.parametrize("order", ks.ORDERS)
+def test_smoother_is_that_of_rauch_tung_and_striebel(order: int) -> None:
+    rng = np.random.default_rng(0)
+    y = np.cumsum(np.cumsum(rng.standard_normal(150))) * 0.3 + rng.standard_normal(150)
+    seen = np.ones(150, dtype=bool)
+    seen[60:75] = False
+    model = ks.MotionModel(order, 1.0, 0.02, 1.0)
+    found = ks.smooth(y, model, seen)
+    means, covs = textbook(y - y[0], seen, model)
+    np.testing.assert_allclose(found.position - y[0], means[:, 0], rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(found.velocity, means[:, 1], rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(found.acceleration_sd, np.sqrt(covs[:, 2, 2]), rtol=1e-4)
+
+
+@pytest.mark.parametrize("order", ks.ORDERS)
+def test_likelihood_recovers_the_noises(order: int) -> None:
+    density, noise_sd = (1.0, 2e-5) if order == 3 else (1e4, 2e-5)
+    rng = np.random.default_rng(1)
+    records = []
+    for seed in range(3):
+        x = walk(order, density, 6000, seed)
+        records.append((x[:, 0] + noise_sd * rng.standard_normal(6000), np.ones(6000, dtype=bool)))
+    fits = {
+        k: ks.maximum_likelihood(records, RATE, 0.0, order=k, bandwidth_limits_hz=(2.0, 120.0))
+        for k in ks.ORDERS
+    }
+    fit = fits[order]
+    assert fit.model.noise_sd == pytest.approx(noise_sd, rel=0.05)
+    assert fit.model.density == pytest.approx(density, rel=0.4)
+    assert fit.innovation_variance == pytest.approx(1.0)
+    assert not fit.at_limit
+    assert max(fits, key=lambda k: fits[k].log_likelihood) == order
+
+
+def test_quantisation_bounds_the_noise_from_below() -> None:
+    x = walk(3, 1.0, 4000, 0)[:, 0]
+    resolution = 5e-5
+    y = np.round(x / resolution) * resolution
+    fit = ks.maximum_likelihood(
+        [(y, np.ones(4000, dtype=bool))], RATE, resolution, order=3,
+        bandwidth_limits_hz=(2.0, 120.0),
+    )  # fmt: skip
+    quantum = resolution / np.sqrt(12.0)
+    assert quantum * (1 - 1e-12) <= fit.model.noise_sd < 1.2 * quantum
+
+
+@pytest.mark.parametrize("order", ks.ORDERS)
+def test_bands_hold_for_the_motion_they_assume(order: int) -> None:
+    density, noise_sd = (1.0, 2e-5) if order == 3 else (1e4, 2e-5)
+    ratio = density / noise_sd**2 / RATE ** (2 * order - 1)
+    rng = np.random.default_rng(2)
+    inside = []
+    for seed in range(20):
+        x = walk(order, density, 600, 100 + seed)
+        seen = rng.random(600) < 0.9
+        seen[0] = True
+        seen[200:230] = False
+        found = ks.smooth(
+            x[:, 0] + noise_sd * rng.standard_normal(600),
+            ks.MotionModel(order, noise_sd, ratio, RATE), seen,
+        )  # fmt: skip
+        inside.append(np.mean(np.abs(found.acceleration - x[:, 2]) < found.acceleration_sd))
+        assert found.velocity_sd[215] > 1.3 * np.median(found.velocity_sd)
+    assert np.mean(inside) == pytest.approx(0.683, abs=0.06)
+
+
+@pytest.mark.parametrize("order", ks.ORDERS)
+def test_bandwidth_and_ratio_are_inverse(order: int) -> None:
+    assert ks.bandwidth(ks.ratio_for(22.0, order, RATE), order, RATE) == pytest.approx(22.0)
+
+
+@pytest.mark.parametrize("order", ks.ORDERS)
+def test_causal_filter_ends_where_the_smoother_ends(order: int) -> None:
+    """At the last sample the smoother knows no more than the filter does."""
+    t = np.arange(1000) / RATE
+    y = np.round(0.3 * np.sin(4.0 * t) / 5e-5) * 5e-5
+    model = ks.MotionModel(order, 1.5e-5, ks.ratio_for(20.0, order, RATE), RATE)
+    seen = np.ones(1000, dtype=bool)
+    seen[300:310] = False
+    causal = ks.CausalKalman(model, velocity_sd=10.0, acceleration_sd=100.0)
+    steps = [causal.step(float(x) if there else None) for x, there in zip(y, seen, strict=True)]
+    found = ks.smooth(y, model, seen)
+    last, band = steps[-1]
+    np.testing.assert_allclose(
+        last, [found.position[-1], found.velocity[-1], found.acceleration[-1]], rtol=1e-6
+    )
+    np.testing.assert_allclose(
+        band,
+        [found.position_sd[-1], found.velocity_sd[-1], found.acceleration_sd[-1]],
+        rtol=1e-6,
+    )
+    assert steps[309][1][1] > 2.0 * steps[299][1][1]
+
+
+def test_causal_filter_starts_with_a_sample() -> None:
+    model = ks.MotionModel(3, 1e-5, 1e-4, RATE)
+    with pytest.raises(ValueError, match="starts with a sample"):
+        ks.CausalKalman(model, 1.0, 1.0).step(None)
+
+
+def test_a_trial_at_rest() -> None:
+    found = ks.smooth(np.full(500, 0.25), ks.MotionModel(4, 1e-5, 1e-4, RATE))
+    np.testing.assert_allclose(found.position, 0.25, atol=1e-12)
+    assert np.all(np.isfinite(found.acceleration_sd))

@@ -1,0 +1,173 @@
+"""The filter stage on simulated and shared sessions."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from run_folders import ingested_session, write_ingested
+
+from bampipe.data.store import read_json, read_parquet, sha256_file
+from bampipe.errors import InputError
+from bampipe.stages import filter as stage
+from bampipe.stages.base import RunFolder, silent
+
+AXES = {"yaw": {"unit": "rad", "resolution": 5e-5}, "extension": {"unit": "m", "resolution": 3e-5}}
+KINEMATIC = ("q", "qd", "qdd", "q_sd", "qd_sd", "qdd_sd")
+
+
+def free_trial(seed: int = 0, seconds: float = 6.0) -> tuple[pd.DataFrame, dict[str, np.ndarray]]:
+    """Return a trial as ingested and the true velocities and accelerations on its samples."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(int(seconds * 500)) / 500.0
+    frame, truth = pd.DataFrame({"t": t}), {}
+    for number, (axis, entry) in enumerate(AXES.items()):
+        w = 2 * np.pi * (0.7 + 0.4 * number)
+        phase = rng.uniform(0, 6)
+        angle = w * t + phase + 0.5 * np.sin(1.7 * w * t)
+        rate, bend = w + 0.85 * w * np.cos(1.7 * w * t), -1.445 * w**2 * np.sin(1.7 * w * t)
+        x = 0.2 * np.sin(angle)
+        truth[f"q_{axis}"] = x
+        truth[f"qd_{axis}"] = 0.2 * np.cos(angle) * rate
+        truth[f"qdd_{axis}"] = 0.2 * (np.cos(angle) * bend - np.sin(angle) * rate**2)
+        frame[f"q_{axis}"] = np.floor(x / entry["resolution"]) * entry["resolution"]
+    truth["force_x"] = 10 * np.sin(2 * np.pi * 1.3 * t)
+    truth["force_rate_x"] = 10 * 2 * np.pi * 1.3 * np.cos(2 * np.pi * 1.3 * t)
+    frame["force_x"] = truth["force_x"] + 0.05 * rng.standard_normal(len(t))
+    frame["brake_yaw"] = np.where(t > 3.0, 2.0, 0.0)
+    return frame, truth
+
+
+def run_stage(run: RunFolder, **settings: object) -> tuple[dict, pd.DataFrame]:
+    """Execute the stage in the run folder; return filter.json and the kinematics."""
+    stage.execute(run, run.root, stage.Config(**settings), silent)
+    content = read_json(run.path("filter/filter.json"))
+    return content, read_parquet(run.path("filter/kinematics.parquet"))
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> RunFolder:
+    """A run folder with a free, a viscous and a locked trial."""
+    frames = {name: free_trial(seed)[0] for seed, name in enumerate("abc")}
+    kinds = {"a": ("free", None), "b": ("viscous", None), "c": ("locked", "yaw")}
+    return write_ingested(tmp_path / "run", frames, kinds, AXES)
+
+
+@pytest.mark.parametrize("method", stage.METHODS)
+def test_motion_is_recovered(run: RunFolder, method: str) -> None:
+    content, kinematics = run_stage(run, method=method)
+    assert set(kinematics["trial_id"]) == {"a", "b"}
+    for seed, trial in enumerate("ab"):
+        rows = kinematics[kinematics["trial_id"] == trial]
+        truth = free_trial(seed)[1]
+        for axis, entry in AXES.items():
+            assert np.std(rows[f"qd_{axis}"] - truth[f"qd_{axis}"]) < 60 * entry["resolution"]
+            error = rows[f"qdd_{axis}"] - truth[f"qdd_{axis}"]
+            assert np.std(error) < 0.05 * np.std(truth[f"qdd_{axis}"])
+        assert np.std(rows["force_rate_x"] - truth["force_rate_x"]) < 2.0
+    for axis, entry in content["axes"].items():
+        assert 20.0 <= entry["bandwidth_hz"] <= 100.0, axis
+        assert entry["measurement_noise_sd"] >= 0.999 * entry["quantisation_sd"]
+
+
+def test_columns_and_bands(run: RunFolder) -> None:
+    _, kinematics = run_stage(run)
+    expected = {f"{kind}_{axis}" for kind in KINEMATIC for axis in AXES}
+    expected |= {"trial_id", "t", "bridged", "brake_yaw"}
+    expected |= {"force_x", "force_rate_x", "force_curvature_x"}
+    assert set(kinematics.columns) == expected
+    assert kinematics.notna().all(axis=None)
+    rows, truth = kinematics[kinematics["trial_id"] == "a"], free_trial(0)[1]
+    for axis in AXES:
+        for kind in ("qd", "qdd"):
+            error = np.abs(rows[f"{kind}_{axis}"] - truth[f"{kind}_{axis}"])
+            assert np.mean(error < 2.0 * rows[f"{kind}_sd_{axis}"]) > 0.9
+
+
+def test_force_is_not_filtered(run: RunFolder) -> None:
+    _, kinematics = run_stage(run)
+    rows = kinematics[kinematics["trial_id"] == "a"]
+    np.testing.assert_array_equal(rows["force_x"], free_trial(0)[0]["force_x"])
+
+
+def test_jitter_and_gaps(tmp_path: Path) -> None:
+    frame, truth = free_trial(0)
+    grid = frame["t"].to_numpy().copy()
+    frame = frame.drop(index=range(1000, 1030)).reset_index(drop=True)
+    frame.loc[2000:2004, "force_x"] = np.nan
+    run = write_ingested(tmp_path / "run", {"a": frame}, {"a": ("free", None)}, AXES)
+    content, rows = run_stage(run)
+    np.testing.assert_allclose(rows["t"], grid, atol=1e-9)
+    assert 28 <= rows["bridged"].iloc[995:1035].sum() <= 30
+    assert 3 <= rows["bridged"].iloc[1100:].sum() <= 5
+    assert content["bridged_fraction"]["a"] == pytest.approx(rows["bridged"].mean())
+    inside = rows["qdd_sd_yaw"].iloc[1015]
+    assert inside > 2.0 * rows["qdd_sd_yaw"].median()
+    error = np.abs(rows["qd_yaw"] - truth["qd_yaw"]) / rows["qd_sd_yaw"]
+    assert np.max(error) < 6.0
+
+
+def test_cut_off_of_the_user(run: RunFolder) -> None:
+    content, _ = run_stage(run, cutoff_hz=33.0)
+    assert {entry["bandwidth_hz"] for entry in content["axes"].values()} == {33.0}
+    assert {entry["bandwidth_reason"] for entry in content["axes"].values()} == {"set by the user"}
+
+
+def test_minimum_bandwidth(run: RunFolder) -> None:
+    content, _ = run_stage(run, minimum_bandwidth_hz=48.0)
+    for entry in content["axes"].values():
+        assert entry["bandwidth_hz"] == pytest.approx(48.0)
+        assert "minimum" in entry["bandwidth_reason"]
+
+
+def test_a_trial_too_short_is_named(tmp_path: Path) -> None:
+    frames = {"a": free_trial(0)[0], "b": free_trial(1)[0].iloc[:10]}
+    kinds = {name: ("free", None) for name in frames}
+    content, kinematics = run_stage(write_ingested(tmp_path / "run", frames, kinds, AXES))
+    assert set(kinematics["trial_id"]) == {"a"}
+    assert "10 sound samples" in content["skipped"]["b"]
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"method": "spline"}, "spline"),
+        ({"cutoff_hz": 400.0}, "half the sampling rate"),
+        ({"cutoff_hz": -1.0}, "negative"),
+        ({"force_cutoff_hz": 0.0}, "positive"),
+        ({"tuning_samples": 1}, "1000"),
+    ],
+)
+def test_settings_that_make_no_sense(
+    run: RunFolder, settings: dict[str, object], message: str
+) -> None:
+    with pytest.raises(InputError, match=message):
+        run_stage(run, **settings)
+
+
+def test_no_trial_to_differentiate(tmp_path: Path) -> None:
+    frames = {"a": free_trial(0)[0]}
+    run = write_ingested(tmp_path / "run", frames, {"a": ("locked", "yaw")}, AXES)
+    with pytest.raises(InputError, match="no free or viscous trial"):
+        run_stage(run)
+
+
+def test_same_bytes(run: RunFolder) -> None:
+    hashes = []
+    for _ in range(2):
+        run_stage(run)
+        hashes.append([sha256_file(run.path(name)) for name in stage.outputs(stage.Config())])
+    assert hashes[0] == hashes[1]
+
+
+def test_shared_session(tmp_path: Path) -> None:
+    content, kinematics = run_stage(ingested_session(tmp_path / "open-09", "open-09"))
+    assert kinematics["trial_id"].nunique() == 8
+    assert kinematics.notna().all(axis=None)
+    for axis, entry in content["axes"].items():
+        assert 20.0 <= entry["bandwidth_hz"] <= 40.0
+        assert entry["measurement_noise_sd"] < 1.3 * entry["quantisation_sd"]
+        slope = np.gradient(kinematics[f"q_{axis}"], 0.002)
+        assert np.corrcoef(slope[10:7990], kinematics[f"qd_{axis}"][10:7990])[0, 1] > 0.999
