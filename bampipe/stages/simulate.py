@@ -42,6 +42,9 @@ ZERO_V = np.array([0.021, -0.034, 0.012])
 STIFFNESS = {"rotary": 2200.0, "linear": 109e3}
 """Typical transmission stiffness (Table I), N.m/rad and N/m."""
 
+REACH = {"rotary": 0.65, "linear": 0.8}
+"""Largest wanted motion as a share of half the range: people use more of a rod than of a turn."""
+
 LOCKED_LOAD = {"rotary": 50.0, "linear": 120.0}
 """Peak load of a locked trial, N.m and N."""
 
@@ -70,7 +73,7 @@ class Config:
         duration: of a free or viscous trial, s.
         sample_rate: Hz.
         viscous_damping: Cartesian damping of the viscous field, N.s/m.
-        amplitude: reach of the motion as a share of half the range of each axis.
+        amplitude: scale of the motion, 1 for all of what a person uses.
         force_noise: standard deviation of the force sensor, N.
         parameters: values that replace drawn ones, by full name.
         file_format: of the trial files, ``csv`` or ``parquet``.
@@ -87,7 +90,7 @@ class Config:
     duration: float = 16.0
     sample_rate: float = 500.0
     viscous_damping: float = 40.0
-    amplitude: float = 0.75
+    amplitude: float = 1.0
     force_noise: float = 0.05
     parameters: Mapping[str, float] = field(default_factory=dict)
     file_format: str = "csv"
@@ -196,7 +199,7 @@ def _check(config: Config) -> None:
         if not 0 <= getattr(config, name) < float("inf"):
             raise InputError(f"{name} must not be negative, found {getattr(config, name)!r}")
     if config.amplitude > 1:
-        raise InputError(f"amplitude is a share of the range, at most 1, found {config.amplitude}")
+        raise InputError(f"amplitude must be at most 1, found {config.amplitude}")
     if config.trials + config.viscous_trials == 0 and not config.locked_trials:
         raise InputError("nothing to simulate", remedy="ask for at least one trial")
     if config.duration * config.sample_rate < 10:
@@ -331,10 +334,11 @@ def _wanted(
         middle, half = _range(device, c)
         frequency = 2 * np.pi * rng.uniform(*BAND, size=40)
         # A hand reaches far slowly and only a little fast.
-        size = rng.normal(size=40) / (1.0 + (frequency / (2 * np.pi * 0.45)) ** 2) ** 1.5
+        size = rng.normal(size=40) / (1.0 + (frequency / (2 * np.pi * 0.6)) ** 2) ** 2
         phase = np.outer(t, frequency) + rng.uniform(0.0, 2 * np.pi, size=40)
         wave, rate = np.sin(phase) @ size, np.cos(phase) @ (size * frequency)
-        scale = half * config.amplitude * share * rng.uniform(0.6, 1.0) / np.abs(wave).max()
+        reach = half * REACH[c.kind] * config.amplitude * share * rng.uniform(0.7, 1.0)
+        scale = reach / np.abs(wave).max()
         q[:, i] = middle + scale * (wave[0] + fade * (wave - wave[0]))
         qd[:, i] = scale * (fade * rate + fade_rate * (wave - wave[0]))
     return q, qd
@@ -345,7 +349,7 @@ def _moving(plant: Plant, config: Config, rng: np.random.Generator, viscous: boo
     system, device = plant.motion, plant.device
     dt = 1.0 / config.sample_rate
     t = np.arange(round(config.duration * config.sample_rate)) * dt
-    q_ref, qd_ref = _wanted(device, config, rng, t, 0.5 if viscous else 1.0)
+    q_ref, qd_ref = _wanted(device, config, rng, t, 0.6 if viscous else 1.0)
     arm = Impedance(natural_frequency=rng.uniform(7.0, 10.0), damping_ratio=1.0, bandwidth=50.0)
     u = np.zeros((len(t), len(system.inputs)))
     if "t" in system.inputs:

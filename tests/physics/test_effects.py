@@ -1,0 +1,399 @@
+"""One battery over every effect of the registry, at every target on the BAM.
+
+Each is declared in consistent units, finite, dissipative if it says so, absent at zero strength,
+and recovered by least squares from a motion that it took part in, starting from a wrong guess.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from bampipe.errors import InputError
+from bampipe.estimate.simulation import simulate_tracking
+from bampipe.physics import Model, compile_model, registry
+
+BAM = registry.device("bam")
+AXES = tuple(c.name for c in BAM.coordinates)
+WIDTH = np.array([c.sign_width for c in BAM.coordinates])
+CASES = [
+    f"{name}:{target}" if target else name
+    for name in registry.effect_names()
+    for target in registry.effect(name).targets(BAM)
+]
+CANONICAL = [
+    "stribeck",
+    "presliding",
+    "asymmetric_coulomb",
+    "quadratic_drag",
+    "position_dependent_friction",
+    "load_dependent_friction",
+    "thermal_damping",
+    "return_spring",
+    "inertia_mismatch",
+    "handle_payload",
+    "base_tilt",
+    "gravity_compensator_lag",
+    "gravity_compensator_rate_limit",
+    "gravity_compensator_mistuned",
+    "brake_lag",
+    "brake_residual_torque",
+    "transmission_compliance",
+    "backlash",
+    "force_bias",
+    "force_gain",
+    "force_crosstalk",
+    "force_delay",
+    "force_drift",
+    "force_application_point",
+    "encoder_scale",
+]
+
+
+def typical(system, strength=1.0):
+    """Parameters with every effect at ``strength`` times its typical size."""
+    values = []
+    for p in system.parameters:
+        value = p.prior if p.typical is None else p.typical
+        values.append(value * strength if p.strength else value)
+    return np.array(values)
+
+
+def effect_of(case):
+    return registry.effect(case.partition(":")[0])
+
+
+@cache
+def system_of(*effects):
+    return compile_model(Model(BAM, effects))
+
+
+def inputs_of(system, force, force_rate, force_curvature, brake, t):
+    """Columns of u for ``system`` from all that there may be."""
+    columns = {"t": t}
+    for j, c in enumerate("xyz"):
+        columns[f"force_{c}"] = force[:, j]
+        columns[f"force_rate_{c}"] = force_rate[:, j]
+        columns[f"force_curvature_{c}"] = force_curvature[:, j]
+    columns |= {f"brake_{a}": brake[:, i] for i, a in enumerate(AXES)}
+    return np.column_stack([columns[name] for name in system.inputs])
+
+
+@cache
+def smooth_motion():
+    """A made-up smooth motion with loads: q, qd, qdd, then what `inputs_of` takes."""
+    rng = np.random.default_rng(3)
+    t = np.arange(1500) / 250.0
+    frequency = 2 * np.pi * rng.uniform(0.1, 1.2, size=(9, 12))
+    angle = frequency[:, :, None] * t + rng.uniform(0, 6.28, size=(9, 12, 1))
+    size = rng.normal(size=(9, 12, 1)) / (1 + frequency[:, :, None] / 3)
+    size *= np.array([0.25, 0.2, 0.07, 8, 6, 8, 6, 6, 6])[:, None, None]
+    wave = (size * np.sin(angle)).sum(axis=1).T
+    rate = (size * frequency[:, :, None] * np.cos(angle)).sum(axis=1).T
+    bend = -(size * frequency[:, :, None] ** 2 * np.sin(angle)).sum(axis=1).T
+    q = wave[:, :3] + np.array([0.0, 0.0, 1.1])
+    rest = (wave[:, 3:6], rate[:, 3:6], bend[:, 3:6], np.abs(wave[:, 6:]), t)
+    return q, rate[:, :3], bend[:, :3], rest
+
+
+def residual_of(system, p, q, qd, qdd, u, t):
+    z = system.memory(q, qd, qdd, u, p, t)
+    return system.applied(q, qd, qdd, z, u, p) - system.required(q, qd, qdd, z, u, p)
+
+
+def contribution(case, p_of):
+    """What the effect adds to the residual along the smooth motion, (T, n_q)."""
+    q, qd, qdd, rest = smooth_motion()
+    with_effect, base = system_of(case), system_of()
+    p = p_of(with_effect)
+    changed = residual_of(with_effect, p, q, qd, qdd, inputs_of(with_effect, *rest), rest[-1])
+    plain = p[: len(base.parameters)]
+    return changed - residual_of(base, plain, q, qd, qdd, inputs_of(base, *rest), rest[-1])
+
+
+def test_every_canonical_name_is_there():
+    assert set(CANONICAL) <= set(registry.effect_names())
+
+
+@pytest.mark.parametrize("name", registry.effect_names())
+def test_says_what_a_user_needs(name):
+    effect = registry.effect(name)
+    assert effect.summary and effect.looks_like
+    assert re.search(r"1[6-9]\d\d|20\d\d", effect.source), "the source names a year"
+    for target in effect.targets(BAM)[:1]:
+        bound = Model(BAM, [f"{name}:{target}" if target else name]).effects[0]
+        assert any(p.strength for p in bound.parameters)
+        for p in bound.parameters:
+            if p.strength:
+                assert p.prior == 0 and p.typical and p.sd > 0
+            elif not p.fixed:
+                assert p.lower < p.typical < p.upper and np.isfinite([p.lower, p.upper]).all()
+
+
+# Units ------------------------------------------------------------------------------------------
+
+BASE = {"": (0, 0, 0), "rad": (0, 0, 0), "m": (1, 0, 0), "kg": (0, 1, 0), "s": (0, 0, 1)}
+BASE |= {"N": (1, 1, -2), "J": (2, 1, -2), "W": (2, 1, -3)}
+ANY = None
+
+
+def dimension(unit):
+    """Powers of metre, kilogram and second in ``unit``, such as N.m.s2/rad2."""
+    total = np.zeros(3)
+    for k, part in enumerate(unit.split("/")):
+        for factor in part.split("."):
+            name, power = re.fullmatch(r"([A-Za-z]*)(\d?)", factor.replace("1", "")).groups()
+            total += (-1 if k else 1) * np.array(BASE[name]) * int(power or 1)
+    return tuple(total)
+
+
+class Dimensions:
+    """Dimensional analysis of an expression; a decimal literal may carry any dimension."""
+
+    def __init__(self, known):
+        self.known = known
+
+    def same(self, nodes):
+        found = {d for d in map(self.of, nodes) if d is not ANY}
+        assert len(found) <= 1, f"terms of different dimension in {ast.unparse(nodes[0])}"
+        return found.pop() if found else ANY
+
+    def pure(self, node):
+        assert self.of(node) in (ANY, (0, 0, 0)), f"{ast.unparse(node)} is not a pure number"
+        return (0, 0, 0)
+
+    def of(self, node):
+        match node:
+            case ast.Constant(value=value):
+                return (0, 0, 0) if isinstance(value, int) and value != 0 else ANY
+            case ast.Name(id=name):
+                return self.known[name]
+            case ast.UnaryOp(operand=operand):
+                return self.of(operand)
+            case ast.BinOp(left=left, op=ast.Add() | ast.Sub(), right=right):
+                return self.same([left, right])
+            case ast.BinOp(left=left, op=ast.Pow(), right=ast.Constant(value=power)):
+                inner = self.of(left)
+                return ANY if inner is ANY else tuple(np.multiply(inner, power))
+            case ast.BinOp(left=left, op=op, right=right):
+                a, b = self.of(left), self.of(right)
+                if a is ANY or b is ANY:
+                    return ANY
+                return tuple(np.add(a, b) if isinstance(op, ast.Mult) else np.subtract(a, b))
+            case ast.Call(func=ast.Name(id=name), args=args):
+                if name in ("sgn", "heaviside"):
+                    self.of(args[0])
+                    return (0, 0, 0)
+                if name == "ddt":
+                    return tuple(np.subtract(self.of(args[0]), (0, 0, 1)))
+                if name == "sqrt":
+                    return tuple(np.multiply(self.of(args[0]), 0.5))
+                if name in ("abs", "min", "max", "clip"):
+                    return self.same(args)
+                return self.pure(args[0])
+        raise AssertionError(ast.dump(node))
+
+
+def symbols_of(case):
+    bound = Model(BAM, [case]).effects[0]
+    newton = dimension("N")
+    known = {c.name: dimension(c.unit) for c in BAM.coordinates}
+    known |= {name: dimension(c.unit) for name, c in BAM.constants.items()}
+    known |= {"rho": dimension("m"), "mass": dimension("kg"), "t": dimension("s")}
+    for k, order in enumerate(("", "rate_", "curvature_")):
+        slope = tuple(np.subtract(newton, (0, 0, k)))
+        known |= {f"force_{order}{c}": slope for c in "xyz"}
+        if bound.effect.scope in ("force_component", "force_pair"):
+            known |= {f"{f}_{order}".rstrip("_"): slope for f in "fg"}
+    for c in BAM.coordinates:
+        torque = dimension(c.torque_unit)
+        known[f"brake_{c.name}"] = torque
+        if c.name == bound.target:
+            known |= dict.fromkeys(("load", "applied", "brake", "side_load", "coulomb"), torque)
+            known |= {"q": dimension(c.unit), "qd": dimension(f"{c.unit}/s")}
+            known["viscous"] = tuple(np.subtract(torque, dimension(f"{c.unit}/s")))
+    known |= {p.name.rpartition(".")[2]: dimension(p.unit) for p in bound.parameters}
+    kind = BAM.coordinate(bound.target).kind if bound.effect.scope == "axis" else ""
+    for state in bound.effect.states:
+        entry = state.entry.get(kind, state.entry)
+        known[state.name] = dimension(entry["unit"])
+    expected = {"kinetic": dimension("J"), "potential": dimension("J"), "input": newton}
+    return bound, known, expected
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_units_are_consistent(case):
+    bound, known, expected = symbols_of(case)
+    check = Dimensions(known)
+    for key, tree in bound.effect.expressions.items():
+        what, _, place = key.partition(".")
+        wanted = expected.get(what)
+        if what == "torque":
+            wanted = dimension(BAM.coordinate(place or bound.target).torque_unit)
+        elif what == "offset":
+            wanted = known["q"]
+        assert check.of(tree) in (wanted, ANY), key
+    for state in bound.effect.states:
+        rate = tuple(np.subtract(known[state.name], (0, 0, 1)))
+        assert check.of(state.rate) in (rate, ANY)
+        assert check.of(state.initial) in (known[state.name], ANY)
+
+
+def test_unit_check_sees_a_mistake():
+    known = symbols_of("stribeck:yaw")[1]
+    with pytest.raises(AssertionError, match="pure number"):
+        Dimensions(known).of(ast.parse("force*exp(-qd)", mode="eval").body)
+    with pytest.raises(AssertionError, match="different dimension"):
+        Dimensions(known).of(ast.parse("force + speed", mode="eval").body)
+
+
+# Values -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_finite_everywhere(case):
+    system = system_of(case)
+    rng = np.random.default_rng(7)
+    n = 400
+    limits = np.array([BAM.limits[a] for a in AXES])
+    q = rng.uniform(*limits.T, size=(n, 3))
+    qd, qdd = rng.normal(size=(n, 3)) * 3, rng.normal(size=(n, 3)) * 30
+    force, brake = rng.normal(size=(n, 3)) * 60, rng.uniform(0, 200, size=(n, 3))
+    for rows in (slice(0, 40), slice(20, 80)):  # standstill, and no load
+        qd[rows] = 0.0
+        force[rows.stop - 20 : rows.stop] = 0.0
+    brake[::3] = 0.0
+    slope = (rng.normal(size=(n, 3)) * 500, rng.normal(size=(n, 3)) * 5e3)
+    u = inputs_of(system, force, *slope, brake, rng.uniform(0, 3600, size=n))
+    z = rng.normal(size=(n, len(system.memory_names)))
+    ends = [typical(system), typical(system, 0.0), system.prior]
+    for side in ("lower", "upper"):
+        end = typical(system, 2.0)
+        for i, p in enumerate(system.parameters):
+            if np.isfinite(getattr(p, side)):
+                end[i] = getattr(p, side)
+        ends.append(end)
+    for p in ends:
+        assert np.isfinite(system.required(q, qd, qdd, z, u, p)).all()
+        assert np.isfinite(system.applied(q, qd, qdd, z, u, p)).all()
+        assert np.isfinite(system.initial_memory(q[0], u[0], p)).all()
+
+
+@pytest.mark.parametrize("case", [c for c in CASES if effect_of(c).dissipative])
+def test_dissipative_as_claimed(case):
+    _, qd, _, _ = smooth_motion()
+    rng = np.random.default_rng(11)
+    for _ in range(2):
+
+        def draw(system):
+            p = typical(system)
+            for i, one in enumerate(system.parameters):
+                top = min(one.upper, 3 * p[i])
+                if one.name.startswith(case.replace(":", ".")) and not one.fixed:
+                    p[i] = rng.uniform(max(one.lower, 0.0), top)
+            return p
+
+        assert (contribution(case, draw) * qd).max() < 1e-9
+
+
+def test_an_active_effect_would_be_caught():
+    active = registry.effect_from(
+        {**registry.effect("stribeck").declaration, "name": "push", "torque": "force*sgn(qd)"}
+    )
+    system = compile_model(Model(BAM, ["push:yaw"], [active]))
+    q, qd, qdd, rest = smooth_motion()
+    p, none = typical(system), np.zeros((len(q), 0))
+    base = system.required(q, qd, qdd, none, inputs_of(system, *rest), typical(system, 0.0))
+    added = base - system.required(q, qd, qdd, none, inputs_of(system, *rest), p)
+    assert (added * qd).max() > 0.1
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_absent_at_zero_strength_and_there_at_typical(case):
+    there = np.abs(contribution(case, typical)).max()
+    left = np.abs(contribution(case, lambda system: typical(system, 0.0))).max()
+    assert there > 0.2
+    # A lag is never shorter than 2 ms, so that its rate stays finite; all others vanish.
+    assert left <= (0.04 * there if effect_of(case).states else 1e-9)
+
+
+# Recovery ---------------------------------------------------------------------------------------
+
+
+def recorded(system, p, braked):
+    """A motion of ``system``: what its sensors and inputs say, free of noise."""
+    rng = np.random.default_rng(5)
+    t = np.arange(5000) / 500.0
+    angle = 2 * np.pi * np.outer(t, rng.uniform(0.1, 1.0, size=10))[:, None, :]
+    angle = angle + rng.uniform(0, 6.28, size=(1, 3, 10))
+    size = rng.uniform(0.5, 1.0, size=(3, 10)) * np.array([0.12, 0.1, 0.04])[:, None]
+    q_ref = (size * np.sin(angle)).sum(axis=2) + np.array([0.0, 0.0, 1.1])
+    qd_ref = np.gradient(q_ref, t, axis=0)
+    u = np.zeros((len(t), len(system.inputs)))
+    if "t" in system.inputs:
+        u[:, system.inputs.index("t")] = t
+    where = {name: i for i, name in enumerate(system.inputs)}
+    x0 = np.concatenate([q_ref[0], np.zeros(3), system.initial_memory(q_ref[0], u[0], p)])
+    x, u = simulate_tracking(
+        system.derivative, x0, u, p, 0.002, q_ref, qd_ref,
+        width=WIDTH, n_noise=len(system.noise),
+        force=[where[f"force_{c}"] for c in "xyz"],
+        rate=[where.get(f"force_rate_{c}", -1) for c in "xyz"],
+        curvature=[where.get(f"force_curvature_{c}", -1) for c in "xyz"],
+        brake=[where[f"brake_{a}"] for a in AXES] if braked else (),
+        brake_gain=np.full((len(t), 3), 20.0) if braked else None,
+    )  # fmt: skip
+    quiet, slope = np.zeros(len(system.noise)), np.empty(x.shape[1])
+    qdd = np.empty((len(t), 3))
+    for k in range(len(t)):
+        system.derivative(x[k], u[k], p, quiet, slope)
+        qdd[k] = slope[3:6]
+    true = [x[:, :3], x[:, 3:6], qdd]
+    seen = [a.copy() for a in true]
+    for _ in range(30):  # what the encoders read, so that the model's correction gives the truth
+        seen = [
+            s + a - b for s, a, b in zip(seen, true, system.true_motion(*seen, u, p), strict=True)
+        ]
+    return *seen, u, t
+
+
+RECOVERED = [c for c in CASES if c.partition(":")[2] in ("", "yaw", "extension", "x", "z", "xy")]
+
+
+@pytest.mark.parametrize("case", RECOVERED)
+def test_recovered_from_a_wrong_guess(case):
+    system = system_of(case)
+    truth = typical(system)
+    data = recorded(system, truth, braked="brake" in case)
+    free = [i for i, p in enumerate(system.parameters) if not p.fixed]
+    own = [i for i in free if system.parameters[i].name.startswith(case.replace(":", "."))]
+    lower = np.array([system.parameters[i].lower for i in free])
+    upper = np.array([system.parameters[i].upper for i in free])
+    # A wave is only found from within half a ripple over the travel: others scan it.
+    near = np.array([system.parameters[i].name.endswith("wavenumber") for i in free])
+    guess = np.where(near, 0.85, np.where(np.isin(free, own), 0.6, 1.3)) * truth[free]
+
+    def misfit(values):
+        p = truth.copy()
+        p[free] = values
+        return residual_of(system, p, *data)[::4].ravel()
+
+    before = np.sqrt(np.mean(misfit(guess) ** 2))
+    found = least_squares(
+        misfit, np.clip(guess, lower, upper), bounds=(lower, upper), x_scale="jac", max_nfev=60
+    )
+    after = np.sqrt(np.mean(found.fun**2))
+    assert after < 0.02 * before
+    np.testing.assert_allclose(found.x, truth[free], rtol=0.03)
+
+
+def test_unknown_effect_and_target_are_named():
+    with pytest.raises(InputError, match="did you mean 'stribeck'"):
+        Model(BAM, ["stribek:yaw"])
+    with pytest.raises(InputError, match="stribeck:pitch"):
+        Model(BAM, ["stribeck:pich"])
