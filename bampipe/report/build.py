@@ -1,0 +1,87 @@
+"""From a run folder to the report's files."""
+
+from __future__ import annotations
+
+import datetime
+import importlib
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from bampipe.report import page, typeset
+from bampipe.report.document import Document, Figure, Section
+from bampipe.report.results import Results
+from bampipe.report.sections import SECTIONS
+
+
+@dataclass(frozen=True)
+class Report:
+    """The files of a report.
+
+    Attributes:
+        pdf: the printed form.
+        html: the page for a browser.
+        figures: SVG text by name.
+        sections: titles, in order.
+    """
+
+    pdf: bytes
+    html: str
+    figures: dict[str, str]
+    sections: tuple[str, ...]
+
+
+def build(results: Results, progress: Callable[[float, str], None]) -> Report:
+    """Return the report of ``results``.
+
+    Args:
+        results: the run folder's.
+        progress: told the share done and what is under way.
+
+    Raises:
+        InputError: ingest has not run, or a result is damaged.
+    """
+    sections = []
+    for number, name in enumerate(SECTIONS):
+        progress(0.7 * number / len(SECTIONS), name)
+        module = importlib.import_module(f"bampipe.report.sections.{name}")
+        section: Section | None = module.section(results)
+        if section is not None:
+            sections.append(section)
+    document = Document(
+        f"Session {results.session['session_id']}", _subtitle(results), tuple(sections)
+    )
+    progress(0.7, "typesetting")
+    printed = typeset.pdf(document, _recorded(results))
+    progress(0.95, "page")
+    figures = {
+        block.name: block.svg
+        for section in sections
+        for block in section.blocks
+        if isinstance(block, Figure)
+    }
+    titles = tuple(section.title for section in sections)
+    return Report(printed, page.page(document), figures, titles)
+
+
+def _subtitle(results: Results) -> str:
+    parts = [f"device {results.session.get('device', 'unknown')}"]
+    recorded = results.session.get("recorded_at")
+    if recorded:
+        when = datetime.datetime.fromisoformat(str(recorded))
+        parts.append(f"recorded {when:%Y-%m-%d %H:%M}{' UTC' if _is_utc(when) else ''}")
+    return ", ".join(parts)
+
+
+def _is_utc(when: datetime.datetime) -> bool:
+    return when.utcoffset() == datetime.timedelta(0)
+
+
+def _recorded(results: Results) -> int:
+    """Return when the session was recorded, in seconds since 1970; 0 where that is not known."""
+    recorded = results.session.get("recorded_at")
+    if not recorded:
+        return 0
+    when = datetime.datetime.fromisoformat(str(recorded))
+    if when.tzinfo is None:
+        when = when.replace(tzinfo=datetime.UTC)
+    return max(0, int(when.timestamp()))

@@ -1,0 +1,135 @@
+"""What a report is made of, before it is typeset: sections of text, tables and figures.
+
+Text may hold two kinds of inline mark: ``**strong**`` and code between backticks.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Literal
+
+Span = tuple[Literal["plain", "strong", "code"], str]
+
+_MARK = re.compile(r"\*\*(?P<strong>[^*]+)\*\*|`(?P<code>[^`]+)`")
+
+
+def spans(text: str) -> list[Span]:
+    """Split ``text`` at its inline marks, in order."""
+    found: list[Span] = []
+    end = 0
+    for match in _MARK.finditer(text):
+        if match.start() > end:
+            found.append(("plain", text[end : match.start()]))
+        strong, code = match["strong"], match["code"]
+        found.append(("strong", strong) if strong is not None else ("code", code))
+        end = match.end()
+    if end < len(text):
+        found.append(("plain", text[end:]))
+    return found
+
+
+@dataclass(frozen=True)
+class Text:
+    """A paragraph."""
+
+    text: str
+
+
+@dataclass(frozen=True)
+class Subheading:
+    """A heading below that of the section."""
+
+    text: str
+
+
+@dataclass(frozen=True)
+class Bullets:
+    """A list of short sentences."""
+
+    items: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Callout:
+    """A verdict in a box.
+
+    Attributes:
+        tone: "good" (nothing to do), "attention" (something is missing), "unknown" (something
+            that nothing explains) or "note" (not done yet).
+        title: the verdict in a few words.
+        text: one to three sentences.
+    """
+
+    tone: Literal["good", "attention", "unknown", "note"]
+    title: str
+    text: str
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table.
+
+    Attributes:
+        caption: what it shows.
+        head: title of each column, units included.
+        rows: the cells, formatted.
+        align: one letter a column: "l" text, "r" numbers, "c" centred.
+        widths: relative widths of columns whose text may wrap; 0 for as wide as needed.
+        note: a sentence below, or "".
+    """
+
+    caption: str
+    head: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    align: str
+    widths: tuple[float, ...] = ()
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A figure.
+
+    Attributes:
+        name: name of its file, without ending.
+        caption: what it shows and how to read it.
+        svg: the drawing, 17 cm wide or less.
+    """
+
+    name: str
+    caption: str
+    svg: str
+
+
+Block = Text | Subheading | Bullets | Callout | Table | Figure
+
+
+@dataclass(frozen=True)
+class Section:
+    """One section.
+
+    Attributes:
+        title: its heading.
+        blocks: what it holds, in order.
+        new_page: starts on a page of its own in print.
+    """
+
+    title: str
+    blocks: tuple[Block, ...]
+    new_page: bool = False
+
+
+@dataclass(frozen=True)
+class Document:
+    """A whole report.
+
+    Attributes:
+        title: its title.
+        subtitle: session, device, date of recording.
+        sections: in order, the summary first.
+    """
+
+    title: str
+    subtitle: str
+    sections: tuple[Section, ...]

@@ -1,0 +1,107 @@
+"""A document as one self-contained page for a browser, light and dark."""
+
+from __future__ import annotations
+
+import html
+import re
+from pathlib import Path
+from string import Template
+
+from bampipe.report import style
+from bampipe.report.document import (
+    Block,
+    Bullets,
+    Callout,
+    Document,
+    Figure,
+    Subheading,
+    Table,
+    Text,
+    spans,
+)
+from bampipe.report.typeset import next_number, numbering
+
+_TEMPLATE = Path(__file__).parent / "templates" / "page.html"
+_TAGS = {"strong": "strong", "code": "code"}
+
+
+def page(document: Document) -> str:
+    """Return ``document`` as HTML with its figures inside; it refers to nothing outside."""
+    numbers = numbering()
+    contents, body = [], []
+    for section in document.sections:
+        anchor = re.sub(r"[^a-z0-9]+", "-", section.title.lower()).strip("-")
+        contents.append(f'<li><a href="#{anchor}">{html.escape(section.title)}</a></li>')
+        blocks = "\n".join(_block(block, next_number(numbers, block)) for block in section.blocks)
+        body.append(
+            f'<section aria-labelledby="{anchor}">\n'
+            f'<h2 id="{anchor}">{html.escape(section.title)}</h2>\n{blocks}\n</section>'
+        )
+    return Template(_TEMPLATE.read_text(encoding="utf-8")).substitute(
+        title=html.escape(document.title),
+        subtitle=html.escape(document.subtitle),
+        contents="\n".join(contents),
+        body="\n".join(body),
+    )
+
+
+def _rich(text: str) -> str:
+    parts = []
+    for kind, body in spans(text):
+        safe = html.escape(body)
+        parts.append(f"<{_TAGS[kind]}>{safe}</{_TAGS[kind]}>" if kind in _TAGS else safe)
+    return "".join(parts)
+
+
+def _block(block: Block, number: str) -> str:
+    match block:
+        case Text(text):
+            return f"<p>{_rich(text)}</p>"
+        case Subheading(text):
+            return f"<h3>{_rich(text)}</h3>"
+        case Bullets(items):
+            return "<ul>" + "".join(f"<li>{_rich(item)}</li>" for item in items) + "</ul>"
+        case Callout(tone, title, text):
+            rest = f"<p>{_rich(text)}</p>" if text else ""
+            return f'<div class="callout {tone}"><p class="verdict">{_rich(title)}</p>{rest}</div>'
+        case Table():
+            return _table(block, number)
+        case Figure(name, caption, svg):
+            return (
+                f"<figure>{_inline(svg, name, caption)}"
+                f"<figcaption><strong>{number}</strong> {_rich(caption)}</figcaption></figure>"
+            )
+
+
+def _table(table: Table, number: str) -> str:
+    head = "".join(
+        f'<th scope="col" class="{side}">{_rich(cell)}</th>'
+        for side, cell in zip(table.align, table.head, strict=True)
+    )
+    rows = "\n".join(
+        "<tr>"
+        + "".join(
+            f'<td class="{side}">{_rich(cell)}</td>'
+            for side, cell in zip(table.align, row, strict=True)
+        )
+        + "</tr>"
+        for row in table.rows
+    )
+    note = f'<p class="remark">{_rich(table.note)}</p>' if table.note else ""
+    return (
+        f'<div class="scroll"><table><caption class="caption"><strong>{number}</strong> '
+        f"{_rich(table.caption)}</caption><thead><tr>{head}</tr></thead>\n"
+        f"<tbody>{rows}</tbody></table></div>{note}"
+    )
+
+
+def _inline(svg: str, name: str, caption: str) -> str:
+    """Return the drawing for use inside a page: ids of its own, colours from the style sheet."""
+    drawing = svg[svg.index("<svg") :]
+    drawing = re.sub(r"<metadata>.*?</metadata>", "", drawing, flags=re.DOTALL)
+    drawing = re.sub(r'\bid="', f'id="{name}-', drawing)
+    drawing = re.sub(r'(url\(#|href="#)', rf"\g<1>{name}-", drawing)
+    for word, colour in style.COLOURS.items():
+        drawing = drawing.replace(colour, f"var(--{word})")
+    title = html.escape(re.sub(r"[*`]", "", caption), quote=True)
+    return drawing.replace("<svg ", f'<svg role="img" aria-label="{title}" ', 1)

@@ -1,0 +1,214 @@
+"""Read access to the results in a run folder, each file read at most once."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from bampipe.errors import InputError
+
+_RATES = {"rad": "rad/s", "m": "m/s"}
+_FORCES = {"rad": "N.m", "m": "N"}
+
+
+@dataclass
+class Results:
+    """The results of one session.
+
+    Attributes:
+        root: the run folder.
+        detail_model: the model shown in detail; "" for the last of the ladder.
+    """
+
+    root: Path
+    detail_model: str = ""
+    _json: dict[str, dict[str, Any] | None] = field(default_factory=dict, repr=False)
+
+    def json(self, relative: str) -> dict[str, Any] | None:
+        """Return the contents of a JSON file, or None where there is none.
+
+        Raises:
+            InputError: the file is damaged.
+        """
+        if relative not in self._json:
+            path = self.root / relative
+            self._json[relative] = _read_json(path) if path.is_file() else None
+        return self._json[relative]
+
+    def table(
+        self,
+        relative: str,
+        columns: Sequence[str] | None = None,
+        trial: str | None = None,
+    ) -> pd.DataFrame | None:
+        """Return a Parquet file, or the rows of one trial; None where there is no such file.
+
+        Raises:
+            InputError: the file is damaged, or lacks one of ``columns``.
+        """
+        path = self.root / relative
+        if not path.is_file():
+            return None
+        filters = [("trial_id", "==", trial)] if trial is not None else None
+        try:
+            return pd.read_parquet(
+                path,
+                columns=None if columns is None else list(columns),
+                filters=filters,
+            )
+        except (OSError, ValueError) as error:
+            raise InputError(
+                "not a sound Parquet file",
+                where=str(path),
+                remedy="make it again (--force)",
+            ) from error
+
+    def columns(self, relative: str) -> tuple[str, ...]:
+        """Return the names of the columns of a Parquet file; none where there is no file."""
+        frame = self.table(relative, trial="")
+        return () if frame is None else tuple(str(name) for name in frame.columns)
+
+    @cached_property
+    def session(self) -> dict[str, Any]:
+        """What ingest says of the session.
+
+        Raises:
+            InputError: ingest has not run.
+        """
+        content = self.json("ingest/session.json")
+        if content is None:
+            raise InputError(
+                "ingest/session.json is missing",
+                where=str(self.root),
+                remedy=f"run `bampipe ingest SESSION` for {self.root} first",
+            )
+        return content
+
+    @cached_property
+    def trials(self) -> pd.DataFrame:
+        """One row a trial.
+
+        Raises:
+            InputError: ingest has not run.
+        """
+        frame = self.table("ingest/trials.parquet")
+        if frame is None:
+            raise InputError(
+                "ingest/trials.parquet is missing",
+                where=str(self.root),
+                remedy=f"run `bampipe ingest SESSION` for {self.root} first",
+            )
+        return frame
+
+    @cached_property
+    def axes(self) -> tuple[str, ...]:
+        """Names of the axes, in the order of the session (JSON sorts them: encoder order)."""
+        found = [str(name) for name in self.session.get("axes", {})]
+        order = [
+            str(name).removeprefix("q_")
+            for name in self.columns("filter/kinematics.parquet")
+            if str(name).startswith("q_") and not str(name).startswith("q_sd_")
+        ]
+        return tuple(sorted(found, key=lambda axis: (order + found).index(axis)))
+
+    @cached_property
+    def components(self) -> tuple[str, ...]:
+        """Names of the force components, in their order."""
+        skip = ("force_rate_", "force_curvature_")
+        return tuple(
+            name.removeprefix("force_")
+            for name in self.columns("filter/kinematics.parquet")
+            if name.startswith("force_") and not name.startswith(skip)
+        )
+
+    def unit(self, axis: str) -> str:
+        """Return the unit of the position of ``axis``."""
+        return str(self.session["axes"][axis].get("unit", ""))
+
+    def rate_unit(self, axis: str) -> str:
+        """Return the unit of the velocity of ``axis``."""
+        return _RATES.get(self.unit(axis), f"{self.unit(axis)}/s")
+
+    def force_unit(self, axis: str) -> str:
+        """Return the unit of the generalised force of ``axis``."""
+        return _FORCES.get(self.unit(axis), "")
+
+    def is_rotary(self, axis: str) -> bool:
+        """Return whether ``axis`` turns."""
+        return self.unit(axis) == "rad"
+
+    @cached_property
+    def models(self) -> tuple[str, ...]:
+        """The models: in the order of the ladder, others behind, parents before children."""
+        found = sorted(
+            (path.parent.name for path in (self.root / "models").glob("*/identify.json")),
+            key=lambda name: (name != "base", name.count("+"), name),
+        )
+        ladder = [
+            str(rung.get("model")) for rung in (self.json("compare.json") or {}).get("ladder", ())
+        ]
+        ranked = [name for name in ladder if name in found]
+        return (*ranked, *(name for name in found if name not in ranked))
+
+    @cached_property
+    def model(self) -> str:
+        """The model shown in detail.
+
+        Raises:
+            InputError: the model asked for has no results.
+        """
+        if self.detail_model:
+            if self.detail_model not in self.models:
+                raise InputError(
+                    f"no results for model {self.detail_model!r}",
+                    where=str(self.root),
+                    remedy=f"choose from {', '.join(self.models) or 'none: identify first'}",
+                )
+            return self.detail_model
+        return self.models[-1] if self.models else "base"
+
+    def of_model(self, name: str, model: str | None = None) -> str:
+        """Return the relative path of a file of ``model`` (default: the one in detail)."""
+        return f"models/{model or self.model}/{name}"
+
+    def effects(self, model: str) -> tuple[str, ...]:
+        """Return the effects that ``model`` has beyond the bare device."""
+        path = self.root / "models" / model / "model.toml"
+        if not path.is_file():
+            return ()
+        try:
+            content = tomllib.loads(path.read_text(encoding="utf-8"))
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise InputError(f"not valid TOML: {error}", where=str(path)) from error
+        return tuple(str(item) for item in content.get("effects", ()))
+
+    @cached_property
+    def paper(self) -> dict[str, Any] | None:
+        """What the device's paper published, or None where there is none for this device."""
+        path = Path(__file__).parent / "papers" / f"{self.session.get('device')}.toml"
+        return tomllib.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
+
+    def as_in(self, place: str) -> str:
+        """Return " (the paper's <place>)" where the device has a paper, else ""."""
+        return f" (the paper's {place})" if self.paper else ""
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise InputError(
+            f"not readable as JSON ({error})",
+            where=str(path),
+            remedy="make it again (--force)",
+        ) from error
+    if not isinstance(content, dict):
+        raise InputError("not a table", where=str(path), remedy="make it again (--force)")
+    return content

@@ -1,0 +1,14 @@
+"""One file, one section. Each has ``section(results)``: a Section, or None where irrelevant."""
+
+SECTIONS: tuple[str, ...] = (
+    "summary",
+    "trials",
+    "stiffness",
+    "identification",
+    "validation",
+    "diagnosis",
+    "ladder",
+    "published",
+    "provenance",
+)
+"""The sections, in the order in which they are printed."""

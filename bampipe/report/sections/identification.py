@@ -1,0 +1,251 @@
+"""Identification: Table VII, Table VI, convergence (Fig. 7), torques and motion (Fig. 6)."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from bampipe.report import style, verdicts, wording
+from bampipe.report.document import Block, Bullets, Figure, Section, Table, Text
+from bampipe.report.results import Results
+
+TITLE = "Identification"
+_NORMAL_95 = 1.959964
+_DASHES = ("-", (0, (5, 1.5)), (0, (1.5, 1.2)), (0, (5, 1.5, 1, 1.5)))
+
+
+def section(results: Results) -> Section:
+    """Return the section."""
+    content = results.json(results.of_model("identify.json"))
+    if content is None:
+        command = f"`bampipe identify {results.root.name}`"
+        return Section(TITLE, (Text(f"No parameters have been identified: {command} does it."),))
+    blocks: list[Block] = [_parameters(content)]
+    notes = tuple(str(note) for note in content.get("notes") or ())
+    if notes:
+        blocks.append(Bullets(notes))
+    trace = results.table(results.of_model("trace.parquet"))
+    if trace is not None and len(trace):
+        blocks.append(_convergence(results, content, trace))
+    bounds = content.get("state_3sigma")
+    if bounds:
+        blocks.append(_bounds(results, bounds))
+    motion = _motion(results)
+    if motion is not None:
+        blocks.append(motion)
+    return Section(TITLE, tuple(blocks))
+
+
+def interval_95(entry: dict[str, Any]) -> tuple[float, float] | None:
+    """Return the 95 % interval of a parameter: the stored one, else the normal one of its sd."""
+    stored = entry.get("interval_95")
+    if stored:
+        return float(stored[0]), float(stored[1])
+    sd = entry.get("sd")
+    if sd is None or entry.get("fixed"):
+        return None
+    return entry["estimate"] - _NORMAL_95 * sd, entry["estimate"] + _NORMAL_95 * sd
+
+
+def _parameters(content: dict[str, Any]) -> Table:
+    rows = []
+    stored = False
+    for name, entry in content.get("parameters", {}).items():
+        interval = interval_95(entry)
+        stored = stored or bool(entry.get("interval_95"))
+        value, sd = entry["estimate"], entry.get("sd")
+        rows.append(
+            (
+                wording.parameter(name),
+                f"`{name}`",
+                wording.plain(value, wording.decimals_for(sd, value)),
+                wording.significant(sd, 2) if sd else "fixed",
+                wording.interval(*interval, sd) if interval else "–",
+                wording.unit(str(entry.get("unit", ""))),
+            )
+        )
+    note = "" if stored else "Interval: estimate ± 1.96 standard deviations."
+    return Table(
+        f"Parameters of model `{content.get('model', 'base')}`{_table_number(content)}",
+        ("Parameter", "Name", "Estimate", "SD", "95 % interval", "Unit"),
+        tuple(rows),
+        "llrrrl",
+        (1.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+        note,
+    )
+
+
+def _table_number(content: dict[str, Any]) -> str:
+    how = {"ukf": "unscented Kalman filter", "least-squares": "least squares"}
+    name = str(content.get("method", ""))
+    return f", {how.get(name, wording.words(name))}" if name else ""
+
+
+def _bounds(results: Results, bounds: dict[str, Any]) -> Table:
+    rows = []
+    for axis in verdicts.ordered(results, bounds):
+        entry = bounds[axis]
+        rows.append(
+            (
+                axis,
+                _scaled(entry.get("position"), results.unit(axis)),
+                _scaled(entry.get("velocity"), results.rate_unit(axis)),
+            )
+        )
+    return Table(
+        f"Error of the filtered state, 3σ bounds{results.as_in('Table VI')}",
+        ("Axis", "Position", "Velocity"),
+        tuple(rows),
+        "lrr",
+    )
+
+
+def _scaled(value: float | None, unit: str) -> str:
+    if value is None:
+        return "–"
+    factor, shown = wording.scale([value], unit)
+    return f"{wording.significant(factor * value, 2)} {shown}"
+
+
+def _groups(content: dict[str, Any], trace: pd.DataFrame) -> list[tuple[str, str, list[str]]]:
+    """Return title, unit and parameters of each panel: those of one kind and unit together."""
+    groups: dict[tuple[str, str], list[str]] = {}
+    for name, entry in content.get("parameters", {}).items():
+        if name in trace.columns:
+            kind = wording.parameter(name.split(".")[0])
+            if not name.startswith(("viscous.", "coulomb.")):
+                kind = wording.parameter(name)
+            groups.setdefault((kind, str(entry.get("unit", ""))), []).append(name)
+    return [(kind, unit, names) for (kind, unit), names in groups.items()]
+
+
+def _convergence(results: Results, content: dict[str, Any], trace: pd.DataFrame) -> Figure:
+    groups = _groups(content, trace)
+    groups.sort(key=lambda group: _rank(group[2][0]))
+    rows = math.ceil(len(groups) / 2)
+    figure, panels = style.panels(rows, 2, 0.35 + 1.35 * rows, sharex=True)
+    time_column = "t_total" if "t_total" in trace else "t"
+    keep = style.pick(len(trace), 1500)
+    shown = trace.iloc[keep]
+    t = shown[time_column].to_numpy()
+    starts = trace.loc[trace["trial_id"].ne(trace["trial_id"].shift()), time_column].to_numpy()
+    for panel, (kind, unit, names) in zip(panels.flat, groups, strict=False):
+        for number, name in enumerate(names):
+            _trace(panel, t, shown, name, number, results)
+        _design(results, panel, names)
+        for start in starts[1:]:
+            panel.axvline(start, color=style.FAINT, lw=0.6, ls=(0, (1, 2)), zorder=0)
+        _settled(panel, trace, names)
+        panel.set_title(kind)
+        panel.set_ylabel(wording.unit(unit) or "1")
+        if len(panel.get_legend_handles_labels()[1]) > 1:
+            panel.legend(loc="best", ncols=2)
+    for panel in panels.flat[len(groups) :]:
+        panel.set_axis_off()
+    for column in range(2):
+        last = (len(groups) - 1 - column) // 2
+        panels[last, column].tick_params(labelbottom=True)
+        panels[last, column].set_xlabel("time in the filter (s)")
+    caption = (
+        f"Convergence of the parameters{results.as_in('Fig. 7')}, with 95 % bounds of the filter. "
+        "Dotted verticals: a new trial starts."
+    )
+    return Figure("convergence", caption, style.svg(figure))
+
+
+def _rank(name: str) -> tuple[int, str]:
+    order = ("viscous", "coulomb", "mass")
+    first = name.split(".")[0]
+    return (order.index(first) if first in order else len(order), "")
+
+
+def _trace(
+    panel: Any,
+    t: np.ndarray,
+    shown: pd.DataFrame,
+    name: str,
+    number: int,
+    results: Results,
+) -> None:
+    axis = name.split(".")[-1]
+    place = results.axes.index(axis) if axis in results.axes else number
+    colour = style.SERIES[place % len(style.SERIES)]
+    value = shown[name].to_numpy()
+    title = axis if axis in results.axes else "estimate"
+    panel.plot(t, value, color=colour, ls=_DASHES[place % len(_DASHES)], label=title)
+    if f"{name}_sd" in shown:
+        half = _NORMAL_95 * shown[f"{name}_sd"].to_numpy()
+        panel.fill_between(t, value - half, value + half, color=colour, alpha=0.18, lw=0)
+
+
+def _design(results: Results, panel: Any, names: list[str]) -> None:
+    design = (results.paper or {}).get("design", {})
+    for name in names:
+        if name in design:
+            entry = design[name]
+            panel.axhline(entry["value"], color=style.INK, lw=0.8, ls="--", label=entry["label"])
+
+
+def _settled(panel: Any, trace: pd.DataFrame, names: list[str]) -> None:
+    """Set the range to the estimates past the first tenth: the start would hide the rest."""
+    tail = trace.iloc[len(trace) // 10 :]
+    values = []
+    for name in names:
+        centre = tail[name].to_numpy()
+        half = 2.5 * tail[f"{name}_sd"].to_numpy() if f"{name}_sd" in tail else 0.0
+        values += [centre - half, centre + half]
+    style.limits(panel, values)
+
+
+def _motion(results: Results) -> Figure | None:
+    path = results.of_model("states.parquet")
+    columns = results.columns(path)
+    torques = [axis for axis in results.axes if f"torque_user_{axis}" in columns]
+    axes = [axis for axis in results.axes if f"q_{axis}" in columns]
+    if not axes:
+        return None
+    ids = results.table(path, ["trial_id"])
+    if ids is None or ids.empty:
+        return None
+    trial = str(ids["trial_id"].iloc[0])
+    frame = results.table(path, trial=trial)
+    assert frame is not None
+    kinds = [
+        kind for kind in (True, False) if any(results.is_rotary(axis) == kind for axis in axes)
+    ]
+    rows = 2 if torques else 1
+    figure, panels = style.panels(rows, len(kinds), 1.9 * rows + 0.3, sharex=True)
+    t = frame["t"].to_numpy()
+    for column, rotary in enumerate(kinds):
+        members = [axis for axis in axes if results.is_rotary(axis) == rotary]
+        for axis in members:
+            place = results.axes.index(axis)
+            look: dict[str, Any] = {"lw": 0.9}
+            colour = style.SERIES[place % len(style.SERIES)]
+            if axis in torques:
+                user = frame[f"torque_user_{axis}"].to_numpy()
+                style.series(panels[0, column], t, user, colour, f"{axis}, hand", **look)
+            if f"torque_gravity_{axis}" in columns:
+                gravity = frame[f"torque_gravity_{axis}"].to_numpy()
+                dashed = {**look, "ls": (0, (3, 1.5))}
+                title = f"{axis}, gravity compensation"
+                style.series(panels[0, column], t, gravity, colour, title, **dashed)
+            position = frame[f"q_{axis}"].to_numpy()
+            style.series(panels[-1, column], t, position, colour, axis, **look)
+        first = members[0]
+        force = "torque" if rotary else "force"
+        panels[0, column].set_ylabel(style.label(force, wording.unit(results.force_unit(first))))
+        panels[-1, column].set_ylabel(style.label("position", wording.unit(results.unit(first))))
+        panels[-1, column].set_xlabel("time (s)")
+        for row in range(rows):
+            panels[row, column].legend(loc="upper right", ncols=2)
+            low, high = panels[row, column].get_ylim()
+            panels[row, column].set_ylim(low, high + 0.22 * (high - low))
+    caption = (
+        f"Trial {trial}{results.as_in('Fig. 6')}: generalised forces of the hand and of the "
+        "gravity compensator (top) and the motion (bottom)."
+    )
+    return Figure("torques-and-motion", caption, style.svg(figure))

@@ -1,0 +1,119 @@
+"""The ladder: held-out error of each model version against the floor; what its parameters did."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from bampipe.report import style, verdicts, wording
+from bampipe.report.document import Block, Bullets, Figure, Section, Table
+from bampipe.report.results import Results
+
+TITLE = "Model versions"
+_MOST_COLUMNS = 3
+
+
+def section(results: Results) -> Section | None:
+    """Return the section; None where there is one model only."""
+    content = results.json("compare.json")
+    rungs = (content or {}).get("ladder") or []
+    if content is None or len(rungs) < 2:
+        return None
+    blocks: list[Block] = [_steps(results, rungs), _picture(results, rungs)]
+    parameters = content.get("parameters") or {}
+    if parameters:
+        blocks.append(_parameters(rungs, parameters))
+    moved = [
+        str(entry["sentence"]) for entry in content.get("moved") or () if entry.get("sentence")
+    ]
+    if moved:
+        blocks.append(Bullets(tuple(moved)))
+    return Section(TITLE, tuple(blocks))
+
+
+def _axes(results: Results, rungs: list[dict[str, Any]]) -> tuple[str, ...]:
+    return verdicts.ordered(
+        results,
+        {axis: None for rung in rungs for axis in rung.get("held_out_rmse", {})},
+    )
+
+
+def _steps(results: Results, rungs: list[dict[str, Any]]) -> Table:
+    axes = _axes(results, rungs)
+    rows = []
+    for rung in rungs:
+        cells = []
+        for axis in axes:
+            error = rung.get("held_out_rmse", {}).get(axis)
+            floor = rung.get("noise_floor", {}).get(axis)
+            text = wording.significant(error)
+            cells.append(f"{text} ({wording.significant(floor)})" if floor else text)
+        added = rung.get("added")
+        added = added if isinstance(added, str) else ", ".join(added or ())
+        rows.append((_version(rungs, rung), f"`{added}`" if added else "–", *cells))
+    units = (f"{axis} ({wording.unit(results.force_unit(axis))})" for axis in axes)
+    return Table(
+        "RMSE on the same held-out trials (noise floor)",
+        ("Version", "Added", *units),
+        tuple(rows),
+        "ll" + "r" * len(axes),
+        (0.0, 1.0, *(0.0 for _ in axes)),
+    )
+
+
+def _version(rungs: list[dict[str, Any]], rung: dict[str, Any]) -> str:
+    """Return a short name: the base model's own, then numbers (names grow with every effect)."""
+    number = rungs.index(rung)
+    return str(rung["model"]) if number == 0 else f"version {number}"
+
+
+def _picture(results: Results, rungs: list[dict[str, Any]]) -> Figure:
+    axes = _axes(results, rungs)
+    figure, panels = style.panels(1, len(axes), 2.3, width=min(style.WIDTH, 2.6 * len(axes)))
+    x = np.arange(len(rungs))
+    for panel, axis in zip(panels[0], axes, strict=True):
+        error = _values(rungs, "held_out_rmse", axis)
+        floor = _values(rungs, "noise_floor", axis)
+        panel.plot(x, error, "o-", color=style.BLUE, ms=4.5, lw=1.3, label="held-out error")
+        panel.plot(x, floor, "s--", color=style.VERMILLION, ms=3.0, lw=1.0, label="noise floor")
+        for place, value in zip(x, error, strict=True):
+            if np.isfinite(value):
+                panel.annotate(
+                    wording.significant(float(value), 2), (place, value), (0, 5),
+                    textcoords="offset points", ha="center", fontsize=7,
+                )  # fmt: skip
+        top = np.nanmax(np.concatenate([error, floor, [0.0]]))
+        panel.set_ylim(0.0, 1.22 * top or 1.0)
+        panel.set_xlim(-0.4, len(rungs) - 0.6)
+        panel.set_xticks(x, [_version(rungs, rung) for rung in rungs])
+        panel.set_title(axis)
+        panel.set_ylabel(style.label("RMSE", wording.unit(results.force_unit(axis))))
+    style.legend_below(figure, panels[0][0])
+    caption = "The error on held-out trials falls as effects are added; the floor is what remains."
+    return Figure("ladder", caption, style.svg(figure))
+
+
+def _values(rungs: list[dict[str, Any]], key: str, axis: str) -> np.ndarray:
+    found = (rung.get(key, {}).get(axis) for rung in rungs)
+    return np.array([np.nan if value is None else float(value) for value in found])
+
+
+def _parameters(rungs: list[dict[str, Any]], parameters: dict[str, Any]) -> Table:
+    shown = rungs if len(rungs) <= _MOST_COLUMNS else [rungs[0], *rungs[-(_MOST_COLUMNS - 1) :]]
+    rows = []
+    for name, by_model in parameters.items():
+        entries = [by_model.get(rung["model"]) for rung in shown]
+        unit = next((entry["unit"] for entry in entries if entry), "")
+        cells = [
+            wording.with_sd(entry["estimate"], entry.get("sd")) if entry else "–"
+            for entry in entries
+        ]
+        rows.append((wording.parameter(name), *cells, wording.unit(str(unit))))
+    return Table(
+        "Parameters of each version (± one standard deviation): a missing effect biases the others",
+        ("Parameter", *(_version(rungs, rung) for rung in shown), "Unit"),
+        tuple(rows),
+        "l" + "r" * len(shown) + "l",
+        (1.0, *(0.0 for _ in shown), 0.0),
+    )

@@ -1,0 +1,134 @@
+"""Stiffness: Table I, the hysteresis loops of Fig. 3, bandwidth in both units."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from bampipe.report import style, verdicts, wording
+from bampipe.report.document import Block, Bullets, Figure, Section, Table, Text
+from bampipe.report.results import Results
+
+TITLE = "Stiffness"
+
+
+def section(results: Results) -> Section | None:
+    """Return the section; None for a session without locked trials."""
+    content = results.json("stiffness/stiffness.json")
+    if content is None:
+        if not (results.trials["kind"] == "locked").any():
+            return None
+        command = f"`bampipe stiffness {results.root.name}`"
+        return Section(TITLE, (Text(f"The locked trials have not been used: {command} does it."),))
+    axes = content.get("axes", {})
+    notes = tuple(str(note) for note in content.get("notes", ()))
+    if not axes:
+        return Section(TITLE, (Text(" ".join(notes) or "There are no locked trials."),))
+    blocks: list[Block] = [_table(results, axes)]
+    loops = results.table("stiffness/loops.parquet")
+    if loops is not None and len(loops):
+        blocks.append(_loops(results, axes, loops))
+    if notes:
+        blocks.append(Bullets(notes))
+    return Section(TITLE, tuple(blocks))
+
+
+def _table(results: Results, axes: dict[str, Any]) -> Table:
+    rows = []
+    poses: dict[str, str] = {}
+    for axis in verdicts.ordered(results, axes):
+        entry = axes[axis]
+        factor, unit = wording.scale([entry["stiffness"]], entry["unit"])
+        value = wording.with_sd(factor * entry["stiffness"], factor * entry["sd"])
+        rows.append(
+            (
+                axis,
+                f"{value} {unit}",
+                str(entry.get("n_cycles", "–")),
+                _scaled(entry.get("loop_width"), entry.get("loop_width_unit", "")),
+                _scaled(entry.get("energy_per_cycle"), entry.get("energy_unit", "J")),
+                wording.significant(entry.get("bandwidth_rad_s")),
+                wording.significant(entry.get("bandwidth_hz")),
+            )
+        )
+        pose = _pose(results, entry)
+        if pose:
+            poses.setdefault(pose, axis)
+    note = "± standard deviation over the load cycles. Loop width at constant deflection."
+    if poses:
+        note += f" Bandwidth √(K/M) at {'; '.join(poses)}."
+    return Table(
+        f"Stiffness of the locked axes{results.as_in('Table I')}",
+        (
+            "Axis",
+            "Stiffness",
+            "Cycles",
+            "Loop width",
+            "Loss per cycle",
+            "Bandwidth (rad/s)",
+            "(Hz)",
+        ),
+        tuple(rows),
+        "lrrrrrr",
+        (0.0, 1.3, 0.0, 1.0, 1.0, 1.0, 0.5),
+        note,
+    )
+
+
+def _pose(results: Results, entry: dict[str, Any]) -> str:
+    name = str(entry.get("bandwidth_pose", ""))
+    pose = (entry.get("poses") or {}).get(name, {})
+    parts = [
+        f"{axis} {wording.significant(float(pose[axis]), 3)} {results.unit(axis)}"
+        for axis in verdicts.ordered(results, pose)
+    ]
+    return f"{wording.words(name)} ({', '.join(parts)})" if parts else wording.words(name)
+
+
+def _scaled(value: float | None, unit: str) -> str:
+    if value is None:
+        return "–"
+    factor, shown = wording.scale([value], unit) if unit != "J" else (1e3, "mJ")
+    return f"{wording.significant(factor * value)} {shown}"
+
+
+def _loops(results: Results, axes: dict[str, Any], loops: pd.DataFrame) -> Figure:
+    names = [axis for axis in verdicts.ordered(results, axes) if (loops["axis"] == axis).any()]
+    figure, panels = style.panels(1, len(names), 2.35, width=min(style.WIDTH, 2.6 * len(names)))
+    for panel, axis in zip(panels[0], names, strict=True):
+        _loop(results, panel, axis, axes[axis], loops[loops["axis"] == axis])
+    style.legend_below(figure, panels[0][0])
+    caption = (
+        f"Hysteresis loops of the locked axes{results.as_in('Fig. 3')}: generalised force of the "
+        "hand against deflection. The slope of the parts away from reversals (blue) is the "
+        "stiffness (dashed)."
+    )
+    return Figure("stiffness-loops", caption, style.svg(figure))
+
+
+def _loop(
+    results: Results, panel: Any, axis: str, entry: dict[str, Any], rows: pd.DataFrame
+) -> None:
+    rows = rows.iloc[style.pick(len(rows), 6000)]
+    deflection = rows["deflection"].to_numpy()
+    torque = rows["torque"].to_numpy()
+    centre = 0.5 * (deflection.min() + deflection.max())
+    level = 0.5 * (torque.min() + torque.max())
+    shown, unit = style.scaled(deflection - centre, results.unit(axis))
+    factor = wording.scale([float(np.max(np.abs(deflection - centre)))], results.unit(axis))[0]
+    panel.plot(shown, torque, color=style.FAINT, lw=0.6, label="around a reversal")
+    if "post_yield" in rows:
+        away = np.where(rows["post_yield"].to_numpy(dtype=bool), torque, np.nan)
+        panel.plot(shown, away, color=style.BLUE, lw=0.8, label="away from reversals")
+    reach = 0.5 * (torque.max() - torque.min())
+    line = np.array([-reach, reach])
+    panel.plot(
+        factor * line / entry["stiffness"], level + line,
+        color=style.VERMILLION, ls=(0, (4, 2)), lw=1.2, label="stiffness",
+    )  # fmt: skip
+    panel.set_title(axis)
+    panel.set_xlabel(style.label("deflection", unit))
+    force = wording.unit(results.force_unit(axis))
+    panel.set_ylabel(style.label("torque" if results.is_rotary(axis) else "force", force))

@@ -1,0 +1,164 @@
+"""Summary: what was done, the verdict, the key numbers."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from bampipe.report import verdicts, wording
+from bampipe.report.document import Block, Section, Table, Text
+from bampipe.report.results import Results
+
+
+def section(results: Results) -> Section:
+    """Return the section."""
+    blocks: list[Block] = [verdicts.overall(results), Text(_done(results))]
+    ladder = _ladder(results)
+    if ladder:
+        blocks.append(Text(ladder))
+    numbers = _numbers(results)
+    if numbers is not None:
+        blocks.append(numbers)
+    return Section("Summary", tuple(blocks))
+
+
+def _done(results: Results) -> str:
+    trials = results.trials
+    kept = trials[trials["status"] != "set_aside"]
+    kinds = [
+        wording.count(int((kept["kind"] == kind).sum()), f"{kind} trial")
+        for kind in ("free", "viscous", "locked")
+        if (kept["kind"] == kind).any()
+    ]
+    seconds = float(kept["duration_s"].sum())
+    parts = [
+        f"{wording.listing(kinds) or 'No trial'} ({wording.plain(seconds, 0)} s) could be used"
+    ]
+    aside = len(trials) - len(kept)
+    parts[0] += f"; {wording.count(aside, 'trial')} set aside." if aside else "."
+    identified = results.json(results.of_model("identify.json"))
+    if identified is not None:
+        names = len(identified.get("parameters", {}))
+        effects = results.effects(results.model)
+        added = (
+            f", which adds {wording.listing(f'`{name}`' for name in effects)}" if effects else ""
+        )
+        parts.append(
+            f"{wording.count(names, 'parameter')} of model `{results.model}`{added} were identified"
+            f"{_how(identified)}."
+        )
+    validated = results.json(results.of_model("validate.json"))
+    if validated is not None:
+        parts.append(
+            "The force that the model predicts was held against the measured one on trials not "
+            "used for identification."
+        )
+    return " ".join(parts)
+
+
+def _how(identified: dict[str, Any]) -> str:
+    method = {"ukf": "an unscented Kalman filter", "least-squares": "least squares"}
+    name = str(identified.get("method", ""))
+    return f" by {method.get(name, wording.words(name))}" if name else ""
+
+
+def _ladder(results: Results) -> str:
+    rungs = (results.json("compare.json") or {}).get("ladder", [])
+    if len(rungs) < 2:
+        return ""
+    first, last = rungs[0], rungs[-1]
+    changes = []
+    for axis in verdicts.ordered(results, first.get("held_out_rmse", {})):
+        before, after = (
+            first["held_out_rmse"][axis],
+            last.get("held_out_rmse", {}).get(axis),
+        )
+        floor = last.get("noise_floor", {}).get(axis)
+        if before is None or after is None:
+            continue
+        unit = wording.unit(results.force_unit(axis))
+        text = f"{axis} {wording.significant(before)} to {wording.significant(after)} {unit}"
+        changes.append(text + (f" (floor {wording.significant(floor)})" if floor else ""))
+    return (
+        f"From model `{first['model']}` to `{last['model']}` the error on held-out trials went: "
+        f"{'; '.join(changes)}."
+    )
+
+
+def _numbers(results: Results) -> Table | None:
+    identified = (results.json(results.of_model("identify.json")) or {}).get("parameters", {})
+    validated = (results.json(results.of_model("validate.json")) or {}).get("axes", {})
+    stiff = (results.json("stiffness/stiffness.json") or {}).get("axes", {})
+    axes = results.axes
+    rows = [
+        _row(
+            f"{title}",
+            axes,
+            lambda axis, key=key: _estimate(identified.get(f"{key}.{axis}")),
+        )
+        for title, key in (
+            ("Viscous damping", "viscous"),
+            ("Coulomb friction", "coulomb"),
+        )
+    ]
+    rows += [
+        _row(
+            title,
+            axes,
+            lambda axis, key=key: _error(results, axis, validated.get(axis), key),
+        )
+        for title, key in (
+            ("Error on held-out trials (RMSE)", "held_out_rmse"),
+            ("Noise floor", "noise_floor"),
+            ("Error without friction terms", "rmse_without_friction"),
+        )
+    ]
+    rows.append(_row("Force explained", axes, lambda axis: _percent(validated.get(axis))))
+    rows.append(_row("Stiffness, brake locked", axes, lambda axis: _stiffness(stiff.get(axis))))
+    rows = [row for row in rows if any(cell != "–" for cell in row[1:])]
+    if not rows:
+        return None
+    return Table(
+        "Key numbers (± one standard deviation)",
+        ("", *axes),
+        tuple(rows),
+        "l" + "r" * len(axes),
+        (0.0, *(1.0 for _ in axes)),
+        _others(identified),
+    )
+
+
+def _row(title: str, axes: tuple[str, ...], cell: Any) -> tuple[str, ...]:
+    return (title, *(cell(axis) for axis in axes))
+
+
+def _estimate(entry: dict[str, Any] | None) -> str:
+    if entry is None:
+        return "–"
+    return f"{wording.with_sd(entry['estimate'], entry.get('sd'))} {wording.unit(entry['unit'])}"
+
+
+def _error(results: Results, axis: str, entry: dict[str, Any] | None, key: str) -> str:
+    if entry is None or entry.get(key) is None:
+        return "–"
+    unit = wording.unit(str(entry.get("unit", results.force_unit(axis))))
+    return f"{wording.significant(entry[key])} {unit}"
+
+
+def _percent(entry: dict[str, Any] | None) -> str:
+    value = None if entry is None else entry.get("fit_percent")
+    return "–" if value is None else f"{wording.plain(float(value), 1)} %"
+
+
+def _stiffness(entry: dict[str, Any] | None) -> str:
+    if entry is None:
+        return "–"
+    factor, unit = wording.scale([entry["stiffness"]], entry["unit"])
+    return f"{wording.with_sd(factor * entry['stiffness'], factor * entry['sd'])} {unit}"
+
+
+def _others(parameters: dict[str, Any]) -> str:
+    others = [name for name in parameters if not name.startswith(("viscous.", "coulomb."))]
+    if not others:
+        return ""
+    shown = (f"{wording.parameter(name)}: {_estimate(parameters[name])}" for name in others)
+    return "; ".join(shown) + "."

@@ -1,0 +1,153 @@
+"""Data: the trials, what was repaired, what was set aside, how motions were differentiated."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+from bampipe.report import verdicts, wording
+from bampipe.report.document import Block, Section, Table, Text
+from bampipe.report.results import Results
+
+_STATES = {"ok": "sound", "repaired": "repaired", "set_aside": "**set aside**"}
+
+
+def section(results: Results) -> Section:
+    """Return the section."""
+    session = results.session
+    blocks: list[Block] = [Text(_sampling(session))]
+    blocks.append(_trials(results))
+    filtered = results.json("filter/filter.json")
+    if filtered is None:
+        blocks.append(
+            Text(
+                "Velocities and accelerations have not been computed: "
+                f"`bampipe filter {results.root.name}` does it."
+            )
+        )
+    else:
+        blocks += _filter(results, filtered)
+    return Section("Data", tuple(blocks))
+
+
+def _sampling(session: dict[str, Any]) -> str:
+    rate = session.get("sample_rate_hz")
+    text = f"Sampled at {wording.plain(float(rate), 0)} Hz." if rate else ""
+    noise = (session.get("force") or {}).get("noise_sd")
+    if noise:
+        unit = wording.unit(str(session["force"].get("unit", "N")))
+        text += f" Noise of the force sensor {wording.significant(float(noise), 2)} {unit}."
+    return text.strip()
+
+
+def _trials(results: Results) -> Table:
+    rows = []
+    for row in results.trials.to_dict("records"):
+        rows.append(
+            (
+                str(row["trial_id"]),
+                _kind(row),
+                wording.plain(float(row["duration_s"]), 1),
+                str(int(row["n_samples"])),
+                _STATES.get(str(row["status"]), str(row["status"])),
+                _remarks(row),
+            )
+        )
+    return Table(
+        "Trials",
+        ("Trial", "Kind", "Duration (s)", "Samples", "State", "Repairs, reason"),
+        tuple(rows),
+        "llrrll",
+        (0.0, 0.0, 0.0, 0.0, 0.0, 1.0),
+    )
+
+
+def _kind(row: dict[Any, Any]) -> str:
+    kind = str(row["kind"])
+    axis, damping = row.get("locked_axis"), row.get("viscous_n_s_per_m")
+    if kind == "locked" and isinstance(axis, str) and axis:
+        return f"locked, {axis}"
+    if kind == "viscous" and damping is not None and math.isfinite(damping):
+        return f"viscous, {wording.significant(float(damping), 2)} N·s/m"
+    return kind
+
+
+def _remarks(row: dict[Any, Any]) -> str:
+    found = [_flat(row.get("reason")), _flat(row.get("repairs"))]
+    return "; ".join(text for text in found if text) or "–"
+
+
+def _flat(value: object) -> str:
+    """Return a text column as a sentence: plain text, or a JSON list or table of texts."""
+    if not isinstance(value, str) or not value.strip():
+        return ""
+    if value.lstrip()[0] not in "[{":
+        return value.strip()
+    try:
+        content = json.loads(value)
+    except json.JSONDecodeError:
+        return value.strip()
+    if isinstance(content, dict):
+        return "; ".join(f"{wording.words(str(key))}: {item}" for key, item in content.items())
+    return "; ".join(str(item) for item in content)
+
+
+def _filter(results: Results, filtered: dict[str, Any]) -> list[Block]:
+    axes = filtered.get("axes", {})
+    rows = []
+    for axis in verdicts.ordered(results, axes):
+        entry = axes[axis]
+        unit = str(entry.get("unit", results.unit(axis)))
+        rows.append(
+            (
+                axis,
+                _scaled(entry.get("resolution"), unit),
+                wording.significant(entry.get("bandwidth_hz")),
+                _scaled(entry.get("position_sd"), unit),
+                _scaled(entry.get("velocity_sd"), f"{unit}/s"),
+                _scaled(entry.get("acceleration_sd"), f"{unit}/s2"),
+            )
+        )
+    method = str(filtered.get("method", ""))
+    names = {
+        "kalman": "a Kalman smoother",
+        "butterworth": "a zero-phase Butterworth filter",
+        "savitzky_golay": "a Savitzky-Golay filter",
+        "savitzky-golay": "a Savitzky-Golay filter",
+    }
+    reason = filtered.get("method_reason")
+    text = f"Velocity and acceleration come from {names.get(method, method)}"
+    blocks: list[Block] = [Text(f"{text} ({reason})." if reason else f"{text}.")]
+    skipped = filtered.get("skipped") or {}
+    if skipped:
+        blocks.append(Text("Not differentiated: " + _pairs(skipped) + "."))
+    if rows:
+        blocks.append(
+            Table(
+                "Encoders and the motion derived from them: typical standard deviations of error",
+                (
+                    "Axis",
+                    "Resolution",
+                    "Bandwidth (Hz)",
+                    "Position",
+                    "Velocity",
+                    "Acceleration",
+                ),
+                tuple(rows),
+                "lrrrrr",
+                (0.0, 1.0, 1.0, 1.0, 1.0, 1.0),
+            )
+        )
+    return blocks
+
+
+def _pairs(reasons: dict[str, Any]) -> str:
+    return "; ".join(f"{name}: {reason}" for name, reason in reasons.items())
+
+
+def _scaled(value: float | None, unit: str) -> str:
+    if value is None:
+        return "–"
+    factor, shown = wording.scale([float(value)], unit)
+    return f"{wording.significant(factor * float(value), 2)} {shown}"

@@ -1,0 +1,241 @@
+"""Validation: force measured and predicted (Fig. 9), error without friction (Fig. 4), tables."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from bampipe.report import style, verdicts, wording
+from bampipe.report.document import Block, Figure, Section, Table, Text
+from bampipe.report.results import Results
+
+TITLE = "Validation"
+_WINDOW_S = 12.0
+_SETTLE_S = 1.0
+
+
+def section(results: Results) -> Section:
+    """Return the section."""
+    content = results.json(results.of_model("validate.json"))
+    if content is None:
+        command = f"`bampipe validate {results.root.name}`"
+        text = f"Predicted and measured force have not been compared: {command} does it."
+        return Section(TITLE, (Text(text),))
+    blocks: list[Block] = [_by_axis(results, content)]
+    trials = _by_trial(results, content)
+    if trials is not None:
+        blocks.append(trials)
+    residuals = _shown_trial(results)
+    if residuals is not None:
+        blocks.append(_forces(results, residuals))
+        velocity = _velocity(results, residuals)
+        if velocity:
+            blocks.append(_friction(results, residuals, velocity))
+    return Section(TITLE, tuple(blocks))
+
+
+def _by_axis(results: Results, content: dict[str, Any]) -> Table:
+    axes = content.get("axes", {})
+    rows = []
+    for axis in verdicts.ordered(results, axes):
+        entry = axes[axis]
+        fit = entry.get("fit_percent")
+        rows.append(
+            (
+                axis,
+                wording.significant(entry.get("held_out_rmse")),
+                wording.significant(entry.get("noise_floor")),
+                wording.significant(entry.get("rmse")),
+                wording.significant(entry.get("rmse_without_friction")),
+                "–" if fit is None else wording.plain(float(fit), 1),
+                wording.unit(str(entry.get("unit", results.force_unit(axis)))),
+            )
+        )
+    return Table(
+        f"Error of the predicted force, model `{content.get('model', results.model)}`",
+        (
+            "Axis",
+            "Held-out RMSE",
+            "Noise floor",
+            "RMSE, all trials",
+            "RMSE without friction",
+            "Fit (%)",
+            "Unit",
+        ),
+        tuple(rows),
+        "lrrrrrl",
+        (0.0, 1.0, 1.0, 1.0, 1.2, 0.6, 0.0),
+        "Held out: each trial predicted with parameters that never saw it. Noise floor: what sensor "
+        "noise, quantisation and filtering alone would leave. Fit: share of the measured force "
+        "that is explained, as 100 (1 − RMSE / standard deviation).",
+    )
+
+
+def _by_trial(results: Results, content: dict[str, Any]) -> Table | None:
+    trials = content.get("trials")
+    if not isinstance(trials, dict) or not trials:
+        return None
+    rows = []
+    for name, entry in trials.items():
+        axes = entry.get("axes", entry)
+        cells = []
+        for axis in results.axes:
+            values = axes.get(axis)
+            values = values if isinstance(values, dict) else {}
+            error, floor = (
+                values.get("rmse", values.get("held_out_rmse")),
+                values.get("noise_floor"),
+            )
+            text = wording.significant(error)
+            cells.append(f"{text} ({wording.significant(floor)})" if floor else text)
+        rows.append((name, "yes" if entry.get("held_out") else "no", *cells))
+    units = (f"{axis} ({wording.unit(results.force_unit(axis))})" for axis in results.axes)
+    return Table(
+        "Error by trial: RMSE (noise floor)",
+        ("Trial", "Held out", *units),
+        tuple(rows),
+        "ll" + "r" * len(results.axes),
+        (0.0, 0.0, *(1.0 for _ in results.axes)),
+    )
+
+
+def _shown_trial(results: Results) -> pd.DataFrame | None:
+    """Return the residuals of the first held-out trial, else of the first."""
+    path = results.of_model("residuals.parquet")
+    columns = results.columns(path)
+    if not columns:
+        return None
+    names = ["trial_id", "held_out"] if "held_out" in columns else ["trial_id"]
+    ids = results.table(path, names)
+    if ids is None or ids.empty:
+        return None
+    held = ids[ids["held_out"].astype(bool)] if "held_out" in ids else ids
+    trial = str((held if len(held) else ids)["trial_id"].iloc[0])
+    return results.table(path, trial=trial)
+
+
+def _forces(results: Results, frame: pd.DataFrame) -> Figure:
+    """Fig. 9: forces at the handle where they are stored with and without friction, else joints."""
+    components = [
+        name.removeprefix("force_predicted_without_friction_")
+        for name in frame.columns
+        if str(name).startswith("force_predicted_without_friction_")
+    ]
+    at_handle = bool(components)
+    names = components or [a for a in results.axes if f"torque_measured_{a}" in frame]
+    kind = "force" if at_handle else "torque"
+    figure, panels = style.panels(len(names), 1, 0.45 + 1.4 * len(names), sharex=True)
+    t = frame["t"].to_numpy()
+    window = (t >= t[0] + _SETTLE_S) & (t <= t[0] + _SETTLE_S + _WINDOW_S)
+    part = frame[window] if window.sum() > 10 else frame
+    t = part["t"].to_numpy()
+    for panel, name in zip(panels[:, 0], names, strict=True):
+        for column, title, colour, look in (
+            (f"{kind}_predicted_without_friction_{name}", "predicted without friction",
+             style.ORANGE, {"ls": (0, (4, 1.5)), "lw": 0.9}),
+            (f"{kind}_measured_{name}", "measured", style.INK, {"lw": 1.5, "alpha": 0.75}),
+            (f"{kind}_predicted_{name}", "predicted", style.BLUE, {"lw": 0.9}),
+        ):  # fmt: skip
+            if column in part:
+                style.series(panel, t, part[column].to_numpy(), colour, title, **look)
+        unit = "N" if at_handle else wording.unit(results.force_unit(name))
+        what = f"force {name}" if at_handle else f"{name}, {_noun(results, name)}"
+        panel.set_ylabel(style.label(what, unit))
+    panels[-1, 0].set_xlabel("time (s)")
+    style.legend_below(figure, panels[0, 0])
+    trial = str(frame["trial_id"].iloc[0])
+    where = "the hand's force" if at_handle else "the hand's generalised force at each joint"
+    caption = (
+        f"Trial {trial}{results.as_in('Fig. 9')}: {where}, measured and predicted by the inverse "
+        "dynamics, with and without its friction terms."
+    )
+    return Figure("force-prediction", caption, style.svg(figure))
+
+
+def _noun(results: Results, axis: str) -> str:
+    return "torque" if results.is_rotary(axis) else "force"
+
+
+def _velocity(results: Results, residuals: pd.DataFrame) -> dict[str, np.ndarray]:
+    """Return the velocity of each axis at the times of the residuals, where it is stored."""
+    axes = [
+        axis
+        for axis in results.axes
+        if f"torque_predicted_without_friction_{axis}" in residuals
+        and f"qd_{axis}" in results.columns("filter/kinematics.parquet")
+    ]
+    trial = str(residuals["trial_id"].iloc[0])
+    frame = results.table(
+        "filter/kinematics.parquet",
+        ["t", *(f"qd_{axis}" for axis in axes)],
+        trial=trial,
+    )
+    if not axes or frame is None or frame.empty:
+        return {}
+    t = residuals["t"].to_numpy()
+    known = frame["t"].to_numpy()
+    return {axis: np.interp(t, known, frame[f"qd_{axis}"].to_numpy()) for axis in axes}
+
+
+def _one_movement(speed: np.ndarray) -> slice:
+    """Return the stretch around the fastest moment, from rest to rest."""
+    peak = int(np.argmax(np.abs(speed)))
+    sign = np.sign(speed[peak])
+    still = np.flatnonzero(sign * speed <= 0.01 * abs(speed[peak]))
+    before, after = still[still < peak], still[still > peak]
+    start = int(before[-1]) if len(before) else 0
+    stop = int(after[0]) + 1 if len(after) else len(speed)
+    margin = (stop - start) // 8
+    return slice(max(0, start - margin), min(len(speed), stop + margin))
+
+
+def _friction(results: Results, frame: pd.DataFrame, velocity: dict[str, np.ndarray]) -> Figure:
+    axes = list(velocity)
+    figure, panels = style.panels(2, len(axes), 4.3, width=min(style.WIDTH, 3.0 * len(axes)))
+    t = frame["t"].to_numpy()
+    for column, axis in enumerate(axes):
+        measured = frame[f"torque_measured_{axis}"].to_numpy()
+        without = frame[f"torque_predicted_without_friction_{axis}"].to_numpy()
+        error = measured - without
+        one = _one_movement(velocity[axis])
+        keep = style.pick(len(error), 2500)
+        speed, unit = velocity[axis], wording.unit(results.rate_unit(axis))
+        top, bottom = panels[0, column], panels[1, column]
+        top.plot(speed[keep], error[keep], ".", ms=1.3, mew=0, color=style.BLUE, alpha=0.6,
+                 label="whole trial", rasterized=False)  # fmt: skip
+        top.plot(speed[one], error[one], color=style.VERMILLION, lw=1.2, label="one movement")
+        _arrow(top, speed[one], error[one])
+        force = wording.unit(results.force_unit(axis))
+        top.set_title(axis)
+        top.set_xlabel(style.label("velocity", unit))
+        top.set_ylabel(style.label(f"{_noun(results, axis)} error", force))
+        style.limits(top, [np.quantile(error, [0.001, 0.999]), error[one]])
+        shown = t[one] - t[one][0]
+        bottom.plot(shown, measured[one], color=style.INK, lw=1.4, label="measured")
+        bottom.plot(shown, without[one], color=style.ORANGE, ls=(0, (4, 1.5)), lw=1.1,
+                    label="predicted without friction")  # fmt: skip
+        bottom.axhline(0.0, color=style.INK, lw=0.5)
+        bottom.set_xlabel("time (s)")
+        bottom.set_ylabel(style.label(_noun(results, axis), force))
+    top_handles, top_names = panels[0, 0].get_legend_handles_labels()
+    more_handles, more_names = panels[1, 0].get_legend_handles_labels()
+    style.legend_of(figure, top_handles + more_handles, top_names + more_names)
+    caption = (
+        f"The friction that a model without it leaves{results.as_in('Fig. 4')}. Top: measured minus "
+        "predicted generalised force against velocity; the arrow shows the start of one movement. "
+        "Bottom: that movement; without friction the prediction overshoots zero."
+    )
+    return Figure("error-without-friction", caption, style.svg(figure))
+
+
+def _arrow(panel: Any, x: np.ndarray, y: np.ndarray) -> None:
+    if len(x) < 12:
+        return
+    start = len(x) // 5
+    ahead = start + max(2, len(x) // 25)
+    panel.annotate(
+        "", xy=(x[ahead], y[ahead]), xytext=(x[start], y[start]),
+        arrowprops={"arrowstyle": "-|>", "color": style.VERMILLION, "lw": 1.2, "mutation_scale": 9},
+    )  # fmt: skip

@@ -1,0 +1,166 @@
+"""How figures look: size, colours that colour-blind readers tell apart, and the SVG they become.
+
+Colours are those of Okabe and Ito (2008). Lines that matter also differ in dash or width.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from bampipe.report import wording
+
+INK = "#1c2024"
+FAINT = "#b4b8bd"
+BLUE = "#0072b2"
+VERMILLION = "#d55e00"
+GREEN = "#009e73"
+ORANGE = "#e69f00"
+SKY = "#56b4e9"
+PURPLE = "#cc79a7"
+
+SERIES = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY)
+"""Colours of axes, components or models, in their order."""
+
+COLOURS = {
+    "ink": INK,
+    "faint": FAINT,
+    "blue": BLUE,
+    "vermillion": VERMILLION,
+    "green": GREEN,
+    "orange": ORANGE,
+    "sky": SKY,
+    "purple": PURPLE,
+}
+"""All colours in use, by the name that the page's style sheet gives them."""
+
+WIDTH = 6.69
+"""Width of the text in print, inches: figures are drawn at the size at which they are printed."""
+
+_SETTINGS = {
+    "font.family": "DejaVu Sans",
+    "font.size": 7.5,
+    "axes.titlesize": 8.0,
+    "axes.titleweight": "bold",
+    "axes.labelsize": 7.5,
+    "legend.fontsize": 7.0,
+    "legend.frameon": False,
+    "legend.handlelength": 1.8,
+    "xtick.labelsize": 7.0,
+    "ytick.labelsize": 7.0,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.linewidth": 0.6,
+    "axes.edgecolor": INK,
+    "axes.labelcolor": INK,
+    "axes.titlecolor": INK,
+    "text.color": INK,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "xtick.major.width": 0.6,
+    "ytick.major.width": 0.6,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": FAINT,
+    "grid.alpha": 0.35,
+    "grid.linewidth": 0.5,
+    "lines.linewidth": 1.0,
+    "figure.facecolor": "none",
+    "axes.facecolor": "none",
+    "savefig.facecolor": "none",
+    "axes.unicode_minus": True,
+    "axes.formatter.useoffset": False,
+    "svg.fonttype": "path",
+    "svg.hashsalt": "bampipe",
+    "path.simplify": True,
+    "path.simplify_threshold": 0.2,
+}
+
+
+def panels(
+    rows: int,
+    columns: int,
+    height: float,
+    *,
+    width: float = WIDTH,
+    sharex: bool | str = False,
+) -> tuple[Figure, np.ndarray]:
+    """Return a figure of ``rows`` by ``columns`` panels.
+
+    Args:
+        rows: number of rows.
+        columns: number of columns.
+        height: of the whole figure, inches.
+        width: of the whole figure, inches.
+        sharex: as matplotlib has it ("col": one time axis a column).
+
+    Returns:
+        The figure and its axes, (rows, columns).
+    """
+    with mpl.rc_context(_SETTINGS):
+        figure = Figure(figsize=(width, height), layout="constrained")
+        axes = figure.subplots(rows, columns, squeeze=False, sharex=sharex)
+    return figure, axes
+
+
+def svg(figure: Figure) -> str:
+    """Return the figure as SVG: the same figure gives the same text."""
+    buffer = io.StringIO()
+    with mpl.rc_context(_SETTINGS):
+        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
+    return buffer.getvalue()
+
+
+def label(quantity: str, unit: str) -> str:
+    """Return the label of an axis: quantity and unit, the latter as printed."""
+    return f"{quantity} ({unit})" if unit else quantity
+
+
+def pick(length: int, most: int) -> slice:
+    """Return every so-manieth sample, so that at most about ``most`` are drawn."""
+    return slice(0, length, max(1, -(-length // most)))
+
+
+def series(
+    axes: Axes, x: np.ndarray, y: np.ndarray, colour: str, name: str, **more: object
+) -> None:
+    """Draw a time series, thinned to what a printed line can show."""
+    keep = pick(len(x), 2000)
+    axes.plot(x[keep], y[keep], color=colour, label=name, **more)  # type: ignore[arg-type]
+
+
+def limits(axes: Axes, values: Sequence[np.ndarray], *, zero: bool = False) -> None:
+    """Set the vertical range to hold all finite ``values`` with a margin, zero too if asked."""
+    joined = np.concatenate([np.asarray(item, dtype=float).ravel() for item in values])
+    joined = joined[np.isfinite(joined)]
+    if not joined.size:
+        return
+    low, high = float(joined.min()), float(joined.max())
+    if zero:
+        low, high = min(low, 0.0), max(high, 0.0)
+    margin = 0.06 * (high - low) or 0.1 * abs(high) or 1.0
+    axes.set_ylim(low if zero and low == 0.0 else low - margin, high + margin)
+
+
+def legend_below(figure: Figure, axes: Axes, columns: int = 4) -> None:
+    """Put one legend below all panels: nothing is covered."""
+    legend_of(figure, *axes.get_legend_handles_labels(), columns=columns)
+
+
+def legend_of(figure: Figure, handles: list[Any], names: list[str], columns: int = 4) -> None:
+    """Put a legend of these entries below all panels."""
+    with mpl.rc_context(_SETTINGS):
+        figure.legend(handles, names, loc="outside lower center", ncols=min(columns, len(names)))
+
+
+def scaled(values: np.ndarray, unit: str) -> tuple[np.ndarray, str]:
+    """Return the values and the unit with a prefix that suits them."""
+    finite = values[np.isfinite(values)]
+    factor, shown = wording.scale([float(np.max(np.abs(finite)))] if finite.size else [], unit)
+    return values * factor, shown

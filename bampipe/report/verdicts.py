@@ -1,0 +1,103 @@
+"""What a session's results amount to, in words: as stored by the stages, worst axis first."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from bampipe.report import wording
+from bampipe.report.document import Callout
+from bampipe.report.results import Results
+
+NEAR_FLOOR = 1.15
+"""A held-out error below this many noise floors counts as at the floor."""
+
+IN_WORDS = {
+    "nothing_missing": "nothing missing",
+    "missing": "an effect is missing",
+    "unknown_effect": "an effect that no library entry explains",
+}
+
+
+def above_floor(results: Results, model: str) -> dict[str, float] | None:
+    """Return, by axis, held-out error over noise floor; None where it was not validated."""
+    content = results.json(results.of_model("validate.json", model))
+    if content is None:
+        return None
+    found: dict[str, float] = {}
+    for axis in ordered(results, content.get("axes", {})):
+        entry = content["axes"][axis]
+        error, floor = entry.get("held_out_rmse"), entry.get("noise_floor")
+        if error is not None and floor:
+            found[axis] = float(error) / float(floor)
+    return found
+
+
+def ordered(results: Results, by_axis: dict[str, Any]) -> tuple[str, ...]:
+    """Return the axes in ``by_axis`` in the order of the session."""
+    return tuple(axis for axis in results.axes if axis in by_axis)
+
+
+def overall(results: Results) -> Callout:
+    """Return the verdict on the session."""
+    diagnosis = results.json(results.of_model("diagnose.json"))
+    if diagnosis is not None:
+        return _diagnosed(results, diagnosis)
+    ratios = above_floor(results, results.model)
+    if ratios is None:
+        done = "identified" if results.models else "read"
+        return Callout(
+            "note",
+            f"The session has been {done}, not validated",
+            f"`bampipe validate {results.root.name}` compares measured and predicted force.",
+        )
+    if not ratios:
+        return Callout(
+            "note",
+            "No held-out error",
+            "The parameters have seen every trial, or no noise floor could be found, so nothing "
+            "can be said about what the model would do on a new trial.",
+        )
+    high = {axis: ratio for axis, ratio in ratios.items() if ratio > NEAR_FLOOR}
+    if not high:
+        return Callout(
+            "good",
+            "The model explains this session down to its noise floor",
+            "On trials that the parameters never saw, the error is what sensor noise, quantisation "
+            f"and filtering alone would leave ({_ratios(ratios)}).",
+        )
+    return Callout(
+        "attention",
+        f"The model leaves something unexplained on {wording.listing(high)}",
+        f"On trials that the parameters never saw, the error is {_ratios(high)}. "
+        f"`bampipe diagnose {results.root.name}` says which effect is missing.",
+    )
+
+
+def _ratios(ratios: dict[str, float]) -> str:
+    parts = (f"{axis} {wording.significant(ratio, 3)} ×" for axis, ratio in ratios.items())
+    return f"{wording.listing(parts)} the noise floor"
+
+
+def _diagnosed(results: Results, diagnosis: dict[str, Any]) -> Callout:
+    axes = diagnosis.get("axes", {})
+    found = {axis: str(axes[axis].get("verdict", "")) for axis in ordered(results, axes)}
+    by_verdict = {
+        verdict: [axis for axis in found if found[axis] == verdict] for verdict in IN_WORDS
+    }
+    effects = results.effects(results.model)
+    with_effects = f" with {wording.listing(f'`{name}`' for name in effects)}" if effects else ""
+    sentence = str(diagnosis.get("sentence") or "")
+    if by_verdict["missing"]:
+        selected = [str(name) for name in diagnosis.get("selected") or ()]
+        what = wording.listing(f"`{name}`" for name in selected) or "an effect"
+        where = wording.listing(by_verdict["missing"])
+        return Callout("attention", f"The model{with_effects} lacks {what} ({where})", sentence)
+    if by_verdict["unknown_effect"]:
+        where = wording.listing(by_verdict["unknown_effect"])
+        return Callout(
+            "unknown",
+            f"Something that no known effect explains acts on {where}",
+            sentence,
+        )
+    title = f"The model{with_effects} explains this session: nothing is missing"
+    return Callout("good", title, sentence)

@@ -1,0 +1,132 @@
+"""Numbers, units and names as a reader wants them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+_POWERS = {"2": "²", "3": "³"}
+_PREFIXES = ((1e-6, "µ"), (1e-3, "m"), (1.0, ""), (1e3, "k"), (1e6, "M"))
+_PREFIXED = ("rad", "m", "N", "Pa")
+"""Units that take a prefix when they lead; kg already has one."""
+
+
+def unit(text: str) -> str:
+    """Return a unit as printed: ``N.m.s/rad`` gives ``N·m·s/rad``, ``m/s2`` gives ``m/s²``."""
+    shown = text.replace(".", "·").replace("*", "·").replace("^", "")
+    return "".join(
+        _POWERS[mark] if mark in _POWERS and before.isalpha() else mark
+        for before, mark in zip(" " + shown, shown, strict=False)
+    )
+
+
+def scale(values: Iterable[float], base: str) -> tuple[float, str]:
+    """Return the factor and the unit that bring the largest of ``values`` to 0.1 … 1000.
+
+    Args:
+        values: finite numbers in the unit ``base``.
+        base: a unit such as ``rad/s`` or ``N.m/rad``.
+    """
+    largest = max((abs(value) for value in values), default=0.0)
+    first = base.replace("/", ".").split(".")[0]
+    if first not in _PREFIXED or largest == 0.0:
+        return 1.0, unit(base)
+    fitting = [item for item in _PREFIXES if largest >= 0.1 * item[0]]
+    size, letter = fitting[-1] if fitting else _PREFIXES[0]
+    if size == 1e3 and largest < 1e3:
+        size, letter = 1.0, ""
+    if size == 1e6 and largest < 1e6:
+        size, letter = 1e3, "k"
+    return 1.0 / size, letter + unit(base)
+
+
+def plain(value: float, decimals: int) -> str:
+    """Return ``value`` with so many decimals and a true minus sign."""
+    text = f"{value:.{decimals}f}"
+    if float(text) == 0.0:
+        text = text.removeprefix("-")
+    return text.replace("-", "−")
+
+
+def significant(value: float | None, digits: int = 3) -> str:
+    """Return ``value`` with so many significant digits; a dash for none."""
+    if value is None or not math.isfinite(value):
+        return "–"
+    if value == 0.0:
+        return "0"
+    exponent = math.floor(math.log10(abs(float(f"{value:.{digits - 1}e}"))))
+    if exponent < -5 or exponent > 6:
+        mantissa = plain(value / 10.0**exponent, digits - 1)
+        raised = "".join("⁻⁰¹²³⁴⁵⁶⁷⁸⁹"["-0123456789".index(mark)] for mark in str(exponent))
+        return f"{mantissa}·10{raised}"
+    return plain(value, max(0, digits - 1 - exponent))
+
+
+def decimals_for(sd: float | None, value: float) -> int:
+    """Return how many decimals of ``value`` mean something: those of two digits of ``sd``."""
+    size = abs(sd) if sd is not None and math.isfinite(sd) else 0.0
+    if size == 0.0:
+        if value == 0.0 or not math.isfinite(value):
+            return 0
+        return max(0, 3 - math.floor(math.log10(abs(value))))
+    return min(9, max(0, 1 - math.floor(math.log10(float(f"{size:.1e}")))))
+
+
+def with_sd(value: float | None, sd: float | None) -> str:
+    """Return ``value ± sd``, both rounded to two digits of ``sd``."""
+    if value is None or not math.isfinite(value):
+        return "–"
+    decimals = decimals_for(sd, value)
+    if sd is None or not math.isfinite(sd) or sd == 0.0:
+        return plain(value, decimals)
+    return f"{plain(value, decimals)} ± {plain(sd, decimals)}"
+
+
+def interval(low: float, high: float, sd: float | None) -> str:
+    """Return ``low to high``, rounded as :func:`with_sd` rounds."""
+    decimals = decimals_for(sd if sd else (high - low) / 4.0, low)
+    return f"{plain(low, decimals)} to {plain(high, decimals)}"
+
+
+def percent(share: float | None) -> str:
+    """Return a share (1 is all) in percent."""
+    if share is None or not math.isfinite(share):
+        return "–"
+    size = 100.0 * share
+    return f"{plain(size, 0 if abs(size) >= 10.0 else 1)} %"
+
+
+def probability(value: float | None) -> str:
+    """Return a p-value, three decimals at most."""
+    if value is None or not math.isfinite(value):
+        return "–"
+    return "< 0.001" if value < 0.001 else significant(value, 2)
+
+
+def words(name: str) -> str:
+    """Return a name from a file as words: ``brake_residual_torque`` with spaces."""
+    return name.replace("_", " ")
+
+
+def listing(items: Iterable[str]) -> str:
+    """Return ``a, b and c``."""
+    found = list(items)
+    if len(found) < 2:
+        return "".join(found)
+    return f"{', '.join(found[:-1])} and {found[-1]}"
+
+
+def count(number: int, noun: str) -> str:
+    """Return ``1 trial``, ``2 trials``."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
+_BASE_PARAMETERS = {"viscous": "viscous damping", "coulomb": "Coulomb friction"}
+
+
+def parameter(name: str) -> str:
+    """Return the name of a parameter in words: ``viscous.yaw`` is "Viscous damping, yaw"."""
+    parts = name.split(".")
+    first = _BASE_PARAMETERS.get(parts[0], words(parts[0]))
+    shown = ", ".join([first, *(words(part) for part in parts[1:])])
+    return shown[:1].upper() + shown[1:]

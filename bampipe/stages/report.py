@@ -1,0 +1,76 @@
+"""Stage report: the stored results as a PDF, a page for the browser, and figures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from bampipe.stages.base import Progress, RunFolder
+
+NAME = "report"
+SUMMARY = "PDF and web page of everything found so far"
+
+_PER_MODEL = (
+    "model.toml",
+    "identify.json",
+    "trace.parquet",
+    "states.parquet",
+    "validate.json",
+    "residuals.parquet",
+    "diagnose.json",
+)
+
+
+@dataclass(frozen=True)
+class Config:
+    """What the stage can be told.
+
+    Attributes:
+        detail_model: the model whose parameters and predictions are shown in detail; "" for the
+            last of the ladder (the base model where there is no other).
+    """
+
+    detail_model: str = ""
+
+
+def inputs(config: Config) -> tuple[str, ...]:
+    """Return the paths the stage reads.
+
+    ``run.json`` is read too, for the page on provenance. It is not declared, for it changes with
+    every run: whatever in it bears on a result comes through the other files.
+    """
+    return (
+        "ingest/session.json",
+        "ingest/trials.parquet",
+        "filter/filter.json?",
+        "filter/kinematics.parquet?",
+        "stiffness/stiffness.json?",
+        "stiffness/loops.parquet?",
+        *(f"models/*/{name}" for name in _PER_MODEL),
+        "compare.json?",
+    )
+
+
+def outputs(config: Config) -> tuple[str, ...]:
+    """Return the paths the stage writes."""
+    return ("report/report.pdf", "report/report.html", "report/figures/*.svg")
+
+
+def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
+    """Write the report of whatever stages have run; ingest must have."""
+    # matplotlib is slow to import: only here, so that other commands do not wait for it
+    from bampipe.report.build import build
+    from bampipe.report.results import Results
+
+    report = build(Results(run.root, config.detail_model), progress)
+    folder = out / "report"
+    (folder / "figures").mkdir(parents=True, exist_ok=True)
+    (folder / "report.pdf").write_bytes(report.pdf)
+    (folder / "report.html").write_text(report.html, encoding="utf-8")
+    for name, svg in report.figures.items():
+        (folder / "figures" / f"{name}.svg").write_text(svg, encoding="utf-8")
+    return {
+        "sections": list(report.sections),
+        "figures": sorted(report.figures),
+        "headline": f"report/report.pdf and report/report.html, {len(report.figures)} figures",
+    }
