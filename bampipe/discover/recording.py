@@ -1,0 +1,100 @@
+"""A trial as its sensors gave it, and the motion that filtering makes of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.estimate.butterworth import zero_phase
+from bampipe.physics import System
+from bampipe.physics.effect import derivative
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Sensors:
+    """What lies between the mechanism and a recording.
+
+    Attributes:
+        rate_hz: sampling rate.
+        resolution: of each encoder, (n_q,), rad or m.
+        force_sd: noise of the force channels, (n_f,), N; zero where it is not known.
+        cutoff_hz: of the filter that velocities, accelerations and force rates go through.
+    """
+
+    rate_hz: float
+    resolution: Array
+    force_sd: Array
+    cutoff_hz: float = 25.0
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One trial on a uniform grid, SI units.
+
+    Attributes:
+        trial_id: its name.
+        q: encoder readings, (T, n_q), rad or m.
+        force: force channels, (T, n_f), N.
+        brake: brake commands in the order of the coordinates, (T, n_q), N.m or N; zeros where
+            an axis has none.
+    """
+
+    trial_id: str
+    q: Array
+    force: Array
+    brake: Array
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A recording with its derivatives; one row a sample.
+
+    Attributes:
+        trial_id: its name.
+        t: time since the start of the trial, (T,), s.
+        q, qd, qdd: (T, n_q), rad or m and derivatives.
+        channels: every input that a model may use, by name, each (T,).
+    """
+
+    trial_id: str
+    t: Array
+    q: Array
+    qd: Array
+    qdd: Array
+    channels: Mapping[str, Array]
+
+    def inputs(self, names: Sequence[str]) -> Array:
+        """The channels called ``names`` as columns, (T, len(names))."""
+        return np.column_stack([self.channels[name] for name in names])
+
+
+def observe(recording: Recording, sensors: Sensors, system: System) -> Motion:
+    """Filter a recording the way every recording, measured or replayed, is filtered.
+
+    Positions come back unfiltered, velocities and accelerations through a zero-phase Butterworth
+    filter at ``sensors.cutoff_hz``; the force itself unfiltered, its derivatives like velocities.
+    """
+    device = system.model.device
+    rate, cutoff = sensors.rate_hz, sensors.cutoff_hz
+    columns = [zero_phase(column, rate, cutoff) for column in recording.q.T]
+    t = np.arange(len(recording.q)) / rate
+    channels: dict[str, Array] = {"t": t}
+    for name, column in zip(device.forces, recording.force.T, strict=True):
+        _, first, second = zero_phase(column, rate, cutoff)
+        channels |= {name: column, derivative(name, 1): first, derivative(name, 2): second}
+    for i, axis in enumerate(system.coordinates):
+        if axis in device.brakes:
+            channels[device.brakes[axis]] = recording.brake[:, i]
+    return Motion(
+        recording.trial_id,
+        t,
+        np.column_stack([c[0] for c in columns]),
+        np.column_stack([c[1] for c in columns]),
+        np.column_stack([c[2] for c in columns]),
+        channels,
+    )
