@@ -7,7 +7,7 @@ import importlib
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from bampipe.report import page, typeset
+from bampipe.report import page, style, typeset
 from bampipe.report.document import Document, Figure, Section
 from bampipe.report.results import Results
 from bampipe.report.sections import SECTIONS
@@ -44,7 +44,8 @@ def build(results: Results, progress: Callable[[float, str], None]) -> Report:
     for number, name in enumerate(SECTIONS):
         progress(0.7 * number / len(SECTIONS), name)
         module = importlib.import_module(f"bampipe.report.sections.{name}")
-        section: Section | None = module.section(results)
+        with style.look():
+            section: Section | None = module.section(results)
         if section is not None:
             sections.append(section)
     document = Document(

@@ -109,24 +109,11 @@ class Results:
 
     @cached_property
     def axes(self) -> tuple[str, ...]:
-        """Names of the axes, in the order of the session (JSON sorts them: encoder order)."""
+        """Names of the axes, in the order of the recorded channels (JSON sorts them)."""
         found = [str(name) for name in self.session.get("axes", {})]
-        order = [
-            str(name).removeprefix("q_")
-            for name in self.columns("filter/kinematics.parquet")
-            if str(name).startswith("q_") and not str(name).startswith("q_sd_")
-        ]
+        channels = self.columns("ingest/samples.parquet")
+        order = [name.removeprefix("q_") for name in channels if name.startswith("q_")]
         return tuple(sorted(found, key=lambda axis: (order + found).index(axis)))
-
-    @cached_property
-    def components(self) -> tuple[str, ...]:
-        """Names of the force components, in their order."""
-        skip = ("force_rate_", "force_curvature_")
-        return tuple(
-            name.removeprefix("force_")
-            for name in self.columns("filter/kinematics.parquet")
-            if name.startswith("force_") and not name.startswith(skip)
-        )
 
     def unit(self, axis: str) -> str:
         """Return the unit of the position of ``axis``."""

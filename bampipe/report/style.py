@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from typing import Any
 
 import matplotlib as mpl
@@ -83,6 +84,11 @@ _SETTINGS = {
 }
 
 
+def look() -> AbstractContextManager[None]:
+    """Return the context in which figures are drawn: nothing of a user's own settings counts."""
+    return mpl.rc_context({**mpl.rcParamsDefault, **_SETTINGS, "backend": "svg"})
+
+
 def panels(
     rows: int,
     columns: int,
@@ -103,17 +109,15 @@ def panels(
     Returns:
         The figure and its axes, (rows, columns).
     """
-    with mpl.rc_context(_SETTINGS):
-        figure = Figure(figsize=(width, height), layout="constrained")
-        axes = figure.subplots(rows, columns, squeeze=False, sharex=sharex)
+    figure = Figure(figsize=(width, height), layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False, sharex=sharex)
     return figure, axes
 
 
 def svg(figure: Figure) -> str:
     """Return the figure as SVG: the same figure gives the same text."""
     buffer = io.StringIO()
-    with mpl.rc_context(_SETTINGS):
-        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
+    figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
     return buffer.getvalue()
 
 
@@ -155,8 +159,7 @@ def legend_below(figure: Figure, axes: Axes, columns: int = 4) -> None:
 
 def legend_of(figure: Figure, handles: list[Any], names: list[str], columns: int = 4) -> None:
     """Put a legend of these entries below all panels."""
-    with mpl.rc_context(_SETTINGS):
-        figure.legend(handles, names, loc="outside lower center", ncols=min(columns, len(names)))
+    figure.legend(handles, names, loc="outside lower center", ncols=min(columns, len(names)))
 
 
 def scaled(values: np.ndarray, unit: str) -> tuple[np.ndarray, str]:

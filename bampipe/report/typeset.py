@@ -7,6 +7,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Iterator
+from itertools import count
 from pathlib import Path
 
 import typst
@@ -80,10 +81,7 @@ def content(document: Document) -> dict[str, object]:
 
 def numbering() -> dict[type, Iterator[str]]:
     """Return counters for figures and tables."""
-    return {
-        kind: (f"{kind.__name__} {number}" for number in range(1, 10_000))
-        for kind in (Figure, Table)
-    }
+    return {kind: map(f"{kind.__name__} {{}}".format, count(1)) for kind in (Figure, Table)}
 
 
 def next_number(numbers: dict[type, Iterator[str]], block: Block) -> str:

@@ -42,6 +42,7 @@ def inputs(config: Config) -> tuple[str, ...]:
     return (
         "ingest/session.json",
         "ingest/trials.parquet",
+        "ingest/samples.parquet?",
         "filter/filter.json?",
         "filter/kinematics.parquet?",
         "stiffness/stiffness.json?",

@@ -21,7 +21,6 @@ def section(results: Results) -> Section | None:
             ("Quantity", "Place", "Paper", "This session", "Unit"),
             rows,
             "llrrl",
-            (1.0, 0.0, 0.0, 0.0, 0.0),
         )
     ]
     comparison = paper.get("comparison")

@@ -1,0 +1,325 @@
+"""Run folders with made-up results of every stage, for the tests of the report.
+
+The numbers mean nothing; files and fields are those that the stages leave.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from bampipe.data.store import write_json, write_parquet, write_text
+
+AXES = ("yaw", "pitch", "extension")
+TORQUE_UNIT = {"yaw": "N.m", "pitch": "N.m", "extension": "N"}
+FREE = ("t01_free", "t02_free", "t03_free")
+BASE = {
+    "viscous.yaw": (4.1712, 0.1283, "N.m.s/rad"),
+    "coulomb.yaw": (1.0864, 0.1031, "N.m"),
+    "viscous.pitch": (3.7521, 0.2962, "N.m.s/rad"),
+    "coulomb.pitch": (2.2541, 0.1092, "N.m"),
+    "viscous.extension": (13.3712, 0.4273, "N.s/m"),
+    "coulomb.extension": (3.5713, 0.1031, "N"),
+    "mass": (3.5521, 0.0132, "kg"),
+}
+ADDED = {
+    "stribeck.yaw.force": (1.0212, 0.0643, "N.m"),
+    "stribeck.yaw.speed": (0.0513, 0.0042, "rad/s"),
+}
+CHILD = "base+stribeck.yaw"
+RATE = 100.0
+SECONDS = 16.0
+
+
+def write_all(root: Path) -> Path:
+    """Write a session whose yaw lacked Stribeck friction, diagnosed and extended."""
+    write_ingest(root)
+    write_filter(root)
+    write_stiffness(root)
+    for model in ("base", CHILD):
+        write_model(root, model)
+        write_validation(root, model)
+        write_diagnosis(root, model)
+    write_comparison(root)
+    write_record(root)
+    return root
+
+
+def write_ingest(root: Path, trials: tuple[str, ...] = FREE) -> None:
+    """Write what ingest leaves; one trial repaired, one set aside."""
+    rows = [_trial(name, "free") for name in trials]
+    rows[-1] |= {"status": "repaired", "repairs": "12 samples missing at 3.2 s: interpolated"}
+    rows.append(_trial("t04_free", "free") | {"status": "set_aside", "reason": "force_x frozen"})
+    rows.append(_trial("t05_locked_yaw", "locked") | {"locked_axis": "yaw"})
+    write_parquet(root / "ingest/trials.parquet", pd.DataFrame(rows))
+    columns = {f"q_{axis}": [0.0] for axis in AXES}
+    samples = {"trial_id": [trials[0]], "t": [0.0], **columns}
+    write_parquet(root / "ingest/samples.parquet", pd.DataFrame(samples))
+    units = {"yaw": ("rad", 47e-6), "pitch": ("rad", 98e-6), "extension": ("m", 30e-6)}
+    session = {
+        "session_id": root.name,
+        "device": "bam",
+        "axes": {axis: {"unit": u, "resolution": r} for axis, (u, r) in units.items()},
+        "force": {"noise_sd": 0.05, "unit": "N", "columns": ["force_x", "force_y", "force_z"]},
+        "sample_rate_hz": RATE,
+        "recorded_at": "2026-10-03T10:12:00+00:00",
+    }
+    write_json(root / "ingest/session.json", session)
+
+
+def _trial(name: str, kind: str) -> dict[str, object]:
+    return {
+        "trial_id": name, "file": f"trials/{name}.csv", "kind": kind, "locked_axis": None,
+        "viscous_n_s_per_m": None, "n_samples": int(SECONDS * RATE), "duration_s": SECONDS,
+        "sample_rate_hz": RATE, "status": "ok", "reason": "", "repairs": "",
+    }  # fmt: skip
+
+
+def motion(number: int) -> pd.DataFrame:
+    """Return t, positions and velocities of one made-up trial."""
+    t = np.arange(0.0, SECONDS, 1.0 / RATE)
+    columns = {"t": t}
+    for place, axis in enumerate(AXES):
+        speed = 2.0 * np.pi * (0.21 + 0.13 * place + 0.02 * number)
+        size = (0.6, 0.4, 0.2)[place]
+        offset = (0.0, 0.05, 1.1)[place]
+        columns[f"q_{axis}"] = offset + size * np.sin(speed * t) * np.sin(0.3 * t)
+        columns[f"qd_{axis}"] = np.gradient(columns[f"q_{axis}"], t)
+    return pd.DataFrame(columns)
+
+
+def _by_trial(frame_of: object) -> pd.DataFrame:
+    parts = []
+    for number, name in enumerate(FREE):
+        frame = frame_of(number)  # type: ignore[operator]
+        frame.insert(0, "trial_id", name)
+        parts.append(frame)
+    return pd.concat(parts, ignore_index=True)
+
+
+def write_filter(root: Path) -> None:
+    """Write what the filter stage leaves."""
+    write_parquet(root / "filter/kinematics.parquet", _by_trial(motion))
+    axes = {
+        axis: {
+            "unit": "m" if axis == "extension" else "rad", "bandwidth_hz": 23.4,
+            "resolution": 47e-6, "position_sd": 4.4e-6, "velocity_sd": 0.36e-3,
+            "acceleration_sd": 0.046,
+        }
+        for axis in AXES
+    }  # fmt: skip
+    content = {"method": "kalman", "method_reason": "default", "axes": axes, "skipped": {}}
+    write_json(root / "filter/filter.json", content)
+
+
+def write_stiffness(root: Path) -> None:
+    """Write one axis with its loops."""
+    phase = np.linspace(0.0, 6.0 * np.pi, 1200)
+    torque = 45.0 * np.sin(phase)
+    deflection = torque / 2300.0 + 1e-3 * np.sign(np.cos(phase))
+    loops = pd.DataFrame(
+        {
+            "trial_id": "t05_locked_yaw", "axis": "yaw", "cycle": (phase // (2 * np.pi)),
+            "branch": np.where(np.cos(phase) > 0, "rising", "falling"), "t": phase,
+            "torque": torque, "deflection": deflection, "post_yield": np.abs(torque) < 30.0,
+        }
+    )  # fmt: skip
+    write_parquet(root / "stiffness/loops.parquet", loops)
+    yaw = {
+        "stiffness": 2304.2, "sd": 13.1, "unit": "N.m/rad", "n_cycles": 3,
+        "bandwidth_rad_s": 25.13, "bandwidth_hz": 4.0, "bandwidth_pose": "recorded",
+        "poses": {"recorded": {"yaw": 0.1, "pitch": 0.05, "extension": 1.1}},
+        "loop_width": 5.53, "loop_width_unit": "N.m", "energy_per_cycle": 0.197, "energy_unit": "J",
+    }  # fmt: skip
+    write_json(root / "stiffness/stiffness.json", {"axes": {"yaw": yaw}, "notes": []})
+
+
+def parameters(model: str) -> dict[str, tuple[float, float, str]]:
+    """Return the made-up parameters of ``model``."""
+    return {**BASE, **(ADDED if model == CHILD else {})}
+
+
+def write_model(root: Path, model: str) -> None:
+    """Write what identification leaves."""
+    effects = '["stribeck:yaw"]' if model == CHILD else "[]"
+    text = f'schema = "bampipe.model/1"\nname = "{model}"\ndevice = "bam"\neffects = {effects}\n'
+    write_text(root / f"models/{model}/model.toml", text)
+    named = {
+        name: {"estimate": value, "sd": sd, "unit": unit}
+        for name, (value, sd, unit) in parameters(model).items()
+    }
+    bounds = {
+        "yaw": {"position": 2.8e-3, "velocity": 43e-3},
+        "pitch": {"position": 5.2e-3, "velocity": 62e-3},
+        "extension": {"position": 0.9e-3, "velocity": 19e-3},
+    }
+    content = {"model": model, "method": "ukf", "parameters": named, "state_3sigma": bounds}
+    write_json(root / f"models/{model}/identify.json", content)
+
+    def states(number: int) -> pd.DataFrame:
+        frame = motion(number)
+        for axis in AXES:
+            frame[f"torque_user_{axis}"] = 4.0 * frame[f"qd_{axis}"]
+        frame["torque_gravity_pitch"] = 20.0 * np.cos(frame["q_pitch"])
+        return frame
+
+    write_parquet(root / f"models/{model}/states.parquet", _by_trial(states))
+    t = np.arange(0.0, SECONDS * len(FREE), 0.05)
+    trace = {
+        "t_total": t,
+        "trial_id": np.array(FREE)[np.minimum((t // SECONDS).astype(int), len(FREE) - 1)],
+    }
+    for name, (value, sd, _) in parameters(model).items():
+        fading = np.exp(-t / 6.0)
+        trace[name] = value + fading * 5.0 * sd * np.cos(t)
+        trace[f"{name}_sd"] = sd * (1.0 + 8.0 * fading)
+    write_parquet(root / f"models/{model}/trace.parquet", pd.DataFrame(trace))
+
+
+def held_out(model: str) -> dict[str, float]:
+    """Return the made-up held-out error of ``model``."""
+    return {"yaw": 0.2117 if model == CHILD else 0.5623, "pitch": 0.2342, "extension": 0.6123}
+
+
+FLOOR = {"yaw": 0.2034, "pitch": 0.2291, "extension": 0.6012}
+
+
+def write_validation(root: Path, model: str) -> None:
+    """Write what validation leaves."""
+    axes = {
+        axis: {
+            "rmse": 0.98 * error, "rmse_without_friction": 3.1234, "held_out_rmse": error,
+            "noise_floor": FLOOR[axis], "fit_percent": 91.24, "unit": TORQUE_UNIT[axis],
+        }
+        for axis, error in held_out(model).items()
+    }  # fmt: skip
+    write_json(root / f"models/{model}/validate.json", {"model": model, "axes": axes})
+
+    def residuals(number: int) -> pd.DataFrame:
+        frame = motion(number)
+        columns: dict[str, object] = {"t": frame["t"], "held_out": number > 0}
+        wave = 0.3 * np.sin(7.0 * frame["t"])
+        for axis in AXES:
+            without = 2.0 * np.gradient(frame[f"qd_{axis}"], frame["t"])
+            friction = 4.0 * frame[f"qd_{axis}"] + np.tanh(frame[f"qd_{axis}"] / 0.01)
+            columns[f"torque_measured_{axis}"] = without + friction + wave
+            columns[f"torque_predicted_{axis}"] = without + friction
+            columns[f"torque_predicted_without_friction_{axis}"] = without
+            columns[f"residual_{axis}"] = wave
+        return pd.DataFrame(columns)
+
+    write_parquet(root / f"models/{model}/residuals.parquet", _by_trial(residuals))
+
+
+def write_diagnosis(root: Path, model: str) -> None:
+    """Write what the diagnosis leaves: Stribeck friction of yaw missing from the base model."""
+    missing = model == "base"
+    axes = {}
+    for axis, error in held_out(model).items():
+        lacking = missing and axis == "yaw"
+        axes[axis] = {
+            "verdict": "missing" if lacking else "nothing_missing",
+            "explainable_share": 0.812 if lacking else 0.013, "explainable_chance": 0.031,
+            "rmse_before": error, "rmse_after": 0.2117 if lacking else error,
+            "noise_floor": FLOOR[axis], "unit": TORQUE_UNIT[axis],
+            "sentence": f"The residual of {axis} "
+            + ("grows as the speed falls to zero." if lacking else "is what the sensors leave."),
+        }  # fmt: skip
+    speed = np.linspace(-0.8, 0.8, 15)
+    size = 1.0 if missing else 0.0
+    maps = {
+        axis: {
+            "velocity": _map("rad/s", speed, size * np.sign(speed) * np.exp(-((speed / 0.1) ** 2))),
+            "position": _map("rad", speed, 0.05 * np.sin(9.0 * speed)),
+            "acceleration": _map("rad/s2", 5.0 * speed, 0.04 * np.cos(5.0 * speed)),
+            "trial": _map("", list(FREE), np.array([0.02, -0.03, 0.01])),
+        }
+        for axis in AXES
+    }
+    ranking = [
+        _candidate("stribeck:yaw", 0.2117, 0.0004, ["presliding:yaw"]),
+        _candidate("presliding:yaw", 0.2323, 0.0021, ["stribeck:yaw"]),
+        _candidate("asymmetric_coulomb:yaw", 0.5589, 0.41, []),
+    ]
+    window = {
+        "axis": "yaw", "trial_id": FREE[1], "t_start": 3.2, "t_end": 3.7, "rmse": 1.234,
+        "doing": "reversing slowly with the arm extended",
+    }  # fmt: skip
+    content = {
+        "model": model,
+        "axes": axes,
+        "ranking": ranking if missing else [],
+        "selected": ["stribeck:yaw"] if missing else [],
+        "suggested_trial": {"sentence": "Move yaw back and forth at 0.02 rad/s for 20 s."}
+        if missing
+        else None,
+        "maps": maps,
+        "worst_windows": [window],
+        "sentence": "Yaw lacks friction that rises as it slows down."
+        if missing
+        else "Nothing that could be explained is left.",
+    }
+    write_json(root / f"models/{model}/diagnose.json", content)
+
+
+def _map(unit: str, centre: object, mean: np.ndarray) -> dict[str, object]:
+    return {
+        "unit": unit, "center": np.asarray(centre).tolist(), "mean": mean.tolist(),
+        "low": (mean - 0.04).tolist(), "high": (mean + 0.04).tolist(), "count": [100] * len(mean),
+    }  # fmt: skip
+
+
+def _candidate(effect: str, after: float, p: float, alike: list[str]) -> dict[str, object]:
+    return {
+        "effect": effect, "axis": "yaw", "held_out_rmse_before": held_out("base")["yaw"],
+        "held_out_rmse_after": after, "p_value": p, "score": 1.0, "indistinguishable_from": alike,
+    }  # fmt: skip
+
+
+def write_comparison(root: Path) -> None:
+    """Write the ladder of the two models."""
+    ladder = [
+        {
+            "model": model, "parent": "base" if model == CHILD else None,
+            "added": "stribeck:yaw" if model == CHILD else None,
+            "held_out_rmse": held_out(model), "noise_floor": FLOOR,
+        }
+        for model in ("base", CHILD)
+    ]  # fmt: skip
+    named: dict[str, dict[str, object]] = {}
+    for model in ("base", CHILD):
+        for name, (value, sd, unit) in parameters(model).items():
+            entry = {"estimate": value, "sd": sd, "unit": unit}
+            named.setdefault(name, {})[model] = entry
+    moved = [
+        {
+            "parameter": "coulomb.yaw", "model": CHILD, "change": -0.21, "sd": 0.1,
+            "sentence": "coulomb.yaw fell by 0.21 N.m, twice its uncertainty.",
+        }
+    ]  # fmt: skip
+    content = {"ladder": ladder, "parameters": named, "moved": moved}
+    write_json(root / "compare.json", content)
+
+
+def write_record(root: Path) -> None:
+    """Write run.json."""
+    hashes = {f"session/trials/{name}.csv": f"{number:x}" * 64 for number, name in enumerate(FREE)}
+    stages = {
+        name: {
+            "state": "done", "key": f"{number}bcdef0123456789", "config": {"model": "base"},
+            "inputs": {"session/session.toml": "a" * 64, **hashes} if name == "ingest" else {},
+            "outputs": {"x": "y"}, "versions": {"bampipe": "0.1.0"},
+        }
+        for number, name in enumerate(("ingest", "filter", "stiffness", "identify:base"))
+    }  # fmt: skip
+    timings = {
+        name: {"started_at": "2026-11-21T07:00:00+00:00", "seconds": 1.25 + number}
+        for number, name in enumerate(stages)
+    }
+    content = {
+        "schema": "bampipe.run/1", "stages": stages, "timings": timings,
+        "versions": {"bampipe": "0.1.0", "python": "3.11.9"},
+    }  # fmt: skip
+    write_json(root / "run.json", content)
