@@ -8,6 +8,8 @@ folder, never inside.
 from __future__ import annotations
 
 import json
+import re
+import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -149,12 +151,19 @@ def simulate_session(out: Path, config: Config, progress: Progress = silent) -> 
         InputError: an effect, parameter or option makes no sense, or ``out`` is not empty.
     """
     _check(config)
-    out = Path(out)
+    out = Path(out).resolve()
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}", out.name):
+        raise InputError(
+            f"{out.name!r} cannot name a session", remedy="use letters, digits, '.', '_' and '-'"
+        )
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError("exists and is not an empty folder", where=str(out))
     plant, strengths = _plant(config)
     trials = _plan(plant.device, config)
-    (out / "trials").mkdir(parents=True, exist_ok=True)
+    try:
+        (out / "trials").mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot make the folder: {error.strerror}", where=str(out)) from error
     for number, trial in enumerate(trials):
         rng = np.random.default_rng([config.seed, 1 + number])
         if trial["kind"] == "locked":
@@ -261,8 +270,6 @@ def _is_delay(item: BoundEffect) -> bool:
 
 
 def _own_effect(path: Path) -> Effect:
-    import tomllib
-
     try:
         return registry.effect_from(tomllib.loads(path.read_text(encoding="utf-8")), str(path))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:

@@ -1,0 +1,147 @@
+"""Forward simulation on a mass with friction whose answers are known by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numba import njit, types
+
+from bampipe.errors import InputError
+from bampipe.estimate.simulation import Impedance, simulate, simulate_tracking
+
+WIDTH = np.array([2.5e-4])
+
+
+@njit(types.void(*[types.float64[::1]] * 5), error_model="numpy")
+def slider(x, u, p, w, dx):
+    """A mass; u: force, brake, force rate; p: mass, viscous, Coulomb."""
+    dx[0] = x[1]
+    drag = p[1] * x[1] + (p[2] + u[1]) * np.tanh(x[1] / 2.5e-4)
+    dx[1] = (u[0] + w[0] - drag) / p[0]
+
+
+def run(u, p, v0=0.0, **options):
+    x0 = np.array([0.0, v0])
+    return simulate(slider, x0, u, np.array(p), 0.002, width=WIDTH, n_noise=1, **options)
+
+
+def test_viscous_decay_is_exact():
+    x = run(np.zeros((1001, 3)), [2.0, 3.0, 0.0], v0=1.0)
+    t = 0.002 * np.arange(1001)
+    np.testing.assert_allclose(x[:, 1], np.exp(-1.5 * t), rtol=1e-9)
+
+
+def test_held_and_linear_inputs_differ_by_half_a_sample():
+    u = np.zeros((1001, 3))
+    u[:, 0] = 0.002 * np.arange(1001)
+    p = [1.0, 0.0, 0.0]
+    linear, held = run(u, p)[-1, 1], run(u, p, hold=True)[-1, 1]
+    assert linear == pytest.approx(0.5 * 2.0**2, rel=1e-9)
+    assert linear - held == pytest.approx(0.5 * 0.002 * 2.0, rel=1e-9)
+
+
+def test_coulomb_friction_stops_and_holds():
+    p = [3.5, 0.0, 3.5]
+    u = np.zeros((2001, 3))
+    u[:, 0] = 0.9 * 3.5 * (np.arange(2001) > 1000)
+    x = run(u, p, v0=0.5)
+    assert x[250, 1] == pytest.approx(0.0, abs=2.5e-4)
+    assert x[200, 0] == pytest.approx(0.5 * 0.4 - 0.5 * 0.4**2, rel=1e-3)
+    assert np.abs(x[1010:, 1]).max() < 5e-4  # creeps within the smoothing, does not slide
+
+
+@pytest.mark.parametrize("brake", [60.0, 600.0])
+def test_a_strong_brake_stays_stable(brake):
+    u = np.zeros((1001, 3))
+    u[:, 0] = 30.0 * np.sin(2 * np.pi * 0.002 * np.arange(1001))
+    u[:, 1] = brake
+    x = run(u, [3.5, 10.0, 3.5], v0=0.3)
+    assert np.isfinite(x).all()
+    assert np.abs(x[100:, 1]).max() < 2.5e-4
+
+
+def test_step_length_does_not_change_the_answer():
+    rng = np.random.default_rng(1)
+    t = 0.002 * np.arange(3000)
+    u = np.zeros((3000, 3))
+    u[:, 0] = 8 * np.sin(np.outer(t, rng.uniform(1, 10, 5)) + rng.uniform(0, 6, 5)).sum(axis=1)
+    coarse, fine = run(u, [3.5, 10.0, 3.5]), run(u, [3.5, 10.0, 3.5], max_step=2e-5)
+    assert np.abs(coarse - fine).max() < 2e-4
+
+
+def test_growth_without_bounds_is_reported():
+    with pytest.raises(InputError, match="without bounds after"):
+        run(np.zeros((3000, 3)), [1.0, -800.0, 0.0], v0=1.0)
+
+
+def recording():
+    """A stick-slip motion and the force that made it."""
+    t = 0.002 * np.arange(4000)
+    u = np.zeros((4000, 3))
+    q_ref = 0.15 * np.sin(2 * np.pi * 0.4 * t)[:, None]
+    qd_ref = np.gradient(q_ref, t, axis=0)
+    return track(u, [3.5, 10.0, 3.5], q_ref, qd_ref)
+
+
+def track(u, p, q_ref, qd_ref, **options):
+    start = np.array([q_ref[0, 0], qd_ref[0, 0]])
+    return simulate_tracking(
+        slider, start, u, np.array(p), 0.002, q_ref, qd_ref,
+        width=WIDTH, n_noise=1, force=[0], **options,
+    )  # fmt: skip
+
+
+def test_the_arm_follows_the_motion_it_wants():
+    x, u = recording()
+    t = 0.002 * np.arange(4000)
+    assert np.abs(x[:, 0] - 0.15 * np.sin(2 * np.pi * 0.4 * t)).max() < 0.05
+    assert np.abs(u[:, 0]).max() > 3.5
+
+
+def test_total_force_alone_gives_the_same_motion():
+    x, u = recording()
+    again = simulate(slider, x[0], u, np.array([3.5, 10.0, 3.5]), 0.002, width=WIDTH, n_noise=1)
+    np.testing.assert_allclose(again, x, atol=1e-12)
+
+
+def test_replay_of_the_true_model_needs_no_arm():
+    x, u = recording()
+    again, total = track(u, [3.5, 10.0, 3.5], x[:, :1], x[:, 1:])
+    np.testing.assert_allclose(again, x, atol=1e-9)
+    np.testing.assert_allclose(total, u, atol=1e-6)
+
+
+def test_replay_with_other_friction_stays_near_the_motion():
+    x, u = recording()
+    again, total = track(u, [3.5, 10.0, 4.5], x[:, :1], x[:, 1:])
+    assert np.abs(again[:, 0] - x[:, 0]).max() < 0.01
+    moving = np.abs(x[:, 1]) > 0.1
+    extra = (total[:, 0] - u[:, 0])[moving] * np.sign(x[moving, 1])
+    assert np.median(extra) == pytest.approx(1.0, abs=0.15)  # the arm supplies the added friction
+
+
+def test_without_natural_frequency_the_arm_is_absent():
+    x, u = recording()
+    _, total = track(u, [3.5, 10.0, 4.5], x[:, :1], x[:, 1:], impedance=Impedance(0.0))
+    np.testing.assert_array_equal(total, u)
+
+
+def test_the_rate_of_the_arm_force_is_its_rate():
+    t = 0.002 * np.arange(4000)
+    q_ref = 0.15 * np.sin(2 * np.pi * 0.4 * t)[:, None]
+    _, u = track(
+        np.zeros((4000, 3)), [3.5, 10.0, 3.5], q_ref, np.gradient(q_ref, t, axis=0), rate=[2]
+    )
+    np.testing.assert_allclose(u[2:-2, 2], np.gradient(u[:, 0], t)[2:-2], atol=2.0)
+    assert np.corrcoef(u[2:-2, 2], np.gradient(u[:, 0], t)[2:-2])[0, 1] > 0.999
+
+
+def test_brakes_render_the_damping():
+    t = 0.002 * np.arange(4000)
+    q_ref = 0.15 * np.sin(2 * np.pi * 0.4 * t)[:, None]
+    x, u = track(
+        np.zeros((4000, 3)), [3.5, 10.0, 3.5], q_ref, np.gradient(q_ref, t, axis=0),
+        brake=[1], brake_gain=np.full((4000, 1), 40.0),
+    )  # fmt: skip
+    late = np.abs(np.interp(t - 0.011, t, x[:, 1]))
+    np.testing.assert_allclose(u[500:, 1], 40 * late[500:], atol=0.5)
