@@ -95,9 +95,7 @@ class _Printer(PythonCodePrinter):  # type: ignore[misc]
         return f"{_NAMES[name]}({', '.join(arguments)})"
 
     _print_Heaviside = _print_sign = _print_Abs = _print_tanh = _print_Function
-    _print_sin = _print_cos = _print_tan = _print_exp = _print_log = _print_atan = (
-        _print_Function
-    )
+    _print_sin = _print_cos = _print_tan = _print_exp = _print_log = _print_atan = _print_Function
 
     def _nested(self, name: str, arguments: Sequence[Any]) -> str:
         text = self._print(arguments[0])
@@ -132,34 +130,20 @@ class _Printer(PythonCodePrinter):  # type: ignore[misc]
 def _block(results: Sequence[Any]) -> tuple[list[str], list[str]]:
     """Assignments of common subexpressions, and one expression a result."""
     printer = _Printer()
-    shared, reduced = sp.cse(
-        list(results), symbols=sp.numbered_symbols("c_"), order="none"
-    )
+    shared, reduced = sp.cse(list(results), symbols=sp.numbered_symbols("c_"), order="none")
     lines = [f"{name} = {printer.doprint(value)}" for name, value in shared]
     return lines, [printer.doprint(value) for value in reduced]
 
 
-def _unpack(
-    group: str, symbols: Sequence[Any], used: set[Any], start: int = 0
-) -> list[str]:
+def _unpack(group: str, symbols: Sequence[Any], used: set[Any], start: int = 0) -> list[str]:
     return [f"{s} = {group}[{start + i}]" for i, s in enumerate(symbols) if s in used]
 
 
-def _function(
-    name: str, groups: dict[str, Sequence[Any]], results: Sequence[Any]
-) -> str:
+def _function(name: str, groups: dict[str, Sequence[Any]], results: Sequence[Any]) -> str:
     """A function of groups of columns that returns one column a result."""
-    used = (
-        set().union(*(sp.sympify(e).free_symbols for e in results))
-        if results
-        else set()
-    )
+    used = set().union(*(sp.sympify(e).free_symbols for e in results)) if results else set()
     lines, values = _block(results)
-    body = [
-        line
-        for group, symbols in groups.items()
-        for line in _unpack(group, symbols, used)
-    ]
+    body = [line for group, symbols in groups.items() for line in _unpack(group, symbols, used)]
     body += [*lines, f"return ({''.join(v + ', ' for v in values)})"]
     return f"\n\ndef {name}({', '.join(groups)}):\n    " + "\n    ".join(body) + "\n"
 
@@ -187,13 +171,9 @@ def array_source(e: Equations, added: Sequence[Any]) -> str:
             [expr for expr in added if expr != 0],
         ),
         _function("true_motion", {**motion, "u": e.u, "p": e.p}, true),
-        _function(
-            "input_map", {"q": e.q}, [entry for row in e.input_map for entry in row]
-        ),
+        _function("input_map", {"q": e.q}, [entry for row in e.input_map for entry in row]),
         _function("initial_memory", {"q": e.q, "u": e.u, "p": e.p}, e.initial),
-        _function(
-            "mass_matrix", {"q": e.q, "p": e.p}, [m for row in e.mass for m in row]
-        ),
+        _function("mass_matrix", {"q": e.q, "p": e.p}, [m for row in e.mass for m in row]),
         _function("energy", {"q": e.q, "qd": e.qd, "p": e.p}, [e.kinetic, e.potential]),
     ]
     return "".join(parts)
@@ -202,11 +182,7 @@ def array_source(e: Equations, added: Sequence[Any]) -> str:
 def _compiled(name: str, arguments: str, body: list[str]) -> str:
     count = len(arguments.split(","))
     head = f"\n\n@njit(types.void({', '.join(['V'] * count)}), cache=True, error_model='numpy')"
-    return (
-        f"{head}\ndef {name}({arguments}):\n    "
-        + "\n    ".join(body or ["pass"])
-        + "\n"
-    )
+    return f"{head}\ndef {name}({arguments}):\n    " + "\n    ".join(body or ["pass"]) + "\n"
 
 
 def _solve(n: int) -> list[str]:
@@ -227,9 +203,7 @@ def scalar_source(e: Equations) -> str:
     """Source of the compiled functions of one state."""
     n = len(e.q)
     upper = [(i, j) for i in range(n) for j in range(i, n)]
-    force = [
-        a + o - h for a, o, h in zip(e.applied_noise, e.other, e.bias, strict=True)
-    ]
+    force = [a + o - h for a, o, h in zip(e.applied_noise, e.other, e.bias, strict=True)]
     results = [*[e.mass[i][j] for i, j in upper], *force, *e.rates]
     used = set().union(*(sp.sympify(x).free_symbols for x in results)) | set(e.qd)
     lines, values = _block(results)
@@ -253,11 +227,7 @@ def scalar_source(e: Equations) -> str:
     used = set().union(*(x.free_symbols for x in residual))
     lines, values = _block(residual)
     groups = {"q": e.q, "qd": e.qd, "qdd": e.qdd, "z": e.z, "u": e.u, "p": e.p}
-    body = [
-        line
-        for group, symbols in groups.items()
-        for line in _unpack(group, symbols, used)
-    ]
+    body = [line for group, symbols in groups.items() for line in _unpack(group, symbols, used)]
     body += lines + [f"out[{i}] = {v}" for i, v in enumerate(values)]
     parts.append(_compiled("residual", "q, qd, qdd, z, u, p, out", body))
 
@@ -265,11 +235,7 @@ def scalar_source(e: Equations) -> str:
     seen += [a - b for a, b in zip(e.qd, e.offset_rate, strict=True)]
     used = set().union(*(x.free_symbols for x in seen))
     lines, values = _block(seen)
-    body = (
-        _unpack("x", [*e.q, *e.qd], used)
-        + _unpack("u", e.u, used)
-        + _unpack("p", e.p, used)
-    )
+    body = _unpack("x", [*e.q, *e.qd], used) + _unpack("u", e.u, used) + _unpack("p", e.p, used)
     body += lines + [f"y[{i}] = {v}" for i, v in enumerate(values)]
     parts.append(_compiled("measure", "x, u, p, y", body))
 

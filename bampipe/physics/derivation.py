@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
+import numpy as np
 import sympy as sp
 
 from bampipe.errors import InputError
@@ -75,29 +76,42 @@ class _Derivation:
         self.model = model
         device = model.device
         self.axes = [c.name for c in device.coordinates]
-        self.q = [sp.Symbol(a, real=True) for a in self.axes]
-        self.qd = [sp.Symbol(f"qd_{a}", real=True) for a in self.axes]
-        self.qdd = [sp.Symbol(f"qdd_{a}", real=True) for a in self.axes]
+        # Symbols are numbered, so that no name from a file is ever printed into generated code.
+        self.q, self.qd, self.qdd = (
+            [sp.Symbol(f"{kind}{i}", real=True) for i in range(len(self.axes))]
+            for kind in ("q", "qd", "qdd")
+        )
         self.channels = [derivative(f, k) for k in (0, 1, 2) for f in device.forces]
         self.channels += [*device.brakes.values(), "t"]
-        self.channel = {name: sp.Symbol(name, real=True) for name in self.channels}
-        self.p = {
-            p.name: sp.Symbol(f"p{i}", real=True)
-            for i, p in enumerate(model.parameters)
-        }
+        self.channel = {name: sp.Symbol(f"u{i}", real=True) for i, name in enumerate(self.channels)}
+        self.p = {p.name: sp.Symbol(f"p{i}", real=True) for i, p in enumerate(model.parameters)}
+        self.z: dict[tuple[str, str], Any] = {}
+        for item in model.effects:
+            for state in item.effect.states:
+                symbol = sp.Symbol(f"z{len(self.z)}", real=True)
+                self.z[item.prefix, state.name] = symbol
         self.special = {"sgn": self._sgn, "ddt": self.ddt}
+        self.sizes: dict[str, int] = {}
         self.base: Symbols = {a: s for a, s in zip(self.axes, self.q, strict=True)}
         self.base |= {f"qd_{a}": s for a, s in zip(self.axes, self.qd, strict=True)}
         self.base |= {name: sp.Float(c.value) for name, c in device.constants.items()}
-        self.base |= {
-            p.name: self.p[p.name] for p in device.parameters if "." not in p.name
-        }
+        self.base |= {p.name: self.p[p.name] for p in device.parameters if "." not in p.name}
         self.base |= self.channel
         for name, tree in device.definitions.items():
             self.base[name] = self.build(tree, self.base, f"definitions.{name}")
+            self.sizes[name] = expression.expanded_size(tree, self.sizes)
 
     def build(self, tree: ast.expr, symbols: Mapping[str, Any], what: str) -> Any:
-        where = f"device {self.model.device.name!r}: {what}"
+        return self.rebuild(tree, symbols, f"device {self.model.device.name!r}: {what}")
+
+    def rebuild(self, tree: ast.expr, symbols: Mapping[str, Any], where: str) -> Any:
+        """`expression.build` of a tree that stays of bounded size with definitions put in."""
+        if expression.expanded_size(tree, self.sizes) > expression.MAX_EXPANDED:
+            raise InputError(
+                f"the expression has more than {expression.MAX_EXPANDED} parts once the "
+                "definitions are put in",
+                where=where,
+            )
         return expression.build(tree, symbols, where, self.special)
 
     def _sgn(self, argument: Any) -> Any:
@@ -109,6 +123,15 @@ class _Derivation:
 
     def ddt(self, expr: Any) -> Any:
         """Total time derivative by the chain rule over motion and measured channels."""
+        last = [
+            *self.qdd,
+            *(self.channel[derivative(f, 2)] for f in self.model.device.forces),
+        ]
+        if expr.has(*last):
+            raise InputError("ddt() of an acceleration, or of a force's curvature")
+        brakes = [self.channel[b] for b in self.model.device.brakes.values()]
+        if expr.has(*self.z.values(), *brakes):
+            raise InputError("ddt() of an internal state or of a brake command")
         total = sp.S.Zero
         for a, b in (
             *zip(self.q, self.qd, strict=True),
@@ -128,15 +151,11 @@ class _Derivation:
     def table(self, entries: Mapping[str, ast.expr], what: str) -> list[Any]:
         """One expression an axis, zero where the table has none."""
         return [
-            self.build(entries[a], self.base, f"{what}.{a}")
-            if a in entries
-            else sp.S.Zero
+            self.build(entries[a], self.base, f"{what}.{a}") if a in entries else sp.S.Zero
             for a in self.axes
         ]
 
-    def effect_symbols(
-        self, item: BoundEffect, applied: list[Any], side: list[Any]
-    ) -> Symbols:
+    def effect_symbols(self, item: BoundEffect, applied: list[Any], side: list[Any]) -> Symbols:
         """Every name that an expression of ``item`` may use."""
         device = self.model.device
         symbols = dict(self.base)
@@ -147,31 +166,77 @@ class _Derivation:
         if item.effect.scope == "axis":
             i, a = self.axes.index(item.target), item.target
             symbols |= {"q": self.q[i], "qd": self.qd[i], "side_load": side[i]}
-            symbols |= {
-                n: symbols[f"{n}_{a}"]
-                for n in ("applied", "load", "viscous", "coulomb")
-            }
+            symbols |= {n: symbols[f"{n}_{a}"] for n in ("applied", "load", "viscous", "coulomb")}
             symbols["brake"] = self.channel.get(device.brakes.get(a, ""), sp.S.Zero)
         elif item.effect.scope in ("force_component", "force_pair"):
-            for letter, component in zip("fg", item.target, strict=False):
-                force = f"force_{component}"
-                if force not in device.forces:
-                    force = f"force_{item.target}"
+            for letter, force in zip("fg", self.targeted(item), strict=False):
                 for k, suffix in enumerate(("", "_rate", "_curvature")):
                     symbols[letter + suffix] = self.channel[derivative(force, k)]
-        symbols |= {s.name: self.z_of(item, s.name) for s in item.effect.states}
+        symbols |= {s.name: self.z[item.prefix, s.name] for s in item.effect.states}
         for p in item.parameters:
             symbols[p.name.removeprefix(f"{item.prefix}.")] = self.p[p.name]
         return symbols
 
-    def z_of(self, item: BoundEffect, state: str) -> Any:
-        return sp.Symbol(f"z_{item.prefix.replace('.', '_')}_{state}", real=True)
+    def targeted(self, item: BoundEffect) -> tuple[str, ...]:
+        """Force channels of a force effect: its own, and for a pair the one that leaks into it."""
+        forces = self.model.device.forces
+        if item.effect.scope == "force_component":
+            return (f"force_{item.target}",)
+        short = self.model.device.components
+        return next(
+            (forces[i], forces[j])
+            for i, a in enumerate(short)
+            for j, b in enumerate(short)
+            if i != j and a + b == item.target
+        )
 
-    def own(
-        self, item: BoundEffect, tree: ast.expr, symbols: Symbols, what: str
-    ) -> Any:
-        return expression.build(
-            tree, symbols, f"effect {item.name!r}: {what}", self.special
+    def own(self, item: BoundEffect, tree: ast.expr, symbols: Symbols, what: str) -> Any:
+        return self.rebuild(tree, symbols, f"effect {item.name!r}: {what}")
+
+
+_PRINTABLE = (
+    sp.sin,
+    sp.cos,
+    sp.tan,
+    sp.exp,
+    sp.log,
+    sp.tanh,
+    sp.atan,
+    sp.Abs,
+    sp.sign,
+    sp.Heaviside,
+)
+_INFINITE = (sp.nan, sp.oo, -sp.oo, sp.zoo, sp.I)
+
+
+def _allow(what: str, exprs: list[Any], allowed: list[Any], words: str) -> None:
+    """Raise InputError unless ``exprs`` use ``allowed`` symbols only and can be computed."""
+    for expr in map(sp.sympify, exprs):
+        if expr.free_symbols - set(allowed):
+            raise InputError(f"{what} may depend on {words} only")
+        odd = [f for f in expr.atoms(sp.Function, sp.Derivative) if not isinstance(f, _PRINTABLE)]
+        if odd or expr.has(*_INFINITE):
+            raise InputError(
+                f"{what} is not smooth enough to be differentiated, or not finite",
+                remedy="keep sgn, abs, heaviside, min and max out of energies and offsets",
+            )
+
+
+def _check_inertia(model: Model, mass: list[list[Any]], symbols: list[Any]) -> None:
+    """Raise InputError where no pose gives every coordinate an inertia."""
+    numbers = {s: 0.37 * (i + 1) % 1.3 for i, s in enumerate(symbols)}
+    numbers |= {
+        sp.Symbol(f"p{i}", real=True): p.prior or 1.0 for i, p in enumerate(model.parameters)
+    }
+    values = np.array([[float(m.subs(numbers)) for m in row] for row in mass])
+    if np.linalg.matrix_rank(values) < len(values):
+        bare = [
+            c.name for c, v in zip(model.device.coordinates, values, strict=True) if not v.any()
+        ]
+        raise InputError(
+            f"{'coordinate ' + bare[0] if bare else 'some coordinate'} has no inertia of its own",
+            where=f"device {model.device.name!r}: energy.kinetic",
+            remedy="the kinetic energy must grow with the rate of every coordinate",
         )
 
 
@@ -187,9 +252,7 @@ def _lagrange(
     Raises:
         InputError: the kinetic energy is not quadratic in the rates.
     """
-    mass = [
-        [sp.expand_trig(sp.simplify(sp.diff(kinetic, a, b))) for b in qd] for a in qd
-    ]
+    mass = [[sp.expand_trig(sp.simplify(sp.diff(kinetic, a, b))) for b in qd] for a in qd]
     if any(entry.has(*qd) for row in mass for entry in row):
         raise InputError("the kinetic energy must be quadratic in the rates")
     bias = []
@@ -221,10 +284,7 @@ def derive(model: Model) -> Equations:
         for key, tree in item.effect.expressions.items():
             force = key.partition(".")[2]
             if not force:
-                component = (
-                    item.target[0] if item.effect.scope == "force_pair" else item.target
-                )
-                force = f"force_{component}"
+                force = d.targeted(item)[0]
             if force not in corrections:
                 raise InputError(f"effect {item.name!r}: device has no input {force!r}")
             corrections[force] += d.own(item, tree, symbols, key) - d.channel[force]
@@ -242,16 +302,12 @@ def derive(model: Model) -> Equations:
     for i, c in enumerate(device.coordinates):
         sign = d._sgn(d.qd[i])
         if c.name in device.frictional:
-            other[i] -= (
-                d.p[f"viscous.{c.name}"] * d.qd[i] + d.p[f"coulomb.{c.name}"] * sign
-            )
+            other[i] -= d.p[f"viscous.{c.name}"] * d.qd[i] + d.p[f"coulomb.{c.name}"] * sign
         if c.name in device.brakes:
             other[i] -= d.channel[device.brakes[c.name]] * sign
     for k, name in enumerate(device.process_noise):
         gains = d.table(device.process_noise[name], f"process_noise.{name}")
-        other = [
-            e + g * w[len(device.forces) + k] for e, g in zip(other, gains, strict=True)
-        ]
+        other = [e + g * w[len(device.forces) + k] for e, g in zip(other, gains, strict=True)]
 
     energies = [(kinetic, potential)]
     offset = [sp.S.Zero] * n
@@ -268,27 +324,36 @@ def derive(model: Model) -> Equations:
             elif key == "potential":
                 energies.append((sp.S.Zero, value))
             elif place not in axes:
-                raise InputError(
-                    f"effect {item.name!r}: {key}: device has no axis {place!r}"
-                )
+                raise InputError(f"effect {item.name!r}: {key}: device has no axis {place!r}")
             elif item.effect.kind == "torque":
                 other[axes.index(place)] += value
             else:
                 offset[axes.index(place)] += value
         for state in item.effect.states:
-            z.append(d.z_of(item, state.name))
+            z.append(d.z[item.prefix, state.name])
             z_names.append(f"{item.prefix}.{state.name}")
             rates.append(d.own(item, state.rate, symbols, f"states.{state.name}.rate"))
-            initial.append(
-                d.own(item, state.initial, symbols, f"states.{state.name}.initial")
-            )
-    for label, exprs in (("torque", other), ("states", rates), ("applied", applied)):
-        if any(e.has(*d.qdd) for e in exprs):
-            raise InputError(f"{label}: an acceleration cannot appear here")
+            initial.append(d.own(item, state.initial, symbols, f"states.{state.name}.initial"))
+    p, u, force0 = [*d.p.values()], [*d.channel.values()], [*forces, d.channel["t"]]
+    motion, memory = [*d.q, *d.qd], [*d.z.values()]
+    gains = [entry for row in input_map for entry in row]
+    words = "motion, inputs, parameters and internal states"
+    kinetics, potentials = zip(*energies, strict=True)
+    _allow("the kinetic energy", [*kinetics], [*motion, *p], "positions, rates and parameters")
+    _allow("the potential energy", [*potentials], [*d.q, *p], "positions and parameters")
+    _allow("the effect of a force on the axes", gains, d.q, "positions")
+    _allow("a torque", other, [*motion, *u, *p, *memory, *w], words)
+    _allow("the applied force", applied, [*motion, *u, *p, *memory], words)
+    _allow("the rate of an internal state", rates, [*motion, *u, *p, *memory], words)
+    _allow("an initial value", initial, [*d.q, *u, *p], "positions, inputs and parameters")
+    _allow("an offset", offset, [*d.q, *force0, *p], "positions, forces and parameters")
 
     terms = [_lagrange(a, b, tuple(d.q), tuple(d.qd)) for a, b in energies]
     mass = [[sum(t[0][i][j] for t in terms) for j in range(n)] for i in range(n)]
     bias = [sum(t[1][i] for t in terms) for i in range(n)]
+    for row, term in zip(mass, bias, strict=True):
+        _allow("the equation of motion", [*row, term], [*motion, *p], "motion and parameters")
+    _check_inertia(model, mass, d.q)
     kinetic, potential = (sum(parts) for parts in zip(*energies, strict=True))
 
     offset_rate = [d.ddt(e) for e in offset]
@@ -331,11 +396,8 @@ def contribution(full: Equations, bare: Equations) -> list[Any]:
     added = []
     for i in range(len(full.q)):
         inertia = sum(
-            (m - n) * a
-            for m, n, a in zip(full.mass[i], bare.mass[i], full.qdd, strict=True)
+            (m - n) * a for m, n, a in zip(full.mass[i], bare.mass[i], full.qdd, strict=True)
         )
         force = full.applied[i] - bare.applied[i] + full.other[i] - bare.other[i]
-        added.append(
-            sp.sympify(force - (full.bias[i] - bare.bias[i]) - inertia).subs(quiet)
-        )
+        added.append(sp.sympify(force - (full.bias[i] - bare.bias[i]) - inertia).subs(quiet))
     return added

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
@@ -100,9 +101,7 @@ class Device:
         return tuple(name.removeprefix("force_") for name in self.forces)
 
 
-def _table(
-    declaration: Mapping[str, Any], key: str, where: str, required: bool
-) -> dict[str, Any]:
+def _table(declaration: Mapping[str, Any], key: str, where: str, required: bool) -> dict[str, Any]:
     value = declaration.get(key, {})
     if not isinstance(value, Mapping) or (required and not value):
         raise InputError(f"table [{key}] is missing or not a table", where=where)
@@ -110,9 +109,7 @@ def _table(
 
 
 def _expressions(table: Mapping[str, Any], where: str) -> dict[str, ast.expr]:
-    return {
-        name: expression.parse(text, f"{where}.{name}") for name, text in table.items()
-    }
+    return {name: expression.parse(text, f"{where}.{name}") for name, text in table.items()}
 
 
 def device_from(declaration: Mapping[str, Any], where: str = "device file") -> Device:
@@ -137,12 +134,11 @@ def device_from(declaration: Mapping[str, Any], where: str = "device file") -> D
     coordinates = []
     for key, entry in _table(declaration, "coordinates", where, True).items():
         at = f"{where}: coordinates.{key}"
-        if not key.isidentifier():
-            raise InputError("a coordinate's name must be an identifier", where=at)
-        if not isinstance(entry, Mapping) or entry.get("kind") not in UNITS:
+        if not isinstance(entry, Mapping) or entry.get("kind") not in (*UNITS,):
             raise InputError("kind must be 'rotary' or 'linear'", where=at)
+        _known(entry, ("kind", "symbol", "sign_width"), at)
         width = entry.get("sign_width", 1e-3 if entry["kind"] == "rotary" else 2.5e-4)
-        if not isinstance(width, int | float) or not width > 0:
+        if isinstance(width, bool) or not isinstance(width, int | float) or not 0 < width < 1e3:
             raise InputError("sign_width must be a positive speed", where=at)
         coordinates.append(
             Coordinate(key, entry["kind"], str(entry.get("symbol", key)), float(width))
@@ -155,11 +151,10 @@ def device_from(declaration: Mapping[str, Any], where: str = "device file") -> D
         if (
             isinstance(value, bool)
             or not isinstance(value, int | float)
-            or abs(value) > 1e30
+            or not abs(value) < expression.MAX_NUMBER
         ):
-            raise InputError(
-                "expected { value = number, unit = text, source = text }", where=at
-            )
+            raise InputError("expected { value = number, unit = text, source = text }", where=at)
+        _known(entry, ("value", "unit", "source", "description", "sd"), at)
         constants[key] = Constant(
             float(value),
             str(entry.get("unit", "")),
@@ -173,31 +168,40 @@ def device_from(declaration: Mapping[str, Any], where: str = "device file") -> D
     for axis, terms in _table(declaration, "friction", where, False).items():
         at = f"{where}: friction.{axis}"
         if axis not in axes:
-            raise InputError(
-                f"unknown axis{expression.did_you_mean(axis, axes)}", where=at
-            )
+            raise InputError(f"unknown axis{expression.did_you_mean(axis, axes)}", where=at)
         if not isinstance(terms, Mapping) or set(terms) != {"viscous", "coulomb"}:
-            raise InputError(
-                "give viscous and coulomb, each with unit, prior, sd", where=at
-            )
+            raise InputError("give viscous and coulomb, each with unit, prior, sd", where=at)
         frictional.append(axis)
         for term in ("viscous", "coulomb"):
-            parameters.append(
-                parameter_from(f"{term}.{axis}", terms[term], f"{at}.{term}")
-            )
+            parameters.append(parameter_from(f"{term}.{axis}", terms[term], f"{at}.{term}"))
     for key, entry in _table(declaration, "parameters", where, False).items():
+        expression.check_name(key, f"{where}: parameters")
         parameters.append(parameter_from(key, entry, f"{where}: parameters.{key}"))
     noise = {}
     for key, entry in _table(declaration, "process_noise", where, False).items():
         at = f"{where}: process_noise.{key}"
-        if not isinstance(entry, Mapping) or not isinstance(
-            entry.get("torque"), Mapping
-        ):
+        if not isinstance(entry, Mapping) or not isinstance(entry.get("torque"), Mapping):
             raise InputError("expected a table with [torque] per axis", where=at)
         noise[key] = _expressions(entry["torque"], at)
     limits = {}
     for axis, entry in _table(declaration, "limits", where, False).items():
-        limits[axis] = (float(entry["lower"]), float(entry["upper"]))
+        at = f"{where}: limits.{axis}"
+        pair = [entry.get(k) for k in ("lower", "upper")] if isinstance(entry, Mapping) else []
+        if not pair or any(isinstance(v, bool) or not isinstance(v, int | float) for v in pair):
+            raise InputError("expected { lower = number, upper = number }", where=at)
+        limits[axis] = (float(pair[0]), float(pair[1]))
+        if not limits[axis][0] < limits[axis][1]:
+            raise InputError("lower must be below upper", where=at)
+    forces = inputs.get("force", [])
+    if not isinstance(forces, list | tuple) or not all(
+        isinstance(f, str) and f.startswith("force_") and f != "force_" for f in forces
+    ):
+        raise InputError(
+            "force must be a list of channels called force_<component>", where=f"{where}: inputs"
+        )
+    brakes = inputs.get("brakes", {})
+    if not isinstance(brakes, Mapping):
+        raise InputError("brakes must be a table, axis = channel", where=f"{where}: inputs")
     device = Device(
         name=name,
         summary=str(declaration.get("summary", "")),
@@ -208,18 +212,12 @@ def device_from(declaration: Mapping[str, Any], where: str = "device file") -> D
             _table(declaration, "definitions", where, False), f"{where}: definitions"
         ),
         kinetic=expression.parse(energy.get("kinetic"), f"{where}: energy.kinetic"),
-        potential=expression.parse(
-            energy.get("potential", "0"), f"{where}: energy.potential"
-        ),
-        torque=_expressions(
-            _table(declaration, "torque", where, False), f"{where}: torque"
-        ),
-        forces=tuple(inputs.get("force", ())),
+        potential=expression.parse(energy.get("potential", "0"), f"{where}: energy.potential"),
+        torque=_expressions(_table(declaration, "torque", where, False), f"{where}: torque"),
+        forces=tuple(forces),
         force_unit=str(inputs.get("force_unit", "N")),
-        brakes=dict(inputs.get("brakes", {})),
-        applied=_expressions(
-            _table(declaration, "applied", where, True), f"{where}: applied"
-        ),
+        brakes=dict(brakes),
+        applied=_expressions(_table(declaration, "applied", where, True), f"{where}: applied"),
         side_load=_expressions(
             _table(declaration, "side_load", where, False), f"{where}: side_load"
         ),
@@ -234,6 +232,8 @@ def device_from(declaration: Mapping[str, Any], where: str = "device file") -> D
         ("applied", device.applied),
         ("side_load", device.side_load),
         ("brakes", device.brakes),
+        ("limits", device.limits),
+        *((f"process_noise.{k}", table) for k, table in device.process_noise.items()),
     ):
         for axis in table:
             if axis not in axes:
@@ -242,4 +242,40 @@ def device_from(declaration: Mapping[str, Any], where: str = "device file") -> D
                     where=f"{where}: {label}",
                     remedy=f"axes are {', '.join(axes)}",
                 )
+    _check_names(device, where)
     return device
+
+
+def _known(entry: Mapping[str, Any], keys: tuple[str, ...], where: str) -> None:
+    """Raise InputError for a key of ``entry`` that is not one of ``keys``."""
+    for key in entry:
+        if key not in keys:
+            raise InputError(
+                f"unknown key {key!r}{expression.did_you_mean(key, keys)}", where=where
+            )
+
+
+def _check_names(device: Device, where: str) -> None:
+    """Raise InputError where a name cannot stand in an expression or means two things."""
+    axes = [c.name for c in device.coordinates]
+    rates = [
+        f"force_{k}_{f.removeprefix('force_')}"
+        for f in device.forces
+        for k in ("rate", "curvature")
+    ]
+    taken = dict.fromkeys(["t", *(f"qd_{a}" for a in axes), *rates], "a built-in symbol")
+    for label, names in (
+        ("coordinates", axes),
+        ("inputs.force", device.forces),
+        ("inputs.brakes", device.brakes.values()),
+        ("constants", device.constants),
+        ("definitions", device.definitions),
+        ("parameters", [p.name for p in device.parameters if "." not in p.name]),
+    ):
+        for name in names:
+            expression.check_name(name, f"{where}: {label}")
+            if name in taken:
+                raise InputError(
+                    f"{name!r} is the name of {taken[name]} already", where=f"{where}: {label}"
+                )
+            taken[name] = f"one of {label}"

@@ -12,6 +12,13 @@ from bampipe.physics import expression
 from bampipe.physics.device import Device
 from bampipe.physics.parameter import Parameter, parameter_from
 
+# What an effect of each kind must give, where it may apply.
+_EXPRESSIONS = {
+    "torque": (("torque",), ("axis", "device")),
+    "input": (("input",), ("force_component", "force_pair", "device")),
+    "energy": (("kinetic", "potential"), ("axis", "device")),
+    "measurement": (("offset",), ("axis", "device")),
+}
 SCOPES = ("axis", "force_component", "force_pair", "device")
 KINDS = ("torque", "input", "energy", "measurement")
 _KEYS = frozenset(
@@ -56,28 +63,19 @@ class Effect:
         if self.scope == "force_component":
             return device.components
         if self.scope == "force_pair":
-            return tuple(
-                a + b for a in device.components for b in device.components if a != b
-            )
+            return tuple(a + b for a in device.components for b in device.components if a != b)
         return ("",) if self._fits(device) else ()
 
     def _fits(self, device: Device) -> bool:
         """Whether every name that a device-wide effect uses exists in ``device``."""
         known = set(device.definitions) | set(device.constants) | {"t"}
-        known |= {c.name for c in device.coordinates} | {
-            p.name for p in device.parameters
-        }
+        known |= {c.name for c in device.coordinates} | {p.name for p in device.parameters}
         for force in device.forces:
             known |= {force, derivative(force, 1), derivative(force, 2)}
-        known |= (
-            set(device.brakes.values())
-            | set(self.parameters)
-            | {s.name for s in self.states}
-        )
+        known |= set(device.brakes.values()) | set(self.parameters) | {s.name for s in self.states}
         for c in device.coordinates:
             known |= {
-                f"{prefix}_{c.name}"
-                for prefix in ("qd", "applied", "viscous", "coulomb", "load")
+                f"{prefix}_{c.name}" for prefix in ("qd", "applied", "viscous", "coulomb", "load")
             }
         trees = [*self.expressions.values()]
         trees += [tree for state in self.states for tree in (state.rate, state.initial)]
@@ -140,31 +138,54 @@ def effect_from(declaration: Mapping[str, Any], where: str = "effect file") -> E
     if kind not in KINDS:
         raise InputError(f"kind {kind!r} is none of {', '.join(KINDS)}", where=where)
     if not declaration["name"].isidentifier():
+        raise InputError("name must be an identifier, such as magnetic_detent", where=where)
+    main, scopes = _EXPRESSIONS[kind]
+    if scope not in scopes:
         raise InputError(
-            "name must be an identifier, such as magnetic_detent", where=where
+            f"an effect of kind {kind!r} cannot have scope {scope!r}",
+            where=where,
+            remedy=f"scope may be {' or '.join(scopes)}",
         )
-    main = {"torque": "torque", "input": "input", "measurement": "offset"}
+    for other in sorted({k for keys, _ in _EXPRESSIONS.values() for k in keys} - {*main}):
+        if other in declaration:
+            raise InputError(f"{other!r} has no meaning for kind {kind!r}", where=where)
     trees: dict[str, ast.expr] = {}
-    for key in [main[kind]] if kind in main else ["kinetic", "potential"]:
+    for key in main:
         value = declaration.get(key)
+        placed = scope == "device" and kind != "energy"
+        if value is not None and isinstance(value, Mapping) != placed:
+            raise InputError(
+                f"{key!r} must be "
+                + ("a table, one expression a place" if placed else "one expression"),
+                where=where,
+            )
         if isinstance(value, Mapping):
             for place, text in value.items():
-                trees[f"{key}.{place}"] = expression.parse(
-                    text, f"{where}: {key}.{place}"
-                )
+                trees[f"{key}.{place}"] = expression.parse(text, f"{where}: {key}.{place}")
         elif value is not None:
             trees[key] = expression.parse(value, f"{where}: {key}")
     if not trees:
         raise InputError(
-            f"an effect of kind {kind!r} needs {main.get(kind, 'kinetic or potential')!r}",
+            f"an effect of kind {kind!r} needs {' or '.join(main)}",
             where=where,
         )
     parameters = declaration.get("parameters")
     if not isinstance(parameters, Mapping) or not parameters:
         raise InputError("[parameters.*] is missing", where=where)
+    for name in parameters:
+        expression.check_name(name, f"{where}: parameters")
     states = []
-    for name, entry in declaration.get("states", {}).items():
+    tables = declaration.get("states", {})
+    if not isinstance(tables, Mapping):
+        raise InputError("states must be tables, [states.name]", where=where)
+    devices = declaration.get("devices", [])
+    if not isinstance(devices, list | tuple) or any(not isinstance(d, str) for d in devices):
+        raise InputError("devices must be a list of names", where=where)
+    for name, entry in tables.items():
         at = f"{where}: states.{name}"
+        expression.check_name(name, f"{where}: states")
+        if name in parameters:
+            raise InputError("a parameter has this name already", where=at)
         if not isinstance(entry, Mapping) or "rate" not in entry:
             raise InputError("a state needs its rate", where=at)
         states.append(
@@ -186,7 +207,7 @@ def effect_from(declaration: Mapping[str, Any], where: str = "effect file") -> E
         dissipative=bool(declaration.get("dissipative", False)),
         looks_like=declaration["looks_like"],
         source=declaration["source"],
-        devices=tuple(declaration.get("devices", ())),
+        devices=tuple(devices),
         declaration=declaration,
     )
 
@@ -217,9 +238,7 @@ def bind(effect: Effect, target: str, device: Device) -> BoundEffect:
         chosen = entry
         if isinstance(entry, Mapping) and ("rotary" in entry or "linear" in entry):
             if kind not in entry:
-                raise InputError(
-                    f"no entry for a {kind or 'device'} parameter", where=where
-                )
+                raise InputError(f"no entry for a {kind or 'device'} parameter", where=where)
             chosen = {**entry[kind]}
             if "description" in entry:
                 chosen.setdefault("description", entry["description"])

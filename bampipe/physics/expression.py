@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import ast
 import difflib
+import keyword
+import math
 from collections.abc import Callable, Mapping
 from functools import cache
 from typing import Any
@@ -17,6 +19,8 @@ from bampipe.errors import InputError
 MAX_LENGTH = 2000
 MAX_NODES = 500
 MAX_EXPONENT = 12
+MAX_NUMBER = 1e30
+MAX_EXPANDED = 20_000
 FUNCTIONS = {
     "sin": 1,
     "cos": 1,
@@ -51,8 +55,13 @@ def parse(text: object, where: str) -> ast.expr:
     if not isinstance(text, str):
         raise InputError(f"expected an expression as text, found {text!r}", where=where)
     if len(text) > MAX_LENGTH:
+        raise InputError(f"expression is longer than {MAX_LENGTH} characters", where=where)
+    if not text.isascii():
+        odd = next(c for c in text if not c.isascii())
         raise InputError(
-            f"expression is longer than {MAX_LENGTH} characters", where=where
+            f"character {odd!r} is not allowed in an expression",
+            where=where,
+            remedy="write names in plain ASCII letters",
         )
     try:
         tree = ast.parse(" ".join(text.split()), mode="eval").body
@@ -71,22 +80,23 @@ def parse(text: object, where: str) -> ast.expr:
     return tree
 
 
-def _check(node: ast.AST, where: str) -> None:
+def _check(node: ast.AST, where: str, power: float = 1.0, rates: int = 0) -> None:
+    """Check ``node``, which stands under powers that multiply to ``power`` and ``rates`` ddt()."""
     match node:
         case ast.Constant(value=value):
             if isinstance(value, bool) or not isinstance(value, int | float):
                 raise InputError(f"{value!r} is not a number", where=where)
-            if not abs(value) < 1e30:
+            if not abs(value) < MAX_NUMBER:
                 raise InputError(f"the number {value!r} is too large", where=where)
         case ast.Name():
             pass
         case ast.BinOp(left=left, op=op, right=right) if isinstance(op, _OPERATORS):
             if isinstance(op, ast.Pow):
-                _check_power(right, where)
-            _check(left, where)
+                power *= _check_power(right, where, power)
+            _check(left, where, power, rates)
             _check(right, where)
         case ast.UnaryOp(op=ast.USub() | ast.UAdd(), operand=operand):
-            _check(operand, where)
+            _check(operand, where, power, rates)
         case ast.Call(func=ast.Name(id=name), args=args, keywords=[]):
             if name not in FUNCTIONS:
                 raise InputError(
@@ -99,8 +109,11 @@ def _check(node: ast.AST, where: str) -> None:
                     f"{name}() takes {FUNCTIONS[name]} argument(s), found {len(args)}",
                     where=where,
                 )
+            rates += name == "ddt"
+            if rates > 2:
+                raise InputError("ddt() may be nested twice at most", where=where)
             for argument in args:
-                _check(argument, where)
+                _check(argument, where, power, rates)
         case _:
             raise InputError(
                 f"{type(node).__name__} is not allowed in an expression",
@@ -109,28 +122,67 @@ def _check(node: ast.AST, where: str) -> None:
             )
 
 
-def _check_power(exponent: ast.AST, where: str) -> None:
+def _check_power(exponent: ast.AST, where: str, outer: float) -> float:
+    """Size of a plain exponent that stands under powers multiplying to ``outer``, at least 1."""
     number = exponent.operand if isinstance(exponent, ast.UnaryOp) else exponent
     if not isinstance(number, ast.Constant):
         raise InputError("an exponent must be a plain number", where=where)
-    if isinstance(number.value, int | float) and abs(number.value) > MAX_EXPONENT:
-        raise InputError(f"an exponent must lie within +-{MAX_EXPONENT}", where=where)
+    _check(number, where)
+    size = max(1.0, abs(float(number.value)))  # type: ignore[arg-type]
+    if size * outer > MAX_EXPONENT:
+        raise InputError(
+            f"an exponent, or exponents of nested powers multiplied, must lie within "
+            f"+-{MAX_EXPONENT}",
+            where=where,
+        )
+    return size
 
 
 def names(tree: ast.AST) -> set[str]:
     """Names of quantities that an expression uses (function names left out)."""
     functions = {id(n.func) for n in ast.walk(tree) if isinstance(n, ast.Call)}
-    return {
-        n.id
-        for n in ast.walk(tree)
-        if isinstance(n, ast.Name) and id(n) not in functions
-    }
+    return {n.id for n in ast.walk(tree) if isinstance(n, ast.Name) and id(n) not in functions}
+
+
+def expanded_size(tree: ast.AST, sizes: Mapping[str, int]) -> int:
+    """Parts of ``tree`` once every name is replaced by what it stands for, ``sizes`` parts."""
+    return sum(
+        sizes.get(node.id, 1) if isinstance(node, ast.Name) else 1 for node in ast.walk(tree)
+    )
+
+
+def check_name(name: object, where: str) -> str:
+    """``name``, if an expression can use it as the name of a quantity.
+
+    Raises:
+        InputError: it is not a plain ASCII identifier, or it is the name of a function.
+    """
+    if (
+        not isinstance(name, str)
+        or not (name.isascii() and name.isidentifier() and len(name) <= 60)
+        or keyword.iskeyword(name)
+    ):
+        raise InputError(
+            f"{str(name)[:60]!r} cannot be a name in expressions",
+            where=where,
+            remedy="use letters, digits and underscores, a letter first",
+        )
+    if name in FUNCTIONS:
+        raise InputError(f"{name!r} is the name of a function", where=where)
+    return name
 
 
 def did_you_mean(word: str, known: Any) -> str:
     """``, did you mean 'x'?`` where something known is close to ``word``, else nothing."""
     close = difflib.get_close_matches(word, [str(k) for k in known], n=1)
     return f", did you mean {close[0]!r}?" if close else ""
+
+
+def _bounded(value: Any) -> bool:
+    """Whether a number is real and below `MAX_NUMBER`."""
+    if not (value.is_extended_real and value.is_finite):
+        return False
+    return math.isfinite(float(value)) and abs(float(value)) < MAX_NUMBER
 
 
 @cache
@@ -169,11 +221,21 @@ def build(
         special: ``sgn`` and ``ddt``, which need to know the device.
 
     Raises:
-        InputError: a name is not known here.
+        InputError: a name is not known here, or a part of the expression is a constant that is
+            not a real number below `MAX_NUMBER`.
     """
     import sympy as sp
 
     def walk(node: ast.AST) -> Any:
+        value = sp.sympify(combine(node))
+        if value.is_number and not _bounded(value):
+            raise InputError(
+                f"{ast.unparse(node)[:60]!r} is not a real number below {MAX_NUMBER:g}",
+                where=where,
+            )
+        return value
+
+    def combine(node: ast.AST) -> Any:
         match node:
             case ast.Constant(value=value):
                 return sp.Integer(value) if isinstance(value, int) else sp.Float(value)
@@ -198,11 +260,17 @@ def build(
                     if b == 0:
                         raise InputError("division by zero", where=where)
                     return a / b
-                return a ** sp.nsimplify(b) if b.is_number else a**b
+                if a == 0 and b < 0:
+                    raise InputError("division by zero", where=where)
+                if a.is_number and a != 0 and b * math.log(abs(a)) > math.log(MAX_NUMBER):
+                    return sp.oo
+                # Halves stay exact: sympy then sees a square root.
+                return a ** (sp.Rational(int(2 * b), 2) if 2 * b == int(2 * b) else b)
             case ast.Call(func=ast.Name(id=name), args=args):
-                return {**_builders(), **special}[name](
-                    *[walk(argument) for argument in args]
-                )
+                values = [walk(argument) for argument in args]
+                if name == "exp" and values[0].is_number and values[0] > 69:
+                    return sp.oo
+                return {**_builders(), **special}[name](*values)
         raise AssertionError(f"unchecked node {type(node).__name__}")
 
     return walk(tree)

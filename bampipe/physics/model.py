@@ -56,9 +56,7 @@ class Model:
                     f"unknown effect {name!r}{did_you_mean(name, known)}",
                     remedy="see them all with: bampipe effects",
                 )
-            item = bind(
-                own[name] if name in own else registry.effect(name), target, device
-            )
+            item = bind(own[name] if name in own else registry.effect(name), target, device)
             if item.name in [b.name for b in bound]:
                 raise InputError(f"effect {item.name!r} is in the model already")
             bound.append(item)

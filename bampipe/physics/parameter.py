@@ -69,9 +69,7 @@ def parameter_from(name: str, entry: object, where: str) -> Parameter:
             lies outside the bounds.
     """
     if not isinstance(entry, Mapping):
-        raise InputError(
-            "expected a table { unit = ..., prior = ..., sd = ... }", where=where
-        )
+        raise InputError("expected a table { unit = ..., prior = ..., sd = ... }", where=where)
     unknown = sorted(set(entry) - _KEYS)
     if unknown:
         raise InputError(
@@ -81,22 +79,19 @@ def parameter_from(name: str, entry: object, where: str) -> Parameter:
         )
     for key in ("unit", "prior", "sd"):
         if key not in entry:
-            raise InputError(
-                f"{key!r} is missing", where=where, remedy="give unit, prior and sd"
-            )
+            raise InputError(f"{key!r} is missing", where=where, remedy="give unit, prior and sd")
     numbers = {}
     for key in ("prior", "sd", "lower", "upper", "typical"):
         if key in entry:
             value = entry[key]
             if isinstance(value, bool) or not isinstance(value, int | float):
-                raise InputError(
-                    f"{key} must be a number, found {value!r}", where=where
-                )
-            if math.isnan(value) or (
-                math.isinf(value) and key in ("prior", "sd", "typical")
-            ):
+                raise InputError(f"{key} must be a number, found {value!r}", where=where)
+            if math.isnan(value) or (math.isinf(value) and key in ("prior", "sd", "typical")):
                 raise InputError(f"{key} must be finite, found {value!r}", where=where)
             numbers[key] = float(value)
+    for key in ("strength", "fixed"):
+        if not isinstance(entry.get(key, False), bool):
+            raise InputError(f"{key} must be true or false", where=where)
     if not isinstance(entry["unit"], str):
         raise InputError(f"unit must be text, found {entry['unit']!r}", where=where)
     parameter = Parameter(
@@ -106,8 +101,8 @@ def parameter_from(name: str, entry: object, where: str) -> Parameter:
         sd=numbers["sd"],
         lower=numbers.get("lower", -math.inf),
         upper=numbers.get("upper", math.inf),
-        strength=bool(entry.get("strength", False)),
-        fixed=bool(entry.get("fixed", False)),
+        strength=entry.get("strength", False),
+        fixed=entry.get("fixed", False),
         typical=numbers.get("typical"),
         description=str(entry.get("description", "")),
     )

@@ -25,18 +25,12 @@ __all__ = [
 
 def _names(folder: str) -> tuple[str, ...]:
     entries = (files("bampipe.physics") / folder).iterdir()
-    return tuple(
-        sorted(
-            e.name.removesuffix(".toml") for e in entries if e.name.endswith(".toml")
-        )
-    )
+    return tuple(sorted(e.name.removesuffix(".toml") for e in entries if e.name.endswith(".toml")))
 
 
 @cache
 def _declaration(folder: str, name: str) -> Mapping[str, Any]:
-    text = (files("bampipe.physics") / folder / f"{name}.toml").read_text(
-        encoding="utf-8"
-    )
+    text = (files("bampipe.physics") / folder / f"{name}.toml").read_text(encoding="utf-8")
     return tomllib.loads(text)
 
 

@@ -93,18 +93,14 @@ class System:
         """h(x, u, p, y): numba-compiled encoder readings, positions then rates."""
         return self._compiled.measure  # type: ignore[no-any-return]
 
-    def true_motion(
-        self, q: Array, qd: Array, qdd: Array, u: Array, p: Array
-    ) -> tuple[Array, ...]:
+    def true_motion(self, q: Array, qd: Array, qdd: Array, u: Array, p: Array) -> tuple[Array, ...]:
         """Motion of the mechanism from what the encoders read; each (T, n_q)."""
         n = len(self.coordinates)
         columns = self._arrays.true_motion(q.T, qd.T, qdd.T, u.T, p)
         stacked = _stack(columns, len(q))
         return stacked[:, :n], stacked[:, n : 2 * n], stacked[:, 2 * n :]
 
-    def required(
-        self, q: Array, qd: Array, qdd: Array, z: Array, u: Array, p: Array
-    ) -> Array:
+    def required(self, q: Array, qd: Array, qdd: Array, z: Array, u: Array, p: Array) -> Array:
         """Generalised force that the user must supply for this motion.
 
         Inertia, Coriolis, gravity, friction, brakes and every effect of kind ``torque``; the
@@ -122,9 +118,7 @@ class System:
         a, b, c = self.true_motion(q, qd, qdd, u, p)
         return _stack(self._arrays.required(a.T, b.T, c.T, z.T, u.T, p), len(q))
 
-    def applied(
-        self, q: Array, qd: Array, qdd: Array, z: Array, u: Array, p: Array
-    ) -> Array:
+    def applied(self, q: Array, qd: Array, qdd: Array, z: Array, u: Array, p: Array) -> Array:
         """Generalised force of the measured input mapped to the joints (eq 19), (T, n_q).
 
         Arguments as in `required`; effects of kind ``input`` are included. The model's residual
@@ -133,23 +127,17 @@ class System:
         a, b, c = self.true_motion(q, qd, qdd, u, p)
         return _stack(self._arrays.applied(a.T, b.T, c.T, z.T, u.T, p), len(q))
 
-    def residual(
-        self, q: Array, qd: Array, qdd: Array, z: Array, u: Array, p: Array
-    ) -> Array:
+    def residual(self, q: Array, qd: Array, qdd: Array, z: Array, u: Array, p: Array) -> Array:
         """``applied - required`` for the mechanism's true motion, compiled; (T, n_q), N.m or N.
 
         Arguments as in `required`, but q, qd, qdd are already what `true_motion` returns.
         """
         from bampipe.physics.loops import residual_rows
 
-        arrays = [
-            np.ascontiguousarray(x, dtype=np.float64) for x in (q, qd, qdd, z, u, p)
-        ]
+        arrays = [np.ascontiguousarray(x, dtype=np.float64) for x in (q, qd, qdd, z, u, p)]
         return residual_rows(self._compiled.residual, *arrays)  # type: ignore[no-any-return]
 
-    def contribution(
-        self, q: Array, qd: Array, qdd: Array, z: Array, u: Array, p: Array
-    ) -> Array:
+    def contribution(self, q: Array, qd: Array, qdd: Array, z: Array, u: Array, p: Array) -> Array:
         """What the model's effects add to the residual of the bare device, (T, n_q).
 
         Effects of kind ``measurement`` change the motion instead; see `true_motion`. Columns of
@@ -180,9 +168,7 @@ class System:
         """Internal states at the start of a trial, (n_z,), from the first q (n_q,) and u (n_u,)."""
         return np.array([float(v) for v in self._arrays.initial_memory(q, u, p)])
 
-    def memory(
-        self, q: Array, qd: Array, qdd: Array, u: Array, p: Array, t: Array
-    ) -> Array:
+    def memory(self, q: Array, qd: Array, qdd: Array, u: Array, p: Array, t: Array) -> Array:
         """Internal states along a measured motion of one trial, (T, n_z).
 
         Integrated by RK4 with inputs interpolated linearly between samples.
