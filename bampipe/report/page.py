@@ -78,11 +78,14 @@ def _table(table: Table, number: str) -> str:
         f'<th scope="col" class="{side}">{_rich(cell)}</th>'
         for side, cell in zip(table.align, table.head, strict=True)
     )
+    widths = table.widths or (0.0,) * len(table.head)
+    looks = [
+        side if width else f"{side} whole" for side, width in zip(table.align, widths, strict=True)
+    ]
     rows = "\n".join(
         "<tr>"
         + "".join(
-            f'<td class="{side}">{_rich(cell)}</td>'
-            for side, cell in zip(table.align, row, strict=True)
+            f'<td class="{look}">{_rich(cell)}</td>' for look, cell in zip(looks, row, strict=True)
         )
         + "</tr>"
         for row in table.rows
@@ -103,5 +106,8 @@ def _inline(svg: str, name: str, caption: str) -> str:
     drawing = re.sub(r'(url\(#|href="#)', rf"\g<1>{name}-", drawing)
     for word, colour in style.COLOURS.items():
         drawing = drawing.replace(colour, f"var(--{word})")
+    width = re.search(r'\bwidth="([\d.]+)pt"', drawing)
+    share = min(1.0, float(width[1]) / 72.0 / style.WIDTH) if width else 1.0
     title = html.escape(re.sub(r"[*`]", "", caption), quote=True)
-    return drawing.replace("<svg ", f'<svg role="img" aria-label="{title}" ', 1)
+    words = f'role="img" aria-label="{title}" style="max-width: {100.0 * share:.1f}%"'
+    return drawing.replace("<svg ", f"<svg {words} ", 1)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -160,6 +160,18 @@ class Results:
                 )
             return self.detail_model
         return self.models[-1] if self.models else "base"
+
+    def in_order(self, parameters: Iterable[str]) -> tuple[str, ...]:
+        """Return names of parameters: those of every axis first, axis by axis, effects last."""
+        kinds = ("viscous", "coulomb")
+
+        def rank(name: str) -> tuple[int, int, str]:
+            first, _, axis = name.partition(".")
+            if first in kinds and axis in self.axes:
+                return kinds.index(first), self.axes.index(axis), ""
+            return len(kinds) + ("." in name), 0, name
+
+        return tuple(sorted(parameters, key=rank))
 
     def of_model(self, name: str, model: str | None = None) -> str:
         """Return the relative path of a file of ``model`` (default: the one in detail)."""

@@ -159,7 +159,9 @@ def legend_below(figure: Figure, axes: Axes, columns: int = 4) -> None:
 
 def legend_of(figure: Figure, handles: list[Any], names: list[str], columns: int = 4) -> None:
     """Put a legend of these entries below all panels."""
-    figure.legend(handles, names, loc="outside lower center", ncols=min(columns, len(names)))
+    figure.legend(
+        handles, names, loc="outside lower center", ncols=min(columns, len(names)), markerscale=1.5
+    )
 
 
 def scaled(values: np.ndarray, unit: str) -> tuple[np.ndarray, str]:

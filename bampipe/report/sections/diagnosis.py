@@ -23,6 +23,8 @@ from bampipe.report.results import Results
 TITLE = "Diagnosis"
 _RANKED = 8
 _WINDOWS = 10
+_FIRST = ("velocity", "position", "acceleration", "load", "direction")
+"""Variables whose maps come first; others follow in their own order."""
 
 
 def section(results: Results) -> Section:
@@ -109,8 +111,7 @@ def _verdicts(results: Results, names: tuple[str, ...], axes: dict[str, Any]) ->
         ),
         tuple(rows),
         "llrrrrrl",
-        (0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
-        "Explainable: share of the residual that any function of motion and load could predict on "
+        note="Explainable: share of the residual that any function of motion and load could predict on "
         "unseen trials; by chance: the same where nothing is missing. Errors are RMSE on held-out "
         "trials.",
     )
@@ -155,11 +156,11 @@ def _maps(
     maps: dict[str, Any],
     later: dict[str, Any] | None,
 ) -> Figure:
-    names = list(maps)
+    names = sorted(maps, key=lambda name: (*_FIRST, name).index(name))
     columns = min(3, len(names))
     rows = math.ceil(len(names) / columns)
     figure, panels = style.panels(
-        rows, columns, 0.35 + 1.65 * rows, width=min(style.WIDTH, 2.4 * columns)
+        rows, columns, 0.35 + 1.65 * rows, width=min(style.WIDTH, 1.0 + 1.9 * columns)
     )
     unit = wording.unit(str(entry.get("unit", results.force_unit(axis))))
     for number, (panel, name) in enumerate(zip(panels.flat, names, strict=False)):

@@ -14,6 +14,7 @@ from bampipe.report.results import Results
 
 TITLE = "Identification"
 _NORMAL_95 = 1.959964
+_TWO_COLUMNS = 6
 _DASHES = ("-", (0, (5, 1.5)), (0, (1.5, 1.2)), (0, (5, 1.5, 1, 1.5)))
 
 
@@ -23,16 +24,16 @@ def section(results: Results) -> Section:
     if content is None:
         command = f"`bampipe identify {results.root.name}`"
         return Section(TITLE, (Text(f"No parameters have been identified: {command} does it."),))
-    blocks: list[Block] = [_parameters(content)]
+    blocks: list[Block] = [_parameters(results, content)]
     notes = tuple(str(note) for note in content.get("notes") or ())
     if notes:
         blocks.append(Bullets(notes))
-    trace = results.table(results.of_model("trace.parquet"))
-    if trace is not None and len(trace):
-        blocks.append(_convergence(results, content, trace))
     bounds = content.get("state_3sigma")
     if bounds:
         blocks.append(_bounds(results, bounds))
+    trace = results.table(results.of_model("trace.parquet"))
+    if trace is not None and len(trace):
+        blocks.append(_convergence(results, content, trace))
     motion = _motion(results)
     if motion is not None:
         blocks.append(motion)
@@ -50,10 +51,12 @@ def interval_95(entry: dict[str, Any]) -> tuple[float, float] | None:
     return entry["estimate"] - _NORMAL_95 * sd, entry["estimate"] + _NORMAL_95 * sd
 
 
-def _parameters(content: dict[str, Any]) -> Table:
+def _parameters(results: Results, content: dict[str, Any]) -> Table:
     rows = []
     stored = False
-    for name, entry in content.get("parameters", {}).items():
+    parameters = content.get("parameters", {})
+    for name in results.in_order(parameters):
+        entry = parameters[name]
         interval = interval_95(entry)
         stored = stored or bool(entry.get("interval_95"))
         value, sd = entry["estimate"], entry.get("sd")
@@ -73,8 +76,7 @@ def _parameters(content: dict[str, Any]) -> Table:
         ("Parameter", "Name", "Estimate", "SD", "95 % interval", "Unit"),
         tuple(rows),
         "llrrrl",
-        (1.0, 0.0, 0.0, 0.0, 0.0, 0.0),
-        note,
+        note=note,
     )
 
 
@@ -110,23 +112,27 @@ def _scaled(value: float | None, unit: str) -> str:
     return f"{wording.significant(factor * value, 2)} {shown}"
 
 
-def _groups(content: dict[str, Any], trace: pd.DataFrame) -> list[tuple[str, str, list[str]]]:
+def _groups(
+    results: Results, content: dict[str, Any], trace: pd.DataFrame
+) -> list[tuple[str, str, list[str]]]:
     """Return title, unit and parameters of each panel: those of one kind and unit together."""
     groups: dict[tuple[str, str], list[str]] = {}
-    for name, entry in content.get("parameters", {}).items():
+    parameters = content.get("parameters", {})
+    for name in results.in_order(parameters):
         if name in trace.columns:
-            kind = wording.parameter(name.split(".")[0])
-            if not name.startswith(("viscous.", "coulomb.")):
-                kind = wording.parameter(name)
-            groups.setdefault((kind, str(entry.get("unit", ""))), []).append(name)
+            kind = wording.parameter(name)
+            if name.startswith(("viscous.", "coulomb.")):
+                kind = wording.parameter(name.split(".")[0])
+            unit = str(parameters[name].get("unit", ""))
+            groups.setdefault((kind, unit), []).append(name)
     return [(kind, unit, names) for (kind, unit), names in groups.items()]
 
 
 def _convergence(results: Results, content: dict[str, Any], trace: pd.DataFrame) -> Figure:
-    groups = _groups(content, trace)
-    groups.sort(key=lambda group: _rank(group[2][0]))
-    rows = math.ceil(len(groups) / 2)
-    figure, panels = style.panels(rows, 2, 0.35 + 1.35 * rows, sharex=True)
+    groups = _groups(results, content, trace)
+    columns = 2 if len(groups) <= _TWO_COLUMNS else 3
+    rows = math.ceil(len(groups) / columns)
+    figure, panels = style.panels(rows, columns, 0.35 + 1.35 * rows, sharex=True)
     time_column = "t_total" if "t_total" in trace else "t"
     keep = style.pick(len(trace), 1500)
     shown = trace.iloc[keep]
@@ -142,11 +148,11 @@ def _convergence(results: Results, content: dict[str, Any], trace: pd.DataFrame)
         panel.set_title(kind)
         panel.set_ylabel(wording.unit(unit) or "1")
         if len(panel.get_legend_handles_labels()[1]) > 1:
-            panel.legend(loc="best", ncols=2)
+            panel.legend(loc="best", ncols=2 if columns == 2 else 1)
     for panel in panels.flat[len(groups) :]:
         panel.set_axis_off()
-    for column in range(2):
-        last = (len(groups) - 1 - column) // 2
+    for column in range(min(columns, len(groups))):
+        last = (len(groups) - 1 - column) // columns
         panels[last, column].tick_params(labelbottom=True)
         panels[last, column].set_xlabel("time in the filter (s)")
     caption = (
@@ -154,12 +160,6 @@ def _convergence(results: Results, content: dict[str, Any], trace: pd.DataFrame)
         "Dotted verticals: a new trial starts."
     )
     return Figure("convergence", caption, style.svg(figure))
-
-
-def _rank(name: str) -> tuple[int, str]:
-    order = ("viscous", "coulomb", "mass")
-    first = name.split(".")[0]
-    return (order.index(first) if first in order else len(order), "")
 
 
 def _trace(

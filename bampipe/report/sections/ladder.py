@@ -23,7 +23,7 @@ def section(results: Results) -> Section | None:
     blocks: list[Block] = [_steps(results, rungs), _picture(results, rungs)]
     parameters = content.get("parameters") or {}
     if parameters:
-        blocks.append(_parameters(rungs, parameters))
+        blocks.append(_parameters(results, rungs, parameters))
     moved = [
         str(entry["sentence"]) for entry in content.get("moved") or () if entry.get("sentence")
     ]
@@ -58,7 +58,6 @@ def _steps(results: Results, rungs: list[dict[str, Any]]) -> Table:
         ("Version", "Added", *units),
         tuple(rows),
         "ll" + "r" * len(axes),
-        (0.0, 1.0, *(0.0 for _ in axes)),
     )
 
 
@@ -70,7 +69,7 @@ def _version(rungs: list[dict[str, Any]], rung: dict[str, Any]) -> str:
 
 def _picture(results: Results, rungs: list[dict[str, Any]]) -> Figure:
     axes = _axes(results, rungs)
-    figure, panels = style.panels(1, len(axes), 2.3, width=min(style.WIDTH, 2.6 * len(axes)))
+    figure, panels = style.panels(1, len(axes), 2.3, width=min(style.WIDTH, 1.2 + 1.9 * len(axes)))
     x = np.arange(len(rungs))
     for panel, axis in zip(panels[0], axes, strict=True):
         error = _values(rungs, "held_out_rmse", axis)
@@ -80,8 +79,8 @@ def _picture(results: Results, rungs: list[dict[str, Any]]) -> Figure:
         for place, value in zip(x, error, strict=True):
             if np.isfinite(value):
                 panel.annotate(
-                    wording.significant(float(value), 2), (place, value), (0, 5),
-                    textcoords="offset points", ha="center", fontsize=7,
+                    wording.significant(float(value), 2), (place, value), (4, 4),
+                    textcoords="offset points", ha="left", fontsize=7,
                 )  # fmt: skip
         top = np.nanmax(np.concatenate([error, floor, [0.0]]))
         panel.set_ylim(0.0, 1.22 * top or 1.0)
@@ -99,10 +98,11 @@ def _values(rungs: list[dict[str, Any]], key: str, axis: str) -> np.ndarray:
     return np.array([np.nan if value is None else float(value) for value in found])
 
 
-def _parameters(rungs: list[dict[str, Any]], parameters: dict[str, Any]) -> Table:
+def _parameters(results: Results, rungs: list[dict[str, Any]], parameters: dict[str, Any]) -> Table:
     shown = rungs if len(rungs) <= _MOST_COLUMNS else [rungs[0], *rungs[-(_MOST_COLUMNS - 1) :]]
     rows = []
-    for name, by_model in parameters.items():
+    for name in results.in_order(parameters):
+        by_model = parameters[name]
         entries = [by_model.get(rung["model"]) for rung in shown]
         unit = next((entry["unit"] for entry in entries if entry), "")
         cells = [
@@ -115,5 +115,4 @@ def _parameters(rungs: list[dict[str, Any]], parameters: dict[str, Any]) -> Tabl
         ("Parameter", *(_version(rungs, rung) for rung in shown), "Unit"),
         tuple(rows),
         "l" + "r" * len(shown) + "l",
-        (1.0, *(0.0 for _ in shown), 0.0),
     )

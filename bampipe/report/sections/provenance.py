@@ -55,7 +55,6 @@ def _inputs(stages: dict[str, Any]) -> Table | None:
         ("File", "Hash"),
         rows,
         "ll",
-        (1.0, 0.0),
     )
 
 
@@ -81,8 +80,7 @@ def _stages(stages: dict[str, Any], timings: dict[str, Any]) -> Table:
         ("Stage", "State", "Started (UTC)", "Seconds", "Files", "Key"),
         tuple(rows),
         "lllrrl",
-        (1.0, 0.0, 0.0, 0.0, 0.0, 0.0),
-        "Key: hash of everything the stage depends on (inputs, settings, code, versions).",
+        note="Key: hash of everything the stage depends on (inputs, settings, code, versions).",
     )
 
 

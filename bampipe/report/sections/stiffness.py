@@ -81,7 +81,7 @@ def _pose(results: Results, entry: dict[str, Any]) -> str:
     name = str(entry.get("bandwidth_pose", ""))
     pose = (entry.get("poses") or {}).get(name, {})
     parts = [
-        f"{axis} {wording.significant(float(pose[axis]), 3)} {results.unit(axis)}"
+        f"{axis} {float(pose[axis]):.3g} {results.unit(axis)}"
         for axis in verdicts.ordered(results, pose)
     ]
     return f"{wording.words(name)} ({', '.join(parts)})" if parts else wording.words(name)
@@ -96,7 +96,9 @@ def _scaled(value: float | None, unit: str) -> str:
 
 def _loops(results: Results, axes: dict[str, Any], loops: pd.DataFrame) -> Figure:
     names = [axis for axis in verdicts.ordered(results, axes) if (loops["axis"] == axis).any()]
-    figure, panels = style.panels(1, len(names), 2.35, width=min(style.WIDTH, 2.6 * len(names)))
+    figure, panels = style.panels(
+        1, len(names), 2.35, width=min(style.WIDTH, 1.6 + 1.9 * len(names))
+    )
     for panel, axis in zip(panels[0], names, strict=True):
         _loop(results, panel, axis, axes[axis], loops[loops["axis"] == axis])
     style.legend_below(figure, panels[0][0])

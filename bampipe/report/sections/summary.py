@@ -39,9 +39,7 @@ def _done(results: Results) -> str:
     if identified is not None:
         names = len(identified.get("parameters", {}))
         effects = results.effects(results.model)
-        added = (
-            f", which adds {wording.listing(f'`{name}`' for name in effects)}" if effects else ""
-        )
+        added = f", with {wording.listing(f'`{name}`' for name in effects)}" if effects else ""
         parts.append(
             f"{wording.count(names, 'parameter')} of model `{results.model}`{added} were identified"
             f"{_how(identified)}."
@@ -112,7 +110,7 @@ def _numbers(results: Results) -> Table | None:
             ("Error without friction terms", "rmse_without_friction"),
         )
     ]
-    rows.append(_row("Force explained", axes, lambda axis: _percent(validated.get(axis))))
+    rows.append(_row("Fit", axes, lambda axis: _percent(validated.get(axis))))
     rows.append(_row("Stiffness, brake locked", axes, lambda axis: _stiffness(stiff.get(axis))))
     rows = [row for row in rows if any(cell != "–" for cell in row[1:])]
     if not rows:
@@ -123,7 +121,7 @@ def _numbers(results: Results) -> Table | None:
         tuple(rows),
         "l" + "r" * len(axes),
         (0.0, *(1.0 for _ in axes)),
-        _others(identified),
+        _others(results, identified),
     )
 
 
@@ -156,8 +154,9 @@ def _stiffness(entry: dict[str, Any] | None) -> str:
     return f"{wording.with_sd(factor * entry['stiffness'], factor * entry['sd'])} {unit}"
 
 
-def _others(parameters: dict[str, Any]) -> str:
-    others = [name for name in parameters if not name.startswith(("viscous.", "coulomb."))]
+def _others(results: Results, parameters: dict[str, Any]) -> str:
+    named = results.in_order(parameters)
+    others = [name for name in named if not name.startswith(("viscous.", "coulomb."))]
     if not others:
         return ""
     shown = (f"{wording.parameter(name)}: {_estimate(parameters[name])}" for name in others)

@@ -126,7 +126,7 @@ def _forces(results: Results, frame: pd.DataFrame) -> Figure:
     at_handle = bool(components)
     names = components or [a for a in results.axes if f"torque_measured_{a}" in frame]
     kind = "force" if at_handle else "torque"
-    figure, panels = style.panels(len(names), 1, 0.45 + 1.4 * len(names), sharex=True)
+    figure, panels = style.panels(len(names), 1, 0.45 + 1.2 * len(names), sharex=True)
     t = frame["t"].to_numpy()
     window = (t >= t[0] + _SETTLE_S) & (t <= t[0] + _SETTLE_S + _WINDOW_S)
     part = frame[window] if window.sum() > 10 else frame
@@ -193,7 +193,7 @@ def _one_movement(speed: np.ndarray) -> slice:
 
 def _friction(results: Results, frame: pd.DataFrame, velocity: dict[str, np.ndarray]) -> Figure:
     axes = list(velocity)
-    figure, panels = style.panels(2, len(axes), 4.3, width=min(style.WIDTH, 3.0 * len(axes)))
+    figure, panels = style.panels(2, len(axes), 3.9, width=min(style.WIDTH, 2.6 + 1.6 * len(axes)))
     t = frame["t"].to_numpy()
     for column, axis in enumerate(axes):
         measured = frame[f"torque_measured_{axis}"].to_numpy()
@@ -203,8 +203,8 @@ def _friction(results: Results, frame: pd.DataFrame, velocity: dict[str, np.ndar
         keep = style.pick(len(error), 2500)
         speed, unit = velocity[axis], wording.unit(results.rate_unit(axis))
         top, bottom = panels[0, column], panels[1, column]
-        top.plot(speed[keep], error[keep], ".", ms=1.3, mew=0, color=style.BLUE, alpha=0.6,
-                 label="whole trial", rasterized=False)  # fmt: skip
+        top.plot(speed[keep], error[keep], ".", ms=2.2, mew=0, color=style.BLUE, alpha=0.5,
+                 label="whole trial")  # fmt: skip
         top.plot(speed[one], error[one], color=style.VERMILLION, lw=1.2, label="one movement")
         _arrow(top, speed[one], error[one])
         force = wording.unit(results.force_unit(axis))
@@ -237,5 +237,5 @@ def _arrow(panel: Any, x: np.ndarray, y: np.ndarray) -> None:
     ahead = start + max(2, len(x) // 25)
     panel.annotate(
         "", xy=(x[ahead], y[ahead]), xytext=(x[start], y[start]),
-        arrowprops={"arrowstyle": "-|>", "color": style.VERMILLION, "lw": 1.2, "mutation_scale": 9},
+        arrowprops={"arrowstyle": "-|>", "color": style.VERMILLION, "lw": 1.2, "mutation_scale": 13},
     )  # fmt: skip

@@ -1,0 +1,259 @@
+"""The report of a made-up run: what it says, and that it says nothing that is not stored."""
+
+from __future__ import annotations
+
+import html
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pandas as pd
+import pytest
+import synthetic_run
+
+from bampipe.errors import InputError
+from bampipe.report import style
+from bampipe.report.build import Report, build
+from bampipe.report.results import Results
+
+
+def quiet(fraction: float, message: str) -> None:
+    assert 0.0 <= fraction <= 1.0
+    assert message
+
+
+def text_of(page: str) -> str:
+    """Return the words of a page without its drawings and marks."""
+    body = page[page.index("<main>") :]
+    body = re.sub(r"<svg.*?</svg>", " ", body, flags=re.DOTALL)
+    body = re.sub(r"<[^>]+>", " ", body)
+    return re.sub(r"\s+", " ", html.unescape(body))
+
+
+def row_of(page: str, *start: str) -> list[str]:
+    """Return the cells of the first table row whose first cells read ``start``."""
+    for row in re.findall(r"<tr>(.*?)</tr>", page, flags=re.DOTALL):
+        cells = [text_of(f"<main>{cell}").strip() for cell in re.findall(r"<td.*?</td>", row)]
+        if tuple(cells[: len(start)]) == start:
+            return cells
+    raise AssertionError(f"no row {start}")
+
+
+@pytest.fixture(scope="module")
+def full_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return synthetic_run.write_all(tmp_path_factory.mktemp("runs") / "s01")
+
+
+@pytest.fixture(scope="module")
+def full(full_run: Path) -> Report:
+    return build(Results(full_run), quiet)
+
+
+@pytest.fixture(scope="module")
+def bare(tmp_path_factory: pytest.TempPathFactory) -> Report:
+    root = tmp_path_factory.mktemp("runs") / "s02"
+    synthetic_run.write_ingest(root)
+    return build(Results(root), quiet)
+
+
+def test_sections_in_order_summary_first_provenance_last(full: Report) -> None:
+    assert full.sections[0] == "Summary"
+    assert full.sections[-1] == "Provenance"
+    headings = re.findall(r"<h2[^>]*>(.*?)</h2>", full.html)
+    assert headings == list(full.sections)
+
+
+def test_summary_gives_the_verdict_and_the_key_numbers(full: Report) -> None:
+    words = text_of(full.html)
+    start = words[: words.index("Trials")]
+    assert "The model with stribeck:yaw explains this session: nothing is missing" in start
+    assert "yaw 0.562 to 0.212 N·m (floor 0.203)" in start
+    assert row_of(full.html, "Viscous damping")[1] == "4.17 ± 0.13 N·m·s/rad"
+    assert row_of(full.html, "Noise floor")[1:] == ["0.203 N·m", "0.229 N·m", "0.601 N"]
+
+
+def test_parameters_are_the_stored_ones_rounded_to_their_uncertainty(full: Report) -> None:
+    for name, (value, sd, unit) in synthetic_run.parameters(synthetic_run.CHILD).items():
+        cells = next(
+            row
+            for row in re.findall(r"<tr>(.*?)</tr>", full.html, flags=re.DOTALL)
+            if f"<code>{name}</code>" in row
+        )
+        shown = [text_of(f"<main>{cell}").strip() for cell in re.findall(r"<td.*?</td>", cells)]
+        estimate, spread = float(shown[2]), float(shown[3])
+        assert estimate == pytest.approx(value, abs=0.06 * sd)
+        assert spread == pytest.approx(sd, rel=0.06)
+        low, high = (float(part) for part in shown[4].split(" to "))
+        assert low == pytest.approx(value - 1.96 * sd, abs=0.06 * sd)
+        assert high == pytest.approx(value + 1.96 * sd, abs=0.06 * sd)
+        assert shown[5] == unit.replace(".", "·")
+
+
+def test_errors_of_every_axis_stand_beside_the_floor(full: Report) -> None:
+    table = full.html[full.html.index("Error of the predicted force") :]
+    for axis, error in synthetic_run.held_out(synthetic_run.CHILD).items():
+        cells = row_of(table, axis)
+        assert float(cells[1]) == pytest.approx(error, rel=3e-3)
+        assert float(cells[2]) == pytest.approx(synthetic_run.FLOOR[axis], rel=3e-3)
+
+
+def test_trials_set_aside_and_repaired_say_why(full: Report) -> None:
+    assert row_of(full.html, "t04_free")[-2:] == ["set aside", "force_x frozen"]
+    assert row_of(full.html, "t03_free")[-2] == "repaired"
+    assert "interpolated" in row_of(full.html, "t03_free")[-1]
+
+
+def test_diagnosis_names_effect_group_and_trial(full: Report) -> None:
+    words = text_of(full.html)
+    assert row_of(full.html, "stribeck:yaw", "yaw")[2:] == [
+        "0.562", "0.212", "N·m", "< 0.001", "presliding:yaw",
+    ]  # fmt: skip
+    assert "Move yaw back and forth at 0.02 rad/s" in words
+    assert "reversing slowly with the arm extended" in words
+    assert "residual-maps-base-yaw" in full.figures
+    assert "residual-maps-base-pitch" not in full.figures
+
+
+def test_ladder_shows_every_version_and_what_moved(full: Report) -> None:
+    table = full.html[full.html.index("RMSE on the same held-out trials") :]
+    assert row_of(table, "base")[2] == "0.562 (0.203)"
+    assert row_of(table, "version 1")[1:3] == ["stribeck:yaw", "0.212 (0.203)"]
+    assert "coulomb.yaw fell by 0.21" in text_of(full.html)
+
+
+def test_stiffness_in_both_units_of_bandwidth(full: Report) -> None:
+    table = full.html[full.html.index("Stiffness of the locked axes") :]
+    assert row_of(table, "yaw")[1:] == [
+        "2.304 ± 0.013 kN·m/rad", "3", "5.53 N·m", "197 mJ", "25.1", "4.00",
+    ]  # fmt: skip
+
+
+def test_paper_beside_session(full: Report) -> None:
+    assert row_of(full.html, "Viscous damping, yaw", "Table VII")[2:4] == [
+        "4.17 ± 0.128", "4.17 ± 0.13",
+    ]  # fmt: skip
+    assert row_of(full.html, "Stiffness, pitch")[3] == "–"
+
+
+def test_provenance_lists_inputs_versions_and_timings(full: Report) -> None:
+    words = text_of(full.html)
+    words = words[words.rindex("Provenance") :]
+    assert "bampipe 0.1.0" in words
+    assert "aaaaaaaaaaaa" in words
+    assert "2.2" in row_of(full.html[full.html.rindex("Stages") :], "filter")
+
+
+def test_all_figures_of_the_paper(full: Report) -> None:
+    assert {
+        "stiffness-loops", "error-without-friction", "torques-and-motion", "convergence",
+        "force-prediction", "ladder",
+    } <= full.figures.keys()  # fmt: skip
+    for place in ("Fig. 3", "Fig. 4", "Fig. 6", "Fig. 7", "Fig. 9", "Table I", "Table VI"):
+        assert f"the paper's {place}" in text_of(full.html)
+
+
+def test_figures_are_vectors_in_the_palette(full: Report) -> None:
+    known = {*style.COLOURS.values(), "#ffffff", "#000000"}
+    for name, svg in full.figures.items():
+        assert "<image" not in svg, name
+        assert set(re.findall(r"#[0-9a-f]{6}\b", svg)) <= known, name
+        assert "<dc:date>" not in svg
+
+
+def test_page_is_self_contained_with_unique_ids(full: Report) -> None:
+    assert not re.search(r'(src|href)="(?!#)[^"]*"', full.html)
+    assert "@import" not in full.html
+    ids = re.findall(r'\bid="([^"]+)"', full.html)
+    assert len(ids) == len(set(ids))
+    targets = set(re.findall(r'(?:href="|url\()#([^")]+)', full.html))
+    assert targets <= set(ids)
+    assert "prefers-color-scheme: dark" in full.html
+
+
+def test_same_results_same_bytes(full: Report, full_run: Path) -> None:
+    again = build(Results(full_run), quiet)
+    assert again == full
+
+
+def test_pdf_text_and_pages(full: Report, tmp_path: Path) -> None:
+    if shutil.which("pdftotext") is None:
+        pytest.skip("pdftotext (poppler) is not installed")
+    path = tmp_path / "report.pdf"
+    path.write_bytes(full.pdf)
+    done = subprocess.run(
+        ["pdftotext", "-layout", str(path), "-"], capture_output=True, text=True, check=True
+    )
+    pages = done.stdout.rstrip("\f").split("\f")
+    assert 7 <= len(pages) <= 12
+    assert "Session s01" in pages[0]
+    assert "nothing is missing" in pages[0]
+    assert "Provenance" in pages[-1]
+    assert "4.17 ± 0.13" in pages[0]
+    assert "3.526 to 3.578" in done.stdout
+    assert all(len(page.split()) > 40 for page in pages)
+
+
+def test_what_was_not_done_is_said_with_its_command(bare: Report) -> None:
+    words = text_of(bare.html)
+    for command in ("filter", "stiffness", "identify", "validate", "diagnose"):
+        assert f"bampipe {command} s02" in words
+    assert "Model versions" not in bare.sections
+    assert bare.figures == {}
+    assert bare.pdf.startswith(b"%PDF")
+
+
+def test_validated_above_the_floor_asks_for_a_diagnosis(tmp_path: Path) -> None:
+    root = tmp_path / "s03"
+    synthetic_run.write_ingest(root)
+    synthetic_run.write_model(root, "base")
+    synthetic_run.write_validation(root, "base")
+    report = build(Results(root), quiet)
+    words = text_of(report.html)
+    assert "leaves something unexplained on yaw" in words
+    assert "2.76 × the noise floor" in words
+    assert "bampipe diagnose s03" in words
+
+
+def test_one_model_in_detail_can_be_chosen(full_run: Path) -> None:
+    results = Results(full_run, "base")
+    assert results.model == "base"
+    assert results.effects("base") == ()
+    with pytest.raises(InputError, match="no results for model 'bse'.*base"):
+        _ = Results(full_run, "bse").model
+
+
+def test_without_ingest_one_line_says_so(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="is missing.*bampipe ingest"):
+        build(Results(tmp_path), quiet)
+
+
+def test_damaged_results_are_named(tmp_path: Path) -> None:
+    synthetic_run.write_ingest(tmp_path)
+    (tmp_path / "stiffness").mkdir()
+    (tmp_path / "stiffness/stiffness.json").write_text("{")
+    with pytest.raises(InputError, match="stiffness.json"):
+        build(Results(tmp_path), quiet)
+    (tmp_path / "stiffness/stiffness.json").unlink()
+    (tmp_path / "ingest/trials.parquet").write_bytes(b"PAR1")
+    with pytest.raises(InputError, match="trials.parquet"):
+        build(Results(tmp_path), quiet)
+
+
+def test_bad_source_date_epoch_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    synthetic_run.write_ingest(tmp_path)
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "yesterday")
+    with pytest.raises(InputError, match="SOURCE_DATE_EPOCH"):
+        build(Results(tmp_path), quiet)
+
+
+def test_text_from_files_cannot_break_the_page_or_the_print(tmp_path: Path) -> None:
+    nasty = '#panic("x") <script>alert(1)</script> $x$ \\ [ ] * _ @a'
+    synthetic_run.write_ingest(tmp_path)
+    frame = pd.read_parquet(tmp_path / "ingest/trials.parquet")
+    frame["reason"] = nasty
+    frame.to_parquet(tmp_path / "ingest/trials.parquet")
+    report = build(Results(tmp_path), quiet)
+    assert "<script>" not in report.html
+    assert nasty in text_of(report.html)
+    assert report.pdf.startswith(b"%PDF")

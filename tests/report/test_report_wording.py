@@ -1,0 +1,84 @@
+"""Numbers, units and names as printed."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bampipe.report import wording
+
+
+@pytest.mark.parametrize(
+    ("stored", "shown"),
+    [("N.m.s/rad", "N·m·s/rad"), ("m/s2", "m/s²"), ("kg.m2", "kg·m²"), ("", ""), ("1/s", "1/s")],
+)
+def test_unit(stored: str, shown: str) -> None:
+    assert wording.unit(stored) == shown
+
+
+@pytest.mark.parametrize(
+    ("value", "sd", "shown"),
+    [
+        (4.1712, 0.1283, "4.17 ± 0.13"),
+        (109020.3, 694.0, "109020 ± 694"),
+        (-0.0513, 0.0042, "−0.0513 ± 0.0042"),
+        (3.0, 0.0996, "3.00 ± 0.10"),
+        (2.5, None, "2.500"),
+        (2.5, 0.0, "2.500"),
+        (None, 0.1, "–"),
+        (float("nan"), 0.1, "–"),
+        (-0.0001, 0.13, "0.00 ± 0.13"),
+    ],
+)
+def test_with_sd(value: float | None, sd: float | None, shown: str) -> None:
+    assert wording.with_sd(value, sd) == shown
+
+
+@given(st.floats(-1e6, 1e6), st.floats(1e-6, 1e4))
+def test_rounding_stays_within_a_twentieth_of_the_uncertainty(value: float, sd: float) -> None:
+    shown = wording.with_sd(value, sd).replace("−", "-").split(" ± ")
+    assert abs(float(shown[0]) - value) <= 0.0505 * sd + 1e-9 * abs(value)
+    assert abs(float(shown[1]) - sd) <= 0.0505 * sd
+
+
+@given(st.floats(1e-9, 1e9))
+def test_significant_keeps_three_digits(value: float) -> None:
+    text = wording.significant(value)
+    if "·10" in text:
+        mantissa, raised = text.split("·10")
+        power = int("".join("-0123456789"["⁻⁰¹²³⁴⁵⁶⁷⁸⁹".index(mark)] for mark in raised))
+        shown = float(mantissa) * 10.0**power
+    else:
+        shown = float(text)
+    assert shown == pytest.approx(value, rel=5.01e-3)
+
+
+@pytest.mark.parametrize(
+    ("values", "base", "shown"),
+    [
+        ([2304.2], "N.m/rad", (1e-3, "kN·m/rad")),
+        ([47e-6], "rad", (1e6, "µrad")),
+        ([0.0009], "m", (1e3, "mm")),
+        ([0.5], "m/s", (1.0, "m/s")),
+        ([500.0], "N", (1.0, "N")),
+        ([3500.0], "kg", (1.0, "kg")),
+        ([0.0], "m", (1.0, "m")),
+        ([1e-9], "m", (1e6, "µm")),
+    ],
+)
+def test_scale(values: list[float], base: str, shown: tuple[float, str]) -> None:
+    factor, unit = wording.scale(values, base)
+    assert factor == pytest.approx(shown[0])
+    assert unit == shown[1]
+
+
+def test_names_in_words() -> None:
+    assert wording.parameter("viscous.yaw") == "Viscous damping, yaw"
+    assert wording.parameter("gravity_compensator_lag.time") == "Gravity compensator lag, time"
+    assert wording.listing(["a", "b", "c"]) == "a, b and c"
+    assert wording.listing(["a"]) == "a"
+    assert wording.count(1, "trial") == "1 trial"
+    assert wording.count(2, "trial") == "2 trials"
+    assert wording.probability(0.0002) == "< 0.001"
+    assert wording.percent(0.812) == "81 %"
