@@ -141,6 +141,12 @@ STAGES: tuple[str, ...] = (
 )
 """All stages, in the order in which they run."""
 
+READS_SESSION: tuple[str, ...] = ("ingest",)
+"""Stages whose ``Config`` has a field ``session``."""
+
+PER_MODEL: tuple[str, ...] = ("identify", "validate", "diagnose")
+"""Stages whose ``Config`` has a field ``model``: they run once for each model."""
+
 
 def load(name: str) -> Stage:
     """Import and return the stage ``name``.

@@ -1,0 +1,153 @@
+"""Several sessions: one after another, or in worker processes; one failure stops no other."""
+
+from __future__ import annotations
+
+import multiprocessing
+import multiprocessing.connection
+import os
+import traceback
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from bampipe.errors import InputError
+from bampipe.run.runner import Event, Listener, Outcome, Request, run_session
+
+THREAD_VARIABLES = (
+    "OMP_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "NUMBA_NUM_THREADS",
+)
+
+
+def limit_threads(jobs: int) -> None:
+    """Give each of ``jobs`` processes its share of the cores, unless the user has said otherwise.
+
+    Linear algebra gets one thread in any case: how many there are changes the last bits of a sum,
+    and the same inputs must give the same bytes. To be called before numpy is imported.
+
+    Args:
+        jobs: number of processes.
+    """
+    share = str(max(1, (os.cpu_count() or 1) // jobs))
+    for name in THREAD_VARIABLES:
+        single = name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+        os.environ.setdefault(name, "1" if single else share)
+
+
+def guarded(request: Request, listen: Listener) -> Outcome:
+    """Run one session; whatever goes wrong becomes part of its outcome.
+
+    Args:
+        request: what to run.
+        listen: told of every event.
+    """
+    try:
+        return run_session(request, listen)
+    except InputError as error:
+        return Outcome(request.root, "refused", error=str(error))
+    except Exception as error:
+        text = f"{type(error).__name__}: {error}"
+        return Outcome(request.root, "crashed", error=text, traceback=traceback.format_exc())
+
+
+def _work(pipe: multiprocessing.connection.Connection) -> None:
+    def listen(event: Event) -> None:
+        pipe.send(event)
+
+    while True:
+        request = pipe.recv()
+        if request is None:
+            return
+        pipe.send(guarded(request, listen))
+
+
+class _Worker:
+    def __init__(self) -> None:
+        context = multiprocessing.get_context("spawn")
+        self.pipe, far = context.Pipe()
+        self.process = context.Process(target=_work, args=(far,), daemon=False)
+        self.process.start()
+        far.close()
+        self.task: int | None = None
+
+    def give(self, index: int, request: Request) -> None:
+        self.task = index
+        self.pipe.send(request)
+
+    def stop(self) -> None:
+        if self.process.is_alive() and self.task is None:
+            self.pipe.send(None)
+        else:
+            self.process.terminate()
+        self.process.join()
+        self.pipe.close()
+
+
+def run_sessions(
+    requests: Sequence[Request],
+    jobs: int,
+    listen: Listener,
+    finished: Callable[[Outcome], None],
+) -> list[Outcome]:
+    """Run several sessions.
+
+    A worker process that dies (killed, out of memory) costs only the session it was at work on,
+    whose run folder the next run completes.
+
+    Args:
+        requests: one for each session; no two may share a run folder.
+        jobs: number of worker processes; 1 runs everything in this process.
+        listen: told of every event of every session.
+        finished: told of each outcome as it comes.
+
+    Returns:
+        The outcomes, in the order of the requests.
+    """
+    if jobs <= 1 or len(requests) <= 1:
+        outcomes = []
+        for request in requests:
+            outcomes.append(guarded(request, listen))
+            finished(outcomes[-1])
+        return outcomes
+    done: dict[int, Outcome] = {}
+    waiting = list(enumerate(requests))[::-1]
+    workers: list[_Worker] = []
+
+    def settle(worker: _Worker, outcome: Outcome) -> None:
+        assert worker.task is not None
+        done[worker.task] = outcome
+        worker.task = None
+        finished(outcome)
+
+    try:
+        while len(done) < len(requests):
+            for worker in workers:
+                if worker.task is None and waiting:
+                    worker.give(*waiting.pop())
+            while waiting and len(workers) < jobs:
+                workers.append(_Worker())
+                workers[-1].give(*waiting.pop())
+            busy = {worker.pipe: worker for worker in workers if worker.task is not None}
+            for pipe in multiprocessing.connection.wait(list(busy)):
+                worker = busy[pipe]  # type: ignore[index]
+                try:
+                    message: Any = worker.pipe.recv()
+                except EOFError:
+                    worker.process.join()
+                    code = worker.process.exitcode
+                    assert worker.task is not None
+                    root = requests[worker.task].root
+                    text = f"the worker process died (exit code {code})"
+                    settle(worker, Outcome(root, "crashed", error=text))
+                    workers.remove(worker)
+                    worker.pipe.close()
+                    continue
+                if isinstance(message, Event):
+                    listen(message)
+                else:
+                    settle(worker, message)
+    finally:
+        for worker in workers:
+            worker.stop()
+    return [done[index] for index in range(len(requests))]

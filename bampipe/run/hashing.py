@@ -1,0 +1,220 @@
+"""Content hashes: of files, of configuration, of sessions, of the code that made a result."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import importlib.util
+import json
+import os
+import platform
+import time
+import tomllib
+from collections.abc import Iterable, Mapping
+from datetime import date, datetime
+from datetime import time as clock_time
+from functools import cache
+from pathlib import Path
+
+import bampipe
+from bampipe.stages import base
+
+PACKAGES = (
+    "h5py",
+    "matplotlib",
+    "numba",
+    "numpy",
+    "pandas",
+    "pyarrow",
+    "scikit-learn",
+    "scipy",
+    "sympy",
+    "typst",
+)
+"""Packages whose version may change a result."""
+
+SHARED_CODE = ("physics", "estimate", "discover", "data")
+"""Sub-packages every stage may call; a change in one of them reruns every stage."""
+
+ABSENT = "absent"
+
+# A file changed within this time of being hashed could change again without its time stamp showing.
+RACY_NS = 2_000_000_000
+
+
+def digest_bytes(content: bytes) -> str:
+    """Return the SHA-256 of ``content`` in hexadecimal."""
+    return hashlib.sha256(content).hexdigest()
+
+
+def digest_file(path: Path) -> str:
+    """Return the SHA-256 of the bytes of ``path`` in hexadecimal, read in pieces."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def _plain(value: object) -> object:
+    if isinstance(value, datetime | date | clock_time):
+        return value.isoformat()
+    raise TypeError(f"cannot hash a {type(value).__name__}")
+
+
+def digest_content(content: object) -> str:
+    """Return the SHA-256 of ``content`` (what JSON or TOML can hold), whatever its key order."""
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"), default=_plain)
+    return digest_bytes(text.encode())
+
+
+def digest_input(path: Path) -> str:
+    """Return the hash of an input: a TOML file counts by what it says, others by their bytes.
+
+    White space and comments in a TOML file therefore change nothing. A file that is not valid
+    TOML counts by its bytes: the stage that reads it says what is wrong with it.
+    """
+    if path.suffix == ".toml":
+        content = path.read_bytes()
+        try:
+            return digest_content(tomllib.loads(content.decode("utf-8")))
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError):
+            return digest_bytes(content)
+    return digest_file(path)
+
+
+class HashMemory:
+    """Hashes of large files outside the run folder, kept with their size and time stamp.
+
+    A file is read again when its size or modification time differs from what was noted. A file
+    modified less than two seconds before it was hashed is not noted at all.
+
+    Args:
+        path: JSON file that holds the notes; a damaged one is started afresh.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.changed = False
+        self.notes: dict[str, list[object]] = {}
+        try:
+            notes = json.loads(path.read_text(encoding="utf-8"))
+        except (FileNotFoundError, json.JSONDecodeError, UnicodeDecodeError):
+            notes = {}
+        if isinstance(notes, dict):
+            self.notes = notes
+
+    def digest(self, path: Path) -> str:
+        """Return the hash of the file ``path`` as :func:`digest_input` would."""
+        key = os.path.realpath(path)
+        now = time.time_ns()
+        status = path.stat()
+        stamp = [status.st_size, status.st_mtime_ns]
+        note = self.notes.get(key)
+        if isinstance(note, list) and len(note) == 3 and note[:2] == stamp:
+            return str(note[2])
+        value = digest_input(path)
+        if now - status.st_mtime_ns > RACY_NS:
+            self.notes[key] = [*stamp, value]
+            self.changed = True
+        return value
+
+
+def _inside(folder: Path, name: object) -> Path | None:
+    """Return the file ``name`` of a session if it lies inside ``folder``."""
+    if not isinstance(name, str) or not name or "\0" in name:
+        return None
+    path = folder / name
+    if not path.resolve().is_relative_to(folder.resolve()):
+        return None
+    return path
+
+
+def session_files(folder: Path) -> dict[str, Path]:
+    """Return the files a session consists of, by the name the session file gives them.
+
+    These are ``session.toml``, the trial files and, where the device is a file, that file.
+    Only files inside the session folder count, since ingest refuses others.
+
+    Args:
+        folder: the session folder.
+    """
+    session = folder / "session.toml"
+    files = {"session.toml": session}
+    try:
+        content = tomllib.loads(session.read_text(encoding="utf-8"))
+    except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError):
+        return files
+    trials = content.get("trials")
+    names = [trial.get("file") for trial in trials if isinstance(trial, dict)] if trials else []
+    for name in names:
+        path = _inside(folder, name)
+        if path is not None:
+            files[str(name)] = path
+    device = content.get("device")
+    if isinstance(device, str) and device.endswith(".toml"):
+        files[device] = folder / device
+    return files
+
+
+def digest_session(folder: Path, memory: HashMemory | None = None) -> dict[str, str]:
+    """Return the hash of each file of a session, ``"absent"`` where there is none.
+
+    Args:
+        folder: the session folder.
+        memory: notes on files hashed before; without it every file is read.
+    """
+    digest = memory.digest if memory is not None else digest_input
+    return {
+        f"session:{name}": digest(path) if path.is_file() else ABSENT
+        for name, path in sorted(session_files(folder).items())
+    }
+
+
+def _source_files(root: Path) -> Iterable[Path]:
+    if root.is_file():
+        yield root
+        return
+    for path in sorted(root.rglob("*")):
+        if path.suffix in {".py", ".toml", ".typ"} and "__pycache__" not in path.parts:
+            yield path
+
+
+@cache
+def _digest_tree(root: Path) -> str:
+    return digest_content(
+        [(str(path.relative_to(root)), digest_file(path)) for path in _source_files(root)]
+    )
+
+
+def digest_code(stage: str) -> str:
+    """Return the hash of the source that ``stage`` may call, without importing it.
+
+    Args:
+        stage: name of a stage.
+    """
+    package = Path(bampipe.__file__).parent
+    parts = [package / name for name in SHARED_CODE]
+    parts.append(package / "errors.py")
+    if stage == "report":
+        parts.append(package / "report")
+    stages = package / "stages"
+    parts += [
+        path
+        for path in sorted(stages.glob("*.py"))
+        if path.stem not in base.STAGES and path.stem != "__init__"
+    ]
+    spec = importlib.util.find_spec(f"bampipe.stages.{stage}")
+    if spec is not None and spec.origin is not None:
+        origin = Path(spec.origin)
+        parts.append(origin.parent if origin.name == "__init__.py" else origin)
+    return digest_content([(part.name, _digest_tree(part)) for part in parts if part.exists()])
+
+
+@cache
+def versions() -> Mapping[str, str]:
+    """Return the version of bampipe, of Python and of every package that may change a result."""
+    found = {"bampipe": bampipe.__version__, "python": platform.python_version()}
+    for name in PACKAGES:
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            found[name] = ABSENT
+    return found
