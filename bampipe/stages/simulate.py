@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import json
 import re
-import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +18,14 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from bampipe.data import store
 from bampipe.errors import InputError
 from bampipe.estimate.simulation import Impedance, simulate_tracking
 from bampipe.physics import Model, registry
 from bampipe.physics.device import Coordinate, Device
 from bampipe.physics.effect import BoundEffect, Effect, derivative
 from bampipe.physics.system import System, compile_model
-from bampipe.stages.base import Progress, silent, write_json
+from bampipe.stages.base import Progress, silent
 
 NAME = "simulate"
 SUMMARY = "Make a session from the model, with known effects hidden in it"
@@ -173,22 +173,21 @@ def simulate_session(out: Path, config: Config, progress: Progress = silent) -> 
         frame = _read_out(plant, config, rng, recording, trial["kind"] == "locked")
         path = out / trial["file"]
         if config.file_format == "csv":
-            frame.to_csv(path, index=False, lineterminator="\n")
+            store.write_text(path, frame.to_csv(index=False, lineterminator="\n"))
         else:
-            frame.to_parquet(path, index=False)
+            store.write_parquet(path, frame)
         progress((number + 1) / len(trials), trial["file"])
-    (out / "session.toml").write_text(_session_toml(out.name, plant.device, config, trials))
+    store.write_text(out / "session.toml", _session_toml(out.name, plant.device, config, trials))
     truth = out.with_name(out.name + ".truth.json")
-    write_json(
+    store.write_json(
         truth,
         {
             "schema": "bampipe.truth/1",
             "device": plant.device.name,
             "effects": strengths,
-            "seed": config.seed,
+            "configuration": asdict(config),
             "parameters": dict(plant.values),
             "stiffness": dict(plant.stiffness) if config.locked_trials else {},
-            "force_noise_sd_n": config.force_noise,
         },
     )
     return {
@@ -270,10 +269,7 @@ def _is_delay(item: BoundEffect) -> bool:
 
 
 def _own_effect(path: Path) -> Effect:
-    try:
-        return registry.effect_from(tomllib.loads(path.read_text(encoding="utf-8")), str(path))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise InputError(f"cannot read the effect file: {error}", where=str(path)) from error
+    return registry.effect_from(store.read_toml(path), str(path))
 
 
 def _strength(text: str, default: float) -> tuple[str, float]:
@@ -355,7 +351,7 @@ def _moving(plant: Plant, config: Config, rng: np.random.Generator, viscous: boo
     """A free trial, or one in a viscous field."""
     system, device = plant.motion, plant.device
     dt = 1.0 / config.sample_rate
-    t = np.arange(round(config.duration * config.sample_rate)) * dt
+    t = np.arange(round(config.duration * config.sample_rate), dtype=np.float64) * np.float64(dt)
     q_ref, qd_ref = _wanted(device, config, rng, t, 0.6 if viscous else 1.0)
     arm = Impedance(natural_frequency=rng.uniform(7.0, 10.0), damping_ratio=1.0, bandwidth=50.0)
     u = np.zeros((len(t), len(system.inputs)))
@@ -425,8 +421,8 @@ def _locked(plant: Plant, config: Config, rng: np.random.Generator, axis: str) -
 
 def _forces(input_map: Array, load: Array) -> Array:
     """Handle forces (T, n_f) that give the generalised forces ``load`` (T, n_q)."""
-    inverse: Array = np.linalg.pinv(input_map)
-    return np.einsum("tfq,tq->tf", inverse, load)
+    inverse = np.linalg.pinv(input_map)
+    return np.asarray(np.einsum("tfq,tq->tf", inverse, load), dtype=np.float64)
 
 
 def _read_out(
@@ -500,7 +496,7 @@ def _sensed_force(plant: Plant, true: Recording) -> Array:
 
     def corrected(u: Array) -> Array:
         applied = system.applied(true.q, true.qd, still, no_states, u, p)
-        return np.einsum("tfq,tq->tf", inverse, applied)
+        return np.asarray(np.einsum("tfq,tq->tf", inverse, applied), dtype=np.float64)
 
     zero = _inputs(system, true, np.zeros_like(late))
     constant = corrected(zero)

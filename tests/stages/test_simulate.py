@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import tomllib
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -18,6 +19,7 @@ from bampipe.physics import Model, compile_model, registry
 from bampipe.stages.simulate import Config, simulate_session
 
 AXES = ("yaw", "pitch", "extension")
+SAMPLES = Path(__file__).parents[2] / "sample_runs"
 
 
 def make(tmp_path, **options):
@@ -236,7 +238,7 @@ def test_parquet_holds_the_same(tmp_path):
         ({"strength": -1.0}, "strength must not be negative"),
         ({"file_format": "xls"}, "neither csv nor parquet"),
         ({"parameters": {"viscos.yaw": 3.0}}, "no parameter 'viscos.yaw'"),
-        ({"effect_files": ("nowhere.toml",)}, "cannot read the effect file"),
+        ({"effect_files": ("nowhere.toml",)}, "nowhere.toml"),
     ],
 )
 def test_mistakes_are_one_clear_line(tmp_path, options, message):
@@ -244,6 +246,21 @@ def test_mistakes_are_one_clear_line(tmp_path, options, message):
         make(tmp_path, **options)
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "made").exists()
+
+
+@pytest.mark.parametrize("name", ["demo", "first"])
+def test_sample_sessions_are_what_their_truth_says(tmp_path, name):
+    truth = json.loads((SAMPLES / f"{name}.truth.json").read_text())
+    lists = {key: tuple(truth["configuration"][key]) for key in ("effects", "effect_files")}
+    options = truth["configuration"] | lists
+    simulate_session(tmp_path / name, Config(**options))
+    assert json.loads((tmp_path / f"{name}.truth.json").read_text()) == truth
+    count = len(tomllib.loads((SAMPLES / name / "session.toml").read_text())["trials"])
+    for number in range(count):
+        shipped, made = read(SAMPLES / name, number), read(tmp_path / name, number)
+        assert shipped[0] == made[0]
+        for left, right in zip(shipped[1:], made[1:], strict=True):
+            np.testing.assert_allclose(left, right, atol=2e-3)  # other processors round otherwise
 
 
 def test_names_that_no_session_can_have(tmp_path):
