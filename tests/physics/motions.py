@@ -1,0 +1,50 @@
+"""Random motions inside a device's workspace, and variants of the BAM."""
+
+import copy
+
+import numpy as np
+
+from bampipe.physics import registry
+
+
+def random_motion(device, count, seed, speed=1.0):
+    """Positions within the limits, rates and accelerations of order ``speed``; each (count, n)."""
+    rng = np.random.default_rng(seed)
+    limits = [device.limits.get(c.name, (-1.0, 1.0)) for c in device.coordinates]
+    q = np.column_stack([rng.uniform(*pair, size=count) for pair in limits])
+    qd, qdd = rng.normal(0.0, speed, size=(2, *q.shape))
+    return q, qd, qdd
+
+
+def random_inputs(system, count, seed):
+    """Columns of u: forces and their rates of either sign, brake commands not negative."""
+    rng = np.random.default_rng(seed)
+    u = rng.normal(0.0, 8.0, size=(count, len(system.inputs)))
+    for j, name in enumerate(system.inputs):
+        if name.startswith("brake") or name == "t":
+            u[:, j] = np.abs(u[:, j])
+    return u
+
+
+def memory_within_reason(system, count, seed):
+    """Internal states of ordinary size, (count, n_z)."""
+    rng = np.random.default_rng(seed)
+    return rng.uniform(0.05, 0.9, size=(count, len(system.memory_names)))
+
+
+def declaration(name="bam"):
+    """A copy of a built-in device's declaration, free to change."""
+    return copy.deepcopy(dict(registry.device(name).declaration))
+
+
+def conservative_bam():
+    """The BAM without compensator, friction and brakes: energies and the hand only."""
+    bare = declaration()
+    bare["name"] = "conservative_bam"
+    del bare["torque"], bare["friction"], bare["inputs"]["brakes"]
+    return registry.device_from(bare)
+
+
+def typical_parameters(system):
+    """Every effect clearly there, (n_p,)."""
+    return np.array([p.prior if p.typical is None else p.typical for p in system.parameters])

@@ -1,0 +1,234 @@
+"""The derived BAM against the equations worked out by hand (sections II-B to II-D)."""
+
+import bam_oracle as oracle
+import numpy as np
+import pytest
+from motions import random_motion
+from scipy.linalg import expm
+
+from bampipe.physics import Model, compile_model, registry
+
+BAM = registry.device("bam")
+
+
+@pytest.fixture(scope="module")
+def system():
+    return compile_model(Model(BAM))
+
+
+def probe(expression):
+    """What ``expression`` of the device file is worth along a motion: (q, qd) -> (T,)."""
+    effect = registry.effect_from(
+        {
+            "name": "probe",
+            "summary": "shows one quantity",
+            "scope": "device",
+            "kind": "torque",
+            "looks_like": "itself",
+            "source": "this test",
+            "torque": {"yaw": f"scale*({expression})"},
+            "parameters": {"scale": {"unit": "", "prior": 1.0, "sd": 0.0}},
+        }
+    )
+    shown = compile_model(Model(BAM, ("probe",), (effect,)))
+
+    def values(q, qd):
+        u = np.zeros((len(q), len(shown.inputs)))
+        z = np.zeros((len(q), 0))
+        return shown.contribution(q, qd, 0 * q, z, u, shown.prior)[:, 0]
+
+    return values
+
+
+def at_rest(system, rows):
+    return np.zeros((rows, 0)), np.zeros((rows, len(system.inputs)))
+
+
+def with_values(system, **values):
+    p = system.prior
+    for name, value in values.items():
+        p[system.index(name)] = value
+    return p
+
+
+def test_mass_matrix_is_symmetric_positive_definite_over_the_workspace(system):
+    grids = [np.linspace(*BAM.limits[c.name], 9) for c in BAM.coordinates]
+    q = np.stack(np.meshgrid(*grids), axis=-1).reshape(-1, 3)
+    for mass in (0.1, 3.56, 10.0):
+        matrices = system.mass_matrix(q, with_values(system, mass=mass))
+        assert np.array_equal(matrices, matrices.transpose(0, 2, 1))
+        assert np.linalg.eigvalsh(matrices).min() > 0.05
+
+
+def test_mass_matrix_equals_the_one_by_hand(system):
+    q, _, _ = random_motion(BAM, 200, 1)
+    expected = np.array([oracle.mass_matrix(row, 3.2) for row in q])
+    found = system.mass_matrix(q, with_values(system, mass=3.2))
+    np.testing.assert_allclose(found, expected, rtol=1e-13, atol=1e-15)
+
+
+def test_inertia_coriolis_and_gravity_equal_those_by_hand(system):
+    q, qd, qdd = random_motion(BAM, 200, 2)
+    p = np.zeros(len(system.parameters))
+    p[system.index("mass")] = 3.2
+    z, u = at_rest(system, len(q))
+    expected = []
+    for a, b, c in zip(q, qd, qdd, strict=True):
+        torque = oracle.mass_matrix(a, 3.2) @ c + oracle.bias(a, b, 3.2)
+        expected.append(torque - [0.0, oracle.compensator(a), 0.0])
+    np.testing.assert_allclose(system.required(q, qd, qdd, z, u, p), expected, atol=1e-12)
+
+
+def test_accelerations_solve_the_equations_by_hand(system):
+    q, qd, _ = random_motion(BAM, 50, 3)
+    p = with_values(system, mass=3.2)
+    force, brake = np.array([4.0, -7.0, 5.0]), np.array([0.5, 0.0, 2.0])
+    u = np.array([*force, *brake])
+    assert system.inputs == (*BAM.forces, *BAM.brakes.values())
+    for a, b in zip(q, qd, strict=True):
+        rate = np.empty(6)
+        system.derivative(np.concatenate([a, b]), u, p, np.zeros(4), rate)
+        smooth = np.tanh(b / [1e-3, 1e-3, 2.5e-4])
+        viscous, coulomb = [3.0, 3.0, 10.0] * b, [1.5, 1.5, 3.0] * smooth
+        torque = oracle.user_torque(a, force) - viscous - coulomb - brake * smooth
+        torque[1] += oracle.compensator(a)
+        expected = np.linalg.solve(oracle.mass_matrix(a, 3.2), torque - oracle.bias(a, b, 3.2))
+        np.testing.assert_allclose(rate, [*b, *expected], rtol=1e-11, atol=1e-11)
+
+
+def test_rod_turns_at_the_rate_of_its_attitude_in_rod_axes():
+    """Eq 8 mended: omega from A^-1 dA/dt, the axes in which the inertia tensor is given."""
+    q, qd, _ = random_motion(BAM, 40, 4)
+    found = np.column_stack([probe(name)(q, qd) for name in ("w_x", "w_y", "w_z")])
+    step = 1e-6
+    for a, b, omega in zip(q, qd, found, strict=True):
+        rate = (oracle.attitude(a + step * b) - oracle.attitude(a - step * b)) / (2 * step)
+        skew = oracle.attitude(a).T @ rate
+        np.testing.assert_allclose(skew, -skew.T, atol=1e-8)
+        np.testing.assert_allclose(omega, [skew[2, 1], skew[0, 2], skew[1, 0]], atol=1e-8)
+        turned = oracle.attitude(a) @ expm(step * skew)
+        np.testing.assert_allclose(turned, oracle.attitude(a + step * b), atol=1e-11)
+
+
+def test_kinematics_are_orthogonal_and_so_is_joint_damping():
+    """Eqs 1-4: J^T J is diagonal, hence J^T K J of a field with one damping for all directions."""
+    q, _, _ = random_motion(BAM, 100, 5)
+    columns = []
+    for axis in range(3):
+        unit = np.zeros_like(q)
+        unit[:, axis] = 1.0
+        columns.append(np.column_stack([probe(f"ddt({x})")(q, unit) for x in "xyz"]))
+    jacobian = np.stack(columns, axis=-1)
+    np.testing.assert_allclose(jacobian, [oracle.jacobian(a) for a in q], atol=1e-14)
+    product = jacobian.transpose(0, 2, 1) @ jacobian
+    rho, c = q[:, 2] - oracle.L, np.cos(q[:, 1])
+    expected = np.zeros_like(product)
+    for i, diagonal in enumerate(((rho * c) ** 2, rho**2, np.ones_like(rho))):
+        expected[:, i, i] = diagonal
+    np.testing.assert_allclose(product, expected, atol=1e-14)
+
+
+def test_tuned_compensator_of_eq_16_is_the_weight_of_the_rod(system):
+    """With L_0 = r_c F_c/(K Delta) and K of eq 15 the cable length cancels."""
+    q, _, _ = random_motion(BAM, 200, 6)
+    literal = np.array([oracle.compensator(a) for a in q])
+    weight = oracle.DESIGN_MASS * oracle.G * (q[:, 2] - oracle.L) * np.cos(q[:, 1])
+    np.testing.assert_allclose(literal, weight, rtol=1e-13)
+    np.testing.assert_allclose(literal, probe("compensation")(q, 0 * q), rtol=1e-13)
+    z, u = at_rest(system, len(q))
+    torque = system.required(q, 0 * q, 0 * q, z, u, with_values(system, mass=oracle.DESIGN_MASS))
+    np.testing.assert_allclose(torque[:, 1], 0.0, atol=1e-13)
+    np.testing.assert_allclose(
+        torque[:, 2], oracle.DESIGN_MASS * oracle.G * np.sin(q[:, 1]), rtol=1e-12
+    )
+
+
+def test_user_torque_does_the_work_of_the_force_at_the_grip(system):
+    """Eqs 7 and 19 mended: the hand pushes at the grip, distance r, not r - L."""
+    q, _, _ = random_motion(BAM, 60, 7)
+    rng = np.random.default_rng(7)
+    z, u = at_rest(system, len(q))
+    u[:, :3] = rng.normal(0.0, 20.0, size=(len(q), 3))
+    applied = system.applied(q, 0 * q, 0 * q, z, u, system.prior)
+    mapped = np.einsum("tij,tj->ti", system.input_map(q), u[:, :3])
+    np.testing.assert_allclose(mapped, applied, rtol=1e-13)
+    step = 1e-6
+    for a, force, torque in zip(q, u[:, :3], applied, strict=True):
+        np.testing.assert_allclose(torque, oracle.user_torque(a, force), atol=1e-12)
+        for axis in range(3):
+            move = step * np.eye(3)[axis]
+            path = oracle.position(a + move, 0.0) - oracle.position(a - move, 0.0)
+            work = (oracle.attitude(a) @ force) @ path / (2 * step)
+            assert work == pytest.approx(torque[axis], abs=1e-7)
+
+
+def test_literal_force_point_of_the_paper_is_the_effect_with_shift_l():
+    moved = compile_model(Model(BAM, ("force_application_point",)))
+    q, _, _ = random_motion(BAM, 50, 8)
+    z, u = at_rest(moved, len(q))
+    u[:, :3] = np.random.default_rng(8).normal(0.0, 20.0, size=(len(q), 3))
+    p = with_values(moved, **{"force_application_point.shift": oracle.L})
+    expected = [
+        oracle.jacobian(a).T @ oracle.attitude(a) @ f for a, f in zip(q, u[:, :3], strict=True)
+    ]
+    np.testing.assert_allclose(moved.applied(q, 0 * q, 0 * q, z, u, p), expected, atol=1e-12)
+
+
+def test_friction_and_brakes_take_energy_out_at_every_speed(system):
+    """Eqs 2, 18, 20: power of each axis' friction and brake is never positive, nil at rest."""
+    q, qd, _ = random_motion(BAM, 400, 9)
+    qd[::2] *= 10.0 ** np.random.default_rng(9).uniform(-7, 0, size=(200, 1))
+    z, u = at_rest(system, len(q))
+    u[:, 3:] = np.abs(np.random.default_rng(10).normal(0.0, 30.0, size=(len(q), 3)))
+    frictionless = with_values(
+        system, **{p.name: 0.0 for p in system.parameters if p.name.partition(".")[2]}
+    )
+    total = system.required(q, qd, 0 * q, z, u, system.prior)
+    ideal = system.required(q, qd, 0 * q, z, 0 * u, frictionless)
+    power = -(total - ideal) * qd
+    assert power.max() <= 0.0
+    assert (power[np.abs(qd) > 0.01] < 0.0).all()
+    still = system.required(q, 0 * q, 0 * q, z, u, system.prior)
+    np.testing.assert_array_equal(still, system.required(q, 0 * q, 0 * q, z, 0 * u, frictionless))
+
+
+def test_a_brake_holds_an_axis_that_is_pushed_less_than_its_command(system):
+    """Eq 18 below saturation: the axis creeps slower than the width of the smoothed sign."""
+    x = np.array([0.1, 0.05, 1.0, 0.0, 0.0, 0.0])
+    force = np.array([20.0, 0.0, 0.0])
+    u = np.array([*force, 60.0, 60.0, 200.0])
+    p, w, rate = system.prior, np.zeros(4), np.empty(6)
+    step = 2e-6
+    for _ in range(20000):
+        system.derivative(x, u, p, w, rate)
+        x += step * rate
+    torque = 20.0 * np.cos(0.05)
+    creep = BAM.coordinate("yaw").sign_width * np.arctanh(torque / (60.0 + 1.5))
+    assert x[3] == pytest.approx(creep, rel=1e-2)
+    assert abs(rate[3]) < 1e-3
+
+
+def test_mass_matrix_stays_regular_where_rho_or_the_cosine_of_pitch_vanish(system):
+    """The drives' inertia keeps the BAM regular; only a device without one can be singular."""
+    for pose in ([0.0, 0.0, oracle.L], [0.0, np.pi / 2, 1.0], [0.0, -np.pi / 2, oracle.L]):
+        matrix = system.mass_matrix(np.array([pose]), system.prior)[0]
+        assert np.linalg.eigvalsh(matrix).min() > 0.3
+
+
+def test_singular_mass_matrix_gives_a_value_that_is_not_finite_instead_of_a_wrong_one():
+    pendulum = registry.device_from(
+        {
+            "name": "telescope",
+            "coordinates": {"angle": {"kind": "rotary"}, "length": {"kind": "linear"}},
+            "energy": {"kinetic": "mass*(length**2*ddt(angle)**2 + ddt(length)**2)/2"},
+            "inputs": {"force": ["force_x"]},
+            "applied": {"angle": "length*force_x"},
+            "parameters": {"mass": {"unit": "kg", "prior": 1.0, "sd": 0.1}},
+        }
+    )
+    system = compile_model(Model(pendulum))
+    rate = np.empty(4)
+    system.derivative(np.zeros(4), np.zeros(1), system.prior, np.zeros(1), rate)
+    assert not np.isfinite(rate).all()
+    system.derivative(np.array([0.0, 0.5, 0.0, 0.0]), np.ones(1), system.prior, np.zeros(1), rate)
+    np.testing.assert_allclose(rate, [0.0, 0.0, 2.0, 0.0])

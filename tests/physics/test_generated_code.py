@@ -1,0 +1,153 @@
+"""Generated code: two printings of one set of equations, keyed by everything they depend on."""
+
+import copy
+import string
+
+import numpy as np
+import pytest
+from motions import (
+    declaration,
+    memory_within_reason,
+    random_inputs,
+    random_motion,
+    typical_parameters,
+)
+
+from bampipe.physics import Model, compile_model, registry
+
+BAM = registry.device("bam")
+
+
+def canonical(name):
+    """The effect at its last target: the extension, which has side loads, or a force."""
+    target = registry.effect(name).targets(BAM)[-1]
+    return f"{name}:{target}" if target else name
+
+
+@pytest.mark.parametrize("name", registry.effect_names())
+def test_columns_and_compiled_functions_agree(name):
+    """The same residual, acceleration and reading from both, to 1e-12 of their size."""
+    system = compile_model(Model(BAM, (canonical(name),)))
+    count, n = 40, len(system.coordinates)
+    q, qd, qdd = random_motion(BAM, count, 21, speed=0.5)
+    qd[::4] *= 1e-3
+    u, z = random_inputs(system, count, 22), memory_within_reason(system, count, 23)
+    p = typical_parameters(system)
+
+    columns = system.applied(q, qd, qdd, z, u, p) - system.required(q, qd, qdd, z, u, p)
+    true = system.true_motion(q, qd, qdd, u, p)
+    scale = np.abs(columns).max()
+    np.testing.assert_allclose(system.residual(*true, z, u, p), columns, atol=1e-12 * scale)
+
+    bare = compile_model(Model(BAM))
+    base = bare.index("mass") + 1
+    used = [system.inputs.index(c) for c in bare.inputs]
+    z0 = np.zeros((count, 0))
+    without = bare.residual(*true, z0, np.ascontiguousarray(u[:, used]), p[:base])
+    added = system.contribution(*true, z, u, p)
+    np.testing.assert_allclose(without + added, columns, atol=1e-12 * scale)
+
+    w, rate = np.zeros(len(system.noise)), np.empty(len(system.states))
+    for i in range(count):
+        x = np.concatenate([true[0][i], true[1][i], z[i]])
+        system.derivative(x, u[i], p, w, rate)
+        row = [a[i][None].copy() for a in true[:2]]
+        again = system.residual(*row, rate[None, n : 2 * n], z[i][None], u[i][None], p)
+        inertia = np.abs(system.mass_matrix(row[0], p)[0] @ rate[n : 2 * n]).max()
+        np.testing.assert_allclose(again, 0.0, atol=1e-12 * max(scale, inertia))
+
+
+@pytest.mark.parametrize("name", registry.effect_names())
+def test_reading_of_the_encoders_inverts_the_true_motion(name):
+    system = compile_model(Model(BAM, (canonical(name),)))
+    q, qd, qdd = random_motion(BAM, 20, 31, speed=0.5)
+    u, p = random_inputs(system, 20, 32), typical_parameters(system)
+    true = system.true_motion(q, qd, qdd, u, p)
+    for i in range(20):
+        x = np.concatenate([true[0][i], true[1][i], np.zeros(len(system.memory_names))])
+        read = np.empty(2 * len(system.coordinates))
+        system.measure(x, u[i], p, read)
+        np.testing.assert_allclose(read, [*q[i], *qd[i]], rtol=1e-7, atol=1e-8)
+
+
+def test_internal_states_settle_where_their_rate_vanishes():
+    system = compile_model(Model(BAM, ("gravity_compensator_lag",)))
+    t = np.arange(0.0, 4.0, 0.005)
+    q = np.tile([0.0, 0.1, 0.9], (len(t), 1))
+    q[t > 0.5, 2] = 1.2
+    qd, u = np.zeros_like(q), np.zeros((len(t), len(system.inputs)))
+    p = typical_parameters(system)
+    z = system.memory(q, qd, qd, u, p, t)
+    assert z.shape == (len(t), 1)
+    np.testing.assert_allclose(z[t <= 0.5, 0], 0.9 - 0.461, atol=1e-12)
+    lag = p[system.index("gravity_compensator_lag.time_constant")] + 0.002
+    later = t > 0.52
+    expected = 1.2 - 0.461 - 0.3 * np.exp(-(t[later] - 0.505) / lag)
+    np.testing.assert_allclose(z[later, 0], expected, atol=0.005)
+
+
+def test_key_changes_with_the_text_of_an_effect_and_only_then():
+    text = dict(registry.effect("stribeck").declaration)
+    keys = [
+        Model(BAM, ("stribeck:yaw",), (registry.effect_from(copy.deepcopy(d)),)).key
+        for d in (text, text, {**text, "torque": text["torque"] + " "}, {**text, "summary": "x"})
+    ]
+    assert keys[0] == keys[1] == Model(BAM, ("stribeck:yaw",)).key
+    assert len(set(keys)) == 3
+    assert Model(BAM, ("stribeck:pitch",)).key != keys[0]
+
+
+def test_key_follows_the_device():
+    same, other = registry.device_from(declaration()), declaration()
+    other["constants"]["L"]["value"] = 0.462
+    assert Model(same).key == Model(BAM).key
+    assert Model(registry.device_from(other)).key != Model(BAM).key
+
+
+def test_generated_code_is_the_same_text_again(tmp_path, monkeypatch):
+    texts = []
+    for folder in ("a", "b"):
+        monkeypatch.setenv("BAMPIPE_CACHE_DIR", str(tmp_path / folder))
+        compile_model(Model(BAM, ("presliding:pitch", "force_delay")))
+        files = sorted((tmp_path / folder).rglob("*_*.*"))
+        texts.append([(f.name, f.read_text()) for f in files])
+    assert len(texts[0]) == 4
+    assert texts[0] == texts[1]
+
+
+def awkward(names):
+    """A mass on a rail whose coordinate and channel carry the names of generated variables."""
+    coordinate, component, parameter = names
+    return registry.device_from(
+        {
+            "name": "rail",
+            "coordinates": {coordinate: {"kind": "linear"}},
+            "energy": {"kinetic": f"{parameter}*ddt({coordinate})**2/2"},
+            "inputs": {"force": [f"force_{component}"]},
+            "applied": {coordinate: f"force_{component}"},
+            "parameters": {parameter: {"unit": "kg", "prior": 2.0, "sd": 1.0}},
+        }
+    )
+
+
+@pytest.mark.parametrize(
+    "names", [("x", "y", "m"), ("q", "u", "p"), ("dx", "w", "z"), ("c_0", "b_0", "m_00")]
+)
+def test_a_device_may_call_its_quantities_anything(names):
+    system = compile_model(Model(awkward(names), (f"return_spring:{names[0]}",)))
+    p = system.prior
+    p[1] = 3.0
+    rate = np.empty(2)
+    system.derivative(np.array([0.5, 0.1]), np.array([4.0]), p, np.zeros(1), rate)
+    np.testing.assert_allclose(rate, [0.1, (4.0 - 1.5) / 2.0])
+
+
+def test_generated_code_holds_no_name_from_a_file(tmp_path, monkeypatch):
+    monkeypatch.setenv("BAMPIPE_CACHE_DIR", str(tmp_path))
+    device = awkward(("wandering", "pushing", "heaviness"))
+    compile_model(Model(device, ("presliding:wandering", "force_drift:pushing")))
+    sources = [f.read_text() for f in tmp_path.rglob("*.py")]
+    assert len(sources) == 3
+    for word in ("wandering", "pushing", "heaviness", "presliding", "deflection", "drift"):
+        assert not any(word in text for text in sources)
+    assert all(set(text) <= set(string.printable) for text in sources)
