@@ -47,6 +47,9 @@ STIFFNESS = {"rotary": 2200.0, "linear": 109e3}
 REACH = {"rotary": 0.65, "linear": 0.8}
 """Largest wanted motion as a share of half the range: people use more of a rod than of a turn."""
 
+HASTE = {"rotary": 15.0, "linear": 6.0}
+"""Largest wanted acceleration, rad/s2 and m/s2: about 40 N at the handle of the BAM."""
+
 LOCKED_LOAD = {"rotary": 50.0, "linear": 120.0}
 """Peak load of a locked trial, N.m and N."""
 
@@ -341,7 +344,8 @@ def _wanted(
         phase = np.outer(t, frequency) + rng.uniform(0.0, 2 * np.pi, size=40)
         wave, rate = np.sin(phase) @ size, np.cos(phase) @ (size * frequency)
         reach = half * REACH[c.kind] * config.amplitude * share * rng.uniform(0.7, 1.0)
-        scale = reach / np.abs(wave).max()
+        bend = np.sin(phase) @ (size * frequency**2)
+        scale = min(reach / np.abs(wave).max(), HASTE[c.kind] / np.abs(bend).max())
         q[:, i] = middle + scale * (wave[0] + fade * (wave - wave[0]))
         qd[:, i] = scale * (fade * rate + fade_rate * (wave - wave[0]))
     return q, qd
