@@ -58,7 +58,7 @@ def filter_covariance(
     innovation_factor = np.zeros((ny, ny))
     predicted = np.empty(ny)
     whitened = np.empty(ny)
-    work = np.empty((8, n + nw + 2 * u.shape[1] + 2 * nx + ny))
+    work = np.empty((10, n + nw + 2 * u.shape[1] + 2 * nx + ny))
     means[0] = mean
     covariances[0] = covariance
     for k in range(1, t.shape[0]):

@@ -24,7 +24,7 @@ KERNEL = int64(
     int64,  # nx
     float64[::1],  # mean (n,), in and out
     float64[:, ::1],  # covariance, or its lower root (n, n), in and out
-    float64[::1],  # p (np,): all parameters
+    float64[::1],  # p (np + 1,): all parameters, then the timing of the inputs
     int64[::1],  # free (n - nx,): places of the estimated ones in p
     boolean[::1],  # logarithmic (n - nx,): which of them are estimated as logarithms
     float64[::1],  # lower (n - nx,)

@@ -127,18 +127,22 @@ def propagate_points(
         noise_sd: (nw,) of the process noise, independent of the state: its root is diagonal,
             which is why the (n + nw) root never needs to be formed.
         nx: length of the state.
-        p: (np,) all parameters; those in ``free`` are overwritten.
+        p: (np + 1,) all parameters, then the time by which the inputs were sampled before the
+            positions, s, at most a fraction of ``dt``; those in ``free`` are overwritten.
         free: (n - nx,) places of the estimated parameters in ``p``.
         logarithmic: (n - nx,) which of them are estimated as logarithms.
         lower, upper: (n - nx,) range of the estimated parameters, logarithms where so estimated.
         u0, u1: (nu,) input at both ends; dt: s; substeps: of the Runge-Kutta method.
         points: (1 + 2 (n + nw), n) result: the centre, then each pair of opposite points.
-        work: (8, ...) scratch.
+        work: (10, >= longest of the vectors) scratch.
     """
     n = mean.shape[0]
     nw = noise_sd.shape[0]
     w = work[6, :nw]
     x = work[7, :nx]
+    nu = u0.shape[0]
+    start = work[8, :nu]
+    end = work[9, :nu]
     for row in range(points.shape[0]):
         pair = (row - 1) // 2
         distance = reach if row % 2 == 1 else -reach
@@ -155,7 +159,11 @@ def propagate_points(
         place_parameters(points[row], nx, free, logarithmic, lower, upper, p)
         for i in range(nx):
             x[i] = points[row, i]
-        runge_kutta(derivative, x, u0, u1, p, w, dt, substeps, work)
+        early = p[p.shape[0] - 1] / dt
+        for i in range(nu):
+            start[i] = u0[i] - early * (u1[i] - u0[i])
+            end[i] = u1[i] - early * (u1[i] - u0[i])
+        runge_kutta(derivative, x, start, end, p, w, dt, substeps, work)
         for i in range(nx):
             points[row, i] = x[i]
 
@@ -190,7 +198,7 @@ def measure_points(
         u: (nu,) input at the time of the measurement.
         observed: (ny,) which elements of the model's measurement are used.
         images: (1 + 2 n, ny) result.
-        work: (8, ...) scratch.
+        work: (2, >= longest of the vectors) scratch.
     """
     n = mean.shape[0]
     point = work[0, :n]

@@ -67,7 +67,7 @@ def filter_square_root(
     single = np.empty(max(n, ny))
     predicted = np.empty(ny)
     whitened = np.empty(ny)
-    work = np.empty((8, n + nw + 2 * u.shape[1] + 2 * nx + ny))
+    work = np.empty((10, n + nw + 2 * u.shape[1] + 2 * nx + ny))
     centre_image = centre + 2 * nw * other
     means[0] = mean
     covariances[0] = factor @ factor.T
