@@ -191,7 +191,7 @@ class Results:
     @cached_property
     def paper(self) -> dict[str, Any] | None:
         """What the device's paper published, or None where there is none for this device."""
-        path = Path(__file__).parent / "papers" / f"{self.session.get('device')}.toml"
+        path = Path(__file__).parent / "templates" / f"paper-{self.session.get('device')}.toml"
         return tomllib.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
 
     def as_in(self, place: str) -> str:

@@ -44,7 +44,7 @@ COLOURS = {
 WIDTH = 6.69
 """Width of the text in print, inches: figures are drawn at the size at which they are printed."""
 
-_SETTINGS = {
+_SETTINGS: dict[str, Any] = {
     "font.family": "DejaVu Sans",
     "font.size": 7.5,
     "axes.titlesize": 8.0,
@@ -95,7 +95,7 @@ def panels(
     height: float,
     *,
     width: float = WIDTH,
-    sharex: bool | str = False,
+    sharex: bool = False,
 ) -> tuple[Figure, np.ndarray]:
     """Return a figure of ``rows`` by ``columns`` panels.
 
@@ -104,7 +104,7 @@ def panels(
         columns: number of columns.
         height: of the whole figure, inches.
         width: of the whole figure, inches.
-        sharex: as matplotlib has it ("col": one time axis a column).
+        sharex: one horizontal range for all panels, labelled on the last row.
 
     Returns:
         The figure and its axes, (rows, columns).
@@ -159,9 +159,7 @@ def legend_below(figure: Figure, axes: Axes, columns: int = 4) -> None:
 
 def legend_of(figure: Figure, handles: list[Any], names: list[str], columns: int = 4) -> None:
     """Put a legend of these entries below all panels."""
-    figure.legend(
-        handles, names, loc="outside lower center", ncols=min(columns, len(names)), markerscale=1.5
-    )
+    figure.legend(handles, names, loc="outside lower center", ncols=min(columns, len(names)))
 
 
 def scaled(values: np.ndarray, unit: str) -> tuple[np.ndarray, str]:

@@ -59,7 +59,9 @@ def pdf(document: Document, recorded: int) -> bytes:
         source = root / _TEMPLATE.name
         shutil.copyfile(_TEMPLATE, source)
         compiler = typst.Compiler(source, root=root, ignore_system_fonts=True)
-        return bytes(compiler.compile(format="pdf", timestamp=int(stamp)))
+        printed = root / "report.pdf"
+        compiler.compile(output=printed, format="pdf", timestamp=int(stamp))
+        return printed.read_bytes()
 
 
 def content(document: Document) -> dict[str, object]:

@@ -219,12 +219,12 @@ def test_one_model_in_detail_can_be_chosen(full_run: Path) -> None:
     results = Results(full_run, "base")
     assert results.model == "base"
     assert results.effects("base") == ()
-    with pytest.raises(InputError, match="no results for model 'bse'.*base"):
+    with pytest.raises(InputError, match=r"no results for model 'bse'.*base"):
         _ = Results(full_run, "bse").model
 
 
 def test_without_ingest_one_line_says_so(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="is missing.*bampipe ingest"):
+    with pytest.raises(InputError, match=r"is missing.*bampipe ingest"):
         build(Results(tmp_path), quiet)
 
 
@@ -232,18 +232,18 @@ def test_damaged_results_are_named(tmp_path: Path) -> None:
     synthetic_run.write_ingest(tmp_path)
     (tmp_path / "stiffness").mkdir()
     (tmp_path / "stiffness/stiffness.json").write_text("{")
-    with pytest.raises(InputError, match="stiffness.json"):
+    with pytest.raises(InputError, match=r"stiffness\.json"):
         build(Results(tmp_path), quiet)
     (tmp_path / "stiffness/stiffness.json").unlink()
     (tmp_path / "ingest/trials.parquet").write_bytes(b"PAR1")
-    with pytest.raises(InputError, match="trials.parquet"):
+    with pytest.raises(InputError, match=r"trials\.parquet"):
         build(Results(tmp_path), quiet)
 
 
 def test_bad_source_date_epoch_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     synthetic_run.write_ingest(tmp_path)
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "yesterday")
-    with pytest.raises(InputError, match="SOURCE_DATE_EPOCH"):
+    with pytest.raises(InputError, match=r"SOURCE_DATE_EPOCH"):
         build(Results(tmp_path), quiet)
 
 

@@ -45,7 +45,7 @@ def section(results: Results) -> Section:
             blocks.append(Subheading(f"Model `{model}`"))
         later = None if model == last else after.get("maps")
         blocks += _model(results, model, content, later)
-    return Section(TITLE, tuple(blocks))
+    return Section(TITLE, tuple(blocks), new_page=True)
 
 
 def _model(
@@ -111,9 +111,9 @@ def _verdicts(results: Results, names: tuple[str, ...], axes: dict[str, Any]) ->
         ),
         tuple(rows),
         "llrrrrrl",
-        note="Explainable: share of the residual that any function of motion and load could predict on "
-        "unseen trials; by chance: the same where nothing is missing. Errors are RMSE on held-out "
-        "trials.",
+        note="Explainable: share of the residual that any function of motion and load could "
+        "predict on unseen trials; by chance: the same where nothing is missing. Errors are RMSE "
+        "on held-out trials.",
     )
 
 
@@ -175,9 +175,9 @@ def _maps(
         panel.set_axis_off()
     style.legend_below(figure, panels.flat[0])
     caption = (
-        f"Where the force prediction of {axis} fails: mean residual (measured minus predicted) with "
-        "its confidence band against what might cause it. A band that leaves zero is structure "
-        "that the model lacks."
+        f"Where the force prediction of {axis} fails: mean residual (measured minus predicted) "
+        "with its confidence band against what might cause it. A band that leaves zero is "
+        "structure that the model lacks."
     )
     return Figure(f"residual-maps-{model}-{axis}".replace(":", "."), caption, style.svg(figure))
 

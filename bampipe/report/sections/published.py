@@ -37,7 +37,7 @@ def section(results: Results) -> Section | None:
     notes = tuple(paper.get("notes", {}).get("text", ()))
     if notes:
         blocks.append(Bullets(notes))
-    return Section("Paper and this session", tuple(blocks))
+    return Section("Paper and this session", tuple(blocks), new_page=True)
 
 
 def _row(results: Results, row: dict[str, Any]) -> tuple[str, ...]:

@@ -67,9 +67,9 @@ def _by_axis(results: Results, content: dict[str, Any]) -> Table:
         tuple(rows),
         "lrrrrrl",
         (0.0, 1.0, 1.0, 1.0, 1.2, 0.6, 0.0),
-        "Held out: each trial predicted with parameters that never saw it. Noise floor: what sensor "
-        "noise, quantisation and filtering alone would leave. Fit: share of the measured force "
-        "that is explained, as 100 (1 − RMSE / standard deviation).",
+        "Held out: each trial predicted with parameters that never saw it. Noise floor: what "
+        "sensor noise, quantisation and filtering alone would leave. Fit: share of the measured "
+        "force that is explained, as 100 (1 − RMSE / standard deviation).",
     )
 
 
@@ -135,7 +135,7 @@ def _forces(results: Results, frame: pd.DataFrame) -> Figure:
         for column, title, colour, look in (
             (f"{kind}_predicted_without_friction_{name}", "predicted without friction",
              style.ORANGE, {"ls": (0, (4, 1.5)), "lw": 0.9}),
-            (f"{kind}_measured_{name}", "measured", style.INK, {"lw": 1.5, "alpha": 0.75}),
+            (f"{kind}_measured_{name}", "measured", style.FAINT, {"lw": 2.6}),
             (f"{kind}_predicted_{name}", "predicted", style.BLUE, {"lw": 0.9}),
         ):  # fmt: skip
             if column in part:
@@ -203,8 +203,7 @@ def _friction(results: Results, frame: pd.DataFrame, velocity: dict[str, np.ndar
         keep = style.pick(len(error), 2500)
         speed, unit = velocity[axis], wording.unit(results.rate_unit(axis))
         top, bottom = panels[0, column], panels[1, column]
-        top.plot(speed[keep], error[keep], ".", ms=2.2, mew=0, color=style.BLUE, alpha=0.5,
-                 label="whole trial")  # fmt: skip
+        top.plot(speed[keep], error[keep], ".", ms=2.2, mew=0, color=style.BLUE, alpha=0.5)
         top.plot(speed[one], error[one], color=style.VERMILLION, lw=1.2, label="one movement")
         _arrow(top, speed[one], error[one])
         force = wording.unit(results.force_unit(axis))
@@ -219,13 +218,14 @@ def _friction(results: Results, frame: pd.DataFrame, velocity: dict[str, np.ndar
         bottom.axhline(0.0, color=style.INK, lw=0.5)
         bottom.set_xlabel("time (s)")
         bottom.set_ylabel(style.label(_noun(results, axis), force))
+    panels[0, 0].plot([], [], "o", ms=3.5, color=style.BLUE, label="whole trial")
     top_handles, top_names = panels[0, 0].get_legend_handles_labels()
     more_handles, more_names = panels[1, 0].get_legend_handles_labels()
     style.legend_of(figure, top_handles + more_handles, top_names + more_names)
     caption = (
-        f"The friction that a model without it leaves{results.as_in('Fig. 4')}. Top: measured minus "
-        "predicted generalised force against velocity; the arrow shows the start of one movement. "
-        "Bottom: that movement; without friction the prediction overshoots zero."
+        f"The friction that a model without it leaves{results.as_in('Fig. 4')}. Top: measured "
+        "minus predicted generalised force against velocity; the arrow shows the start of one "
+        "movement. Bottom: that movement; without friction the prediction overshoots zero."
     )
     return Figure("error-without-friction", caption, style.svg(figure))
 
@@ -237,5 +237,5 @@ def _arrow(panel: Any, x: np.ndarray, y: np.ndarray) -> None:
     ahead = start + max(2, len(x) // 25)
     panel.annotate(
         "", xy=(x[ahead], y[ahead]), xytext=(x[start], y[start]),
-        arrowprops={"arrowstyle": "-|>", "color": style.VERMILLION, "lw": 1.2, "mutation_scale": 13},
+        arrowprops={"arrowstyle": "-|>", "color": style.VERMILLION, "mutation_scale": 13},
     )  # fmt: skip
