@@ -86,7 +86,8 @@ _SETTINGS: dict[str, Any] = {
 
 def look() -> AbstractContextManager[None]:
     """Return the context in which figures are drawn: nothing of a user's own settings counts."""
-    return mpl.rc_context({**mpl.rcParamsDefault, **_SETTINGS, "backend": "svg"})
+    settings: dict[Any, Any] = {**mpl.rcParamsDefault, **_SETTINGS, "backend": "svg"}
+    return mpl.rc_context(settings)
 
 
 def panels(

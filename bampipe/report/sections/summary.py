@@ -77,7 +77,8 @@ def _ladder(results: Results) -> str:
         text = f"{axis} {wording.significant(before)} to {wording.significant(after)} {unit}"
         changes.append(text + (f" (floor {wording.significant(floor)})" if floor else ""))
     return (
-        f"From model `{first['model']}` to `{last['model']}` the error on held-out trials went: "
+        f"From model `{first['model']}` to version {len(rungs) - 1} (`{last['model']}`) the error "
+        "on held-out trials went: "
         f"{'; '.join(changes)}."
     )
 
