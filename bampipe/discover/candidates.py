@@ -26,6 +26,9 @@ Array = NDArray[np.float64]
 
 _GRID = 7
 _REFINE = 3
+_ALIKE = 0.7
+_DENSEST = 48
+_WORTH = 4.0
 
 
 @dataclass(frozen=True)
@@ -74,16 +77,15 @@ class Score:
 
 def library(
     device: Device, present: Sequence[str], extra: Sequence[Effect] = ()
-) -> tuple[Candidate, ...]:
-    """Every effect that could be added to ``device``, those in ``present`` left out."""
+) -> tuple[str, ...]:
+    """Names of the effects that could be added to ``device``, those in ``present`` left out."""
     known = {name: built_in(name) for name in effect_names()} | {e.name: e for e in extra}
-    found = []
-    for name, effect in sorted(known.items()):
-        for target in effect.targets(device):
-            full = f"{name}:{target}" if target else name
-            if full not in present:
-                found.append(candidate(device, full, extra))
-    return tuple(found)
+    names = [
+        f"{name}:{target}" if target else name
+        for name, effect in sorted(known.items())
+        for target in effect.targets(device)
+    ]
+    return tuple(name for name in names if name not in present)
 
 
 def candidate(device: Device, name: str, extra: Sequence[Effect] = ()) -> Candidate:
@@ -131,6 +133,13 @@ class Scorer:
         return np.asarray(self.counts.sum(axis=0) * min(1.0, spacing))
 
     @cached_property
+    def _cost_before(self) -> float:
+        weight = 1.0 / np.maximum(self.evidence.rmse(), 1e-12) ** 2
+        beta = _solve(self._base.xx, self._base.xy, weight)
+        left = _squares(self._base, beta).sum(axis=0) / np.maximum(self.counts.sum(axis=0), 1.0)
+        return float(np.sum(self.independent * np.log(np.maximum(left, 1e-30))))
+
+    @cached_property
     def before(self) -> Score:
         """The model as it is."""
         weight = 1.0 / np.maximum(self.evidence.rmse(), 1e-12) ** 2
@@ -139,49 +148,72 @@ class Scorer:
         return Score("", error, np.zeros(0), shift, np.zeros(len(error)))
 
     def score(self, item: Candidate) -> Score | None:
-        """Refit with ``item`` added; None where it does nothing in these trials."""
-        ranges = [_search_range(item.own[i]) for i in item.searched]
-        if not ranges:
-            return self._at(item, np.zeros(0))
-        best: Score | None = None
-        best_cost = np.inf
-        at = [float(_starts(r)[len(_starts(r)) // 2]) for r in ranges]
-        for round_ in range(2 if len(ranges) > 1 else 1):
-            for k, interval in enumerate(ranges):
-                grid = _starts(interval)
-                costs = []
-                for value in grid:
-                    found = self._in_sample(item, np.array([*at[:k], value, *at[k + 1 :]]))
-                    if found is None:
-                        return None
-                    costs.append(found)
-                j = int(np.argmin(costs))
-                at[k] = float(grid[j])
-                low, high = grid[max(j - 1, 0)], grid[min(j + 1, len(grid) - 1)]
-                at[k] = self._refine(item, at, k, low, high, costs[j])
-            found = self._in_sample(item, np.array(at))
-            if found is None or found > best_cost - 1e-3:
-                break
-            best_cost = found
-        best = self._at(item, np.array(at))
-        return best
+        """Refit with ``item`` added; None where it does nothing in these trials.
 
-    def _refine(
-        self, item: Candidate, at: list[float], k: int, low: float, high: float, cost: float
-    ) -> float:
-        """Narrow one searched parameter between its neighbours on the grid, by halving."""
-        x, y = at[k], cost
+        Searched parameters are scanned over their range, finely enough that neighbours on the
+        grid resemble each other, and narrowed around the best; several are taken in turn.
+        """
+        ranges = [_search_range(item.own[i]) for i in item.searched]
+        at = [_middle(low, high) for low, high, _ in ranges]
+        hopeless = self._cost_before - _WORTH
+        for _ in range(min(len(ranges), 2)):
+            for k, interval in enumerate(ranges):
+                found = self._scan(item, at, k, interval)
+                if found is None:
+                    return None
+                at[k], cost = found
+                if cost > hopeless:
+                    return self._absent(item)
+        return self._at(item, np.array(at))
+
+    def _absent(self, item: Candidate) -> Score:
+        """The score of an effect that these trials do not ask for: strength zero."""
+        values = np.array([0.0 if p.strength else p.prior for p in item.own])
+        nothing = np.zeros(len(self.before.error))
+        return Score(item.name, self.before.error, values, nothing[:0], nothing)
+
+    def _scan(
+        self,
+        item: Candidate,
+        at: list[float],
+        k: int,
+        interval: tuple[float, float, bool],
+    ) -> tuple[float, float] | None:
+        """Best value of one searched parameter, the others held, and its cost; None if it
+        never matters."""
+
+        def cost(value: float) -> tuple[float, Array] | None:
+            return self._in_sample(item, np.array([*at[:k], value, *at[k + 1 :]]))
+
+        low, high, ratio = interval
+        count = _GRID if len(item.searched) == 1 else _GRID - 2
+        grid = list(np.geomspace(low, high, count) if ratio else np.linspace(low, high, count))
+        known = [cost(value) for value in grid]
+        if any(found is None for found in known):
+            return None
+        i = 0
+        while i + 1 < len(grid) and len(grid) < _DENSEST:
+            first, second = known[i], known[i + 1]
+            if item.linear and first and second and _likeness(first[1], second[1]) < _ALIKE:
+                middle = _middle(grid[i], grid[i + 1])
+                grid.insert(i + 1, middle)
+                known.insert(i + 1, cost(middle))
+            else:
+                i += 1
+        values = [found[0] if found else np.inf for found in known]
+        j = int(np.argmin(values))
+        best, x = values[j], grid[j]
+        ends = [grid[max(j - 1, 0)], grid[min(j + 1, len(grid) - 1)]]
         for _ in range(_REFINE):
-            for end, left in ((low, True), (high, False)):
-                middle = _middle(x, end)
-                found = self._in_sample(item, np.array([*at[:k], middle, *at[k + 1 :]]))
-                if found is not None and found < y:
-                    low, high = (low, x) if left else (x, high)
-                    x, y = middle, found
+            for side in (0, 1):
+                middle = _middle(x, ends[side])
+                found = cost(middle)
+                if found is not None and found[0] < best:
+                    ends[1 - side], x, best = x, middle, found[0]
                     break
             else:
-                low, high = _middle(x, low), _middle(x, high)
-        return x
+                ends = [_middle(x, ends[0]), _middle(x, ends[1])]
+        return float(x), float(best)
 
     def _problem(self, item: Candidate, searched: Array) -> tuple[_Sums, Array] | None:
         columns, change = self._columns(item, searched)
@@ -192,17 +224,20 @@ class Scorer:
             for j, c in zip(self.evidence.jacobian, columns, strict=True)
         ]
         y = [-(r + c) for r, c in zip(self.evidence.residual, change, strict=True)]
-        return _sums(x, y), np.concatenate(change)
+        shape = np.concatenate(columns)
+        return _sums(x, y), shape.reshape(
+            shape.shape[0] * shape.shape[1], -1
+        ) if item.linear else shape
 
-    def _in_sample(self, item: Candidate, searched: Array) -> float | None:
-        """Sum over axes of n log(mean square) with everything refitted."""
+    def _in_sample(self, item: Candidate, searched: Array) -> tuple[float, Array] | None:
+        """Sum over axes of n log(mean square) with everything refitted, and the effect's columns."""
         problem = self._problem(item, searched)
         if problem is None:
             return None
-        sums, _ = problem
-        beta, weight = self._fit(item, sums)
+        sums, columns = problem
+        beta, _ = self._fit(item, sums)
         left = _squares(sums, beta).sum(axis=0) / np.maximum(self.counts.sum(axis=0), 1.0)
-        return float(np.sum(self.independent * np.log(np.maximum(left, 1e-30))))
+        return float(np.sum(self.independent * np.log(np.maximum(left, 1e-30)))), columns
 
     def _fit(self, item: Candidate, sums: _Sums) -> tuple[Array, Array]:
         """Coefficients of the joint fit, reweighted once by what each axis is left with."""
@@ -232,7 +267,9 @@ class Scorer:
         for k in range(len(sums.yy)):
             rest = [i for i in range(len(sums.yy)) if i != k] or [k]
             part = _Sums(sums.xx[rest], sums.xy[rest], sums.yy[rest])
-            beta = _solve(part.xx, part.xy, weight) if item is None else _bounded(item, part, weight)
+            beta = (
+                _solve(part.xx, part.xy, weight) if item is None else _bounded(item, part, weight)
+            )
             squares += _squares(_Sums(sums.xx[[k]], sums.xy[[k]], sums.yy[[k]]), beta)[0]
         return np.asarray(np.sqrt(squares / np.maximum(self.counts.sum(axis=0), 1.0)))
 
@@ -244,9 +281,7 @@ class Scorer:
         p[[count + i for i in item.searched]] = searched
         p[[count + i for i in item.linear]] = 0.0
         columns, changes = [], []
-        for motion, used, memory, plain in zip(
-            e.motions, e.used, e.memory, e.plain, strict=True
-        ):
+        for motion, used, memory, plain in zip(e.motions, e.used, e.memory, e.plain, strict=True):
             u = motion.inputs(system.inputs)
             rows = []
             if system.moves_sensors:
@@ -259,9 +294,7 @@ class Scorer:
                     probe = p.copy()
                     if i is not None:
                         probe[count + i] = 1.0
-                    rows.append(
-                        system.contribution(motion.q, motion.qd, motion.qdd, z, u, probe)
-                    )
+                    rows.append(system.contribution(motion.q, motion.qd, motion.qdd, z, u, probe))
             thin = self._thin(rows, used)
             if item.linear:
                 columns.append(thin.transpose(0, 2, 1))
@@ -341,9 +374,10 @@ def _search_range(parameter: Parameter) -> tuple[float, float, bool]:
     return lower, upper, False
 
 
-def _starts(interval: tuple[float, float, bool]) -> Array:
-    low, high, ratio = interval
-    return np.geomspace(low, high, _GRID) if ratio else np.linspace(low, high, _GRID + 1)
+def _likeness(a: Array, b: Array) -> float:
+    """Cosine between two sets of columns: one where they span the same, zero where nothing."""
+    first, second = np.linalg.qr(a)[0], np.linalg.qr(b)[0]
+    return float(np.linalg.norm(first.T @ second) / np.sqrt(a.shape[1]))
 
 
 def _middle(a: float, b: float) -> float:

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import butter, sosfiltfilt
 
 from bampipe.discover.recording import Motion, Sensors
+from bampipe.estimate.low_pass import low_pass_at
 from bampipe.physics import System
 
 Array = NDArray[np.float64]
@@ -42,16 +42,14 @@ class Band:
         """Samples from one kept value to the next: five values a cut-off period."""
         return max(1, int(self.rate_hz / (5.0 * self.cutoff_hz)))
 
-    def kept(self, count: int) -> Array:
+    def kept(self, count: int) -> NDArray[np.int64]:
         """Indices of the samples that `thin` keeps of ``count``."""
         margin = int(self.margin_s * self.rate_hz)
-        return np.arange(margin, count - margin, self.step)
+        return np.arange(margin, count - margin, self.step, dtype=np.int64)
 
     def thin(self, values: Array) -> Array:
         """Low-pass (T, k) without phase and keep every `step`-th row, margins left out."""
-        sections = butter(2, self.cutoff_hz, fs=self.rate_hz, output="sos")
-        smooth = sosfiltfilt(sections, values, axis=0)
-        return np.ascontiguousarray(smooth[self.kept(len(values))])
+        return low_pass_at(values, self.cutoff_hz, self.rate_hz, self.kept(len(values)))
 
 
 def moving(motion: Motion, sensors: Sensors, band: Band) -> Array:

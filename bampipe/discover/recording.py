@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,10 +67,14 @@ class Motion:
     qd: Array
     qdd: Array
     channels: Mapping[str, Array]
+    _columns: dict[tuple[str, ...], Array] = field(default_factory=dict, repr=False, compare=False)
 
     def inputs(self, names: Sequence[str]) -> Array:
-        """The channels called ``names`` as columns, (T, len(names))."""
-        return np.column_stack([self.channels[name] for name in names])
+        """The channels called ``names`` as columns, (T, len(names)); do not write to them."""
+        key = tuple(names)
+        if key not in self._columns:
+            self._columns[key] = np.column_stack([self.channels[name] for name in key])
+        return self._columns[key]
 
 
 def observe(recording: Recording, sensors: Sensors, system: System) -> Motion:
@@ -86,7 +90,11 @@ def observe(recording: Recording, sensors: Sensors, system: System) -> Motion:
     channels: dict[str, Array] = {"t": t}
     for name, column in zip(device.forces, recording.force.T, strict=True):
         _, first, second = zero_phase(column, rate, cutoff)
-        channels |= {name: column, derivative(name, 1): first, derivative(name, 2): second}
+        channels |= {
+            name: column,
+            derivative(name, 1): first,
+            derivative(name, 2): second,
+        }
     for i, axis in enumerate(system.coordinates):
         if axis in device.brakes:
             channels[device.brakes[axis]] = recording.brake[:, i]

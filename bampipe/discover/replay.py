@@ -34,9 +34,7 @@ def replay(
     """
     u = motion.inputs(system.inputs)
     n = len(system.coordinates)
-    start = np.concatenate(
-        [motion.q[0], motion.qd[0], system.initial_memory(motion.q[0], u[0], p)]
-    )
+    start = np.concatenate([motion.q[0], motion.qd[0], system.initial_memory(motion.q[0], u[0], p)])
     at = {name: i for i, name in enumerate(system.inputs)}
     forces = system.model.device.forces
     widths = np.array([c.sign_width for c in system.model.device.coordinates])

@@ -1,0 +1,451 @@
+"""Which effect a model lacks, or that it lacks none, or that the library has no name for it.
+
+1. Every candidate is refitted with the model and scored on trials left out.
+2. The same is done with replays of the fitted model, which lack nothing: the chance level.
+3. The best candidate that beats chance is added, and so on until none does. Candidates that come
+   close to the best are told apart by replaying each of them: the pattern of all their scores must
+   look like the measured one. Those that pass alike are reported as one group.
+4. What is left is compared with the noise floor of the final model, found by replaying it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import t as student
+
+from bampipe.discover.candidates import Score, Scorer, library
+from bampipe.discover.chance import (
+    Pool,
+    Recipe,
+    Replicate,
+    ReplicateTask,
+    ScoreTask,
+    Session,
+    run_replicate,
+    run_scores,
+    system_of,
+    workers,
+)
+from bampipe.discover.evidence import Evidence, fit
+from bampipe.discover.shape import explainable_share
+from bampipe.physics.parameter import Parameter
+from bampipe.physics.registry import effect_from
+
+Array = NDArray[np.float64]
+Progress = Callable[[float, str], None]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How carefully to look.
+
+    Attributes:
+        replicates: replays of the model for the chance level.
+        final_replicates: replays of the final model for the noise floor.
+        rival_replicates: replays of each rival when candidates come close.
+        most_effects: the most effects added.
+        significance: chance of a false alarm in a session that is accepted.
+        worth: least drop of log error beyond chance, on one axis, that is worth an effect.
+        above_floor: error over floor beyond which an axis still lacks something.
+        explained: least share of the excess error that the effects found must remove, else the
+            axis is reported as unknown.
+        jobs: worker processes.
+        seed: of all noise.
+    """
+
+    replicates: int = 10
+    final_replicates: int = 6
+    rival_replicates: int = 4
+    most_effects: int = 4
+    significance: float = 0.01
+    worth: float = 0.03
+    above_floor: float = 1.3
+    explained: float = 0.7
+    jobs: int = 2
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Ranked:
+    """One candidate in the ranking; errors are of the axis where it helps most, N.m or N."""
+
+    effect: str
+    axis: int
+    held_out_rmse_before: float
+    held_out_rmse_after: float
+    p_value: float
+    score: float
+    values: Mapping[str, float]
+    indistinguishable_from: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class AxisFinding:
+    """Verdict on one axis.
+
+    Attributes:
+        verdict: ``nothing_missing``, ``missing`` or ``unknown_effect``.
+        rmse_before, rmse_after: held-out error without and with the effects found, N.m or N.
+        noise_floor: what the final model leaves when it is the whole truth, N.m or N.
+        floor_sd: its scatter over replays.
+        explainable_share: share of the final residual that a flexible regressor predicts.
+        explainable_chance: the same on replays, the largest.
+        effects: effects found that act on this axis.
+    """
+
+    verdict: str
+    rmse_before: float
+    rmse_after: float
+    noise_floor: float
+    floor_sd: float
+    explainable_share: float
+    explainable_chance: float
+    effects: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What `diagnose` found.
+
+    Attributes:
+        axes: by coordinate, in order.
+        ranking: candidates, best first.
+        selected: effects to add, in order.
+        groups: for each selected effect, the others that these trials cannot tell from it.
+        evidence: of the model with all selected effects.
+        initial: of the model as given.
+    """
+
+    axes: tuple[AxisFinding, ...]
+    ranking: tuple[Ranked, ...]
+    selected: tuple[str, ...]
+    groups: Mapping[str, tuple[str, ...]]
+    evidence: Evidence
+    initial: Evidence
+
+
+@dataclass
+class _Chance:
+    """Mean and scatter of every candidate's score on replays of the bare model."""
+
+    replicates: list[Replicate]
+    names: Sequence[str]
+    gains: dict[str, Array] = field(init=False)
+
+    def __post_init__(self) -> None:
+        n = len(self.replicates[0].error)
+        self.gains = {
+            name: np.array(
+                [r.scores[name].gain if name in r.scores else np.zeros(n) for r in self.replicates]
+            )
+            for name in self.names
+        }
+
+    def p_value(self, score: Score) -> float:
+        """Chance that any candidate scores this high with nothing missing (Bonferroni)."""
+        count = len(self.replicates)
+        z = self.distance(score) / np.sqrt(1.0 + 1.0 / count)
+        return float(min(1.0, len(self.names) * student.sf(z, count - 1)))
+
+    def distance(self, score: Score) -> float:
+        """Score above its mean on replays, in standard deviations (at least one unit)."""
+        totals = self.gains[score.name].sum(axis=1)
+        return float((score.total - totals.mean()) / max(totals.std(ddof=1), 1.0))
+
+    def excess(self, score: Score) -> Array:
+        """Gain beyond the mean on replays, by axis."""
+        return np.asarray(score.gain - self.gains[score.name].mean(axis=0))
+
+
+def diagnose(
+    session: Session,
+    recipe: Recipe,
+    start: Array,
+    settings: Settings | None = None,
+    progress: Progress = lambda fraction, message: None,
+) -> Diagnosis:
+    """Find what a model lacks.
+
+    Args:
+        session: the measured trials, at least two.
+        recipe: the model.
+        start: parameters to start its fit from, (n_p,).
+        settings: how carefully to look.
+        progress: called with a fraction and a message.
+
+    Raises:
+        ValueError: fewer than two trials.
+    """
+    settings = settings or Settings()
+    if len(session.motions) < 2:
+        raise ValueError("a diagnosis needs at least two trials: one is held out")
+    with workers(session, settings.jobs) as pool:
+        return _Search(session, recipe, start, settings, pool, progress).run()
+
+
+class _Search:
+    def __init__(
+        self,
+        session: Session,
+        recipe: Recipe,
+        start: Array,
+        settings: Settings,
+        pool: Pool,
+        progress: Progress,
+    ) -> None:
+        self.session, self.recipe, self.settings = session, recipe, settings
+        self.pool, self.progress = pool, progress
+        self.initial = self._fit(recipe, start)
+        model = recipe.model()
+        extra = [effect_from(e) for e in recipe.extra]
+        self.names = library(model.device, recipe.effects, extra)
+        self.groups: dict[str, tuple[str, ...]] = {}
+
+    def _fit(self, recipe: Recipe, start: Array) -> Evidence:
+        s = self.session
+        return fit(system_of(recipe), s.motions, s.sensors, s.band, start)
+
+    def run(self) -> Diagnosis:
+        s = self.settings
+        self.progress(0.02, "replaying the model for chance levels")
+        chance = _Chance(
+            self._replicas(self.recipe, self.initial.p, s.replicates, self.names, (0,)),
+            self.names,
+        )
+        self.progress(0.4, "scoring every candidate on the measured trials")
+        first = self._scores(self.recipe, self.initial.p, self.names)
+        recipe, evidence, scores = self.recipe, self.initial, first
+        selected: list[str] = []
+        while len(selected) < s.most_effects:
+            able = self._able(scores, chance, evidence)
+            if not able:
+                break
+            best = self._choose(able, chance, recipe, evidence, scores)
+            selected.append(best)
+            self.progress(0.45 + 0.1 * len(selected), f"added {best}, looking for more")
+            recipe = replace(self.recipe, effects=(*self.recipe.effects, *selected))
+            evidence = self._fit(recipe, self._start(recipe, evidence, scores[best]))
+            rest = [n for n in self.names if n not in selected]
+            scores = self._scores(recipe, evidence.p, rest)
+        self.progress(0.85, "replaying the final model for its noise floor")
+        final = self._replicas(recipe, evidence.p, s.final_replicates, (), (1,), share=True)
+        return self._conclude(chance, first, selected, evidence, final)
+
+    def _replicas(
+        self,
+        recipe: Recipe,
+        p: Array,
+        count: int,
+        names: Sequence[str],
+        seed: tuple[int, ...],
+        share: bool = False,
+        analysed: tuple[Recipe, Array] | None = None,
+    ) -> list[Replicate]:
+        into, start = analysed or (recipe, p)
+        tasks = [
+            ReplicateTask(
+                recipe, p, into, start, (self.settings.seed, *seed, k), tuple(names), share
+            )
+            for k in range(count)
+        ]
+        return list(self.pool(run_replicate, tasks))
+
+    def _scores(self, recipe: Recipe, p: Array, names: Sequence[str]) -> dict[str, Score]:
+        parts = 2 * self.settings.jobs
+        tasks = [ScoreTask(recipe, p, tuple(names[k::parts])) for k in range(parts)]
+        merged: dict[str, Score] = {}
+        for found in self.pool(run_scores, tasks):
+            merged |= found
+        return merged
+
+    def _able(
+        self, scores: Mapping[str, Score], chance: _Chance, evidence: Evidence
+    ) -> list[tuple[float, str]]:
+        """Candidates that beat chance and are worth having, best first."""
+        independent = Scorer(evidence).independent
+        able = []
+        for name, score in scores.items():
+            excess = chance.excess(score)
+            if (
+                np.max(excess / independent) > self.settings.worth
+                and chance.p_value(score) < self.settings.significance
+            ):
+                able.append((float(excess.sum()), name))
+        return sorted(able, reverse=True)
+
+    def _choose(
+        self,
+        able: Sequence[tuple[float, str]],
+        chance: _Chance,
+        recipe: Recipe,
+        evidence: Evidence,
+        scores: Mapping[str, Score],
+    ) -> str:
+        """The best of ``able``; close ones are told apart by replaying each of them."""
+        top, best = able[0]
+        axis = int(np.argmax(chance.excess(scores[best])))
+        rivals = [
+            name
+            for excess, name in able[:6]
+            if excess > 0.6 * top and int(np.argmax(chance.excess(scores[name]))) == axis
+        ][:4]
+        if len(rivals) == 1:
+            self.groups[best] = ()
+            return best
+        misfit = {}
+        for k, name in enumerate(rivals):
+            self.progress(0.5, f"replaying {name} to tell it from {len(rivals) - 1} rival(s)")
+            wider = replace(recipe, effects=(*recipe.effects, name))
+            fitted = self._fit(wider, self._start(wider, evidence, scores[name]))
+            replicas = self._replicas(
+                wider,
+                fitted.p,
+                self.settings.rival_replicates,
+                rivals,
+                (2, k),
+                analysed=(recipe, evidence.p),
+            )
+            misfit[name] = _misfit(rivals, scores, replicas, axis)
+        ordered = sorted(rivals, key=lambda n: misfit[n])
+        winner = ordered[0]
+        limit = max(2.0, misfit[winner] + 1.0)
+        alike = tuple(n for n in ordered[1:] if misfit[n] < limit)
+        if best in alike:
+            alike = (winner, *[n for n in alike if n != best])
+            winner = best
+        self.groups[winner] = alike[:2]
+        return winner
+
+    def _start(self, recipe: Recipe, evidence: Evidence, score: Score) -> Array:
+        """Where the fit of the wider model starts: the scored values."""
+        old = {q.name: v for q, v in zip(evidence.system.parameters, evidence.p, strict=True)}
+        for i, shift in zip(evidence.free, score.shift, strict=False):
+            old[evidence.system.parameters[i].name] += shift
+        system = system_of(recipe)
+        fresh = system.parameters[-len(score.values) :]
+        old |= {q.name: float(v) for q, v in zip(fresh, score.values, strict=True)}
+        start = np.array([old[q.name] for q in system.parameters])
+        lower = np.array([q.lower for q in system.parameters])
+        upper = np.array([q.upper for q in system.parameters])
+        return np.clip(start, lower, upper)
+
+    def _conclude(
+        self,
+        chance: _Chance,
+        first: Mapping[str, Score],
+        selected: list[str],
+        evidence: Evidence,
+        final: list[Replicate],
+    ) -> Diagnosis:
+        s = self.settings
+        before = Scorer(self.initial).before.error
+        after = Scorer(evidence).before.error
+        floors = np.array([r.error for r in final])
+        bare_floor = np.array([r.error for r in chance.replicates]).mean(axis=0)
+        shares = np.array([r.share for r in final])
+        main = {n: int(np.argmax(chance.excess(first[n]))) if n in first else 0 for n in selected}
+        findings = []
+        unknown = set()
+        for axis in range(len(before)):
+            floor, scatter = floors[:, axis].mean(), floors[:, axis].std(ddof=1)
+            share = explainable_share(evidence, axis)
+            luck = float(shares[:, axis].max())
+            here = tuple(
+                n
+                for n in selected
+                if main[n] == axis or n.endswith(f":{evidence.system.coordinates[axis]}")
+            )
+            excess = before[axis] ** 2 - min(floor, bare_floor[axis]) ** 2
+            left = max(after[axis] ** 2 - floor**2, 0.0)
+            lacking = after[axis] > s.above_floor * floor + 3.0 * scatter and share > luck + 0.05
+            verdict = "missing" if here else "nothing_missing"
+            if lacking and (not here or left > (1.0 - s.explained) * max(excess, 1e-30)):
+                verdict = "unknown_effect"
+                unknown |= set(here)
+            findings.append(
+                AxisFinding(
+                    verdict,
+                    float(before[axis]),
+                    float(after[axis]),
+                    float(floor),
+                    float(scatter),
+                    share,
+                    luck,
+                    here if verdict == "missing" else (),
+                )
+            )
+        kept = [n for n in selected if n not in unknown]
+        ranking = self._ranking(chance, first, kept, before)
+        groups = {n: self.groups.get(n, ()) for n in kept}
+        return Diagnosis(
+            tuple(findings), tuple(ranking), tuple(kept), groups, evidence, self.initial
+        )
+
+    def _ranking(
+        self,
+        chance: _Chance,
+        first: Mapping[str, Score],
+        selected: Sequence[str],
+        before: Array,
+    ) -> list[Ranked]:
+        """Selected effects with their groups, then the others by their score beyond chance."""
+        order: list[str] = []
+        for name in selected:
+            order += [n for n in (name, *self.groups.get(name, ())) if n not in order]
+        others = sorted(
+            (n for n in first if n not in order),
+            key=lambda n: -float(chance.excess(first[n]).sum()),
+        )
+        rows = []
+        for name in [*order, *others]:
+            if name not in first:
+                continue
+            score = first[name]
+            excess = chance.excess(score)
+            axis = int(np.argmax(excess))
+            group = next(
+                ({g, *r} - {name} for g, r in self.groups.items() if name in (g, *r)), set()
+            )
+            own = [q.name for q in _own_parameters(self.recipe, name)]
+            rows.append(
+                Ranked(
+                    name,
+                    axis,
+                    float(before[axis]),
+                    float(score.error[axis]),
+                    chance.p_value(score),
+                    float(excess.sum()),
+                    dict(zip(own, [float(v) for v in score.values], strict=True)),
+                    tuple(sorted(group)),
+                )
+            )
+        return rows
+
+
+def _own_parameters(recipe: Recipe, name: str) -> tuple[Parameter, ...]:
+    return replace(recipe, effects=(name,)).model().effects[0].parameters
+
+
+def _misfit(
+    rivals: Sequence[str],
+    scores: Mapping[str, Score],
+    replicas: Sequence[Replicate],
+    axis: int,
+) -> float:
+    """How unlike the measured pattern of scores is to the replayed one: mean squared z.
+
+    A tenth of the score is allowed for, because no replay is perfect.
+    """
+    total = 0.0
+    for name in rivals:
+        seen = scores[name].gain[axis]
+        replayed = np.array(
+            [r.scores[name].gain[axis] if name in r.scores else 0.0 for r in replicas]
+        )
+        spread = np.sqrt(replayed.var(ddof=1) + (0.1 * replayed.mean()) ** 2 + 4.0)
+        total += ((seen - replayed.mean()) / spread) ** 2
+    return float(total / len(rivals))

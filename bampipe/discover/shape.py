@@ -1,0 +1,211 @@
+"""The shape of a residual: maps of it, worst windows, explainable share."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.discover.evidence import Evidence
+from bampipe.discover.recording import Motion
+
+Array = NDArray[np.float64]
+
+_BINS = 16
+_LEAST = 12
+
+
+@dataclass(frozen=True)
+class Variable:
+    """One quantity that a residual may depend on, at the kept samples of every trial.
+
+    Attributes:
+        name: ``position``, ``velocity``, ...
+        unit: SI unit as text.
+        values: by trial, each (K,).
+    """
+
+    name: str
+    unit: str
+    values: tuple[Array, ...]
+
+
+@dataclass(frozen=True)
+class Map:
+    """Mean residual in bins of one variable, with 95 % confidence bands over independent samples.
+
+    Attributes:
+        variable: its name.
+        unit: its unit.
+        center, mean, low, high: by bin; the residual's are N.m or N.
+        count: samples in each bin.
+        share: share of the residual's variance that the bin means carry.
+    """
+
+    variable: str
+    unit: str
+    center: Array
+    mean: Array
+    low: Array
+    high: Array
+    count: Array
+    share: float
+
+
+@dataclass(frozen=True)
+class Window:
+    """A stretch of a trial where the model fails."""
+
+    axis: str
+    trial_id: str
+    t_start: float
+    t_end: float
+    rmse: float
+    doing: str
+
+
+def variables(evidence: Evidence, axis: int) -> tuple[Variable, ...]:
+    """What the residual of one axis is mapped against."""
+    system, band = evidence.system, evidence.band
+    coordinate = system.model.device.coordinates[axis]
+    unit = coordinate.unit
+    columns: dict[str, tuple[str, list[Array]]] = {}
+
+    def put(name: str, in_unit: str, values: Array) -> None:
+        columns.setdefault(name, (in_unit, []))[1].append(values)
+
+    for index, motion in enumerate(evidence.motions):
+        kept = band.kept(len(motion.t))
+        u = motion.inputs(system.inputs)
+        load = system.applied(
+            motion.q, motion.qd, motion.qdd, evidence.memory[index], u, evidence.p
+        )[:, axis]
+        since, distance = _since_reversal(motion, axis)
+        put("position", unit, motion.q[kept, axis])
+        put("velocity", f"{unit}/s", motion.qd[kept, axis])
+        put("acceleration", f"{unit}/s2", motion.qdd[kept, axis])
+        put("load", coordinate.torque_unit, load[kept])
+        put("direction", "", np.sign(motion.qd[kept, axis]))
+        put("time since reversal", "s", since[kept])
+        put("distance since reversal", unit, distance[kept])
+        for k, other in enumerate(system.model.device.coordinates):
+            if k != axis:
+                put(f"{other.name} position", other.unit, motion.q[kept, k])
+                put(f"{other.name} velocity", f"{other.unit}/s", motion.qd[kept, k])
+        for k, name in enumerate(system.memory_names):
+            put(name, "", evidence.memory[index][kept, k])
+        put("time", "s", motion.t[kept])
+        put("trial", "", np.full(len(kept), float(index)))
+    return tuple(Variable(name, u, tuple(v)) for name, (u, v) in columns.items())
+
+
+def _since_reversal(motion: Motion, axis: int) -> tuple[Array, Array]:
+    """Time (s) and distance travelled since the velocity last changed sign, each (T,)."""
+    sign = motion.qd[:, axis] > 0.0
+    last = np.zeros(len(sign), dtype=int)
+    changes = np.flatnonzero(sign[1:] != sign[:-1]) + 1
+    last[changes] = changes
+    last = np.maximum.accumulate(last)
+    return motion.t - motion.t[last], np.abs(motion.q[:, axis] - motion.q[last, axis])
+
+
+def residual_map(evidence: Evidence, axis: int, variable: Variable) -> Map:
+    """Bin the residual of ``axis`` by ``variable`` into parts of equal count."""
+    use = np.concatenate([u[:, axis] for u in evidence.used]) > 0
+    r = np.concatenate([x[:, axis] for x in evidence.residual])[use]
+    v = np.concatenate(variable.values)[use]
+    levels = np.unique(v)
+    if len(levels) <= _BINS:
+        which = np.searchsorted(levels, v)
+        count = len(levels)
+    else:
+        edges = np.unique(np.quantile(v, np.linspace(0.0, 1.0, _BINS + 1)))
+        which = np.clip(np.searchsorted(edges, v, side="right") - 1, 0, len(edges) - 2)
+        count = len(edges) - 1
+    rows = [
+        (v[which == b].mean(), r[which == b].mean(), r[which == b].std(), np.sum(which == b))
+        for b in range(count)
+        if np.sum(which == b) >= _LEAST
+    ]
+    center, mean, sd, n = (np.array(c, dtype=float) for c in zip(*rows, strict=True))
+    independent = np.maximum(n * 2.0 * evidence.band.step * evidence.band.cutoff_hz, 1.0)
+    half = 1.96 * sd / np.sqrt(np.maximum(independent / evidence.band.rate_hz, 2.0))
+    share = float(np.sum(n * (mean - r.mean()) ** 2) / max(np.sum((r - r.mean()) ** 2), 1e-30))
+    return Map(variable.name, variable.unit, center, mean, mean - half, mean + half, n, share)
+
+
+def explainable_share(evidence: Evidence, axis: int, seed: int = 0) -> float:
+    """Share of the residual's variance that a flexible regressor predicts on unseen trials.
+
+    Extremely randomised trees (Geurts, Ernst and Wehenkel 2006) on the variables of the residual
+    maps, each trial predicted from the others. Zero where it predicts nothing.
+    """
+    from sklearn.ensemble import ExtraTreesRegressor
+
+    chosen = [v for v in variables(evidence, axis) if v.name not in ("trial", "time")]
+    use = [u[:, axis] > 0 for u in evidence.used]
+    x = [
+        np.column_stack([v.values[k] for v in chosen])[use[k]] for k in range(len(evidence.motions))
+    ]
+    y = [r[:, axis][use[k]] for k, r in enumerate(evidence.residual)]
+    left = total = 0.0
+    for k in range(len(x)):
+        others = [i for i in range(len(x)) if i != k]
+        trees = ExtraTreesRegressor(
+            n_estimators=40, min_samples_leaf=8, max_features=0.6, random_state=seed, n_jobs=1
+        )
+        trees.fit(np.concatenate([x[i] for i in others]), np.concatenate([y[i] for i in others]))
+        left += float(np.sum((y[k] - trees.predict(x[k])) ** 2))
+        total += float(np.sum(y[k] ** 2))
+    return max(0.0, 1.0 - left / max(total, 1e-30))
+
+
+def worst_windows(evidence: Evidence, count: int = 10, width_s: float = 0.5) -> list[Window]:
+    """The stretches with the largest residual relative to the axis' own, over all axes."""
+    band, system = evidence.band, evidence.system
+    length = max(2, int(width_s * band.rate_hz / band.step))
+    typical = evidence.rmse()
+    found: list[tuple[float, Window]] = []
+    for k, motion in enumerate(evidence.motions):
+        kept = band.kept(len(motion.t))
+        for start in range(0, len(kept) - length + 1, length):
+            rows = slice(start, start + length)
+            for axis, name in enumerate(system.coordinates):
+                n = evidence.used[k][rows, axis].sum()
+                if n < 0.5 * length:
+                    continue
+                rmse = float(np.sqrt(np.sum(evidence.residual[k][rows, axis] ** 2) / n))
+                t = motion.t[kept[rows]]
+                doing = _doing(motion, kept[rows], axis, system.coordinate_units[axis])
+                window = Window(name, motion.trial_id, float(t[0]), float(t[-1]), rmse, doing)
+                found.append((rmse / max(typical[axis], 1e-12), window))
+    found.sort(key=lambda pair: -pair[0])
+    return [window for _, window in found[:count]]
+
+
+def _doing(motion: Motion, rows: Sequence[int] | Array, axis: int, unit: str) -> str:
+    q, qd = motion.q[rows, axis], motion.qd[rows, axis]
+    moved = "reversing" if np.any(qd > 0) and np.any(qd < 0) else (
+        "moving up" if qd.mean() > 0 else "moving down"
+    )  # fmt: skip
+    return f"{moved} near {q.mean():.2f} {unit} at up to {np.abs(qd).max():.2f} {unit}/s"
+
+
+def describe(evidence: Evidence, axis: int) -> str:
+    """The residual's shape in one sentence: what it varies with most, and where it peaks."""
+    skip = {"trial", "direction"}
+    maps = [residual_map(evidence, axis, v) for v in variables(evidence, axis)]
+    maps = [m for m in maps if m.variable not in skip]
+    best = max(maps, key=lambda m: m.share)
+    unit = evidence.system.torque_units[axis]
+    peak = int(np.argmax(np.abs(best.mean)))
+    half = np.abs(best.mean) > 0.5 * np.abs(best.mean[peak])
+    inside = best.center[half]
+    form = "a bump" if half.sum() <= len(best.center) / 3 else "a broad change"
+    return (
+        f"{form} of {best.mean[peak]:+.2g} {unit} near {best.variable} {best.center[peak]:.3g} "
+        f"{best.unit} (between {inside.min():.3g} and {inside.max():.3g} {best.unit}), "
+        f"which carries {100 * best.share:.0f} % of the residual's variance"
+    )
