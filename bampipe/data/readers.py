@@ -128,8 +128,9 @@ def _check_columns(found: Sequence[str], wanted: Sequence[str], name: str) -> No
     for column in wanted:
         if column not in found:
             shown = ", ".join(found[:12]) + (", ..." if len(found) > 12 else "")
+            others = [other for other in found if other not in wanted]
             raise InputError(
-                f"no column '{column}'{did_you_mean(column, [f for f in found if f not in wanted])}",
+                f"no column '{column}'{did_you_mean(column, others)}",
                 where=name,
                 remedy=f"it has {shown}",
             )

@@ -78,6 +78,7 @@ class Force:
         calibration: n by n, N (N.m) for one raw unit.
         zero: raw readings without force.
         noise_sd: standard deviation at rest, in ``unit``; None if not measured.
+        volts: whether the raw readings are a sensor's voltages.
     """
 
     columns: tuple[str, ...]
@@ -86,6 +87,7 @@ class Force:
     calibration: tuple[tuple[float, ...], ...]
     zero: tuple[float, ...]
     noise_sd: float | None
+    volts: bool
 
 
 @dataclass(frozen=True)
@@ -381,6 +383,7 @@ def _force(entry: Mapping[str, Any], where: str) -> Force:
         calibration=tuple(tuple(float(v) for v in row) for row in calibration),
         zero=tuple(float(v) for v in zero),
         noise_sd=None if "noise_sd_n" not in entry else float(entry["noise_sd_n"]),
+        volts=volts,
     )
 
 

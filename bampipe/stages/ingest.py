@@ -1,0 +1,300 @@
+"""Ingest: from the raw logs of a session to sound trials in SI units.
+
+Trials are read, checked, repaired where that is safe, and written one at a time. A trial that
+cannot be trusted is set aside with a reason (file, row, column), and the others go on.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+
+from bampipe.data.quality import CleanTrial, Limits, clean
+from bampipe.data.readers import read_trial
+from bampipe.data.session import Session, TrialEntry, inside, read_session
+from bampipe.data.store import ParquetAppender, read_toml, sha256_file, write_json, write_parquet
+from bampipe.errors import InputError
+from bampipe.physics import registry
+from bampipe.physics.device import Device
+from bampipe.stages.base import Progress, RunFolder
+
+NAME = "ingest"
+SUMMARY = "Read a session's raw logs, check and repair the trials, bring them to SI units"
+
+RATE_TOLERANCE = 0.02
+"""The announced sample rate stands where the time stamps agree with it this well."""
+
+
+@dataclass(frozen=True)
+class Config(Limits):
+    """What the stage can be told.
+
+    Attributes:
+        session: folder of the session.
+        largest_trial_mb: a trial that takes more memory than this, MB, is set aside.
+        shortest_s: a trial shorter than this, s, is set aside.
+        gap_s: longest gap in the time stamps that is left to resampling, s.
+        sound_share: least share of a trial that its longest stretch between gaps must hold.
+        dropped_share: largest share of rows that may be dropped for their time stamps.
+        nan_run: longest run of missing samples that is interpolated.
+        nan_share: largest share of missing samples in a channel.
+        saturated_share: largest share of samples at the rail of a force channel.
+        frozen_share: largest share of the trial over which a force channel may stand still.
+        still_rad: a free trial moves more than this, rad, or ``still_m`` on some axis.
+        still_m: the same for linear axes, m.
+        locked_rad: a locked rotary axis moves less than this, rad.
+        locked_m: a locked linear axis moves less than this, m.
+        locked_steps: a locked axis deflects by at least this many encoder steps.
+        brake_on: a brake command above this, N.m or N, makes a trial not free.
+    """
+
+    session: str = ""
+    largest_trial_mb: int = 4096
+
+
+def inputs(config: Config) -> tuple[str, ...]:
+    """Nothing in the run folder: the session is read."""
+    return ()
+
+
+def outputs(config: Config) -> tuple[str, ...]:
+    """Return the paths the stage writes; the device file only where the lab brings its own."""
+    return (
+        "ingest/session.json",
+        "ingest/trials.parquet",
+        "ingest/samples.parquet",
+        "ingest/device*.toml",
+    )
+
+
+def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
+    """Write the sound trials of a session and what became of each.
+
+    Raises:
+        InputError: a mistake in the session file, or no trial is sound.
+    """
+    _check(config)
+    session = read_session(Path(config.session))
+    device = _device(session)
+    _match(session, device)
+    (out / "ingest").mkdir(parents=True, exist_ok=True)
+    rows: list[dict[str, object]] = []
+    reasons = _refused(session)
+    total = len(session.trials)
+    with ParquetAppender(out / "ingest/samples.parquet") as samples:
+        for number, entry in enumerate(session.trials):
+            progress(number / total, entry.trial_id)
+            try:
+                trial = _trial(session, entry, config, reasons[number])
+            except InputError as error:
+                rows.append(_row(entry, None, str(error)))
+                continue
+            rows.append(_row(entry, trial, ""))
+            _append(samples, entry, trial)
+        if all(row["status"] == "set_aside" for row in rows):
+            raise InputError(
+                f"none of the {total} trials is sound; the first: {rows[0]['reason']}",
+                where=str(session.root),
+            )
+    trials = _trials_table(rows)
+    write_parquet(out / "ingest/trials.parquet", trials)
+    rate = _rate(session, trials)
+    write_json(out / "ingest/session.json", _description(session, device, rate))
+    if session.device_file is not None:
+        (out / "ingest/device.toml").write_bytes(session.device_file.read_bytes())
+    return _summary(session, rows)
+
+
+def _check(config: Config) -> None:
+    if not config.session:
+        raise InputError("no session folder given", remedy="bampipe ingest SESSION")
+    for name in Limits.__dataclass_fields__:
+        if not getattr(config, name) >= 0:
+            raise InputError("must not be negative", where=f"ingest.{name}")
+    if config.largest_trial_mb < 1:
+        raise InputError("must be 1 or more", where="ingest.largest_trial_mb")
+
+
+def _device(session: Session) -> Device:
+    path = session.device_file
+    if path is not None:
+        return registry.device_from(read_toml(path), str(path))
+    try:
+        return registry.device(session.device)
+    except InputError as error:
+        raise InputError(
+            error.what, where=f"{session.root / 'session.toml'}: device", remedy=error.remedy
+        ) from error
+
+
+def _match(session: Session, device: Device) -> None:
+    """Hold the session's channels to the device's axes and inputs.
+
+    Raises:
+        InputError: an axis or an input is missing, of another name or of another unit.
+    """
+    where = f"{session.root / 'session.toml'}"
+    encoders = {encoder.axis: encoder for encoder in session.encoders}
+    axes = {coordinate.name: coordinate.unit for coordinate in device.coordinates}
+    for axis in encoders:
+        if axis not in axes:
+            raise InputError(
+                f"device '{device.name}' has no axis '{axis}'",
+                where=f"{where}: encoders.{axis}",
+                remedy=f"its axes are {', '.join(axes)}",
+            )
+    for axis, unit in axes.items():
+        if axis not in encoders:
+            raise InputError(
+                f"no encoder for axis '{axis}' of device '{device.name}'",
+                where=f"{where}: encoders",
+            )
+        if encoders[axis].unit != unit:
+            raise InputError(
+                f"a unit of {encoders[axis].unit}, but device '{device.name}' has this axis"
+                f" in {unit}",
+                where=f"{where}: encoders.{axis}.unit",
+            )
+    given = {channel.name for channel in session.channels}
+    given |= set(session.force.names) if session.force else set()
+    for name in device.forces:
+        if name not in given:
+            raise InputError(
+                f"no channel for input '{name}' of device '{device.name}'",
+                where=f"{where}: force",
+                remedy=f"these are given: {', '.join(sorted(given)) or 'none'}",
+            )
+    if session.force and not session.force.volts and session.force.unit != device.force_unit:
+        raise InputError(
+            f"found \"{session.force.unit}\", but device '{device.name}' takes {device.force_unit}",
+            where=f"{where}: force.unit",
+        )
+
+
+def _refused(session: Session) -> list[str]:
+    """Why each trial is refused before it is read: the same file or content as another, or ''."""
+    same: dict[str, list[int]] = defaultdict(list)
+    for number, entry in enumerate(session.trials):
+        try:
+            path = inside(session.root, entry.file, where="")
+        except InputError:
+            continue  # said when the trial's turn comes
+        same[sha256_file(path)].append(number)
+    reasons = [""] * len(session.trials)
+    for numbers in same.values():
+        entries = [session.trials[number] for number in numbers]
+        alike = len({(entry.kind, entry.locked_axis, entry.viscous) for entry in entries}) == 1
+        for number in numbers[1:] if alike else numbers if len(numbers) > 1 else []:
+            entry = session.trials[number]
+            other = next(e for e in entries if e is not entry)
+            what = "file" if other.file == entry.file else "content"
+            reasons[number] = f"the same {what} as trial {other.trial_id}" + (
+                ": used once" if alike else f", which is declared {other.kind}"
+            )
+    return reasons
+
+
+def _trial(session: Session, entry: TrialEntry, config: Config, reason: str) -> CleanTrial:
+    """One sound trial in SI units.
+
+    Raises:
+        InputError: the trial is to be set aside, with the reason.
+    """
+    if reason:
+        raise InputError(reason, where=entry.file)
+    path = inside(session.root, entry.file, where=entry.file)
+    raw = read_trial(
+        path, session.columns, name=entry.file, largest_bytes=config.largest_trial_mb << 20
+    )
+    return clean(raw, session, entry, config)
+
+
+def _append(samples: ParquetAppender, entry: TrialEntry, trial: CleanTrial) -> None:
+    ids = pa.DictionaryArray.from_arrays(
+        np.zeros(len(trial.t), dtype=np.int32), pa.array([entry.trial_id])
+    )
+    samples.append({"trial_id": ids, "t": trial.t, **trial.columns})
+
+
+def _row(entry: TrialEntry, trial: CleanTrial | None, reason: str) -> dict[str, object]:
+    status = "set_aside"
+    if trial is not None:
+        status = "repaired" if trial.repairs else "ok"
+    return {
+        "trial_id": entry.trial_id,
+        "file": entry.file,
+        "kind": entry.kind,
+        "locked_axis": entry.locked_axis,
+        "viscous_n_s_per_m": np.nan if entry.viscous is None else entry.viscous,
+        "n_samples": 0 if trial is None else len(trial.t),
+        "duration_s": np.nan if trial is None else float(trial.t[-1]),
+        "sample_rate_hz": np.nan if trial is None else trial.sample_rate,
+        "status": status,
+        "reason": reason,
+        "repairs": "" if trial is None else "; ".join([*trial.repairs, *trial.notes]),
+    }
+
+
+def _trials_table(rows: list[dict[str, object]]) -> pd.DataFrame:
+    table = pd.DataFrame(rows)
+    text = ("trial_id", "file", "kind", "locked_axis", "status", "reason", "repairs")
+    return table.astype(dict.fromkeys(text, "string"))
+
+
+def _rate(session: Session, trials: pd.DataFrame) -> float:
+    """Announced sample rate, or the median of the trials where the time stamps say otherwise."""
+    measured = float(trials["sample_rate_hz"].median())
+    if abs(measured - session.sample_rate) <= RATE_TOLERANCE * session.sample_rate:
+        return session.sample_rate
+    return measured
+
+
+def _description(session: Session, device: Device, rate: float) -> dict[str, object]:
+    force = session.force
+    return {
+        "session_id": session.session_id,
+        "device": device.name,
+        "device_file": session.device if session.device_file is not None else None,
+        "recorded_at": session.recorded_at,
+        "sample_rate_hz": rate,
+        "announced_rate_hz": session.sample_rate,
+        "axes": {
+            encoder.axis: {"unit": encoder.unit, "resolution": encoder.resolution}
+            for encoder in session.encoders
+        },
+        "force": {
+            "columns": list(force.names) if force else [],
+            "unit": device.force_unit,
+            "noise_sd": force.noise_sd if force else None,
+        },
+        "brakes": {f"brake_{brake.axis}": {"unit": brake.unit} for brake in session.brakes},
+        "channels": {channel.name: {"unit": channel.unit} for channel in session.channels},
+    }
+
+
+def _summary(session: Session, rows: list[dict[str, object]]) -> dict[str, object]:
+    names = ("ok", "repaired", "set_aside")
+    counts = {name: sum(row["status"] == name for row in rows) for name in names}
+    parts = [f"{counts['ok']} sound"]
+    parts += [f"{counts['repaired']} repaired"] if counts["repaired"] else []
+    parts += [f"{counts['set_aside']} set aside"] if counts["set_aside"] else []
+    return {
+        "session_id": session.session_id,
+        "trials": counts,
+        "headline": f"{len(rows)} trials: {', '.join(parts)}",
+        "set_aside": [
+            {"trial_id": row["trial_id"], "reason": row["reason"]}
+            for row in rows
+            if row["status"] == "set_aside"
+        ],
+        "repaired": [
+            {"trial_id": row["trial_id"], "repairs": row["repairs"]}
+            for row in rows
+            if row["repairs"]
+        ],
+    }
