@@ -51,7 +51,9 @@ def write_ingest(root: Path, trials: tuple[str, ...] = FREE) -> None:
     """Write what ingest leaves; one trial repaired, one set aside."""
     rows = [_trial(name, "free") for name in trials]
     rows[-1] |= {"status": "repaired", "repairs": "12 samples missing at 3.2 s: interpolated"}
-    rows.append(_trial("t04_free", "free") | {"status": "set_aside", "reason": "force_x frozen"})
+    aside = {"status": "set_aside", "reason": "force_x frozen"}
+    aside |= {"n_samples": 0, "duration_s": np.nan, "sample_rate_hz": np.nan}
+    rows.append(_trial("t04_free", "free") | aside)
     rows.append(_trial("t05_locked_yaw", "locked") | {"locked_axis": "yaw"})
     write_parquet(root / "ingest/trials.parquet", pd.DataFrame(rows))
     columns = {f"q_{axis}": [0.0] for axis in AXES}

@@ -48,8 +48,8 @@ def _trials(results: Results) -> Table:
             (
                 str(row["trial_id"]),
                 _kind(row),
-                wording.plain(float(row["duration_s"]), 1),
-                str(int(row["n_samples"])),
+                _duration(row["duration_s"]),
+                str(int(row["n_samples"])) if row["n_samples"] else "–",
                 _STATES.get(str(row["status"]), str(row["status"])),
                 _remarks(row),
             )
@@ -71,6 +71,13 @@ def _kind(row: dict[Any, Any]) -> str:
     if kind == "viscous" and damping is not None and math.isfinite(damping):
         return f"viscous, {wording.significant(float(damping), 2)} N·s/m"
     return kind
+
+
+def _duration(seconds: object) -> str:
+    """Return seconds; a dash for a trial that was set aside before it was read."""
+    if isinstance(seconds, float) and math.isfinite(seconds):
+        return wording.plain(seconds, 1)
+    return "–"
 
 
 def _remarks(row: dict[Any, Any]) -> str:
