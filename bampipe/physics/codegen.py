@@ -117,7 +117,7 @@ class _Printer(PythonCodePrinter):  # type: ignore[misc]
             factor = f"({self._print(base)})"
             return "(" + "*".join([factor] * int(exponent)) + ")"
         if exponent.is_Integer and exponent < 0:
-            return f"(1.0/{self._print(base ** (-exponent)) if exponent != -1 else '(' + self._print(base) + ')'})"
+            return f"(1.0/({self._print(base**-exponent)}))"
         return f"({self._print(base)})**({self._print(exponent)})"
 
     def _print_Rational(self, expr: Any) -> str:

@@ -226,8 +226,9 @@ def bind(effect: Effect, target: str, device: Device) -> BoundEffect:
         )
     if target not in targets:
         choices = ", ".join(f"{effect.name}:{t}" if t else effect.name for t in targets)
+        hint = expression.did_you_mean(target, targets)
         raise InputError(
-            f"effect {effect.name!r} has no target {target!r}{expression.did_you_mean(target, targets)}",
+            f"effect {effect.name!r} has no target {target!r}{hint}",
             remedy=f"choose from {choices}",
         )
     kind = device.coordinate(target).kind if effect.scope == "axis" else ""

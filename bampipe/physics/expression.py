@@ -10,6 +10,7 @@ import ast
 import difflib
 import keyword
 import math
+import warnings
 from collections.abc import Callable, Mapping
 from functools import cache
 from typing import Any
@@ -53,19 +54,21 @@ def parse(text: object, where: str) -> ast.expr:
             and the functions in `FUNCTIONS`.
     """
     if not isinstance(text, str):
-        raise InputError(f"expected an expression as text, found {text!r}", where=where)
+        raise InputError(f"expected an expression as text, found {text!r:.60}", where=where)
     if len(text) > MAX_LENGTH:
         raise InputError(f"expression is longer than {MAX_LENGTH} characters", where=where)
-    if not text.isascii():
-        odd = next(c for c in text if not c.isascii())
+    odd = next((c for c in text if c == "#" or not c.isascii()), "")
+    if odd:
         raise InputError(
             f"character {odd!r} is not allowed in an expression",
             where=where,
-            remedy="write names in plain ASCII letters",
+            remedy="write names in plain ASCII letters and comments outside",
         )
     try:
-        tree = ast.parse(" ".join(text.split()), mode="eval").body
-    except (SyntaxError, ValueError, MemoryError, RecursionError) as error:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # such as "1if": read by today's Python, with a warning
+            tree = ast.parse(" ".join(text.split()), mode="eval").body
+    except (SyntaxError, ValueError, MemoryError, RecursionError, Warning) as error:
         reason = getattr(error, "msg", None) or type(error).__name__
         raise InputError(
             f"cannot read the expression {text[:60]!r}: {reason}", where=where
@@ -85,9 +88,9 @@ def _check(node: ast.AST, where: str, power: float = 1.0, rates: int = 0) -> Non
     match node:
         case ast.Constant(value=value):
             if isinstance(value, bool) or not isinstance(value, int | float):
-                raise InputError(f"{value!r} is not a number", where=where)
+                raise InputError(f"{value!r:.60} is not a number", where=where)
             if not abs(value) < MAX_NUMBER:
-                raise InputError(f"the number {value!r} is too large", where=where)
+                raise InputError(f"the number {value!r:.60} is too large", where=where)
         case ast.Name():
             pass
         case ast.BinOp(left=left, op=op, right=right) if isinstance(op, _OPERATORS):
@@ -100,7 +103,7 @@ def _check(node: ast.AST, where: str, power: float = 1.0, rates: int = 0) -> Non
         case ast.Call(func=ast.Name(id=name), args=args, keywords=[]):
             if name not in FUNCTIONS:
                 raise InputError(
-                    f"unknown function {name!r}{did_you_mean(name, FUNCTIONS)}",
+                    f"unknown function {name!r:.60}{did_you_mean(name, FUNCTIONS)}",
                     where=where,
                     remedy=f"known: {', '.join(sorted(FUNCTIONS))}",
                 )
@@ -242,7 +245,7 @@ def build(
             case ast.Name(id=name):
                 if name not in symbols:
                     raise InputError(
-                        f"unknown symbol {name!r}{did_you_mean(name, symbols)}",
+                        f"unknown symbol {name!r:.60}{did_you_mean(name, symbols)}",
                         where=where,
                     )
                 return symbols[name]

@@ -71,6 +71,6 @@ def device(name: str) -> Device:
     if name not in device_names():
         raise InputError(
             f"unknown device {name!r}{did_you_mean(name, device_names())}",
-            remedy=f"built-in devices: {', '.join(device_names())}; or give the path of a device file",
+            remedy=f"built in: {', '.join(device_names())}; or give the path of a device file",
         )
     return device_from(_declaration("devices", name), f"devices/{name}.toml")
