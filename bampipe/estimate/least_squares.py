@@ -22,6 +22,9 @@ Array = NDArray[np.float64]
 Residual = Callable[[int, Array], Array]
 """residual(trial, p) -> (T, n_q): unfiltered residual of one trial for parameters p (np,)."""
 
+_REACH = 0.02
+"""Share that a rest may have in a low-passed sample before the sample is left out."""
+
 
 @dataclass(frozen=True)
 class Band:
@@ -37,11 +40,15 @@ class Band:
     cutoff_hz: float = 8.0
     margin_s: float = 0.2
 
+    @property
+    def step(self) -> int:
+        """Samples from one kept value to the next: five a period of the cut-off frequency."""
+        return max(1, int(self.rate_hz / (5.0 * self.cutoff_hz)))
+
     def kept(self, count: int) -> NDArray[np.int64]:
-        """Indices of the samples kept of ``count``: five a period of the cut-off frequency."""
-        step = max(1, int(self.rate_hz / (5.0 * self.cutoff_hz)))
+        """Indices of the samples kept of ``count``."""
         margin = int(self.margin_s * self.rate_hz)
-        return np.arange(margin, count - margin, step, dtype=np.int64)
+        return np.arange(margin, count - margin, self.step, dtype=np.int64)
 
     def thin(self, values: Array) -> Array:
         """Low-pass (T, k) without phase and keep the rows `kept`."""
@@ -53,12 +60,14 @@ class Stacked:
     """Residual and slopes of one trial after the low-pass.
 
     Attributes:
-        residual: (K, n_q), N.m or N.
-        slope: (K, n_q, n_free), its derivative by the free parameters.
+        residual: (K, n_q), N.m or N, zero where not used.
+        slope: (K, n_q, n_free), its derivative by the free parameters, zero where not used.
+        used: (K, n_q) which samples count.
     """
 
     residual: Array
     slope: Array
+    used: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -74,6 +83,7 @@ class Problem:
             linear in the parameter.
         linear: whether the residual is linear in all of them.
         band: the low-pass.
+        resting: by trial, (T, n_q) whether an axis stands still; see `resting`.
     """
 
     residual: Residual
@@ -84,6 +94,7 @@ class Problem:
     step: Array
     linear: bool
     band: Band
+    resting: Sequence[NDArray[np.bool_]]
 
 
 @dataclass(frozen=True)
@@ -97,6 +108,7 @@ class LeastSquares:
         residual_sd: (n_q,) root mean square of the low-passed residual.
         stacked: by trial, linearised at ``p``.
         iterations: Gauss-Newton steps taken.
+        converged: whether the last step no longer changed the fit.
         at_bound: (n_free,) which parameters ended on a bound.
     """
 
@@ -105,7 +117,29 @@ class LeastSquares:
     residual_sd: Array
     stacked: tuple[Stacked, ...]
     iterations: int
+    converged: bool
     at_bound: NDArray[np.bool_]
+
+
+def resting(qd: Array, qd_sd: Array, rate_hz: float) -> NDArray[np.bool_]:
+    """Tell where an axis stands still: there Coulomb friction balances the load, whatever it is.
+
+    An axis rests where its velocity stays within five of its standard deviations, where its sign
+    is noise, for longer than 0.03 s; a change of direction is shorter.
+
+    Args:
+        qd: (T, n_q) velocity; qd_sd: (T, n_q) its standard deviation; rate_hz: of the samples.
+
+    Returns:
+        (T, n_q).
+    """
+    still = np.abs(qd) < 5.0 * qd_sd
+    longest = int(0.03 * rate_hz)
+    for column in still.T:
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], column.astype(int), [0]])))
+        for start, end in zip(edges[::2], edges[1::2], strict=True):
+            column[start:end] = end - start > longest
+    return still
 
 
 def stacked_residual(problem: Problem, trial: int, p: Array) -> Stacked:
@@ -128,8 +162,10 @@ def stacked_residual(problem: Problem, trial: int, p: Array) -> Stacked:
         difference = (problem.residual(trial, moved) - base) / (moved[place] - p[place])
         columns[:, (k + 1) * n_q : (k + 2) * n_q] = difference
     thin = problem.band.thin(columns)
+    reach = problem.band.thin(problem.resting[trial].astype(float))
+    used = np.abs(reach) < _REACH
     slope = thin[:, n_q:].reshape(len(thin), n_free, n_q).transpose(0, 2, 1)
-    return Stacked(thin[:, :n_q], np.ascontiguousarray(slope))
+    return Stacked(thin[:, :n_q] * used, np.ascontiguousarray(slope * used[:, :, None]), used)
 
 
 def fit(
@@ -160,7 +196,7 @@ def fit(
     stacked = [stacked_residual(problem, trial, p) for trial in chosen]
     if sum(len(s.residual) for s in stacked) <= problem.free.size:
         raise ValueError("fewer samples than parameters")
-    iterations = 0
+    iterations, converged = 0, False
     for iterations in range(1, most_iterations + 1):
         before, cost = p, _cost(stacked)
         target = refit(stacked, p[problem.free], problem.lower, problem.upper)
@@ -176,9 +212,9 @@ def fit(
             if gained >= 0.0 or share < 1e-3:
                 break
             share /= 2.0
-        if gained < 0.0:
-            break
-        p, stacked = moved, tried
+        converged = abs(gained) < 1e-10
+        if gained >= 0.0:
+            p, stacked = moved, tried
         if gained < 1e-10:
             break
     value = p[problem.free]
@@ -189,6 +225,7 @@ def fit(
         residual_sd=_scatter(stacked),
         stacked=tuple(stacked),
         iterations=iterations,
+        converged=converged,
         at_bound=np.asarray((value <= problem.lower) | (value >= problem.upper)),
     )
 
@@ -236,12 +273,13 @@ def refit(
 
 
 def _moved(stacked: Stacked, step: Array) -> Stacked:
-    return Stacked(stacked.residual + stacked.slope @ step, stacked.slope)
+    return Stacked(stacked.residual + stacked.slope @ step, stacked.slope, stacked.used)
 
 
 def _scatter(stacked: Sequence[Stacked]) -> Array:
     square = np.sum([np.sum(s.residual**2, axis=0) for s in stacked], axis=0)
-    return np.asarray(np.sqrt(square / sum(len(s.residual) for s in stacked)))
+    count = np.sum([np.sum(s.used, axis=0) for s in stacked], axis=0)
+    return np.asarray(np.sqrt(square / np.maximum(count, 1)))
 
 
 def _cost(stacked: Sequence[Stacked]) -> float:
@@ -254,7 +292,7 @@ def _sandwich(problem: Problem, stacked: Sequence[Stacked], block_s: float) -> A
     weight = 1.0 / np.maximum(_scatter(stacked), 1e-300)
     n_free = problem.free.size
     band = problem.band
-    samples = max(1, round(block_s * band.rate_hz / max(1, int(band.rate_hz / (5 * band.cutoff_hz)))))
+    samples = max(1, round(block_s * band.rate_hz / band.step))
     bread, meat, blocks = np.zeros((n_free, n_free)), np.zeros((n_free, n_free)), 0
     for s in stacked:
         slope = s.slope * weight[None, :, None]

@@ -23,7 +23,7 @@ from bampipe.estimate.signatures import DERIVATIVE, MEASURE
 def runge_kutta(derivative, x, u0, u1, p, w, dt, substeps, work):
     """Advance ``x`` in place by ``dt``: classical fourth order, eq 22 with k4 at x + delta k3.
 
-    The input runs linearly from ``u0`` to ``u1`` over the interval; held constant instead, it
+    The input runs linlate from ``u0`` to ``u1`` over the interval; held constant instead, it
     would lag the motion by half a sample, which at human forces exceeds the sensor noise.
 
     Args:
@@ -127,7 +127,7 @@ def propagate_points(
         noise_sd: (nw,) of the process noise, independent of the state: its root is diagonal,
             which is why the (n + nw) root never needs to be formed.
         nx: length of the state.
-        p: (np + 1,) all parameters, then the time by which the inputs were sampled before the
+        p: (np + 1,) all parameters, then the time by which the inputs were sampled after the
             positions, s, at most a fraction of ``dt``; those in ``free`` are overwritten.
         free: (n - nx,) places of the estimated parameters in ``p``.
         logarithmic: (n - nx,) which of them are estimated as logarithms.
@@ -159,10 +159,10 @@ def propagate_points(
         place_parameters(points[row], nx, free, logarithmic, lower, upper, p)
         for i in range(nx):
             x[i] = points[row, i]
-        early = p[p.shape[0] - 1] / dt
+        late = p[p.shape[0] - 1] / dt
         for i in range(nu):
-            start[i] = u0[i] - early * (u1[i] - u0[i])
-            end[i] = u1[i] - early * (u1[i] - u0[i])
+            start[i] = u0[i] - late * (u1[i] - u0[i])
+            end[i] = u1[i] - late * (u1[i] - u0[i])
         runge_kutta(derivative, x, start, end, p, w, dt, substeps, work)
         for i in range(nx):
             points[row, i] = x[i]

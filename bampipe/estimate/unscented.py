@@ -61,7 +61,7 @@ class FilterModel:
         measure: compiled h(x, u, p, y), of type ``signatures.MEASURE``.
         n_states: length of x.
         parameters: (np + 1,) values of all parameters, then the timing of the inputs: the time
-            by which they were sampled before the positions, s. Channels of one sample are never
+            by which they were sampled after the positions, s. Channels of one sample are never
             taken at one instant; unmodelled, 0.1 ms already biases a damping by ten of its
             standard deviations. What is not estimated stays as given.
         free: (nt,) places of the estimated parameters in ``parameters``.

@@ -1,0 +1,113 @@
+"""How far to believe a filter: covariance from its own increments, noise from its likelihood.
+
+A filter's covariance is right only if its noise is white and of the size that it was told. What
+each stretch of time added to the estimate can be read back from the filter in information form;
+how much those stretches disagree, beside how much they should, is the sandwich covariance, which
+holds whatever the noise is, as long as stretches are independent of each other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.estimate.unscented import FilteredTrial
+
+Array = NDArray[np.float64]
+
+
+def sandwich_covariance(
+    trials: Sequence[FilteredTrial],
+    n_states: int,
+    theta: Array,
+    covariance: Array,
+    block_s: float,
+) -> tuple[Array, int]:
+    """Covariance of the filter's final parameters from the scatter of blocks of time.
+
+    With information matrix ``L = P^-1`` and vector ``e = L theta`` at both ends of a block, the
+    block alone contributes ``dL`` and ``de`` and its score at the final estimate is ``de - dL
+    theta``. The meat of the sandwich is the sum of their squares. Where the result claims less
+    than the filter does, the filter's standard deviation is kept.
+
+    Args:
+        trials: filtered trials in order, parameters not walking.
+        n_states: length of the state in front of the parameters.
+        theta: (nt,) parameters before the first of them, on the scale of estimation;
+            covariance: (nt, nt).
+        block_s: shortest length of a block, s; the last of a trial takes the rest.
+
+    Returns:
+        (nt, nt) covariance on the scale of estimation, and the number of blocks. With no more
+        blocks than parameters, the filter's own covariance.
+    """
+    information = np.linalg.inv(covariance)
+    vector = information @ theta
+    gains: list[tuple[Array, Array]] = []
+    for trial in trials:
+        for row in _block_ends(trial.t, block_s):
+            after = np.linalg.inv(trial.covariance[row][n_states:, n_states:])
+            end = after @ trial.mean[row][n_states:]
+            gains.append((after - information, end - vector))
+            information, vector = after, end
+    final = trials[-1].mean[-1][n_states:]
+    model = trials[-1].covariance[-1][n_states:, n_states:]
+    if len(gains) <= final.size:
+        return model, len(gains)
+    scores = np.array([gain - matrix @ final for matrix, gain in gains])
+    meat = scores.T @ scores * (len(gains) / (len(gains) - final.size))
+    found = model @ meat @ model
+    widen = np.sqrt(np.maximum(np.diag(model) / np.diag(found), 1.0))
+    return np.asarray(found * np.outer(widen, widen)), len(gains)
+
+
+def _block_ends(t: Array, block_s: float) -> list[int]:
+    """Rows at which blocks of at least ``block_s`` end; the last row always is one."""
+    count = max(1, int((t[-1] - t[0]) / block_s))
+    ends = np.searchsorted(t, t[0] + block_s * np.arange(1, count))
+    return [*(int(end) for end in ends), len(t) - 1]
+
+
+def climb(
+    log_likelihood: Callable[[Array], float],
+    start: Array,
+    step: Array,
+    lower: Array,
+    most_rounds: int = 3,
+    most_steps: int = 12,
+) -> tuple[Array, float]:
+    """Maximise a likelihood over a few noise levels, one at a time, by doubling steps.
+
+    Noise levels matter by their order of magnitude, so a coarse grid is enough: every coordinate
+    moves by its step as long as that pays, first up, then down.
+
+    Args:
+        log_likelihood: of the logarithms of the levels (k,); minus infinity where it fails.
+        start: (k,) logarithms; step: (k,) by how much to try; lower: (k,) least values.
+        most_rounds: passes over all coordinates; most_steps: of one coordinate in one pass.
+
+    Returns:
+        (k,) best logarithms, and the likelihood there.
+    """
+    best, value = start.copy(), log_likelihood(start)
+    for _ in range(most_rounds):
+        before = value
+        for k in range(start.size):
+            for sign in (1.0, -1.0):
+                moved_any = False
+                for _ in range(most_steps):
+                    tried = best.copy()
+                    tried[k] = max(tried[k] + sign * step[k], lower[k])
+                    if tried[k] == best[k]:
+                        break
+                    candidate = log_likelihood(tried)
+                    if not candidate > value:
+                        break
+                    best, value, moved_any = tried, candidate, True
+                if moved_any:
+                    break
+        if value == before:
+            break
+    return best, value

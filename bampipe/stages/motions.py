@@ -1,0 +1,172 @@
+"""Free trials of a run folder as arrays, and a model's residual on them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from bampipe.data.store import read_parquet
+from bampipe.errors import InputError
+from bampipe.estimate.least_squares import Band, Problem, resting
+from bampipe.physics import System
+from bampipe.stages.base import RunFolder
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Motion:
+    """One trial with its derivatives, on a uniform grid.
+
+    Attributes:
+        trial_id: its name.
+        t: (T,) s since the start of the trial.
+        q, qd, qdd: (T, n_q) rad or m and derivatives; qd_sd: (T, n_q).
+        u: (T, n_u) inputs of the model; u_rate: (T, n_u) their rates, zero where not stored.
+    """
+
+    trial_id: str
+    t: Array
+    q: Array
+    qd: Array
+    qdd: Array
+    qd_sd: Array
+    u: Array
+    u_rate: Array
+
+
+def free_trials(run: RunFolder) -> tuple[str, ...]:
+    """Return the free trials that were differentiated, in the order of the session.
+
+    Raises:
+        InputError: there is none.
+    """
+    trials = read_parquet(run.require("ingest/trials.parquet", "ingest"))
+    usable = trials[(trials["kind"] == "free") & (trials["status"] != "set_aside")]
+    path = run.require("filter/kinematics.parquet", "filter")
+    moving = set(read_parquet(path, columns=["trial_id"])["trial_id"].astype(str))
+    found = tuple(str(name) for name in usable["trial_id"] if str(name) in moving)
+    if not found:
+        raise InputError(
+            "no free trial to identify from",
+            where=str(run.root),
+            remedy="look at ingest/trials.parquet for the reasons",
+        )
+    return found
+
+
+def read_motion(run: RunFolder, trial_id: str, system: System) -> Motion:
+    """Read one trial of ``filter/kinematics.parquet``.
+
+    Raises:
+        InputError: the file or a column that the model needs is missing.
+    """
+    path = run.require("filter/kinematics.parquet", "filter")
+    frame = read_parquet(path, trial=trial_id)
+    axes = system.coordinates
+    t = frame["t"].to_numpy(dtype=float)
+    return Motion(
+        trial_id=trial_id,
+        t=t - t[0],
+        q=_columns(frame, [f"q_{axis}" for axis in axes], str(path)),
+        qd=_columns(frame, [f"qd_{axis}" for axis in axes], str(path)),
+        qdd=_columns(frame, [f"qdd_{axis}" for axis in axes], str(path)),
+        qd_sd=_columns(frame, [f"qd_sd_{axis}" for axis in axes], str(path)),
+        u=input_columns(frame, system.inputs, system.model.device.brakes, t, str(path)),
+        u_rate=_rates(frame, system.inputs),
+    )
+
+
+def input_columns(
+    frame: pd.DataFrame,
+    names: Sequence[str],
+    brakes: Mapping[str, str],
+    t: Array,
+    where: str,
+) -> Array:
+    """Return the model's inputs as columns (T, n_u).
+
+    Args:
+        frame: columns force_<c>, force_rate_<c>, ..., brake_<axis>.
+        names: inputs of the model.
+        brakes: input that is the brake command, by axis.
+        t: (T,) time, s.
+        where: file, for messages.
+
+    Raises:
+        InputError: an input has no column.
+    """
+    column = {name: f"brake_{axis}" for axis, name in brakes.items()}
+    values = np.empty((len(frame), len(names)))
+    for place, name in enumerate(names):
+        if name == "t":
+            values[:, place] = t - t[0]
+            continue
+        values[:, place] = _columns(frame, [column.get(name, name)], where)[:, 0]
+    return values
+
+
+def problem_of(
+    system: System, motions: Sequence[Motion], band: Band, held: Sequence[str] = ()
+) -> Problem:
+    """Return the inverse dynamics of ``motions`` as a least-squares problem.
+
+    Its parameters are the model's, then the time by which the inputs were sampled after the
+    positions, s, within half a sample.
+
+    Args:
+        system: the model; motions: the trials; band: the low-pass of the residual.
+        held: parameters that are not estimated, beside those that the model fixes.
+    """
+    n = len(system.parameters)
+
+    def residual(trial: int, p: Array) -> Array:
+        motion = motions[trial]
+        u = motion.u - p[n] * motion.u_rate
+        z = system.memory(motion.q, motion.qd, motion.qdd, u, p[:n], motion.t)
+        true = system.true_motion(motion.q, motion.qd, motion.qdd, u, p[:n])
+        return system.residual(*true, z, u, p[:n])
+
+    free = [
+        i for i, item in enumerate(system.parameters) if not item.fixed and item.name not in held
+    ]
+    half = 0.5 / band.rate_hz
+    lower = [system.parameters[i].lower for i in free]
+    upper = [system.parameters[i].upper for i in free]
+    step = [system.parameters[i].sd * (1.0 if system.linear[i] else 1e-4) or 1.0 for i in free]
+    return Problem(
+        residual=residual,
+        n_trials=len(motions),
+        free=np.array([*free, n], dtype=np.int64),
+        lower=np.array([*lower, -half]),
+        upper=np.array([*upper, half]),
+        step=np.array([*step, half]),
+        linear=all(system.linear[i] for i in free),
+        band=band,
+        resting=[resting(m.qd, m.qd_sd, band.rate_hz) for m in motions],
+    )
+
+
+def _columns(frame: pd.DataFrame, names: Sequence[str], where: str) -> Array:
+    for name in names:
+        if name not in frame:
+            raise InputError(
+                f"no column {name!r}, which the model needs",
+                where=where,
+                remedy="run the stages before this one again (--force)",
+            )
+    return frame[list(names)].to_numpy(dtype=float)
+
+
+def _rates(frame: pd.DataFrame, names: Sequence[str]) -> Array:
+    rates = np.zeros((len(frame), len(names)))
+    for place, name in enumerate(names):
+        head, _, component = name.rpartition("_")
+        column = f"{head}_rate_{component}"
+        if head == "force" and column in frame:
+            rates[:, place] = frame[column]
+    return rates
