@@ -92,7 +92,7 @@ class _Derivation:
                 self.z[item.prefix, state.name] = symbol
         self.special = {"sgn": self._sgn, "ddt": self.ddt}
         self.sizes: dict[str, int] = {}
-        self.base: Symbols = {a: s for a, s in zip(self.axes, self.q, strict=True)}
+        self.base: Symbols = dict(zip(self.axes, self.q, strict=True))
         self.base |= {f"qd_{a}": s for a, s in zip(self.axes, self.qd, strict=True)}
         self.base |= {name: sp.Float(c.value) for name, c in device.constants.items()}
         self.base |= {p.name: self.p[p.name] for p in device.parameters if "." not in p.name}
@@ -334,25 +334,25 @@ def derive(model: Model) -> Equations:
             z_names.append(f"{item.prefix}.{state.name}")
             rates.append(d.own(item, state.rate, symbols, f"states.{state.name}.rate"))
             initial.append(d.own(item, state.initial, symbols, f"states.{state.name}.initial"))
-    p, u, force0 = [*d.p.values()], [*d.channel.values()], [*forces, d.channel["t"]]
+    free, u, force0 = [*d.p.values()], [*d.channel.values()], [*forces, d.channel["t"]]
     motion, memory = [*d.q, *d.qd], [*d.z.values()]
     gains = [entry for row in input_map for entry in row]
     words = "motion, inputs, parameters and internal states"
     kinetics, potentials = zip(*energies, strict=True)
-    _allow("the kinetic energy", [*kinetics], [*motion, *p], "positions, rates and parameters")
-    _allow("the potential energy", [*potentials], [*d.q, *p], "positions and parameters")
+    _allow("the kinetic energy", [*kinetics], [*motion, *free], "positions, rates and parameters")
+    _allow("the potential energy", [*potentials], [*d.q, *free], "positions and parameters")
     _allow("the effect of a force on the axes", gains, d.q, "positions")
-    _allow("a torque", other, [*motion, *u, *p, *memory, *w], words)
-    _allow("the applied force", applied, [*motion, *u, *p, *memory], words)
-    _allow("the rate of an internal state", rates, [*motion, *u, *p, *memory], words)
-    _allow("an initial value", initial, [*d.q, *u, *p], "positions, inputs and parameters")
-    _allow("an offset", offset, [*d.q, *force0, *p], "positions, forces and parameters")
+    _allow("a torque", other, [*motion, *u, *free, *memory, *w], words)
+    _allow("the applied force", applied, [*motion, *u, *free, *memory], words)
+    _allow("the rate of an internal state", rates, [*motion, *u, *free, *memory], words)
+    _allow("an initial value", initial, [*d.q, *u, *free], "positions, inputs and parameters")
+    _allow("an offset", offset, [*d.q, *force0, *free], "positions, forces and parameters")
 
     terms = [_lagrange(a, b, tuple(d.q), tuple(d.qd)) for a, b in energies]
     mass = [[sum(t[0][i][j] for t in terms) for j in range(n)] for i in range(n)]
     bias = [sum(t[1][i] for t in terms) for i in range(n)]
     for row, term in zip(mass, bias, strict=True):
-        _allow("the equation of motion", [*row, term], [*motion, *p], "motion and parameters")
+        _allow("the equation of motion", [*row, term], [*motion, *free], "motion and parameters")
     _check_inertia(model, mass, d.q)
     kinetic, potential = (sum(parts) for parts in zip(*energies, strict=True))
 

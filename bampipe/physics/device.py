@@ -13,8 +13,26 @@ from bampipe.physics import expression
 from bampipe.physics.parameter import Parameter, parameter_from
 
 _KEYS = frozenset(
-    "schema name summary source coordinates constants definitions energy torque inputs applied "
-    "side_load process_noise friction parameters limits default_effects motor".split()
+    [
+        "schema",
+        "name",
+        "summary",
+        "source",
+        "coordinates",
+        "constants",
+        "definitions",
+        "energy",
+        "torque",
+        "inputs",
+        "applied",
+        "side_load",
+        "process_noise",
+        "friction",
+        "parameters",
+        "limits",
+        "default_effects",
+        "motor",
+    ]
 )
 UNITS = MappingProxyType({"rotary": "rad", "linear": "m"})
 TORQUE_UNITS = MappingProxyType({"rotary": "N.m", "linear": "N"})
@@ -127,6 +145,8 @@ def device_from(declaration: Mapping[str, Any], where: str = "device file") -> D
             f"unknown table {unknown[0]!r}{expression.did_you_mean(unknown[0], _KEYS)}",
             where=where,
         )
+    if declaration.get("schema", "bampipe.device/1") != "bampipe.device/1":
+        raise InputError("schema must be 'bampipe.device/1'", where=where)
     name = declaration.get("name")
     if not isinstance(name, str) or not name:
         raise InputError("name is missing", where=where)
@@ -185,7 +205,9 @@ def device_from(declaration: Mapping[str, Any], where: str = "device file") -> D
     limits = {}
     for axis, entry in _table(declaration, "limits", where, False).items():
         at = f"{where}: limits.{axis}"
-        pair = [entry.get(k) for k in ("lower", "upper")] if isinstance(entry, Mapping) else []
+        pair: list[Any] = []
+        if isinstance(entry, Mapping):
+            pair = [entry.get("lower"), entry.get("upper")]
         if not pair or any(isinstance(v, bool) or not isinstance(v, int | float) for v in pair):
             raise InputError("expected { lower = number, upper = number }", where=at)
         limits[axis] = (float(pair[0]), float(pair[1]))

@@ -22,8 +22,24 @@ _EXPRESSIONS = {
 SCOPES = ("axis", "force_component", "force_pair", "device")
 KINDS = ("torque", "input", "energy", "measurement")
 _KEYS = frozenset(
-    "schema name summary scope kind torque input kinetic potential offset dissipative looks_like "
-    "source parameters states devices".split()
+    [
+        "schema",
+        "name",
+        "summary",
+        "scope",
+        "kind",
+        "torque",
+        "input",
+        "kinetic",
+        "potential",
+        "offset",
+        "dissipative",
+        "looks_like",
+        "source",
+        "parameters",
+        "states",
+        "devices",
+    ]
 )
 
 
@@ -129,6 +145,8 @@ def effect_from(declaration: Mapping[str, Any], where: str = "effect file") -> E
             f"unknown key {unknown[0]!r}{expression.did_you_mean(unknown[0], _KEYS)}",
             where=where,
         )
+    if declaration.get("schema", "bampipe.effect/1") != "bampipe.effect/1":
+        raise InputError("schema must be 'bampipe.effect/1'", where=where)
     for key in ("name", "summary", "scope", "kind", "looks_like", "source"):
         if not isinstance(declaration.get(key), str) or not declaration[key]:
             raise InputError(f"{key!r} is missing or not text", where=where)

@@ -86,12 +86,12 @@ class System:
     @property
     def derivative(self) -> Callable[..., None]:
         """f(x, u, p, w, dx): numba-compiled state derivative (eq 14)."""
-        return self._compiled.derivative  # type: ignore[no-any-return]
+        return self._compiled.derivative
 
     @property
     def measure(self) -> Callable[..., None]:
         """h(x, u, p, y): numba-compiled encoder readings, positions then rates."""
-        return self._compiled.measure  # type: ignore[no-any-return]
+        return self._compiled.measure
 
     def true_motion(self, q: Array, qd: Array, qdd: Array, u: Array, p: Array) -> tuple[Array, ...]:
         """Motion of the mechanism from what the encoders read; each (T, n_q)."""
@@ -135,7 +135,7 @@ class System:
         from bampipe.physics.loops import residual_rows
 
         arrays = [np.ascontiguousarray(x, dtype=np.float64) for x in (q, qd, qdd, z, u, p)]
-        return residual_rows(self._compiled.residual, *arrays)  # type: ignore[no-any-return]
+        return residual_rows(self._compiled.residual, *arrays)
 
     def contribution(self, q: Array, qd: Array, qdd: Array, z: Array, u: Array, p: Array) -> Array:
         """What the model's effects add to the residual of the bare device, (T, n_q).

@@ -1,0 +1,250 @@
+"""Device and effect files that are wrong: InputError that names the field, never a traceback."""
+
+import copy
+import math
+
+import numpy as np
+import pytest
+from motions import declaration
+
+from bampipe.errors import InputError
+from bampipe.physics import Model, compile_model, registry
+
+BAM = registry.device("bam")
+REMOVE = object()
+
+
+def stribeck():
+    return copy.deepcopy(dict(registry.effect("stribeck").declaration))
+
+
+def change(tree, path, value):
+    """``tree`` with the entry at dotted ``path`` set to ``value``, or removed."""
+    *folders, last = path.split(".")
+    for key in folders:
+        tree = tree.setdefault(key, {})
+    if value is REMOVE:
+        del tree[last]
+    else:
+        tree[last] = value
+
+
+def compile_device(entries):
+    compile_model(Model(registry.device_from(entries, "lab.toml")))
+
+
+DEVICES = [
+    ("name", REMOVE, "name is missing"),
+    ("name", 3, "name is missing"),
+    ("schema", "bampipe.device/9", "schema"),
+    ("coordinate", {}, "did you mean 'coordinates'"),
+    ("coordinates", REMOVE, "coordinates"),
+    ("coordinates", [1], "coordinates"),
+    ("coordinates.yaw", 3, "coordinates.yaw"),
+    ("coordinates.yaw.kind", "angular", "coordinates.yaw"),
+    ("coordinates.yaw.kind", ["rotary"], "coordinates.yaw"),
+    ("coordinates.yaw.kimd", "rotary", "did you mean 'kind'"),
+    ("coordinates.yaw.sign_width", 0.0, "sign_width"),
+    ("coordinates.yaw.sign_width", math.nan, "sign_width"),
+    ("coordinates.yaw.sign_width", math.inf, "sign_width"),
+    ("coordinates.yaw.sign_width", "small", "sign_width"),
+    ("coordinates.yaw.sign_width", True, "sign_width"),
+    ("coordinates.my axis", {"kind": "rotary"}, "cannot be a name"),
+    ("coordinates.lambda", {"kind": "rotary"}, "cannot be a name"),
+    ("coordinates.θ", {"kind": "rotary"}, "cannot be a name"),
+    ("coordinates.sin", {"kind": "rotary"}, "name of a function"),
+    ("coordinates.t", {"kind": "rotary"}, "already"),
+    ("coordinates.elbow", {"kind": "rotary"}, "elbow has no inertia"),
+    ("constants.L", 0.461, "constants.L"),
+    ("constants.L.value", "0.461", "constants.L"),
+    ("constants.L.value", True, "constants.L"),
+    ("constants.L.value", math.nan, "constants.L"),
+    ("constants.L.value", math.inf, "constants.L"),
+    ("constants.L.valeu", 1.0, "constants.L"),
+    ("constants.yaw", {"value": 1.0}, "already"),
+    ("constants.qd_yaw", {"value": 1.0}, "already"),
+    ("constants.force_rate_x", {"value": 1.0}, "already"),
+    ("constants.mass", {"value": 1.0}, "already"),
+    ("constants", "none", "constants"),
+    ("definitions.rho", "extension - LL", "did you mean 'L'"),
+    ("definitions.rho", 0.5, "definitions.rho"),
+    ("definitions.rho", "ddt(ddt(ddt(extension)))", "ddt"),
+    ("definitions.force_x", "1", "already"),
+    ("energy", REMOVE, "energy"),
+    ("energy.kinetic", REMOVE, "energy.kinetic"),
+    ("energy.kinetic", "mass*ddt(yaw)", "no inertia"),
+    ("energy.kinetic", "mass*ddt(yaw)**3", "quadratic"),
+    ("energy.kinetic", "mass*ddt(yaw)**2*force_x", "kinetic energy"),
+    ("energy.kinetic", "0", "no inertia"),
+    ("energy.potential", "mass*ddt(yaw)", "potential energy"),
+    ("energy.potential", "mass*sgn(yaw)", "smooth"),
+    ("energy.potential", "mass*g*rho*sin(pich)", "did you mean 'pitch'"),
+    ("torque.pich", "compensation", "did you mean 'pitch'"),
+    ("torque.pitch", "compensation*ddt(ddt(pitch))", "torque"),
+    ("torque.pitch", 5, "torque.pitch"),
+    ("torque", "compensation", "torque"),
+    ("inputs", REMOVE, "inputs"),
+    ("inputs.force", "force_x", "inputs"),
+    ("inputs.force", ["force_x", 2], "inputs"),
+    ("inputs.force", ["force_x", "force_x", "force_y", "force_z"], "already"),
+    ("inputs.force", ["handle"], "inputs"),
+    ("inputs.force", ["force_x", "force_y", "force_z", "force_a = 0; import os"], "be a name"),
+    ("inputs.force", ["force_x", "force_y"], "unknown symbol 'force_z'"),
+    ("inputs.brakes", ["brake_yaw"], "inputs"),
+    ("inputs.brakes.elbow", "brake_elbow", "brakes"),
+    ("inputs.brakes.yaw", "brake yaw", "cannot be a name"),
+    ("inputs.brakes.yaw", 7, "cannot be a name"),
+    ("applied", REMOVE, "applied"),
+    ("applied.elbow", "force_x", "applied"),
+    ("applied.yaw", "extension*force_x**2", "effect of a force"),
+    ("applied.yaw", "mass*force_x", "effect of a force"),
+    ("side_load.elbow", "force_x", "side_load"),
+    ("process_noise.gravity_compensator", "1", "process_noise.gravity_compensator"),
+    ("process_noise.gravity_compensator.torque.elbow", "1", "process_noise.gravity_compensator"),
+    ("friction.elbow", {}, "friction.elbow"),
+    ("friction.yaw.coulomb", REMOVE, "friction.yaw"),
+    ("friction.yaw.viscous.prior", "three", "prior"),
+    ("friction.yaw.viscous.prior", -1.0, "outside"),
+    ("friction.yaw.viscous.sd", -1.0, "sd"),
+    ("friction.yaw.viscous.sd", math.nan, "sd"),
+    ("friction.yaw.viscous.unit", 5, "unit"),
+    ("friction.yaw.viscous.unit", REMOVE, "unit"),
+    ("friction.yaw.viscous.lower", 9.0, "outside"),
+    ("friction.yaw.viscous.sigma", 1.0, "sigma"),
+    ("parameters.mass.fixed", "yes", "fixed"),
+    ("parameters.mass", 3.56, "parameters.mass"),
+    ("parameters.viscous.yaw", {"unit": "", "prior": 0, "sd": 1}, "parameters.viscous"),
+    ("parameters.a-b", {"unit": "", "prior": 0, "sd": 1}, "cannot be a name"),
+    ("limits.yaw", 3, "limits.yaw"),
+    ("limits.yaw.lower", REMOVE, "limits.yaw"),
+    ("limits.yaw.lower", 9.0, "limits.yaw"),
+    ("limits.elbow", {"lower": 0.0, "upper": 1.0}, "limits"),
+]
+
+
+@pytest.mark.parametrize(("path", "value", "says"), DEVICES, ids=lambda v: str(v)[:30])
+def test_wrong_device_file_is_refused_with_its_field(path, value, says):
+    entries = declaration()
+    change(entries, path, value)
+    with pytest.raises(InputError) as caught:
+        compile_device(entries)
+    assert says in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+EFFECTS = [
+    ("name", REMOVE, "'name'"),
+    ("name", "with space", "name"),
+    ("summary", "", "'summary'"),
+    ("source", REMOVE, "'source'"),
+    ("looks_like", 4, "'looks_like'"),
+    ("schema", "bampipe.effect/9", "schema"),
+    ("torq", "1", "did you mean 'torque'"),
+    ("scope", "joint", "scope"),
+    ("scope", "force_component", "scope"),
+    ("scope", "device", "table"),
+    ("kind", "force", "kind"),
+    ("kind", "energy", "'torque' has no meaning"),
+    ("potential", "1", "'potential' has no meaning"),
+    ("torque", REMOVE, "torque"),
+    ("torque", 5, "torque"),
+    ("torque", {"yaw": "1"}, "one expression"),
+    ("torque", "-forc*qd", "did you mean 'force'"),
+    ("torque", "-force*ddt(qd)", "torque"),
+    ("torque", "-force*ddt(brake)", "brake"),
+    ("torque", "-force*qd/0", "division by zero"),
+    ("parameters", REMOVE, "parameters"),
+    ("parameters", {}, "parameters"),
+    ("parameters.force", 5, "parameters.force"),
+    ("parameters.force.rotary", REMOVE, "rotary"),
+    ("parameters.force.rotary.prior", None, "prior"),
+    ("parameters.force.rotary.strength", "false", "strength"),
+    ("parameters.force.rotary.typical", math.inf, "typical"),
+    ("parameters.a b", {"unit": "", "prior": 0, "sd": 1}, "cannot be a name"),
+    ("states", [1], "states"),
+    ("states.z", {}, "states.z"),
+    ("states.z", {"rate": 4}, "states.z.rate"),
+    ("states.force", {"rate": "qd"}, "already"),
+    ("states.z = 0; import os", {"rate": "qd"}, "cannot be a name"),
+    ("states.z", {"rate": "qd", "initial": "qd"}, "initial value"),
+    ("states.z", {"rate": "ddt(qd)"}, "rate of an internal state"),
+    ("devices", "bam", "devices"),
+    ("devices", ["other"], "does not have"),
+]
+
+
+@pytest.mark.parametrize(("path", "value", "says"), EFFECTS, ids=lambda v: str(v)[:30])
+def test_wrong_effect_file_is_refused_with_its_field(path, value, says):
+    entries = stribeck()
+    change(entries, path, value)
+    with pytest.raises(InputError) as caught:
+        effect = registry.effect_from(entries, "lab.toml")
+        compile_model(Model(BAM, ("stribeck:yaw",), (effect,)))
+    assert says in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+OFFSETS = ["error*qd", "error*ddt(qd)", "error*brake", "error*ddt(f)", "error*sgn(q)*log(q - q)"]
+
+
+@pytest.mark.parametrize("offset", OFFSETS)
+def test_sensor_offset_that_cannot_be_differentiated_is_refused(offset):
+    entries = copy.deepcopy(dict(registry.effect("encoder_scale").declaration))
+    entries["offset"] = offset
+    with pytest.raises(InputError):
+        compile_model(Model(BAM, ("encoder_scale:yaw",), (registry.effect_from(entries),)))
+
+
+def test_wrong_names_suggest_the_right_ones():
+    with pytest.raises(InputError, match="did you mean 'stribeck'"):
+        Model(BAM, ("stribek:yaw",))
+    with pytest.raises(InputError, match="did you mean 'pitch'"):
+        Model(BAM, ("stribeck:pich",))
+    with pytest.raises(InputError, match="choose from stribeck:yaw, stribeck:pitch"):
+        Model(BAM, ("stribeck",))
+    with pytest.raises(InputError, match="in the model already"):
+        Model(BAM, ("stribeck:yaw", "stribeck:yaw"))
+    with pytest.raises(InputError, match="did you mean 'bam'"):
+        registry.device("bum")
+    with pytest.raises(InputError, match="did you mean 'stribeck'"):
+        registry.effect("stribec")
+
+
+def test_an_effect_says_when_a_device_lacks_what_it_needs():
+    rail = registry.device_from(
+        {
+            "name": "rail",
+            "coordinates": {"position": {"kind": "linear"}},
+            "energy": {"kinetic": "mass*ddt(position)**2/2"},
+            "inputs": {"force": ["force_motor"]},
+            "applied": {"position": "force_motor"},
+            "parameters": {"mass": {"unit": "kg", "prior": 2.0, "sd": 1.0}},
+        }
+    )
+    for name in ("gravity_compensator_lag", "handle_payload", "base_tilt"):
+        assert registry.effect(name).targets(rail) == ()
+        with pytest.raises(InputError, match="device 'rail' does not have"):
+            Model(rail, (name,))
+    assert registry.effect("force_gain").targets(rail) == ("motor",)
+    system = compile_model(Model(rail, ("force_gain:motor",)))
+    assert system.inputs == ("force_motor",)
+
+
+def test_force_pairs_of_long_names_leak_the_right_way():
+    device = declaration()
+    names = {"force_x": "force_left", "force_y": "force_right", "force_z": "force_le"}
+    device["inputs"]["force"] = list(names.values())
+    for table in (device["applied"], device["side_load"]):
+        for axis, text in table.items():
+            for old, new in names.items():
+                text = text.replace(old, new)
+            table[axis] = text
+    renamed = registry.device_from(device)
+    assert "leftright" in registry.effect("force_crosstalk").targets(renamed)
+    system = compile_model(Model(renamed, ("force_crosstalk:rightle",)))
+    q, z = np.array([[0.0, 0.0, 1.0]]), np.zeros((1, 0))
+    u = np.zeros((1, len(system.inputs)))
+    u[0, :3] = [1.0, 10.0, 100.0]
+    p = system.prior
+    p[-1] = 0.05
+    np.testing.assert_allclose(system.applied(q, 0 * q, 0 * q, z, u, p), [[1.0, 5.0, 100.0]])
