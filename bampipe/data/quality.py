@@ -171,8 +171,11 @@ def _time_to_seconds(table: _Table) -> None:
     steps = np.diff(table.t)
     steps = steps[steps > 0]
     if len(steps) == 0:
+        falls = len(table) > 1 and table.t[-1] < table.t[0]
         raise table.fault(
-            "time stands still", column=table.clock, remedy="is this the time column?"
+            "time runs backwards throughout" if falls else "time stands still",
+            column=table.clock,
+            remedy="is this the time column?",
         )
     table.t = table.t * table.session.clock.seconds
     nominal = table.session.sample_rate
@@ -343,15 +346,15 @@ def _unwrap(table: _Table, encoder: Encoder) -> None:
 def _mend_jumps(table: _Table, encoder: Encoder) -> None:
     """Interpolate isolated wild readings; refuse a lasting jump (lost counts, a reset).
 
-    A step is wild when it is 20 times what all but one step in a thousand stay below, and
-    faster than any of these axes can go.
+    A step is wild when it is 20 times what all but one step in twenty stay below, and faster
+    than any of these axes can go.
     """
     values = table.columns[encoder.column]
     if len(table) < 4:
         return
     steps = np.abs(np.diff(values))
     fastest = FASTEST[encoder.unit] * float(np.median(np.diff(table.t))) / encoder.scale
-    limit = max(20 * float(np.quantile(steps, 0.999)), abs(fastest))
+    limit = max(20 * float(np.quantile(steps, 0.95)), abs(fastest))
     jumps = np.flatnonzero(steps > limit)
     if len(jumps) == 0:
         return
@@ -506,6 +509,7 @@ def _to_si(table: _Table) -> dict[str, np.ndarray]:
     if session.force is not None:
         force = session.force
         for column, zero in zip(force.columns, force.zero, strict=True):
+            _refuse_wild(table, raw[column], f"reads {column}", column)
             raw[column] -= zero
         for name, column, gains in zip(force.names, force.columns, force.calibration, strict=True):
             total = np.zeros(len(table))
@@ -526,16 +530,20 @@ def _to_si(table: _Table) -> dict[str, np.ndarray]:
         si[channel.name] = values
         source[channel.name] = channel.column
     for name, values in si.items():
-        wild = ~(np.abs(values) < LARGEST_VALUE)
-        if wild.any():
-            at = int(np.argmax(wild))
-            raise table.fault(
-                f"gives {name} = {values[at]:.3g}, which no such machine does",
-                column=source[name],
-                at=at,
-                remedy="check the column and its calibration",
-            )
+        _refuse_wild(table, values, f"gives {name}", source[name])
     return si
+
+
+def _refuse_wild(table: _Table, values: np.ndarray, words: str, column: str) -> None:
+    wild = ~(np.abs(values) < LARGEST_VALUE)
+    if wild.any():
+        at = int(np.argmax(wild))
+        raise table.fault(
+            f"{words} = {values[at]:.3g}, which no such machine does",
+            column=column,
+            at=at,
+            remedy="check the column and its calibration",
+        )
 
 
 def _refuse_wrong_motion(table: _Table, columns: dict[str, np.ndarray]) -> None:

@@ -317,7 +317,7 @@ def _csv_fault(
         what = "a line is far too long" if "straddl" in str(error) else str(error)
         return InputError(what, where=name)
     column, row_number, value = header[int(cell[1])], cell[2], cell[3]
-    shown = value if value.isprintable() and len(value) <= 40 else ascii(value)[:40]
+    shown = value if value.isprintable() and len(value) <= 40 else ascii(value)[1:41]
     comma = re.fullmatch(r"\s*[-+]?\d+,\d+\s*", value)
     place = f", row {_line(path, int(row_number))}" if row_number else ""
     return InputError(

@@ -86,8 +86,11 @@ def validate(value: object, name: str, where: str) -> None:
         what = f"unknown key {_shown(unknown)}{did_you_mean(unknown, known)}"
         remedy = "" if "did you mean" in what else f"known keys: {', '.join(known)}"
     else:
-        expected = _KEYWORDS.get(first.validator, lambda bound: first.message)
-        found = f"found {_shown(first.instance)}, expected {expected(first.validator_value)}"
+        describe = _KEYWORDS.get(first.validator, lambda bound: first.message)
+        expected = describe(first.validator_value)
+        if first.validator == "pattern":
+            expected = first.schema.get("description", expected)
+        found = f"found {_shown(first.instance)}, expected {expected}"
         what, remedy = found, ""
         if first.validator == "enum" and isinstance(first.instance, str):
             what += did_you_mean(first.instance, first.validator_value)
@@ -128,6 +131,6 @@ def _described(schema: Mapping[str, Any], key: str) -> str:
 
 def _shown(value: object) -> str:
     if isinstance(value, Mapping):
-        return "a table"
+        return "a table" if value else "an empty table"
     text = json.dumps(value, ensure_ascii=False)
     return text if len(text) <= 60 else text[:57] + "..."

@@ -283,8 +283,11 @@ def inside(root: Path, path: str, where: str) -> Path:
             remedy="copy the file into the session folder",
         )
     if not exists:
-        names = [p.relative_to(root).as_posix() for p in full.parent.glob("*")]
-        raise InputError(f"no such file '{path}'{did_you_mean(path, names)}", where=where)
+        stem = full.stem.lower()
+        near = [other for other in full.parent.glob("*") if other.stem.lower() == stem != ""]
+        names = [other.relative_to(root).as_posix() for other in near if other != full]
+        remedy = f"there is '{min(names)}'" if names else ""
+        raise InputError(f"no such file '{path}'", where=where, remedy=remedy)
     if not regular:
         raise InputError(f"'{path}' is not a file", where=where)
     return full
@@ -398,7 +401,7 @@ def _calibration(entry: Mapping[str, Any], size: int, where: str) -> tuple[np.nd
         )
     if len(zero) != size:
         raise InputError(
-            f"found {len(zero)} numbers, expected {size}, one a column", where=f"{where}.zero_v"
+            f"found {len(zero)}, expected {size} numbers, one a column", where=f"{where}.zero_v"
         )
     calibration = np.array(rows, dtype=float)
     condition = float(np.linalg.cond(calibration))

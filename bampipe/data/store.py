@@ -116,9 +116,10 @@ def read_toml(path: Path) -> dict[str, Any]:
             "not UTF-8 text", where=f"{path}, line {line}", remedy="save it as UTF-8"
         ) from error
     except tomllib.TOMLDecodeError as error:
-        found = re.search(r"^(.*?) \(at line (\d+), column \d+\)$", str(error), re.DOTALL)
-        what, where = (found[1], f"{path}, line {found[2]}") if found else (str(error), str(path))
-        raise InputError(f"not TOML: {what}", where=where) from error
+        what, _, place = str(error).rpartition(" (at ")
+        found = re.match(r"line (\d+)", place)
+        line = found[1] if found else data.rstrip().count(b"\n") + 1
+        raise InputError(f"not TOML: {what}", where=f"{path}, line {line}") from error
     except RecursionError as error:
         raise InputError("nested too deeply", where=str(path)) from error
     if _deeper(table, DEEPEST_TOML):

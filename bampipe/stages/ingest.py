@@ -184,7 +184,8 @@ def _refused(session: Session) -> list[str]:
             path = inside(session.root, entry.file, where="")
         except InputError:
             continue  # said when the trial's turn comes
-        same[sha256_file(path)].append(number)
+        if path.stat().st_size > 0:
+            same[sha256_file(path)].append(number)
     reasons = [""] * len(session.trials)
     for numbers in same.values():
         entries = [session.trials[number] for number in numbers]

@@ -1,0 +1,738 @@
+"""The bad-input corpus: every way we know in which a session comes damaged.
+
+Each case damages a small sound session in one way and states what ingest must say: the whole
+session is refused (one line, nothing written), one trial is set aside with a reason while the
+others are kept, or the trial is repaired and the repair is said.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pandas as pd
+import pytest
+import scipy.io
+from made_session import COLUMNS, Made, csv_text, free_trial, locked_trial
+
+from bampipe.data.store import read_parquet
+from bampipe.errors import InputError
+from bampipe.stages import ingest
+from bampipe.stages.base import RunFolder, silent
+
+T01 = "trials/t01.csv"
+Damage = Callable[[Made], Callable[[Path], None] | None]
+
+
+def run_ingest(made: Made, root: Path, damage: Damage | None = None, **settings: object):
+    """Ingest a damaged session; returns the trials table by id, and the output folder."""
+    after = damage(made) if damage is not None else None
+    session, out = root / "session", root / "out"
+    made.write(session)
+    if after is not None:
+        after(session)
+    out.mkdir()
+    config = ingest.Config(session=str(session), **settings)
+    ingest.execute(RunFolder(out), out, config, silent)
+    return read_parquet(out / "ingest/trials.parquet").set_index("trial_id"), out
+
+
+# What can be done to a session
+
+
+def put(path: str, value: object) -> Damage:
+    """Set a field of session.toml: ``"trials.0.kind"``."""
+
+    def damage(made):
+        *parents, last = path.split(".")
+        table = made.session
+        for part in parents:
+            table = table[int(part) if part.isdigit() else part]
+        table[int(last) if last.isdigit() else last] = value
+
+    return damage
+
+
+def drop(path: str) -> Damage:
+    """Take a field of session.toml away."""
+
+    def damage(made):
+        *parents, last = path.split(".")
+        table = made.session
+        for part in parents:
+            table = table[int(part) if part.isdigit() else part]
+        del table[last]
+
+    return damage
+
+
+def file(content: bytes | str, name: str = T01) -> Damage:
+    """Put other content in the place of a file."""
+    return lambda made: made.files.update({name: content})
+
+
+def text(change: Callable[[str], str | bytes]) -> Damage:
+    """Change the CSV text of the first trial."""
+    return lambda made: made.files.update({T01: change(made.text())})
+
+
+def line(number: int, change: Callable[[str], str]) -> Damage:
+    """Change one line (counted from 1) of the first trial."""
+
+    def changed(content):
+        lines = content.split("\n")
+        lines[number - 1] = change(lines[number - 1])
+        return "\n".join(lines)
+
+    return text(changed)
+
+
+def cell(row: int, column: str, value: str) -> Damage:
+    """Change one cell, by its row in the file (the header is row 1)."""
+
+    def changed(content):
+        cells = content.split(",")
+        cells[COLUMNS.index(column)] = value
+        return ",".join(cells)
+
+    return line(row, changed)
+
+
+def table(change: Callable[[dict[str, np.ndarray]], object], name: str = T01) -> Damage:
+    """Change the raw columns of a trial in place, or give others."""
+
+    def damage(made):
+        changed = change(made.tables[name])
+        if isinstance(changed, dict):
+            made.tables[name] = changed
+
+    return damage
+
+
+def samples(column: str, where: object, value: object) -> Damage:
+    return table(lambda t: t[column].__setitem__(where, value))
+
+
+def both(*damages: Damage) -> Damage:
+    def damage(made):
+        for one in damages:
+            one(made)
+
+    return damage
+
+
+def rows(which: Callable[[int], np.ndarray]) -> Damage:
+    """Keep only some rows of the first trial, in this order."""
+    return table(lambda t: {name: values[which(len(values))] for name, values in t.items()})
+
+
+def as_file(ending: str, content: Callable[[dict[str, np.ndarray]], bytes]) -> Damage:
+    """Give the first trial as a file of another kind."""
+
+    def damage(made):
+        made.session["trials"][0]["file"] = f"trials/t01{ending}"
+        made.files[f"trials/t01{ending}"] = content(made.tables.pop(T01))
+
+    return damage
+
+
+def parquet(t: dict[str, np.ndarray]) -> bytes:
+    stream = io.BytesIO()
+    pd.DataFrame(t).to_parquet(stream)
+    return stream.getvalue()
+
+
+def mat5(t: dict[str, object]) -> bytes:
+    stream = io.BytesIO()
+    scipy.io.savemat(stream, t)
+    return stream.getvalue()
+
+
+def mat73(t: dict[str, np.ndarray], change: Callable[[h5py.File], None] | None = None) -> bytes:
+    stream = io.BytesIO()
+    with h5py.File(stream, "w", userblock_size=512) as out:
+        for name, values in t.items():
+            out[name] = values[None, :]
+        if change is not None:
+            change(out)
+    content = stream.getvalue()
+    return b"MATLAB 7.3 MAT-file".ljust(512) + content[512:]
+
+
+def wild_reading(t):
+    t["enc_yaw"][400] += 40_000
+
+
+def renamed(header: str) -> Damage:
+    return line(1, lambda _: header)
+
+
+def swapped(first: str, second: str) -> Damage:
+    return renamed(",".join({first: second, second: first}.get(name, name) for name in COLUMNS))
+
+
+def in_its_place(make: Callable[[Path], object]) -> Callable[[Path], None]:
+    """Put something else in the place of the first trial file."""
+
+    def after(root):
+        (root / T01).unlink()
+        make(root / T01)
+
+    return after
+
+
+def link_out(root: Path) -> None:
+    outside = root.parent / "secret.csv"
+    outside.write_text((root / T01).read_text())
+    (root / T01).unlink()
+    (root / T01).symlink_to(outside)
+
+
+def link_folder_out(root: Path) -> None:
+    (root / "trials").rename(root.parent / "elsewhere")
+    (root / "trials").symlink_to(root.parent / "elsewhere")
+
+
+def wrap(bits: int, column: str = "enc_yaw") -> Damage:
+    def wrapped(t):
+        half = 2.0 ** (bits - 1)
+        # Put the zero of the counter in the middle of the motion, so that it wraps there.
+        moved = t[column] - np.rint(t[column].mean()) + half
+        t[column][:] = np.mod(moved + half, 2 * half) - half
+
+    return table(wrapped)
+
+
+SQUARE = [[1.0, 2.0, 3.0]] * 3
+
+# name: (damage, what the one line must say)
+REFUSED: dict[str, tuple[Damage, str]] = {
+    "no session file": (
+        lambda made: lambda root: (root / "session.toml").unlink(),
+        "no session.toml in this folder",
+    ),
+    "empty session file": (file("", "session.toml"), "'schema' is missing"),
+    "session file is binary": (
+        file(bytes(range(256)), "session.toml"),
+        "session.toml, line 2: not UTF-8",
+    ),
+    "session file is UTF-16": (file("a = 1".encode("utf-16"), "session.toml"), "UTF-16"),
+    "session file is not TOML": (
+        file("schema = 1\nfoo = = 2\n", "session.toml"),
+        r"session.toml, line 2: not TOML",
+    ),
+    "key twice": (file("device = 1\ndevice = 2\n", "session.toml"), "line 2: not TOML"),
+    "another schema": (put("schema", "bampipe.session/9"), 'expected "bampipe.session/1"'),
+    "unknown key": (put("sample_rate", 1), 'unknown key "sample_rate", did you mean'),
+    "unknown key in encoder": (put("encoders.yaw.colunm", 1), "did you mean 'column'"),
+    "session_id is a path": (put("session_id", "../x"), r'session_id: found "../x"'),
+    "session_id is a number": (put("session_id", 3), "found 3, expected text"),
+    "rate is text": (put("sample_rate_hz", "fast"), 'found "fast", expected a number'),
+    "rate is zero": (put("sample_rate_hz", 0), "sample_rate_hz: found 0, expected more than 0"),
+    "rate is NaN": (put("sample_rate_hz", float("nan")), "found nan, expected a finite number"),
+    "rate is true": (put("sample_rate_hz", True), "found true, expected a number"),
+    "number too large": (put("encoders.yaw.zero_counts", 10**40), "beyond 2"),
+    "date is nonsense": (put("recorded_at", "yesterday"), "recorded_at: found"),
+    "unknown device": (put("device", "bom"), "unknown device 'bom', did you mean 'bam'"),
+    "device file missing": (put("device", "my.toml"), "no such file 'my.toml'"),
+    "device file outside": (put("device", "../my.toml"), "leaves the session folder"),
+    "device file is broken": (
+        both(put("device", "my.toml"), file("nonsense", "my.toml")),
+        "my.toml, line 1: not TOML",
+    ),
+    "device file is no device": (
+        both(put("device", "my.toml"), file('name = "x"\nfoo = 1', "my.toml")),
+        "my.toml: unknown table 'foo'",
+    ),
+    "no encoders": (put("encoders", {}), "expected at least 1 entry"),
+    "axis of another device": (
+        put("encoders.roll", {"column": "enc_roll", "unit": "rad"}),
+        "device 'bam' has no axis 'roll'",
+    ),
+    "axis missing": (
+        both(
+            drop("encoders.pitch"),
+            put("brakes.columns", ["brake_yaw", "brake_extension"]),
+            put("brakes.unit", "N.m, N"),
+        ),
+        "no encoder for axis 'pitch'",
+    ),
+    "axis in the wrong unit": (put("encoders.yaw.unit", "mm"), "brakes.unit: found"),
+    "unknown unit": (put("encoders.yaw.unit", "radian"), "did you mean 'rad'"),
+    "zero counts_per_unit": (put("encoders.yaw.counts_per_unit", 0), "counts_per_unit: found 0"),
+    "counts_per_unit is text": (
+        put("encoders.yaw.counts_per_unit", "many"),
+        r'encoders.yaw.counts_per_unit: found "many", expected a number',
+    ),
+    "infinite counts_per_unit": (
+        put("encoders.yaw.counts_per_unit", float("inf")),
+        "encoders.yaw.counts_per_unit: found inf",
+    ),
+    "one column for two channels": (
+        put("encoders.yaw.column", "enc_pitch"),
+        "column 'enc_pitch' is used for 2 channels",
+    ),
+    "calibration missing": (drop("force.calibration_n_per_v"), "'calibration_n_per_v' is missing"),
+    "calibration of the wrong shape": (
+        put("force.calibration_n_per_v", [[1.0, 0.0], [0.0, 1.0]]),
+        "found 2 rows of 2 numbers, expected 3 rows of 3",
+    ),
+    "calibration ragged": (
+        put("force.calibration_n_per_v", [[1.0, 0.0, 0.0], [0.0, 1.0], [0.0, 0.0, 1.0]]),
+        "rows of 2 and 3 numbers",
+    ),
+    "calibration singular": (put("force.calibration_n_per_v", SQUARE), "singular"),
+    "calibration is text": (put("force.calibration_n_per_v", [["a"]]), 'found "a"'),
+    "zero_v of the wrong length": (put("force.zero_v", [0.0]), "zero_v: found 1, expected 3"),
+    "calibration for a channel in N": (put("force.unit", "N"), "needs no calibration"),
+    "force without its columns": (drop("force.columns"), "'columns' is missing"),
+    "an input of the device missing": (drop("force"), "no channel for input 'force_x'"),
+    "noise below zero": (put("force.noise_sd_n", -1), "expected 0 or more"),
+    "brake of no axis": (
+        put("brakes.columns", ["brake_yaw", "brake_pich", "brake_extension"]),
+        "names no axis, did you mean 'pitch'",
+    ),
+    "brake units too few": (put("brakes.unit", "N.m, N.m"), "found 2 units, expected 3"),
+    "brake in the wrong unit": (put("brakes.unit", "N, N, N"), 'found "N" for yaw'),
+    "channel with a taken name": (
+        put("channels", {"force_x": {"column": "a", "unit": "N"}}),
+        "the name 'force_x' is taken",
+    ),
+    "axis name with a blank": (
+        put("encoders.my axis", {"column": "a", "unit": "m"}),
+        "expected a name of letters, digits",
+    ),
+    "no trials": (put("trials", []), "expected at least 1 in the list"),
+    "trials is a table": (put("trials", {}), "expected a list"),
+    "unknown kind": (put("trials.0.kind", "fre"), "did you mean 'free'"),
+    "locked without an axis": (put("trials.0.kind", "locked"), "'locked_axis' is missing"),
+    "locked on an unknown axis": (put("trials.2.locked_axis", "yow"), "did you mean 'yaw'"),
+    "locked axis on a free trial": (put("trials.0.locked_axis", "yaw"), 'given for a "free"'),
+    "viscous without its damping": (
+        put("trials.0.kind", "viscous"),
+        "'viscous_n_s_per_m' is missing",
+    ),
+    "viscous damping below zero": (
+        both(put("trials.0.kind", "viscous"), put("trials.0.viscous_n_s_per_m", -4)),
+        "expected more than 0",
+    ),
+    "trial path leaves the session": (put("trials.0.file", "../x.csv"), "leaves the session"),
+    "trial path leaves it later": (put("trials.0.file", "a/../../x.csv"), "leaves the session"),
+    "trial path absolute": (put("trials.0.file", "/etc/passwd"), "absolute path"),
+    "trial path of Windows": (put("trials.0.file", "C:\\data\\x.csv"), "absolute path"),
+    "trial path with backslashes": (put("trials.0.file", "trials\\t01.csv"), "not portable"),
+    "trial path with a NUL": (put("trials.0.file", "a\0b.csv"), "not portable"),
+    "trial path empty": (put("trials.0.file", ""), "expected text that is not empty"),
+    "unit of time unknown": (
+        put("time", {"column": "time_us", "unit": "minutes"}),
+        'time.unit: found "minutes"',
+    ),
+    "no trial is sound": (
+        lambda made: [made.files.update({f"trials/t0{n}.csv": ""}) for n in (1, 2, 3)] and None,
+        "none of the 3 trials is sound; the first: trials/t01.csv: the file is empty",
+    ),
+}
+
+# name: (damage of the first trial, what its reason must say)
+ASIDE: dict[str, tuple[Damage, str]] = {
+    "empty file": (file(""), r"^trials/t01.csv: the file is empty$"),
+    "header only": (text(lambda s: s.split("\n")[0] + "\n"), "a header but no samples"),
+    "header without line end": (text(lambda s: s.split("\n")[0]), "a header but no samples"),
+    "binary garbage": (file(np.random.default_rng(0).bytes(5000)), "binary data, not text"),
+    "garbage in the middle": (
+        text(lambda s: s[:70000].encode() + b"\xff\xfe\x00\x01" * 20 + s[70000:].encode()),
+        "row ",
+    ),
+    "UTF-16 with mark": (text(lambda s: s.encode("utf-16")), "UTF-16 text; save it as UTF-8"),
+    "UTF-16 without mark": (text(lambda s: s.encode("utf-16-be")), "UTF-16 text"),
+    "header in Latin-1": (
+        text(lambda s: b"gr\xf6\xdfe," + s.encode()),
+        "row 1: the header is not UTF-8",
+    ),
+    "semicolons": (text(lambda s: s.replace(",", ";")), "separated by semicolons"),
+    "tabs": (text(lambda s: s.replace(",", "\t")), "separated by tabs"),
+    "semicolons and decimal commas": (
+        text(lambda s: s.replace(",", ";").replace(".", ",")),
+        "row 1: columns are separated by semicolons",
+    ),
+    "decimal commas": (
+        text(lambda s: s.split("\n")[0] + "\n" + s.split("\n", 1)[1].replace(".", ",")),
+        "row 2: 16 cells, where the header has 10; decimal commas",
+    ),
+    "quoted decimal commas": (
+        cell(700, "force_x_v", '"0,5"'),
+        "row 700, column 'force_x_v': found '0,5', expected a number; .*decimal sign",
+    ),
+    "no header": (text(lambda s: s.split("\n", 1)[1]), "no header"),
+    "column missing": (
+        renamed(",".join(COLUMNS).replace("enc_yaw", "other")),
+        "no column 'enc_yaw'",
+    ),
+    "column misspelt": (
+        renamed(",".join(COLUMNS).replace("enc_yaw", "enc_yow")),
+        "row 1: no column 'enc_yaw', did you mean 'enc_yow'",
+    ),
+    "column in capitals": (
+        renamed(",".join(COLUMNS).replace("enc_yaw", "ENC_YAW")),
+        "did you mean 'ENC_YAW'",
+    ),
+    "column twice": (
+        renamed(",".join(COLUMNS).replace("enc_pitch", "enc_yaw")),
+        "no column 'enc_pitch'|column 'enc_yaw' stands twice, as columns 2 and 3",
+    ),
+    "encoder and force swapped": (swapped("enc_yaw", "force_x_v"), "columns swapped"),
+    "time and encoder swapped": (swapped("time_us", "enc_yaw"), "column 'time_us'"),
+    "text in a cell": (
+        cell(30, "enc_pitch", "oops"),
+        r"^trials/t01.csv, row 30, column 'enc_pitch': found 'oops', expected a number$",
+    ),
+    "hexadecimal in a cell": (cell(31, "enc_pitch", "0x1F"), "row 31, .*found '0x1F'"),
+    "a row too short": (line(500, lambda s: s.rsplit(",", 2)[0]), "row 500: 8 cells"),
+    "a row too long": (line(501, lambda s: s + ",1"), "row 501: 11 cells"),
+    "two lines in one": (
+        text(lambda s: "\n".join(s.split("\n")[:400]) + "".join(s.split("\n")[400:])),
+        r"row 400: \d+ cells|far too long",
+    ),
+    "quotation mark left open": (cell(50, "time_us", '"98000'), "row "),
+    "a spreadsheet": (
+        lambda made: (
+            put("trials.0.file", "trials/t01.xlsx")(made)
+            or file(b"PK\x03\x04" + bytes(99), "trials/t01.xlsx")(made)
+        ),
+        "ending '.xlsx'",
+    ),
+    "a spreadsheet called CSV": (file(b"PK\x03\x04" + bytes(99)), "zip archive or spreadsheet"),
+    "a gzip archive called CSV": (file(b"\x1f\x8b" + bytes(99)), "gzip archive"),
+    "Parquet called CSV": (
+        lambda made: made.files.update({T01: parquet(made.tables[T01])}),
+        r"this is a Parquet file, not \*.csv",
+    ),
+    "file missing": (lambda made: lambda root: (root / T01).unlink(), "no such file 'trials/t01"),
+    "a folder in its place": (
+        lambda made: in_its_place(lambda path: path.mkdir()),
+        "'trials/t01.csv' is not a file",
+    ),
+    "a pipe in its place": (lambda made: in_its_place(os.mkfifo), "'trials/t01.csv' is not a file"),
+    "a link out of the session": (lambda made: link_out, "outside the session folder"),
+    "a link to itself": (
+        lambda made: in_its_place(lambda path: path.symlink_to(path)),
+        "cannot be used|no such file",
+    ),
+    "three samples": (rows(lambda n: np.arange(3)), "3 samples over 0.004 s, less than 1 s"),
+    "half a second": (rows(lambda n: np.arange(250)), "250 samples over 0.498 s"),
+    "time missing": (samples("time_us", slice(100, 200), np.nan), "100 time stamps are missing"),
+    "time stands still": (samples("time_us", slice(None), 5.0), "time stands still"),
+    "time backwards": (rows(lambda n: np.arange(n)[::-1]), "time runs backwards throughout"),
+    "two recordings in one file": (
+        rows(lambda n: np.r_[0:n, 0:n]),
+        r"row 1002, column 'time_us': time runs backwards: .*two recordings",
+    ),
+    "many repeated stamps": (
+        table(lambda t: t["time_us"].__setitem__(slice(None), t["time_us"] // 4000 * 4000)),
+        "500 of 1000 time stamps are repeated",
+    ),
+    "unit of time out of all proportion": (
+        table(lambda t: t["time_us"].__imul__(40)),
+        "does not fit sample_rate_hz = 500",
+    ),
+    "a long gap in the middle": (
+        table(lambda t: t["time_us"].__setitem__(slice(500, None), t["time_us"][500:] + 1e6)),
+        "1 gap of up to 1 s in the time stamps, and the longest stretch .* holds 50%",
+    ),
+    "counter reset": (
+        table(lambda t: t["enc_yaw"].__setitem__(slice(500, None), t["enc_yaw"][500:] - 20_000)),
+        "column 'enc_yaw': jumps by 0.9.* rad .*counter was reset",
+    ),
+    "fractional counts": (
+        cell(9, "enc_yaw", "100.5"),
+        "row 9, column 'enc_yaw': found 100.5, expected whole",
+    ),
+    "NaN for a while": (
+        samples("force_x_v", slice(300, 320), np.nan),
+        "row 302, column 'force_x_v': 20 samples in a row are missing, more than 5",
+    ),
+    "NaN here and there, too often": (
+        samples("force_x_v", slice(0, None, 20), np.nan),
+        "50 of 1000 samples are missing, more than 1%",
+    ),
+    "a column of NaN": (samples("enc_pitch", slice(None), np.nan), "holds no number at all"),
+    "a column of infinities": (
+        text(lambda s: re.sub(r"(\n(?:[^,\n]*,){4})[^,\n]*", r"\1inf", s)),
+        "column 'force_x_v': holds no number at all",
+    ),
+    "force saturated": (
+        table(lambda t: np.clip(t["force_y_v"], -0.8, 0.8, out=t["force_y_v"]) is None),
+        r"column 'force_y_v': 2\d.\d% of the samples are at the rail -?0.8: saturated",
+    ),
+    "force frozen": (samples("force_z_v", slice(200, 800), 0.25), "reads 0.25 without a change"),
+    "force disconnected": (samples("force_z_v", slice(None), 0.0), "frozen"),
+    "force out of this world": (samples("force_z_v", 300, 1e9), "which no such machine does"),
+    "encoder stuck": (samples("enc_pitch", slice(None), 77.0), "never changes while other axes"),
+    "free trial that never moves": (
+        table(lambda t: [t[f"enc_{a}"].fill(500.0) for a in ("yaw", "pitch", "extension")]),
+        "declared free, but never moves",
+    ),
+    "free trial with brakes": (
+        samples("brake_pitch", slice(None), 50.0),
+        "declared free, but the brake is commanded up to 50 N.m",
+    ),
+    "viscous trial without brakes": (
+        both(put("trials.0.kind", "viscous"), put("trials.0.viscous_n_s_per_m", 40)),
+        "declared viscous, but no brake is ever commanded",
+    ),
+    "locked trial that moves": (
+        both(
+            put("trials.0.kind", "locked"),
+            put("trials.0.locked_axis", "extension"),
+            table(lambda t: free_trial(5) | {"brake_extension": np.full(1000, 200.0)}),
+        ),
+        "extension is declared locked, but moves by 0.4.* m",
+    ),
+    "locked on the wrong axis": (
+        both(
+            put("trials.0.kind", "locked"),
+            put("trials.0.locked_axis", "yaw"),
+            table(lambda t: locked_trial("pitch", seed=3)),
+        ),
+        "locked yaw deflects by 0 encoder steps only",
+    ),
+    "Parquet cut off": (as_file(".parquet", lambda t: parquet(t)[:3000]), "not a sound Parquet"),
+    "Parquet with text": (
+        as_file(".parquet", lambda t: parquet({**t, "enc_yaw": t["enc_yaw"].astype(str)})),
+        "column 'enc_yaw': holds .*string, expected numbers",
+    ),
+    "Parquet without a column": (
+        as_file(".parquet", lambda t: parquet({k: v for k, v in t.items() if k != "enc_yaw"})),
+        "no column 'enc_yaw'",
+    ),
+    "MATLAB cut off": (
+        as_file(".mat", lambda t: mat5(t)[:2000]),
+        "not a sound MATLAB file|no column",
+    ),
+    "MATLAB lengths differ": (
+        as_file(".mat", lambda t: mat5({**t, "enc_yaw": t["enc_yaw"][:-7]})),
+        "variable 'enc_yaw': 993 values, where 'time_us' has 1000",
+    ),
+    "MATLAB text": (
+        as_file(".mat", lambda t: mat5({**t, "enc_yaw": "left"})),
+        "variable 'enc_yaw': not numbers",
+    ),
+    "MATLAB matrix": (
+        as_file(".mat", lambda t: mat5({**t, "enc_yaw": np.zeros((500, 2))})),
+        "variable 'enc_yaw': a 500 by 2 array, expected a vector",
+    ),
+    "MATLAB complex": (
+        as_file(".mat", lambda t: mat5({**t, "enc_yaw": t["enc_yaw"] * 1j})),
+        "not numbers",
+    ),
+    "MATLAB 7.3 cut off": (as_file(".mat", lambda t: mat73(t)[:4000]), "not a sound MATLAB file"),
+    "MATLAB 7.3 linked outside": (
+        as_file(
+            ".mat",
+            lambda t: mat73(
+                {k: v for k, v in t.items() if k != "enc_yaw"},
+                lambda f: f.__setitem__("enc_yaw", h5py.ExternalLink("/etc/x.h5", "/enc_yaw")),
+            ),
+        ),
+        "variable 'enc_yaw': a link",
+    ),
+    "MATLAB 7.3 structure": (
+        as_file(
+            ".mat",
+            lambda t: mat73(
+                {k: v for k, v in t.items() if k != "enc_yaw"},
+                lambda f: f.create_group("enc_yaw"),
+            ),
+        ),
+        "variable 'enc_yaw': a structure",
+    ),
+}
+
+# name: (damage of the first trial, what must be said of it)
+REPAIRED: dict[str, tuple[Damage, str]] = {
+    "last line cut off": (text(lambda s: s[:-30]), "last line is cut off: 1 row dropped"),
+    "last cell cut off": (text(lambda s: s[:-3]), "last line is cut off: 1 row dropped"),
+    "time in seconds": (
+        text(lambda s: re.sub(r"(?m)^(\d+),", lambda m: f"{int(m[1]) * 1e-6:.3f},", s)),
+        "time stamps are in s, not us, by the nominal rate: converted",
+    ),
+    "time in milliseconds": (
+        table(lambda t: t["time_us"].__imul__(1e-3)),
+        "time stamps are in ms, not us",
+    ),
+    "a few repeated stamps": (
+        samples("time_us", [100, 200], [198_000, 398_000]),
+        "2 rows with a repeated time stamp dropped",
+    ),
+    "a stamp that leaps ahead": (
+        samples("time_us", 100, 1e9),
+        "1 row with a time stamp out of order dropped",
+    ),
+    "a stamp that falls back": (samples("time_us", 100, 3), "1 row with a time stamp out of order"),
+    "a stamp missing": (cell(60, "time_us", ""), "1 row without a time stamp dropped"),
+    "clock rolls over": (
+        table(lambda t: t.update(time_us=np.mod(t["time_us"] + 2.0**32 - 1e6, 2.0**32))),
+        "clock rolls over at 32 bits once: unrolled",
+    ),
+    "a gap near the end": (
+        table(lambda t: t["time_us"].__setitem__(slice(800, None), t["time_us"][800:] + 1e6)),
+        "1 gap of up to 1 s in the time stamps: rows 2 to 801 kept, 200 rows dropped",
+    ),
+    "counter of 16 bits": (wrap(16), "column 'enc_yaw' wraps at 16 bits .*unwrapped"),
+    "counter of 24 bits": (wrap(24), "wraps at 24 bits"),
+    "counter of 32 bits": (wrap(32), "wraps at 32 bits"),
+    "a wild encoder reading": (
+        table(wild_reading),
+        "column 'enc_yaw': 1 wild reading taken out.*1 missing sample interpolated",
+    ),
+    "first reading is zero": (samples("enc_yaw", 0, -90_000.0), "1 wild reading taken out"),
+    "a few NaN": (
+        samples("force_x_v", [50, 51, 700], np.nan),
+        "column 'force_x_v': 3 missing samples interpolated",
+    ),
+    "NaN at the start": (
+        samples("force_x_v", slice(0, 3), np.nan),
+        "3 rows with missing samples at the ends dropped",
+    ),
+    "an infinity": (cell(70, "force_x_v", "-inf"), "1 missing sample interpolated"),
+}
+
+# name: (damage of the first trial, what is noted; "" for nothing): sound all the same
+SOUND: dict[str, tuple[Damage, str]] = {
+    "nothing": (lambda made: None, ""),
+    "byte order mark": (text(lambda s: b"\xef\xbb\xbf" + s.encode()), ""),
+    "Windows line ends": (text(lambda s: s.replace("\n", "\r\n")), ""),
+    "blank lines at the end": (text(lambda s: s + "\n\n"), ""),
+    "blanks after commas": (text(lambda s: s.replace(",", ", ")), ""),
+    "quoted names": (renamed(",".join(f'"{name}"' for name in COLUMNS)), ""),
+    "columns in another order": (
+        lambda made: made.files.update({T01: csv_text(made.tables[T01], COLUMNS[::-1])}),
+        "",
+    ),
+    "a column more, of text": (
+        text(lambda s: "\n".join(f"{row},note" for row in s.split("\n") if row) + "\n"),
+        "",
+    ),
+    "time since 1970": (table(lambda t: t["time_us"].__iadd__(1.79e15)), ""),
+    "samples lost here and there": (
+        rows(lambda n: np.delete(np.arange(n), [100, 300, 301])),
+        "2 small gaps in the time stamps, about 3 samples missing",
+    ),
+    "jitter": (
+        table(
+            lambda t: t["time_us"].__iadd__(
+                np.rint(np.random.default_rng(0).uniform(-500, 500, len(t["time_us"])))
+            )
+        ),
+        "time stamps jitter by 0.4.* ms",
+    ),
+    "another rate than announced": (
+        table(lambda t: t["time_us"].__imul__(2)),
+        "sampled at 250 Hz, announced 500 Hz",
+    ),
+    "negative counts per unit": (put("encoders.yaw.counts_per_unit", -21333.3333), ""),
+    "Parquet": (as_file(".parquet", parquet), ""),
+    "MATLAB 5": (as_file(".mat", mat5), ""),
+    "MATLAB 7.3": (as_file(".mat", mat73), ""),
+}
+
+
+def test_the_corpus_is_large():
+    assert len(REFUSED) + len(ASIDE) >= 60
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_session_refused(name, tmp_path):
+    damage, message = REFUSED[name]
+    with pytest.raises(InputError, match=message) as caught:
+        run_ingest(Made(), tmp_path, damage)
+    line = str(caught.value)
+    assert "\n" not in line and "session" in line
+    assert not [path for path in (tmp_path / "out").rglob("*") if path.is_file()]
+
+
+@pytest.mark.parametrize("name", ASIDE)
+def test_trial_set_aside_and_the_others_kept(name, tmp_path):
+    damage, message = ASIDE[name]
+    trials, out = run_ingest(Made(), tmp_path, damage)
+    reason = trials.reason["t01"]
+    assert trials.status.tolist() == ["set_aside", "ok", "ok"], trials.T
+    assert re.search(message, reason), reason
+    assert reason.startswith("trials/t01.") and "\n" not in reason
+    assert set(read_parquet(out / "ingest/samples.parquet").trial_id) == {"t02", "t03"}
+
+
+@pytest.mark.parametrize("name", REPAIRED)
+def test_trial_repaired_and_said(name, tmp_path):
+    damage, message = REPAIRED[name]
+    trials, out = run_ingest(Made(), tmp_path, damage)
+    assert trials.status.tolist() == ["repaired", "ok", "ok"], trials.T
+    assert re.search(message, trials.repairs["t01"]), trials.repairs["t01"]
+    check_samples(out, "t01")
+
+
+@pytest.mark.parametrize("name", SOUND)
+def test_sound_trial_is_left_alone(name, tmp_path):
+    damage, message = SOUND[name]
+    trials, out = run_ingest(Made(), tmp_path, damage)
+    assert trials.status.tolist() == ["ok", "ok", "ok"], trials.T
+    assert re.fullmatch(f"{message}.*" if message else "", trials.repairs["t01"])
+    check_samples(out, "t01")
+
+
+def check_samples(out: Path, trial: str) -> None:
+    """The repaired trial follows the undamaged motion, in SI units."""
+    frame = read_parquet(out / "ingest/samples.parquet", trial=trial)
+    values = frame.drop(columns="trial_id").to_numpy()
+    assert np.isfinite(values).all()
+    assert (np.diff(frame.t) > 0).all() and frame.t[0] == 0
+    assert 0.9 <= np.ptp(frame.q_yaw) <= 1.01 or len(frame) < 990
+    assert np.abs(np.diff(frame.q_yaw)).max() < 0.05
+
+
+def test_the_same_file_twice_is_used_once(tmp_path):
+    made = Made()
+    made.session["trials"].append({"file": "./trials/t01.csv", "kind": "free"})
+    trials, _ = run_ingest(made, tmp_path)
+    assert trials.status.tolist() == ["ok", "ok", "ok", "set_aside"]
+    assert trials.reason.iloc[3] == "trials/t01.csv: the same file as trial t01: used once"
+
+
+def test_a_copy_under_another_name_is_used_once(tmp_path):
+    made = Made()
+    made.session["trials"].append({"file": "trials/copy.csv", "kind": "free"})
+    made.files["trials/copy.csv"] = made.text()
+    trials, _ = run_ingest(made, tmp_path)
+    assert trials.reason["copy"] == "trials/copy.csv: the same content as trial t01: used once"
+
+
+def test_one_file_declared_as_two_kinds_is_not_used(tmp_path):
+    made = Made()
+    made.session["trials"].append({"file": T01, "kind": "locked", "locked_axis": "yaw"})
+    trials, _ = run_ingest(made, tmp_path)
+    assert trials.status.tolist() == ["set_aside", "ok", "ok", "set_aside"]
+    assert "which is declared locked" in trials.reason["t01"]
+
+
+def test_a_trial_folder_linked_out_of_the_session(tmp_path):
+    with pytest.raises(InputError, match=r"none of the 3 trials .* outside the session folder"):
+        run_ingest(Made(), tmp_path, lambda made: link_folder_out)
+
+
+def test_a_trial_over_the_memory_allowed(tmp_path):
+    made = Made()
+    made.tables[T01] = free_trial(1, seconds=40.0)
+    trials, _ = run_ingest(made, tmp_path, largest_trial_mb=1)
+    assert trials.status.tolist() == ["set_aside", "ok", "ok"]
+    assert "columns are more than the 1 MB allowed" in trials.reason["t01"]
+
+
+def test_no_session_folder(tmp_path):
+    config = ingest.Config(session=str(tmp_path / "nowhere"))
+    with pytest.raises(InputError, match="nowhere: no such session folder"):
+        ingest.execute(RunFolder(tmp_path), tmp_path, config, silent)
