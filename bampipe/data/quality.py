@@ -177,7 +177,8 @@ def _time_to_seconds(table: _Table) -> None:
             column=table.clock,
             remedy="is this the time column?",
         )
-    table.t = table.t * table.session.clock.seconds
+    # The first stamp goes first: stamps since 1970 in s have no room for fractions of 1 us.
+    table.t = (table.t - table.t[0]) * table.session.clock.seconds
     nominal = table.session.sample_rate
     ratio = float(np.median(steps)) * table.session.clock.seconds * nominal
     power = 3 * round(np.log10(ratio) / 3)

@@ -1,0 +1,231 @@
+"""Ingest of sound sessions: units, files, determinism, other devices, memory."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet as pq
+import pytest
+from made_session import COUNTS, SESSION, Made, free_trial, toml_text
+from run_folders import SESSIONS
+
+from bampipe.data.store import read_json, read_parquet
+from bampipe.errors import InputError
+from bampipe.stages import ingest
+from bampipe.stages.base import RunFolder, silent
+
+NAMES = [f"open-0{number}" for number in range(1, 10)]
+
+
+def run_ingest(session: Path, out: Path, **settings: object):
+    out.mkdir(exist_ok=True)
+    config = ingest.Config(session=str(session), **settings)
+    return ingest.execute(RunFolder(out), out, config, silent)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_shared_session_is_sound(name, tmp_path):
+    if not (SESSIONS / name).is_dir():
+        pytest.skip(f"{SESSIONS / name} is not here")
+    summary = run_ingest(SESSIONS / name, tmp_path / "out")
+    trials = read_parquet(tmp_path / "out/ingest/trials.parquet")
+    assert (trials.status == "ok").all() and (trials.repairs == "").all()
+    assert summary["trials"] == {"ok": len(trials), "repaired": 0, "set_aside": 0}
+    np.testing.assert_allclose(trials.sample_rate_hz, 500.0)
+    samples = pq.ParquetFile(tmp_path / "out/ingest/samples.parquet")
+    assert samples.num_row_groups == len(trials)
+    assert samples.metadata.num_rows == trials.n_samples.sum()
+
+
+def test_samples_are_the_raw_columns_in_si_units(tmp_path):
+    made = Made()
+    run_ingest(made.write(tmp_path / "session"), tmp_path / "out")
+    frame = read_parquet(tmp_path / "out/ingest/samples.parquet", trial="t01")
+    raw = made.tables["trials/t01.csv"]
+    assert list(frame) == [
+        "trial_id", "t", "q_yaw", "q_pitch", "q_extension", "force_x", "force_y", "force_z",
+        "brake_yaw", "brake_pitch", "brake_extension",
+    ]  # fmt: skip
+    np.testing.assert_allclose(frame.t, raw["time_us"] * 1e-6, atol=1e-12)
+    for axis, (per_unit, zero) in COUNTS.items():
+        np.testing.assert_allclose(frame[f"q_{axis}"], (raw[f"enc_{axis}"] - zero) / per_unit)
+    force = SESSION["force"]
+    volts = np.column_stack([raw[name] for name in force["columns"]]) - force["zero_v"]
+    expected = volts @ np.array(force["calibration_n_per_v"]).T
+    np.testing.assert_allclose(frame[["force_x", "force_y", "force_z"]], expected, atol=1e-12)
+
+
+def test_session_json_says_what_later_stages_need(tmp_path):
+    run_ingest(Made().write(tmp_path / "session"), tmp_path / "out")
+    content = read_json(tmp_path / "out/ingest/session.json")
+    assert content["session_id"] == "made" and content["device"] == "bam"
+    assert content["axes"]["extension"] == {"unit": "m", "resolution": 1 / 33333.3333}
+    assert content["force"] == {
+        "columns": ["force_x", "force_y", "force_z"],
+        "unit": "N",
+        "noise_sd": 0.05,
+    }
+    assert content["sample_rate_hz"] == 500.0
+    assert content["recorded_at"] == "2026-10-03T10:12:00+00:00"
+
+
+def test_same_session_same_bytes(tmp_path):
+    session = Made().write(tmp_path / "session")
+    for name in ("a", "b"):
+        run_ingest(session, tmp_path / name)
+    files = sorted(p.relative_to(tmp_path / "a") for p in (tmp_path / "a").rglob("*.*"))
+    assert [path.name for path in files] == ["samples.parquet", "session.json", "trials.parquet"]
+    for path in files:
+        assert (tmp_path / "a" / path).read_bytes() == (tmp_path / "b" / path).read_bytes()
+
+
+def test_the_time_column_rules_over_the_announced_rate(tmp_path):
+    made = Made()
+    made.session["sample_rate_hz"] = 400.0
+    run_ingest(made.write(tmp_path / "session"), tmp_path / "out")
+    content = read_json(tmp_path / "out/ingest/session.json")
+    assert content["sample_rate_hz"] == pytest.approx(500.0)
+    assert content["announced_rate_hz"] == 400.0
+
+
+def test_trials_of_one_name_in_two_folders_keep_apart(tmp_path):
+    made = Made()
+    made.session["trials"][1]["file"] = "more/t01.csv"
+    made.tables["more/t01.csv"] = made.tables.pop("trials/t02.csv")
+    run_ingest(made.write(tmp_path / "session"), tmp_path / "out")
+    trials = read_parquet(tmp_path / "out/ingest/trials.parquet")
+    assert trials.trial_id.tolist() == ["trials_t01_csv", "more_t01_csv", "t03"]
+
+
+def test_the_session_file_itself_may_be_named(tmp_path):
+    session = Made().write(tmp_path / "session")
+    assert run_ingest(session / "session.toml", tmp_path / "out")["session_id"] == "made"
+
+
+def test_a_limit_can_be_changed(tmp_path):
+    session = Made().write(tmp_path / "session")
+    with pytest.raises(InputError, match="less than 3 s"):
+        run_ingest(session, tmp_path / "out", shortest_s=3.0)
+    with pytest.raises(InputError, match=r"ingest\.gap_s: must not be negative"):
+        run_ingest(session, tmp_path / "out", gap_s=-1.0)
+
+
+SLED = """
+schema = "bampipe.device/1"
+name = "sled"
+[coordinates.slide]
+kind = "linear"
+[energy]
+kinetic = "mass*ddt(slide)**2/2"
+[inputs]
+force = ["force_motor"]
+force_unit = "N"
+[applied]
+slide = "force_motor"
+[friction]
+slide = { viscous = { unit = "N.s/m", prior = 10.0, sd = 10.0, lower = 0.0 }, \
+coulomb = { unit = "N", prior = 3.0, sd = 3.0, lower = 0.0 } }
+[parameters.mass]
+unit = "kg"
+prior = 3.0
+sd = 1.0
+lower = 0.1
+"""
+
+
+def sled(unit: str = "N") -> Made:
+    """A device of the lab's own: one axis in mm, a motor force in N, time in s, one channel."""
+    t = np.arange(1000) / 500.0
+    table = {
+        "t": t,
+        "pos": 200.0 * np.sin(2 * np.pi * t),
+        "motor": np.sin(4 * np.pi * t),
+        "heat": 20.0 + t,
+    }
+    session = {
+        "schema": "bampipe.session/1",
+        "session_id": "sled-1",
+        "device": "my/sled.toml",
+        "sample_rate_hz": 500,
+        "time": {"column": "t", "unit": "s"},
+        "encoders": {"slide": {"column": "pos", "unit": "mm", "resolution": 0.01}},
+        "force": {"columns": ["motor"], "components": ["motor"], "unit": unit},
+        "channels": {
+            "temperature": {"column": "heat", "unit": "K", "scale": 1.0, "offset": 273.15}
+        },
+        "trials": [{"file": "one.parquet", "kind": "free"}],
+    }
+    stream = pa.BufferOutputStream()
+    pq.write_table(pa.table(table), stream)
+    content = stream.getvalue().to_pybytes()
+    return Made(session, {}, {"one.parquet": content, "my/sled.toml": SLED})
+
+
+def test_a_device_of_another_kind(tmp_path):
+    session = sled().write(tmp_path / "session")
+    run_ingest(session, tmp_path / "out")
+    frame = read_parquet(tmp_path / "out/ingest/samples.parquet")
+    assert list(frame) == ["trial_id", "t", "q_slide", "force_motor", "temperature"]
+    assert np.ptp(frame.q_slide) == pytest.approx(0.4, abs=1e-4)
+    assert frame.temperature[0] == pytest.approx(293.15)
+    content = read_json(tmp_path / "out/ingest/session.json")
+    assert content["device"] == "sled" and content["device_file"] == "my/sled.toml"
+    assert content["axes"]["slide"] == {"unit": "m", "resolution": pytest.approx(1e-5)}
+    copy = tmp_path / "out/ingest/device.toml"
+    assert copy.read_bytes() == (session / "my/sled.toml").read_bytes()
+
+
+def test_a_force_in_another_unit_than_the_device_takes(tmp_path):
+    session = sled("N.m").write(tmp_path / "session")
+    with pytest.raises(InputError, match=r'force\.unit: found "N\.m", but device \'sled\' takes N'):
+        run_ingest(session, tmp_path / "out")
+
+
+MEASURE = """
+import json, resource, sys
+from bampipe.stages import ingest
+from bampipe.stages.base import RunFolder, silent
+from pathlib import Path
+
+def peak():
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+peaks = []
+for session in sys.argv[1:]:
+    out = Path(session + "-out")
+    out.mkdir()
+    ingest.execute(RunFolder(out), out, ingest.Config(session=session), silent)
+    peaks.append(peak())
+print(json.dumps(peaks))
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="peak memory is counted in kB on Linux only")
+def test_memory_stays_below_three_times_the_largest_trial(tmp_path):
+    small, large = Made(), Made()
+    table = free_trial(1, seconds=1200.0)
+    # One row in a thousand is damaged, so that the repairs are counted in.
+    table["force_x_v"][::997] = np.nan
+    table["time_us"][1000::2000] = table["time_us"][999::2000]
+    raw = sum(column.nbytes for column in table.values())
+    made = small.write(tmp_path / "small"), large.write(tmp_path / "large")
+    for trial in large.session["trials"][:2]:
+        with open(made[1] / trial["file"], "wb") as stream:
+            pa.csv.write_csv(pa.table(table), stream)
+    session = large.session | {"trials": [large.session["trials"][0]]}
+    (made[1] / "session.toml").write_text(toml_text(session))
+    result = subprocess.run(
+        [sys.executable, "-c", MEASURE, *map(str, made)],
+        capture_output=True, text=True, check=True, env={**os.environ, "MALLOC_ARENA_MAX": "1"},
+    )  # fmt: skip
+    before, after = json.loads(result.stdout)
+    status = read_parquet(tmp_path / "large-out/ingest/trials.parquet").status[0]
+    assert status == "repaired"
+    assert after - before < 3 * raw, f"{(after - before) / raw:.2f} times {raw >> 20} MB"
