@@ -6,7 +6,7 @@ import multiprocessing
 import multiprocessing.connection
 import os
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from bampipe.errors import InputError
@@ -88,7 +88,6 @@ def run_sessions(
     requests: Sequence[Request],
     jobs: int,
     listen: Listener,
-    finished: Callable[[Outcome], None],
 ) -> list[Outcome]:
     """Run several sessions.
 
@@ -99,17 +98,12 @@ def run_sessions(
         requests: one for each session; no two may share a run folder.
         jobs: number of worker processes; 1 runs everything in this process.
         listen: told of every event of every session.
-        finished: told of each outcome as it comes.
 
     Returns:
         The outcomes, in the order of the requests.
     """
     if jobs <= 1 or len(requests) <= 1:
-        outcomes = []
-        for request in requests:
-            outcomes.append(guarded(request, listen))
-            finished(outcomes[-1])
-        return outcomes
+        return [guarded(request, listen) for request in requests]
     done: dict[int, Outcome] = {}
     waiting = list(enumerate(requests))[::-1]
     workers: list[_Worker] = []
@@ -118,7 +112,6 @@ def run_sessions(
         assert worker.task is not None
         done[worker.task] = outcome
         worker.task = None
-        finished(outcome)
 
     try:
         while len(done) < len(requests):

@@ -20,7 +20,7 @@ from bampipe.errors import InputError
 from bampipe.run import hashing, models, record
 from bampipe.run.gates import Verdict, judge
 from bampipe.run.pipeline import Pipeline
-from bampipe.run.settings import configure, did_you_mean, plain
+from bampipe.run.settings import configure, plain
 from bampipe.stages import base
 
 COMMIT = ".commit.json"
@@ -205,8 +205,8 @@ def session_id(session: Path) -> str:
 def _selected(request: Request) -> tuple[str, ...]:
     stages = request.pipeline.stages
     for name in (request.first, request.last):
-        if name and name not in base.STAGES:
-            raise InputError(f"no stage {name!r}", remedy=did_you_mean(name, base.STAGES))
+        if name:
+            base.check_name(name)
         if name and name not in stages:
             raise InputError(
                 f"pipeline {request.pipeline.name!r} has no stage {name!r}",

@@ -24,6 +24,7 @@ files into the run folder once ``execute`` has returned. No stage calls another.
 
 from __future__ import annotations
 
+import difflib
 import importlib
 import json
 from collections.abc import Mapping
@@ -148,12 +149,20 @@ PER_MODEL: tuple[str, ...] = ("identify", "validate", "diagnose")
 """Stages whose ``Config`` has a field ``model``: they run once for each model."""
 
 
+def check_name(name: str) -> None:
+    """Raise InputError unless there is a stage ``name``."""
+    if name in STAGES:
+        return
+    near = difflib.get_close_matches(name, STAGES, n=1, cutoff=0.55)
+    choices = f"did you mean {near[0]!r}?" if near else f"choose from {', '.join(STAGES)}"
+    raise InputError(f"no stage {name!r}", remedy=choices)
+
+
 def load(name: str) -> Stage:
     """Import and return the stage ``name``.
 
     Raises:
         InputError: there is no such stage.
     """
-    if name not in STAGES:
-        raise InputError(f"no stage {name!r}", remedy=f"choose from {', '.join(STAGES)}")
+    check_name(name)
     return cast(Stage, importlib.import_module(f"bampipe.stages.{name}"))

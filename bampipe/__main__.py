@@ -1,0 +1,5 @@
+"""``python -m bampipe``."""
+
+from bampipe.cli import main
+
+main()

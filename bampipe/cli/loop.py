@@ -1,0 +1,234 @@
+"""The loop on the command line: add an effect, measure again, follow the diagnosis."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tomllib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import bampipe
+from bampipe.cli import places
+from bampipe.errors import InputError
+from bampipe.run import models, pipeline
+from bampipe.run.pipeline import Pipeline
+from bampipe.run.runner import Listener, Request, run_session, session_id
+from bampipe.stages import base
+
+MOST_EFFECTS = 5
+
+_PACKAGE = Path(bampipe.__file__).parent
+_SAMPLES = (_PACKAGE / "_sample_runs", _PACKAGE.parent / "sample_runs")
+
+
+@dataclass(frozen=True)
+class Options:
+    """What every step of the loop needs.
+
+    Attributes:
+        root: the run folder.
+        pipeline: whose settings count.
+        force: run even if nothing changed.
+        wait: wait while another process holds the run folder.
+        listen: told of every event.
+    """
+
+    root: Path
+    pipeline: Pipeline
+    force: bool
+    wait: bool
+    listen: Listener
+
+    def run(self, first: str, last: str, model: str) -> None:
+        """Run the stages from ``first`` to ``last`` on ``model``."""
+        run_session(
+            Request(
+                root=self.root,
+                pipeline=self.pipeline,
+                first=first,
+                last=last,
+                model=model,
+                force=self.force,
+                wait=self.wait,
+            ),
+            self.listen,
+        )
+
+
+def current_model(root: Path) -> str:
+    """Return the model with the most effects added; of several the one made last."""
+    known = models.names(root)
+    if not known:
+        return models.BASE
+    made = {name: (root / "models" / name / "model.toml").stat().st_mtime_ns for name in known}
+    return max(known, key=lambda name: (name.count("+"), made[name]))
+
+
+def _diagnosis(root: Path, model: str) -> dict[str, Any]:
+    return base.RunFolder(root).read_json(f"models/{model}/diagnose.json")
+
+
+def next_effect(root: Path, model: str) -> str:
+    """Return the effect that the diagnosis of ``model`` ranks first, "" if nothing is to be added.
+
+    Args:
+        root: the run folder; the model must have been diagnosed.
+        model: name of the model.
+    """
+    diagnosis = _diagnosis(root, model)
+    missing = {axis for axis, entry in diagnosis["axes"].items() if entry["verdict"] == "missing"}
+    for entry in diagnosis["ranking"]:
+        if entry["axis"] in missing:
+            return str(entry["effect"])
+    return ""
+
+
+def _own_file(text: str) -> tuple[Path, str] | None:
+    """Split ``file.toml[:target]``; None if ``text`` names no file."""
+    name, _, target = text.partition(":")
+    return (Path(name), target) if name.endswith(".toml") else None
+
+
+def _named(text: str) -> tuple[str, Path | None]:
+    """Return the effect ``name[:target]`` and the file it comes from, if it is a lab's own."""
+    own = _own_file(text)
+    if own is None:
+        return text, None
+    path, target = own
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise InputError("no such effect file", where=str(path)) from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"not valid TOML: {error}", where=str(path)) from error
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror}", where=str(path)) from error
+    from bampipe.physics import registry
+
+    effect = registry.effect_from(content, str(path))
+    return f"{effect.name}:{target}" if target else effect.name, path
+
+
+def extend(options: Options, parent: str, effect: str) -> str:
+    """Make the child of ``parent`` that has ``effect`` too; identify, validate, compare.
+
+    Args:
+        options: run folder, settings, listener.
+        parent: name of a model of this run.
+        effect: ``name[:target]``, or ``file.toml[:target]`` for a lab's own.
+
+    Returns:
+        The name of the child.
+
+    Raises:
+        InputError: no such parent or effect, one the device cannot have, or one that the parent
+            has already; nothing is left behind.
+    """
+    from bampipe.stages.modelfile import load_model
+
+    root = options.root
+    models.ensure_base(root, options.pipeline.device, options.pipeline.effects)
+    before = models.read(root, parent)
+    name, file = _named(effect)
+    if name in before.effects:
+        raise InputError(f"model {parent!r} has {name} already", where=str(root))
+    child = models.child_name(parent, name)
+    folder = root / "models" / child
+    fresh = not folder.exists()
+    try:
+        for own in sorted((root / "models" / parent / "effects").glob("*.toml")):
+            _copy(own, folder / "effects" / own.name)
+        if file is not None:
+            _copy(file, folder / "effects" / f"{name.partition(':')[0]}.toml")
+        models.write(root, models.ModelFile(child, parent, before.device, (*before.effects, name)))
+        load_model(base.RunFolder(root), child)
+        options.run("identify", "validate", parent)
+        options.run("identify", "validate", child)
+    except InputError:
+        if fresh:
+            shutil.rmtree(folder, ignore_errors=True)
+        raise
+    options.run("compare", "compare", "")
+    return child
+
+
+def _copy(source: Path, target: Path) -> None:
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if source.resolve() != target.resolve():
+        target.write_bytes(source.read_bytes())
+
+
+def follow(options: Options, model: str, tell: Callable[[str], None]) -> str:
+    """Diagnose and extend until the diagnosis says stop.
+
+    Args:
+        options: run folder, settings, listener.
+        model: name of the model to start from.
+        tell: told, in a line each, what was found and done.
+
+    Returns:
+        The name of the last model.
+    """
+    for _ in range(MOST_EFFECTS):
+        options.run("diagnose", "diagnose", model)
+        effect = next_effect(options.root, model)
+        for axis, entry in sorted(_diagnosis(options.root, model)["axes"].items()):
+            tell(f"{model}, {axis}: {str(entry['verdict']).replace('_', ' ')}")
+        if not effect:
+            break
+        tell(f"adding {effect}")
+        model = extend(options, model, effect)
+    else:
+        tell(f"stopped after {MOST_EFFECTS} effects")
+    options.run("compare", "compare", "")
+    return model
+
+
+def demonstrate(runs: Path, force: bool, listen: Listener, tell: Callable[[str], None]) -> None:
+    """Run the whole loop on the session that ships for it.
+
+    Args:
+        runs: folder of run folders.
+        force: run even if nothing changed.
+        listen: told of every event.
+        tell: told the story, line by line.
+
+    Raises:
+        InputError: the session does not ship with this installation.
+    """
+    samples = next((folder for folder in _SAMPLES if folder.is_dir()), None)
+    if samples is None:
+        raise InputError("this installation has no sample sessions", where=str(_SAMPLES[0]))
+    session = samples / "demo"
+    root = runs / session_id(session)
+    chosen = pipeline.load()
+    tell(f"1. {session}: an arm with something wrong that its model does not know.")
+    run_session(Request(root, chosen, session=session, force=force, judged=models.BASE), listen)
+    validated = base.RunFolder(root).read_json(f"models/{models.BASE}/validate.json")
+    for axis, entry in sorted(validated["axes"].items()):
+        tell(
+            f"   {axis}: error on unseen trials {entry['held_out_rmse']:.3g} {entry['unit']}, "
+            f"sensor noise alone would leave {entry['noise_floor']:.3g} {entry['unit']}"
+        )
+    tell("2. Which effect is missing? The diagnosis, then the model extended, until nothing is.")
+    options = Options(
+        root, Pipeline(**{**vars(chosen), "stages": base.STAGES}), force, True, listen
+    )
+    last = follow(options, models.BASE, lambda line: tell(f"   {line}"))
+    tell("3. The error on unseen trials, model by model.")
+    ladder = base.RunFolder(root).read_json("compare.json")["ladder"]
+    for rung in ladder:
+        errors = ", ".join(
+            f"{axis} {value:.3g} (floor {rung['noise_floor'][axis]:.3g})"
+            for axis, value in sorted(rung["held_out_rmse"].items())
+        )
+        tell(f"   {rung['model']}: {errors}")
+    options.run("report", "report", "")
+    truth = json.loads((samples / "demo.truth.json").read_text(encoding="utf-8"))
+    hidden = ", ".join(truth["configuration"]["effects"])
+    found = ", ".join(models.read(root, last).effects) or "nothing"
+    tell(f"4. Found: {found}. What was hidden: {hidden}.")
+    tell(f"   The story with its figures: {places.next_to(root, runs)}: {root}/report/report.pdf")

@@ -1,0 +1,76 @@
+"""Which session and which run an argument means."""
+
+from __future__ import annotations
+
+import glob
+from collections.abc import Sequence
+from pathlib import Path
+
+from bampipe.errors import InputError
+from bampipe.run import record
+from bampipe.run.runner import session_id
+from bampipe.run.settings import did_you_mean
+
+
+def known_runs(runs: Path) -> list[Path]:
+    """Return the run folders in ``runs``, the most recent first."""
+    found = [path.parent for path in runs.glob(f"*/{record.FILE}")]
+    return sorted(found, key=lambda root: (root / record.FILE).stat().st_mtime_ns, reverse=True)
+
+
+def find_run(argument: str | None, runs: Path) -> Path:
+    """Return the run folder that ``argument`` means.
+
+    Args:
+        argument: a run folder, the name of one in ``runs``, or a session that was run; None for
+            the most recent run.
+        runs: the folder of runs.
+
+    Raises:
+        InputError: there is no such run.
+    """
+    if argument is None:
+        known = known_runs(runs)
+        if not known:
+            raise InputError(f"no run yet in {runs}", remedy="start with `bampipe run SESSION`")
+        return known[0]
+    for path in (Path(argument), runs / argument):
+        if (path / record.FILE).is_file():
+            return path
+    if (Path(argument) / "session.toml").is_file():
+        root = runs / session_id(Path(argument))
+        if (root / record.FILE).is_file():
+            return root
+        raise InputError(
+            "this session has not been run", where=argument, remedy=f"`bampipe run {argument}`"
+        )
+    names = [root.name for root in known_runs(runs)]
+    remedy = did_you_mean(argument, names) or "start with `bampipe run SESSION`"
+    raise InputError(f"no run {argument!r}", where=str(runs), remedy=remedy)
+
+
+def find_sessions(arguments: Sequence[str]) -> list[Path]:
+    """Return the session folders that ``arguments`` mean, patterns expanded, each once.
+
+    A folder that a pattern finds counts only if it holds a session.
+
+    Raises:
+        InputError: a pattern finds no session.
+    """
+    found: list[Path] = []
+    for argument in arguments:
+        if Path(argument).exists() or not glob.has_magic(argument):
+            found.append(Path(argument))
+            continue
+        matches = [Path(name) for name in sorted(glob.glob(argument))]
+        sessions = [path for path in matches if (path / "session.toml").is_file()]
+        if not sessions:
+            raise InputError("no session matches", where=argument)
+        found += sessions
+    unique = {path.resolve(): path for path in reversed(found)}
+    return list(reversed(unique.values()))
+
+
+def next_to(path: Path, runs: Path) -> str:
+    """Return how to name the run ``path`` in the next command."""
+    return path.name if path.parent == runs and runs == Path("runs") else str(path)

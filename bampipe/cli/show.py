@@ -1,0 +1,216 @@
+"""What the commands print: results on standard output, progress and errors on standard error."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from types import TracebackType
+from typing import Any
+
+from bampipe.run.runner import Event, Outcome
+
+LARGEST_TABLE = 40
+
+
+def number(value: object) -> str:
+    """Return a cell: four significant digits for a number, plain words for the rest."""
+    if value is None:
+        return "–"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key} {number(item)}" for key, item in value.items())
+    if isinstance(value, list | tuple):
+        return ", ".join(number(item) for item in value) or "–"
+    return str(value)
+
+
+def say(text: str) -> None:
+    """Print a line on standard output."""
+    print(text)
+
+
+def note(text: str) -> None:
+    """Print a line on standard error."""
+    print(text, file=sys.stderr, flush=True)
+
+
+def as_json(content: object) -> None:
+    """Print ``content`` as JSON on standard output."""
+    print(json.dumps(content, sort_keys=True, indent=1, ensure_ascii=False))
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+    """Print a table: text to the left, numbers to the right, no lines.
+
+    Args:
+        head: column names.
+        rows: cells.
+    """
+    raw = [list(row) for row in rows]
+    cells = [[number(cell) for cell in row] for row in raw]
+    for column in range(len(head)):
+        if head[column] == "" and all(not row[column] for row in cells):
+            cells = [[*row[:column], "", *row[column + 1 :]] for row in cells]
+    widths = [
+        max([len(name), *(len(row[column]) for row in cells)]) for column, name in enumerate(head)
+    ]
+    right = [
+        bool(raw) and all(isinstance(row[column], int | float | None) for row in raw)
+        for column in range(len(head))
+    ]
+
+    def line(row: Sequence[str]) -> str:
+        parts = [
+            cell.rjust(width) if to_right else cell.ljust(width)
+            for cell, width, to_right in zip(row, widths, right, strict=True)
+        ]
+        return "  " + "  ".join(parts).rstrip()
+
+    say(line(list(head)))
+    for row in cells:
+        say(line(row))
+
+
+def _is_scalar(value: object) -> bool:
+    return value is None or isinstance(value, str | int | float | bool)
+
+
+def _records(value: object) -> list[dict[str, Any]] | None:
+    """Return a table of named records, or a list of records, as rows; None if it is neither."""
+    if isinstance(value, Mapping) and value:
+        if not all(isinstance(item, Mapping) for item in value.values()):
+            return None
+        return [{"": name, **item} for name, item in value.items()]
+    if isinstance(value, list) and value and all(isinstance(item, Mapping) for item in value):
+        return [dict(item) for item in value]
+    return None
+
+
+def _flat(row: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the columns a record shows: scalars, and tables of scalars key by key."""
+    shown: dict[str, Any] = {}
+    for name, value in row.items():
+        if _is_scalar(value):
+            shown[name] = value
+        elif isinstance(value, Mapping) and value and all(map(_is_scalar, value.values())):
+            shown.update({f"{name} {key}": item for key, item in value.items()})
+        elif isinstance(value, list) and all(isinstance(item, str) for item in value):
+            shown[name] = ", ".join(value)
+    return shown
+
+
+def summary(content: Mapping[str, object]) -> None:
+    """Print what a stage found: its headline, then its tables.
+
+    Args:
+        content: the summary of a stage. ``headline`` is a line; ``axes``, ``parameters``,
+            ``trials``, ``ranking`` and ``ladder`` are tables; ``notes`` are lines.
+    """
+    if isinstance(content.get("headline"), str):
+        say(str(content["headline"]))
+    for name in ("axes", "parameters", "trials", "ranking", "ladder"):
+        rows = _records(content.get(name))
+        if rows is None or len(rows) > LARGEST_TABLE:
+            continue
+        flat = [_flat(row) for row in rows]
+        head = list(dict.fromkeys(column for row in flat for column in row))
+        if len(head) < 2:
+            continue
+        say("")
+        say(name)
+        table(
+            [column.replace("_", " ") for column in head],
+            [[row.get(column) for column in head] for row in flat],
+        )
+    notes = content.get("notes")
+    if isinstance(notes, list) and notes:
+        say("")
+        for line in notes:
+            say(f"note: {line}")
+
+
+def outcome(result: Outcome) -> None:
+    """Print the steps of a run and its gates."""
+    rows = []
+    for step in result.steps:
+        took = f"{step.seconds:.1f} s" if step.state == "done" else ""
+        rows.append([step.step, step.state, took, _first_line(step.summary)])
+    if rows:
+        table(["step", "state", "time", ""], rows)
+    shown = [verdict for verdict in result.verdicts if verdict.state != "absent"]
+    if shown:
+        say("")
+        table(
+            ["gate", "", "verdict", ""],
+            [[verdict.gate, verdict.key, verdict.state, verdict.message] for verdict in shown],
+        )
+
+
+def _first_line(content: Mapping[str, object]) -> str:
+    line = content.get("headline")
+    return line if isinstance(line, str) else ""
+
+
+class Watcher:
+    """Shows the events of a run on standard error: a bar on a terminal, else lines.
+
+    Args:
+        quiet: show nothing.
+        several: name the run in each line.
+    """
+
+    def __init__(self, quiet: bool, several: bool = False) -> None:
+        self.quiet = quiet
+        self.several = several
+        self.bars: Any = None
+        self.tasks: dict[str, Any] = {}
+
+    def __enter__(self) -> Watcher:
+        if not self.quiet and sys.stderr.isatty():
+            from rich.console import Console
+            from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+            self.bars = Progress(
+                TextColumn("{task.description}"),
+                BarColumn(bar_width=30),
+                TimeElapsedColumn(),
+                TextColumn("{task.fields[message]}"),
+                console=Console(stderr=True),
+                transient=True,
+            )
+            self.bars.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if self.bars is not None:
+            self.bars.stop()
+
+    def __call__(self, event: Event) -> None:
+        """Show one event."""
+        if self.quiet:
+            return
+        name = f"{event.run}: {event.step}" if self.several else event.step
+        if event.kind == "waiting":
+            note(f"bampipe: another run holds {event.run}; waiting for it")
+        elif self.bars is None:
+            if event.kind == "start":
+                note(f"{name} ({event.message})" if event.message else name)
+        else:
+            self._draw(event, name)
+
+    def _draw(self, event: Event, name: str) -> None:
+        if event.kind in ("start", "progress"):
+            if name not in self.tasks:
+                self.tasks[name] = self.bars.add_task(name, total=1.0, message="")
+            self.bars.update(self.tasks[name], completed=event.fraction, message=event.message)
+        elif name in self.tasks:
+            self.bars.remove_task(self.tasks.pop(name))
