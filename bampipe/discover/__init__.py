@@ -1,1 +1,1 @@
-"""What a model lacks: residual maps, explainable share, candidate effects and their chance level."""
+"""What a model lacks: residual maps, explainable share, candidates and their chance level."""

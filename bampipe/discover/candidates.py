@@ -230,7 +230,7 @@ class Scorer:
         ) if item.linear else shape
 
     def _in_sample(self, item: Candidate, searched: Array) -> tuple[float, Array] | None:
-        """Sum over axes of n log(mean square) with everything refitted, and the effect's columns."""
+        """Cost of the joint fit, sum over axes of n log(mean square), and the columns."""
         problem = self._problem(item, searched)
         if problem is None:
             return None

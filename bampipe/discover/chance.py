@@ -186,7 +186,7 @@ Pool = Callable[[Callable[[Any], Any], Sequence[Any]], Iterator[Any]]
 
 @contextmanager
 def workers(session: Session, jobs: int) -> Iterator[Pool]:
-    """Something like `map` over worker processes that share ``session``; in this one if jobs = 1."""
+    """A `map` over worker processes that share ``session``; over none if jobs is 1."""
     _enter(session)
     if jobs <= 1:
         yield lambda function, tasks: map(function, tasks)

@@ -1,0 +1,306 @@
+"""Stage diagnose: what the model lacks, axis by axis, and how sure that is."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from bampipe.data.store import read_parquet, write_json
+from bampipe.discover.advice import advise
+from bampipe.discover.chance import Recipe, Session
+from bampipe.discover.diagnosis import Diagnosis, Settings, diagnose
+from bampipe.discover.evidence import Band
+from bampipe.discover.recording import Motion, Recording, Sensors, observe
+from bampipe.discover.shape import describe, residual_map, variables, worst_windows
+from bampipe.errors import InputError
+from bampipe.estimate.differentiation import uniform_grid
+from bampipe.estimate.hysteresis import noise_of
+from bampipe.physics import System, compile_model
+from bampipe.stages.base import Progress, RunFolder
+from bampipe.stages.modelfile import load_model, model_inputs
+
+NAME = "diagnose"
+SUMMARY = "Find which physical effect the model lacks"
+
+
+@dataclass(frozen=True)
+class Config:
+    """What the stage can be told.
+
+    Attributes:
+        model: which model version to diagnose.
+        replicates: replays of the fitted model for the chance level; more is slower and sharper.
+        cutoff_hz: low-pass that both sides of the equation go through, Hz.
+        kinematics_cutoff_hz: low-pass of the velocities, Hz.
+        significance: chance of a false alarm in a session that is accepted.
+        jobs: worker processes; 0 means one for each processor, eight at most.
+        seed: of the noise in the replays.
+    """
+
+    model: str = "base"
+    replicates: int = 10
+    cutoff_hz: float = 8.0
+    kinematics_cutoff_hz: float = 25.0
+    significance: float = 0.01
+    jobs: int = 0
+    seed: int = 0
+
+
+def inputs(config: Config) -> tuple[str, ...]:
+    """Return the paths the stage reads."""
+    return (
+        "ingest/session.json",
+        "ingest/trials.parquet",
+        "ingest/samples.parquet",
+        f"models/{config.model}/identify.json",
+        *model_inputs(config.model),
+    )
+
+
+def outputs(config: Config) -> tuple[str, ...]:
+    """Return the paths the stage writes."""
+    return (f"models/{config.model}/diagnose.json",)
+
+
+def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
+    """Diagnose one model and write ``models/<model>/diagnose.json``.
+
+    Raises:
+        InputError: fewer than two free trials, or a setting out of range.
+    """
+    if config.replicates < 4:
+        raise InputError("must be 4 or more", where="diagnose.replicates")
+    model = load_model(run, config.model)
+    system = compile_model(model)
+    sensors, motions = read_session(run, system, config.kinematics_cutoff_hz)
+    if len(motions) < 2:
+        raise InputError(
+            f"a diagnosis needs at least two free trials, found {len(motions)}",
+            where=str(run.root),
+            remedy="one trial is held out to judge the others; record more free trials",
+        )
+    session = Session(tuple(motions), sensors, Band(sensors.rate_hz, config.cutoff_hz))
+    recipe = Recipe(
+        model.device.declaration,
+        tuple(e.name for e in model.effects),
+        tuple(own_effects(run, config.model)),
+    )
+    identified = run.read_json(f"models/{config.model}/identify.json")["parameters"]
+    start = np.array([float(identified[p.name]["estimate"]) for p in system.parameters])
+    settings = Settings(
+        replicates=config.replicates,
+        significance=config.significance,
+        jobs=config.jobs or min(8, os.cpu_count() or 1),
+        seed=config.seed,
+    )
+    found = diagnose(session, recipe, start, settings, progress)
+    result = _result(found, session, recipe, config.model)
+    write_json(out / f"models/{config.model}/diagnose.json", result)
+    return result
+
+
+def own_effects(run: RunFolder, model: str) -> list[dict[str, object]]:
+    """Declarations of a lab's own effects that go with ``model``."""
+    from bampipe.data.store import read_toml
+
+    return [read_toml(run.path(p)) for p in run.glob(f"models/{model}/effects/*.toml")]
+
+
+def read_session(run: RunFolder, system: System, cutoff_hz: float) -> tuple[Sensors, list[Motion]]:
+    """Free trials of a run folder on uniform grids, filtered for the diagnosis, and the sensors.
+
+    Raises:
+        InputError: a file or channel that the model needs is missing.
+    """
+    about = run.read_json("ingest/session.json")
+    rate = float(about["sample_rate_hz"])
+    device = system.model.device
+    trials = read_parquet(run.require("ingest/trials.parquet", "ingest"))
+    sound = trials[(trials["kind"] == "free") & (trials["status"] != "set_aside")]
+    samples = run.require("ingest/samples.parquet", "ingest")
+    recordings = []
+    for trial_id in sound["trial_id"].astype(str):
+        frame = read_parquet(samples, trial=trial_id)
+        frame = frame[frame.drop(columns="trial_id").notna().all(axis=1)]
+        grid = uniform_grid(frame["t"].to_numpy(dtype=float), rate)
+        q = [grid.resample(frame[f"q_{a}"].to_numpy(dtype=float)) for a in system.coordinates]
+        missing = [f for f in device.forces if f not in frame]
+        if missing:
+            raise InputError(
+                f"no column {missing[0]!r}, which device {device.name!r} needs",
+                where=str(samples),
+                remedy="name the channel in session.toml",
+            )
+        force = [grid.resample(frame[f].to_numpy(dtype=float)) for f in device.forces]
+        brake = [
+            grid.hold(frame[f"brake_{a}"].to_numpy(dtype=float))
+            if f"brake_{a}" in frame
+            else np.zeros(len(grid.t))
+            for a in system.coordinates
+        ]
+        recordings.append(
+            Recording(trial_id, np.column_stack(q), np.column_stack(force), np.column_stack(brake))
+        )
+    stated = (about.get("force") or {}).get("noise_sd")
+    if stated is None:
+        rows = [[noise_of(column) for column in r.force.T] for r in recordings]
+        noise = np.median(np.array(rows), axis=0) if rows else np.zeros(len(device.forces))
+    else:
+        noise = np.broadcast_to(np.asarray(stated, dtype=float), (len(device.forces),))
+    resolution = np.array([float(about["axes"][a]["resolution"]) for a in system.coordinates])
+    sensors = Sensors(rate, resolution, np.array(noise), cutoff_hz)
+    return sensors, [observe(r, sensors, system) for r in recordings]
+
+
+def _result(found: Diagnosis, session: Session, recipe: Recipe, model: str) -> dict[str, object]:
+    names = found.evidence.system.coordinates
+    units = found.evidence.system.torque_units
+    shapes = {
+        axis: describe(found.evidence, i)
+        for i, axis in enumerate(names)
+        if found.axes[i].verdict == "unknown_effect"
+    }
+    axes = {}
+    for i, axis in enumerate(names):
+        a = found.axes[i]
+        axes[axis] = {
+            "verdict": a.verdict,
+            "explainable_share": a.explainable_share,
+            "explainable_chance": a.explainable_chance,
+            "rmse_before": a.rmse_before,
+            "rmse_after": a.rmse_after,
+            "noise_floor": a.noise_floor,
+            "noise_floor_sd": a.floor_sd,
+            "unit": units[i],
+            "effects": list(a.effects),
+            "sentence": _sentence(axis, i, found, shapes.get(axis, "")),
+        }
+    ranking = [
+        {
+            "effect": r.effect,
+            "axis": names[r.axis],
+            "held_out_rmse_before": r.held_out_rmse_before,
+            "held_out_rmse_after": r.held_out_rmse_after,
+            "unit": units[r.axis],
+            "p_value": r.p_value,
+            "score": r.score,
+            "parameters": dict(r.values),
+            "indistinguishable_from": list(r.indistinguishable_from),
+        }
+        for r in found.ranking
+    ]
+    suggestion = _suggestion(found, session, recipe)
+    return {
+        "model": model,
+        "axes": axes,
+        "ranking": ranking,
+        "selected": list(found.selected),
+        "groups": {name: list(group) for name, group in found.groups.items()},
+        "suggested_trial": suggestion,
+        "maps": _maps(found),
+        "worst_windows": [
+            {
+                "axis": w.axis,
+                "trial_id": w.trial_id,
+                "t_start": w.t_start,
+                "t_end": w.t_end,
+                "rmse": w.rmse,
+                "unit": units[names.index(w.axis)],
+                "doing": w.doing,
+            }
+            for w in worst_windows(found.initial)
+        ],
+        "sentence": " ".join(str(a["sentence"]) for a in axes.values()),
+        "next": _next(found, suggestion, model),
+    }
+
+
+def _sentence(axis: str, i: int, found: Diagnosis, shape: str) -> str:
+    a, unit = found.axes[i], found.evidence.system.torque_units[i]
+    ratio = a.rmse_after / max(a.noise_floor, 1e-30)
+    if a.verdict == "missing":
+        words = " and ".join(a.effects)
+        alike = [g for n in a.effects for g in found.groups.get(n, ())]
+        also = f" (these trials cannot tell it from {', '.join(alike)})" if alike else ""
+        return (
+            f"{axis.capitalize()}: {words} is missing{also}; adding it takes the held-out error "
+            f"from {a.rmse_before:.3g} to {a.rmse_after:.3g} {unit}, {ratio:.2f} times the noise "
+            f"floor."
+        )
+    if a.verdict == "unknown_effect":
+        return (
+            f"{axis.capitalize()}: something is missing that no effect in the library explains "
+            f"(held-out error {a.rmse_after:.3g} {unit}, {ratio:.1f} times the noise floor); its "
+            f"shape: {shape}."
+        )
+    return (
+        f"{axis.capitalize()}: nothing is missing that these trials could show (held-out error "
+        f"{a.rmse_after:.3g} {unit}, noise floor {a.noise_floor:.3g} {unit})."
+    )
+
+
+def _maps(found: Diagnosis) -> dict[str, object]:
+    out: dict[str, object] = {}
+    for i, axis in enumerate(found.initial.system.coordinates):
+        entries = {}
+        for variable in variables(found.initial, i):
+            m = residual_map(found.initial, i, variable)
+            entries[m.variable] = {
+                "unit": m.unit,
+                "center": m.center.tolist(),
+                "mean": m.mean.tolist(),
+                "low": m.low.tolist(),
+                "high": m.high.tolist(),
+                "count": [int(c) for c in m.count],
+                "variance_share": m.share,
+            }
+        out[axis] = entries
+    return out
+
+
+def _suggestion(found: Diagnosis, session: Session, recipe: Recipe) -> dict[str, object] | None:
+    for name in found.selected:
+        group = found.groups.get(name, ())
+        if not group:
+            continue
+        ranked = {r.effect: r for r in found.ranking}
+        if name not in ranked or group[0] not in ranked:
+            continue
+        axis = ranked[name].axis
+        values = {n: np.array(list(ranked[n].values.values())) for n in (name, group[0])}
+        floor = found.axes[axis].noise_floor
+        kept = replace(recipe)
+        advice = advise(session, kept, found.initial, axis, name, group[0], values, floor)
+        return {
+            "between": [name, group[0]],
+            "axis": found.initial.system.coordinates[axis],
+            "design": advice.design,
+            "separation": advice.separation,
+            "separation_now": advice.separation_now,
+            "sentence": (
+                f"To tell {name} from {group[0]}, record {advice.design}: taking one for the "
+                f"other would there leave {advice.separation:.1f} noise floors, against "
+                f"{advice.separation_now:.1f} in these trials."
+            ),
+        }
+    return None
+
+
+def _next(found: Diagnosis, suggestion: object, model: str) -> str:
+    if found.selected:
+        return f"bampipe extend RUN {found.selected[0]} --model {model}"
+    unknown: Sequence[str] = [
+        axis
+        for axis, a in zip(found.evidence.system.coordinates, found.axes, strict=True)
+        if a.verdict == "unknown_effect"
+    ]
+    if unknown:
+        return (
+            f"look at the residual maps of {', '.join(unknown)} with `bampipe report RUN`, write "
+            "an effect file of that shape, and add it with `bampipe extend RUN FILE`"
+        )
+    return "nothing to add; `bampipe report RUN` writes it up"
