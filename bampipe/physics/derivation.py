@@ -69,10 +69,15 @@ class Equations:
     linear: list[bool]
 
 
+def constant_symbol(name: str) -> Any:
+    """Symbol that stands for a constant where its number is not put in."""
+    return sp.Symbol(f"constant {name}", real=True)
+
+
 class _Derivation:
     """Working state while the equations of one model are put together."""
 
-    def __init__(self, model: Model) -> None:
+    def __init__(self, model: Model, named_constants: bool = False) -> None:
         self.model = model
         device = model.device
         self.axes = [c.name for c in device.coordinates]
@@ -94,7 +99,10 @@ class _Derivation:
         self.sizes: dict[str, int] = {}
         self.base: Symbols = dict(zip(self.axes, self.q, strict=True))
         self.base |= {f"qd_{a}": s for a, s in zip(self.axes, self.qd, strict=True)}
-        self.base |= {name: sp.Float(c.value) for name, c in device.constants.items()}
+        self.base |= {
+            name: constant_symbol(name) if named_constants else sp.Float(c.value)
+            for name, c in device.constants.items()
+        }
         self.base |= {p.name: self.p[p.name] for p in device.parameters if "." not in p.name}
         self.base |= self.channel
         for name, tree in device.definitions.items():
@@ -263,14 +271,19 @@ def _lagrange(
     return mass, bias
 
 
-def derive(model: Model) -> Equations:
+def derive(model: Model, named_constants: bool = False) -> Equations:
     """Derive the equations of motion of ``model``.
+
+    Args:
+        model: the device and its effects.
+        named_constants: leave the device's constants as symbols, for people to read.
 
     Raises:
         InputError: an expression uses a name that does not exist there, or the mass matrix is
             singular everywhere.
     """
-    d = _Derivation(model)
+    d = _Derivation(model, named_constants)
+    constants = [constant_symbol(c) for c in model.device.constants if named_constants]
     device, axes = model.device, d.axes
     n = len(axes)
     raw_applied = d.table(device.applied, "applied")
@@ -334,14 +347,14 @@ def derive(model: Model) -> Equations:
             z_names.append(f"{item.prefix}.{state.name}")
             rates.append(d.own(item, state.rate, symbols, f"states.{state.name}.rate"))
             initial.append(d.own(item, state.initial, symbols, f"states.{state.name}.initial"))
-    free, u, force0 = [*d.p.values()], [*d.channel.values()], [*forces, d.channel["t"]]
+    free, u, force0 = [*d.p.values(), *constants], [*d.channel.values()], [*forces, d.channel["t"]]
     motion, memory = [*d.q, *d.qd], [*d.z.values()]
     gains = [entry for row in input_map for entry in row]
     words = "motion, inputs, parameters and internal states"
     kinetics, potentials = zip(*energies, strict=True)
     _allow("the kinetic energy", [*kinetics], [*motion, *free], "positions, rates and parameters")
     _allow("the potential energy", [*potentials], [*d.q, *free], "positions and parameters")
-    _allow("the effect of a force on the axes", gains, d.q, "positions")
+    _allow("the effect of a force on the axes", gains, [*d.q, *constants], "positions")
     _allow("a torque", other, [*motion, *u, *free, *memory, *w], words)
     _allow("the applied force", applied, [*motion, *u, *free, *memory], words)
     _allow("the rate of an internal state", rates, [*motion, *u, *free, *memory], words)
@@ -353,7 +366,7 @@ def derive(model: Model) -> Equations:
     bias = [sum(t[1][i] for t in terms) for i in range(n)]
     for row, term in zip(mass, bias, strict=True):
         _allow("the equation of motion", [*row, term], [*motion, *free], "motion and parameters")
-    _check_inertia(model, mass, d.q)
+    _check_inertia(model, mass, [*d.q, *constants])
     kinetic, potential = (sum(parts) for parts in zip(*energies, strict=True))
 
     offset_rate = [d.ddt(e) for e in offset]

@@ -1,0 +1,92 @@
+"""A device's equations of motion as a person would write them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import sympy as sp
+from sympy.printing.str import StrPrinter
+
+from bampipe.physics.derivation import constant_symbol, derive
+from bampipe.physics.device import Device
+from bampipe.physics.model import Model
+
+
+class _Notation(StrPrinter):  # type: ignore[misc]
+    """Sympy's text, with ``^`` for powers and spaces for products."""
+
+    def _print_Pow(self, expr: Any, rational: bool = False) -> str:
+        return super()._print_Pow(expr, rational).replace("**", "^")
+
+    def _print_Mul(self, expr: Any) -> str:
+        return super()._print_Mul(expr).replace("*", " ")
+
+
+def describe_equations(device: Device) -> str:
+    """The derived equations of motion, line by line.
+
+    Rates carry primes: ``θ'`` is the first, ``θ''`` the second derivative. Numbers of the device
+    stand by their names; definitions are put in.
+
+    Args:
+        device: from `registry.device_from`.
+
+    Returns:
+        Text of several lines: coordinates, energies, mass matrix M, terms h, generalised forces Q
+        of M q'' + h = Q.
+
+    Raises:
+        InputError: an expression of the device is wrong.
+    """
+    model = Model(device)
+    e = derive(model, named_constants=True)
+    marks = [c.symbol for c in device.coordinates]
+    names: dict[Any, Any] = {}
+    for group, suffix in ((e.q, ""), (e.qd, "'"), (e.qdd, "''")):
+        names |= {s: sp.Symbol(m + suffix, real=True) for s, m in zip(group, marks, strict=True)}
+    for symbol, label in [
+        *zip(e.u, e.inputs, strict=True),
+        *zip(e.p, (p.name for p in model.parameters), strict=True),
+    ]:
+        names[symbol] = sp.Symbol(label, real=True)
+    names |= {constant_symbol(c): sp.Symbol(c, real=True) for c in device.constants}
+    quiet = dict.fromkeys(e.w, 0)
+    sign = sp.Function("sgn")
+
+    def text(expr: Any) -> str:
+        plain = sp.sympify(expr).subs(quiet)
+        for rate in e.qd:
+            plain = plain.replace(
+                lambda f, rate=rate: isinstance(f, sp.tanh) and f.args[0].free_symbols == {rate},
+                lambda f, rate=rate: sign(rate),
+            )
+        return str(_Notation().doprint(plain.xreplace(names)))
+
+    lines = [f"{device.name}: {device.summary}", "", "Coordinates"]
+    for c in device.coordinates:
+        lines.append(f"  {c.symbol} = {c.name}, {c.unit}; generalised force in {c.torque_unit}")
+    lines += ["", "Energies"]
+    lines += [f"  kinetic   = {text(sp.factor_terms(sp.simplify(e.kinetic)))}"]
+    lines += [f"  potential = {text(e.potential)}", "", "M q'' + h = Q, where"]
+    for i, a in enumerate(marks):
+        for j, b in enumerate(marks):
+            if j >= i and e.mass[i][j] != 0:
+                lines.append(f"  M[{a},{b}] = {text(e.mass[i][j])}")
+    lines += [f"  h[{a}] = {text(h)}" for a, h in zip(marks, e.bias, strict=True)]
+    for a, applied, other in zip(marks, e.applied, e.other, strict=True):
+        lines.append(f"  Q[{a}] = {text(applied + other)}")
+    lines += ["", "Numbers", *_numbers(device)]
+    return "\n".join(lines) + "\n"
+
+
+def _numbers(device: Device) -> list[str]:
+    """One line a constant and a parameter: value, unit, where from."""
+    rows: Mapping[str, tuple[str, str]] = {
+        **{n: (f"{c.value:g} {c.unit}", c.source) for n, c in device.constants.items()},
+        **{
+            p.name: (f"{p.prior:g} ± {p.sd:g} {p.unit}", "prior, to be estimated")
+            for p in device.parameters
+        },
+    }
+    return [f"  {n} = {v.strip()}" + (f"  ({s})" if s else "") for n, (v, s) in rows.items()]

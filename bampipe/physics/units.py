@@ -1,0 +1,358 @@
+"""Dimensional analysis of device and effect files.
+
+Units are written as products such as ``N.m.s/rad`` or ``kg.m2``: names joined by ``.``, each with
+an optional whole exponent, and ``/`` before every name that divides. Only coherent SI units are
+known, because values are used as they stand. A radian counts as a pure number.
+
+A number in an expression is pure if it is a multiple of one quarter; any other may carry a unit
+that the text does not show, and is let pass. Give such a number a name and a unit instead.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from fractions import Fraction
+
+from bampipe.errors import InputError
+from bampipe.physics import expression
+from bampipe.physics.device import Device
+from bampipe.physics.effect import BoundEffect, Effect, bind, derivative
+
+BASE = ("kg", "m", "s", "A", "K")
+
+
+@dataclass(frozen=True)
+class Dimension:
+    """Exponents of the SI base units in `BASE`."""
+
+    exponents: tuple[Fraction, ...] = (Fraction(0),) * len(BASE)
+
+    def __mul__(self, other: Dimension) -> Dimension:
+        pairs = zip(self.exponents, other.exponents, strict=True)
+        return Dimension(tuple(a + b for a, b in pairs))
+
+    def __truediv__(self, other: Dimension) -> Dimension:
+        return self * other**-1
+
+    def __pow__(self, power: Fraction | int) -> Dimension:
+        return Dimension(tuple(e * power for e in self.exponents))
+
+    def __str__(self) -> str:
+        for name in ("N.m", "N", "W"):
+            if self == parse_unit(name, name):
+                return name
+        above = [(b, e) for b, e in zip(BASE, self.exponents, strict=True) if e > 0]
+        below = [(b, -e) for b, e in zip(BASE, self.exponents, strict=True) if e < 0]
+        text = ".".join(f"{b}{'' if e == 1 else e}" for b, e in above) or "1"
+        text += "".join(f"/{b}{'' if e == 1 else e}" for b, e in below)
+        return "a pure number" if text == "1" else text
+
+
+PURE = Dimension()
+
+
+def _of(kg: int = 0, m: int = 0, s: int = 0, ampere: int = 0, kelvin: int = 0) -> Dimension:
+    return Dimension(tuple(Fraction(e) for e in (kg, m, s, ampere, kelvin)))
+
+
+_UNITS = {
+    "1": PURE,
+    "rad": PURE,
+    "m": _of(m=1),
+    "kg": _of(kg=1),
+    "s": _of(s=1),
+    "A": _of(ampere=1),
+    "K": _of(kelvin=1),
+    "Hz": _of(s=-1),
+    "N": _of(1, 1, -2),
+    "Pa": _of(1, -1, -2),
+    "J": _of(1, 2, -2),
+    "W": _of(1, 2, -3),
+    "V": _of(1, 2, -3, -1),
+    "Ohm": _of(1, 2, -3, -2),
+    "H": _of(1, 2, -2, -2),
+    "F": _of(-1, -2, 4, 2),
+    "C": _of(s=1, ampere=1),
+    "T": _of(1, 0, -2, -1),
+    "Wb": _of(1, 2, -2, -1),
+}
+_FACTOR = re.compile(r"([A-Za-z]+|1)(-?\d{1,2})?\Z")
+
+
+def parse_unit(text: str, where: str) -> Dimension:
+    """Dimension of a unit such as ``N.m.s2/rad2``; ``""`` is a pure number.
+
+    Args:
+        text: the unit.
+        where: file and field, for messages.
+
+    Raises:
+        InputError: it is not a product of known coherent SI units.
+    """
+    total = PURE
+    if not text:
+        return total
+    for sign, part in zip("." + re.sub(r"[^./]", "", text), re.split(r"[./]", text), strict=True):
+        match = _FACTOR.match(part)
+        if not match or match[1] not in _UNITS:
+            raise InputError(
+                f"unit {text!r:.60}: {part!r:.30} is not an SI unit known here",
+                where=where,
+                remedy=f"write products like N.m.s/rad of {', '.join(_UNITS)}",
+            )
+        total *= _UNITS[match[1]] ** (int(match[2] or 1) * (1 if sign == "." else -1))
+    return total
+
+
+class _Mismatch(Exception):
+    """Two quantities of an expression do not fit together; the text says which."""
+
+
+# A dimension, or None where a number might carry any.
+Found = Dimension | None
+
+
+def _number(value: float) -> Found:
+    return PURE if 4 * value == int(4 * value) and value != 0 else None
+
+
+def dimension(tree: ast.expr, symbols: Mapping[str, Found]) -> Found:
+    """Dimension of a checked expression, ``None`` where a number in it might carry any unit.
+
+    Args:
+        tree: from `expression.parse`.
+        symbols: dimension of every name in it.
+
+    Raises:
+        InputError: a name is unknown, or quantities of unlike dimension are added or compared, or
+            a function is given one that it cannot take.
+    """
+    try:
+        return _walk(tree, symbols)
+    except _Mismatch as error:
+        raise InputError(str(error)) from None
+
+
+def _walk(node: ast.expr, symbols: Mapping[str, Found]) -> Found:
+    match node:
+        case ast.Constant(value=value):
+            return _number(float(value))  # type: ignore[arg-type]
+        case ast.Name(id=name):
+            if name not in symbols:
+                raise _Mismatch(f"unknown symbol {name!r}{expression.did_you_mean(name, symbols)}")
+            return symbols[name]
+        case ast.UnaryOp(operand=operand):
+            return _walk(operand, symbols)
+        case ast.BinOp(left=left, op=ast.Pow(), right=right):
+            base = _walk(left, symbols)
+            power = Fraction(ast.literal_eval(right)).limit_denominator(1000)
+            return None if base is None else base**power
+        case ast.BinOp(left=left, op=op, right=right):
+            a, b = _walk(left, symbols), _walk(right, symbols)
+            if isinstance(op, ast.Add | ast.Sub):
+                return _alike(node, [left, right], [a, b])
+            if a is None or b is None:
+                return None
+            return a * b if isinstance(op, ast.Mult) else a / b
+        case ast.Call(func=ast.Name(id=name), args=args):
+            return _call(node, name, args, [_walk(a, symbols) for a in args])
+    raise AssertionError(f"unchecked node {type(node).__name__}")
+
+
+def _alike(node: ast.expr, parts: list[ast.expr], found: list[Found]) -> Found:
+    """Common dimension of ``parts``, which are added or compared in ``node``."""
+    pairs = [(p, f) for p, f in zip(parts, found, strict=True) if f is not None]
+    for part, other in pairs[1:]:
+        if other != pairs[0][1]:
+            raise _Mismatch(
+                f"{_short(node)} puts together {_short(pairs[0][0])} ({pairs[0][1]}) "
+                f"and {_short(part)} ({other})"
+            )
+    return pairs[0][1] if pairs else None
+
+
+def _call(node: ast.expr, name: str, args: list[ast.expr], found: list[Found]) -> Found:
+    match name:
+        case "abs":
+            return found[0]
+        case "sgn" | "heaviside":
+            return PURE
+        case "sqrt":
+            return None if found[0] is None else found[0] ** Fraction(1, 2)
+        case "ddt":
+            return None if found[0] is None else found[0] / _UNITS["s"]
+        case "min" | "max" | "clip":
+            return _alike(node, args, found)
+    if found[0] not in (None, PURE):
+        raise _Mismatch(f"{name}() takes a pure number, and {_short(args[0])} is in {found[0]}")
+    return PURE
+
+
+def _short(node: ast.expr) -> str:
+    text = ast.unparse(node)
+    return repr(text if len(text) <= 60 else text[:57] + "...")
+
+
+class _Check:
+    """Sentences about one file, collected while its expressions are gone through."""
+
+    def __init__(self) -> None:
+        self.found: list[str] = []
+
+    def unit(self, text: str, field: str) -> Found:
+        """Dimension of a unit; a wrong one becomes a sentence and stays unknown."""
+        try:
+            return parse_unit(text, field)
+        except InputError as error:
+            self.found.append(str(error))
+            return None
+
+    def named(self, text: str, field: str, wanted: Dimension) -> None:
+        """A unit that must have the dimension ``wanted``."""
+        given = self.unit(text, field)
+        if given not in (None, wanted):
+            self.found.append(f"{field}: unit {text!r} where {wanted} is needed")
+
+    def expression(
+        self, tree: ast.expr, symbols: Mapping[str, Found], field: str, wanted: Found
+    ) -> Found:
+        """An expression that must have the dimension ``wanted``; any if that is ``None``."""
+        try:
+            given = dimension(tree, symbols)
+        except InputError as error:
+            self.found.append(f"{field}: {error}")
+            return wanted
+        if None not in (given, wanted) and given != wanted:
+            self.found.append(f"{field}: is {given} where {wanted} is needed")
+        return given
+
+
+def _axes(device: Device) -> Iterator[tuple[str, Dimension, Dimension]]:
+    """Name, dimension of the coordinate and of its generalised force, per axis."""
+    for c in device.coordinates:
+        yield c.name, parse_unit(c.unit, c.name), parse_unit(c.torque_unit, c.name)
+
+
+def _device_symbols(device: Device, check: _Check) -> dict[str, Found]:
+    """Dimension of every name that the device's expressions may use."""
+    second = _UNITS["s"]
+    symbols: dict[str, Found] = {"t": second}
+    for axis, unit, torque in _axes(device):
+        symbols |= {axis: unit, f"qd_{axis}": unit / second}
+        if axis in device.brakes:
+            symbols[device.brakes[axis]] = torque
+    force = check.unit(device.force_unit, "inputs.force_unit")
+    for channel in device.forces:
+        for order in (0, 1, 2):
+            known = None if force is None else force / second**order
+            symbols[derivative(channel, order)] = known
+    for name, constant in device.constants.items():
+        symbols[name] = check.unit(constant.unit, f"constants.{name}")
+    for parameter in device.parameters:
+        symbols[parameter.name] = check.unit(parameter.unit, f"parameters.{parameter.name}")
+    for name, tree in device.definitions.items():
+        symbols[name] = check.expression(tree, symbols, f"definitions.{name}", None)
+    return symbols
+
+
+def check_device(device: Device) -> list[str]:
+    """What is inconsistent in the units and symbols of a device file; empty if nothing is.
+
+    Args:
+        device: from `registry.device_from`.
+
+    Returns:
+        One plain sentence a finding, the field first.
+    """
+    check, joule = _Check(), _UNITS["J"]
+    symbols = _device_symbols(device, check)
+    check.expression(device.kinetic, symbols, "energy.kinetic", joule)
+    check.expression(device.potential, symbols, "energy.potential", joule)
+    noise = device.declaration.get("process_noise", {})
+    for axis, unit, torque in _axes(device):
+        for label, table in (("torque", device.torque), ("applied", device.applied)):
+            if axis in table:
+                check.expression(table[axis], symbols, f"{label}.{axis}", torque)
+        if axis in device.side_load:
+            check.expression(device.side_load[axis], symbols, f"side_load.{axis}", None)
+        for name, gains in device.process_noise.items():
+            if axis in gains:
+                field = f"process_noise.{name}"
+                own = check.unit(str(noise[name].get("unit", "")), f"{field}.unit")
+                wanted = None if own is None else torque / own
+                check.expression(gains[axis], symbols, f"{field}.torque.{axis}", wanted)
+        if axis in device.frictional:
+            wanted_units = {"viscous": torque * _UNITS["s"] / unit, "coulomb": torque}
+            for p in device.parameters:
+                term, _, place = p.name.partition(".")
+                if place == axis:
+                    check.named(p.unit, f"friction.{axis}.{term}", wanted_units[term])
+    return list(dict.fromkeys(check.found))
+
+
+def _effect_symbols(item: BoundEffect, device: Device, check: _Check) -> dict[str, Found]:
+    """Dimension of every name that the expressions of a bound effect may use."""
+    second = _UNITS["s"]
+    symbols = _device_symbols(device, _Check())
+    for axis, unit, torque in _axes(device):
+        symbols |= dict.fromkeys((f"applied_{axis}", f"load_{axis}", f"coulomb_{axis}"), torque)
+        symbols[f"viscous_{axis}"] = torque * second / unit
+        if axis == item.target and item.effect.scope == "axis":
+            symbols |= {"q": unit, "qd": unit / second, "brake": torque, "side_load": None}
+            symbols |= dict.fromkeys(("applied", "load", "coulomb"), torque)
+            symbols["viscous"] = torque * second / unit
+            if axis in device.side_load:
+                side = device.side_load[axis]
+                symbols["side_load"] = check.expression(side, symbols, f"side_load.{axis}", None)
+    if item.effect.scope in ("force_component", "force_pair"):
+        for letter in "fg"[: 1 + (item.effect.scope == "force_pair")]:
+            for order, suffix in enumerate(("", "_rate", "_curvature")):
+                symbols[letter + suffix] = symbols[derivative(device.forces[0], order)]
+    for p in item.parameters:
+        short = p.name.removeprefix(f"{item.prefix}.")
+        symbols[short] = check.unit(p.unit, f"parameters.{short}.unit")
+    return symbols
+
+
+def check_effect(effect: Effect, device: Device, target: str = "") -> list[str]:
+    """What is inconsistent in the units and symbols of an effect at ``target`` of ``device``.
+
+    Args:
+        effect: from `registry.effect_from`.
+        device: where it is to act.
+        target: axis, force component or pair; empty for an effect of scope ``device``.
+
+    Returns:
+        One plain sentence a finding, the field first; empty if all is consistent.
+
+    Raises:
+        InputError: the target does not exist.
+    """
+    check = _Check()
+    item = bind(effect, target, device)
+    symbols = _effect_symbols(item, device, check)
+    kind = device.coordinate(target).kind if effect.scope == "axis" else ""
+    for state in effect.states:
+        entry = state.entry.get(kind, state.entry)
+        unit = str(entry.get("unit", "")) if isinstance(entry, Mapping) else ""
+        symbols[state.name] = check.unit(unit, f"states.{state.name}.unit")
+    force = symbols[device.forces[0]] if device.forces else None
+    wanted: dict[str, Callable[[str], Found]] = {
+        "torque": {axis: torque for axis, _, torque in _axes(device)}.get,
+        "offset": {axis: unit for axis, unit, _ in _axes(device)}.get,
+        "input": lambda _: force,
+        "kinetic": lambda _: _UNITS["J"],
+        "potential": lambda _: _UNITS["J"],
+    }
+    for key, tree in effect.expressions.items():
+        term, _, place = key.partition(".")
+        check.expression(tree, symbols, key, wanted[term](place or target))
+    for state in effect.states:
+        own = symbols[state.name]
+        rate = None if own is None else own / _UNITS["s"]
+        check.expression(state.rate, symbols, f"states.{state.name}.rate", rate)
+        check.expression(state.initial, symbols, f"states.{state.name}.initial", own)
+    return list(dict.fromkeys(check.found))

@@ -1,0 +1,88 @@
+"""The equations of motion as text."""
+
+import numpy as np
+import pytest
+import sympy as sp
+
+from bampipe.errors import InputError
+from bampipe.physics import Model, compile_model, registry
+from bampipe.physics.readable import describe_equations
+
+BAM = registry.device("bam")
+
+
+@pytest.fixture(scope="module")
+def lines():
+    text = describe_equations(BAM)
+    return dict(line.strip().split(" = ", 1) for line in text.splitlines() if " = " in line)
+
+
+def value(text, q, qd, qdd=None):
+    """Number that a printed expression stands for."""
+    numbers = {c: v.value for c, v in BAM.constants.items()} | {"mass": 3.56}
+    for mark, i in (("θ", 0), ("φ", 1), ("r", 2)):
+        numbers |= {mark: q[i], f"{mark}p": qd[i]}
+    python = text.replace("'", "p").replace(" ", "*").replace("*+*", "+").replace("*-*", "-")
+    python = python.replace("^", "**")
+    names = {n: sp.Symbol(n) for n in numbers}
+    return float(sp.sympify(python, locals=names).subs({names[n]: v for n, v in numbers.items()}))
+
+
+def test_printed_mass_matrix_and_bias_are_those_that_are_computed(lines):
+    system = compile_model(Model(BAM))
+    q, qd = np.array([0.2, 0.4, 1.1]), np.array([0.5, -0.3, 0.2])
+    matrix = system.mass_matrix(q[None], system.prior)[0]
+    assert value(lines["M[θ,θ]"], q, qd) == pytest.approx(matrix[0, 0])
+    assert value(lines["M[θ,φ]"], q, qd) == pytest.approx(matrix[0, 1])
+    assert value(lines["M[φ,φ]"], q, qd) == pytest.approx(matrix[1, 1])
+    assert "M[θ,r]" not in lines
+    p = np.where([x.name == "mass" for x in system.parameters], 3.56, 0.0)
+    z, u = np.zeros((1, 0)), np.zeros((1, len(system.inputs)))
+    needed = system.required(q[None], qd[None], 0 * q[None], z, u, p)[0]
+    needed[1] += 3.56 * 9.81 * (1.1 - 0.461) * np.cos(0.4)
+    for i, mark in enumerate("θφr"):
+        assert value(lines[f"h[{mark}]"], q, qd) == pytest.approx(needed[i])
+
+
+def test_generalised_forces_are_named(lines):
+    assert lines["Q[θ]"] == (
+        "-brake_yaw sgn(θ') - coulomb.yaw sgn(θ') + force_x r cos(φ) - viscous.yaw θ'"
+    )
+    assert lines["L"] == "0.461 m  (Table II)"
+    assert lines["mass"] == "3.56 ± 0.5 kg  (prior, to be estimated)"
+
+
+def test_the_text_is_the_same_again():
+    assert describe_equations(BAM) == describe_equations(BAM)
+
+
+def test_names_of_constants_may_be_those_of_internal_symbols():
+    rail = registry.device_from(
+        {
+            "name": "rail",
+            "coordinates": {"s": {"kind": "linear"}},
+            "constants": {"p0": {"value": 2.0, "unit": "1"}, "q0": {"value": 3.0, "unit": "N"}},
+            "energy": {"kinetic": "p0*mass*ddt(s)**2/2", "potential": "q0*s"},
+            "inputs": {"force": ["force_x"]},
+            "applied": {"s": "force_x"},
+            "parameters": {"mass": {"unit": "kg", "prior": 2.0, "sd": 1.0}},
+        }
+    )
+    text = describe_equations(rail)
+    assert "M[s,s] = mass p0" in text
+    assert "h[s] = q0" in text
+
+
+def test_a_wrong_device_is_an_input_error():
+    rail = registry.device_from(
+        {
+            "name": "rail",
+            "coordinates": {"s": {"kind": "linear"}},
+            "energy": {"kinetic": "maas*ddt(s)**2/2"},
+            "inputs": {"force": ["force_x"]},
+            "applied": {"s": "force_x"},
+            "parameters": {"mass": {"unit": "kg", "prior": 2.0, "sd": 1.0}},
+        }
+    )
+    with pytest.raises(InputError, match="did you mean 'mass'"):
+        describe_equations(rail)

@@ -1,0 +1,207 @@
+"""Dimensional analysis: what is built in is consistent, what is not is said plainly."""
+
+import copy
+from fractions import Fraction
+
+import pytest
+from motions import declaration
+
+from bampipe.errors import InputError
+from bampipe.physics import expression, registry
+from bampipe.physics.units import PURE, check_device, check_effect, dimension, parse_unit
+
+BAM = registry.device("bam")
+
+
+def exponents(text):
+    return tuple(int(e) for e in parse_unit(text, "here").exponents)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("", (0, 0, 0, 0, 0)),
+        ("rad", (0, 0, 0, 0, 0)),
+        ("1/rad", (0, 0, 0, 0, 0)),
+        ("m/s2", (0, 1, -2, 0, 0)),
+        ("N.m.s/rad", (1, 2, -1, 0, 0)),
+        ("kg.m2", (1, 2, 0, 0, 0)),
+        ("N.m.s2/rad2", (1, 2, 0, 0, 0)),
+        ("rad/N/m", (-1, -2, 2, 0, 0)),
+        ("1/W", (-1, -2, 3, 0, 0)),
+        ("m.s-1", (0, 1, -1, 0, 0)),
+        ("N.m/A", (1, 2, -2, -1, 0)),
+        ("V.s/rad", (1, 2, -2, -1, 0)),
+        ("Ohm", (1, 2, -3, -2, 0)),
+    ],
+)
+def test_units_have_the_exponents_of_their_definitions(text, expected):
+    assert exponents(text) == expected
+
+
+def test_equal_quantities_in_other_words_are_equal():
+    for a, b in [("J", "N.m"), ("W", "N.m/s"), ("V.A", "W"), ("Ohm.A", "V"), ("H.A2", "J")]:
+        assert parse_unit(a, "") == parse_unit(b, "")
+    for a, b in [("C.V", "J"), ("F.V", "C"), ("Wb", "V.s"), ("T.m2", "Wb"), ("Pa.m2", "N")]:
+        assert parse_unit(a, "") == parse_unit(b, "")
+
+
+@pytest.mark.parametrize(
+    "text", ["Nm", "mm", "deg", "N*m", "m^2", "N..m", "/s", "m2.", "m s", "µm"]
+)
+def test_a_unit_that_is_not_coherent_si_is_refused(text):
+    with pytest.raises(InputError, match="not an SI unit"):
+        parse_unit(text, "constants.L")
+
+
+def test_dimensions_print_as_units():
+    assert str(parse_unit("J", "")) == "N.m"
+    assert str(parse_unit("N.s/m", "")) == "kg/s"
+    assert str(parse_unit("m2/s3", "")) == "m2/s3"
+    assert str(parse_unit("1/s", "")) == "1/s"
+    assert str(PURE) == "a pure number"
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("a*b/c", "m.kg/s"),
+        ("sqrt(a**4)", "m2"),
+        ("a**0.5*a**1.5", "m2"),
+        ("ddt(a)*c", "m"),
+        ("sgn(a)*b", "kg"),
+        ("max(a, a*2)", "m"),
+        ("clip(a, -a, 3*a)", "m"),
+        ("b*exp(-a/a)", "kg"),
+        ("-a + 0", "m"),
+        ("abs(a)*heaviside(c)", "m"),
+        ("a/2 + 0.25*a", "m"),
+    ],
+)
+def test_expressions_have_the_dimension_of_their_parts(text, expected):
+    symbols = {"a": parse_unit("m", ""), "b": parse_unit("kg", ""), "c": parse_unit("s", "")}
+    assert dimension(expression.parse(text, ""), symbols) == parse_unit(expected, "")
+
+
+def test_a_number_that_may_carry_a_unit_is_let_pass():
+    symbols = {"a": parse_unit("m", ""), "c": parse_unit("s", "")}
+    assert dimension(expression.parse("a/0.02", ""), symbols) is None
+    assert dimension(expression.parse("c + 0.002", ""), symbols) == parse_unit("s", "")
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("a + c", "'a + c' puts together 'a' (m) and 'c' (s)"),
+        ("max(a, c)", "puts together"),
+        ("sin(a)", "sin() takes a pure number, and 'a' is in m"),
+        ("exp(a*c)", "exp() takes a pure number"),
+        ("a + 1", "'1' (a pure number)"),
+        ("a*d", "unknown symbol 'd'"),
+    ],
+)
+def test_unlike_quantities_are_named(text, says):
+    symbols = {"a": parse_unit("m", ""), "c": parse_unit("s", "")}
+    with pytest.raises(InputError) as caught:
+        dimension(expression.parse(text, ""), symbols)
+    assert says in str(caught.value)
+
+
+@pytest.mark.parametrize("name", registry.device_names())
+def test_built_in_devices_are_consistent(name):
+    assert check_device(registry.device(name)) == []
+
+
+@pytest.mark.parametrize("name", registry.effect_names())
+def test_built_in_effects_are_consistent_at_every_target(name):
+    effect = registry.effect(name)
+    targets = effect.targets(BAM)
+    assert targets
+    for target in targets:
+        assert check_effect(effect, BAM, target) == []
+
+
+def wrong_device(change):
+    entries = declaration()
+    change(entries)
+    return check_device(registry.device_from(entries))
+
+
+def test_a_wrong_unit_in_a_device_is_found_where_it_matters():
+    found = wrong_device(lambda d: d["constants"]["I_g"].update(unit="kg.m"))
+    assert len(found) == 1
+    assert found[0].startswith("energy.kinetic: ")
+    assert "(kg.m)" in found[0]
+
+
+def test_a_wrong_expression_in_a_device_is_found():
+    found = wrong_device(lambda d: d["applied"].update(pitch="force_y"))
+    assert found == ["applied.pitch: is N where N.m is needed"]
+    found = wrong_device(lambda d: d["energy"].update(potential="mass*g*sin(pitch)"))
+    assert found == ["energy.potential: is N where N.m is needed"]
+    found = wrong_device(lambda d: d["definitions"].update(rho="extension - pitch"))
+    assert found == [
+        "definitions.rho: 'extension - pitch' puts together 'extension' (m) "
+        "and 'pitch' (a pure number)"
+    ]
+
+
+def test_wrong_units_of_friction_and_noise_are_found():
+    found = wrong_device(lambda d: d["friction"]["yaw"]["viscous"].update(unit="N.m.s2/rad"))
+    assert found == ["friction.yaw.viscous: unit 'N.m.s2/rad' where kg.m2/s is needed"]
+    found = wrong_device(lambda d: d["process_noise"]["gravity_compensator"].update(unit="N"))
+    assert found == [
+        "process_noise.gravity_compensator.torque.pitch: is a pure number where m is needed"
+    ]
+    found = wrong_device(lambda d: d["inputs"].update(force_unit="N.m"))
+    assert [f.partition(":")[0] for f in found] == [
+        "applied.yaw",
+        "applied.pitch",
+        "applied.extension",
+    ]
+
+
+def test_an_unknown_unit_or_symbol_is_a_sentence_not_an_error():
+    found = wrong_device(lambda d: d["constants"]["L"].update(unit="inch"))
+    assert len(found) == 1
+    assert "constants.L" in found[0]
+    assert "'inch'" in found[0]
+    found = wrong_device(lambda d: d["torque"].update(pitch="compensatoin"))
+    assert found == ["torque.pitch: unknown symbol 'compensatoin', did you mean 'compensation'?"]
+
+
+def wrong_effect(name, target, **changes):
+    entries = copy.deepcopy(dict(registry.effect(name).declaration))
+    for key, value in changes.items():
+        entries[key] = value
+    return check_effect(registry.effect_from(entries), BAM, target)
+
+
+def test_a_wrong_effect_is_found():
+    assert wrong_effect("stribeck", "yaw", torque="-force*exp(-(qd/speed)**2)*qd") == [
+        "torque: is W where N.m is needed"
+    ]
+    found = wrong_effect("stribeck", "extension", torque="-force*exp(-qd**2/speed)*sgn(qd)")
+    assert found == ["torque: exp() takes a pure number, and '-qd ** 2 / speed' is in m/s"]
+    assert wrong_effect("force_bias", "x", input="f - bias*t") == [
+        "input: 'f - bias * t' puts together 'f' (N) and 'bias * t' (kg.m/s)"
+    ]
+    assert wrong_effect("transmission_compliance", "yaw", offset="compliance*q")[0].startswith(
+        "offset: is "
+    )
+    states = {"deflection": {"unit": "", "rate": "qd - deflection/distance"}}
+    assert "puts together" in wrong_effect("presliding", "extension", states=states)[0]
+
+
+def test_a_finding_may_depend_on_the_kind_of_axis():
+    torque = "-force*sin(q)"
+    assert wrong_effect("stribeck", "yaw", torque=torque) == []
+    assert wrong_effect("stribeck", "extension", torque=torque) == [
+        "torque: sin() takes a pure number, and 'q' is in m"
+    ]
+
+
+def test_exponents_stay_exact():
+    metre = parse_unit("m", "")
+    assert (metre ** Fraction(1, 2)) ** 2 == metre
+    assert metre / metre == PURE
