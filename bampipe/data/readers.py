@@ -188,7 +188,6 @@ def _read_csv(path: Path, columns: Sequence[str], name: str, largest: int) -> Ra
         end, notes = _sound_end(stream, len(header), name)
         stream.seek(0)
         parts: dict[str, list[np.ndarray]] = {column: [] for column in columns}
-        torn: list[Any] = []
         rows = 0
         try:
             reader = pa_csv.open_csv(
@@ -199,9 +198,6 @@ def _read_csv(path: Path, columns: Sequence[str], name: str, largest: int) -> Ra
                     skip_rows=1,
                     # Names that are not wanted may be repeated or empty: a number stands for them.
                     column_names=[c if c in columns else f"\0{n}" for n, c in enumerate(header)],
-                ),
-                parse_options=pa_csv.ParseOptions(
-                    invalid_row_handler=lambda row: (torn.append(row), "error")[1]
                 ),
                 convert_options=pa_csv.ConvertOptions(
                     column_types=dict.fromkeys(columns, pa.float64()),
@@ -217,7 +213,7 @@ def _read_csv(path: Path, columns: Sequence[str], name: str, largest: int) -> Ra
                     values = batch.column(column).to_numpy(zero_copy_only=False)
                     parts[column].append(np.array(values, dtype=np.float64))
         except pa.ArrowInvalid as error:
-            raise _csv_fault(path, error, torn, header, name) from error
+            raise _csv_fault(path, str(error), header, name) from error
     return RawTrial(_joined(parts), first_row=2, notes=notes)
 
 
@@ -293,28 +289,28 @@ def _sound_end(stream: BinaryIO, width: int, name: str) -> tuple[int, tuple[str,
     return start + cut + 1, ("last line is cut off: 1 row dropped",)
 
 
-def _csv_fault(
-    path: Path, error: pa.ArrowInvalid, torn: list[Any], header: list[str], name: str
-) -> InputError:
+def _csv_fault(path: Path, message: str, header: list[str], name: str) -> InputError:
     """The plain form of what Arrow says about a CSV file."""
+    torn = re.search(
+        r"Row #(\d+): Expected (\d+) columns, got (\d+): (.*?)(?: \.\.\.)?$", message, re.DOTALL
+    )
     if torn:
-        row = torn[0]
-        expected, actual = row.expected_columns, row.actual_columns
-        remedy = "the line is damaged"
-        if actual > expected and re.fullmatch(r'[\s"0-9,+-]*', row.text):
-            remedy = "decimal commas? export with points as decimal sign"
+        row, expected, actual, text = int(torn[1]), int(torn[2]), int(torn[3]), torn[4]
+        commas = actual > expected and re.fullmatch(r'[\s"0-9,+-]*', text)
         return InputError(
             f"{actual} cells, where the header has {expected}",
-            where=f"{name}, row {_line(path, row.number)}",
-            remedy=remedy,
+            where=f"{name}, row {_line(path, row)}",
+            remedy="decimal commas? export with points as decimal sign"
+            if commas
+            else "the line is damaged",
         )
     cell = re.search(
-        r"In CSV column #(\d+): (?:Row #(\d+): )?.*invalid value '(.*)'", str(error), re.DOTALL
+        r"In CSV column #(\d+): (?:Row #(\d+): )?.*invalid value '(.*)'", message, re.DOTALL
     )
     if cell is None:
-        if "Could not skip" in str(error):
+        if "Could not skip" in message:
             return InputError("a header but no samples", where=name)
-        what = "a line is far too long" if "straddl" in str(error) else str(error)
+        what = "a line is far too long" if "straddl" in message else message
         return InputError(what, where=name)
     column, row_number, value = header[int(cell[1])], cell[2], cell[3]
     shown = value if value.isprintable() and len(value) <= 40 else ascii(value)[1:41]
@@ -388,6 +384,7 @@ _MAT_FAULTS = (
     EOFError,
     AttributeError,
     UnicodeError,
+    RuntimeError,
     zlib.error,
     struct.error,
 )

@@ -60,7 +60,7 @@ def test_toml_that_is_broken_is_named_with_its_line(tmp_path, content, message):
 
 def test_missing_files_are_named(tmp_path):
     for read in (store.read_json, store.read_toml, store.read_parquet):
-        with pytest.raises(InputError, match="nowhere.*: no such file"):
+        with pytest.raises(InputError, match=r"nowhere.*: no such file"):
             read(tmp_path / "nowhere")
 
 

@@ -1,0 +1,207 @@
+"""Readers: the three kinds of file give the same numbers, and nothing but InputError."""
+
+from __future__ import annotations
+
+import io
+import tempfile
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pytest
+import scipy.io
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from bampipe.data import readers
+from bampipe.data.readers import read_trial
+from bampipe.errors import InputError
+
+TABLE = {
+    "time_us": np.arange(0, 40_000, 2000),
+    "enc": np.arange(20) - 7,
+    "force_v": np.linspace(-1, 1, 20).round(6),
+}
+QUICK = settings(
+    max_examples=150, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck)
+)
+
+
+def read(path, content, columns=tuple(TABLE), **more):
+    path.write_bytes(content)
+    return read_trial(path, columns, name=path.name, **more)
+
+
+def as_csv(table):
+    return pd.DataFrame(table).to_csv(index=False).encode()
+
+
+def as_parquet(table):
+    stream = io.BytesIO()
+    pd.DataFrame(table).to_parquet(stream)
+    return stream.getvalue()
+
+
+def as_mat(table, **options):
+    stream = io.BytesIO()
+    scipy.io.savemat(stream, table, **options)
+    return stream.getvalue()
+
+
+def as_mat73(table, userblock=512):
+    stream = io.BytesIO()
+    with h5py.File(stream, "w", userblock_size=userblock) as file:
+        for name, values in table.items():
+            file[name] = values[None, :]
+    content = stream.getvalue()
+    return b"MATLAB 7.3 MAT-file".ljust(userblock) + content[userblock:]
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("a.csv", as_csv(TABLE)),
+        ("A.CSV", as_csv(TABLE)),
+        ("a.parquet", as_parquet(TABLE)),
+        ("a.parquet", as_parquet(pd.DataFrame(TABLE).astype("float32"))),
+        ("a.mat", as_mat(TABLE, oned_as="row")),
+        ("a.mat", as_mat(TABLE, oned_as="column", do_compression=True)),
+        ("a.mat", as_mat(TABLE, format="4")),
+        ("a.mat", as_mat73(TABLE)),
+    ],
+)
+def test_all_kinds_of_file_give_the_same_numbers(tmp_path, name, content):
+    trial = read(tmp_path / name, content)
+    assert list(trial.columns) == list(TABLE) and trial.notes == ()
+    assert trial.first_row == (2 if name.lower().endswith("csv") else 1)
+    for column, values in TABLE.items():
+        assert trial.columns[column].dtype == np.float64
+        np.testing.assert_allclose(trial.columns[column], values, atol=1e-7)
+
+
+def test_empty_cells_and_words_for_missing_are_nan(tmp_path):
+    content = b"a,b\n1,\n,2\nNaN,NA\nnull,inf\n5,6\n"
+    columns = read(tmp_path / "a.csv", content, ("a", "b")).columns
+    np.testing.assert_array_equal(columns["a"], [1, np.nan, np.nan, np.nan, 5])
+    np.testing.assert_array_equal(columns["b"], [np.nan, 2, np.nan, np.inf, 6])
+
+
+def test_missing_parquet_values_are_nan(tmp_path):
+    table = pd.DataFrame({"a": pa.array([1, None, 3]).to_pandas(), "b": [1, 2, 3]})
+    columns = read(tmp_path / "a.parquet", as_parquet(table), ("a", "b")).columns
+    np.testing.assert_array_equal(columns["a"], [1, np.nan, 3])
+
+
+def test_many_blocks_are_joined_in_order(tmp_path, monkeypatch):
+    monkeypatch.setattr(readers, "_BLOCK", 1024)
+    monkeypatch.setattr(readers, "_BATCH_ROWS", 100)
+    table = {"a": np.arange(5000), "b": np.arange(5000) * 0.5}
+    for name, content in (("a.csv", as_csv(table)), ("a.parquet", as_parquet(table))):
+        columns = read(tmp_path / name, content, ("b", "a")).columns
+        np.testing.assert_array_equal(columns["a"], table["a"])
+        np.testing.assert_array_equal(columns["b"], table["b"])
+
+
+@pytest.mark.parametrize("blank", [0, 3])
+def test_a_bad_cell_is_found_in_any_block(tmp_path, monkeypatch, blank):
+    monkeypatch.setattr(readers, "_BLOCK", 1024)
+    lines = ["a,b"] + ["1,2"] * 10 + [""] * blank + ["1,2"] * 2000 + ["1,x"] + ["1,2"] * 2000
+    with pytest.raises(InputError, match=f"row {2012 + blank}, column 'b': found 'x'"):
+        read(tmp_path / "a.csv", "\n".join(lines).encode() + b"\n", ("a", "b"))
+
+
+@pytest.mark.parametrize(
+    ("content", "rows", "said"),
+    [
+        (b"a,b\n1,2.5\n3,4.5\n", 2, False),
+        (b"a,b\n1,2.5\n3,4.5", 2, False),
+        (b"a,b\n1,2.5\n3,4", 1, True),
+        (b"a,b\n1,2.5\n3,", 1, True),
+        (b"a,b\n1,2.5\n3", 1, True),
+        (b"a,b\n1,2.5\n3\n", 1, True),
+        (b"a,b\n1,2\n3,4", 1, True),
+        (b"a,b\r\n1,2.5\r\n3,4.", 1, True),
+        (b"a,b\r\n1,2.5\r\n3,4.5\r\n\r\n", 2, False),
+        (b"a,b\n1,2", 1, False),
+    ],
+)
+def test_a_last_line_that_may_be_cut_off_is_dropped_and_said(tmp_path, content, rows, said):
+    trial = read(tmp_path / "a.csv", content, ("a", "b"))
+    assert len(trial.columns["a"]) == rows
+    assert trial.notes == (("last line is cut off: 1 row dropped",) if said else ())
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("a.csv", as_csv(TABLE)),
+        ("a.parquet", as_parquet(TABLE)),
+        ("a.mat", as_mat(TABLE)),
+        ("a.mat", as_mat73(TABLE)),
+    ],
+)
+def test_a_trial_that_is_too_large_is_refused(tmp_path, name, content):
+    with pytest.raises(InputError, match="are more than the 0 MB allowed"):
+        read(tmp_path / name, content, largest_bytes=100)
+
+
+def test_a_mat_file_without_a_user_block(tmp_path):
+    stream = io.BytesIO()
+    with h5py.File(stream, "w") as file:
+        for name, values in TABLE.items():
+            file[name] = values
+    assert len(read(tmp_path / "a.mat", stream.getvalue()).columns["enc"]) == 20
+
+
+CELLS = st.one_of(
+    st.floats(allow_nan=True, allow_infinity=True).map(str),
+    st.integers().map(str),
+    st.text(max_size=6),
+)
+
+
+@QUICK
+@given(st.lists(st.lists(CELLS, min_size=1, max_size=4), max_size=8), st.sampled_from(",;\t"))
+def test_any_table_of_text_reads_or_is_refused_in_one_line(rows, delimiter):
+    content = "\n".join(["a,b", *(delimiter.join(row) for row in rows)])
+    check_reads_or_refuses("a.csv", content.encode("utf-8", "surrogatepass"), ("a", "b"))
+
+
+@QUICK
+@given(st.binary(max_size=300), st.sampled_from([".csv", ".parquet", ".mat"]))
+def test_any_bytes_are_refused_in_one_line(content, ending):
+    check_reads_or_refuses(f"a{ending}", content, ("a", "b"))
+
+
+WHOLE = {
+    "a.csv": as_csv(TABLE),
+    "b.parquet": as_parquet(TABLE),
+    "c.mat": as_mat(TABLE),
+    "d.mat": as_mat(TABLE, do_compression=True),
+    "e.mat": as_mat73(TABLE),
+}
+
+
+@settings(QUICK, max_examples=300)
+@given(st.sampled_from(sorted(WHOLE)), st.data())
+def test_a_file_with_bytes_changed_reads_or_is_refused_in_one_line(name, data):
+    content = bytearray(WHOLE[name])
+    for _ in range(data.draw(st.integers(1, 4))):
+        place = data.draw(st.integers(0, len(content) - 1))
+        content[place] = data.draw(st.integers(0, 255))
+    if data.draw(st.booleans()):
+        del content[data.draw(st.integers(0, len(content))) :]
+    check_reads_or_refuses(name, bytes(content), tuple(TABLE))
+
+
+def check_reads_or_refuses(name, content, columns):
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            trial = read(Path(folder) / name, content, columns, largest_bytes=1 << 20)
+        except InputError as error:
+            assert "\n" not in str(error) and str(error).startswith(name)
+        else:
+            lengths = {len(values) for values in trial.columns.values()}
+            assert len(lengths) == 1 and lengths.pop() > 0
