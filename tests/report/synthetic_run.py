@@ -149,15 +149,23 @@ def write_model(root: Path, model: str) -> None:
     text = f'schema = "bampipe.model/1"\nname = "{model}"\ndevice = "bam"\neffects = {effects}\n'
     write_text(root / f"models/{model}/model.toml", text)
     named = {
-        name: {"estimate": value, "sd": sd, "unit": unit}
+        name: {
+            "estimate": value, "sd": sd, "unit": unit, "at_bound": name == "stribeck.yaw.speed",
+            "filter_sd": 0.5 * sd, "least_squares": value + 0.4 * sd,
+        }
         for name, (value, sd, unit) in parameters(model).items()
-    }
+    }  # fmt: skip
     bounds = {
         "yaw": {"position": 2.8e-3, "velocity": 43e-3},
         "pitch": {"position": 5.2e-3, "velocity": 62e-3},
         "extension": {"position": 0.9e-3, "velocity": 19e-3},
     }
-    content = {"model": model, "method": "ukf", "parameters": named, "state_3sigma": bounds}
+    content = {
+        "model": model, "method": "ukf", "parameters": named, "state_3sigma": bounds,
+        "convergence": {"converged": True, "total_s": 48.0, "settled_s": {"mass": 16.93}},
+        "nis": {"mean": 1.0231, "by_trial": {}},
+        "input_timing": {"estimate": 1.2e-4, "sd": 3.1e-5, "unit": "s"},
+    }  # fmt: skip
     write_json(root / f"models/{model}/identify.json", content)
 
     def states(number: int) -> pd.DataFrame:
@@ -197,7 +205,15 @@ def write_validation(root: Path, model: str) -> None:
         }
         for axis, error in held_out(model).items()
     }  # fmt: skip
-    write_json(root / f"models/{model}/validate.json", {"model": model, "axes": axes})
+    content = {
+        "model": model,
+        "axes": axes,
+        "trials": {name: {**axes, "held_out": True} for name in FREE},
+        "forces": {"force_x": {"rmse": 0.1234, "unit": "N"}},
+        "cutoff_hz": 8.0,
+        "notes": ["A note of the validation."],
+    }
+    write_json(root / f"models/{model}/validate.json", content)
 
     def residuals(number: int) -> pd.DataFrame:
         frame = motion(number)
@@ -236,7 +252,8 @@ def write_diagnosis(root: Path, model: str) -> None:
             "velocity": _map("rad/s", speed, size * np.sign(speed) * np.exp(-((speed / 0.1) ** 2))),
             "position": _map("rad", speed, 0.05 * np.sin(9.0 * speed)),
             "acceleration": _map("rad/s2", 5.0 * speed, 0.04 * np.cos(5.0 * speed)),
-            "trial": _map("", list(FREE), np.array([0.02, -0.03, 0.01])),
+            "trial": _map("", [0.0, 1.0, 2.0], np.array([0.02, -0.03, 0.01])),
+            "direction": _map("", [-1.0, 1.0], np.array([0.02, -0.03])),
         }
         for axis in AXES
     }
@@ -259,6 +276,7 @@ def write_diagnosis(root: Path, model: str) -> None:
         else None,
         "maps": maps,
         "worst_windows": [window],
+        "next": "bampipe extend RUN stribeck:yaw --model base" if missing else "nothing to add",
         "sentence": "Yaw lacks friction that rises as it slows down."
         if missing
         else "Nothing that could be explained is left.",

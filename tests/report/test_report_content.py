@@ -81,13 +81,15 @@ def test_parameters_are_the_stored_ones_rounded_to_their_uncertainty(full: Repor
             if f"<code>{name}</code>" in row
         )
         shown = [text_of(f"<main>{cell}").strip() for cell in re.findall(r"<td.*?</td>", cells)]
-        estimate, spread = float(shown[2]), float(shown[3])
+        estimate, spread = float(shown[2].removesuffix(" *")), float(shown[3])
+        assert shown[2].endswith("*") == (name == "stribeck.yaw.speed")
+        assert float(shown[5]) == pytest.approx(value + 0.4 * sd, abs=0.06 * sd)
         assert estimate == pytest.approx(value, abs=0.06 * sd)
         assert spread == pytest.approx(sd, rel=0.06)
         low, high = (float(part) for part in shown[4].split(" to "))
         assert low == pytest.approx(value - 1.96 * sd, abs=0.06 * sd)
         assert high == pytest.approx(value + 1.96 * sd, abs=0.06 * sd)
-        assert shown[5] == unit.replace(".", "·")
+        assert shown[6] == unit.replace(".", "·")
 
 
 def test_errors_of_every_axis_stand_beside_the_floor(full: Report) -> None:
@@ -96,6 +98,18 @@ def test_errors_of_every_axis_stand_beside_the_floor(full: Report) -> None:
         cells = row_of(table, axis)
         assert float(cells[1]) == pytest.approx(error, rel=3e-3)
         assert float(cells[2]) == pytest.approx(synthetic_run.FLOOR[axis], rel=3e-3)
+
+
+def test_what_the_stages_say_of_themselves_is_passed_on(full: Report) -> None:
+    words = text_of(full.html)
+    assert "All estimates had settled after 16.9 s of 48.0 s" in words
+    assert "normalised innovation squared is 1.0;" in words
+    assert "The force lags the encoders by 0.120 ± 0.031 ms" in words
+    assert "force x 0.123 N (RMSE)" in words
+    assert "A note of the validation." in words
+    assert "bampipe extend RUN stribeck:yaw --model base" in words
+    assert "At the limit of its range" in words
+    assert row_of(full.html[full.html.index("RMSE by trial") :], "t02_free", "yes")[2] == "0.212"
 
 
 def test_trials_set_aside_and_repaired_say_why(full: Report) -> None:

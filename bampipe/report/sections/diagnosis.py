@@ -23,8 +23,8 @@ from bampipe.report.results import Results
 TITLE = "Diagnosis"
 _RANKED = 8
 _WINDOWS = 10
-_FIRST = ("velocity", "position", "acceleration", "load", "direction")
-"""Variables whose maps come first; others follow in their own order."""
+_MAPS = 9
+"""Most maps of one axis: those that tell most, best first."""
 
 
 def section(results: Results) -> Section:
@@ -54,17 +54,19 @@ def _model(
     axes = content.get("axes", {})
     names = verdicts.ordered(results, axes)
     blocks: list[Block] = []
-    if content.get("sentence"):
-        blocks.append(Text(str(content["sentence"])))
-    blocks.append(_verdicts(results, names, axes))
-    sentences = tuple(
-        f"**{axis}**: {axes[axis]['sentence']}" for axis in names if axes[axis].get("sentence")
-    )
+    sentences = tuple(str(axes[axis]["sentence"]) for axis in names if axes[axis].get("sentence"))
     if sentences:
         blocks.append(Bullets(sentences))
+    elif content.get("sentence"):
+        blocks.append(Text(str(content["sentence"])))
+    blocks.append(_verdicts(results, names, axes))
     ranking = content.get("ranking") or []
     if ranking:
         blocks.append(_ranking(results, ranking))
+    following = str(content.get("next") or "")
+    if following:
+        command = following.startswith("bampipe ")
+        blocks.append(Text(f"Next: `{following}`" if command else f"Next: {following}."))
     suggestion = content.get("suggested_trial")
     if isinstance(suggestion, dict) and suggestion.get("sentence"):
         blocks.append(Callout("note", "A trial that would tell more", suggestion["sentence"]))
@@ -156,7 +158,8 @@ def _maps(
     maps: dict[str, Any],
     later: dict[str, Any] | None,
 ) -> Figure:
-    names = sorted(maps, key=lambda name: (*_FIRST, name).index(name))
+    names = sorted(maps, key=lambda name: -float(maps[name].get("variance_share") or 0.0))
+    names = names[:_MAPS]
     columns = min(3, len(names))
     rows = math.ceil(len(names) / columns)
     figure, panels = style.panels(
@@ -191,7 +194,8 @@ def _map(
     low = _numbers(content.get("low") or content["mean"])
     high = _numbers(content.get("high") or content["mean"])
     unit = str(content.get("unit") or "")
-    if all(isinstance(value, int | float) for value in centre):
+    levels = _levels(name, centre) if not unit else None
+    if levels is None:
         x, shown = style.scaled(_numbers(centre), unit)
         panel.fill_between(x, low, high, color=colour, alpha=0.2, lw=0)
         panel.plot(x, mean, color=colour, lw=1.1, label=title)
@@ -200,9 +204,19 @@ def _map(
         x = np.arange(len(centre), dtype=float)
         spread = np.abs(np.vstack([mean - low, high - mean]))
         panel.errorbar(x, mean, spread, color=colour, fmt="o", ms=3, lw=1.0, label=title)
-        panel.set_xticks(x, [str(value) for value in centre], rotation=45, ha="right")
+        panel.set_xticks(x, levels)
+        panel.set_xlim(-0.5, len(centre) - 0.5)
         panel.set_xlabel(wording.words(name))
     return low, high
+
+
+def _levels(name: str, centre: list[Any]) -> list[str] | None:
+    """Return the names of the levels of a variable that counts or sorts, else None."""
+    if not all(isinstance(value, int | float) and float(value).is_integer() for value in centre):
+        return None
+    first = 1 if name == "trial" else 0
+    signed = {-1: "−", 0: "0", 1: "+"} if name == "direction" else {}
+    return [signed.get(int(value), str(int(value) + first)) for value in centre]
 
 
 def _numbers(values: list[float | None]) -> np.ndarray:

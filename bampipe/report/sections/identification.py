@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from bampipe.report import style, verdicts, wording
-from bampipe.report.document import Block, Bullets, Figure, Section, Table, Text
+from bampipe.report.document import Block, Figure, Section, Table, Text
 from bampipe.report.results import Results
 
 TITLE = "Identification"
@@ -25,9 +25,9 @@ def section(results: Results) -> Section:
         command = f"`bampipe identify {results.root.name}`"
         return Section(TITLE, (Text(f"No parameters have been identified: {command} does it."),))
     blocks: list[Block] = [_parameters(results, content)]
-    notes = tuple(str(note) for note in content.get("notes") or ())
-    if notes:
-        blocks.append(Bullets(notes))
+    checks = _checks(content)
+    if checks:
+        blocks.append(Text(checks))
     bounds = content.get("state_3sigma")
     if bounds:
         blocks.append(_bounds(results, bounds))
@@ -40,47 +40,79 @@ def section(results: Results) -> Section:
     return Section(TITLE, tuple(blocks))
 
 
-def interval_95(entry: dict[str, Any]) -> tuple[float, float] | None:
-    """Return the 95 % interval of a parameter: the stored one, else the normal one of its sd."""
-    stored = entry.get("interval_95")
-    if stored:
-        return float(stored[0]), float(stored[1])
-    sd = entry.get("sd")
-    if sd is None or entry.get("fixed"):
-        return None
-    return entry["estimate"] - _NORMAL_95 * sd, entry["estimate"] + _NORMAL_95 * sd
-
-
 def _parameters(results: Results, content: dict[str, Any]) -> Table:
-    rows = []
-    stored = False
     parameters = content.get("parameters", {})
-    for name in results.in_order(parameters):
+    names = results.in_order(parameters)
+    checked = any("least_squares" in parameters[name] for name in names)
+    rows = []
+    for name in names:
         entry = parameters[name]
-        interval = interval_95(entry)
-        stored = stored or bool(entry.get("interval_95"))
         value, sd = entry["estimate"], entry.get("sd")
+        decimals = wording.decimals_for(sd, value)
+        half = _NORMAL_95 * sd if sd else 0.0
+        other = entry.get("least_squares")
         rows.append(
             (
                 wording.parameter(name),
                 f"`{name}`",
-                wording.plain(value, wording.decimals_for(sd, value)),
+                wording.plain(value, decimals) + (" *" if entry.get("at_bound") else ""),
                 wording.significant(sd, 2) if sd else "fixed",
-                wording.interval(*interval, sd) if interval else "–",
+                wording.interval(value - half, value + half, sd) if sd else "–",
+                *(("–" if other is None else wording.plain(other, decimals),) if checked else ()),
                 wording.unit(str(entry.get("unit", ""))),
             )
         )
-    note = "" if stored else "Interval: estimate ± 1.96 standard deviations."
+    note = "Interval: estimate ± 1.96 standard deviations."
+    if checked:
+        note += " Least squares on the inverse dynamics, for comparison."
+    if any(parameters[name].get("at_bound") for name in names):
+        note += " * At the limit of its range: the data ask for a value beyond it."
     return Table(
-        f"Parameters of model `{content.get('model', 'base')}`{_table_number(content)}",
-        ("Parameter", "Name", "Estimate", "SD", "95 % interval", "Unit"),
+        f"Parameters of model `{content.get('model', 'base')}`{_method(content)}"
+        f"{results.as_in('Table VII')}",
+        (
+            "Parameter",
+            "Name",
+            "Estimate",
+            "SD",
+            "95 % interval",
+            *(("Least squares",) if checked else ()),
+            "Unit",
+        ),
         tuple(rows),
-        "llrrrl",
+        "llrrr" + ("r" if checked else "") + "l",
         note=note,
     )
 
 
-def _table_number(content: dict[str, Any]) -> str:
+def _checks(content: dict[str, Any]) -> str:
+    """Return what the filter says of itself: when it settled, whether its noise levels fit."""
+    parts = []
+    convergence = content.get("convergence") or {}
+    settled = convergence.get("settled_s") or {}
+    if settled and convergence.get("total_s"):
+        last = max(settled, key=lambda name: (float(settled[name]), name))
+        parts.append(
+            f"All estimates had settled after {wording.plain(float(settled[last]), 1)} s of "
+            f"{wording.plain(float(convergence['total_s']), 1)} s (the last was `{last}`)."
+        )
+    if convergence.get("converged") is False:
+        parts.append("**The estimates have not converged.**")
+    nis = (content.get("nis") or {}).get("mean")
+    if nis is not None:
+        parts.append(
+            f"The mean normalised innovation squared is {wording.significant(nis, 2)}; it is 1 "
+            "where the noise levels are right."
+        )
+    timing = content.get("input_timing") or {}
+    if timing.get("estimate") is not None:
+        sd = timing.get("sd")
+        shown = wording.with_sd(1e3 * timing["estimate"], None if sd is None else 1e3 * sd)
+        parts.append(f"The force lags the encoders by {shown} ms.")
+    return " ".join(parts)
+
+
+def _method(content: dict[str, Any]) -> str:
     how = {"ukf": "unscented Kalman filter", "least-squares": "least squares"}
     name = str(content.get("method", ""))
     return f", {how.get(name, wording.words(name))}" if name else ""
@@ -156,8 +188,8 @@ def _convergence(results: Results, content: dict[str, Any], trace: pd.DataFrame)
         panels[last, column].tick_params(labelbottom=True)
         panels[last, column].set_xlabel("time in the filter (s)")
     caption = (
-        f"Convergence of the parameters{results.as_in('Fig. 7')}, with 95 % bounds of the filter. "
-        "Dotted verticals: a new trial starts."
+        f"Convergence of the parameters{results.as_in('Fig. 7')}, with the filter's own 95 % "
+        "bounds. Dotted verticals: a new trial starts."
     )
     return Figure("convergence", caption, style.svg(figure))
 
@@ -244,8 +276,8 @@ def _motion(results: Results) -> Figure | None:
             panels[row, column].legend(loc="upper right", ncols=2)
             low, high = panels[row, column].get_ylim()
             panels[row, column].set_ylim(low, high + 0.22 * (high - low))
-    caption = (
-        f"Trial {trial}{results.as_in('Fig. 6')}: generalised forces of the hand and of the "
-        "gravity compensator (top) and the motion (bottom)."
-    )
+    forces = "generalised forces of the hand"
+    if any(f"torque_gravity_{axis}" in columns for axis in axes):
+        forces += " and of the gravity compensator"
+    caption = f"Trial {trial}{results.as_in('Fig. 6')}: {forces} (top) and the motion (bottom)."
     return Figure("torques-and-motion", caption, style.svg(figure))

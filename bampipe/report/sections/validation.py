@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from bampipe.report import style, verdicts, wording
-from bampipe.report.document import Block, Figure, Section, Table, Text
+from bampipe.report.document import Block, Bullets, Figure, Section, Table, Text
 from bampipe.report.results import Results
 
 TITLE = "Validation"
@@ -27,6 +27,12 @@ def section(results: Results) -> Section:
     trials = _by_trial(results, content)
     if trials is not None:
         blocks.append(trials)
+    handle = _at_the_handle(content)
+    if handle:
+        blocks.append(Text(handle))
+    notes = tuple(str(note) for note in content.get("notes") or ())
+    if notes:
+        blocks.append(Bullets(notes))
     residuals = _shown_trial(results)
     if residuals is not None:
         blocks.append(_forces(results, residuals))
@@ -69,36 +75,46 @@ def _by_axis(results: Results, content: dict[str, Any]) -> Table:
         (0.0, 1.0, 1.0, 1.0, 1.2, 0.6, 0.0),
         "Held out: each trial predicted with parameters that never saw it. Noise floor: what "
         "sensor noise, quantisation and filtering alone would leave. Fit: share of the measured "
-        "force that is explained, as 100 (1 − RMSE / standard deviation).",
+        "force that is explained, as 100 (1 − held-out RMSE / standard deviation)."
+        + _filtered(content),
     )
+
+
+def _filtered(content: dict[str, Any]) -> str:
+    cutoff = content.get("cutoff_hz")
+    if cutoff is None:
+        return ""
+    return f" Measured and predicted force are low-passed at {wording.significant(cutoff, 2)} Hz."
 
 
 def _by_trial(results: Results, content: dict[str, Any]) -> Table | None:
-    trials = content.get("trials")
-    if not isinstance(trials, dict) or not trials:
+    trials = content.get("trials") or {}
+    if not trials:
         return None
     rows = []
     for name, entry in trials.items():
-        axes = entry.get("axes", entry)
-        cells = []
-        for axis in results.axes:
-            values = axes.get(axis)
-            values = values if isinstance(values, dict) else {}
-            error, floor = (
-                values.get("rmse", values.get("held_out_rmse")),
-                values.get("noise_floor"),
-            )
-            text = wording.significant(error)
-            cells.append(f"{text} ({wording.significant(floor)})" if floor else text)
+        key = "held_out_rmse" if entry.get("held_out") else "rmse"
+        errors = ((entry.get(axis) or {}).get(key) for axis in results.axes)
+        cells = (wording.significant(error) for error in errors)
         rows.append((name, "yes" if entry.get("held_out") else "no", *cells))
     units = (f"{axis} ({wording.unit(results.force_unit(axis))})" for axis in results.axes)
     return Table(
-        "Error by trial: RMSE (noise floor)",
+        "RMSE by trial",
         ("Trial", "Held out", *units),
         tuple(rows),
         "ll" + "r" * len(results.axes),
-        (0.0, 0.0, *(1.0 for _ in results.axes)),
     )
+
+
+def _at_the_handle(content: dict[str, Any]) -> str:
+    """Return the error of the force at the handle in words, where it is stored."""
+    forces = content.get("forces") or {}
+    shown = (
+        f"{wording.words(name)} {wording.significant(entry['rmse'])} "
+        f"{wording.unit(str(entry.get('unit', 'N')))}"
+        for name, entry in forces.items()
+    )
+    return f"At the handle the error is {wording.listing(shown)} (RMSE)." if forces else ""
 
 
 def _shown_trial(results: Results) -> pd.DataFrame | None:
