@@ -280,6 +280,7 @@ class Scorer:
         p = np.concatenate([e.p[:count], [q.prior for q in item.own]])
         p[[count + i for i in item.searched]] = searched
         p[[count + i for i in item.linear]] = 0.0
+        axes = list(range(len(system.coordinates)) if system.moves_sensors else system.touched)
         columns, changes = [], []
         for motion, used, memory, plain in zip(e.motions, e.used, e.memory, e.plain, strict=True):
             u = motion.inputs(system.inputs)
@@ -295,7 +296,7 @@ class Scorer:
                     if i is not None:
                         probe[count + i] = 1.0
                     rows.append(system.contribution(motion.q, motion.qd, motion.qdd, z, u, probe))
-            thin = self._thin(rows, used)
+            thin = self._thin(rows, used, axes)
             if item.linear:
                 columns.append(thin.transpose(0, 2, 1))
                 changes.append(np.zeros(used.shape))
@@ -304,13 +305,11 @@ class Scorer:
                 changes.append(thin[:, 0])
         return columns, changes
 
-    def _thin(self, rows: list[Array], used: Array) -> Array:
-        """Low-pass each (T, n_q) of ``rows``; axes that are zero throughout cost nothing."""
+    def _thin(self, rows: list[Array], used: Array, axes: Sequence[int]) -> Array:
+        """Low-pass each (T, n_q) of ``rows``; only ``axes`` can differ from zero."""
         out = np.zeros((len(used), len(rows), used.shape[1]))
         for r, values in enumerate(rows):
-            axes = np.flatnonzero(values.any(axis=0))
-            if len(axes):
-                out[:, r, axes] = self.evidence.band.thin(values[:, axes]) * used[:, axes]
+            out[:, r, axes] = self.evidence.band.thin(values[:, axes]) * used[:, axes]
         return out
 
 
