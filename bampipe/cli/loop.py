@@ -78,12 +78,8 @@ def next_effect(root: Path, model: str) -> str:
         root: the run folder; the model must have been diagnosed.
         model: name of the model.
     """
-    diagnosis = _diagnosis(root, model)
-    missing = {axis for axis, entry in diagnosis["axes"].items() if entry["verdict"] == "missing"}
-    for entry in diagnosis["ranking"]:
-        if entry["axis"] in missing:
-            return str(entry["effect"])
-    return ""
+    selected = _diagnosis(root, model)["selected"]
+    return str(selected[0]) if selected else ""
 
 
 def _own_file(text: str) -> tuple[Path, str] | None:

@@ -1,0 +1,136 @@
+"""Stage compare: the ladder of model versions on the same held-out trials."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from bampipe.data.store import read_toml, write_json
+from bampipe.errors import InputError
+from bampipe.stages.base import Progress, RunFolder
+
+NAME = "compare"
+SUMMARY = "Held-out error of every model version, and which parameters moved"
+
+
+@dataclass(frozen=True)
+class Config:
+    """What the stage can be told.
+
+    Attributes:
+        sigmas: a parameter has moved when it changed by more than this many standard deviations
+            of the change.
+    """
+
+    sigmas: float = 3.0
+
+
+def inputs(config: Config) -> tuple[str, ...]:
+    """Return the paths the stage reads."""
+    return ("models/*/model.toml", "models/*/identify.json", "models/*/validate.json")
+
+
+def outputs(config: Config) -> tuple[str, ...]:
+    """Return the paths the stage writes."""
+    return ("compare.json",)
+
+
+def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
+    """Put the validated models of a run side by side, parents before children.
+
+    Raises:
+        InputError: no model has been validated, or the parent of one is missing.
+    """
+    if not config.sigmas > 0:
+        raise InputError("must be positive", where="compare.sigmas")
+    models: dict[str, Mapping[str, Any]] = {}
+    for path in run.glob("models/*/model.toml"):
+        name = Path(path).parent.name
+        if run.exists(f"models/{name}/validate.json"):
+            models[name] = read_toml(run.path(path))
+    if not models:
+        raise InputError(
+            "no model has been validated yet",
+            where=str(run.root),
+            remedy=f"run `bampipe validate {run.root}` first",
+        )
+    declared = {Path(p).parent.name for p in run.glob("models/*/model.toml")}
+    for name, content in models.items():
+        parent = content.get("parent", "")
+        if parent and parent not in declared:
+            raise InputError(
+                f"model {name!r} has parent {parent!r}, which is missing",
+                where=str(run.path(f"models/{name}/model.toml")),
+                remedy="restore the parent's folder, or remove the child's",
+            )
+    order = sorted(models, key=lambda n: (len(models[n].get("effects", [])), n))
+    ladder = [_rung(run, name, models[name], models) for name in order]
+    parameters: dict[str, dict[str, object]] = {}
+    for name in order:
+        found = run.read_json(f"models/{name}/identify.json")["parameters"]
+        for key, entry in found.items():
+            kept = {k: entry.get(k) for k in ("estimate", "sd", "unit")}
+            parameters.setdefault(key, {})[name] = kept
+    result: dict[str, object] = {
+        "ladder": ladder,
+        "parameters": parameters,
+        "moved": _moved(parameters, models, order, config.sigmas),
+    }
+    write_json(out / "compare.json", result)
+    return result
+
+
+def _rung(
+    run: RunFolder, name: str, content: Mapping[str, Any], models: Mapping[str, Mapping[str, Any]]
+) -> dict[str, object]:
+    axes = run.read_json(f"models/{name}/validate.json")["axes"]
+    parent = str(content.get("parent", ""))
+    had = models.get(parent, {}).get("effects", []) if parent else []
+    added = [e for e in content.get("effects", []) if e not in had]
+    return {
+        "model": name,
+        "parent": parent or None,
+        "added": ", ".join(added) or None,
+        "effects": list(content.get("effects", [])),
+        "held_out_rmse": {a: entry["held_out_rmse"] for a, entry in axes.items()},
+        "noise_floor": {a: entry.get("noise_floor") for a, entry in axes.items()},
+        "unit": {a: entry["unit"] for a, entry in axes.items()},
+    }
+
+
+def _moved(
+    parameters: Mapping[str, Mapping[str, Any]],
+    models: Mapping[str, Mapping[str, Any]],
+    order: list[str],
+    sigmas: float,
+) -> list[dict[str, object]]:
+    """Parameters that changed from parent to child by more than their uncertainty."""
+    moved = []
+    for model in order:
+        parent = str(models[model].get("parent", ""))
+        for name, by_model in parameters.items():
+            if parent not in by_model or model not in by_model:
+                continue
+            old, new = by_model[parent], by_model[model]
+            sd = math.hypot(float(old["sd"]), float(new["sd"]))
+            change = float(new["estimate"]) - float(old["estimate"])
+            if abs(change) > sigmas * sd:
+                moved.append(
+                    {
+                        "parameter": name,
+                        "model": model,
+                        "parent": parent,
+                        "change": change,
+                        "sd": sd,
+                        "unit": new["unit"],
+                        "sentence": (
+                            f"{name} moved from {float(old['estimate']):.4g} to "
+                            f"{float(new['estimate']):.4g} {new['unit']}: without the effect it "
+                            f"was biased."
+                        ),
+                    }
+                )
+    return moved
