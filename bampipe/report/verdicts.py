@@ -74,7 +74,7 @@ def overall(results: Results) -> Callout:
 
 
 def _ratios(ratios: dict[str, float]) -> str:
-    parts = (f"{axis} {wording.significant(ratio, 3)} ×" for axis, ratio in ratios.items())
+    parts = (f"{axis} {wording.plain(ratio, 2)} ×" for axis, ratio in ratios.items())
     return f"{wording.listing(parts)} the noise floor"
 
 
@@ -86,7 +86,7 @@ def _diagnosed(results: Results, diagnosis: dict[str, Any]) -> Callout:
     }
     effects = results.effects(results.model)
     with_effects = f" with {wording.listing(f'`{name}`' for name in effects)}" if effects else ""
-    sentence = str(diagnosis.get("sentence") or "")
+    sentence = wording.sentence(diagnosis.get("sentence") or "")
     if by_verdict["missing"]:
         selected = [str(name) for name in diagnosis.get("selected") or ()]
         what = wording.listing(f"`{name}`" for name in selected) or "an effect"

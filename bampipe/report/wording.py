@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable
 
 _POWERS = {"2": "²", "3": "³"}
@@ -18,6 +19,11 @@ def unit(text: str) -> str:
         _POWERS[mark] if mark in _POWERS and before.isalpha() else mark
         for before, mark in zip(" " + shown, shown, strict=False)
     )
+
+
+def sentence(text: object) -> str:
+    """Return a stored sentence with its units as printed."""
+    return re.sub(r"\b(N|kg)\.m2?\b", lambda found: unit(found[0]), str(text))
 
 
 def scale(values: Iterable[float], base: str) -> tuple[float, str]:

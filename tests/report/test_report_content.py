@@ -133,7 +133,7 @@ def test_ladder_shows_every_version_and_what_moved(full: Report) -> None:
     table = full.html[full.html.index("RMSE on the same held-out trials") :]
     assert row_of(table, "base")[2] == "0.562 (0.203)"
     assert row_of(table, "version 1")[1:3] == ["stribeck:yaw", "0.212 (0.203)"]
-    assert "coulomb.yaw fell by 0.21" in text_of(full.html)
+    assert "coulomb.yaw fell by 0.21 N·m" in text_of(full.html)
 
 
 def test_stiffness_in_both_units_of_bandwidth(full: Report) -> None:

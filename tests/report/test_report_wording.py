@@ -80,5 +80,6 @@ def test_names_in_words() -> None:
     assert wording.listing(["a"]) == "a"
     assert wording.count(1, "trial") == "1 trial"
     assert wording.count(2, "trial") == "2 trials"
+    assert wording.sentence("fell by 0.2 N.m. Done") == "fell by 0.2 N·m. Done"
     assert wording.probability(0.0002) == "< 0.001"
     assert wording.percent(0.812) == "81 %"

@@ -22,8 +22,8 @@ from bampipe.report.results import Results
 
 TITLE = "Diagnosis"
 _RANKED = 8
-_WINDOWS = 10
-_MAPS = 9
+_WINDOWS = 6
+_MAPS = 6
 """Most maps of one axis: those that tell most, best first."""
 
 
@@ -54,11 +54,13 @@ def _model(
     axes = content.get("axes", {})
     names = verdicts.ordered(results, axes)
     blocks: list[Block] = []
-    sentences = tuple(str(axes[axis]["sentence"]) for axis in names if axes[axis].get("sentence"))
+    sentences = tuple(
+        wording.sentence(axes[axis]["sentence"]) for axis in names if axes[axis].get("sentence")
+    )
     if sentences:
         blocks.append(Bullets(sentences))
     elif content.get("sentence"):
-        blocks.append(Text(str(content["sentence"])))
+        blocks.append(Text(wording.sentence(content["sentence"])))
     blocks.append(_verdicts(results, names, axes))
     ranking = content.get("ranking") or []
     if ranking:
@@ -69,7 +71,11 @@ def _model(
         blocks.append(Text(f"Next: `{following}`" if command else f"Next: {following}."))
     suggestion = content.get("suggested_trial")
     if isinstance(suggestion, dict) and suggestion.get("sentence"):
-        blocks.append(Callout("note", "A trial that would tell more", suggestion["sentence"]))
+        blocks.append(
+            Callout(
+                "note", "A trial that would tell more", wording.sentence(suggestion["sentence"])
+            )
+        )
     maps = content.get("maps") or {}
     blocks += [
         _maps(results, model, axis, axes[axis], maps[axis], (later or {}).get(axis))

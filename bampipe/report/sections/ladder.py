@@ -25,7 +25,9 @@ def section(results: Results) -> Section | None:
     if parameters:
         blocks.append(_parameters(results, rungs, parameters))
     moved = [
-        str(entry["sentence"]) for entry in content.get("moved") or () if entry.get("sentence")
+        wording.sentence(entry["sentence"])
+        for entry in content.get("moved") or ()
+        if entry.get("sentence")
     ]
     if moved:
         blocks.append(Bullets(tuple(moved)))
