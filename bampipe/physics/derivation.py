@@ -10,6 +10,7 @@ import ast
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
+from itertools import combinations_with_replacement
 from typing import Any
 
 import numpy as np
@@ -261,13 +262,18 @@ def _lagrange(
         InputError: the kinetic energy is not quadratic in the rates.
     """
     mass = [[sp.expand_trig(sp.simplify(sp.diff(kinetic, a, b))) for b in qd] for a in qd]
-    if any(entry.has(*qd) for row in mass for entry in row):
+    still = dict.fromkeys(qd, 0)
+    lower = [kinetic.subs(still), *(sp.diff(kinetic, a).subs(still) for a in qd)]
+    if any(e.has(*qd) for row in mass for e in row) or any(sp.simplify(e) != 0 for e in lower):
         raise InputError("the kinetic energy must be quadratic in the rates")
+    # Christoffel's symbols of the simplified matrix: the same as d/dt dT/dqd - dT/dq, but compact.
     bias = []
-    for i, rate in enumerate(qd):
-        momentum = sp.diff(kinetic, rate)
-        convective = sum(sp.diff(momentum, a) * b for a, b in zip(q, qd, strict=True))
-        bias.append(sp.simplify(convective - sp.diff(kinetic - potential, q[i])))
+    for i, a in enumerate(q):
+        total = sp.diff(potential, a)
+        for j, k in combinations_with_replacement(range(len(q)), 2):
+            slope = sp.diff(mass[i][j], q[k]) + sp.diff(mass[i][k], q[j]) - sp.diff(mass[j][k], a)
+            total += (slope / 2 if j == k else slope) * qd[j] * qd[k]
+        bias.append(total)
     return mass, bias
 
 

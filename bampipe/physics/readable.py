@@ -67,8 +67,8 @@ def describe_equations(device: Device) -> str:
     for c in device.coordinates:
         lines.append(f"  {c.symbol} = {c.name}, {c.unit}; generalised force in {c.torque_unit}")
     lines += ["", "Energies"]
-    lines += [f"  kinetic   = {text(sp.factor_terms(sp.simplify(e.kinetic)))}"]
-    lines += [f"  potential = {text(e.potential)}", "", "M q'' + h = Q, where"]
+    lines += ["  kinetic   = q'ᵀ M q' / 2", f"  potential = {text(e.potential)}"]
+    lines += ["", "M q'' + h = Q, where"]
     for i, a in enumerate(marks):
         for j, b in enumerate(marks):
             if j >= i and e.mass[i][j] != 0:
