@@ -11,6 +11,7 @@ from typing import Any
 from bampipe.run.runner import Event, Outcome
 
 LARGEST_TABLE = 40
+FIRST_COLUMNS = ("", "trial_id", "estimate", "sd", "unit", "rmse", "held_out_rmse", "noise_floor")
 
 
 def number(value: object) -> str:
@@ -90,13 +91,13 @@ def _records(value: object) -> list[dict[str, Any]] | None:
     return None
 
 
-def _flat(row: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the columns a record shows: scalars, and tables of scalars key by key."""
-    shown: dict[str, Any] = {}
+def _flat(row: Mapping[str, Any], deep: bool) -> dict[str, Any]:
+    """Return the columns a record shows: scalars and, if ``deep``, tables of them key by key."""
+    shown: dict[str, Any] = {name: row[name] for name in FIRST_COLUMNS if name in row}
     for name, value in row.items():
         if _is_scalar(value):
             shown[name] = value
-        elif isinstance(value, Mapping) and value and all(map(_is_scalar, value.values())):
+        elif deep and isinstance(value, Mapping) and value and all(map(_is_scalar, value.values())):
             shown.update({f"{name} {key}": item for key, item in value.items()})
         elif isinstance(value, list) and all(isinstance(item, str) for item in value):
             shown[name] = ", ".join(value)
@@ -116,7 +117,7 @@ def summary(content: Mapping[str, object]) -> None:
         rows = _records(content.get(name))
         if rows is None or len(rows) > LARGEST_TABLE:
             continue
-        flat = [_flat(row) for row in rows]
+        flat = [_flat(row, name in ("ladder", "ranking")) for row in rows]
         head = list(dict.fromkeys(column for row in flat for column in row))
         if len(head) < 2:
             continue

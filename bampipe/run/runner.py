@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import errno
 import json
 import os
@@ -231,8 +232,10 @@ class _Run:
         self.root = request.root
         self.folder = base.RunFolder(request.root)
         self.content = record.read(request.root)
+        self.written = copy.deepcopy(self.content)
         self.records: dict[str, dict[str, Any]] = self.content.setdefault("stages", {})
         self.timings: dict[str, Any] = self.content.setdefault("timings", {})
+        self.failures: dict[str, str] = self.content.setdefault("failures", {})
         self.place: dict[str, Any] = self.content.setdefault("place", {})
         self.digests: dict[tuple[str, int, int, int], str] = {}
         self.memory = hashing.HashMemory(self.root / record.PRIVATE / "hashes.json")
@@ -346,8 +349,6 @@ class _Run:
         made = self.records.get(step.name)
         if made is None:
             return "never run"
-        if made["state"] != "done":
-            return "failed last time"
         if self.request.force:
             return "forced"
         for name, written in made["outputs"].items():
@@ -400,7 +401,6 @@ class _Run:
         settings = _lasting(config)
         previous = self.records.get(step.name, {}).get("outputs", {})
         made: dict[str, Any] = {
-            "state": "done",
             "key": self.key(step, settings, inputs),
             "config": settings,
             "settings": self.settings(step),
@@ -441,6 +441,7 @@ class _Run:
         for relative in entry["remove"]:
             (self.root / relative).unlink(missing_ok=True)
         self.records[entry["step"]] = entry["record"]
+        self.failures.pop(entry["step"], None)
         self.timings[entry["step"]] = entry["timing"]
         self.save()
         shutil.rmtree(staging)
@@ -464,11 +465,9 @@ class _Run:
         record.write(self.root, self.content)
 
     def failed(self, step: Step, error: str) -> None:
-        """Note that the step failed; the outputs of its last success stay, and stay recorded."""
+        """Note that the step failed; what its last success left stays, and stays recorded."""
         shutil.rmtree(self.staging(step), ignore_errors=True)
-        made = self.records.setdefault(step.name, {"outputs": {}})
-        made["state"] = "failed"
-        made["error"] = error
+        self.failures[step.name] = error
         self.save()
         self.listen(Event(self.root.name, step.name, "failed", 0.0, error))
 
@@ -500,13 +499,13 @@ class _Run:
         if self.request.judged:
             for gate in pipeline.gates:
                 verdicts += judge(gate, self.root, self.request.judged)
-        noted = dict(self.content)
+        noted = {**self.content, "failures": dict(self.failures)}
         if self.request.judged:
             noted["pipeline"] = pipeline.content()
             noted["gates"] = [verdict.content() for verdict in verdicts]
         if self.session is not None:
             noted["place"] = {**self.place, "session": str(self.session.resolve())}
-        if noted != self.content:
+        if noted != self.written:
             self.content.update(noted)
             self.place = self.content["place"]
             self.save()
@@ -525,6 +524,7 @@ class _Run:
         except Exception as error:
             self.failed(step, f"{type(error).__name__}: {error}")
             raise
+        self.failures.pop(step.name, None)
         self.listen(Event(self.root.name, step.name, "unchanged", 1.0))
         return StepResult(step.name, "unchanged", "", 0.0, self.records[step.name]["summary"])
 
@@ -608,7 +608,7 @@ def run_session(request: Request, listen: Listener = unheard) -> Outcome:
             try:
                 return run.run()
             except InputError:
-                if fresh and not any(made["state"] == "done" for made in run.records.values()):
+                if fresh and not run.records:
                     shutil.rmtree(request.root)
                 raise
     except OSError as error:
@@ -657,12 +657,11 @@ def status(root: Path, pipeline: Pipeline) -> list[StepStatus]:
     stale = False
     for stage in shown:
         for step in run.steps(stage):
-            made = run.records.get(step.name)
             timing = run.timings.get(step.name, {})
-            if made is None:
+            if step.name in run.failures:
+                state, reason = "failed", run.failures[step.name]
+            elif step.name not in run.records:
                 state, reason = "not run", ""
-            elif made["state"] == "failed":
-                state, reason = "failed", made["error"]
             else:
                 try:
                     reason = run.reason(step)

@@ -1,0 +1,188 @@
+"""``bampipe effects``: the library, and one effect in full."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from bampipe.cli import show
+from bampipe.errors import InputError
+from bampipe.run.settings import did_you_mean
+
+COLUMNS, ROWS = 61, 13
+
+
+def list_all(json: bool) -> None:
+    """Print every built-in effect: its name, what it may act on, what it is."""
+    from bampipe.physics import registry
+
+    found = [registry.effect(name) for name in registry.effect_names()]
+    if json:
+        show.as_json(
+            [
+                {"name": e.name, "scope": e.scope, "kind": e.kind, "summary": e.summary}
+                for e in found
+            ]
+        )
+        return
+    show.table(
+        ["effect", "acts on", "kind", "summary"],
+        [[e.name, e.scope.replace("_", " "), e.kind, e.summary] for e in found],
+    )
+    show.say("")
+    show.say("one in full: bampipe effects NAME")
+
+
+def show_one(text: str, device_name: str, json: bool) -> None:
+    """Print one effect: formula, parameters, what it looks like, its signature.
+
+    Args:
+        text: ``name[:target]`` or ``file.toml[:target]``.
+        device_name: the built-in device it is shown on.
+        json: print JSON instead.
+
+    Raises:
+        InputError: no such effect, device or target.
+    """
+    from bampipe.physics import registry
+
+    name, _, target = text.partition(":")
+    device = registry.device(device_name)
+    if name.endswith(".toml"):
+        effect = registry.effect_from(_read(Path(name)), name)
+    else:
+        effect = registry.effect(name)
+    targets = effect.targets(device)
+    if not targets:
+        raise InputError(f"device {device_name!r} cannot have effect {effect.name!r}")
+    if target and target not in targets:
+        raise InputError(
+            f"effect {effect.name!r} has no target {target!r} on device {device_name!r}",
+            remedy=did_you_mean(target, targets),
+        )
+    chosen = target or targets[0]
+
+    from bampipe.discover.signature import signature
+
+    found = signature(device, effect, chosen)
+    if json:
+        show.as_json(
+            {
+                "declaration": dict(effect.declaration),
+                "targets": [item for item in targets if item],
+                "signature": None
+                if found is None
+                else {
+                    "target": chosen,
+                    "axis": found.axis,
+                    "rms": dict(found.rms),
+                    "unit": found.unit,
+                    "against": found.against,
+                    "share": found.share,
+                },
+            }
+        )
+        return
+    show.say(f"{effect.name}: {effect.summary}")
+    show.say("")
+    for line in _formulas(effect.declaration):
+        show.say(f"  {line}")
+    show.say("")
+    rows = [_parameter_row(*item) for item in _parameters(effect.declaration)]
+    head = ["parameter", "axis", "unit", "prior", "sd", "lower", "upper", "typical", ""]
+    used = [
+        column
+        for column in range(len(head))
+        if column < 1 or any(row[column] not in (None, "") for row in rows)
+    ]
+    show.table([head[c] for c in used], [[row[c] for c in used] for row in rows])
+    show.say("")
+    names = [f"{effect.name}:{item}" if item else effect.name for item in targets]
+    show.say(f"on {device_name}: {', '.join(names)}")
+    show.say(f"looks like: {effect.looks_like}")
+    show.say(f"source: {effect.source}")
+    show.say("")
+    title = f"{effect.name}:{chosen}" if chosen else effect.name
+    if found is None:
+        show.say(f"{title} leaves nothing in the residual of a free or braked motion")
+        return
+    brakes = ", brakes on" if found.braked else ""
+    show.say(
+        f"what {title} leaves on {found.axis} ({found.unit}) in a model without it, "
+        f"against {found.against} ({found.against_unit}){brakes}:"
+    )
+    for line in plot(found.abscissa.tolist(), found.residual.tolist()):
+        show.say(line)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror}", where=str(path)) from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"not valid TOML: {error}", where=str(path)) from error
+
+
+def _formulas(declaration: Mapping[str, Any]) -> list[str]:
+    lines = []
+    for key in ("torque", "input", "kinetic", "potential", "offset"):
+        value = declaration.get(key)
+        if isinstance(value, str):
+            lines.append(f"{key} = {' '.join(value.split())}")
+        elif isinstance(value, Mapping):
+            lines += [
+                f"{key} of {place} = {' '.join(str(v).split())}" for place, v in value.items()
+            ]
+    for name, state in declaration.get("states", {}).items():
+        lines.append(f"d {name}/dt = {' '.join(str(state['rate']).split())}")
+        if "initial" in state:
+            lines.append(f"{name} at the start = {state['initial']}")
+    return lines
+
+
+def _parameters(declaration: Mapping[str, Any]) -> list[tuple[str, str, Mapping[str, Any]]]:
+    found = []
+    for name, entry in declaration.get("parameters", {}).items():
+        text = entry.get("description", "")
+        if "unit" in entry:
+            found.append((name, "", {"description": text, **entry}))
+        for kind in ("rotary", "linear"):
+            if kind in entry:
+                found.append((name, kind, {"description": text, **entry[kind]}))
+    return found
+
+
+def _parameter_row(name: str, kind: str, entry: Mapping[str, Any]) -> list[object]:
+    keys = ("prior", "sd", "lower", "upper", "typical")
+    numbers = [None if entry.get(key) is None else float(entry[key]) for key in keys]
+    return [name, kind, entry["unit"], *numbers, entry["description"]]
+
+
+def plot(abscissa: Sequence[float], ordinate: Sequence[float]) -> list[str]:
+    """Return a scatter plot in characters.
+
+    Args:
+        abscissa: values across, any number of them.
+        ordinate: values upward, as many.
+    """
+    left, right = min(abscissa), max(abscissa)
+    bottom, top = min(0.0, *ordinate), max(0.0, *ordinate)
+    wide, high = (right - left) or 1.0, (top - bottom) or 1.0
+    grid = [[" "] * COLUMNS for _ in range(ROWS)]
+    zero = round((top - 0.0) / high * (ROWS - 1))
+    grid[zero] = ["-"] * COLUMNS
+    if left < 0.0 < right:
+        column = round(-left / wide * (COLUMNS - 1))
+        for row in grid:
+            row[column] = "|"
+        grid[zero][column] = "+"
+    for x, y in zip(abscissa, ordinate, strict=True):
+        grid[round((top - y) / high * (ROWS - 1))][round((x - left) / wide * (COLUMNS - 1))] = "•"
+    labels = {0: f"{top:.3g}", zero: "0", ROWS - 1: f"{bottom:.3g}"}
+    lines = [f"{labels.get(n, ''):>10} {''.join(row).rstrip()}" for n, row in enumerate(grid)]
+    low, end = f"{left:.3g}", f"{right:.3g}"
+    lines.append(f"{'':>10} {low}{end.rjust(COLUMNS - len(low))}")
+    return lines
