@@ -15,13 +15,14 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.csv as pa_csv
 import pyarrow.parquet as pq
 
+from bampipe.data import matlab
 from bampipe.data.schema import did_you_mean
 from bampipe.errors import InputError
 
@@ -378,23 +379,28 @@ _MAT_FAULTS = (
     ValueError,
     TypeError,
     KeyError,
-    IndexError,
     NotImplementedError,
     OverflowError,
-    EOFError,
-    AttributeError,
-    UnicodeError,
     RuntimeError,
     zlib.error,
     struct.error,
 )
-"""What scipy.io and h5py raise on damaged files: neither has one error type for it."""
+"""What reading a damaged file raises: h5py has no one error type for it."""
 
 
 def _read_mat(path: Path, columns: Sequence[str], name: str, largest: int) -> RawTrial:
     with path.open("rb") as stream:
         head = stream.read(1024)
-    read = _read_mat73 if _HDF5 in (head[:8], head[512:520]) else _read_mat5
+    if _HDF5 in (head[:8], head[512:520]):
+        read = _read_mat73
+    elif matlab.is_level5(head):
+        read = _read_mat5
+    else:
+        raise InputError(
+            "not a MATLAB file of version 5 or newer",
+            where=name,
+            remedy="save it again from MATLAB (-v7)",
+        )
     try:
         values = read(path, columns, name, largest)
     except _MAT_FAULTS as error:
@@ -414,20 +420,17 @@ def _read_mat(path: Path, columns: Sequence[str], name: str, largest: int) -> Ra
 def _read_mat5(
     path: Path, columns: Sequence[str], name: str, largest: int
 ) -> dict[str, np.ndarray]:
-    from scipy.io import loadmat, whosmat  # heavy: only for .mat files
-    from scipy.io.matlab import MatReadError
-
-    try:
-        shapes = {variable: shape for variable, shape, _ in whosmat(path)}
-        _check_columns(list(shapes), columns, name)
-        for column in columns:
-            _check_size(int(np.prod(shapes[column], dtype=object)), columns, largest, name)
-        values = {}
-        for column in columns:
-            array = loadmat(path, variable_names=[column])[column]
-            values[column] = _vector(array, name, column)
-    except MatReadError as error:
-        raise ValueError from error
+    found = matlab.variables(path)
+    _check_columns([variable.name for variable in found], columns, name)
+    known = {variable.name: variable for variable in found}
+    values = {}
+    for column in columns:
+        variable = known[column]
+        if not variable.real:
+            raise _no_numbers(name, column)
+        _check_vector(variable.shape, name, column)
+        _check_size(variable.length, columns, largest, name)
+        values[column] = matlab.values(path, variable)
     return values
 
 
@@ -448,19 +451,23 @@ def _read_mat73(
                 raise InputError("a structure, expected a vector of numbers", where=place)
             if data.external or data.is_virtual:
                 raise InputError("stored outside this file", where=place)
-            if data.attrs.get("MATLAB_class") == b"char":
-                raise InputError("text, expected a vector of numbers", where=place)
-            _check_size(int(data.size or 0), columns, largest, name)
-            values[column] = _vector(np.asarray(data[()]), name, column)
+            if data.dtype.kind not in "iufb" or data.attrs.get("MATLAB_class") == b"char":
+                raise _no_numbers(name, column)
+            _check_vector(data.shape, name, column)
+            _check_size(int(data.size), columns, largest, name)
+            values[column] = np.asarray(data[()], dtype=np.float64).ravel()
     return values
 
 
-def _vector(array: Any, name: str, variable: str) -> np.ndarray:
-    """A (T,), (T,1) or (1,T) array of real numbers as (T,) float64."""
-    place = f"{name}, variable '{variable}'"
-    if not isinstance(array, np.ndarray) or array.dtype.kind not in "iufb":
-        raise InputError("not numbers, expected a vector of real numbers", where=place)
-    if array.size != max(array.shape, default=0) and array.size > 0:
-        shape = " by ".join(map(str, array.shape))
-        raise InputError(f"a {shape} array, expected a vector", where=place)
-    return np.ascontiguousarray(array.ravel(), dtype=np.float64)
+def _check_vector(shape: tuple[int, ...], name: str, variable: str) -> None:
+    if sum(extent != 1 for extent in shape) > 1 and 0 not in shape:
+        shown = " by ".join(map(str, shape))
+        raise InputError(
+            f"a {shown} array, expected a vector", where=f"{name}, variable '{variable}'"
+        )
+
+
+def _no_numbers(name: str, variable: str) -> InputError:
+    return InputError(
+        "not numbers, expected a vector of real numbers", where=f"{name}, variable '{variable}'"
+    )

@@ -68,7 +68,6 @@ def as_mat73(table, userblock=512):
         ("a.parquet", as_parquet(pd.DataFrame(TABLE).astype("float32"))),
         ("a.mat", as_mat(TABLE, oned_as="row")),
         ("a.mat", as_mat(TABLE, oned_as="column", do_compression=True)),
-        ("a.mat", as_mat(TABLE, format="4")),
         ("a.mat", as_mat73(TABLE)),
     ],
 )

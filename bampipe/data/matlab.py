@@ -1,0 +1,176 @@
+"""Real vectors in MATLAB files of version 5 to 7.2, read with every length checked.
+
+scipy.io reads the same files, but writes and reads past its buffers where a damaged file lies
+about a length, which ends the process without a word. Only what a log needs is read here:
+variables that are real numeric arrays. Source: MathWorks, MAT-File Format, level 5.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+_MATRIX, _COMPRESSED = 14, 15
+_NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8"}
+_NUMBERS |= {12: "i8", 13: "u8"}
+_NUMERIC_CLASSES = range(6, 16)
+_COMPLEX = 0x0800
+_HEADER = 128
+_LARGEST_HEAD = 4096
+_CHUNK = 1 << 16
+
+
+@dataclass(frozen=True)
+class Variable:
+    """One variable of a file.
+
+    Attributes:
+        name: of the variable.
+        shape: of the array.
+        real: whether it is an array of real numbers.
+        start, size: place of its element in the file, bytes.
+        compressed: whether that element is compressed.
+    """
+
+    name: str
+    shape: tuple[int, ...]
+    real: bool
+    start: int
+    size: int
+    compressed: bool
+
+    @property
+    def length(self) -> int:
+        """Number of elements."""
+        return math.prod(self.shape)
+
+
+def is_level5(head: bytes) -> bool:
+    """Whether a file that begins with ``head`` is of MATLAB 5 to 7.2 (or claims to be)."""
+    return len(head) >= _HEADER and head[126:128] in (b"IM", b"MI")
+
+
+def variables(path: Path) -> list[Variable]:
+    """The variables of the file, in its order.
+
+    Raises:
+        ValueError: the file is damaged.
+    """
+    found = []
+    with path.open("rb") as stream:
+        order = _order(stream)
+        end = stream.seek(0, 2)
+        place = _HEADER
+        while place + 8 <= end:
+            stream.seek(place)
+            kind, size = struct.unpack(order + "II", stream.read(8))
+            place += 8
+            if size > end - place or kind not in (_MATRIX, _COMPRESSED):
+                raise ValueError("an element is not what it says")
+            source = _Source(stream, place, size, kind == _COMPRESSED, order)
+            name, shape, real = source.matrix_head()
+            if name:
+                found.append(Variable(name, shape, real, place, size, kind == _COMPRESSED))
+            place += size
+    return found
+
+
+def values(path: Path, variable: Variable) -> np.ndarray:
+    """The elements of one real variable, in column-major order, as (n,) float64.
+
+    Raises:
+        ValueError: the file is damaged.
+    """
+    with path.open("rb") as stream:
+        source = _Source(stream, variable.start, variable.size, variable.compressed, _order(stream))
+        source.matrix_head()
+        kind, data = source.element(8 * variable.length)
+        if kind not in _NUMBERS:
+            raise ValueError(f"'{variable.name}' holds no numbers")
+        numbers = np.dtype(source.order + _NUMBERS[kind])
+        if len(data) != variable.length * numbers.itemsize:
+            raise ValueError(f"'{variable.name}' is not as long as it says")
+        return np.frombuffer(data, dtype=numbers).astype(np.float64)
+
+
+def _order(stream: BinaryIO) -> str:
+    """Byte order of a file, as struct and numpy write it."""
+    stream.seek(126)
+    return "<" if stream.read(2) == b"IM" else ">"
+
+
+class _Source:
+    """The bytes of one variable's element, inflated where it is compressed."""
+
+    def __init__(
+        self, stream: BinaryIO, start: int, size: int, compressed: bool, order: str
+    ) -> None:
+        self._stream = stream
+        self._next, self._left = start, size
+        self._inflate = zlib.decompressobj() if compressed else None
+        self._ahead = b""
+        self.order = order
+        if compressed and struct.unpack(order + "II", self._take(8))[0] != _MATRIX:
+            raise ValueError("a compressed element holds no array")
+
+    def matrix_head(self) -> tuple[str, tuple[int, ...], bool]:
+        """Name and shape of the array, and whether it holds real numbers."""
+        _, flags = self.element(_LARGEST_HEAD)
+        _, shape = self.element(_LARGEST_HEAD)
+        _, name = self.element(_LARGEST_HEAD)
+        if len(flags) != 8 or len(shape) % 4 or len(shape) < 8:
+            raise ValueError("an array is not what it says")
+        word = struct.unpack(self.order + "II", flags)[0]
+        extents = struct.unpack(f"{self.order}{len(shape) // 4}i", shape)
+        if min(extents) < 0:
+            raise ValueError("an array has a negative size")
+        real = word & 0xFF in _NUMERIC_CLASSES and not word & _COMPLEX
+        return name.decode("utf-8", "replace"), extents, real
+
+    def element(self, limit: int) -> tuple[int, bytes]:
+        """Type and data of the next element, of ``limit`` bytes at most."""
+        head = self._take(8)
+        word, size = struct.unpack(self.order + "II", head)
+        if word >> 16:  # a small element has its data in the second half of its head
+            kind, size = word & 0xFFFF, word >> 16
+            if size > 4:
+                raise ValueError("a small element is larger than four bytes")
+            return kind, head[4 : 4 + size]
+        if size > limit:
+            raise ValueError("an element is larger than it should be")
+        data = self._take(size)
+        if size <= _LARGEST_HEAD and size % 8:
+            self._take(-size % 8, whole=False)
+        return word, data
+
+    def _take(self, size: int, whole: bool = True) -> bytes:
+        data = self._raw(size) if self._inflate is None else self._inflated(size)
+        if whole and len(data) != size:
+            raise ValueError("an element ends early")
+        return data
+
+    def _raw(self, size: int) -> bytes:
+        self._stream.seek(self._next)
+        data = self._stream.read(min(size, self._left))
+        self._next += len(data)
+        self._left -= len(data)
+        return data
+
+    def _inflated(self, size: int) -> bytes:
+        parts = []
+        while size:
+            if not self._ahead:
+                self._ahead = self._raw(_CHUNK)
+            part = self._inflate.decompress(self._ahead, size)
+            self._ahead = self._inflate.unconsumed_tail
+            if not part and not self._ahead and not self._left:
+                break
+            parts.append(part)
+            size -= len(part)
+        return b"".join(parts)
