@@ -328,7 +328,7 @@ def write_record(root: Path) -> None:
     hashes = {f"session/trials/{name}.csv": f"{number:x}" * 64 for number, name in enumerate(FREE)}
     stages = {
         name: {
-            "state": "done", "key": f"{number}bcdef0123456789", "config": {"model": "base"},
+            "key": f"{number}bcdef0123456789", "config": {"model": "base"},
             "inputs": {"session/session.toml": "a" * 64, **hashes} if name == "ingest" else {},
             "outputs": {"x": "y"}, "versions": {"bampipe": "0.1.0"},
         }
@@ -340,6 +340,7 @@ def write_record(root: Path) -> None:
     }
     content = {
         "schema": "bampipe.run/1", "stages": stages, "timings": timings,
+        "failures": {"diagnose:base": "one free trial only"},
         "versions": {"bampipe": "0.1.0", "python": "3.11.9"},
     }  # fmt: skip
     write_json(root / "run.json", content)

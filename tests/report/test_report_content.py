@@ -155,6 +155,7 @@ def test_provenance_lists_inputs_versions_and_timings(full: Report) -> None:
     words = words[words.rindex("Provenance") :]
     assert "bampipe 0.1.0" in words
     assert "aaaaaaaaaaaa" in words
+    assert "diagnose:base failed when last tried: one free trial only" in words
     assert "2.2" in row_of(full.html[full.html.rindex("Stages") :], "filter")
 
 

@@ -78,10 +78,10 @@ def _picture(results: Results, rungs: list[dict[str, Any]]) -> Figure:
         floor = _values(rungs, "noise_floor", axis)
         panel.plot(x, error, "o-", color=style.BLUE, ms=4.5, lw=1.3, label="held-out error")
         panel.plot(x, floor, "s--", color=style.VERMILLION, ms=3.0, lw=1.0, label="noise floor")
-        for place, value in zip(x, error, strict=True):
+        for place, value, least in zip(x, error, floor, strict=True):
             if np.isfinite(value):
                 panel.annotate(
-                    wording.significant(float(value), 2), (place, value), (4, 4),
+                    wording.significant(float(value), 2), (place, value), (4, -10 if least > value else 4),
                     textcoords="offset points", ha="left", fontsize=7,
                 )  # fmt: skip
         top = np.nanmax(np.concatenate([error, floor, [0.0]]))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from bampipe.report import wording
-from bampipe.report.document import Block, Section, Subheading, Table, Text
+from bampipe.report.document import Block, Bullets, Section, Subheading, Table, Text
 from bampipe.report.results import Results
 
 TITLE = "Provenance"
@@ -24,9 +24,13 @@ def section(results: Results) -> Section:
     if inputs is not None:
         blocks.append(inputs)
     blocks.append(_stages(stages, content.get("timings", {})))
-    gates = content.get("gates") or []
-    if gates:
-        blocks.append(_gates(gates))
+    failures = content.get("failures") or {}
+    if failures:
+        blocks.append(
+            Bullets(
+                tuple(f"`{name}` failed when last tried: {why}" for name, why in failures.items())
+            )
+        )
     settings = _settings(stages)
     if settings is not None:
         blocks += [Subheading("Settings"), settings]
@@ -60,15 +64,16 @@ def _inputs(stages: dict[str, Any]) -> Table | None:
 
 def _stages(stages: dict[str, Any], timings: dict[str, Any]) -> Table:
     rows = []
-    for name, made in stages.items():
+    order = sorted(stages, key=lambda name: str(timings.get(name, {}).get("started_at", "")))
+    for name in order:
         if name == "report":
             continue
+        made = stages[name]
         timing = timings.get(name, {})
         seconds = timing.get("seconds")
         rows.append(
             (
                 f"`{name}`",
-                str(made.get("state", "–")),
                 str(timing.get("started_at", "–")).replace("T", " ").removesuffix("+00:00"),
                 "–" if seconds is None else wording.plain(float(seconds), 1),
                 str(len(made.get("outputs") or ())),
@@ -77,23 +82,11 @@ def _stages(stages: dict[str, Any], timings: dict[str, Any]) -> Table:
         )
     return Table(
         "Stages",
-        ("Stage", "State", "Started (UTC)", "Seconds", "Files", "Key"),
+        ("Stage", "Started (UTC)", "Seconds", "Files", "Key"),
         tuple(rows),
-        "lllrrl",
+        "llrrl",
         note="Key: hash of everything the stage depends on (inputs, settings, code, versions).",
     )
-
-
-def _gates(gates: list[dict[str, Any]]) -> Table:
-    rows = tuple(
-        (
-            str(gate.get("gate", "")),
-            str(gate.get("state", "")),
-            str(gate.get("message", "")),
-        )
-        for gate in gates
-    )
-    return Table("Quality gates", ("Gate", "State", "Found"), rows, "lll", (0.7, 0.0, 1.0))
 
 
 def _settings(stages: dict[str, Any]) -> Table | None:
