@@ -95,6 +95,8 @@ def read_json(path: Path) -> Any:
         raise InputError(f"not JSON: {error.msg}", where=f"{path}, line {error.lineno}") from error
     except UnicodeDecodeError as error:
         raise InputError("not JSON: not UTF-8 text", where=str(path)) from error
+    except (ValueError, RecursionError) as error:
+        raise InputError("not JSON of a sensible size", where=str(path)) from error
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -115,7 +117,7 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise InputError(
             "not UTF-8 text", where=f"{path}, line {line}", remedy="save it as UTF-8"
         ) from error
-    except tomllib.TOMLDecodeError as error:
+    except ValueError as error:  # TOMLDecodeError, or a number of thousands of digits
         what, _, place = str(error).rpartition(" (at ")
         found = re.match(r"line (\d+)", place)
         line = found[1] if found else data.rstrip().count(b"\n") + 1

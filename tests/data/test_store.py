@@ -33,6 +33,13 @@ def test_json_names_the_place_of_a_number_that_is_not_finite(tmp_path, bad):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("content", [b"[" * 100_000, b"9" * 5000, b"\xff", b""])
+def test_json_that_is_no_json_is_named(tmp_path, content):
+    (tmp_path / "x.json").write_bytes(content)
+    with pytest.raises(InputError, match=r"x\.json.*: not JSON"):
+        store.read_json(tmp_path / "x.json")
+
+
 def test_json_that_is_broken_is_named_with_its_line(tmp_path):
     path = tmp_path / "x.json"
     path.write_text('{"a": 1,\n oops}')
@@ -45,6 +52,8 @@ def test_json_that_is_broken_is_named_with_its_line(tmp_path):
     [
         (b"a = 1\nb = = 2\n", "line 2"),
         (b"a = 1\n\xff = 2\n", "line 2: not UTF-8"),
+        (b"a = 2026-13-45\n", "line 1: not TOML"),
+        (b"a = " + b"9" * 5000, "not TOML"),
         ("a = 1\n".encode("utf-16"), "UTF-16"),
         (b"a = " + b"[" * 50_000, "nested too deeply"),
         (b".".join([b"a"] * 5_000) + b" = 1", "nested too deeply"),

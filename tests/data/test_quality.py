@@ -1,0 +1,171 @@
+"""Quality rules: what they leave alone, and that nothing unsound comes through."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bampipe.data.quality import Limits, clean
+from bampipe.data.readers import RawTrial
+from bampipe.data.session import session_from
+from bampipe.errors import InputError
+
+TABLE = {
+    "schema": "bampipe.session/1",
+    "session_id": "s",
+    "device": "any",
+    "sample_rate_hz": 500.0,
+    "encoders": {
+        "yaw": {"column": "yaw", "counts_per_unit": 20000.0, "unit": "rad"},
+        "turn": {"column": "turn", "unit": "rad", "resolution": 1e-4},
+    },
+    "force": {
+        "columns": ["force_x"],
+        "unit": "V",
+        "calibration_n_per_v": [[10.0]],
+        "zero_v": [0.5],
+    },
+    "trials": [
+        {"file": "a.csv", "kind": "free"},
+        {"file": "b.csv", "kind": "locked", "locked_axis": "yaw"},
+    ],
+}
+SESSION = session_from(TABLE, Path())
+N = 1500
+
+
+def columns(n=N, seed=0):
+    rng = np.random.default_rng(seed)
+    t = np.arange(n) / 500.0
+    return {
+        "time_us": np.rint(t * 1e6),
+        "yaw": np.rint(10_000 * np.sin(2 * np.pi * t)),
+        "turn": 0.5 * np.sin(3 * t),
+        "force_x": np.sin(5 * t) + 0.01 * rng.standard_normal(n),
+    }
+
+
+def cleaned(table, kind=0, limits=None):
+    raw = RawTrial({name: np.array(values, dtype=float) for name, values in table.items()}, 2)
+    return clean(raw, SESSION, SESSION.trials[kind], limits or Limits())
+
+
+def test_a_sound_trial_comes_through_untouched():
+    table = columns()
+    trial = cleaned(table)
+    assert trial.repairs == [] and trial.notes == []
+    np.testing.assert_allclose(trial.columns["q_yaw"], table["yaw"] / 20000.0)
+    np.testing.assert_allclose(trial.columns["force_x"], 10.0 * (table["force_x"] - 0.5))
+    assert trial.sample_rate == pytest.approx(500.0)
+
+
+def test_a_quiet_channel_of_a_coarse_converter_is_not_saturated():
+    table = columns()
+    slow = 0.004 * np.sin(np.arange(N) / 60.0)
+    table["force_x"] = np.round((slow + 0.0005 * np.random.default_rng(1).normal(size=N)) / 2e-3)
+    table["force_x"] *= 2e-3
+    assert cleaned(table).repairs == []
+
+
+def test_a_short_clip_is_left():
+    table = columns()
+    top = np.sort(table["force_x"])[-10]
+    table["force_x"] = np.minimum(table["force_x"], top)
+    assert cleaned(table).repairs == []
+
+
+def test_a_quick_start_after_a_long_rest_is_no_jump():
+    table = columns()
+    table["yaw"] = np.rint(np.where(np.arange(N) < 1450, 0, (np.arange(N) - 1450) * 600.0))
+    assert cleaned(table).repairs == []
+
+
+def test_an_angle_that_goes_on_past_a_full_turn_is_unwrapped():
+    table = columns()
+    table["turn"] = np.linspace(0, 14, N)
+    wrapped = cleaned({**table, "turn": np.mod(table["turn"] + np.pi, 2 * np.pi) - np.pi})
+    assert "wraps at a full turn 2 times" in wrapped.repairs[0]
+    np.testing.assert_allclose(wrapped.columns["q_turn"], table["turn"], atol=1e-9)
+
+
+def test_wraps_and_missing_samples_together():
+    table = columns()
+    table["yaw"] = np.mod(table["yaw"] + 2**15, 2**16)
+    table["yaw"][[0, 375, 376, 1000]] = np.nan
+    trial = cleaned(table)
+    assert "1 row with missing samples at the ends dropped" in trial.repairs
+    assert "column 'yaw': 3 missing samples interpolated" in trial.repairs
+    assert np.abs(np.diff(trial.columns["q_yaw"])).max() < 0.01
+
+
+def test_wraps_are_undone_exactly():
+    table = columns()
+    table["yaw"] *= 4
+    wrapped = cleaned({**table, "yaw": np.mod(table["yaw"], 2**16)})
+    start = np.mod(table["yaw"][0], 2**16) - table["yaw"][0]
+    np.testing.assert_allclose(wrapped.columns["q_yaw"] * 20000, table["yaw"] + start)
+
+
+def test_limits_are_heeded():
+    table = columns()
+    table["force_x"][100:107] = np.nan
+    with pytest.raises(InputError, match=r"a\.csv, row 102, column 'force_x': 7 samples in a row"):
+        cleaned(table)
+    assert "7 missing samples interpolated" in cleaned(table, limits=Limits(nan_run=7)).repairs[0]
+
+
+def test_interpolation_follows_the_time_stamps():
+    table = columns()
+    table["time_us"][500:] += 2000
+    table["turn"] = table["time_us"] * 1e-6
+    expected = table["turn"].copy()
+    table["turn"][499:502] = np.nan
+    np.testing.assert_allclose(cleaned(table).columns["q_turn"], expected, atol=1e-12)
+
+
+DAMAGE = st.lists(
+    st.tuples(
+        st.sampled_from(list(columns(4))),
+        st.integers(0, N - 1),
+        st.integers(1, 40),
+        st.sampled_from(["nan", "inf", "zero", "hold", "jump", "flip", "huge"]),
+    ),
+    max_size=6,
+)
+
+
+@settings(max_examples=200, deadline=None, derandomize=True)
+@given(DAMAGE, st.integers(1, N), st.integers(0, 1))
+def test_what_comes_through_is_sound_and_what_changed_is_said(damages, length, kind):
+    table = columns()
+    for name, start, size, how in damages:
+        part = slice(start, start + size)
+        values = table[name]
+        if how in ("nan", "inf"):
+            values[part] = float(how)
+        elif how == "zero":
+            values[part] = 0.0
+        elif how == "hold":
+            values[part] = values[start]
+        elif how == "jump":
+            values[start:] += 30_000
+        elif how == "flip":
+            values[part] = values[part][::-1].copy()
+        else:
+            values[part] = 1e300
+    table = {name: values[:length] for name, values in table.items()}
+    try:
+        trial = cleaned(table, kind)
+    except InputError as error:
+        assert str(error).startswith(SESSION.trials[kind].file) and "\n" not in str(error)
+        return
+    assert (np.diff(trial.t) > 0).all() and trial.t[0] == 0 and trial.t[-1] >= 1.0
+    for name, values in trial.columns.items():
+        assert np.isfinite(values).all() and len(values) == len(trial.t), name
+    assert np.abs(np.diff(trial.columns["q_yaw"])).max() < 0.5
+    if len(trial.t) != length:
+        assert trial.repairs
