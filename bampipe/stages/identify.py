@@ -38,8 +38,14 @@ FORMS = ("square_root", "covariance")
 MEASURES = ("position", "position_velocity")
 _TUNING_SAMPLES = 4000
 """Samples of one trial on which the noise levels are tuned."""
-_COARSE = 30.0
+_TUNING_STEP_S = 2e-3
+"""Longest Runge-Kutta step while tuning, s: noise levels need no more."""
+_COARSE = 300.0
 """Factor on the process noise of the search for the region of the answer."""
+_RESTARTS = 5
+"""Further searches, each with four times the process noise of the one before."""
+_LARGEST_NIS = 10.0
+"""Mean normalised innovation squared from which on the filter is taken to have lost the motion."""
 
 Array = NDArray[np.float64]
 
@@ -107,6 +113,7 @@ class _Estimate:
     value: Array
     covariance: Array
     filter_sd: Array | None
+    systematic_sd: Array | None
     at_bound: NDArray[np.bool_]
     report: dict[str, object]
     states: pd.DataFrame
@@ -276,31 +283,58 @@ def _unscented(
     prior_sd = np.array([*(item.sd for item in _free(system)), model.upper[-1] / np.sqrt(3.0)])
     first = np.append(start[model.free[:-1]], 0.0)
     spread = np.hypot(prior_sd, first - np.append(system.prior[model.free[:-1]], 0.0))
-    mean, sd = model.to_estimated(first, spread)
+    order = [*range(1, len(trials)), 0]
 
     def told(done: int) -> None:
-        progress(
-            0.35 + 0.6 * done / (len(trials) + 1), motions[min(done, len(motions) - 1)].trial_id
-        )
+        place = order[done - 1] if done else 0
+        progress(0.35 + 0.6 * done / (len(trials) + 1), motions[place].trial_id)
+
+    def attempt(value: Array, sd: Array, noise_factor: float) -> tuple[FilterResult, ...]:
+        mean, sd = model.to_estimated(value, sd)
+        level = replace(settings, noise_sd=noise_factor * settings.noise_sd)
+        told(0)
+        search = run_filter(
+            model, trials[:1], mean, np.diag(sd**2),
+            replace(level, noise_sd=_COARSE * level.noise_sd),
+        )  # fmt: skip
+        main = run_filter(
+            model, [trials[i] for i in order], search.theta, search.covariance, level,
+            lambda done: told(done),
+        )  # fmt: skip
+        return search, main
 
     # A filter that trusts its model far from the truth does not find back. The first trial is
     # filtered with much process noise, which adds next to no information, and filtered again at
-    # the end in its own right.
-    coarse = replace(settings, noise_sd=_COARSE * settings.noise_sd)
-    order = [*range(1, len(trials)), 0]
-    try:
-        search = run_filter(model, trials[:1], mean, np.diag(sd**2), coarse)
-        told(1)
-        main = run_filter(
-            model, [trials[i] for i in order], search.theta, search.covariance, settings,
-            lambda done: told(done + 1),
-        )  # fmt: skip
-    except FilterFailure as error:
-        raise _plain(error, motions, trials, config) from error
+    # the end in its own right. If that fails, the search starts from least squares instead, then
+    # with more and more process noise, as a model that lacks much needs.
+    failure: FilterFailure | None = None
+    found: tuple[FilterResult, ...] | None = None
+    level = settings
+    tries = [(first, spread, 1.0)]
+    settled = squares.p[model.free]
+    tries += [(settled, prior_sd, 4.0**k) for k in range(_RESTARTS)]
+    restarts = -1
+    for value, sd, factor in tries:
+        restarts += 1
+        try:
+            candidate = attempt(value, sd, factor)
+        except FilterFailure as error:
+            failure = error
+            continue
+        found, level = candidate, replace(settings, noise_sd=factor * settings.noise_sd)
+        if _mean_nis(candidate[1], settings) < _LARGEST_NIS:
+            break
+    if found is None or _mean_nis(found[1], settings) >= _LARGEST_NIS:
+        raise _lost(found, failure, system, motions, trials, order, config)
+    search, main = found
+    settings = level
     covariance, blocks = sandwich_covariance(
         main.trials, model.n_states, search.theta, search.covariance, config.block_s
     )
     value, slope = model.to_physical(main.theta)
+    scaled = covariance * np.outer(slope, slope)
+    systematic = _systematic(value, scaled, squares, model)
+    scaled += np.diag(systematic**2)
     lower, upper = model.range
     tight = np.sqrt(np.diag(main.covariance))
     kept = value.size - 1
@@ -309,20 +343,21 @@ def _unscented(
         "noise": _noise_report(system, settings, noise),
         "input_timing": {
             "estimate": float(value[-1]),
-            "sd": float(np.sqrt(covariance[-1, -1])),
+            "sd": float(np.sqrt(scaled[-1, -1])),
             "unit": "s",
         },
         "blocks": blocks,
+        "restarts": restarts,
         "state_3sigma": _state_3sigma(system, main.trials),
         "convergence": _convergence(system, model, search, main, covariance),
     }
     steps = [motions[0], *(motions[i] for i in order)]
     passes = [*search.trials, *main.trials]
-    scaled = covariance * np.outer(slope, slope)
     return _Estimate(
         value=value[:kept],
         covariance=scaled[:kept, :kept],
         filter_sd=(slope * tight)[:kept],
+        systematic_sd=systematic[:kept],
         at_bound=((main.theta - lower < tight) | (upper - main.theta < tight))[:kept],
         report=report,
         states=_states(system, motions, order, main, value, config),
@@ -377,7 +412,7 @@ def _tuned(
         reading_sd=noise.reading_sd,
         noise_sd=noise.process_sd,
         walk_sd=config.random_walk * prior_sd,
-        longest_step=config.longest_step_s,
+        longest_step=_TUNING_STEP_S,
         square_root=config.form == "square_root",
     )
     longest = max(range(len(trials)), key=lambda i: trials[i].t.size)
@@ -412,21 +447,62 @@ def _tuned(
     if config.force_noise > 0.0:
         step[1:][noise.is_force] = 0.0
     best, _ = climb(log_likelihood, np.zeros(count + 1), step, lower)
-    return with_levels(best)
+    return replace(with_levels(best), longest_step=config.longest_step_s)
 
 
-def _plain(
-    error: FilterFailure, motions: Sequence[Motion], trials: Sequence[Trial], config: Config
+def _systematic(
+    value: Array, covariance: Array, squares: LeastSquares, model: FilterModel
+) -> Array:
+    """Return how far filter and least squares disagree beyond their standard deviations.
+
+    Both see the same data and err alike by noise, but not by what the model lacks: where the
+    model is right, their difference stays below the sum of their variances and adds nothing.
+    """
+    difference = value - squares.p[model.free]
+    variance = np.diag(covariance) + np.diag(squares.covariance)
+    return np.asarray(np.sqrt(np.maximum(difference**2 - variance, 0.0)))
+
+
+def _lost(
+    found: tuple[FilterResult, ...] | None,
+    failure: FilterFailure | None,
+    system: System,
+    motions: Sequence[Motion],
+    trials: Sequence[Trial],
+    order: Sequence[int],
+    config: Config,
 ) -> InputError:
     """Say in physical words where the filter lost the motion."""
-    number = error.trial if len(trials) == 1 else (error.trial + 1) % len(trials)
-    t = trials[number].t[error.sample]
+    remedy = "try --method least-squares, or set the trial aside if its sensors jumped there"
+    where = f"model {config.model}"
+    if found is not None:
+        nis = [float(np.nanmean(trial.nis)) for trial in found[1].trials]
+        worst = int(np.argmax(nis))
+        trial = found[1].trials[worst]
+        ratio = np.sqrt(np.nanmean((trial.innovation / trial.innovation_sd) ** 2, axis=0))
+        axis = (*system.coordinates, *system.coordinates)[int(np.argmax(ratio))]
+        return InputError(
+            f"the filter does not follow trial {motions[order[worst]].trial_id}: its prediction "
+            f"of {axis} one sample ahead errs {ratio.max():.0f} times more than noise explains",
+            where=where,
+            remedy=remedy,
+        )
+    if failure is None:
+        raise RuntimeError("no attempt was made")
+    number = order[failure.trial] if failure.trial < len(order) else 0
+    t = trials[number].t[min(failure.sample, trials[number].t.size - 1)]
     return InputError(
         f"the filter lost the motion of trial {motions[number].trial_id} at {t:.2f} s: "
-        f"{error.reason}",
-        where=f"model {config.model}",
-        remedy="try --method least-squares, or set the trial aside if its sensors jumped there",
+        f"{failure.reason}",
+        where=where,
+        remedy=remedy,
     )
+
+
+def _mean_nis(found: FilterResult, settings: FilterSettings) -> float:
+    """Return the mean normalised innovation squared of the worst trial; 1 is consistent."""
+    worst = max(float(np.nanmean(trial.nis)) for trial in found.trials)
+    return worst / settings.observed.size if np.isfinite(worst) else np.inf
 
 
 def _nis(
@@ -577,7 +653,6 @@ def _from_squares(
 ) -> _Estimate:
     """Return the least-squares estimate; its trace is the fit to the trials so far."""
     names = [system.parameters[i].name for i in problem.free[:-1]]
-    n = len(system.coordinates)
     rows, clock = [], 0.0
     for number, motion in enumerate(motions):
         clock += float(motion.t[-1])
@@ -612,6 +687,7 @@ def _from_squares(
         value=squares.p[problem.free[:-1]],
         covariance=squares.covariance[:kept, :kept],
         filter_sd=None,
+        systematic_sd=None,
         at_bound=squares.at_bound[:kept],
         report=report,
         states=pd.concat(frames, ignore_index=True),
@@ -638,8 +714,9 @@ def _content(
             "unit": system.parameters[free[i]].unit,
             "at_bound": bool(estimate.at_bound[i]),
         }
-        if estimate.filter_sd is not None:
+        if estimate.filter_sd is not None and estimate.systematic_sd is not None:
             entry["filter_sd"] = float(estimate.filter_sd[i])
+            entry["systematic_sd"] = float(estimate.systematic_sd[i])
             entry["least_squares"] = float(squares.p[free[i]])
         parameters[name] = entry
     return {

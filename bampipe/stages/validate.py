@@ -1,0 +1,363 @@
+"""Stage validate: inverse-dynamics torque and handle force against the measured ones (Fig. 9)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from bampipe.data.store import write_json, write_parquet
+from bampipe.discover.recording import Motion as Driven
+from bampipe.discover.recording import Recording, Sensors
+from bampipe.discover.replay import replay
+from bampipe.errors import InputError
+from bampipe.estimate import butterworth, kalman_smoother, savitzky_golay
+from bampipe.estimate.differentiation import Derivatives
+from bampipe.estimate.least_squares import Band, Problem, fit
+from bampipe.physics import System, compile_model
+from bampipe.physics.effect import derivative
+from bampipe.stages.base import Progress, RunFolder
+from bampipe.stages.modelfile import load_model, model_inputs
+from bampipe.stages.motions import Motion, free_trials, problem_of, read_motion
+
+NAME = "validate"
+SUMMARY = "Predicted against measured torque and force, on trials that the fit has not seen"
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Config:
+    """What the stage can be told.
+
+    Attributes:
+        model: which model version.
+        cutoff_hz: low-pass that measured and predicted torque both go through, Hz.
+        noise_floor: whether to compute what sensors and filters alone would leave.
+        repeats: simulated sessions for the noise floor.
+        seed: of their sensor noise.
+    """
+
+    model: str = "base"
+    cutoff_hz: float = 8.0
+    noise_floor: bool = True
+    repeats: int = 1
+    seed: int = 0
+
+
+def inputs(config: Config) -> tuple[str, ...]:
+    """Return the paths the stage reads."""
+    return (
+        "ingest/trials.parquet",
+        "ingest/session.json",
+        "filter/kinematics.parquet",
+        "filter/filter.json",
+        *model_inputs(config.model),
+        f"models/{config.model}/identify.json",
+    )
+
+
+def outputs(config: Config) -> tuple[str, ...]:
+    """Return the paths the stage writes."""
+    folder = f"models/{config.model}"
+    return (f"{folder}/validate.json", f"{folder}/residuals.parquet")
+
+
+@dataclass(frozen=True)
+class _Compared:
+    """One trial, low-passed and thinned; torques (K, n_q), N.m or N, forces (K, n_f), N.
+
+    ``used`` (K, n_q) is false where an axis stands still: there Coulomb friction balances
+    whatever the load is, and no model predicts it.
+    """
+
+    trial_id: str
+    t: Array
+    used: NDArray[np.bool_]
+    measured: Array
+    residual: Array
+    residual_held_out: Array
+    residual_without_friction: Array
+    force: Array
+    force_residual: Array
+
+
+def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
+    """Compare one identified model with all free trials."""
+    if not config.cutoff_hz > 0.0:
+        raise InputError("must be positive", where="validate.cutoff_hz")
+    if config.repeats < 1:
+        raise InputError("must be 1 or more", where="validate.repeats")
+    session = run.read_json("ingest/session.json")
+    run.require(f"models/{config.model}/identify.json", "identify")
+    identified = run.read_json(f"models/{config.model}/identify.json")
+    system = compile_model(load_model(run, config.model))
+    motions = [read_motion(run, trial, system) for trial in free_trials(run)]
+    band = Band(float(session["sample_rate_hz"]), config.cutoff_hz)
+    problem = problem_of(system, motions, band)
+    p = _identified(system, identified, run)
+    progress(0.1, "held-out fits")
+    compared = _compare(system, motions, problem, p)
+    notes = []
+    if len(motions) == 1:
+        notes.append("One free trial: nothing is held out; its error is that of the fit itself.")
+    floor: Array | None = None
+    if config.noise_floor:
+        progress(0.4, "noise floor")
+        try:
+            floor = _noise_floor(run, session, system, motions, band, p, config)
+        except InputError as error:
+            notes.append(f"No noise floor: simulating the fitted model failed ({error}).")
+    content = _content(system, compared, floor, notes, config)
+    write_json(out / f"models/{config.model}/validate.json", content)
+    write_parquet(
+        out / f"models/{config.model}/residuals.parquet", _table(system, compared, len(motions) > 1)
+    )
+    return content
+
+
+def _identified(system: System, content: Mapping[str, Any], run: RunFolder) -> Array:
+    """Return the identified parameters (np + 1,), the timing of the inputs last."""
+    p = system.prior
+    for i, item in enumerate(system.parameters):
+        if item.fixed:
+            continue
+        if item.name not in content["parameters"]:
+            raise InputError(
+                f"identify.json has no parameter {item.name!r}",
+                where=str(run.root),
+                remedy="run identify again (--force)",
+            )
+        p[i] = content["parameters"][item.name]["estimate"]
+    return np.append(p, content["input_timing"]["estimate"])
+
+
+def _compare(
+    system: System, motions: Sequence[Motion], problem: Problem, p: Array
+) -> list[_Compared]:
+    """Compare every trial with the model as identified, held out, and without friction."""
+    frictionless = p.copy()
+    for i, item in enumerate(system.parameters):
+        if item.name.startswith(("viscous.", "coulomb.")):
+            frictionless[i] = 0.0
+    held_out = _held_out(problem, p)
+    compared = []
+    for k, motion in enumerate(motions):
+        n = len(system.parameters)
+        u = motion.u - p[n] * motion.u_rate
+        z = system.memory(motion.q, motion.qd, motion.qdd, u, p[:n], motion.t)
+        applied = system.applied(motion.q, motion.qd, motion.qdd, z, u, p[:n])
+        force = [system.inputs.index(name) for name in system.model.device.forces]
+        kept = problem.band.kept(len(motion.t))
+        thin = problem.band.thin
+        resting = np.abs(thin(problem.resting[k].astype(float)))
+        residual = thin(problem.residual(k, p))
+        push = np.linalg.pinv(system.input_map(motion.q[kept]))
+        compared.append(
+            _Compared(
+                trial_id=motion.trial_id,
+                t=motion.t[kept],
+                used=resting < 0.02,
+                measured=thin(applied),
+                residual=residual,
+                residual_held_out=thin(problem.residual(k, held_out[k])),
+                residual_without_friction=thin(problem.residual(k, frictionless)),
+                force=thin(motion.u[:, force]),
+                force_residual=np.einsum("tfq,tq->tf", push, residual),
+            )
+        )
+    return compared
+
+
+def _held_out(problem: Problem, p: Array) -> list[Array]:
+    """Return, for each trial, the parameters that the other trials give."""
+    everything = range(problem.n_trials)
+    if problem.n_trials == 1:
+        return [p]
+    start = fit(problem, p).p
+    return [fit(problem, start, trials=[i for i in everything if i != k]).p for k in everything]
+
+
+def _noise_floor(
+    run: RunFolder,
+    session: Mapping[str, Any],
+    system: System,
+    motions: Sequence[Motion],
+    band: Band,
+    p: Array,
+    config: Config,
+) -> Array:
+    """Return the held-out error (n_q,) that the identified model leaves when it is the truth.
+
+    Every trial is replayed by the model under the measured force and an arm that keeps the
+    motion near the measured one; the replay goes through the same encoders, force noise,
+    filters and fits as the measurement.
+    """
+    settings = run.read_json("filter/filter.json")
+    noise = session.get("force", {}).get("noise_sd")
+    resolution = [session["axes"][axis].get("resolution") or 0.0 for axis in system.coordinates]
+    quiet = [settings["axes"][axis]["measurement_noise_sd"] for axis in system.coordinates]
+    sensors = Sensors(
+        rate_hz=band.rate_hz,
+        resolution=np.where(
+            np.array(resolution) > 0.0, resolution, np.sqrt(12.0) * np.array(quiet)
+        ),
+        force_sd=np.full(len(system.model.device.forces), float(noise or 0.0)),
+    )
+    squares, counts = np.zeros(len(system.coordinates)), np.zeros(len(system.coordinates))
+    parameters = p[: len(system.parameters)]
+    for repeat in range(config.repeats):
+        seen = []
+        for number, motion in enumerate(motions):
+            rng = np.random.default_rng([config.seed, repeat, number])
+            channels = dict(zip(system.inputs, motion.u.T, strict=True))
+            for axis in system.coordinates:
+                brake = system.model.device.brakes.get(axis)
+                channels.setdefault(brake or axis, np.zeros(len(motion.t)))
+            driven = Driven(motion.trial_id, motion.t, motion.q, motion.qd, motion.qdd, channels)
+            recording = replay(system, parameters, driven, sensors, rng)
+            seen.append(_filtered(recording, motion, system, settings, band.rate_hz))
+        problem = problem_of(system, seen, band)
+        start = np.append(parameters, 0.0)
+        for k, held in enumerate(_held_out(problem, start)):
+            used = np.abs(band.thin(problem.resting[k].astype(float))) < 0.02
+            residual = band.thin(problem.residual(k, held)) * used
+            squares += np.sum(residual**2, axis=0)
+            counts += used.sum(axis=0)
+    return np.asarray(np.sqrt(squares / np.maximum(counts, 1.0)))
+
+
+def _filtered(
+    recording: Recording,
+    motion: Motion,
+    system: System,
+    settings: Mapping[str, Any],
+    rate: float,
+) -> Motion:
+    """Return a replayed trial after the filters that the measured one went through."""
+    moved = [
+        _differentiated(recording.q[:, i], settings["method"], settings["axes"][axis], rate)
+        for i, axis in enumerate(system.coordinates)
+    ]
+    u, u_rate = motion.u.copy(), np.zeros_like(motion.u)
+    cutoff = settings["force"]["derivative_cutoff_hz"]
+    at = {name: place for place, name in enumerate(system.inputs)}
+    for column, name in enumerate(system.model.device.forces):
+        _, first, second = butterworth.zero_phase(recording.force[:, column], rate, cutoff)
+        u[:, at[name]], u_rate[:, at[name]] = recording.force[:, column], first
+        for order, values in ((1, first), (2, second)):
+            if derivative(name, order) in at:
+                u[:, at[derivative(name, order)]] = values
+    return replace(
+        motion,
+        q=np.stack([m.position for m in moved], axis=1),
+        qd=np.stack([m.velocity for m in moved], axis=1),
+        qdd=np.stack([m.acceleration for m in moved], axis=1),
+        u=u,
+        u_rate=u_rate,
+    )
+
+
+def _differentiated(
+    position: Array, method: str, axis: Mapping[str, Any], rate: float
+) -> Derivatives:
+    """Differentiate as ``filter/filter.json`` says that the measured positions were."""
+    noise_sd, cutoff = float(axis["measurement_noise_sd"]), float(axis["bandwidth_hz"])
+    if method == "kalman":
+        order = int(axis["order"])
+        ratio = kalman_smoother.ratio_for(cutoff, order, rate)
+        model = kalman_smoother.MotionModel(order, noise_sd, ratio, rate)
+        return kalman_smoother.smooth(position, model)
+    smooth = butterworth.smooth if method == "butterworth" else savitzky_golay.smooth
+    return smooth(position, rate, cutoff, noise_sd)
+
+
+def _rms(values: Sequence[Array], used: Sequence[NDArray[np.bool_]]) -> Array:
+    """Return the root mean square by axis of the samples that count."""
+    square = sum(np.sum(v**2 * keep, axis=0) for v, keep in zip(values, used, strict=True))
+    count = sum(keep.sum(axis=0) for keep in used)
+    return np.asarray(np.sqrt(square / np.maximum(count, 1)))
+
+
+def _entries(
+    system: System, compared: Sequence[_Compared], floor: Array | None
+) -> dict[str, dict[str, object]]:
+    """Return the numbers of each axis over some trials."""
+    used = [c.used for c in compared]
+    rmse = _rms([c.residual for c in compared], used)
+    held_out = _rms([c.residual_held_out for c in compared], used)
+    without = _rms([c.residual_without_friction for c in compared], used)
+    count = np.maximum(sum(keep.sum(axis=0) for keep in used), 1)
+    mean = sum(np.sum(c.measured * c.used, axis=0) for c in compared) / count
+    spread = _rms([c.measured - mean for c in compared], used)
+    entries: dict[str, dict[str, object]] = {}
+    for i, axis in enumerate(system.coordinates):
+        share = held_out[i] / spread[i] if spread[i] > 0.0 else 1.0
+        entries[axis] = {
+            "rmse": float(rmse[i]),
+            "rmse_without_friction": float(without[i]),
+            "held_out_rmse": float(held_out[i]),
+            "fit_percent": float(100.0 * (1.0 - share)),
+            "unit": system.torque_units[i],
+        }
+        if floor is not None:
+            entries[axis]["noise_floor"] = float(floor[i])
+    return entries
+
+
+def _content(
+    system: System,
+    compared: Sequence[_Compared],
+    floor: Array | None,
+    notes: Sequence[str],
+    config: Config,
+) -> dict[str, object]:
+    """Return what validate.json says."""
+    axes = _entries(system, compared, floor)
+    forces = {}
+    for column, name in enumerate(system.model.device.forces):
+        error = np.concatenate([c.force_residual[c.used.all(axis=1), column] for c in compared])
+        forces[name] = {
+            "rmse": float(np.sqrt(np.mean(error**2))) if error.size else 0.0,
+            "unit": "N",
+        }
+    best = ", ".join(f"{axis} {entry['fit_percent']:.1f} %" for axis, entry in axes.items())
+    return {
+        "model": config.model,
+        "axes": axes,
+        "trials": {
+            c.trial_id: _entries(system, [c], None) | {"held_out": len(compared) > 1}
+            for c in compared
+        },
+        "forces": forces,
+        "cutoff_hz": config.cutoff_hz,
+        "notes": list(notes),
+        "headline": f"fit on held-out trials: {best}",
+    }
+
+
+def _table(system: System, compared: Sequence[_Compared], held_out: bool) -> pd.DataFrame:
+    """Return residuals.parquet: predictions by parameters that have not seen the trial."""
+    frames = []
+    for c in compared:
+        columns: dict[str, object] = {"trial_id": c.trial_id, "t": c.t, "held_out": held_out}
+        for i, axis in enumerate(system.coordinates):
+            measured = c.measured[:, i]
+            columns[f"torque_measured_{axis}"] = measured
+            columns[f"torque_predicted_{axis}"] = measured - c.residual_held_out[:, i]
+            columns[f"torque_predicted_without_friction_{axis}"] = (
+                measured - c.residual_without_friction[:, i]
+            )
+            columns[f"residual_{axis}"] = c.residual_held_out[:, i]
+            columns[f"moving_{axis}"] = c.used[:, i]
+        for j, name in enumerate(system.model.device.forces):
+            component = name.removeprefix("force_")
+            columns[f"force_measured_{component}"] = c.force[:, j]
+            columns[f"force_predicted_{component}"] = c.force[:, j] - c.force_residual[:, j]
+        frames.append(pd.DataFrame(columns))
+    return pd.concat(frames, ignore_index=True)
