@@ -1,0 +1,99 @@
+"""Fixtures of the whole test suite: toy stages, and folders to work in."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+TOYS = Path(__file__).parent / "toys"
+sys.path.insert(0, str(TOYS))
+
+import install_toys  # noqa: E402
+
+import bampipe.stages  # noqa: E402
+from bampipe.run import pipeline as pipelines  # noqa: E402
+from bampipe.run.runner import Event, Outcome, Request, run_session  # noqa: E402
+from bampipe.stages import base  # noqa: E402
+
+
+class Toy:
+    """A session of the toy stages in a folder of its own, and how to run it."""
+
+    def __init__(self, folder: Path, log: Path) -> None:
+        self.folder = folder
+        self.session = install_toys.make_session(folder / "sessions" / "first")
+        self.pipeline_file = install_toys.make_pipeline(folder)
+        self.runs = folder / "runs"
+        self.root = self.runs / "first"
+        self.log = log
+        self.events: list[Event] = []
+
+    def request(self, **changes: Any) -> Request:
+        pipeline = pipelines.load(str(self.pipeline_file))
+        return replace(Request(self.root, pipeline, session=self.session, judged="base"), **changes)
+
+    def run(self, **changes: Any) -> Outcome:
+        return run_session(self.request(**changes), self.events.append)
+
+    def ran(self) -> list[str]:
+        """Names of the toys that ran since the last call."""
+        if not self.log.exists():
+            return []
+        names = [line.strip('"\n') for line in self.log.open()]
+        self.log.unlink()
+        return names
+
+    def files(self) -> dict[str, bytes]:
+        """Everything in the run folder, run.json and what is private apart."""
+        return contents(self.root)
+
+
+def contents(root: Path) -> dict[str, bytes]:
+    """The files of a run by path: results, without run.json and the private folder."""
+    return {
+        path.relative_to(root).as_posix(): path.read_bytes()
+        for path in sorted(root.rglob("*"))
+        if path.is_file()
+        and path.name != "run.json"
+        and path.relative_to(root).parts[0] != ".bampipe"
+    }
+
+
+@pytest.fixture
+def toy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Toy]:
+    """A toy session; the stages of bampipe are replaced by the toys for the test."""
+    path = list(bampipe.stages.__path__)
+    for name in install_toys.TABLES:
+        monkeypatch.setattr(base, name, getattr(base, name))
+    install_toys.install()
+    monkeypatch.setenv("TOY_LOG", str(tmp_path / "log"))
+    yield Toy(tmp_path, tmp_path / "log")
+    bampipe.stages.__path__[:] = path
+
+
+@pytest.fixture
+def command(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Callable[..., tuple[int, str, str]]:
+    """Run ``bampipe ARGUMENTS`` in this process; returns exit code, output and errors."""
+    from bampipe.cli import main
+
+    def call(*arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["bampipe", *map(str, arguments)])
+        capsys.readouterr()
+        try:
+            main()
+        except SystemExit as stop:
+            code = stop.code or 0
+        else:
+            code = 0
+        printed = capsys.readouterr()
+        assert isinstance(code, int)
+        return code, printed.out, printed.err
+
+    return call

@@ -1,0 +1,197 @@
+"""The law of the house: which layer may import what, and how soon the command line answers."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+import bampipe
+from bampipe.stages import base
+
+PACKAGE = Path(bampipe.__file__).parent
+HEAVY = ("h5py", "matplotlib", "numba", "numpy", "pandas", "pyarrow", "scipy", "sklearn", "sympy")
+
+# What each layer may import beside the standard library and itself.
+LAWS = {
+    "physics": {"numpy", "sympy", "numba", "llvmlite", "bampipe.errors"},
+    "estimate": {"numpy", "scipy", "numba", "llvmlite", "filterpy", "bampipe.errors"},
+    "discover": {
+        "numpy",
+        "scipy",
+        "sklearn",
+        "joblib",
+        "threadpoolctl",
+        "numba",
+        "bampipe.errors",
+        "bampipe.physics",
+        "bampipe.estimate",
+    },
+    "data": {
+        "numpy",
+        "scipy",
+        "pandas",
+        "pyarrow",
+        "h5py",
+        "jsonschema",
+        "bampipe.errors",
+    },
+    "stages": {
+        "numpy",
+        "scipy",
+        "pandas",
+        "pyarrow",
+        "numba",
+        "bampipe.errors",
+        "bampipe.physics",
+        "bampipe.estimate",
+        "bampipe.discover",
+        "bampipe.data",
+        "bampipe.report",
+    },
+    "report": {"numpy", "matplotlib", "typst", "pandas", "pyarrow", "bampipe", "bampipe.errors"},
+    "run": {
+        "dask",
+        "distributed",
+        "bampipe",
+        "bampipe.errors",
+        "bampipe.data",
+        "bampipe.stages.base",
+    },
+    "cli": {
+        "typer",
+        "rich",
+        "bampipe",
+        "bampipe.errors",
+        "bampipe.run",
+        "bampipe.stages",
+        "bampipe.physics",
+        "bampipe.discover",
+    },
+}
+
+
+def imported(path: Path, lazily: bool = True) -> set[str]:
+    """Full names of the modules that ``path`` imports; ``lazily``: inside functions too."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    found = set()
+    for node in ast.walk(tree) if lazily else _at_import(tree):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            found |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return found
+
+
+def _at_import(tree: ast.AST) -> list[ast.AST]:
+    """Nodes that run when the module is imported, type-checking blocks apart."""
+    found: list[ast.AST] = []
+    for node in ast.iter_child_nodes(tree):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            continue
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test):
+            continue
+        found += [node, *_at_import(node)]
+    return found
+
+
+def sources(layer: str) -> list[Path]:
+    return sorted((PACKAGE / layer).rglob("*.py"))
+
+
+def allowed(name: str, layer: str) -> bool:
+    top = name.partition(".")[0]
+    if top in sys.stdlib_module_names or top == "__future__":
+        return True
+    if name.startswith(f"bampipe.{layer}.") or name == f"bampipe.{layer}":
+        return True
+    for permitted in LAWS[layer]:
+        if permitted == "bampipe":
+            if name == "bampipe" or name == "bampipe.__version__":
+                return True
+        elif name == permitted or name.startswith(permitted + "."):
+            return True
+    return False
+
+
+@pytest.mark.parametrize("layer", LAWS)
+def test_a_layer_imports_only_what_the_law_allows(layer: str) -> None:
+    broken = [
+        f"{path.relative_to(PACKAGE)} imports {name}"
+        for path in sources(layer)
+        for name in sorted(imported(path))
+        if not allowed(name, layer)
+    ]
+    assert sources(layer)
+    assert broken == []
+
+
+def test_every_layer_is_under_the_law() -> None:
+    layers = {path.name for path in PACKAGE.iterdir() if (path / "__init__.py").is_file()}
+    assert layers == set(LAWS)
+
+
+def test_no_stage_imports_another() -> None:
+    names = {*base.STAGES, "simulate"}
+    for name in names:
+        path = PACKAGE / "stages" / f"{name}.py"
+        if not path.is_file():
+            continue
+        others = {f"bampipe.stages.{other}" for other in names - {name}}
+        for found in imported(path):
+            assert not any(found == o or found.startswith(o + ".") for o in others), (name, found)
+
+
+def test_only_the_filterpy_engine_knows_filterpy_and_only_when_asked() -> None:
+    for path in sources("estimate"):
+        assert not any(name.startswith("filterpy") for name in imported(path, lazily=False)), path
+
+
+@pytest.mark.parametrize("layer", ["run", "cli"])
+def test_nothing_heavy_is_imported_before_a_command_needs_it(layer: str) -> None:
+    for path in [*sources(layer), PACKAGE / "stages" / "base.py", PACKAGE / "data" / "schema.py"]:
+        tops = {name.partition(".")[0] for name in imported(path, lazily=False)}
+        assert tops.isdisjoint({*HEAVY, "rich", "jsonschema"}), path
+
+
+def test_help_imports_nothing_heavy() -> None:
+    code = (
+        "import sys\n"
+        "from bampipe.cli.app import app\n"
+        "app(['--help'], standalone_mode=False)\n"
+        f"print([n for n in {HEAVY!r} if n in sys.modules], file=sys.stderr)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stderr.strip() == "[]"
+
+
+def test_help_is_quick() -> None:
+    """0.4 s warm on an idle machine; the limit leaves room for a busy one."""
+    seconds = []
+    for _ in range(3):
+        start = time.perf_counter()
+        subprocess.run([sys.executable, "-m", "bampipe", "--help"], capture_output=True, check=True)
+        seconds.append(time.perf_counter() - start)
+    assert min(seconds) < 1.0
+
+
+@pytest.mark.parametrize("name", base.STAGES)
+def test_the_static_tables_agree_with_the_stages(name: str) -> None:
+    module = base.load(name)
+    fields = set(module.Config.__dataclass_fields__)
+    assert name == module.NAME
+    assert ("model" in fields) == (name in base.PER_MODEL)
+    assert ("session" in fields) == (name in base.READS_SESSION)
+
+
+@pytest.mark.parametrize("name", base.STAGES)
+def test_every_setting_is_described(name: str) -> None:
+    config = base.load(name).Config
+    text = "".join(cls.__doc__ or "" for cls in config.__mro__[:-1])
+    for field in config.__dataclass_fields__:
+        assert field in text, f"{name}: {field}"

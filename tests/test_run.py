@@ -1,0 +1,651 @@
+"""The runner: order, cache by content, whole files, recovery, provenance, gates, batches."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
+from pathlib import Path
+
+import install_toys
+import pytest
+from conftest import TOYS, Toy, contents
+
+from bampipe.errors import InputError
+from bampipe.run import batch, gates, models, record
+from bampipe.run import pipeline as pipelines
+from bampipe.run.runner import Outcome, run_session, session_id, status, verify
+from bampipe.run.settings import configure, parse_assignment
+
+ALL = ["toy_read", "toy_double", "toy_fit:base", "toy_sum"]
+
+
+def states(outcome: Outcome) -> list[str]:
+    return [step.state for step in outcome.steps]
+
+
+def run_record(toy: Toy) -> dict[str, object]:
+    content = json.loads((toy.root / "run.json").read_text())
+    assert isinstance(content, dict)
+    return content
+
+
+# Cache
+
+
+def test_all_stages_run_once_then_nothing(toy: Toy) -> None:
+    assert states(toy.run()) == ["done"] * 4
+    assert toy.ran() == ALL
+    before = (toy.root / "run.json").read_bytes()
+    assert states(toy.run()) == ["unchanged"] * 4
+    assert toy.ran() == []
+    assert (toy.root / "run.json").read_bytes() == before
+
+
+def test_same_input_gives_same_bytes_and_record(toy: Toy) -> None:
+    toy.run()
+    other = replace(toy.request(), root=toy.folder / "elsewhere" / "first")
+    run_session(other)
+    assert contents(other.root) == toy.files()
+    apart = ("timings",)
+    first, second = run_record(toy), json.loads((other.root / "run.json").read_text())
+    assert {k: v for k, v in first.items() if k not in apart} == {
+        k: v for k, v in second.items() if k not in apart
+    }
+
+
+def test_white_space_and_comments_in_toml_rerun_nothing(toy: Toy) -> None:
+    toy.run()
+    toy.ran()
+    for path in (
+        toy.session / "session.toml",
+        toy.pipeline_file,
+        toy.root / "models/base/model.toml",
+    ):
+        path.write_text("# a comment\n\n" + path.read_text().replace(" = ", "   =  ") + "\n\n")
+    assert states(toy.run()) == ["unchanged"] * 4
+    assert toy.ran() == []
+
+
+def test_changed_session_file_reruns(toy: Toy) -> None:
+    toy.run()
+    toy.ran()
+    path = toy.session / "session.toml"
+    path.write_text(path.read_text() + 'note = "new"\n')
+    outcome = toy.run()
+    assert outcome.steps[0].reason == "session.toml changed"
+    assert toy.ran() == ["toy_read"]
+    assert states(outcome) == ["done", "unchanged", "unchanged", "unchanged"]
+
+
+def test_changed_trial_reruns_what_depends_on_it(toy: Toy) -> None:
+    toy.run()
+    toy.ran()
+    (toy.session / "numbers.txt").write_text("1 2 4")
+    outcome = toy.run()
+    assert toy.ran() == ALL
+    assert outcome.steps[0].reason == "numbers.txt changed"
+    assert outcome.steps[1].reason == "toy/numbers.json changed"
+
+
+def test_touched_trial_with_equal_content_reruns_nothing(toy: Toy) -> None:
+    toy.run()
+    toy.ran()
+    os.utime(toy.session / "numbers.txt", (1, 1))
+    assert states(toy.run()) == ["unchanged"] * 4
+
+
+def test_settled_trials_are_not_read_again(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
+    for path in toy.session.iterdir():
+        os.utime(path, (1, 1))
+    toy.run()
+    from bampipe.run import hashing
+
+    read: list[Path] = []
+    monkeypatch.setattr(hashing, "digest_input", lambda path: read.append(path) or "read")
+    monkeypatch.setattr(hashing, "digest_code", lambda stage: "same")
+    memory = hashing.HashMemory(toy.root / ".bampipe" / "hashes.json")
+    hashing.digest_session(toy.session, memory)
+    assert read == []
+    os.utime(toy.session / "numbers.txt", (2, 2))
+    hashing.digest_session(toy.session, memory)
+    assert read == [toy.session / "numbers.txt"]
+
+
+def test_fewer_outputs_leave_no_stale_files(toy: Toy) -> None:
+    toy.run()
+    assert (toy.root / "toy/parts/2.json").exists()
+    (toy.session / "numbers.txt").write_text("1 2")
+    toy.run()
+    assert not (toy.root / "toy/parts/2.json").exists()
+
+
+def test_changed_setting_reruns_from_there(toy: Toy) -> None:
+    toy.run()
+    toy.ran()
+    outcome = toy.run(settings={"toy_double": {"factor": 3}})
+    assert toy.ran() == ALL[1:]
+    assert outcome.steps[1].reason == "settings changed"
+    toy.run(settings={"toy_double": {"factor": 3.0}})
+    assert toy.ran() == [], "3 and 3.0 are the same factor"
+
+
+def test_setting_without_effect_on_the_result_stops_there(toy: Toy) -> None:
+    toy.run()
+    toy.ran()
+    toy.run(settings={"toy_double": {"label": "new"}})
+    assert toy.ran() == ["toy_double"], "its outputs are the same bytes"
+
+
+@pytest.mark.parametrize("damage", ["change", "truncate", "remove"])
+def test_damaged_output_is_noticed_named_and_rebuilt(toy: Toy, damage: str) -> None:
+    toy.run()
+    toy.ran()
+    good = toy.files()
+    path = toy.root / "toy/double.json"
+    if damage == "remove":
+        path.unlink()
+    else:
+        content = path.read_bytes()
+        keep = os.stat(path)
+        changed = content.replace(b"2", b"7") if damage == "change" else content[:10]
+        path.write_bytes(changed)
+        os.utime(path, ns=(keep.st_atime_ns, keep.st_mtime_ns))
+    outcome = toy.run()
+    assert "toy/double.json" in outcome.steps[1].reason
+    assert toy.ran() == ["toy_double"]
+    assert toy.files() == good
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", '{"schema": "other"}', "\x00\x01"])
+def test_damaged_record_is_rebuilt(toy: Toy, content: str) -> None:
+    toy.run()
+    toy.ran()
+    good = toy.files()
+    (toy.root / "run.json").write_text(content)
+    assert states(toy.run()) == ["done"] * 4
+    assert toy.files() == good
+
+
+def test_from_takes_what_is_before_as_it_stands(toy: Toy) -> None:
+    toy.run()
+    toy.ran()
+    (toy.session / "numbers.txt").write_text("5")
+    assert states(toy.run(first="toy_double")) == ["unchanged"] * 3
+    assert toy.ran() == []
+
+
+def test_from_refuses_what_was_tampered_with(toy: Toy) -> None:
+    toy.run()
+    (toy.root / "toy/numbers.json").write_text('{"numbers": [9]}')
+    with pytest.raises(InputError, match=r"toy/numbers\.json was changed since toy_read wrote it"):
+        toy.run(first="toy_double")
+
+
+def test_from_needs_what_comes_before(toy: Toy) -> None:
+    with pytest.raises(InputError, match=r"toy/numbers\.json is missing"):
+        toy.run(first="toy_double")
+
+
+def test_until_stops_after_the_stage(toy: Toy) -> None:
+    toy.run(last="toy_double", judged="")
+    assert toy.ran() == ALL[:2]
+    toy.run()
+    assert toy.ran() == ALL[2:]
+
+
+def test_force_runs_the_selected_steps(toy: Toy) -> None:
+    toy.run()
+    toy.ran()
+    toy.run(first="toy_double", last="toy_fit", force=True)
+    assert toy.ran() == ["toy_double", "toy_fit:base"]
+
+
+def test_from_after_until_is_refused(toy: Toy) -> None:
+    with pytest.raises(InputError, match="comes after"):
+        toy.run(first="toy_sum", last="toy_read")
+
+
+def test_unknown_stage_gets_a_suggestion(toy: Toy) -> None:
+    with pytest.raises(InputError, match="did you mean 'toy_double'"):
+        toy.run(first="toy_duoble")
+    assert not toy.root.exists()
+
+
+# Faults
+
+
+def test_bad_input_leaves_no_run_folder(toy: Toy) -> None:
+    (toy.session / "numbers.txt").write_text("1 two")
+    with pytest.raises(InputError, match=r"numbers\.txt.*write whole numbers"):
+        toy.run()
+    assert not toy.root.exists()
+
+
+def test_failure_keeps_the_last_good_result(toy: Toy) -> None:
+    toy.run()
+    good = toy.files()
+    toy.ran()
+    (toy.session / "numbers.txt").write_text("1 two")
+    with pytest.raises(InputError):
+        toy.run()
+    assert toy.files() == good
+    pipeline = toy.request().pipeline
+    assert status(toy.root, pipeline)[0].state == "failed"
+    (toy.session / "numbers.txt").write_text("1 2 3")
+    toy.ran()
+    assert states(toy.run()) == ["unchanged"] * 4
+    assert [s.state for s in status(toy.root, pipeline)] == ["current"] * 4
+
+
+def test_wrong_setting_keeps_the_result_current(toy: Toy) -> None:
+    toy.run()
+    toy.ran()
+    with pytest.raises(InputError, match="did you mean 'factor'"):
+        toy.run(settings={"toy_double": {"factr": 3}})
+    with pytest.raises(InputError, match="must be a number"):
+        toy.run(settings={"toy_double": {"factor": "many"}})
+    toy.run()
+    assert toy.ran() == []
+
+
+def test_stage_must_write_what_it_declares(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
+    from bampipe.stages import toy_sum  # type: ignore[attr-defined]
+
+    monkeypatch.setattr(toy_sum, "outputs", lambda config: ("other.json",))
+    with pytest.raises(RuntimeError, match=r"did not write other\.json"):
+        toy.run()
+    monkeypatch.setattr(toy_sum, "outputs", lambda config: ())
+    with pytest.raises(RuntimeError, match=r"wrote sum\.json, which it does not declare"):
+        toy.run()
+
+
+def test_kill_between_stage_and_commit_is_completed(
+    toy: Toy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    toy.run()
+    good = toy.files()
+    (toy.session / "numbers.txt").write_text("4 5 6")
+    moves = 0
+    real = Path.replace
+
+    def replace_twice(self: Path, target: Path) -> Path:
+        nonlocal moves
+        moves += "staging" in self.parts and self.name != "..commit.json.part"
+        if moves > 1:
+            raise KeyboardInterrupt
+        return real(self, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "replace", replace_twice)
+        with pytest.raises(KeyboardInterrupt):
+            toy.run(last="toy_read")
+    toy.ran()
+    toy.run()
+    assert "toy_read" not in toy.ran(), "the stage had finished: its outputs count"
+    (toy.session / "numbers.txt").write_text("1 2 3")
+    toy.run()
+    assert toy.files() == good
+
+
+def start(toy: Toy, *arguments: str, pause: float = 0.0) -> subprocess.Popen[str]:
+    environment = {**os.environ, "TOY_PAUSE": str(pause)}
+    return subprocess.Popen(
+        [sys.executable, str(TOYS / "toy_bampipe.py"), *arguments],
+        env=environment,
+        cwd=toy.folder,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def run_arguments(toy: Toy) -> list[str]:
+    return ["run", str(toy.session), "--pipeline", str(toy.pipeline_file), "--runs", str(toy.runs)]
+
+
+def test_kill_in_mid_stage_leaves_the_previous_result(toy: Toy) -> None:
+    toy.run()
+    good = toy.files()
+    (toy.session / "numbers.txt").write_text("7 8 9")
+    toy.ran()
+    process = start(toy, *run_arguments(toy), pause=5.0)
+    staged = toy.root / ".bampipe" / "staging" / "toy_double" / "toy" / "parts" / "0.json"
+    deadline = time.monotonic() + 20.0
+    while not staged.exists() and time.monotonic() < deadline:
+        time.sleep(0.02)
+    assert staged.exists()
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    left = toy.files()
+    assert {k: v for k, v in left.items() if "double" in k or "parts" in k} == {
+        k: v for k, v in good.items() if "double" in k or "parts" in k
+    }
+    toy.ran()
+    assert states(toy.run()) == ["unchanged", "done", "done", "done"]
+    fresh = replace(toy.request(), root=toy.folder / "fresh" / "first")
+    run_session(fresh)
+    assert toy.files() == contents(fresh.root)
+    assert not list((toy.root / ".bampipe" / "staging").iterdir())
+
+
+def test_kill_at_any_moment_then_the_same_bytes(toy: Toy) -> None:
+    draw = random.Random(4)
+    fresh = replace(toy.request(), root=toy.folder / "fresh" / "first")
+    run_session(fresh)
+    for _ in range(8):
+        process = start(toy, *run_arguments(toy), "--force", pause=0.02)
+        time.sleep(draw.uniform(0.1, 0.6))
+        process.send_signal(signal.SIGKILL)
+        process.communicate()
+        for path in toy.root.rglob("*.json"):
+            if ".bampipe" not in path.parts:
+                json.loads(path.read_text())
+    toy.run()
+    assert toy.files() == contents(fresh.root)
+    assert verify(toy.root) == []
+
+
+def test_second_run_waits_or_refuses(toy: Toy) -> None:
+    process = start(toy, *run_arguments(toy), pause=0.5)
+    while not (toy.root / ".bampipe" / "staging" / "toy_double").exists():
+        time.sleep(0.02)
+    with pytest.raises(InputError, match="another bampipe is at work"):
+        toy.run(wait=False)
+    outcome = toy.run()
+    assert [step.reason for step in outcome.steps] == [""] * 4
+    assert any(event.kind == "waiting" for event in toy.events)
+    process.communicate()
+    assert process.returncode == 0
+
+
+@pytest.mark.parametrize("number", ["ENOSPC", "EROFS", "EACCES"])
+def test_storage_faults_are_said_plainly(
+    toy: Toy, monkeypatch: pytest.MonkeyPatch, number: str
+) -> None:
+    import errno
+
+    from bampipe.stages import toy_double  # type: ignore[attr-defined]
+
+    toy.run()
+    good = toy.files()
+
+    def fail(*_: object) -> None:
+        raise OSError(getattr(errno, number), "no", str(toy.root))
+
+    monkeypatch.setattr(toy_double, "execute", fail)
+    with pytest.raises(InputError, match="earlier results are untouched"):
+        toy.run(force=True)
+    assert toy.files() == good
+
+
+# Models
+
+
+def test_children_are_refreshed_once_they_were_run(toy: Toy) -> None:
+    toy.run()
+    toy.ran()
+    parent = models.read(toy.root, "base")
+    name = models.child_name("base", "stribeck:yaw")
+    assert name == "base+stribeck.yaw"
+    models.write(toy.root, models.ModelFile(name, "base", parent.device, ("stribeck:yaw",)))
+    toy.run()
+    assert toy.ran() == [], "nobody has asked for the child yet"
+    toy.run(first="toy_fit", last="toy_fit", model=name, judged="")
+    assert toy.ran() == [f"toy_fit:{name}"]
+    toy.run()
+    assert toy.ran() == ["toy_sum"]
+    (toy.session / "numbers.txt").write_text("2 3")
+    toy.run()
+    assert toy.ran() == [*ALL[:3], f"toy_fit:{name}", "toy_sum"]
+    assert models.read(toy.root, name).effects == ("stribeck:yaw",)
+
+
+def test_a_new_effect_file_reruns_its_model(toy: Toy) -> None:
+    toy.run()
+    toy.ran()
+    (toy.root / "models/base/effects").mkdir()
+    (toy.root / "models/base/effects/own.toml").write_text('name = "own"\n')
+    toy.run()
+    assert toy.ran() == ["toy_fit:base"]
+
+
+def test_unknown_model_gets_a_suggestion(toy: Toy) -> None:
+    toy.run()
+    with pytest.raises(InputError, match="did you mean 'base'"):
+        toy.run(model="bse")
+
+
+# Provenance
+
+
+def test_record_says_what_was_run_on_what(toy: Toy) -> None:
+    toy.run()
+    content = run_record(toy)
+    assert content["schema"] == "bampipe.run/1"
+    stages = content["stages"]
+    assert isinstance(stages, dict)
+    assert list(stages) == sorted(ALL)
+    read, double = stages["toy_read"], stages["toy_double"]
+    assert set(read["inputs"]) == {"session:session.toml", "session:numbers.txt"}
+    assert "session" not in read["config"]
+    assert double["config"] == {"factor": 2.0, "label": ""}
+    assert double["inputs"]["toy/numbers.json"] == read["outputs"]["toy/numbers.json"]
+    assert {"bampipe", "python", "numpy", "scipy", "numba"} <= set(double["versions"])
+    timings = content["timings"]
+    assert isinstance(timings, dict)
+    assert set(timings) == set(ALL)
+
+
+def test_verify_says_what_was_touched(toy: Toy) -> None:
+    toy.run()
+    assert verify(toy.root) == []
+    (toy.root / "toy/parts/1.json").write_text("{}")
+    (toy.root / "sum.json").unlink()
+    (toy.root / "notes.txt").write_text("mine")
+    (toy.session / "numbers.txt").write_text("9")
+    with (toy.root / "models/base/model.toml").open("a") as stream:
+        stream.write("# only a comment\n")
+    assert verify(toy.root) == [
+        ("notes.txt", "unknown"),
+        ("session:numbers.txt", "changed"),
+        ("sum.json", "gone"),
+        ("toy/parts/1.json", "changed"),
+    ]
+
+
+def test_status_changes_nothing_and_names_what_is_stale(toy: Toy) -> None:
+    toy.run()
+    (toy.session / "numbers.txt").write_text("9")
+    before = {p: p.read_bytes() for p in toy.root.rglob("*") if p.is_file()}
+    found = status(toy.root, toy.request().pipeline)
+    assert [step.state for step in found] == ["stale"] * 4
+    assert found[0].reason == "numbers.txt changed"
+    assert {p: p.read_bytes() for p in toy.root.rglob("*") if p.is_file()} == before
+
+
+# Session identity
+
+
+@pytest.mark.parametrize("name", ["../up", "a/b", "", ".hidden", "x" * 200, "a b"])
+def test_session_id_must_be_a_name(tmp_path: Path, name: str) -> None:
+    (tmp_path / "session.toml").write_text(f"session_id = {json.dumps(name)}\n")
+    with pytest.raises(InputError, match="session_id"):
+        session_id(tmp_path)
+
+
+def test_folder_of_sessions_is_not_a_session(toy: Toy) -> None:
+    with pytest.raises(InputError, match="folder of sessions"):
+        session_id(toy.session.parent)
+
+
+# Gates
+
+
+def gate(**changes: object) -> pipelines.Gate:
+    return replace(pipelines.Gate("limit", "models/{model}/v.json", "axes.*.a", max=2.0), **changes)
+
+
+def judged(tmp_path: Path, content: object, **changes: object) -> list[gates.Verdict]:
+    path = tmp_path / "models" / "base" / "v.json"
+    path.parent.mkdir(parents=True)
+    path.write_text(json.dumps(content))
+    return gates.judge(gate(**changes), tmp_path, "base")
+
+
+def test_gate_judges_each_axis(tmp_path: Path) -> None:
+    found = judged(tmp_path, {"axes": {"yaw": {"a": 1.0}, "pitch": {"a": 3}}})
+    assert [(v.key, v.state) for v in found] == [("pitch", "failed"), ("yaw", "passed")]
+    assert found[0].message == "3 is above 2"
+
+
+def test_gate_divides(tmp_path: Path) -> None:
+    content = {"axes": {"yaw": {"a": 3.0, "b": 2.0}, "pitch": {"a": 1.0, "b": 0.0}}}
+    found = judged(tmp_path, content, divide_by="axes.*.b", level="warn")
+    assert [(v.key, v.state, v.value) for v in found] == [
+        ("pitch", "warned", None),
+        ("yaw", "passed", 1.5),
+    ]
+
+
+@pytest.mark.parametrize("optional", [True, False])
+@pytest.mark.parametrize("content", [{}, {"axes": {"yaw": {"a": None}}}, {"axes": [1]}])
+def test_gate_without_a_number(tmp_path: Path, content: object, optional: bool) -> None:
+    found = judged(tmp_path, content, optional=optional)
+    assert [v.state for v in found] == ["absent" if optional else "failed"]
+
+
+def test_gate_without_a_result(tmp_path: Path) -> None:
+    assert [v.state for v in gates.judge(gate(), tmp_path, "base")] == ["failed"]
+
+
+def test_failed_gate_decides_the_exit_code(toy: Toy) -> None:
+    assert toy.run().exit_code == 0
+    (toy.session / "numbers.txt").write_text("1000")
+    outcome = toy.run()
+    assert outcome.exit_code == 1
+    assert outcome.verdicts[0].message == "2000 is above 100; take smaller numbers"
+
+
+def test_junit_counts(tmp_path: Path) -> None:
+    verdicts = judged(tmp_path, {"axes": {"yaw": {"a": 1.0}, "pitch": {"a": 3}}})
+    suites = [gates.Suite("s1", tuple(verdicts)), gates.Suite("s2", (), "no\x07 session")]
+    top = ElementTree.fromstring(gates.junit(suites))
+    assert [s.get("failures") for s in top] == ["1", "0"]
+    assert [s.get("errors") for s in top] == ["0", "1"]
+    assert top.find(".//failure") is not None
+    assert gates.junit(suites) == gates.junit(suites)
+
+
+# Pipelines
+
+
+@pytest.mark.parametrize("name", pipelines.names())
+def test_shipped_pipelines_are_sound(name: str) -> None:
+    loaded = pipelines.load(name)
+    assert loaded.name == name
+    for stage, settings in loaded.settings.items():
+        configure(stage, settings)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('"toy_sum"]', '"toy_smu"]', "did you mean 'toy_sum'"),
+        ('"toy_read", "toy_double"', '"toy_double", "toy_read"', "in order"),
+        ("max = 100.0", 'max = "high"', "gates"),
+        ("max = 100.0", "maximum = 100.0", "maximum"),
+        ('name = "toy"', "name = 3", "name"),
+        ("stages =", "stage =", "stage"),
+        ('schema = "bampipe.pipeline/1"', "schema = ", "not valid TOML"),
+        ('value = "axes.*.value"', 'value = "*.*"', "value"),
+        ('result = "toy/double.json"', 'result = "/etc/x.json"', "result"),
+    ],
+)
+def test_wrong_pipelines_are_refused(toy: Toy, old: str, new: str, message: str) -> None:
+    text = toy.pipeline_file.read_text()
+    assert old in text
+    toy.pipeline_file.write_text(text.replace(old, new))
+    with pytest.raises(InputError, match=message):
+        pipelines.load(str(toy.pipeline_file))
+
+
+def test_settings_for_no_stage_are_refused(toy: Toy) -> None:
+    with toy.pipeline_file.open("a") as stream:
+        stream.write("[settings.toy_duble]\nfactor = 3\n")
+    with pytest.raises(InputError, match="did you mean 'toy_double'"):
+        pipelines.load(str(toy.pipeline_file))
+
+
+def test_unknown_pipeline_gets_a_suggestion() -> None:
+    with pytest.raises(InputError, match="did you mean 'default'"):
+        pipelines.load("defualt")
+
+
+def test_assignment() -> None:
+    assert parse_assignment("a=1") == ("a", 1)
+    assert parse_assignment("a=[1, 2]") == ("a", [1, 2])
+    assert parse_assignment("a=least-squares") == ("a", "least-squares")
+    with pytest.raises(InputError, match="not a setting"):
+        parse_assignment("a")
+
+
+# Several sessions
+
+
+def several(toy: Toy, contents: dict[str, str]) -> list[Path]:
+    return [
+        install_toys.make_session(toy.folder / "many" / name, text)
+        for name, text in contents.items()
+    ]
+
+
+def test_one_failing_session_stops_no_other(toy: Toy) -> None:
+    folders = several(toy, {"a": "1", "b": "two", "c": "crash", "d": "5000", "e": "4"})
+    requests = [
+        replace(toy.request(), root=toy.runs / folder.name, session=folder) for folder in folders
+    ]
+    outcomes = batch.run_sessions(requests, 1, toy.events.append)
+    assert [outcome.exit_code for outcome in outcomes] == [0, 2, 3, 1, 0]
+    assert "ZeroDivisionError" in outcomes[2].error
+    assert "Traceback" in outcomes[2].traceback
+
+
+@pytest.mark.slow
+def test_worker_processes_survive_a_death_and_give_the_same_bytes(toy: Toy) -> None:
+    several(toy, {"a": "1", "b": "two", "c": "die", "d": "4", "e": "5 6"})
+    process = start(
+        toy,
+        "run",
+        str(toy.folder / "many" / "*"),
+        "--pipeline",
+        str(toy.pipeline_file),
+        "--runs",
+        str(toy.folder / "parallel"),
+        "--jobs",
+        "2",
+        "--json",
+    )
+    out, _ = process.communicate()
+    found = {Path(item["run"]).name: item["state"] for item in json.loads(out)["sessions"]}
+    assert found == {"a": "done", "b": "refused", "c": "crashed", "d": "done", "e": "done"}
+    assert process.returncode == 3
+    for name in ("a", "d", "e"):
+        root = toy.folder / "serial" / name
+        run_session(replace(toy.request(), root=root, session=toy.folder / "many" / name))
+        assert contents(root) == contents(toy.folder / "parallel" / name)
+
+
+def test_lock_is_free_after_a_crash(toy: Toy) -> None:
+    (toy.session / "numbers.txt").write_text("crash")
+    with pytest.raises(ZeroDivisionError):
+        toy.run()
+    (toy.session / "numbers.txt").write_text("1")
+    assert states(toy.run(wait=False)) == ["done"] * 4
+    assert record.read(toy.root)["failures"] == {}

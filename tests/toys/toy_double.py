@@ -1,0 +1,43 @@
+"""Toy: doubles the numbers, slowly where the test asks for it."""
+
+from __future__ import annotations
+
+import os
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from bampipe.stages.base import Progress, RunFolder, write_json
+from bampipe.stages.toy_read import log
+
+NAME = "toy_double"
+SUMMARY = "Double the numbers"
+
+
+@dataclass(frozen=True)
+class Config:
+    """factor: of the doubling; label: a text."""
+
+    factor: float = 2.0
+    label: str = ""
+
+
+def inputs(config: Config) -> tuple[str, ...]:
+    return ("toy/numbers.json",)
+
+
+def outputs(config: Config) -> tuple[str, ...]:
+    return ("toy/double.json", "toy/parts/*.json")
+
+
+def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
+    log(NAME)
+    numbers = run.read_json("toy/numbers.json")["numbers"]
+    doubled = [config.factor * number for number in numbers]
+    for index, value in enumerate(doubled):
+        write_json(out / f"toy/parts/{index}.json", {"value": value})
+        progress(index / len(doubled), f"number {index}")
+        time.sleep(float(os.environ.get("TOY_PAUSE", "0")))
+    axes = {f"n{index}": {"value": value, "scale": 1} for index, value in enumerate(doubled)}
+    write_json(out / "toy/double.json", {"axes": axes})
+    return {"headline": f"times {config.factor:g}", "axes": axes}

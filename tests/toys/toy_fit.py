@@ -1,0 +1,39 @@
+"""Toy: one result a model."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from bampipe.stages.base import Progress, RunFolder, write_json
+from bampipe.stages.toy_read import log
+
+NAME = "toy_fit"
+SUMMARY = "Fit the numbers"
+
+
+@dataclass(frozen=True)
+class Config:
+    """model: its name."""
+
+    model: str = "base"
+
+
+def inputs(config: Config) -> tuple[str, ...]:
+    return (
+        "toy/double.json",
+        f"models/{config.model}/model.toml",
+        f"models/{config.model}/effects/*.toml",
+    )
+
+
+def outputs(config: Config) -> tuple[str, ...]:
+    return (f"models/{config.model}/fit.json",)
+
+
+def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
+    log(f"{NAME}:{config.model}")
+    axes = run.read_json("toy/double.json")["axes"]
+    total = sum(axis["value"] for axis in axes.values())
+    write_json(out / f"models/{config.model}/fit.json", {"total": total})
+    return {"headline": f"total {total:g}"}

@@ -1,0 +1,54 @@
+"""Toy: reads the numbers of a session."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from bampipe.errors import InputError
+from bampipe.stages.base import Progress, RunFolder, write_json
+
+NAME = "toy_read"
+SUMMARY = "Read the numbers"
+
+
+@dataclass(frozen=True)
+class Config:
+    """session: the folder; offset: added to each number."""
+
+    session: str = ""
+    offset: int = 0
+
+
+def inputs(config: Config) -> tuple[str, ...]:
+    return ()
+
+
+def outputs(config: Config) -> tuple[str, ...]:
+    return ("ingest/session.json", "toy/numbers.json")
+
+
+def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
+    log(NAME)
+    text = (Path(config.session) / "numbers.txt").read_text()
+    if text == "crash":
+        raise ZeroDivisionError("a fault of the stage")
+    if text == "die":
+        os.kill(os.getpid(), 9)
+    try:
+        numbers = [int(word) + config.offset for word in text.split()]
+    except ValueError as error:
+        raise InputError(str(error), where="numbers.txt", remedy="write whole numbers") from error
+    write_json(out / "ingest/session.json", {"device": "bam"})
+    write_json(out / "toy/numbers.json", {"numbers": numbers})
+    return {"headline": f"{len(numbers)} numbers"}
+
+
+def log(name: str) -> None:
+    """Note that a toy ran, where the test asked for it."""
+    path = os.environ.get("TOY_LOG")
+    if path:
+        with open(path, "a") as stream:
+            stream.write(json.dumps(name) + "\n")

@@ -1,0 +1,32 @@
+"""Toy: sums up whatever fits there are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from bampipe.stages.base import Progress, RunFolder, write_json
+from bampipe.stages.toy_read import log
+
+NAME = "toy_sum"
+SUMMARY = "Sum up"
+
+
+@dataclass(frozen=True)
+class Config:
+    """Nothing to set."""
+
+
+def inputs(config: Config) -> tuple[str, ...]:
+    return ("models/*/fit.json", "toy/absent.json?")
+
+
+def outputs(config: Config) -> tuple[str, ...]:
+    return ("sum.json",)
+
+
+def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
+    log(NAME)
+    totals = {name: run.read_json(name)["total"] for name in run.glob("models/*/fit.json")}
+    write_json(out / "sum.json", totals)
+    return {"totals": totals}
