@@ -113,11 +113,13 @@ def summary(content: Mapping[str, object]) -> None:
     """
     if isinstance(content.get("headline"), str):
         say(str(content["headline"]))
-    for name in ("axes", "parameters", "trials", "ranking", "ladder"):
+    for name in ("axes", "parameters", "trials", "ranking"):
         rows = _records(content.get(name))
         if rows is None or len(rows) > LARGEST_TABLE:
             continue
-        flat = [_flat(row, name in ("ladder", "ranking")) for row in rows]
+        flat = [_flat(row, name == "ranking") for row in rows]
+        for row in flat:
+            row.pop("sentence", None)
         head = list(dict.fromkeys(column for row in flat for column in row))
         if len(head) < 2:
             continue
@@ -127,11 +129,38 @@ def summary(content: Mapping[str, object]) -> None:
             [column.replace("_", " ") for column in head],
             [[row.get(column) for column in head] for row in flat],
         )
+    _ladder(content.get("ladder"))
+    for row in [*(_records(content.get("axes")) or []), *(_records(content.get("moved")) or [])]:
+        if isinstance(row.get("sentence"), str):
+            say(str(row["sentence"]))
     notes = content.get("notes")
     if isinstance(notes, list) and notes:
         say("")
         for line in notes:
             say(f"note: {line}")
+
+
+def _ladder(value: object) -> None:
+    """Print one row a model version: its held-out error over the noise floor, axis by axis."""
+    rows = _records(value)
+    if not rows:
+        return
+    axes = list(dict.fromkeys(axis for row in rows for axis in row["held_out_rmse"]))
+    body = []
+    for row in rows:
+        cells = [row["model"], row.get("added") or ""]
+        for axis in axes:
+            error, floor = row["held_out_rmse"].get(axis), row["noise_floor"].get(axis)
+            cells += [number(error), number(error / floor) if error and floor else ""]
+        body.append(cells)
+    head = ["model", "added"]
+    for axis in axes:
+        unit = (rows[0].get("unit") or {}).get(axis, "")
+        head += [f"{axis}, {unit}", "/ floor"]
+    say("")
+    say("ladder: error on held-out trials, and over its noise floor")
+    table(head, body)
+    say("")
 
 
 def outcome(result: Outcome) -> None:

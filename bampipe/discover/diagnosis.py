@@ -20,11 +20,13 @@ from scipy.stats import t as student
 from bampipe.discover.candidates import Score, Scorer, library
 from bampipe.discover.chance import (
     Pool,
+    PrepareTask,
     Recipe,
     Replicate,
     ReplicateTask,
     ScoreTask,
     Session,
+    prepare,
     run_replicate,
     run_scores,
     system_of,
@@ -211,7 +213,15 @@ class _Search:
 
     def run(self) -> Diagnosis:
         s = self.settings
-        self.progress(0.02, "replaying the model for chance levels")
+        self.progress(0.0, "preparing the candidates")
+        parts = 4 * s.jobs
+        list(
+            self.pool(
+                prepare,
+                [PrepareTask(self.recipe, self.names[k::parts]) for k in range(parts)],
+            )
+        )
+        self.progress(0.05, "replaying the model for chance levels")
         chance = _Chance(
             self._replicas(self.recipe, self.initial.p, s.replicates, self.names, (0,)),
             self.names,

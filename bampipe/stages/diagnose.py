@@ -6,10 +6,11 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from bampipe.data.store import read_parquet, write_json
+from bampipe.data.store import read_parquet, read_toml, write_json
 from bampipe.discover.advice import advise
 from bampipe.discover.chance import Recipe, Session
 from bampipe.discover.diagnosis import Diagnosis, Settings, diagnose
@@ -100,13 +101,30 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     found = diagnose(session, recipe, start, settings, progress)
     result = _result(found, session, recipe, config.model)
     write_json(out / f"models/{config.model}/diagnose.json", result)
-    return result
+    return _summary(result)
+
+
+def _summary(result: dict[str, Any]) -> dict[str, object]:
+    """What a person needs first: verdicts, the head of the ranking, what to record or do next."""
+    notes = [result["suggested_trial"]["sentence"]] if result["suggested_trial"] else []
+    shown = ("verdict", "rmse_before", "rmse_after", "noise_floor", "unit", "explainable_share")
+    return {
+        "axes": {
+            axis: {k: entry[k] for k in (*shown, "sentence")}
+            for axis, entry in result["axes"].items()
+        },
+        "ranking": [
+            {k: v for k, v in row.items() if k not in ("parameters", "score")}
+            for row in result["ranking"][:5]
+        ],
+        "selected": result["selected"],
+        "suggested_trial": result["suggested_trial"],
+        "notes": notes,
+    }
 
 
 def own_effects(run: RunFolder, model: str) -> list[dict[str, object]]:
     """Declarations of a lab's own effects that go with ``model``."""
-    from bampipe.data.store import read_toml
-
     return [read_toml(run.path(p)) for p in run.glob(f"models/{model}/effects/*.toml")]
 
 
@@ -156,7 +174,7 @@ def read_session(run: RunFolder, system: System, cutoff_hz: float) -> tuple[Sens
     return sensors, [observe(r, sensors, system) for r in recordings]
 
 
-def _result(found: Diagnosis, session: Session, recipe: Recipe, model: str) -> dict[str, object]:
+def _result(found: Diagnosis, session: Session, recipe: Recipe, model: str) -> dict[str, Any]:
     names = found.evidence.system.coordinates
     units = found.evidence.system.torque_units
     shapes = {
