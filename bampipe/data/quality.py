@@ -272,8 +272,10 @@ def _keep_longest_stretch(table: _Table) -> None:
 
 
 def _refuse_short(table: _Table) -> None:
-    duration = float(table.t[-1]) if len(table) else 0.0
-    if len(table) < 4 or duration < table.limits.shortest_s:
+    # Each sample stands for one step: 500 samples at 500 Hz are 1 s.
+    step = float(np.median(np.diff(table.t))) if len(table) > 1 else 0.0
+    duration = float(table.t[-1]) + step
+    if len(table) < 4 or duration < table.limits.shortest_s * (1 - 1e-6):
         raise table.fault(
             f"{_counted(len(table), 'sample')} over {duration:.3g} s,"
             f" less than {table.limits.shortest_s:g} s"
