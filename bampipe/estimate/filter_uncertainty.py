@@ -75,7 +75,7 @@ def climb(
     start: Array,
     step: Array,
     lower: Array,
-    most_rounds: int = 3,
+    most_rounds: int = 2,
     most_steps: int = 12,
 ) -> tuple[Array, float]:
     """Maximise a likelihood over a few noise levels, one at a time, by doubling steps.

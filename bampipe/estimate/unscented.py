@@ -6,10 +6,12 @@ motion and gets sigma points of its own; measurement noise is additive.
 
 Physical range. A parameter whose lower bound is above zero (a mass, a speed) is estimated as its
 logarithm: a sigma point can then not come near zero, where the motion would explode, and starts
-five times too small and five times too large are alike. Any other parameter is estimated as it
-is, because a damping, a Coulomb friction or the strength of an effect may properly be zero,
-where a logarithm has no end. What leaves its range is clamped in every sigma point before the
-model sees it, and the mean is clamped after every update; inside the range this changes nothing.
+five times too small and five times too large are alike. A parameter with a lower bound of zero
+(a damping, a friction, the strength of an effect) is estimated as it is, because zero is a proper
+value, where a logarithm has no end; the filter lets it pass through zero and `constrain` moves
+the final estimate to the most likely one within the range. Clamping it on the way instead would
+cut off every excursion to one side and settle at a positive value where the truth is zero. Other
+bounds are kept all along, by clamping sigma points and mean.
 """
 
 from __future__ import annotations
@@ -65,7 +67,8 @@ class FilterModel:
             taken at one instant; unmodelled, 0.1 ms already biases a damping by ten of its
             standard deviations. What is not estimated stays as given.
         free: (nt,) places of the estimated parameters in ``parameters``.
-        lower, upper: (nt,) physical range of the estimated parameters; infinite where none.
+        lower, upper: (nt,) physical range of the estimated parameters; infinite where none; see
+            the module docstring on when it is kept.
     """
 
     derivative: Callable[..., Any]
@@ -83,9 +86,10 @@ class FilterModel:
 
     @property
     def range(self) -> tuple[Array, Array]:
-        """(nt,) and (nt,): the physical range on the scale of estimation."""
+        """(nt,) and (nt,): the range kept all along, on the scale of estimation."""
         log = self.logarithmic
         lower, upper = self.lower.astype(float), self.upper.astype(float)
+        lower[lower == 0.0] = -np.inf
         lower[log], upper[log] = np.log(lower[log]), np.log(upper[log])
         return lower, upper
 
@@ -282,6 +286,34 @@ def filter_trials(
         if progress is not None:
             progress(index + 1)
     return FilterResult(theta, covariance, tuple(found))
+
+
+def constrain(model: FilterModel, theta: Array, covariance: Array) -> Array:
+    """Return the most likely parameters within the physical range.
+
+    Those outside are put on their bound and the others follow by their covariance.
+
+    Args:
+        model: gives the range.
+        theta: (nt,) on the scale of estimation; covariance: (nt, nt).
+    """
+    lower, upper = model.range
+    lower[~model.logarithmic] = model.lower[~model.logarithmic]
+    held = np.zeros(theta.size, dtype=bool)
+    value = theta
+    for _ in range(theta.size):
+        outside = ~held & ((value < lower) | (value > upper))
+        if not outside.any():
+            break
+        held |= outside
+        shift = np.clip(theta, lower, upper)[held] - theta[held]
+        value = (
+            theta
+            + covariance[:, held]
+            @ np.linalg.lstsq(covariance[np.ix_(held, held)], shift, rcond=None)[0]
+        )
+        value[held] = np.clip(theta, lower, upper)[held]
+    return np.asarray(value)
 
 
 def _kernel(square_root: bool) -> Callable[..., int]:

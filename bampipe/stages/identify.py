@@ -22,6 +22,7 @@ from bampipe.estimate.unscented import (
     FilterResult,
     FilterSettings,
     Trial,
+    constrain,
     filter_trials,
 )
 from bampipe.physics import System, compile_model
@@ -36,7 +37,7 @@ METHODS = ("ukf", "least-squares")
 ENGINES = ("compiled", "filterpy")
 FORMS = ("square_root", "covariance")
 MEASURES = ("position", "position_velocity")
-_TUNING_SAMPLES = 4000
+_TUNING_SAMPLES = 3000
 """Samples of one trial on which the noise levels are tuned."""
 _TUNING_STEP_S = 2e-3
 """Longest Runge-Kutta step while tuning, s: noise levels need no more."""
@@ -331,12 +332,12 @@ def _unscented(
     covariance, blocks = sandwich_covariance(
         main.trials, model.n_states, search.theta, search.covariance, config.block_s
     )
-    value, slope = model.to_physical(main.theta)
+    value, slope = model.to_physical(constrain(model, main.theta, covariance))
     scaled = covariance * np.outer(slope, slope)
     systematic = _systematic(value, scaled, squares, model)
     scaled += np.diag(systematic**2)
-    lower, upper = model.range
-    tight = np.sqrt(np.diag(main.covariance))
+    tight = slope * np.sqrt(np.diag(main.covariance))
+    near = (value - model.lower < tight) | (model.upper - value < tight)
     kept = value.size - 1
     report: dict[str, object] = {
         "nis": _nis(main, settings, motions, order),
@@ -356,9 +357,9 @@ def _unscented(
     return _Estimate(
         value=value[:kept],
         covariance=scaled[:kept, :kept],
-        filter_sd=(slope * tight)[:kept],
+        filter_sd=tight[:kept],
         systematic_sd=systematic[:kept],
-        at_bound=((main.theta - lower < tight) | (upper - main.theta < tight))[:kept],
+        at_bound=near[:kept],
         report=report,
         states=_states(system, motions, order, main, value, config),
         trace=_trace(model, system, steps, passes, config),
@@ -639,6 +640,7 @@ def _trace(
     for motion, trial, elapsed in zip(steps, passes, _elapsed(passes), strict=True):
         keep = _thinned(trial.t.size, config.trace_rows)
         value, slope = model.to_physical(trial.mean[keep, model.n_states :])
+        value = np.clip(value, model.lower, model.upper)
         variance = np.diagonal(trial.covariance[keep], axis1=1, axis2=2)[:, model.n_states :]
         frame = pd.DataFrame({"t_total": elapsed[keep], "trial_id": motion.trial_id})
         for place, name in enumerate(names):

@@ -1,0 +1,122 @@
+"""The filter of `unscented` by filterpy: slow, and the oracle of the compiled engine.
+
+filterpy knows no process noise that enters the equations of motion, so the noise is part of its
+state: carried as a state that each step forgets, with its variance put back by Q. Since 2.0
+filterpy draws the sigma points afresh after adding Q, as the compiled engine does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.errors import InputError
+from bampipe.estimate.propagation import place_parameters, runge_kutta
+from bampipe.estimate.unscented import (
+    FilteredTrial,
+    FilterFailure,
+    FilterModel,
+    FilterResult,
+    FilterSettings,
+    Trial,
+)
+
+Array = NDArray[np.float64]
+
+
+def filter_trials_by_filterpy(
+    model: FilterModel,
+    trials: Sequence[Trial],
+    theta: Array,
+    covariance: Array,
+    settings: FilterSettings,
+    progress: Callable[[int], None] | None = None,
+) -> FilterResult:
+    """Filter trials in sequence, as `unscented.filter_trials` does; same arguments and result.
+
+    Raises:
+        FilterFailure: the covariance lost positive definiteness.
+        InputError: filterpy 2 is not installed.
+    """
+    try:
+        from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
+    except ImportError as error:
+        raise InputError(
+            "engine filterpy needs filterpy 2", remedy="pip install 'filterpy>=2'"
+        ) from error
+
+    nx, nt, nw = model.n_states, model.free.size, settings.noise_sd.size
+    n, ny = nx + nt, settings.observed.size
+    lower, upper = model.range
+    log = model.logarithmic
+    theta = np.clip(np.asarray(theta, dtype=float), lower, upper)
+    covariance = np.array(covariance, dtype=float)
+    p = np.array(model.parameters, dtype=float)
+    chosen = settings.points
+    found = []
+    for index, trial in enumerate(trials):
+        t = np.asarray(trial.t, dtype=float)
+        u = np.ascontiguousarray(trial.u, dtype=float)
+        work = np.empty((6, max(n, 2 * nx) + u.shape[1]))
+        reading = np.empty(2 * nx)
+
+        def move(point: Array, dt: float, k: int) -> Array:
+            place_parameters(point, nx, model.free, log, lower, upper, p)
+            x, w = point[:nx].copy(), point[n:].copy()
+            late = p[-1] / dt * (u[k] - u[k - 1])
+            substeps = max(1, int(np.ceil(dt / settings.longest_step - 1e-6)))
+            runge_kutta(model.derivative, x, u[k - 1] - late, u[k] - late, p, w, dt, substeps, work)
+            return np.concatenate([x, point[nx:n], np.zeros(nw)])
+
+        def read(point: Array, k: int) -> Array:
+            place_parameters(point, nx, model.free, log, lower, upper, p)
+            model.measure(point[:nx].copy(), u[k], p, reading)
+            return reading[settings.observed].copy()
+
+        points = MerweScaledSigmaPoints(n + nw, chosen.alpha, chosen.beta, chosen.kappa)
+        ukf = UnscentedKalmanFilter(n + nw, ny, 1.0, hx=read, fx=move, points=points)
+        ukf.x = np.concatenate([trial.x, theta, np.zeros(nw)])
+        ukf.P = np.zeros((n + nw, n + nw))
+        ukf.P[:nx, :nx] = np.diag(np.square(trial.x_sd))
+        ukf.P[nx:n, nx:n] = covariance
+        ukf.P[n:, n:] = np.diag(np.square(settings.noise_sd))
+        ukf.R = np.diag(np.square(settings.reading_sd))
+        means, covariances = [ukf.x[:n].copy()], [ukf.P[:n, :n].copy()]
+        innovation, innovation_sd = np.full((t.size, ny), np.nan), np.full((t.size, ny), np.nan)
+        nis, log_likelihood = np.full(t.size, np.nan), np.full(t.size, np.nan)
+        for k in range(1, t.size):
+            dt = t[k] - t[k - 1]
+            walk = np.square(settings.walk_sd) * dt
+            ukf.Q = np.diag(np.concatenate([np.zeros(nx), walk, np.square(settings.noise_sd)]))
+            try:
+                ukf.predict(dt=dt, k=k)
+                if np.isfinite(trial.y[k]).all():
+                    ukf.update(np.asarray(trial.y[k], dtype=float), k=k)
+                    innovation[k], innovation_sd[k] = ukf.y, np.sqrt(np.diag(ukf.S))
+                    nis[k] = float(ukf.y @ ukf.SI @ ukf.y)
+                    determinant = np.linalg.slogdet(2.0 * np.pi * ukf.S)[1]
+                    log_likelihood[k] = -0.5 * (nis[k] + determinant)
+                    ukf.x[nx:n] = np.clip(ukf.x[nx:n], lower, upper)
+            except np.linalg.LinAlgError as error:
+                reason = "the covariance of the state lost positive definiteness"
+                raise FilterFailure(index, k, reason) from error
+            if k % settings.stride == 0:
+                means.append(ukf.x[:n].copy())
+                covariances.append(ukf.P[:n, :n].copy())
+        theta, covariance = ukf.x[nx:n].copy(), ukf.P[nx:n, nx:n].copy()
+        found.append(
+            FilteredTrial(
+                t=t[:: settings.stride],
+                mean=np.array(means),
+                covariance=np.array(covariances),
+                innovation=innovation,
+                innovation_sd=innovation_sd,
+                nis=nis,
+                log_likelihood=log_likelihood,
+            )
+        )
+        if progress is not None:
+            progress(index + 1)
+    return FilterResult(theta, covariance, tuple(found))

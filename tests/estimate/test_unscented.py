@@ -1,0 +1,201 @@
+"""The augmented unscented filter on a slider with friction; filterpy is the oracle."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from slider import TRUTH, model, position_only, record, settings
+
+from bampipe.estimate.filter_uncertainty import climb, sandwich_covariance
+from bampipe.estimate.filterpy_oracle import filter_trials_by_filterpy
+from bampipe.estimate.sigma_points import SigmaPoints
+from bampipe.estimate.smoother import smooth_trial
+from bampipe.estimate.unscented import FilterFailure, Trial, constrain, filter_trials
+
+
+def run(trials, chosen, slider=None, start=TRUTH, sd=TRUTH, engine=filter_trials):
+    slider = slider or model(start)
+    mean, spread = slider.to_estimated(np.asarray(start), np.asarray(sd))
+    return engine(slider, trials, mean, np.diag(spread**2), chosen)
+
+
+def short(seed: int, samples: int = 150) -> Trial:
+    trial = position_only(record(seed, 1.0))
+    return Trial(trial.t[:samples], trial.u[:samples], trial.y[:samples], trial.x, trial.x_sd)
+
+
+@pytest.mark.parametrize("square_root", [False, True])
+@pytest.mark.parametrize("alpha", [SigmaPoints().alpha, 0.8, 0.4])
+def test_filterpy_gives_the_same_numbers(square_root: bool, alpha: float) -> None:
+    chosen = settings(
+        walk_sd=np.array([0.1, 0.1, 0.05]), points=SigmaPoints(alpha), square_root=square_root
+    )
+    trials = [short(1), short(2)]
+    start, sd = 1.3 * TRUTH, 0.3 * TRUTH
+    ours = run(trials, chosen, start=start, sd=sd)
+    theirs = run(trials, chosen, start=start, sd=sd, engine=filter_trials_by_filterpy)
+    for a, b in zip(ours.trials, theirs.trials, strict=True):
+        np.testing.assert_allclose(a.mean, b.mean, rtol=1e-8, atol=1e-10)
+        scale = np.sqrt(np.einsum("ti,tj->tij", *2 * [np.diagonal(b.covariance, 0, 1, 2)]))
+        assert np.max(np.abs(a.covariance - b.covariance) / scale) < 1e-8
+        np.testing.assert_allclose(a.nis[1:], b.nis[1:], rtol=1e-6, atol=1e-8)
+        np.testing.assert_allclose(a.log_likelihood[1:], b.log_likelihood[1:], rtol=1e-8)
+    np.testing.assert_allclose(ours.theta, theirs.theta, rtol=1e-8)
+
+
+@pytest.mark.parametrize("observed", [[0], [0, 1]])
+def test_both_forms_agree(observed: list[int]) -> None:
+    trials = [record(1, 4.0), record(2, 4.0)]
+    if observed == [0]:
+        trials = [position_only(trial) for trial in trials]
+    sd = np.array([6e-6, 3e-3])[observed]
+    results = [
+        run(
+            trials,
+            settings(observed=np.array(observed), reading_sd=sd, square_root=form),
+            start=2.0 * TRUTH,
+            sd=TRUTH,
+        )
+        for form in (False, True)
+    ]
+    np.testing.assert_allclose(results[0].theta, results[1].theta, rtol=1e-9)
+    for a, b in zip(results[0].trials, results[1].trials, strict=True):
+        np.testing.assert_allclose(a.mean, b.mean, rtol=1e-9, atol=1e-11)
+
+
+def test_square_root_runs_where_the_covariance_is_lost() -> None:
+    """Readings 1e-11 of the prior's spread: rounding makes the covariance indefinite."""
+    trial = replace(position_only(record(3, 2.0, resolution=1e-11)), x_sd=np.array([1.0, 1.0]))
+    chosen = settings(reading_sd=np.array([1e-11]), noise_sd=np.array([1e-2]))
+    with pytest.raises(FilterFailure, match="positive definiteness"):
+        run([trial], replace(chosen, square_root=False), sd=0.1 * TRUTH)
+    found = run([trial], chosen, sd=0.1 * TRUTH)
+    value, _ = model().to_physical(found.theta)
+    np.testing.assert_allclose(value, TRUTH, rtol=0.2)
+
+
+@pytest.mark.parametrize("factor", [0.2, 5.0])
+def test_recovers_from_a_wrong_start(factor: float) -> None:
+    trials = [position_only(record(seed)) for seed in range(4)]
+    start = factor * TRUTH
+    found = run(trials, settings(), start=start, sd=np.maximum(start, TRUTH))
+    value, _ = model().to_physical(found.theta)
+    np.testing.assert_allclose(value, TRUTH, rtol=5e-3)
+
+
+def test_intervals_cover_and_innovations_are_consistent() -> None:
+    covered, nis = [], []
+    for session in range(10):
+        trials = [position_only(record(100 + 3 * session + k)) for k in range(3)]
+        slider = model()
+        mean, spread = slider.to_estimated(1.2 * TRUTH, 0.5 * TRUTH)
+        found = filter_trials(slider, trials, mean, np.diag(spread**2), settings())
+        nis.append(np.nanmean(np.concatenate([t.nis for t in found.trials])))
+        covariance, blocks = sandwich_covariance(found.trials, 2, mean, np.diag(spread**2), 2.0)
+        value, slope = slider.to_physical(found.theta)
+        sd = slope * np.sqrt(np.diag(covariance))
+        covered.append(np.abs(value - TRUTH) < 1.96 * sd)
+        assert blocks == 9
+    assert np.mean(covered) >= 0.8  # 30 intervals: 0.8 is three standard errors below 0.95
+    assert 0.8 < np.mean(nis) < 1.2
+
+
+def test_timing_of_the_inputs_is_found() -> None:
+    trials = []
+    for seed in range(3):
+        trial = position_only(record(seed))
+        late = np.interp(trial.t + 3e-4, trial.t, trial.u[:, 0])  # sampled 0.3 ms after positions
+        trials.append(replace(trial, u=late[:, None]))
+    slider = model(timing=True)
+    mean, spread = slider.to_estimated(np.append(TRUTH, 0.0), np.append(TRUTH, 6e-4))
+    found = filter_trials(slider, trials, mean, np.diag(spread**2), settings(walk_sd=np.zeros(4)))
+    value, _ = slider.to_physical(found.theta)
+    assert value[3] == pytest.approx(3e-4, abs=5e-5)
+    np.testing.assert_allclose(value[:3], TRUTH, rtol=5e-3)
+
+
+def test_ends_within_the_physical_range() -> None:
+    """Without Coulomb friction the estimate is zero or above, and unbiased."""
+    truth = np.array([4.0, 0.0, 2.0])
+    values = []
+    for session in range(4):
+        trials = [position_only(record(2 * session + k, truth=truth)) for k in range(2)]
+        found = run(trials, settings())
+        inside = constrain(model(), found.theta, found.covariance)
+        values.append(model().to_physical(inside)[0])
+        assert abs(found.theta[1]) < 4.0 * np.sqrt(found.covariance[1, 1])
+    assert np.min(values) >= 0.0
+    np.testing.assert_allclose(np.array(values)[:, 0], 4.0, rtol=2e-3)
+
+
+def test_missing_readings_are_bridged() -> None:
+    trial = position_only(record(5))
+    y = trial.y.copy()
+    y[1000:1050] = np.nan
+    found = run([replace(trial, y=y)], settings())
+    value, _ = model().to_physical(found.theta)
+    assert np.isnan(found.trials[0].nis[1000:1050]).all()
+    np.testing.assert_allclose(value, TRUTH, rtol=2e-2)
+
+
+def test_continued_in_parts_is_the_same() -> None:
+    """What an online filter needs: the state handed on gives the batch's numbers."""
+    trial = position_only(record(6, 2.0))
+    chosen = settings(square_root=False)
+    whole = run([trial], chosen)
+    slider = model()
+    mean, spread = slider.to_estimated(TRUTH, TRUTH)
+    joint, x, x_cov = np.diag(spread**2), trial.x, np.diag(trial.x_sd**2)
+    from bampipe.estimate.covariance_form import filter_covariance
+
+    state = np.concatenate([x, mean])
+    covariance = np.zeros((5, 5))
+    covariance[:2, :2], covariance[2:, 2:] = x_cov, joint
+    lower, upper = slider.range
+    weights = np.array(chosen.points.weights(6))
+    for k in range(1, trial.t.size):
+        part = slice(k - 1, k + 1)
+        filter_covariance(
+            slider.derivative, slider.measure, trial.t[part], trial.u[part], trial.y[part],
+            chosen.observed, 2, state, covariance, slider.parameters.copy(), slider.free,
+            slider.logarithmic, lower, upper, chosen.noise_sd, chosen.walk_sd, chosen.reading_sd,
+            weights, chosen.longest_step, 1, np.empty((2, 5)), np.empty((2, 5, 5)),
+            np.empty((2, 1)), np.empty((2, 1)), np.empty((2, 2)), np.zeros(1, dtype=np.int64),
+        )  # fmt: skip
+    np.testing.assert_allclose(state, whole.trials[0].mean[-1], rtol=1e-12, atol=1e-14)
+
+
+def test_smoother_is_closer_than_the_filter() -> None:
+    fine = record(7, 3.0, resolution=1e-12)
+    rng = np.random.default_rng(0)
+    noisy = fine.y[:, :1] + 2e-4 * rng.standard_normal((len(fine.t), 1))
+    trial = replace(fine, y=noisy, x_sd=np.array([2e-4, 0.1]))
+    chosen = settings(reading_sd=np.array([2e-4]), noise_sd=np.array([0.3]))
+    slider = model()
+    mean, spread = slider.to_estimated(TRUTH, 1e-3 * TRUTH)
+    filtered = filter_trials(slider, [trial], mean, np.diag(spread**2), chosen).trials[0]
+    smoothed, covariance = smooth_trial(slider, trial, filtered, chosen)
+    truth = fine.y[:, 1]
+    error = [np.sqrt(np.mean((m[:, 1] - truth) ** 2)) for m in (filtered.mean, smoothed)]
+    assert error[1] < 0.8 * error[0]
+    assert (
+        np.diagonal(covariance, 0, 1, 2) <= np.diagonal(filtered.covariance, 0, 1, 2) * (1 + 1e-9)
+    ).all()
+    inside = np.abs(smoothed[:, 1] - truth) < 3.0 * np.sqrt(covariance[:, 1, 1])
+    assert inside.mean() > 0.9
+
+
+def test_sigma_points_refuse_an_impossible_spread() -> None:
+    with pytest.raises(ValueError, match="sigma points"):
+        SigmaPoints(kappa=-5.0).weights(5)
+
+
+def test_climb_finds_the_maximum_on_its_grid() -> None:
+    best, value = climb(
+        lambda x: -float((x[0] - 2.1) ** 2 + (x[1] + 0.9) ** 2),
+        np.zeros(2), np.array([1.0, 0.5]), np.array([-np.inf, -0.5]),
+    )  # fmt: skip
+    np.testing.assert_allclose(best, [2.0, -0.5])
+    assert value == pytest.approx(-0.17)
