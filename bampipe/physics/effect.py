@@ -75,12 +75,21 @@ class Effect:
         if self.devices and device.name not in self.devices:
             return ()
         if self.scope == "axis":
-            return tuple(c.name for c in device.coordinates)
+            braked = "brake" in self._names()
+            return tuple(
+                c.name for c in device.coordinates if not braked or c.name in device.brakes
+            )
         if self.scope == "force_component":
             return device.components
         if self.scope == "force_pair":
             return tuple(a + b for a in device.components for b in device.components if a != b)
         return ("",) if self._fits(device) else ()
+
+    def _names(self) -> set[str]:
+        """Every name that its expressions use."""
+        trees = [*self.expressions.values()]
+        trees += [tree for state in self.states for tree in (state.rate, state.initial)]
+        return set().union(*map(expression.names, trees))
 
     def _fits(self, device: Device) -> bool:
         """Whether every name that a device-wide effect uses exists in ``device``."""
@@ -93,11 +102,9 @@ class Effect:
             known |= {
                 f"{prefix}_{c.name}" for prefix in ("qd", "applied", "viscous", "coulomb", "load")
             }
-        trees = [*self.expressions.values()]
-        trees += [tree for state in self.states for tree in (state.rate, state.initial)]
         keys = {key.partition(".")[2] for key in self.expressions} - {""}
         places = {c.name for c in device.coordinates} | set(device.forces)
-        return keys <= places and all(expression.names(tree) <= known for tree in trees)
+        return keys <= places and self._names() <= known
 
 
 @dataclass(frozen=True)

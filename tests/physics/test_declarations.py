@@ -227,6 +227,7 @@ def test_an_effect_says_when_a_device_lacks_what_it_needs():
         assert registry.effect(name).targets(rail) == ()
         with pytest.raises(InputError, match="device 'rail' does not have"):
             Model(rail, (name,))
+    assert registry.effect("brake_residual_torque").targets(rail) == ()
     assert registry.effect("force_gain").targets(rail) == ("motor",)
     system = compile_model(Model(rail, ("force_gain:motor",)))
     assert system.inputs == ("force_motor",)
