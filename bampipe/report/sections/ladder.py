@@ -80,8 +80,9 @@ def _picture(results: Results, rungs: list[dict[str, Any]]) -> Figure:
         panel.plot(x, floor, "s--", color=style.VERMILLION, ms=3.0, lw=1.0, label="noise floor")
         for place, value, least in zip(x, error, floor, strict=True):
             if np.isfinite(value):
+                up = -10 if least > value else 4
                 panel.annotate(
-                    wording.significant(float(value), 2), (place, value), (4, -10 if least > value else 4),
+                    wording.significant(float(value), 2), (place, value), (4, up),
                     textcoords="offset points", ha="left", fontsize=7,
                 )  # fmt: skip
         top = np.nanmax(np.concatenate([error, floor, [0.0]]))
