@@ -1,0 +1,335 @@
+"""The command line: what it prints, where, and with which exit code."""
+
+from __future__ import annotations
+
+import ast
+import json
+import subprocess
+import sys
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable
+from pathlib import Path
+
+import install_toys
+import pytest
+from conftest import Toy
+
+import bampipe
+from bampipe.cli import places, show
+from bampipe.errors import InputError
+
+Command = Callable[..., tuple[int, str, str]]
+
+COMMANDS = [
+    "run",
+    "ingest",
+    "filter",
+    "stiffness",
+    "identify",
+    "validate",
+    "diagnose",
+    "extend",
+    "compare",
+    "report",
+    "effects",
+    "simulate",
+    "demo",
+    "status",
+    "verify",
+    "version",
+]
+
+
+def arguments(toy: Toy) -> list[str]:
+    return [str(toy.session), "--pipeline", str(toy.pipeline_file), "--runs", str(toy.runs)]
+
+
+def one_line_error(code: int, out: str, err: str) -> str:
+    """The message of a refused command, which must be one line on standard error."""
+    assert code == 2
+    assert out == ""
+    lines = [line for line in err.splitlines() if line.startswith("bampipe: error: ")]
+    assert len(lines) == 1
+    assert "Traceback" not in err
+    return lines[0]
+
+
+# Help
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_has_help_with_an_example(name: str, command: Command) -> None:
+    code, out, _ = command(name, "--help")
+    assert code == 0
+    assert f"Example: bampipe {name}" in " ".join(out.split())
+
+
+def test_help_lists_the_commands_of_the_contract(command: Command) -> None:
+    code, out, _ = command("--help")
+    assert code == 0
+    for name in COMMANDS:
+        assert f"  {name} " in out
+
+
+@pytest.mark.parametrize("name", [n for n in COMMANDS if n not in ("demo", "simulate")])
+def test_results_come_as_json_too(name: str, command: Command) -> None:
+    if name == "version":
+        return
+    assert "--json" in command(name, "--help")[1]
+
+
+def test_wrong_command_gets_a_suggestion(command: Command) -> None:
+    code, _, err = command("identfy")
+    assert code == 2
+    assert "identify" in err
+
+
+def test_version(command: Command) -> None:
+    assert command("version") == (0, bampipe.__version__ + "\n", "")
+
+
+# Run, on toy stages
+
+
+def test_run_shows_steps_and_what_to_do_next(toy: Toy, command: Command) -> None:
+    code, out, err = command("run", *arguments(toy))
+    assert code == 0
+    assert "toy_read" in out
+    assert "3 numbers" in out
+    assert "small enough" in out
+    assert out.rstrip().splitlines()[-1].startswith("next: bampipe status ")
+    assert "toy_double (never run)" in err
+
+
+def test_quiet_says_nothing_on_the_way(toy: Toy, command: Command) -> None:
+    _, out, err = command("run", *arguments(toy), "--quiet")
+    assert err == ""
+    assert "next:" not in out
+
+
+def test_run_json_is_all_there_is_on_standard_output(toy: Toy, command: Command) -> None:
+    _, out, _ = command("run", *arguments(toy), "--json")
+    session = json.loads(out)["sessions"][0]
+    assert session["state"] == "done"
+    assert session["steps"]["toy_double"]["summary"]["headline"] == "times 2"
+    assert {gate["state"] for gate in session["gates"]} == {"passed"}
+
+
+def test_failed_gate_is_exit_code_one(toy: Toy, command: Command) -> None:
+    (toy.session / "numbers.txt").write_text("1000")
+    junit = toy.folder / "out" / "gates.xml"
+    code, out, _ = command("run", *arguments(toy), "--junit", junit)
+    assert code == 1
+    assert "take smaller numbers" in out
+    assert ElementTree.parse(junit).getroot()[0].get("failures") == "1"
+
+
+def test_several_sessions_end_in_a_table(toy: Toy, command: Command) -> None:
+    for name, text in {"a": "1", "b": "two", "c": "1000"}.items():
+        install_toys.make_session(toy.folder / "many" / name, text)
+    (toy.folder / "many" / "no session").mkdir()
+    pattern = str(toy.folder / "many" / "*")
+    junit = toy.folder / "gates.xml"
+    options = ["--pipeline", toy.pipeline_file, "--runs", toy.runs, "--junit", junit]
+    code, out, _ = command("run", pattern, *options)
+    assert code == 2
+    table = {line.split()[0]: line for line in out.splitlines() if line.strip()}
+    assert "done" in table["a"]
+    assert "bad input" in table["b"]
+    assert "write whole numbers" in table["b"]
+    assert "gate failed" in table["c"]
+    suites = {s.get("name"): s for s in ElementTree.parse(junit).getroot()}
+    assert suites["b"].get("errors") == "1"
+    assert suites["c"].get("failures") == "1"
+
+
+def test_two_sessions_with_one_id(toy: Toy, command: Command) -> None:
+    other = install_toys.make_session(toy.folder / "other" / "first")
+    code, out, _ = command("run", *arguments(toy), str(other))
+    assert code == 2
+    assert "session_id 'first' is that of" in out
+
+
+def test_a_session_named_twice_runs_once(toy: Toy, command: Command) -> None:
+    code, out, _ = command("run", *arguments(toy), str(toy.session), "--json")
+    assert code == 0
+    assert len(json.loads(out)["sessions"]) == 1
+
+
+def test_set_reaches_the_stage(toy: Toy, command: Command) -> None:
+    command("run", *arguments(toy), "--set", "toy_double.factor=5")
+    assert json.loads((toy.root / "toy/double.json").read_text())["axes"]["n0"]["value"] == 5.0
+
+
+@pytest.mark.parametrize(
+    ("extra", "message"),
+    [
+        (["--from", "toy_duble"], "did you mean 'toy_double'"),
+        (["--until", "ingest"], "no stage 'ingest'"),
+        (["--set", "toy_double.factr=5"], "did you mean 'factor'"),
+        (["--set", "toy_duble.factor=5"], "did you mean 'toy_double'"),
+        (["--set", "factor=5"], "does not say which stage"),
+        (["--set", "nothing"], "write --set name=value"),
+        (["--pipeline", "defualt"], "did you mean 'default'"),
+        (["--pipeline", "absent.toml"], "no such pipeline file"),
+        (["--engine", "cloud"], "choose local or dask"),
+        (["--scheduler", "tcp://localhost:1"], "needs --engine dask"),
+        (["--model", "bse"], "did you mean 'base'"),
+    ],
+)
+def test_mistakes_are_one_line_and_exit_code_two(
+    toy: Toy, command: Command, extra: list[str], message: str
+) -> None:
+    assert message in one_line_error(*command("run", *arguments(toy), *extra))
+
+
+def test_status_and_verify(toy: Toy, command: Command) -> None:
+    command("run", *arguments(toy))
+    code, out, _ = command("status", "first", "--runs", toy.runs)
+    assert code == 0
+    assert out.count("current") == 4
+    assert command("verify", toy.root)[0] == 0
+    (toy.root / "sum.json").write_text("{}")
+    code, out, _ = command("verify", toy.root)
+    assert code == 1
+    assert "sum.json" in out
+    code, out, _ = command("status", toy.root, "--json")
+    steps = {step["step"]: step for step in json.loads(out)["steps"]}
+    assert steps["toy_sum"]["state"] == "stale"
+    assert "was changed" in steps["toy_sum"]["reason"]
+
+
+def test_read_only_commands_write_nothing(toy: Toy, command: Command) -> None:
+    command("run", *arguments(toy))
+    before = {p: p.stat().st_mtime_ns for p in toy.root.rglob("*")}
+    command("status", toy.root)
+    command("verify", toy.root)
+    assert {p: p.stat().st_mtime_ns for p in toy.root.rglob("*")} == before
+
+
+# Which run is meant
+
+
+def test_run_is_found_by_name_folder_session_or_not_named(toy: Toy) -> None:
+    with pytest.raises(InputError, match="no run yet"):
+        places.find_run(None, toy.runs)
+    with pytest.raises(InputError, match="has not been run"):
+        places.find_run(str(toy.session), toy.runs)
+    toy.run()
+    for argument in (None, "first", str(toy.root), str(toy.session)):
+        assert places.find_run(argument, toy.runs) == toy.root
+    with pytest.raises(InputError, match="did you mean 'first'"):
+        places.find_run("frist", toy.runs)
+
+
+def test_pattern_without_a_session(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no session matches"):
+        places.find_sessions([str(tmp_path / "*")])
+
+
+# Real stages, no data needed
+
+
+@pytest.mark.parametrize("name", ["filter", "stiffness", "identify", "validate", "report"])
+def test_stage_without_a_run(name: str, command: Command, tmp_path: Path) -> None:
+    assert "bampipe run SESSION" in one_line_error(*command(name, "--runs", tmp_path))
+
+
+def test_settings_are_listed(command: Command) -> None:
+    code, out, _ = command("filter", "--settings")
+    assert code == 0
+    assert "cutoff_hz" in out
+
+
+def test_effects(command: Command) -> None:
+    from bampipe.physics import registry
+
+    code, out, _ = command("effects")
+    assert code == 0
+    for name in registry.effect_names():
+        assert f"  {name} " in out
+    assert {e["name"] for e in json.loads(command("effects", "--json")[1])} == set(
+        registry.effect_names()
+    )
+
+
+def test_one_effect_in_full(command: Command) -> None:
+    code, out, _ = command("effects", "stribeck:yaw")
+    assert code == 0
+    for text in ("torque = ", "N.m", "looks like: ", "source: ", "against yaw velocity", "•"):
+        assert text in out
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("stribek", "did you mean 'stribeck'"),
+        ("stribeck:yow", "did you mean 'yaw'"),
+        ("absent.toml", "cannot be read"),
+    ],
+)
+def test_wrong_effect(command: Command, name: str, message: str) -> None:
+    assert message in one_line_error(*command("effects", name))
+
+
+def test_plot_keeps_its_frame() -> None:
+    from bampipe.cli.effects import COLUMNS, ROWS, plot
+
+    lines = plot([-1.0, 0.0, 2.0], [3.0, 0.0, -1.0])
+    assert len(lines) == ROWS + 1
+    assert all(len(line) <= COLUMNS + 11 for line in lines)
+    assert lines[0].strip().startswith("3")
+    assert plot([1.0, 1.0], [0.0, 0.0])
+
+
+# Printing
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (None, "–"),
+        (True, "yes"),
+        (0.00012346, "0.0001235"),
+        ([1.0, "a"], "1, a"),
+        ({"a": 1}, "a 1"),
+    ],
+)
+def test_cells(value: object, text: str) -> None:
+    assert show.number(value) == text
+
+
+def test_summary_prints_tables(capsys: pytest.CaptureFixture[str]) -> None:
+    show.summary(
+        {
+            "headline": "two axes",
+            "parameters": {"mass": {"unit": "kg", "estimate": 3.5, "sd": 0.1}},
+            "ladder": [{"model": "base", "held_out_rmse": {"yaw": 0.5}}],
+            "notes": ["mind the gap"],
+        }
+    )
+    out = capsys.readouterr().out
+    assert "estimate   sd  unit" in out
+    assert "held out rmse yaw" in out
+    assert "note: mind the gap" in out
+
+
+def test_closed_pipe_makes_no_noise() -> None:
+    line = f"{sys.executable} -m bampipe effects | head -1"
+    done = subprocess.run(["bash", "-c", line], capture_output=True, text=True, check=True)
+    assert "Traceback" not in done.stderr
+
+
+def test_nothing_is_printed_outside_the_command_line() -> None:
+    package = Path(bampipe.__file__).parent
+    for path in package.rglob("*.py"):
+        if path.parent.name == "cli":
+            continue
+        calls = [
+            node
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+            if isinstance(node, ast.Call)
+            and isinstance(node.func, ast.Name)
+            and node.func.id == "print"
+        ]
+        assert not calls, path
