@@ -62,8 +62,9 @@ def _model(
     elif content.get("sentence"):
         blocks.append(Text(wording.sentence(content["sentence"])))
     blocks.append(_verdicts(results, names, axes))
+    lacking = any(axes[axis].get("verdict") != "nothing_missing" for axis in names)
     ranking = content.get("ranking") or []
-    if ranking:
+    if ranking and lacking:
         blocks.append(_ranking(results, ranking))
     following = str(content.get("next") or "")
     if following:
@@ -83,7 +84,7 @@ def _model(
         if maps.get(axis) and axes[axis].get("verdict") != "nothing_missing"
     ]
     windows = content.get("worst_windows") or []
-    if windows and any(axes[axis].get("verdict") != "nothing_missing" for axis in names):
+    if windows and lacking:
         blocks.append(_windows(results, windows))
     return blocks
 

@@ -222,8 +222,10 @@ def _design(results: Results, panel: Any, names: list[str]) -> None:
 
 
 def _settled(panel: Any, trace: pd.DataFrame, names: list[str]) -> None:
-    """Set the range to the estimates past the first tenth: the start would hide the rest."""
-    tail = trace.iloc[len(trace) // 10 :]
+    """Set the range to the estimates past the first trial: the search there would hide the rest."""
+    later = np.flatnonzero(trace["trial_id"].ne(trace["trial_id"].iloc[0]).to_numpy())
+    start = int(later[0]) + len(trace) // 100 if len(later) else len(trace) // 10
+    tail = trace.iloc[start:]
     values = []
     for name in names:
         centre = tail[name].to_numpy()
