@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from bampipe.data.readers import RawTrial
-from bampipe.data.session import SECONDS, Encoder, Session, TrialEntry
+from bampipe.data.session import SECONDS, Channel, Encoder, Session, TrialEntry
 from bampipe.errors import InputError
 
 FASTEST = {"rad": 20.0, "m": 4.0}
@@ -133,10 +133,13 @@ def clean(raw: RawTrial, session: Session, entry: TrialEntry, limits: Limits) ->
     table = _Table(raw, session, entry, limits)
     _time_to_seconds(table)
     _drop_backward_stamps(table)
+    _cut_stretch(table)
     _keep_longest_stretch(table)
     for encoder in session.encoders:
         _refuse_fractions(table, encoder)
         _unwrap(table, encoder)
+    for channel in session.channels:
+        _to_signed(table, channel)
     _fill_missing(table)
     for encoder in session.encoders:
         _mend_jumps(table, encoder)
@@ -242,6 +245,23 @@ def _drop_backward_stamps(table: _Table) -> None:
         table.repairs.append(f"{_rows(counts[0])} with a repeated time stamp dropped")
     if counts[1]:
         table.repairs.append(f"{_rows(counts[1])} with a time stamp out of order dropped")
+
+
+def _cut_stretch(table: _Table) -> None:
+    """Keep the stretch of the record that the session file gives to this trial."""
+    start, end = table.entry.start_s, table.entry.end_s
+    if start == 0.0 and np.isinf(end):
+        return
+    t = table.t - table.t[0]
+    inside = (t >= start) & (t < end)
+    if not inside.any():
+        raise table.fault(
+            f"start_s = {start:g} is after the last sample, at {t[-1]:.3f} s of the record",
+            column=table.clock,
+        )
+    table.keep(inside)
+    until = f"{end:g}" if end <= t[-1] else f"{t[-1]:.3f}"
+    table.notes.append(f"from {start:g} to {until} s of the record")
 
 
 def _keep_longest_stretch(table: _Table) -> None:
@@ -535,6 +555,23 @@ def _to_si(table: _Table) -> dict[str, np.ndarray]:
     for name, values in si.items():
         _refuse_wild(table, values, f"gives {name}", source[name])
     return si
+
+
+def _to_signed(table: _Table, channel: Channel) -> None:
+    """Read the unsigned register of a signed number as what it stands for."""
+    if not channel.wrap_bits:
+        return
+    values = table.columns[channel.column]
+    beyond = (values < 0.0) | (values >= 2.0**channel.wrap_bits)
+    if beyond.any():
+        at = int(np.argmax(beyond))
+        raise table.fault(
+            f"found {values[at]:g}, expected 0 to {2**channel.wrap_bits - 1}",
+            column=channel.column,
+            at=at,
+            remedy="a column that is signed already needs no wrap_bits",
+        )
+    values[values >= 2.0 ** (channel.wrap_bits - 1)] -= 2.0**channel.wrap_bits
 
 
 def _refuse_wild(table: _Table, values: np.ndarray, words: str, column: str) -> None:

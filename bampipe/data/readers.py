@@ -1,14 +1,16 @@
-"""Readers of trial files: CSV, Parquet and MATLAB (.mat), one trial at a time.
+"""Readers of trial files: CSV, Parquet, MATLAB (.mat) and JSON, one trial at a time.
 
 Every reader returns the wanted columns as float64, with NaN where a cell is empty, and raises
 :class:`bampipe.errors.InputError` naming file, row and column where the file cannot be trusted.
-Rows of a CSV file are counted as an editor does (the header is row 1); samples of Parquet and
-MATLAB files are counted from 1. Memory stays below three times what is returned.
+Rows of a CSV file are counted as an editor does (the header is row 1); samples of the other
+files are counted from 1. Memory stays below three times what is returned, JSON aside, which has
+to be held as a whole.
 """
 
 from __future__ import annotations
 
 import csv
+import json
 import re
 import struct
 import zlib
@@ -34,7 +36,9 @@ _BLOCK = 1 << 20
 _BATCH_ROWS = 1 << 16
 _NULLS = ["", "nan", "NaN", "NAN", "NA", "N/A", "#N/A", "null", "NULL", "None"]
 _DELIMITERS = {";": "semicolons", "\t": "tabs", "|": "bars", " ": "blanks"}
-_ENDINGS = (".csv", ".parquet", ".mat")
+_ENDINGS = (".csv", ".parquet", ".mat", ".json", ".jsonl")
+_JSON_COST = 12
+"""Memory that a JSON text takes once parsed, in multiples of its length, at most."""
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 
 
@@ -90,7 +94,13 @@ def read_trial(
         )
     if size == 0:
         raise InputError("the file is empty", where=name)
-    read = {".csv": _read_csv, ".parquet": _read_parquet, ".mat": _read_mat}[ending]
+    read = {
+        ".csv": _read_csv,
+        ".parquet": _read_parquet,
+        ".mat": _read_mat,
+        ".json": _read_json,
+        ".jsonl": _read_json,
+    }[ending]
     _check_kind(head, ending, name)
     try:
         trial = read(path, columns, name, largest_bytes)
@@ -370,6 +380,88 @@ def _read_parquet(path: Path, columns: Sequence[str], name: str, largest: int) -
     if done != rows:
         raise InputError(f"{done} rows, where it claims {rows}", where=name)
     return RawTrial(values, first_row=1)
+
+
+# JSON
+
+
+def _read_json(path: Path, columns: Sequence[str], name: str, largest: int) -> RawTrial:
+    """Samples that are objects: a list of them, a list under one key, or one a line (.jsonl).
+
+    Numbers beside that list are the same at every sample: a column for each of them.
+    """
+    if path.stat().st_size * _JSON_COST > largest:
+        raise InputError(
+            f"a JSON text of {path.stat().st_size >> 20} MB takes more memory than the"
+            f" {largest >> 20} MB allowed",
+            where=name,
+            remedy="log to CSV or Parquet, or allow more (largest_trial_mb)",
+        )
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError("not UTF-8 text", where=name, remedy="save it as UTF-8") from error
+    if path.suffix.lower() == ".jsonl":
+        lines = [line for line in text.splitlines() if line.strip()]
+        samples = [_parsed(x, f"{name}, sample {n}") for n, x in enumerate(lines, 1)]
+        constants: dict[str, object] = {}
+    else:
+        samples, constants = _json_samples(_parsed(text, name), name)
+    if not samples:
+        raise InputError("a header but no samples", where=name)
+    values = {column: np.empty(len(samples)) for column in columns}
+    for number, sample in enumerate(samples, 1):
+        if not isinstance(sample, dict):
+            raise InputError("not an object with named values", where=f"{name}, sample {number}")
+        if number == 1:
+            _check_columns([*sample, *(c for c in constants if c not in sample)], columns, name)
+        for column in columns:
+            cell = sample[column] if column in sample else constants.get(column)
+            values[column][number - 1] = _number(cell, f"{name}, sample {number}, '{column}'")
+    return RawTrial(values, first_row=1)
+
+
+def _parsed(text: str, where: str) -> object:
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        place = f" at line {error.lineno}" if isinstance(error, json.JSONDecodeError) else ""
+        raise InputError(
+            f"not sound JSON{place}", where=where, remedy="was the log cut off? copy it again"
+        ) from error
+
+
+def _json_samples(content: object, name: str) -> tuple[list[object], dict[str, object]]:
+    """Samples of a parsed file, and the numbers beside them."""
+    if isinstance(content, list):
+        return content, {}
+    content = content if isinstance(content, dict) else {}
+    lists = {
+        key: value
+        for key, value in content.items()
+        if isinstance(value, list) and value and isinstance(value[0], dict)
+    }
+    if len(lists) != 1:
+        raise InputError(
+            f"{len(lists)} lists of samples: {', '.join(lists)}"
+            if lists
+            else "no list of samples, that is of objects with named values",
+            where=name,
+        )
+    constants = {k: v for k, v in content.items() if isinstance(v, int | float)}
+    return next(iter(lists.values())), constants
+
+
+def _number(cell: object, where: str) -> float:
+    """A JSON value as a number: null is missing, true is 1."""
+    if cell is None:
+        return float("nan")
+    if not isinstance(cell, int | float):
+        raise InputError(f"found {str(cell)[:40]!r}, expected a number", where=where)
+    try:
+        return float(cell)
+    except OverflowError as error:
+        raise InputError("found a number beyond all range", where=where) from error
 
 
 # MATLAB

@@ -101,13 +101,18 @@ class Brake:
 
 @dataclass(frozen=True)
 class Channel:
-    """Any other recorded input: SI value = scale * raw + offset."""
+    """Any other recorded input: SI value = scale * raw + offset.
+
+    Where ``wrap_bits`` is not 0 the raw readings are the unsigned register of a signed number of
+    so many bits (two's complement): those in the upper half stand for negative numbers.
+    """
 
     name: str
     column: str
     unit: str
     scale: float
     offset: float
+    wrap_bits: int = 0
 
 
 @dataclass(frozen=True)
@@ -120,6 +125,8 @@ class TrialEntry:
         kind: "free", "locked" or "viscous".
         locked_axis: for "locked".
         viscous: commanded Cartesian damping, N.s/m, for "viscous".
+        start_s, end_s: the stretch of the record that is this trial, s after its first sample;
+            0 and infinity for all of it.
     """
 
     trial_id: str
@@ -127,6 +134,12 @@ class TrialEntry:
     kind: str
     locked_axis: str | None
     viscous: float | None
+    start_s: float = 0.0
+    end_s: float = math.inf
+
+    def overlaps(self, other: TrialEntry) -> bool:
+        """Whether the stretches of two trials of one record have samples in common."""
+        return self.start_s < other.end_s and other.start_s < self.end_s
 
 
 @dataclass(frozen=True)
@@ -470,8 +483,21 @@ def _channels(entries: Mapping[str, Any], where: str) -> tuple[Channel, ...]:
         scale = float(entry.get("scale", 1.0))
         if scale == 0.0:
             raise InputError("found 0, expected another number", where=f"{where}.{name}.scale")
+        if entry.get("signed", False) != ("wrap_bits" in entry):
+            raise InputError(
+                "signed and wrap_bits belong together",
+                where=f"{where}.{name}",
+                remedy="give wrap_bits = 16, signed = true for a signed register read as unsigned",
+            )
         channels.append(
-            Channel(name, entry["column"], entry["unit"], scale, float(entry.get("offset", 0.0)))
+            Channel(
+                name=name,
+                column=entry["column"],
+                unit=entry["unit"],
+                scale=scale,
+                offset=float(entry.get("offset", 0.0)),
+                wrap_bits=int(entry.get("wrap_bits", 0)),
+            )
         )
     return tuple(channels)
 
@@ -499,16 +525,43 @@ def _trials(
             )
     files = [PurePosixPath(entry["file"]).as_posix() for entry in entries]
     ids = _trial_ids(files)
-    return tuple(
+    trials = tuple(
         TrialEntry(
             trial_id=trial_id,
             file=file,
             kind=entry["kind"],
             locked_axis=entry.get("locked_axis"),
             viscous=None if "viscous_n_s_per_m" not in entry else float(entry["viscous_n_s_per_m"]),
+            start_s=float(entry.get("start_s", 0.0)),
+            end_s=float(entry.get("end_s", math.inf)),
         )
         for trial_id, file, entry in zip(ids, files, entries, strict=True)
     )
+    _refuse_bad_stretches(trials, where)
+    return trials
+
+
+def _refuse_bad_stretches(trials: tuple[TrialEntry, ...], where: str) -> None:
+    """Raise InputError for an empty stretch, or for stretches of one file that overlap.
+
+    The same file twice without stretches is left to ingest, which uses it once and says so.
+    """
+    for number, trial in enumerate(trials):
+        place = f"{where}: trials[{number}]"
+        if not trial.start_s < trial.end_s:
+            raise InputError(
+                f"found {trial.end_s:g}, expected more than start_s = {trial.start_s:g}",
+                where=f"{place}.end_s",
+            )
+        for other in trials[:number]:
+            whole = (trial.start_s, trial.end_s) == (other.start_s, other.end_s) == (0.0, math.inf)
+            if other.file == trial.file and other.overlaps(trial) and not whole:
+                raise InputError(
+                    f"overlaps trial {other.trial_id} of the same file",
+                    where=place,
+                    remedy="give each stretch its own start_s and end_s: held-out samples must"
+                    " not be in another trial",
+                )
 
 
 def _trial_ids(files: list[str]) -> list[str]:

@@ -278,8 +278,8 @@ def simulate_tracking(
     brakes = brake if brake_gain is not None else ()
     _track(
         derivative, x, total, np.ascontiguousarray(p, dtype=np.float64), np.zeros(n_noise),
-        np.ascontiguousarray(q_ref, dtype=np.float64),
-        np.ascontiguousarray(qd_ref, dtype=np.float64),
+        np.array(q_ref, dtype=np.float64, order="C"),  # a copy: columns of a table are read-only
+        np.array(qd_ref, dtype=np.float64, order="C"),
         np.ascontiguousarray(width, dtype=np.float64), dt, max_step,
         np.array(force, dtype=np.int64), np.array(rate, dtype=np.int64),
         np.array(curvature, dtype=np.int64), np.array(brakes, dtype=np.int64), gain, brake_time,

@@ -187,7 +187,12 @@ def _refused(session: Session) -> list[str]:
         if path.stat().st_size > 0:
             same[sha256_file(path)].append(number)
     reasons = [""] * len(session.trials)
-    for numbers in same.values():
+    for alike_files in same.values():
+        numbers = [
+            n
+            for n in alike_files
+            if any(session.trials[n].overlaps(session.trials[m]) for m in alike_files if m != n)
+        ]
         entries = [session.trials[number] for number in numbers]
         alike = len({(entry.kind, entry.locked_axis, entry.viscous) for entry in entries}) == 1
         for number in numbers[1:] if alike else numbers if len(numbers) > 1 else []:

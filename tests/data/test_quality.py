@@ -117,6 +117,36 @@ def test_a_second_of_samples_is_a_second():
         cleaned({name: values[:499] for name, values in table.items()})
 
 
+def test_a_trial_is_a_stretch_of_a_record():
+    table = {**TABLE, "trials": [{"file": "a.csv", "kind": "free", "start_s": 0.5, "end_s": 2.0}]}
+    session = session_from(table, Path())
+    whole = columns()
+    trial = clean(RawTrial(columns(), 2), session, session.trials[0], Limits())
+    assert len(trial.t) == 750 and trial.t[0] == 0.0 and trial.repairs == []
+    np.testing.assert_allclose(trial.columns["q_turn"], whole["turn"][250:1000])
+    assert trial.notes == ["from 0.5 to 2 s of the record"]
+
+
+def test_a_stretch_after_the_end_of_the_record_is_refused():
+    table = {**TABLE, "trials": [{"file": "a.csv", "kind": "free", "start_s": 3.0}]}
+    session = session_from(table, Path())
+    with pytest.raises(InputError, match=r"after the last sample, at 2\.998 s"):
+        clean(RawTrial(columns(), 2), session, session.trials[0], Limits())
+
+
+def test_an_unsigned_register_is_read_as_signed():
+    channel = {"column": "pwm", "unit": "", "scale": 0.5, "wrap_bits": 16, "signed": True}
+    session = session_from({**TABLE, "channels": {"duty": channel}}, Path())
+    signed = np.rint(300 * np.sin(np.arange(N) / 40.0))
+    raw = columns() | {"pwm": np.where(signed < 0, signed + 65536, signed)}
+    raw["pwm"][np.flatnonzero(np.diff(np.sign(signed)))[3]] = np.nan
+    trial = clean(RawTrial(raw, 2), session, session.trials[0], Limits())
+    np.testing.assert_allclose(trial.columns["duty"], 0.5 * signed, atol=3.0)
+    below = columns() | {"pwm": signed}
+    with pytest.raises(InputError, match="expected 0 to 65535"):
+        clean(RawTrial(below, 2), session, session.trials[0], Limits())
+
+
 def test_limits_are_heeded():
     table = columns()
     table["force_x"][100:107] = np.nan

@@ -204,3 +204,50 @@ def check_reads_or_refuses(name, content, columns):
         else:
             lengths = {len(values) for values in trial.columns.values()}
             assert len(lengths) == 1 and lengths.pop() > 0
+
+
+def read_json(tmp_path, text, columns=("t", "x"), name="a.json"):
+    (tmp_path / name).write_text(text)
+    return read_trial(tmp_path / name, columns, name=name)
+
+
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [
+        ('[{"t": 0, "x": 1.5}, {"t": 1, "x": null}]', "a.json"),
+        ('{"gain": 2, "log": [{"t": 0, "x": 1.5}, {"x": null, "t": 1}]}', "a.json"),
+        ('{"t": 0, "x": 1.5}\n\n{"t": 1, "x": null}\n', "a.jsonl"),
+    ],
+)
+def test_samples_that_are_json_objects(tmp_path, text, name):
+    trial = read_json(tmp_path, text, name=name)
+    np.testing.assert_array_equal(trial.columns["t"], [0.0, 1.0])
+    np.testing.assert_array_equal(trial.columns["x"], [1.5, np.nan])
+
+
+def test_numbers_beside_the_samples_are_columns(tmp_path):
+    text = '{"gain": 2, "who": "a", "log": [{"on": true}, {"on": false}]}'
+    trial = read_json(tmp_path, text, ("on", "gain"))
+    np.testing.assert_array_equal(trial.columns["on"], [1.0, 0.0])
+    np.testing.assert_array_equal(trial.columns["gain"], [2.0, 2.0])
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ('{"log": [{"t": 0}]}', "no column 'x'"),
+        ('{"a": [{"t": 0}], "b": [{"x": 0}]}', "2 lists of samples: a, b"),
+        ('{"a": 3}', "no list of samples"),
+        ("3", "no list of samples"),
+        ("[]", "no samples"),
+        ('[{"t": 0, "x": 1}, 5]', "sample 2: not an object"),
+        ('[{"t": 0, "x": "fast"}]', "sample 1, 'x': found 'fast', expected a number"),
+        ('[{"t": 0, "x": 1}, {"t": 1, "x":', "not sound JSON at line 1"),
+        ("[" * 100_000, "not sound JSON"),
+        ('[{"t": 0, "x": 1' + "0" * 400 + "}]", "beyond all range"),
+    ],
+)
+def test_json_that_is_no_trial_is_refused_in_one_line(tmp_path, text, said):
+    with pytest.raises(InputError) as caught:
+        read_json(tmp_path, text)
+    assert said in str(caught.value) and "\n" not in str(caught.value)

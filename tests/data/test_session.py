@@ -107,6 +107,44 @@ def test_a_session_reached_by_a_link_is_read(tmp_path):
     assert inside(tmp_path / "link", "a.csv", "w").is_file()
 
 
+def record_in(*stretches):
+    table = copy.deepcopy(TABLE)
+    table["trials"] = [{"file": "r.mat", "kind": "free", **s} for s in stretches]
+    return session_from(table, Path("here"))
+
+
+def test_one_record_gives_several_trials():
+    session = record_in({"end_s": 4}, {"start_s": 4, "end_s": 9.5}, {"start_s": 9.5})
+    assert [trial.trial_id for trial in session.trials] == ["r", "r_2", "r_3"]
+    assert [trial.start_s for trial in session.trials] == [0.0, 4.0, 9.5]
+    assert session.trials[2].end_s == float("inf")
+    record_in({}, {})  # the same file twice is for ingest to judge
+
+
+@pytest.mark.parametrize(
+    ("stretches", "said"),
+    [
+        (({"end_s": 4}, {"start_s": 3.9}), "trials[1]: overlaps trial r of the same file"),
+        (({}, {"start_s": 3.0}), "trials[1]: overlaps trial r"),
+        (({"start_s": 2, "end_s": 2},), "trials[0].end_s: found 2, expected more than start_s"),
+        (({"start_s": -1},), "trials[0].start_s"),
+        (({"end_s": "4"},), "trials[0].end_s"),
+    ],
+)
+def test_stretches_that_make_no_sense_are_refused(stretches, said):
+    with pytest.raises(InputError) as caught:
+        record_in(*stretches)
+    assert said in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("extra", [{"wrap_bits": 16}, {"signed": True}])
+def test_a_register_is_declared_in_full(extra):
+    table = copy.deepcopy(TABLE)
+    table["channels"]["current"] |= extra
+    with pytest.raises(InputError, match="signed and wrap_bits belong together"):
+        session_from(table, Path("here"))
+
+
 def test_a_file_of_another_ending_is_pointed_out(tmp_path):
     (tmp_path / "A.parquet").write_text("")
     with pytest.raises(InputError, match=r"no such file 'a\.csv'; there is 'A\.parquet'"):
