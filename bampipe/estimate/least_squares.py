@@ -302,5 +302,7 @@ def _sandwich(problem: Problem, stacked: Sequence[Stacked], block_s: float) -> A
             part = score[start : start + samples].sum(axis=0)
             meat += np.outer(part, part)
             blocks += 1
+    held = problem.lower == problem.upper
+    bread[held], bread[:, held], meat[held], meat[:, held] = 0.0, 0.0, 0.0, 0.0
     inverse = np.linalg.pinv(bread, hermitian=True)
     return np.asarray(inverse @ meat @ inverse * (blocks / max(blocks - n_free, 1)))

@@ -73,6 +73,8 @@ class Config:
         cutoff_hz: low-pass of the least-squares residual, Hz.
         block_s: length of the blocks that are taken as independent of each other, s.
         trace_rows: most rows a trial in trace.parquet and states.parquet.
+        input_timing: whether to estimate by how much inputs were sampled after positions; the
+            filter always does, least squares may take them as simultaneous.
     """
 
     model: str = "base"
@@ -88,6 +90,7 @@ class Config:
     cutoff_hz: float = 8.0
     block_s: float = 2.0
     trace_rows: int = 2000
+    input_timing: bool = True
 
 
 def inputs(config: Config) -> tuple[str, ...]:
@@ -129,7 +132,9 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     progress(0.0, "reading the trials")
     motions = [read_motion(run, trial, system) for trial in free_trials(run)]
     rate = float(session["sample_rate_hz"])
-    problem = problem_of(system, motions, Band(rate, config.cutoff_hz))
+    problem = problem_of(
+        system, motions, Band(rate, config.cutoff_hz), timing=config.input_timing
+    )
     progress(0.1, "least squares")
     start = system.prior
     variable = [i for i, item in enumerate(system.parameters) if not item.fixed]
@@ -168,6 +173,12 @@ def _check(config: Config) -> None:
                 where=f"identify.{name}",
                 remedy=f"choose from {', '.join(known)}",
             )
+    if config.method == "ukf" and not config.input_timing:
+        raise InputError(
+            "the filter always estimates the timing of the inputs",
+            where="identify.input_timing",
+            remedy="choose method = least-squares",
+        )
     for name in ("start_factor", "longest_step_s", "cutoff_hz", "block_s", "trace_rows"):
         if not getattr(config, name) > 0:
             raise InputError("must be positive", where=f"identify.{name}")

@@ -111,7 +111,11 @@ def input_columns(
 
 
 def problem_of(
-    system: System, motions: Sequence[Motion], band: Band, held: Sequence[str] = ()
+    system: System,
+    motions: Sequence[Motion],
+    band: Band,
+    held: Sequence[str] = (),
+    timing: bool = True,
 ) -> Problem:
     """Return the inverse dynamics of ``motions`` as a least-squares problem.
 
@@ -121,6 +125,7 @@ def problem_of(
     Args:
         system: the model; motions: the trials; band: the low-pass of the residual.
         held: parameters that are not estimated, beside those that the model fixes.
+        timing: whether that time is estimated; else it is zero.
     """
     n = len(system.parameters)
 
@@ -134,7 +139,7 @@ def problem_of(
     free = [
         i for i, item in enumerate(system.parameters) if not item.fixed and item.name not in held
     ]
-    half = 0.5 / band.rate_hz
+    half = 0.5 / band.rate_hz if timing else 0.0
     lower = [system.parameters[i].lower for i in free]
     upper = [system.parameters[i].upper for i in free]
     step = [system.parameters[i].sd * (1.0 if system.linear[i] else 1e-4) or 1.0 for i in free]
@@ -144,7 +149,7 @@ def problem_of(
         free=np.array([*free, n], dtype=np.int64),
         lower=np.array([*lower, -half]),
         upper=np.array([*upper, half]),
-        step=np.array([*step, half]),
+        step=np.array([*step, 0.5 / band.rate_hz]),
         linear=all(system.linear[i] for i in free),
         band=band,
         resting=[resting(m.qd, m.qd_sd, band.rate_hz) for m in motions],

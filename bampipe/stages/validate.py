@@ -99,7 +99,8 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     system = compile_model(load_model(run, config.model))
     motions = [read_motion(run, trial, system) for trial in free_trials(run)]
     band = Band(float(session["sample_rate_hz"]), config.cutoff_hz)
-    problem = problem_of(system, motions, band)
+    timing = identified["input_timing"]["sd"] > 0.0  # zero where it was not estimated
+    problem = problem_of(system, motions, band, timing=timing)
     p = _identified(system, identified, run)
     progress(0.1, "held-out fits")
     compared = _compare(system, motions, problem, p)
@@ -284,6 +285,11 @@ def _rms(values: Sequence[Array], used: Sequence[NDArray[np.bool_]]) -> Array:
     return np.asarray(np.sqrt(square / np.maximum(count, 1)))
 
 
+def _percent(error: float, size: float) -> float:
+    """Relative error: norm of the residual over norm of the measured torque, per cent."""
+    return float(100.0 * error / size) if size > 0.0 else 100.0
+
+
 def _entries(
     system: System, compared: Sequence[_Compared], floor: Array | None
 ) -> dict[str, dict[str, object]]:
@@ -295,6 +301,7 @@ def _entries(
     count = np.maximum(sum(keep.sum(axis=0) for keep in used), 1)
     mean = sum(np.sum(c.measured * c.used, axis=0) for c in compared) / count
     spread = _rms([c.measured - mean for c in compared], used)
+    size = _rms([c.measured for c in compared], used)
     entries: dict[str, dict[str, object]] = {}
     for i, axis in enumerate(system.coordinates):
         share = held_out[i] / spread[i] if spread[i] > 0.0 else 1.0
@@ -302,6 +309,8 @@ def _entries(
             "rmse": float(rmse[i]),
             "rmse_without_friction": float(without[i]),
             "held_out_rmse": float(held_out[i]),
+            "relative_error_percent": _percent(rmse[i], size[i]),
+            "held_out_relative_error_percent": _percent(held_out[i], size[i]),
             "fit_percent": float(100.0 * (1.0 - share)),
             "unit": system.torque_units[i],
         }
