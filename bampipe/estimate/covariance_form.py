@@ -15,7 +15,7 @@ from bampipe.estimate.triangular import cholesky, forward_substitute
 
 
 @njit(KERNEL, cache=True)
-def filter_covariance(
+def filter_covariance(  # type: ignore[no-untyped-def]
     derivative,
     measure,
     t,

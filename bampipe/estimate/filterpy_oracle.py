@@ -40,6 +40,25 @@ def filter_trials_by_filterpy(
         FilterFailure: the covariance lost positive definiteness.
         InputError: filterpy 2 is not installed.
     """
+    theta, covariance = np.asarray(theta, dtype=float), np.array(covariance, dtype=float)
+    found = []
+    for index, trial in enumerate(trials):
+        filtered, theta, covariance = _filter(model, index, trial, theta, covariance, settings)
+        found.append(filtered)
+        if progress is not None:
+            progress(index + 1)
+    return FilterResult(theta, covariance, tuple(found))
+
+
+def _filter(
+    model: FilterModel,
+    index: int,
+    trial: Trial,
+    theta: Array,
+    covariance: Array,
+    settings: FilterSettings,
+) -> tuple[FilteredTrial, Array, Array]:
+    """Filter one trial; return it and the parameters with their covariance after it."""
     try:
         from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
     except ImportError as error:
@@ -47,76 +66,69 @@ def filter_trials_by_filterpy(
             "engine filterpy needs filterpy 2", remedy="pip install 'filterpy>=2'"
         ) from error
 
-    nx, nt, nw = model.n_states, model.free.size, settings.noise_sd.size
-    n, ny = nx + nt, settings.observed.size
+    nx, nw = model.n_states, settings.noise_sd.size
+    n, ny = nx + model.free.size, settings.observed.size
     lower, upper = model.range
-    log = model.logarithmic
-    theta = np.clip(np.asarray(theta, dtype=float), lower, upper)
-    covariance = np.array(covariance, dtype=float)
     p = np.array(model.parameters, dtype=float)
+    t = np.asarray(trial.t, dtype=float)
+    u = np.ascontiguousarray(trial.u, dtype=float)
+    work = np.empty((6, max(n, 2 * nx) + u.shape[1]))
+    reading = np.empty(2 * nx)
+
+    def place(point: Array) -> None:
+        place_parameters(point, nx, model.free, model.logarithmic, lower, upper, p)
+
+    def move(point: Array, dt: float, k: int) -> Array:
+        place(point)
+        x, w = point[:nx].copy(), point[n:].copy()
+        late = p[-1] / dt * (u[k] - u[k - 1])
+        start, end = u[k - 1] - late, u[k] - late
+        substeps = max(1, int(np.ceil(dt / settings.longest_step - 1e-6)))
+        runge_kutta(model.derivative, x, start, end, p, w, dt, substeps, work)
+        return np.concatenate([x, point[nx:n], np.zeros(nw)])
+
+    def read(point: Array, k: int) -> Array:
+        place(point)
+        model.measure(point[:nx].copy(), u[k], p, reading)
+        return reading[settings.observed].copy()
+
     chosen = settings.points
-    found = []
-    for index, trial in enumerate(trials):
-        t = np.asarray(trial.t, dtype=float)
-        u = np.ascontiguousarray(trial.u, dtype=float)
-        work = np.empty((6, max(n, 2 * nx) + u.shape[1]))
-        reading = np.empty(2 * nx)
-
-        def move(point: Array, dt: float, k: int) -> Array:
-            place_parameters(point, nx, model.free, log, lower, upper, p)
-            x, w = point[:nx].copy(), point[n:].copy()
-            late = p[-1] / dt * (u[k] - u[k - 1])
-            substeps = max(1, int(np.ceil(dt / settings.longest_step - 1e-6)))
-            runge_kutta(model.derivative, x, u[k - 1] - late, u[k] - late, p, w, dt, substeps, work)
-            return np.concatenate([x, point[nx:n], np.zeros(nw)])
-
-        def read(point: Array, k: int) -> Array:
-            place_parameters(point, nx, model.free, log, lower, upper, p)
-            model.measure(point[:nx].copy(), u[k], p, reading)
-            return reading[settings.observed].copy()
-
-        points = MerweScaledSigmaPoints(n + nw, chosen.alpha, chosen.beta, chosen.kappa)
-        ukf = UnscentedKalmanFilter(n + nw, ny, 1.0, hx=read, fx=move, points=points)
-        ukf.x = np.concatenate([trial.x, theta, np.zeros(nw)])
-        ukf.P = np.zeros((n + nw, n + nw))
-        ukf.P[:nx, :nx] = np.diag(np.square(trial.x_sd))
-        ukf.P[nx:n, nx:n] = covariance
-        ukf.P[n:, n:] = np.diag(np.square(settings.noise_sd))
-        ukf.R = np.diag(np.square(settings.reading_sd))
-        means, covariances = [ukf.x[:n].copy()], [ukf.P[:n, :n].copy()]
-        innovation, innovation_sd = np.full((t.size, ny), np.nan), np.full((t.size, ny), np.nan)
-        nis, log_likelihood = np.full(t.size, np.nan), np.full(t.size, np.nan)
-        for k in range(1, t.size):
-            dt = t[k] - t[k - 1]
-            walk = np.square(settings.walk_sd) * dt
-            ukf.Q = np.diag(np.concatenate([np.zeros(nx), walk, np.square(settings.noise_sd)]))
-            try:
-                ukf.predict(dt=dt, k=k)
-                if np.isfinite(trial.y[k]).all():
-                    ukf.update(np.asarray(trial.y[k], dtype=float), k=k)
-                    innovation[k], innovation_sd[k] = ukf.y, np.sqrt(np.diag(ukf.S))
-                    nis[k] = float(ukf.y @ ukf.SI @ ukf.y)
-                    determinant = np.linalg.slogdet(2.0 * np.pi * ukf.S)[1]
-                    log_likelihood[k] = -0.5 * (nis[k] + determinant)
-                    ukf.x[nx:n] = np.clip(ukf.x[nx:n], lower, upper)
-            except np.linalg.LinAlgError as error:
-                reason = "the covariance of the state lost positive definiteness"
-                raise FilterFailure(index, k, reason) from error
-            if k % settings.stride == 0:
-                means.append(ukf.x[:n].copy())
-                covariances.append(ukf.P[:n, :n].copy())
-        theta, covariance = ukf.x[nx:n].copy(), ukf.P[nx:n, nx:n].copy()
-        found.append(
-            FilteredTrial(
-                t=t[:: settings.stride],
-                mean=np.array(means),
-                covariance=np.array(covariances),
-                innovation=innovation,
-                innovation_sd=innovation_sd,
-                nis=nis,
-                log_likelihood=log_likelihood,
-            )
-        )
-        if progress is not None:
-            progress(index + 1)
-    return FilterResult(theta, covariance, tuple(found))
+    points = MerweScaledSigmaPoints(n + nw, chosen.alpha, chosen.beta, chosen.kappa)
+    ukf = UnscentedKalmanFilter(n + nw, ny, 1.0, hx=read, fx=move, points=points)
+    ukf.x = np.concatenate([trial.x, np.clip(theta, lower, upper), np.zeros(nw)])
+    ukf.P = np.zeros((n + nw, n + nw))
+    ukf.P[:nx, :nx] = np.diag(np.square(trial.x_sd))
+    ukf.P[nx:n, nx:n] = covariance
+    ukf.P[n:, n:] = np.diag(np.square(settings.noise_sd))
+    ukf.R = np.diag(np.square(settings.reading_sd))
+    means, covariances = [ukf.x[:n].copy()], [ukf.P[:n, :n].copy()]
+    innovation, innovation_sd = np.full((t.size, ny), np.nan), np.full((t.size, ny), np.nan)
+    nis, log_likelihood = np.full(t.size, np.nan), np.full(t.size, np.nan)
+    for k in range(1, t.size):
+        dt = t[k] - t[k - 1]
+        walk = np.square(settings.walk_sd) * dt
+        ukf.Q = np.diag(np.concatenate([np.zeros(nx), walk, np.square(settings.noise_sd)]))
+        try:
+            ukf.predict(dt=dt, k=k)
+            if np.isfinite(trial.y[k]).all():
+                ukf.update(np.asarray(trial.y[k], dtype=float), k=k)
+                innovation[k], innovation_sd[k] = ukf.y, np.sqrt(np.diag(ukf.S))
+                nis[k] = float(ukf.y @ ukf.SI @ ukf.y)
+                log_likelihood[k] = -0.5 * (nis[k] + np.linalg.slogdet(2.0 * np.pi * ukf.S)[1])
+                ukf.x[nx:n] = np.clip(ukf.x[nx:n], lower, upper)
+        except np.linalg.LinAlgError as error:
+            reason = "the covariance of the state lost positive definiteness"
+            raise FilterFailure(index, k, reason) from error
+        if k % settings.stride == 0:
+            means.append(ukf.x[:n].copy())
+            covariances.append(ukf.P[:n, :n].copy())
+    filtered = FilteredTrial(
+        t=t[:: settings.stride],
+        mean=np.array(means),
+        covariance=np.array(covariances),
+        innovation=innovation,
+        innovation_sd=innovation_sd,
+        nis=nis,
+        log_likelihood=log_likelihood,
+    )
+    return filtered, ukf.x[nx:n].copy(), ukf.P[nx:n, nx:n].copy()

@@ -197,7 +197,8 @@ def fit(
     if sum(len(s.residual) for s in stacked) <= problem.free.size:
         raise ValueError("fewer samples than parameters")
     iterations, converged = 0, False
-    for iterations in range(1, most_iterations + 1):
+    while iterations < most_iterations:
+        iterations += 1
         before, cost = p, _cost(stacked)
         target = refit(stacked, p[problem.free], problem.lower, problem.upper)
         share = 1.0

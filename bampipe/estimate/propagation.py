@@ -20,7 +20,7 @@ from bampipe.estimate.signatures import DERIVATIVE, MEASURE
     ),
     cache=True,
 )
-def runge_kutta(derivative, x, u0, u1, p, w, dt, substeps, work):
+def runge_kutta(derivative, x, u0, u1, p, w, dt, substeps, work):  # type: ignore[no-untyped-def]
     """Advance ``x`` in place by ``dt``: classical fourth order, eq 22 with k4 at x + delta k3.
 
     The input runs linlate from ``u0`` to ``u1`` over the interval; held constant instead, it
@@ -70,7 +70,7 @@ def runge_kutta(derivative, x, u0, u1, p, w, dt, substeps, work):
     void(float64[::1], int64, int64[::1], boolean[::1], float64[::1], float64[::1], float64[::1]),
     cache=True,
 )
-def place_parameters(point, nx, free, logarithmic, lower, upper, p):
+def place_parameters(point, nx, free, logarithmic, lower, upper, p):  # type: ignore[no-untyped-def]
     """Write the parameters of a sigma point into ``p``, clamped to their physical range."""
     for j in range(free.shape[0]):
         value = min(max(point[nx + j], lower[j]), upper[j])
@@ -99,7 +99,7 @@ def place_parameters(point, nx, free, logarithmic, lower, upper, p):
     ),
     cache=True,
 )
-def propagate_points(
+def propagate_points(  # type: ignore[no-untyped-def]
     derivative,
     mean,
     factor,
@@ -187,7 +187,7 @@ def propagate_points(
     ),
     cache=True,
 )
-def measure_points(
+def measure_points(  # type: ignore[no-untyped-def]
     measure, mean, factor, reach, nx, p, free, logarithmic, lower, upper, u, observed, images, work
 ):
     """Draw sigma points of (state, parameters) afresh and take the measurement of each.

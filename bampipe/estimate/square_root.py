@@ -15,7 +15,7 @@ from bampipe.estimate.triangular import factor_of_rows, forward_substitute, rank
 
 
 @njit(KERNEL, cache=True)
-def filter_square_root(
+def filter_square_root(  # type: ignore[no-untyped-def]
     derivative,
     measure,
     t,

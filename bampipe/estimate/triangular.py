@@ -10,7 +10,7 @@ _REASSOCIATE = {"reassoc", "nsz", "contract"}  # lets sums use vector registers;
 
 
 @njit(boolean(float64[:, ::1], float64[:, ::1]), cache=True, fastmath=_REASSOCIATE)
-def cholesky(covariance, factor):
+def cholesky(covariance, factor):  # type: ignore[no-untyped-def]
     """Write the lower Cholesky factor of ``covariance`` (n, n) into ``factor`` (n, n).
 
     A coordinate with exactly zero variance gets a zero column: it is known and stays so.
@@ -44,7 +44,7 @@ def cholesky(covariance, factor):
 
 
 @njit(void(float64[:, ::1], int64, float64[:, ::1]), cache=True, fastmath=_REASSOCIATE)
-def factor_of_rows(columns, n_rows, factor):
+def factor_of_rows(columns, n_rows, factor):  # type: ignore[no-untyped-def]
     """Write the lower L with L L^T = A^T A into ``factor`` (n, n), by Householder reflections.
 
     Args:
@@ -81,7 +81,7 @@ def factor_of_rows(columns, n_rows, factor):
 
 
 @njit(void(float64[:, ::1], int64, float64[::1]), cache=True)
-def forward_substitute(factor, n, vector):
+def forward_substitute(factor, n, vector):  # type: ignore[no-untyped-def]
     """Replace ``vector`` (>= n,) by L^-1 vector, L the leading (n, n) block of ``factor``."""
     for i in range(n):
         total = vector[i]
@@ -91,7 +91,7 @@ def forward_substitute(factor, n, vector):
 
 
 @njit(void(float64[:, ::1], int64, float64[::1]), cache=True)
-def back_substitute(factor, n, vector):
+def back_substitute(factor, n, vector):  # type: ignore[no-untyped-def]
     """Replace ``vector`` (>= n,) by L^-T vector, L the leading (n, n) block of ``factor``."""
     for i in range(n - 1, -1, -1):
         total = vector[i]
@@ -101,7 +101,7 @@ def back_substitute(factor, n, vector):
 
 
 @njit(boolean(float64[:, ::1], float64, float64[::1]), cache=True)
-def rank_one_update(factor, sign, vector):
+def rank_one_update(factor, sign, vector):  # type: ignore[no-untyped-def]
     """Replace L by the factor of L L^T + sign vector vector^T; ``vector`` (n,) is destroyed.
 
     Returns:

@@ -132,9 +132,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     progress(0.0, "reading the trials")
     motions = [read_motion(run, trial, system) for trial in free_trials(run)]
     rate = float(session["sample_rate_hz"])
-    problem = problem_of(
-        system, motions, Band(rate, config.cutoff_hz), timing=config.input_timing
-    )
+    problem = problem_of(system, motions, Band(rate, config.cutoff_hz), timing=config.input_timing)
     progress(0.1, "least squares")
     start = system.prior
     variable = [i for i, item in enumerate(system.parameters) if not item.fixed]
@@ -265,7 +263,8 @@ def _trial(run: RunFolder, motion: Motion, system: System, noise: _Noise, config
         lost = np.isnan(column)
         if lost.any():
             column[lost] = np.interp(t[lost], t[~lost], column[~lost])
-    y = frame[[f"q_{axis}" for axis in system.coordinates]].to_numpy(dtype=float)
+    # A copy: a table's only column would come out read-only, which compiled code refuses.
+    y = frame[[f"q_{axis}" for axis in system.coordinates]].to_numpy(dtype=float, copy=True)
     if config.measure == "position_velocity":
         velocity = [np.interp(t, motion.t, column) for column in motion.qd.T]
         y = np.hstack([y, np.stack(velocity, axis=1)])

@@ -1,0 +1,158 @@
+"""Least squares on the inverse dynamics of a slider with friction."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from slider import RATE, TRUTH, record
+
+from bampipe.estimate.butterworth import zero_phase
+from bampipe.estimate.least_squares import Band, Problem, fit, refit, resting, stacked_residual
+
+BOUNDS = (np.array([0.0, 0.0, 0.01]), np.array([np.inf, np.inf, np.inf]))
+
+
+def problem(count: int = 3, truth: np.ndarray = TRUTH, **changes: object) -> Problem:
+    """The slider as residuals; p = viscous, Coulomb, mass."""
+    motions = []
+    for seed in range(count):
+        trial = record(seed, truth=truth)
+        _, qd, qdd = zero_phase(trial.y[:, 0], RATE, 25.0)
+        motions.append((qd, qdd, trial.u[:, 0]))
+
+    def residual(trial: int, p: np.ndarray) -> np.ndarray:
+        qd, qdd, force = motions[trial]
+        return (force - p[0] * qd - p[1] * np.tanh(qd / 1e-3) - p[2] * qdd)[:, None]
+
+    standard: dict[str, object] = {
+        "residual": residual,
+        "n_trials": count,
+        "free": np.arange(3),
+        "lower": BOUNDS[0],
+        "upper": BOUNDS[1],
+        "step": np.ones(3),
+        "linear": True,
+        "band": Band(RATE),
+        "resting": [np.zeros((len(m[0]), 1), dtype=bool) for m in motions],
+    }
+    return Problem(**(standard | changes))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("factor", [0.2, 1.0, 5.0])
+def test_recovers_the_truth_from_any_start(factor: float) -> None:
+    found = fit(problem(), factor * TRUTH)
+    np.testing.assert_allclose(found.p, TRUTH, rtol=1e-2)
+    assert found.converged
+    assert not found.at_bound.any()
+
+
+def test_a_model_that_is_not_linear_is_found_by_gauss_newton() -> None:
+    inner = problem()
+
+    def residual(trial: int, p: np.ndarray) -> np.ndarray:
+        return inner.residual(trial, np.exp(p))
+
+    curved = problem(
+        residual=residual, linear=False, step=np.full(3, 1e-5), lower=np.full(3, -np.inf)
+    )
+    found = fit(curved, np.log(2.0 * TRUTH))
+    np.testing.assert_allclose(np.exp(found.p), fit(inner, TRUTH).p, rtol=1e-5)
+
+
+def test_bounds_hold_and_are_reported() -> None:
+    truth = np.array([4.0, 0.0, 2.0])
+    inside = problem(truth=truth, lower=np.array([0.0, 0.5, 0.01]))
+    found = fit(inside, TRUTH)
+    assert found.p[1] == 0.5
+    assert found.at_bound.tolist() == [False, True, False]
+    free = fit(problem(truth=truth, lower=np.full(3, -np.inf)), TRUTH)
+    assert found.residual_sd[0] > free.residual_sd[0]
+
+
+def test_parameters_not_free_stay() -> None:
+    held = problem(
+        free=np.array([0, 1]), lower=np.zeros(2), upper=np.full(2, np.inf), step=np.ones(2)
+    )
+    found = fit(held, np.array([1.0, 1.0, 2.0]))
+    assert found.p[2] == 2.0
+    assert found.covariance.shape == (2, 2)
+
+
+def test_trial_left_out_is_the_same_as_never_seen() -> None:
+    whole = problem(3)
+    direct = fit(whole, TRUTH, trials=[0, 2]).p
+    stacked = [stacked_residual(whole, k, TRUTH) for k in (0, 2)]
+    value = TRUTH
+    for _ in range(5):
+        value = refit([stacked_residual(whole, k, value) for k in (0, 2)], value, *BOUNDS)
+    np.testing.assert_allclose(direct, value, rtol=1e-9)
+    np.testing.assert_allclose(direct, refit(stacked, TRUTH, *BOUNDS), rtol=1e-6)
+
+
+def test_slopes_are_those_of_the_filtered_regressors() -> None:
+    at = stacked_residual(problem(1), 0, TRUTH)
+    moved = stacked_residual(problem(1), 0, TRUTH + np.array([0.3, -0.2, 0.1]))
+    step = at.slope @ np.array([0.3, -0.2, 0.1])
+    np.testing.assert_allclose(moved.residual - at.residual, step, atol=1e-9)
+
+
+def test_intervals_cover_coloured_noise() -> None:
+    """Noise with a memory of 0.2 s: intervals from white residuals would be far too narrow."""
+    rng = np.random.default_rng(0)
+    inner = problem(4)
+    inside = []
+    for _ in range(30):
+        noise = [_coloured(rng, 4000, 0.2) for _ in range(4)]
+        noisy = problem(4, residual=_with(inner.residual, noise))
+        found = fit(noisy, TRUTH)
+        clean = fit(inner, TRUTH).p
+        inside.append(np.abs(found.p - clean) < 1.96 * np.sqrt(np.diag(found.covariance)))
+    assert 0.8 <= np.mean(inside) <= 1.0
+
+
+def _with(
+    residual: Callable[[int, np.ndarray], np.ndarray], noise: list[np.ndarray]
+) -> Callable[[int, np.ndarray], np.ndarray]:
+    return lambda trial, p: residual(trial, p) + noise[trial][:, None]
+
+
+def _coloured(rng: np.random.Generator, count: int, memory_s: float) -> np.ndarray:
+    fade = np.exp(-1.0 / (memory_s * RATE))
+    out = np.zeros(count)
+    for i in range(1, count):
+        out[i] = fade * out[i - 1] + rng.standard_normal() * np.sqrt(1 - fade**2)
+    return 0.2 * out
+
+
+def test_rest_is_told_from_a_change_of_direction() -> None:
+    t = np.arange(0.0, 4.0, 1.0 / RATE)
+    qd = np.sin(2 * np.pi * t)[:, None]
+    qd[1000:1200] = 0.0
+    still = resting(qd, np.full_like(qd, 1e-3), RATE)
+    assert still[1001:1199].all()
+    assert not still[:990].any()
+
+
+def test_samples_at_rest_do_not_count() -> None:
+    inner = problem(1)
+    mask = np.zeros((4000, 1), dtype=bool)
+    mask[1000:2000] = True
+    spoiled = np.zeros((4000, 1))
+    spoiled[1200:1800] = 50.0
+    found = fit(
+        problem(1, residual=lambda k, p: inner.residual(k, p) + spoiled, resting=[mask]), TRUTH
+    )
+    np.testing.assert_allclose(found.p, TRUTH, rtol=2e-2)
+
+
+def test_too_short_a_record_is_refused() -> None:
+    inner = problem(1)
+    short = problem(
+        1,
+        residual=lambda k, p: inner.residual(k, p)[:220],
+        resting=[np.zeros((220, 1), dtype=bool)],
+    )
+    with pytest.raises(ValueError, match="fewer samples"):
+        fit(short, TRUTH)

@@ -1,0 +1,94 @@
+"""Run folders up to the filter stage, simulated or from a shared session."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from run_folders import SESSIONS, ingested_session, write_ingested
+
+from bampipe.data.store import write_text
+from bampipe.discover.recording import Motion, Sensors
+from bampipe.discover.replay import replay
+from bampipe.physics import Model, compile_model, registry
+from bampipe.stages import filter as filter_stage
+from bampipe.stages.base import RunFolder, silent
+
+RATE = 500.0
+RESOLUTION = {"yaw": 4.6875e-5, "pitch": 9.8125e-5, "extension": 3.0e-5}
+TRUTH = {
+    "viscous.yaw": 4.2, "coulomb.yaw": 1.05, "viscous.pitch": 3.6, "coulomb.pitch": 2.2,
+    "viscous.extension": 13.0, "coulomb.extension": 3.5, "mass": 3.5,
+}  # fmt: skip
+MODEL = 'schema = "bampipe.model/1"\nname = "base"\ndevice = "bam"\neffects = []\n'
+
+
+def simulated_run(
+    root: Path, *, trials: int = 2, seconds: float = 12.0, scramble: bool = False
+) -> RunFolder:
+    """Simulate the BAM under a hand, read by its sensors, up to the filter stage.
+
+    ``scramble`` turns the force channels round in time, so that no model explains the motion.
+    """
+    system = compile_model(Model(registry.device("bam")))
+    p = np.array([TRUTH[item.name] for item in system.parameters])
+    resolution = np.array(list(RESOLUTION.values()))
+    sensors = Sensors(RATE, resolution, np.full(3, 0.05))
+    frames = {}
+    for number in range(trials):
+        rng = np.random.default_rng([11, number])
+        wanted = _wanted(rng, seconds, tuple(system.inputs), f"t{number:02d}")
+        recording = replay(system, p, wanted, sensors, rng)
+        force = recording.force[::-1] if scramble else recording.force
+        frame = pd.DataFrame({"t": wanted.t})
+        for i, axis in enumerate(RESOLUTION):
+            frame[f"q_{axis}"] = recording.q[:, i]
+        for i, component in enumerate("xyz"):
+            frame[f"force_{component}"] = force[:, i]
+        for i, axis in enumerate(RESOLUTION):
+            frame[f"brake_{axis}"] = recording.brake[:, i]
+        frames[wanted.trial_id] = frame
+    axes = {
+        axis: {"unit": "m" if axis == "extension" else "rad", "resolution": step}
+        for axis, step in RESOLUTION.items()
+    }
+    return _filtered(write_ingested(root, frames, {name: ("free", None) for name in frames}, axes))
+
+
+def shared_run(root: Path, name: str) -> RunFolder:
+    """Take the shared session ``name`` up to the filter stage; skip where it is absent."""
+    return _filtered(ingested_session(root, name))
+
+
+def session_truth(name: str) -> dict[str, float]:
+    """Return the true parameters of the shared session ``name``."""
+    truth = json.loads((SESSIONS / f"{name}.truth.json").read_text())
+    values = {"mass": truth["mass"]}
+    for i, axis in enumerate(RESOLUTION):
+        values[f"viscous.{axis}"], values[f"coulomb.{axis}"] = truth["kd"][i], truth["fc"][i]
+    return values
+
+
+def _filtered(run: RunFolder) -> RunFolder:
+    filter_stage.execute(run, run.root, filter_stage.Config(), silent)
+    write_text(run.root / "models/base/model.toml", MODEL)
+    return run
+
+
+def _wanted(
+    rng: np.random.Generator, seconds: float, inputs: tuple[str, ...], trial_id: str
+) -> Motion:
+    """The motion that the hand wants: a few sines of 0.1 to 1.5 Hz on every axis."""
+    t = np.arange(0.0, seconds, 1.0 / RATE)
+    middle, reach = np.array([0.0, 0.0, 1.1]), np.array([0.35, 0.25, 0.12])
+    q, qd, qdd = (np.zeros((t.size, 3)) for _ in range(3))
+    q += middle
+    for i in range(3):
+        for f, phase in zip(rng.uniform(0.1, 1.5, 4), rng.uniform(0, 2 * np.pi, 4), strict=True):
+            w, size = 2 * np.pi * f, reach[i] / 2 / (1.0 + f)
+            q[:, i] += size * np.sin(w * t + phase)
+            qd[:, i] += size * w * np.cos(w * t + phase)
+            qdd[:, i] -= size * w * w * np.sin(w * t + phase)
+    return Motion(trial_id, t, q, qd, qdd, {name: np.zeros(t.size) for name in inputs})

@@ -1,0 +1,126 @@
+"""The identify stage on simulated and shared sessions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from identified_run import TRUTH, session_truth, shared_run, simulated_run
+
+from bampipe.data.schema import validate
+from bampipe.data.store import read_json, read_parquet, sha256_file
+from bampipe.errors import InputError
+from bampipe.stages import identify
+from bampipe.stages.base import RunFolder, silent
+
+TOLERANCE = {"viscous": 0.03, "coulomb": 0.05, "mass": 0.01}
+FAST = identify.Config(longest_step_s=2e-3)
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunFolder]:
+    yield simulated_run(tmp_path_factory.mktemp("simulated"))
+
+
+def identified(run: RunFolder, config: identify.Config = FAST) -> dict:
+    """Execute the stage in the run folder; return identify.json, checked."""
+    identify.execute(run, run.root, config, silent)
+    content = read_json(run.path(f"models/{config.model}/identify.json"))
+    validate(content, "identify", "identify.json")
+    return content
+
+
+def assert_recovered(content: dict, truth: dict[str, float]) -> None:
+    for name, value in truth.items():
+        estimate = content["parameters"][name]["estimate"]
+        assert estimate == pytest.approx(value, rel=TOLERANCE[name.split(".")[0]]), name
+
+
+@pytest.mark.parametrize("name", ["open-01", "open-09"])
+def test_shared_sessions_within_what_is_asked(tmp_path: Path, name: str) -> None:
+    run = shared_run(tmp_path / name, name)
+    content = identified(run)
+    assert_recovered(content, session_truth(name))
+    assert content["convergence"]["converged"]
+    assert 0.7 < content["nis"]["mean"] < 1.4
+    for name_, value in session_truth(name).items():
+        entry = content["parameters"][name_]
+        assert abs(entry["estimate"] - value) < 6.0 * entry["sd"], name_
+
+
+def test_intervals_hold_on_a_simulated_session(simulated: RunFolder) -> None:
+    content = identified(simulated)
+    assert_recovered(content, TRUTH)
+    z = [
+        (content["parameters"][name]["estimate"] - value) / content["parameters"][name]["sd"]
+        for name, value in TRUTH.items()
+    ]
+    assert np.sqrt(np.mean(np.square(z))) < 2.0
+    assert np.max(np.abs(z)) < 4.0
+
+
+@pytest.mark.parametrize("factor", [0.2, 5.0])
+def test_start_does_not_matter(simulated: RunFolder, factor: float) -> None:
+    content = identified(simulated, replace(FAST, start_factor=factor))
+    assert_recovered(content, TRUTH)
+
+
+def test_least_squares(simulated: RunFolder) -> None:
+    content = identified(simulated, replace(FAST, method="least-squares"))
+    assert_recovered(content, TRUTH)
+    trace = read_parquet(simulated.path("models/base/trace.parquet"))
+    assert len(trace) == 2
+
+
+def test_velocity_may_be_measured_too(simulated: RunFolder) -> None:
+    """Filtered velocities are neither white nor unbiased: why positions alone are the default."""
+    content = identified(simulated, replace(FAST, measure="position_velocity"))
+    for name, value in TRUTH.items():
+        assert content["parameters"][name]["estimate"] == pytest.approx(value, rel=0.1), name
+
+
+def test_tables_and_determinism(simulated: RunFolder, tmp_path: Path) -> None:
+    config = replace(FAST, trace_rows=300)
+    files = identify.outputs(config)
+    hashes = []
+    for folder in ("one", "two"):
+        identify.execute(simulated, tmp_path / folder, config, silent)
+        hashes.append([sha256_file(tmp_path / folder / name) for name in files])
+    assert hashes[0] == hashes[1]
+    states = read_parquet(tmp_path / "one/models/base/states.parquet")
+    assert states["trial_id"].unique().tolist() == ["t00", "t01"]
+    assert states.groupby("trial_id").size().max() <= 300
+    trace = read_parquet(tmp_path / "one/models/base/trace.parquet")
+    assert (np.diff(trace["t_total"]) >= 0.0).all()
+    assert {"mass", "mass_sd", "viscous.yaw", "coulomb.extension_sd"} <= set(trace.columns)
+    assert np.isfinite(trace.drop(columns="trial_id").to_numpy(dtype=float)).all()
+
+
+def test_filterpy_gives_the_same_numbers(tmp_path: Path) -> None:
+    run = simulated_run(tmp_path / "short", trials=1, seconds=2.0)
+    numbers = []
+    for engine in identify.ENGINES:
+        content = identified(run, replace(FAST, engine=engine, block_s=0.1))
+        numbers.append([entry["estimate"] for entry in content["parameters"].values()])
+    np.testing.assert_allclose(numbers[0], numbers[1], rtol=1e-8)
+
+
+def test_mistakes_are_told(simulated: RunFolder, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="choose from ukf, least-squares"):
+        identified(simulated, replace(FAST, method="magic"))
+    with pytest.raises(InputError, match="must be positive"):
+        identified(simulated, replace(FAST, block_s=0.0))
+    with pytest.raises(InputError, match="must not be negative"):
+        identified(simulated, replace(FAST, random_walk=-1.0))
+    with pytest.raises(InputError, match="missing"):
+        identified(simulated, replace(FAST, model="base+none"))
+
+
+def test_a_motion_that_no_noise_explains_is_refused(tmp_path: Path) -> None:
+    """Force channels that have nothing to do with the motion, and noise that may not grow."""
+    run = simulated_run(tmp_path / "wrong", scramble=True)
+    with pytest.raises(InputError, match=r"does not follow trial|lost the motion"):
+        identified(run, replace(FAST, force_noise=1e-4))

@@ -1,0 +1,116 @@
+"""The validate stage on simulated and shared sessions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from identified_run import shared_run, simulated_run
+
+from bampipe.data.schema import validate as check
+from bampipe.data.store import read_json, read_parquet, sha256_file, write_json
+from bampipe.errors import InputError
+from bampipe.stages import identify, validate
+from bampipe.stages.base import RunFolder, silent
+
+SQUARES = identify.Config(method="least-squares")
+
+
+def identified(run: RunFolder) -> RunFolder:
+    """Identify by least squares, which is quick."""
+    identify.execute(run, run.root, SQUARES, silent)
+    return run
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunFolder]:
+    yield identified(simulated_run(tmp_path_factory.mktemp("simulated")))
+
+
+def validated(run: RunFolder, config: validate.Config | None = None) -> dict:
+    """Execute the stage in the run folder; return validate.json, checked."""
+    validate.execute(run, run.root, config or validate.Config(), silent)
+    content = read_json(run.path("models/base/validate.json"))
+    check(content, "validate", "validate.json")
+    return content
+
+
+def test_a_sound_model_is_at_its_noise_floor(simulated: RunFolder) -> None:
+    content = validated(simulated)
+    for axis, entry in content["axes"].items():
+        assert entry["held_out_rmse"] < 1.5 * entry["noise_floor"], axis
+        assert entry["rmse_without_friction"] > 10.0 * entry["rmse"], axis
+        assert entry["fit_percent"] > 95.0, axis
+    assert content["notes"] == []
+
+
+@pytest.mark.parametrize(("name", "missing"), [("open-01", None), ("open-02", "yaw")])
+def test_shared_sessions_stand_out_where_something_is_missing(
+    tmp_path: Path, name: str, missing: str | None
+) -> None:
+    content = validated(identified(shared_run(tmp_path / name, name)))
+    for axis, entry in content["axes"].items():
+        ratio = entry["held_out_rmse"] / entry["noise_floor"]
+        assert ratio > 3.0 if axis == missing else ratio < 1.5, (axis, ratio)
+
+
+def test_wrong_parameters_show(simulated: RunFolder, tmp_path: Path) -> None:
+    content = read_json(simulated.path("models/base/identify.json"))
+    content["parameters"]["coulomb.yaw"]["estimate"] *= 1.5
+    config = validate.Config(noise_floor=False)
+    right = validated(simulated, config)["axes"]
+    write_json(simulated.path("models/base/identify.json"), content)
+    wrong = validated(simulated, config)["axes"]
+    identified(simulated)
+    assert wrong["yaw"]["rmse"] > 5.0 * right["yaw"]["rmse"]
+    assert wrong["pitch"]["rmse"] == pytest.approx(right["pitch"]["rmse"])
+    assert wrong["yaw"]["held_out_rmse"] == pytest.approx(right["yaw"]["held_out_rmse"], rel=1e-6)
+
+
+def test_residuals_add_up_and_repeat(simulated: RunFolder, tmp_path: Path) -> None:
+    hashes = []
+    for folder in ("one", "two"):
+        validate.execute(simulated, tmp_path / folder, validate.Config(), silent)
+        hashes.append(
+            [sha256_file(tmp_path / folder / p) for p in validate.outputs(validate.Config())]
+        )
+    assert hashes[0] == hashes[1]
+    table = read_parquet(tmp_path / "one/models/base/residuals.parquet")
+    assert table["held_out"].all()
+    for axis in ("yaw", "pitch", "extension"):
+        np.testing.assert_allclose(
+            table[f"torque_measured_{axis}"] - table[f"torque_predicted_{axis}"],
+            table[f"residual_{axis}"],
+            atol=1e-9,
+        )
+        assert f"torque_predicted_without_friction_{axis}" in table
+    assert {"force_measured_x", "force_predicted_x"} <= set(table.columns)
+    share = (table["force_measured_z"] - table["force_predicted_z"]).std()
+    assert share < 0.2 * table["force_measured_z"].std()
+
+
+def test_one_trial_holds_nothing_out(tmp_path: Path) -> None:
+    run = identified(simulated_run(tmp_path / "one", trials=1))
+    content = validated(run)
+    assert "nothing is held out" in content["notes"][0]
+    assert not content["trials"]["t00"]["held_out"]
+    assert not read_parquet(run.path("models/base/residuals.parquet"))["held_out"].any()
+
+
+def test_mistakes_are_told(simulated: RunFolder, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="must be positive"):
+        validated(simulated, validate.Config(cutoff_hz=0.0))
+    with pytest.raises(InputError, match="1 or more"):
+        validated(simulated, validate.Config(repeats=0))
+    bare = simulated_run(tmp_path / "bare", trials=1, seconds=3.0)
+    with pytest.raises(InputError, match="bampipe identify"):
+        validated(bare)
+    content = read_json(simulated.path("models/base/identify.json"))
+    saved = dict(content["parameters"])
+    del content["parameters"]["mass"]
+    write_json(simulated.path("models/base/identify.json"), content)
+    with pytest.raises(InputError, match="no parameter 'mass'"):
+        validated(simulated)
+    write_json(simulated.path("models/base/identify.json"), content | {"parameters": saved})
