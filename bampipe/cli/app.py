@@ -657,12 +657,12 @@ def effects(
 
     Example: bampipe effects stribeck:yaw
     """
-    from bampipe.cli import effects as view
+    from bampipe.cli.effects import list_all, show_one
 
     if name is None:
-        view.list_all(json)
+        list_all(json)
     else:
-        view.show_one(name, device, json)
+        show_one(name, device, json)
 
 
 @app.command()

@@ -144,7 +144,7 @@ def _formulas(declaration: Mapping[str, Any]) -> list[str]:
 
 
 def _parameters(declaration: Mapping[str, Any]) -> list[tuple[str, str, Mapping[str, Any]]]:
-    found = []
+    found: list[tuple[str, str, Mapping[str, Any]]] = []
     for name, entry in declaration.get("parameters", {}).items():
         text = entry.get("description", "")
         if "unit" in entry:
