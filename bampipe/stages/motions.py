@@ -164,7 +164,7 @@ def _columns(frame: pd.DataFrame, names: Sequence[str], where: str) -> Array:
                 where=where,
                 remedy="run the stages before this one again (--force)",
             )
-    return frame[list(names)].to_numpy(dtype=float)
+    return frame[list(names)].to_numpy(dtype=float, copy=True)  # one column alone is read-only
 
 
 def _rates(frame: pd.DataFrame, names: Sequence[str]) -> Array:
