@@ -133,8 +133,8 @@ def problem_of(
         motion = motions[trial]
         u = motion.u - p[n] * motion.u_rate
         z = system.memory(motion.q, motion.qd, motion.qdd, u, p[:n], motion.t)
-        true = system.true_motion(motion.q, motion.qd, motion.qdd, u, p[:n])
-        return system.residual(*true, z, u, p[:n])
+        q, qd, qdd = system.true_motion(motion.q, motion.qd, motion.qdd, u, p[:n])
+        return system.residual(q, qd, qdd, z, u, p[:n])
 
     free = [
         i for i, item in enumerate(system.parameters) if not item.fixed and item.name not in held

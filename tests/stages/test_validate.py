@@ -66,7 +66,7 @@ def test_wrong_parameters_show(simulated: RunFolder, tmp_path: Path) -> None:
     identified(simulated)
     assert wrong["yaw"]["rmse"] > 5.0 * right["yaw"]["rmse"]
     assert wrong["pitch"]["rmse"] == pytest.approx(right["pitch"]["rmse"])
-    assert wrong["yaw"]["held_out_rmse"] == pytest.approx(right["yaw"]["held_out_rmse"], rel=1e-6)
+    assert wrong["yaw"]["held_out_rmse"] == pytest.approx(right["yaw"]["held_out_rmse"], rel=1e-4)
 
 
 def test_residuals_add_up_and_repeat(simulated: RunFolder, tmp_path: Path) -> None:
