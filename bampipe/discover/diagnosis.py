@@ -52,6 +52,10 @@ class Settings:
         most_effects: the most effects added.
         significance: chance of a false alarm in a session that is accepted.
         worth: least drop of log error beyond chance, on one axis, that is worth an effect.
+        worth_at_floor: the same on an axis whose error is already within ``at_floor`` times its
+            noise floor: no replay is perfect, and changes of direction blurred by sampling invite
+            spurious effects, up to a tenth of the error on a linear axis.
+        at_floor: see ``worth_at_floor``.
         above_floor: error over floor beyond which an axis still lacks something.
         explained: least share of the excess error that the effects found must remove, else the
             axis is reported as unknown.
@@ -65,6 +69,8 @@ class Settings:
     most_effects: int = 4
     significance: float = 0.01
     worth: float = 0.03
+    worth_at_floor: float = 0.16
+    at_floor: float = 1.12
     above_floor: float = 1.3
     explained: float = 0.7
     jobs: int = 2
@@ -230,8 +236,9 @@ class _Search:
         first = self._scores(self.recipe, self.initial.p, self.names)
         recipe, evidence, scores = self.recipe, self.initial, first
         selected: list[str] = []
+        replayed = chance.replicates
         while len(selected) < s.most_effects:
-            able = self._able(scores, chance, evidence)
+            able = self._able(scores, chance, evidence, replayed)
             if not able:
                 break
             best = self._choose(able, chance, recipe, evidence, scores)
@@ -239,6 +246,7 @@ class _Search:
             self.progress(0.45 + 0.1 * len(selected), f"added {best}, looking for more")
             recipe = replace(self.recipe, effects=(*self.recipe.effects, *selected))
             evidence = self._fit(recipe, self._start(recipe, evidence, scores[best]))
+            replayed = self._replicas(recipe, evidence.p, s.rival_replicates, (), (3,))
             rest = [n for n in self.names if n not in selected]
             scores = self._scores(recipe, evidence.p, rest)
         self.progress(0.85, "replaying the final model for its noise floor")
@@ -273,16 +281,23 @@ class _Search:
         return merged
 
     def _able(
-        self, scores: Mapping[str, Score], chance: _Chance, evidence: Evidence
+        self,
+        scores: Mapping[str, Score],
+        chance: _Chance,
+        evidence: Evidence,
+        replayed: Sequence[Replicate],
     ) -> list[tuple[float, str]]:
         """Candidates that beat chance and are worth having, best first."""
-        independent = Scorer(evidence).independent
+        scorer, s = Scorer(evidence), self.settings
+        errors = np.array([r.error for r in replayed])
+        ceiling = s.at_floor * errors.mean(axis=0) + 2.0 * errors.std(axis=0, ddof=1)
+        worth = np.where(scorer.before.error > ceiling, s.worth, s.worth_at_floor)
         able = []
         for name, score in scores.items():
             excess = chance.excess(score)
             if (
-                np.max(excess / independent) > self.settings.worth
-                and chance.p_value(score) < self.settings.significance
+                np.any(excess / scorer.independent > worth)
+                and chance.p_value(score) < s.significance
             ):
                 able.append((float(excess.sum()), name))
         return sorted(able, reverse=True)
