@@ -57,6 +57,7 @@ class Case:
     effects: tuple[str, ...]
     strength: float
     seed: int
+    replicates: int
 
 
 @dataclass(frozen=True)
@@ -108,7 +109,7 @@ def run_case(case: Case) -> Outcome:
             Session(tuple(motions), sensors, Band(sensors.rate_hz)),
             Recipe(device.declaration, (), ()),
             system.prior,
-            Settings(jobs=1, seed=case.seed),
+            Settings(replicates=case.replicates, jobs=1, seed=case.seed),
         )
         seconds = time.perf_counter() - begun
     return Outcome(
@@ -158,15 +159,17 @@ def main(arguments: Sequence[str]) -> None:
     parser.add_argument("--first-seed", type=int, default=1000)
     parser.add_argument("--nothing", type=int, default=10, help="sessions with nothing hidden")
     parser.add_argument("--pairs", action="store_true")
+    parser.add_argument("--replicates", type=int, default=10, help="replays for the chance level")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--out", type=Path, help="write the outcomes as JSON")
     options = parser.parse_args(arguments)
     seeds = range(options.first_seed, options.first_seed + options.seeds)
     chosen = SINGLES if options.effects is None else tuple(options.effects)
-    cases = [Case((), 1.0, options.first_seed + 500 + k) for k in range(options.nothing)]
-    cases += [Case((e,), s, seed) for s in options.strengths for e in chosen for seed in seeds]
+    plan = [((), 1.0, options.first_seed + 500 + k) for k in range(options.nothing)]
+    plan += [((e,), s, seed) for s in options.strengths for e in chosen for seed in seeds]
     if options.pairs:
-        cases += [Case(pair, 1.0, seed) for pair in PAIRS for seed in seeds]
+        plan += [(pair, 1.0, seed) for pair in PAIRS for seed in seeds]
+    cases = [Case(*entry, options.replicates) for entry in plan]
     outcomes = []
     with ProcessPoolExecutor(options.jobs) as pool:
         for outcome in pool.map(run_case, cases):
