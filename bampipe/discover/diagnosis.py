@@ -38,6 +38,9 @@ from bampipe.physics.parameter import Parameter
 from bampipe.physics.registry import effect_from
 
 Array = NDArray[np.float64]
+REPLAY_ERROR = 0.01
+"""How far the log error of a replay may be off because no replay is perfect."""
+
 Progress = Callable[[float, str], None]
 
 
@@ -100,8 +103,10 @@ class AxisFinding:
         rmse_before, rmse_after: held-out error without and with the effects found, N.m or N.
         noise_floor: what the final model leaves when it is the whole truth, N.m or N.
         floor_sd: its scatter over replays.
-        explainable_share: share of the final residual that a flexible regressor predicts.
-        explainable_chance: the same on replays, the largest.
+        explainable_share: share of the residual of the model as given that a flexible regressor
+            predicts on unseen trials, beyond what it predicts on replays; zero where that is nil.
+        explainable_after: the same with the effects found.
+        explainable_chance: share that it predicts on replays of the final model, the largest.
         effects: effects found that act on this axis.
     """
 
@@ -111,6 +116,7 @@ class AxisFinding:
     noise_floor: float
     floor_sd: float
     explainable_share: float
+    explainable_after: float
     explainable_chance: float
     effects: tuple[str, ...] = ()
 
@@ -142,6 +148,7 @@ class _Chance:
 
     replicates: list[Replicate]
     names: Sequence[str]
+    independent: float
     gains: dict[str, Array] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -156,13 +163,12 @@ class _Chance:
     def p_value(self, score: Score) -> float:
         """Chance that any candidate scores this high with nothing missing (Bonferroni)."""
         count = len(self.replicates)
-        z = self.distance(score) / np.sqrt(1.0 + 1.0 / count)
-        return float(min(1.0, len(self.names) * student.sf(z, count - 1)))
-
-    def distance(self, score: Score) -> float:
-        """Score above its mean on replays, in standard deviations (at least one unit)."""
         totals = self.gains[score.name].sum(axis=1)
-        return float((score.total - totals.mean()) / max(totals.std(ddof=1), 1.0))
+        spread = np.hypot(
+            totals.std(ddof=1) * np.sqrt(1.0 + 1.0 / count), REPLAY_ERROR * self.independent
+        )
+        z = (score.total - totals.mean()) / spread
+        return float(min(1.0, len(self.names) * student.sf(z, count - 1)))
 
     def excess(self, score: Score) -> Array:
         """Gain beyond the mean on replays, by axis."""
@@ -231,6 +237,7 @@ class _Search:
         chance = _Chance(
             self._replicas(self.recipe, self.initial.p, s.replicates, self.names, (0,)),
             self.names,
+            float(Scorer(self.initial).independent.mean()),
         )
         self.progress(0.4, "scoring every candidate on the measured trials")
         first = self._scores(self.recipe, self.initial.p, self.names)
@@ -377,8 +384,9 @@ class _Search:
         unknown = set()
         for axis in range(len(before)):
             floor, scatter = floors[:, axis].mean(), floors[:, axis].std(ddof=1)
-            share = explainable_share(evidence, axis)
             luck = float(shares[:, axis].max())
+            given = _beyond(explainable_share(self.initial, axis), luck)
+            share = _beyond(explainable_share(evidence, axis), luck) if selected else given
             here = tuple(
                 n
                 for n in selected
@@ -386,7 +394,7 @@ class _Search:
             )
             excess = before[axis] ** 2 - min(floor, bare_floor[axis]) ** 2
             left = max(after[axis] ** 2 - floor**2, 0.0)
-            lacking = after[axis] > s.above_floor * floor + 3.0 * scatter and share > luck + 0.05
+            lacking = after[axis] > s.above_floor * floor + 3.0 * scatter and share > 0.05
             verdict = "missing" if here else "nothing_missing"
             if lacking and (not here or left > (1.0 - s.explained) * max(excess, 1e-30)):
                 verdict = "unknown_effect"
@@ -398,6 +406,7 @@ class _Search:
                     float(after[axis]),
                     float(floor),
                     float(scatter),
+                    given,
                     share,
                     luck,
                     here if verdict == "missing" else (),
@@ -449,6 +458,11 @@ class _Search:
                 )
             )
         return rows
+
+
+def _beyond(share: float, luck: float) -> float:
+    """Explained share beyond the one that replays give, of what they leave."""
+    return float(max(0.0, (share - luck) / max(1.0 - luck, 1e-9)))
 
 
 def _own_parameters(recipe: Recipe, name: str) -> tuple[Parameter, ...]:

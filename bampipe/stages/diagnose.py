@@ -188,6 +188,7 @@ def _result(found: Diagnosis, session: Session, recipe: Recipe, model: str) -> d
         axes[axis] = {
             "verdict": a.verdict,
             "explainable_share": a.explainable_share,
+            "explainable_after": a.explainable_after,
             "explainable_chance": a.explainable_chance,
             "rmse_before": a.rmse_before,
             "rmse_after": a.rmse_after,
