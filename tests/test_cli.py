@@ -304,13 +304,21 @@ def test_summary_prints_tables(capsys: pytest.CaptureFixture[str]) -> None:
         {
             "headline": "two axes",
             "parameters": {"mass": {"unit": "kg", "estimate": 3.5, "sd": 0.1}},
-            "ladder": [{"model": "base", "held_out_rmse": {"yaw": 0.5}}],
+            "ladder": [
+                {
+                    "model": "base",
+                    "added": "",
+                    "held_out_rmse": {"yaw": 0.5},
+                    "noise_floor": {"yaw": 0.25},
+                    "unit": {"yaw": "N.m"},
+                }
+            ],
             "notes": ["mind the gap"],
         }
     )
     out = capsys.readouterr().out
     assert "estimate   sd  unit" in out
-    assert "held out rmse yaw" in out
+    assert "base           0.5        2" in out
     assert "note: mind the gap" in out
 
 

@@ -25,6 +25,7 @@ from bampipe.run.settings import configure, plain
 from bampipe.stages import base
 
 COMMIT = ".commit.json"
+NEUTRAL = ("session", "jobs")
 STORAGE_FAULTS = {
     errno.ENOSPC: "the disk is full",
     errno.EDQUOT: "the disk quota is used up",
@@ -542,10 +543,11 @@ def _maker(name: str) -> str:
 
 
 def _lasting(config: object) -> dict[str, object]:
-    """Return the fields of a configuration that a result depends on, the session's place apart."""
-    table = plain(config)
-    table.pop("session", None)
-    return table
+    """Return the fields of a configuration that a result depends on.
+
+    Not the session's place (its content counts) nor the number of processes.
+    """
+    return {name: value for name, value in plain(config).items() if name not in NEUTRAL}
 
 
 def _written(staging: Path, declared: tuple[str, ...], step: Step) -> dict[str, str]:

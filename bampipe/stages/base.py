@@ -15,6 +15,7 @@ files match it (``"models/*/validate.json"``, ``"report/figures/*.svg"``, ``"rep
 A stage whose ``Config`` has a field ``model`` runs once for each model. The runner writes
 ``models/<model>/model.toml`` before the first such stage, so those stages only read it
 (declare ``models/<model>/model.toml`` and ``models/<model>/effects/*.toml`` as inputs).
+A field ``jobs`` of a ``Config`` says how many processes to use and must not change the result.
 A stage whose ``Config`` has a field ``session`` reads that session folder, and the runner
 hashes the session file and the files it names.
 
