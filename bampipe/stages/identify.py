@@ -134,7 +134,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     rate = float(session["sample_rate_hz"])
     problem = problem_of(system, motions, Band(rate, config.cutoff_hz), timing=config.input_timing)
     progress(0.1, "least squares")
-    start = system.prior
+    start = _start(run, system, rate, config)
     variable = [i for i, item in enumerate(system.parameters) if not item.fixed]
     start[variable] *= config.start_factor
     try:
@@ -154,6 +154,19 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     write_parquet(out / f"models/{config.model}/states.parquet", estimate.states)
     write_parquet(out / f"models/{config.model}/trace.parquet", estimate.trace)
     return content
+
+
+def _start(run: RunFolder, system: System, rate: float, config: Config) -> Array:
+    """Priors of the device; of effects, what a search over their range finds."""
+    start = system.prior
+    if system.model.effects:
+        sensors, motions = read_session(run, system)
+        recipe = recipe_of(run, config.model, system.model)
+        band = DiscoverBand(rate, config.cutoff_hz)
+        found = search_start(Session(tuple(motions), sensors, band), recipe)
+        count = len(system.model.device.parameters)
+        start[count:] = found[count:]
+    return start
 
 
 def _check(config: Config) -> None:
@@ -718,7 +731,7 @@ def _content(
     """Return what identify.json says."""
     names = [system.parameters[i].name for i in free]
     sd = np.sqrt(np.diag(estimate.covariance))
-    parameters = {}
+    parameters: dict[str, dict[str, object]] = {}
     for i, name in enumerate(names):
         entry: dict[str, object] = {
             "estimate": float(estimate.value[i]),
@@ -731,8 +744,13 @@ def _content(
             entry["systematic_sd"] = float(estimate.systematic_sd[i])
             entry["least_squares"] = float(squares.p[free[i]])
         parameters[name] = entry
+    told = ", ".join(
+        f"{name} {entry['estimate']:.4g} ± {entry['sd']:.2g} {entry['unit']}"
+        for name, entry in parameters.items()
+    )
     return {
         "model": config.model,
+        "headline": told,
         "method": config.method,
         "engine": config.engine if config.method == "ukf" else "compiled",
         "parameters": parameters,
