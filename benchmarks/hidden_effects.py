@@ -23,9 +23,9 @@ from bampipe.discover.chance import Recipe, Session
 from bampipe.discover.diagnosis import Settings, diagnose
 from bampipe.discover.evidence import Band
 from bampipe.physics import Model, compile_model, registry
-from bampipe.stages import diagnose as stage
 from bampipe.stages import ingest, simulate
 from bampipe.stages.base import RunFolder, silent
+from bampipe.stages.recordings import read_session
 
 SINGLES = (
     "stribeck:yaw", "stribeck:pitch", "stribeck:extension", "presliding:yaw", "presliding:pitch",
@@ -104,7 +104,7 @@ def run_case(case: Case) -> Outcome:
         device = registry.device("bam")
         system = compile_model(Model(device))
         begun = time.perf_counter()
-        sensors, motions = stage.read_session(RunFolder(root / "run"), system, 25.0)
+        sensors, motions = read_session(RunFolder(root / "run"), system)
         found = diagnose(
             Session(tuple(motions), sensors, Band(sensors.rate_hz)),
             Recipe(device.declaration, (), ()),

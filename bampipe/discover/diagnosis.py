@@ -34,6 +34,7 @@ from bampipe.discover.chance import (
 )
 from bampipe.discover.evidence import Evidence, fit
 from bampipe.discover.shape import explainable_share
+from bampipe.discover.start import with_effect
 from bampipe.physics.parameter import Parameter
 from bampipe.physics.registry import effect_from
 
@@ -252,7 +253,7 @@ class _Search:
             selected.append(best)
             self.progress(0.45 + 0.1 * len(selected), f"added {best}, looking for more")
             recipe = replace(self.recipe, effects=(*self.recipe.effects, *selected))
-            evidence = self._fit(recipe, self._start(recipe, evidence, scores[best]))
+            evidence = self._fit(recipe, with_effect(recipe, evidence, scores[best]))
             replayed = self._replicas(recipe, evidence.p, s.rival_replicates, (), (3,))
             rest = [n for n in self.names if n not in selected]
             scores = self._scores(recipe, evidence.p, rest)
@@ -332,7 +333,7 @@ class _Search:
         for k, name in enumerate(rivals):
             self.progress(0.5, f"replaying {name} to tell it from {len(rivals) - 1} rival(s)")
             wider = replace(recipe, effects=(*recipe.effects, name))
-            fitted = self._fit(wider, self._start(wider, evidence, scores[name]))
+            fitted = self._fit(wider, with_effect(wider, evidence, scores[name]))
             replicas = self._replicas(
                 wider,
                 fitted.p,
@@ -351,19 +352,6 @@ class _Search:
             winner = best
         self.groups[winner] = alike[:2]
         return winner
-
-    def _start(self, recipe: Recipe, evidence: Evidence, score: Score) -> Array:
-        """Where the fit of the wider model starts: the scored values."""
-        old = {q.name: v for q, v in zip(evidence.system.parameters, evidence.p, strict=True)}
-        for i, shift in zip(evidence.free, score.shift, strict=False):
-            old[evidence.system.parameters[i].name] += shift
-        system = system_of(recipe)
-        fresh = system.parameters[-len(score.values) :]
-        old |= {q.name: float(v) for q, v in zip(fresh, score.values, strict=True)}
-        start = np.array([old[q.name] for q in system.parameters])
-        lower = np.array([q.lower for q in system.parameters])
-        upper = np.array([q.upper for q in system.parameters])
-        return np.clip(start, lower, upper)
 
     def _conclude(
         self,

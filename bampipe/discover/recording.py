@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from bampipe.estimate.butterworth import zero_phase
 from bampipe.physics import System
-from bampipe.physics.effect import derivative
+from bampipe.physics.device import derivative
 
 Array = NDArray[np.float64]
 
@@ -42,12 +42,14 @@ class Recording:
         force: force channels, (T, n_f), N.
         brake: brake commands in the order of the coordinates, (T, n_q), N.m or N; zeros where
             an axis has none.
+        other: channels that are neither, by name, each (T,); no noise is added to them.
     """
 
     trial_id: str
     q: Array
     force: Array
     brake: Array
+    other: Mapping[str, Array] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -87,7 +89,7 @@ def observe(recording: Recording, sensors: Sensors, system: System) -> Motion:
     rate, cutoff = sensors.rate_hz, sensors.cutoff_hz
     columns = [zero_phase(column, rate, cutoff) for column in recording.q.T]
     t = np.arange(len(recording.q)) / rate
-    channels: dict[str, Array] = {"t": t}
+    channels: dict[str, Array] = {"t": t, **recording.other}
     for name, column in zip(device.forces, recording.force.T, strict=True):
         _, first, second = zero_phase(column, rate, cutoff)
         channels |= {

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from bampipe.discover.recording import Motion, Recording, Sensors
 from bampipe.estimate.simulation import simulate_tracking
 from bampipe.physics import System
-from bampipe.physics.effect import derivative
+from bampipe.physics.device import derivative
 
 Array = NDArray[np.float64]
 
@@ -59,4 +59,6 @@ def replay(
     for i, axis in enumerate(system.coordinates):
         if axis in brakes:
             brake[:, i] = motion.channels[brakes[axis]]
-    return Recording(motion.trial_id, (counts + 0.5) * sensors.resolution - offset, force, brake)
+    other = {name: motion.channels[name] for name in system.model.device.channels}
+    q = (counts + 0.5) * sensors.resolution - offset
+    return Recording(motion.trial_id, q, force, brake, other)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.physics import Model, compile_model
-from bampipe.physics.device import Coordinate, Device
+from bampipe.physics.device import Coordinate, Device, derivative
 from bampipe.physics.effect import Effect
 from bampipe.physics.parameter import Parameter
 from bampipe.physics.system import System
@@ -82,18 +82,18 @@ def _along(device: Device, bare: System, full: System, braked: bool) -> Signatur
     for number, axis in enumerate(bare.coordinates):
         if axis in device.brakes:
             channels[device.brakes[axis]] = braked * BRAKE_DAMPING * np.abs(qd[:, number])
+    channels |= {name: np.ones_like(t) for name in device.channels}
     p = bare.prior
     u = _inputs(bare, channels, t)
     needed = bare.required(q, qd, qdd, bare.memory(q, qd, qdd, u, p, t), u, p)
     applied = bare.applied(q, qd, qdd, bare.memory(q, qd, qdd, u, p, t), u, p)
-    map_ = bare.input_map(q)
+    map_ = bare.input_map(q, u, p)
     force = _smooth(np.einsum("tij,tj->ti", np.linalg.pinv(map_), needed - applied))
     for number, label in enumerate(device.forces):
-        short = label.removeprefix("force_")
         channels[label] = force[:, number]
         rate = np.gradient(force[:, number], t)
-        channels[f"force_rate_{short}"] = rate
-        channels[f"force_curvature_{short}"] = np.gradient(rate, t)
+        channels[derivative(label, 1)] = rate
+        channels[derivative(label, 2)] = np.gradient(rate, t)
     left = _residual(bare, q, qd, qdd, channels, t, p)
     values = np.array([_typical(item) for item in full.parameters])
     values[: len(p)] = p

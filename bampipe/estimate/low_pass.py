@@ -67,4 +67,4 @@ def low_pass_at(values: Array, cutoff_hz: float, rate_hz: float, kept: NDArray[n
         ValueError: the cut-off is not between 0 and half the sampling rate.
     """
     section, start = _design(cutoff_hz, rate_hz)
-    return _run(np.ascontiguousarray(values), section, start, kept)  # type: ignore[no-any-return]
+    return _run(np.ascontiguousarray(values), section, start, kept)

@@ -10,19 +10,17 @@ from typing import Any
 
 import numpy as np
 
-from bampipe.data.store import read_parquet, read_toml, write_json
+from bampipe.data.store import write_json
 from bampipe.discover.advice import advise
 from bampipe.discover.chance import Recipe, Session
 from bampipe.discover.diagnosis import Diagnosis, Settings, diagnose
 from bampipe.discover.evidence import Band
-from bampipe.discover.recording import Motion, Recording, Sensors, observe
 from bampipe.discover.shape import describe, residual_map, variables, worst_windows
 from bampipe.errors import InputError
-from bampipe.estimate.differentiation import uniform_grid
-from bampipe.estimate.hysteresis import noise_of
-from bampipe.physics import System, compile_model
+from bampipe.physics import compile_model
 from bampipe.stages.base import Progress, RunFolder
 from bampipe.stages.modelfile import load_model, model_inputs
+from bampipe.stages.recordings import read_session, recipe_of
 
 NAME = "diagnose"
 SUMMARY = "Find which physical effect the model lacks"
@@ -84,12 +82,10 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
             where=str(run.root),
             remedy="one trial is held out to judge the others; record more free trials",
         )
-    session = Session(tuple(motions), sensors, Band(sensors.rate_hz, config.cutoff_hz))
-    recipe = Recipe(
-        model.device.declaration,
-        tuple(e.name for e in model.effects),
-        tuple(own_effects(run, config.model)),
+    session = Session(
+        tuple(motions), sensors, Band(sensors.rate_hz, min(config.cutoff_hz, 0.1 * sensors.rate_hz))
     )
+    recipe = recipe_of(run, config.model, model)
     identified = run.read_json(f"models/{config.model}/identify.json")["parameters"]
     start = np.array([float(identified[p.name]["estimate"]) for p in system.parameters])
     settings = Settings(
@@ -121,57 +117,6 @@ def _summary(result: dict[str, Any]) -> dict[str, object]:
         "suggested_trial": result["suggested_trial"],
         "notes": notes,
     }
-
-
-def own_effects(run: RunFolder, model: str) -> list[dict[str, object]]:
-    """Declarations of a lab's own effects that go with ``model``."""
-    return [read_toml(run.path(p)) for p in run.glob(f"models/{model}/effects/*.toml")]
-
-
-def read_session(run: RunFolder, system: System, cutoff_hz: float) -> tuple[Sensors, list[Motion]]:
-    """Free trials of a run folder on uniform grids, filtered for the diagnosis, and the sensors.
-
-    Raises:
-        InputError: a file or channel that the model needs is missing.
-    """
-    about = run.read_json("ingest/session.json")
-    rate = float(about["sample_rate_hz"])
-    device = system.model.device
-    trials = read_parquet(run.require("ingest/trials.parquet", "ingest"))
-    sound = trials[(trials["kind"] == "free") & (trials["status"] != "set_aside")]
-    samples = run.require("ingest/samples.parquet", "ingest")
-    recordings = []
-    for trial_id in sound["trial_id"].astype(str):
-        frame = read_parquet(samples, trial=trial_id)
-        frame = frame[frame.drop(columns="trial_id").notna().all(axis=1)]
-        grid = uniform_grid(frame["t"].to_numpy(dtype=float), rate)
-        q = [grid.resample(frame[f"q_{a}"].to_numpy(dtype=float)) for a in system.coordinates]
-        missing = [f for f in device.forces if f not in frame]
-        if missing:
-            raise InputError(
-                f"no column {missing[0]!r}, which device {device.name!r} needs",
-                where=str(samples),
-                remedy="name the channel in session.toml",
-            )
-        force = [grid.resample(frame[f].to_numpy(dtype=float)) for f in device.forces]
-        brake = [
-            grid.hold(frame[f"brake_{a}"].to_numpy(dtype=float))
-            if f"brake_{a}" in frame
-            else np.zeros(len(grid.t))
-            for a in system.coordinates
-        ]
-        recordings.append(
-            Recording(trial_id, np.column_stack(q), np.column_stack(force), np.column_stack(brake))
-        )
-    stated = (about.get("force") or {}).get("noise_sd")
-    if stated is None:
-        rows = [[noise_of(column) for column in r.force.T] for r in recordings]
-        noise = np.median(np.array(rows), axis=0) if rows else np.zeros(len(device.forces))
-    else:
-        noise = np.broadcast_to(np.asarray(stated, dtype=float), (len(device.forces),))
-    resolution = np.array([float(about["axes"][a]["resolution"]) for a in system.coordinates])
-    sensors = Sensors(rate, resolution, np.array(noise), cutoff_hz)
-    return sensors, [observe(r, sensors, system) for r in recordings]
 
 
 def _result(found: Diagnosis, session: Session, recipe: Recipe, model: str) -> dict[str, Any]:

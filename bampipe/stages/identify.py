@@ -12,6 +12,9 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from bampipe.data.store import read_parquet, write_json, write_parquet
+from bampipe.discover.chance import Session
+from bampipe.discover.evidence import Band as ResidualBand
+from bampipe.discover.start import search_start
 from bampipe.errors import InputError
 from bampipe.estimate.filter_uncertainty import climb, sandwich_covariance
 from bampipe.estimate.least_squares import Band, LeastSquares, Problem, fit
@@ -29,6 +32,7 @@ from bampipe.physics import System, compile_model
 from bampipe.stages.base import Progress, RunFolder
 from bampipe.stages.modelfile import load_model, model_inputs
 from bampipe.stages.motions import Motion, free_trials, input_columns, problem_of, read_motion
+from bampipe.stages.recordings import read_session, recipe_of
 
 NAME = "identify"
 SUMMARY = "Parameters of the model with uncertainties, from the free trials"
@@ -162,8 +166,8 @@ def _start(run: RunFolder, system: System, rate: float, config: Config) -> Array
     if system.model.effects:
         sensors, motions = read_session(run, system)
         recipe = recipe_of(run, config.model, system.model)
-        band = DiscoverBand(rate, config.cutoff_hz)
-        found = search_start(Session(tuple(motions), sensors, band), recipe)
+        session = Session(tuple(motions), sensors, ResidualBand(rate, config.cutoff_hz))
+        found = search_start(session, recipe)
         count = len(system.model.device.parameters)
         start[count:] = found[count:]
     return start
@@ -268,8 +272,9 @@ def _trial(run: RunFolder, motion: Motion, system: System, noise: _Noise, config
     n = len(system.coordinates)
     stamps = frame["t"].to_numpy(dtype=float)
     t = stamps - stamps[0]
+    brakes = system.model.device.brakes.values()
     for place, name in enumerate(system.inputs):
-        if name not in frame and name.startswith("force_"):
+        if name not in frame and name != "t" and name not in brakes:
             frame[name] = np.interp(t, motion.t, motion.u[:, place])
     u = input_columns(frame, system.inputs, system.model.device.brakes, t, str(path))
     for column in u.T:

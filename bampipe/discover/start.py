@@ -1,0 +1,65 @@
+"""Where an identification starts: effects searched over their range, not at their prior."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.discover.candidates import Score, Scorer, candidate
+from bampipe.discover.chance import Recipe, Session, system_of
+from bampipe.discover.evidence import Evidence, fit
+from bampipe.physics.registry import device_from, effect_from
+
+Array = NDArray[np.float64]
+
+
+def with_effect(recipe: Recipe, evidence: Evidence, score: Score) -> Array:
+    """Parameters of ``recipe``, whose last effect is the one scored, from the narrower model.
+
+    Args:
+        recipe: the wider model.
+        evidence: of the model without its last effect.
+        score: of that effect on this evidence.
+
+    Returns:
+        (n_p,), within the bounds.
+    """
+    known = {q.name: v for q, v in zip(evidence.system.parameters, evidence.p, strict=True)}
+    for i, shift in zip(evidence.free, score.shift, strict=False):
+        known[evidence.system.parameters[i].name] += shift
+    system = system_of(recipe)
+    added = system.parameters[len(evidence.system.parameters) :]
+    known |= {q.name: float(v) for q, v in zip(added, score.values, strict=True)}
+    start = np.array([known[q.name] for q in system.parameters])
+    lower = np.array([q.lower for q in system.parameters])
+    upper = np.array([q.upper for q in system.parameters])
+    return np.clip(start, lower, upper)
+
+
+def search_start(session: Session, recipe: Recipe) -> Array:
+    """Starting values of every parameter of a model, its effects taken one after the other.
+
+    The device's parameters start at their priors and are fitted; each effect's shape is scanned
+    over its range, where a descent from the prior would stay in the nearest valley.
+    """
+    bare = replace(recipe, effects=())
+    evidence = _fit(session, bare, system_of(bare).prior)
+    device = device_from(recipe.device)
+    extra = [effect_from(e) for e in recipe.extra]
+    for count, name in enumerate(recipe.effects, start=1):
+        wider = replace(recipe, effects=recipe.effects[:count])
+        score = Scorer(evidence).score(candidate(device, name, extra))
+        if score is None:
+            prior = np.array([q.prior for q in system_of(wider).parameters])
+            prior[: len(evidence.p)] = evidence.p
+            start = prior
+        else:
+            start = with_effect(wider, evidence, score)
+        evidence = _fit(session, wider, start)
+    return evidence.p
+
+
+def _fit(session: Session, recipe: Recipe, start: Array) -> Evidence:
+    return fit(system_of(recipe), session.motions, session.sensors, session.band, start)
