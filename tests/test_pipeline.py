@@ -1,0 +1,118 @@
+"""The main job on a shipped session: the run folder that other programs read, twice the same."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from conftest import contents
+
+ROOT = Path(__file__).parent.parent
+SESSION = ROOT / "sample_runs" / "first"
+AXES = ("yaw", "pitch", "extension")
+
+pytestmark = pytest.mark.slow
+
+
+def bampipe(folder: Path, *arguments: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "bampipe", *map(str, arguments)]
+    environment = {**os.environ, "SOURCE_DATE_EPOCH": "0"}
+    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("work")
+    done = bampipe(folder, "run", SESSION)
+    assert done.returncode == 0, done.stderr
+    return folder / "runs" / "first"
+
+
+def result(run: Path, name: str) -> dict[str, Any]:
+    content = json.loads((run / name).read_text())
+    assert isinstance(content, dict)
+    return content
+
+
+def finite(content: object) -> bool:
+    if isinstance(content, dict):
+        return all(map(finite, content.values()))
+    if isinstance(content, list):
+        return all(map(finite, content))
+    return not isinstance(content, float) or math.isfinite(content)
+
+
+def test_the_run_folder_is_as_promised(run: Path) -> None:
+    for name in (
+        "run.json",
+        "ingest/trials.parquet",
+        "ingest/samples.parquet",
+        "ingest/session.json",
+        "filter/kinematics.parquet",
+        "stiffness/stiffness.json",
+        "stiffness/loops.parquet",
+        "models/base/model.toml",
+        "models/base/identify.json",
+        "models/base/states.parquet",
+        "models/base/validate.json",
+        "models/base/residuals.parquet",
+        "compare.json",
+        "report/report.pdf",
+        "report/report.html",
+    ):
+        assert (run / name).stat().st_size > 0, name
+    assert list((run / "report" / "figures").iterdir())
+
+
+def test_the_fields_other_programs_read(run: Path) -> None:
+    stiffness = result(run, "stiffness/stiffness.json")["axes"]
+    identified = result(run, "models/base/identify.json")
+    validated = result(run, "models/base/validate.json")["axes"]
+    for axis in AXES:
+        assert {"stiffness", "sd", "unit", "bandwidth_rad_s", "bandwidth_hz"} <= set(
+            stiffness[axis]
+        )
+        assert {
+            "rmse",
+            "rmse_without_friction",
+            "held_out_rmse",
+            "noise_floor",
+            "fit_percent",
+            "unit",
+        } <= set(validated[axis])
+        for kind in ("viscous", "coulomb"):
+            entry = identified["parameters"][f"{kind}.{axis}"]
+            assert {"estimate", "sd", "unit"} <= set(entry)
+    assert identified["model"] == "base"
+    assert identified["state_3sigma"]
+    rung = result(run, "compare.json")["ladder"][0]
+    assert rung["model"] == "base"
+    assert set(rung["held_out_rmse"]) == set(rung["noise_floor"]) == set(AXES)
+    for path in run.rglob("*.json"):
+        assert finite(json.loads(path.read_text())), path
+
+
+def test_nothing_changed_nothing_runs_and_soon(run: Path) -> None:
+    start = time.perf_counter()
+    done = bampipe(run.parent.parent, "run", SESSION, "--json")
+    seconds = time.perf_counter() - start
+    steps = json.loads(done.stdout)["sessions"][0]["steps"]
+    assert {step["state"] for step in steps.values()} == {"unchanged"}
+    assert seconds < 3.0
+    assert bampipe(run.parent.parent, "verify", "first").returncode == 0
+
+
+def test_twice_the_same_bytes(run: Path, tmp_path: Path) -> None:
+    done = bampipe(tmp_path, "run", SESSION)
+    assert done.returncode == 0, done.stderr
+    first, second = contents(run), contents(tmp_path / "runs" / "first")
+    differing = [name for name in first if first[name] != second.get(name)]
+    assert set(first) == set(second)
+    assert [name for name in differing if not name.startswith("report/report.")] == []
