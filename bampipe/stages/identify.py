@@ -45,6 +45,8 @@ _TUNING_SAMPLES = 3000
 """Samples of one trial on which the noise levels are tuned."""
 _TUNING_STEP_S = 2e-3
 """Longest Runge-Kutta step while tuning, s: noise levels need no more."""
+_STORED = 20_000
+"""Most distributions stored of one trial: memory must not grow with the log."""
 _COARSE = 300.0
 """Factor on the process noise of the search for the region of the answer."""
 _RESTARTS = 5
@@ -77,8 +79,6 @@ class Config:
         cutoff_hz: low-pass of the least-squares residual, Hz.
         block_s: length of the blocks that are taken as independent of each other, s.
         trace_rows: most rows a trial in trace.parquet and states.parquet.
-        input_timing: whether to estimate by how much inputs were sampled after positions; the
-            filter always does, least squares may take them as simultaneous.
     """
 
     model: str = "base"
@@ -94,7 +94,6 @@ class Config:
     cutoff_hz: float = 8.0
     block_s: float = 2.0
     trace_rows: int = 2000
-    input_timing: bool = True
 
 
 def inputs(config: Config) -> tuple[str, ...]:
@@ -136,7 +135,9 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     progress(0.0, "reading the trials")
     motions = [read_motion(run, trial, system) for trial in free_trials(run)]
     rate = float(session["sample_rate_hz"])
-    problem = problem_of(system, motions, Band(rate, config.cutoff_hz), timing=config.input_timing)
+    # Filtered accelerations fall short at high frequency, which least squares takes for a delay
+    # of the force: the filter alone can tell the two apart.
+    problem = _without_timing(problem_of(system, motions, Band(rate, config.cutoff_hz)))
     progress(0.1, "least squares")
     start = _start(run, system, rate, config)
     variable = [i for i, item in enumerate(system.parameters) if not item.fixed]
@@ -149,11 +150,14 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         ) from error
     if config.method == "ukf":
         noise = _Noise.from_session(session, run, system, motions, config)
-        trials = [_trial(run, motion, system, noise, config) for motion in motions]
-        estimate = _unscented(system, motions, trials, start, squares, noise, config, progress)
+        stride = _stride(motions)
+        trials = [_trial(run, motion, system, noise, stride, config) for motion in motions]
+        estimate, squares = _unscented(
+            system, motions, trials, start, problem, squares, noise, config, progress
+        )
     else:
         estimate = _from_squares(system, motions, problem, squares)
-    content = _content(system, problem.free[:-1], estimate, squares, motions, config)
+    content = _content(system, problem.free, estimate, squares, motions, config)
     write_json(out / f"models/{config.model}/identify.json", content)
     write_parquet(out / f"models/{config.model}/states.parquet", estimate.states)
     write_parquet(out / f"models/{config.model}/trace.parquet", estimate.trace)
@@ -188,12 +192,6 @@ def _check(config: Config) -> None:
                 where=f"identify.{name}",
                 remedy=f"choose from {', '.join(known)}",
             )
-    if config.method == "ukf" and not config.input_timing:
-        raise InputError(
-            "the filter always estimates the timing of the inputs",
-            where="identify.input_timing",
-            remedy="choose method = least-squares",
-        )
     for name in ("start_factor", "longest_step_s", "cutoff_hz", "block_s", "trace_rows"):
         if not getattr(config, name) > 0:
             raise InputError("must be positive", where=f"identify.{name}")
@@ -265,7 +263,9 @@ def _white_part(records: Sequence[Array]) -> float:
     return float(np.median(np.abs(second)) / (0.6745 * np.sqrt(6.0)))
 
 
-def _trial(run: RunFolder, motion: Motion, system: System, noise: _Noise, config: Config) -> Trial:
+def _trial(
+    run: RunFolder, motion: Motion, system: System, noise: _Noise, stride: int, config: Config
+) -> Trial:
     """Return the raw samples of one trial as the filter wants them."""
     path = run.require("ingest/samples.parquet", "ingest")
     frame = read_parquet(path, trial=motion.trial_id)
@@ -291,7 +291,9 @@ def _trial(run: RunFolder, motion: Motion, system: System, noise: _Noise, config
     x = np.concatenate([y[first, :n], motion.qd[0], memory])
     speed = np.maximum(motion.qd_sd[0], np.sqrt(np.mean(motion.qd**2, axis=0)) * 0.1)
     x_sd = np.concatenate([2.0 * noise.reading_sd[:n], speed, np.zeros(len(memory))])
-    return Trial(t[first:], u[first:], y[first:], x, x_sd)
+    # The last stored distribution must be that of the last sample.
+    last = first + (t.size - 1 - first) // stride * stride + 1
+    return Trial(t[first:last], u[first:last], y[first:last], x, x_sd)
 
 
 def _unscented(
@@ -299,16 +301,21 @@ def _unscented(
     motions: Sequence[Motion],
     trials: Sequence[Trial],
     start: Array,
+    problem: Problem,
     squares: LeastSquares,
     noise: _Noise,
     config: Config,
     progress: Progress,
-) -> _Estimate:
-    """Tune the noise, converge on the first trial, then filter all trials."""
+) -> tuple[_Estimate, LeastSquares]:
+    """Tune the noise, converge on the first trial, then filter all trials.
+
+    Returns the estimate, and least squares again with the timing that the filter found.
+    """
     model = _filter_model(system, trials, start)
     run_filter = _engine(config)
     progress(0.15, "noise levels")
     settings = _tuned(system, model, trials, squares, noise, config)
+    settings = replace(settings, stride=_stride(motions))
     prior_sd = np.array([*(item.sd for item in _free(system)), model.upper[-1] / np.sqrt(3.0)])
     first = np.append(start[model.free[:-1]], 0.0)
     spread = np.hypot(prior_sd, first - np.append(system.prior[model.free[:-1]], 0.0))
@@ -362,7 +369,8 @@ def _unscented(
     )
     value, slope = model.to_physical(constrain(model, main.theta, covariance))
     scaled = covariance * np.outer(slope, slope)
-    systematic = _systematic(value, scaled, squares, model)
+    squares = fit(problem, np.append(squares.p[:-1], value[-1]), block_s=config.block_s)
+    systematic = _systematic(value, scaled, squares, problem.free)
     scaled += np.diag(systematic**2)
     tight = slope * np.sqrt(np.diag(main.covariance))
     near = (value - model.lower < tight) | (model.upper - value < tight)
@@ -382,7 +390,7 @@ def _unscented(
     }
     steps = [motions[0], *(motions[i] for i in order)]
     passes = [*search.trials, *main.trials]
-    return _Estimate(
+    estimate = _Estimate(
         value=value[:kept],
         covariance=scaled[:kept, :kept],
         filter_sd=tight[:kept],
@@ -391,6 +399,23 @@ def _unscented(
         report=report,
         states=_states(system, motions, order, main, value, config),
         trace=_trace(model, system, steps, passes, config),
+    )
+    return estimate, squares
+
+
+def _stride(motions: Sequence[Motion]) -> int:
+    """Return every how many samples the filter stores its distribution."""
+    return -(-max(motion.t.size for motion in motions) // _STORED)
+
+
+def _without_timing(problem: Problem) -> Problem:
+    """Return the problem with the timing of the inputs held where the starting values put it."""
+    return replace(
+        problem,
+        free=problem.free[:-1],
+        lower=problem.lower[:-1],
+        upper=problem.upper[:-1],
+        step=problem.step[:-1],
     )
 
 
@@ -450,7 +475,8 @@ def _tuned(
         whole, t=whole.t[:_TUNING_SAMPLES], u=whole.u[:_TUNING_SAMPLES], y=whole.y[:_TUNING_SAMPLES]
     )
     value = squares.p[model.free]
-    spread = np.maximum(np.sqrt(np.diag(squares.covariance)), 1e-6 * np.abs(value))
+    sd = np.append(np.sqrt(np.diag(squares.covariance)), model.upper[-1] / np.sqrt(3.0))
+    spread = np.maximum(sd, 1e-6 * np.abs(value))
     mean, sd = model.to_estimated(value, np.maximum(spread, np.finfo(float).tiny))
 
     def with_levels(levels: Array) -> FilterSettings:
@@ -480,16 +506,18 @@ def _tuned(
 
 
 def _systematic(
-    value: Array, covariance: Array, squares: LeastSquares, model: FilterModel
+    value: Array, covariance: Array, squares: LeastSquares, free: NDArray[np.int64]
 ) -> Array:
     """Return how far filter and least squares disagree beyond their standard deviations.
 
     Both see the same data and err alike by noise, but not by what the model lacks: where the
     model is right, their difference stays below the sum of their variances and adds nothing.
+    The timing of the inputs is the filter's in both and gets nothing.
     """
-    difference = value - squares.p[model.free]
-    variance = np.diag(covariance) + np.diag(squares.covariance)
-    return np.asarray(np.sqrt(np.maximum(difference**2 - variance, 0.0)))
+    kept = value.size - 1
+    difference = value[:kept] - squares.p[free]
+    variance = np.diag(covariance)[:kept] + np.diag(squares.covariance)
+    return np.append(np.sqrt(np.maximum(difference**2 - variance, 0.0)), 0.0)
 
 
 def _lost(
@@ -682,7 +710,7 @@ def _from_squares(
     system: System, motions: Sequence[Motion], problem: Problem, squares: LeastSquares
 ) -> _Estimate:
     """Return the least-squares estimate; its trace is the fit to the trials so far."""
-    names = [system.parameters[i].name for i in problem.free[:-1]]
+    names = [system.parameters[i].name for i in problem.free]
     rows, clock = [], 0.0
     for number, motion in enumerate(motions):
         clock += float(motion.t[-1])
@@ -698,13 +726,12 @@ def _from_squares(
         for i, axis in enumerate(system.coordinates):
             columns[f"q_{axis}"], columns[f"qd_{axis}"] = motion.q[:, i], motion.qd[:, i]
             columns[f"qd_sd_{axis}"] = motion.qd_sd[:, i]
-        frames.append(_with_torque(system, motion, motion.t, columns, squares.p[problem.free[:-1]]))
+        frames.append(_with_torque(system, motion, motion.t, columns, squares.p[problem.free]))
     sd = 3.0 * np.median(np.concatenate([motion.qd_sd for motion in motions]), axis=0)
-    kept = problem.free.size - 1
     report: dict[str, object] = {
         "input_timing": {
-            "estimate": float(squares.p[-1]),
-            "sd": float(np.sqrt(squares.covariance[-1, -1])),
+            "estimate": 0.0,
+            "sd": 0.0,
             "unit": "s",
         },
         "residual_sd": dict(zip(system.coordinates, map(float, squares.residual_sd), strict=True)),
@@ -714,11 +741,11 @@ def _from_squares(
         },
     }
     return _Estimate(
-        value=squares.p[problem.free[:-1]],
-        covariance=squares.covariance[:kept, :kept],
+        value=squares.p[problem.free],
+        covariance=squares.covariance,
         filter_sd=None,
         systematic_sd=None,
-        at_bound=squares.at_bound[:kept],
+        at_bound=squares.at_bound,
         report=report,
         states=pd.concat(frames, ignore_index=True),
         trace=pd.DataFrame(rows),
