@@ -171,7 +171,11 @@ def array_source(e: Equations, added: Sequence[Any]) -> str:
             [expr for expr in added if expr != 0],
         ),
         _function("true_motion", {**motion, "u": e.u, "p": e.p}, true),
-        _function("input_map", {"q": e.q}, [entry for row in e.input_map for entry in row]),
+        _function(
+            "input_map",
+            {"q": e.q, "u": e.u, "p": e.p},
+            [entry for row in e.input_map for entry in row],
+        ),
         _function("initial_memory", {"q": e.q, "u": e.u, "p": e.p}, e.initial),
         _function("mass_matrix", {"q": e.q, "p": e.p}, [m for row in e.mass for m in row]),
         _function("energy", {"q": e.q, "qd": e.qd, "p": e.p}, [e.kinetic, e.potential]),

@@ -18,7 +18,8 @@ import sympy as sp
 
 from bampipe.errors import InputError
 from bampipe.physics import expression
-from bampipe.physics.effect import BoundEffect, derivative
+from bampipe.physics.device import derivative
+from bampipe.physics.effect import BoundEffect
 from bampipe.physics.model import Model
 
 Symbols = dict[str, Any]
@@ -88,7 +89,7 @@ class _Derivation:
             for kind in ("q", "qd", "qdd")
         )
         self.channels = [derivative(f, k) for k in (0, 1, 2) for f in device.forces]
-        self.channels += [*device.brakes.values(), "t"]
+        self.channels += [*device.brakes.values(), *device.channels, "t"]
         self.channel = {name: sp.Symbol(f"u{i}", real=True) for i, name in enumerate(self.channels)}
         self.p = {p.name: sp.Symbol(f"p{i}", real=True) for i, p in enumerate(model.parameters)}
         self.z: dict[tuple[str, str], Any] = {}
@@ -138,9 +139,10 @@ class _Derivation:
         ]
         if expr.has(*last):
             raise InputError("ddt() of an acceleration, or of a force's curvature")
-        brakes = [self.channel[b] for b in self.model.device.brakes.values()]
-        if expr.has(*self.z.values(), *brakes):
-            raise InputError("ddt() of an internal state or of a brake command")
+        device = self.model.device
+        held = [self.channel[c] for c in (*device.brakes.values(), *device.channels)]
+        if expr.has(*self.z.values(), *held):
+            raise InputError("ddt() of an internal state, of a brake command or other channel")
         total = sp.S.Zero
         for a, b in (
             *zip(self.q, self.qd, strict=True),
@@ -190,7 +192,7 @@ class _Derivation:
         """Force channels of a force effect: its own, and for a pair the one that leaks into it."""
         forces = self.model.device.forces
         if item.effect.scope == "force_component":
-            return (f"force_{item.target}",)
+            return (forces[self.model.device.components.index(item.target)],)
         short = self.model.device.components
         return next(
             (forces[i], forces[j])
@@ -360,7 +362,13 @@ def derive(model: Model, named_constants: bool = False) -> Equations:
     kinetics, potentials = zip(*energies, strict=True)
     _allow("the kinetic energy", [*kinetics], [*motion, *free], "positions, rates and parameters")
     _allow("the potential energy", [*potentials], [*d.q, *free], "positions and parameters")
-    _allow("the effect of a force on the axes", gains, [*d.q, *constants], "positions")
+    others = [d.channel[c] for c in device.channels]
+    _allow(
+        "the effect of a force on the axes",
+        gains,
+        [*d.q, *others, *free],
+        "positions, parameters and channels that are no forces",
+    )
     _allow("a torque", other, [*motion, *u, *free, *memory, *w], words)
     _allow("the applied force", applied, [*motion, *u, *free, *memory], words)
     _allow("the rate of an internal state", rates, [*motion, *u, *free, *memory], words)

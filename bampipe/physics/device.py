@@ -89,6 +89,7 @@ class Device:
     forces: tuple[str, ...]
     force_unit: str
     brakes: Mapping[str, str]
+    channels: Mapping[str, str]
     applied: Mapping[str, ast.expr]
     side_load: Mapping[str, ast.expr]
     process_noise: Mapping[str, Mapping[str, ast.expr]]
@@ -114,8 +115,18 @@ class Device:
 
     @property
     def components(self) -> tuple[str, ...]:
-        """Short names of the force components: ``x`` for the channel ``force_x``."""
+        """Short names of the forces: ``x`` for the channel ``force_x``, ``duty`` for ``duty``."""
         return tuple(name.removeprefix("force_") for name in self.forces)
+
+
+def derivative(force: str, order: int) -> str:
+    """Name of the time derivative of an input: ``force_x`` -> ``force_rate_x``, ``duty_rate``."""
+    kind = ("", "rate", "curvature")[order]
+    if not kind:
+        return force
+    if force.startswith("force_"):
+        return f"force_{kind}_{force.removeprefix('force_')}"
+    return f"{force}_{kind}"
 
 
 def _table(declaration: Mapping[str, Any], key: str, where: str, required: bool) -> dict[str, Any]:
@@ -215,11 +226,13 @@ def device_from(declaration: Mapping[str, Any], where: str = "device file") -> D
             raise InputError("lower must be below upper", where=at)
     forces = inputs.get("force", [])
     if not isinstance(forces, list | tuple) or not all(
-        isinstance(f, str) and f.startswith("force_") and f != "force_" for f in forces
+        isinstance(f, str) and f not in ("", "force_") for f in forces
     ):
-        raise InputError(
-            "force must be a list of channels called force_<component>", where=f"{where}: inputs"
-        )
+        raise InputError("force must be a list of channel names", where=f"{where}: inputs")
+    _known(inputs, ("force", "force_unit", "brakes", "channels"), f"{where}: inputs")
+    channels = inputs.get("channels", {})
+    if not isinstance(channels, Mapping) or not all(isinstance(u, str) for u in channels.values()):
+        raise InputError("channels must be a table, name = unit", where=f"{where}: inputs")
     brakes = inputs.get("brakes", {})
     if not isinstance(brakes, Mapping):
         raise InputError("brakes must be a table, axis = channel", where=f"{where}: inputs")
@@ -238,6 +251,7 @@ def device_from(declaration: Mapping[str, Any], where: str = "device file") -> D
         forces=tuple(forces),
         force_unit=str(inputs.get("force_unit", "N")),
         brakes=dict(brakes),
+        channels=dict(channels),
         applied=_expressions(_table(declaration, "applied", where, True), f"{where}: applied"),
         side_load=_expressions(
             _table(declaration, "side_load", where, False), f"{where}: side_load"
@@ -279,16 +293,13 @@ def _known(entry: Mapping[str, Any], keys: tuple[str, ...], where: str) -> None:
 def _check_names(device: Device, where: str) -> None:
     """Raise InputError where a name cannot stand in an expression or means two things."""
     axes = [c.name for c in device.coordinates]
-    rates = [
-        f"force_{k}_{f.removeprefix('force_')}"
-        for f in device.forces
-        for k in ("rate", "curvature")
-    ]
+    rates = [derivative(f, k) for f in device.forces for k in (1, 2)]
     taken = dict.fromkeys(["t", *(f"qd_{a}" for a in axes), *rates], "a built-in symbol")
     for label, names in (
         ("coordinates", axes),
         ("inputs.force", device.forces),
         ("inputs.brakes", device.brakes.values()),
+        ("inputs.channels", device.channels),
         ("constants", device.constants),
         ("definitions", device.definitions),
         ("parameters", [p.name for p in device.parameters if "." not in p.name]),

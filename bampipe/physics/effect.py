@@ -9,7 +9,7 @@ from typing import Any
 
 from bampipe.errors import InputError
 from bampipe.physics import expression
-from bampipe.physics.device import Device
+from bampipe.physics.device import Device, derivative
 from bampipe.physics.parameter import Parameter, parameter_from
 
 # What an effect of each kind must give, where it may apply.
@@ -97,6 +97,7 @@ class Effect:
         known |= {c.name for c in device.coordinates} | {p.name for p in device.parameters}
         for force in device.forces:
             known |= {force, derivative(force, 1), derivative(force, 2)}
+        known |= set(device.channels)
         known |= set(device.brakes.values()) | set(self.parameters) | {s.name for s in self.states}
         for c in device.coordinates:
             known |= {
@@ -128,12 +129,6 @@ class BoundEffect:
     def parameter(self, short: str) -> Parameter:
         """Its parameter called ``short``, such as ``force``."""
         return next(p for p in self.parameters if p.name == f"{self.prefix}.{short}")
-
-
-def derivative(force: str, order: int) -> str:
-    """Name of the time derivative of a force channel: ``force_x`` -> ``force_rate_x``."""
-    label = {0: "force_", 1: "force_rate_", 2: "force_curvature_"}[order]
-    return label + force.removeprefix("force_")
 
 
 def effect_from(declaration: Mapping[str, Any], where: str = "effect file") -> Effect:

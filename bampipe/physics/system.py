@@ -149,10 +149,19 @@ class System:
             out[:, axis] = column
         return out
 
-    def input_map(self, q: Array) -> Array:
-        """d applied / d force of the device itself, (T, n_q, n_force)."""
+    def input_map(self, q: Array, u: Array | None = None, p: Array | None = None) -> Array:
+        """d applied / d force of the device itself, (T, n_q, n_force).
+
+        Args:
+            q: positions, (T, n_q).
+            u: inputs, (T, n_u); needed where a force acts through another input, such as a duty
+                cycle through the supply voltage. Zeros by default.
+            p: parameters, (n_p,); priors by default.
+        """
         n = len(self.coordinates)
-        return _stack(self._arrays.input_map(q.T), len(q)).reshape(len(q), n, -1)
+        u = np.zeros((len(q), len(self.inputs))) if u is None else u
+        columns = self._arrays.input_map(q.T, u.T, self.prior if p is None else p)
+        return _stack(columns, len(q)).reshape(len(q), n, -1)
 
     def mass_matrix(self, q: Array, p: Array) -> Array:
         """Mass matrix (eq 13), (T, n_q, n_q), kg m2, kg m, kg."""

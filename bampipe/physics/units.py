@@ -18,8 +18,8 @@ from fractions import Fraction
 
 from bampipe.errors import InputError
 from bampipe.physics import expression
-from bampipe.physics.device import Device
-from bampipe.physics.effect import BoundEffect, Effect, bind, derivative
+from bampipe.physics.device import Device, derivative
+from bampipe.physics.effect import BoundEffect, Effect, bind
 
 BASE = ("kg", "m", "s", "A", "K")
 
@@ -249,6 +249,8 @@ def _device_symbols(device: Device, check: _Check) -> dict[str, Found]:
         for order in (0, 1, 2):
             known = None if force is None else force / second**order
             symbols[derivative(channel, order)] = known
+    for name, unit_text in device.channels.items():
+        symbols[name] = check.unit(unit_text, f"inputs.channels.{name}")
     for name, constant in device.constants.items():
         symbols[name] = check.unit(constant.unit, f"constants.{name}")
     for parameter in device.parameters:

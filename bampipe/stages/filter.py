@@ -19,6 +19,7 @@ from bampipe.estimate.differentiation import (
     UniformGrid,
     uniform_grid,
 )
+from bampipe.physics.device import derivative
 from bampipe.stages.base import Progress, RunFolder
 
 NAME = "filter"
@@ -279,16 +280,17 @@ def _named(frame: pd.DataFrame, prefix: str) -> tuple[str, ...]:
 def _forces(
     grid: UniformGrid, frame: pd.DataFrame, rate: float, cutoff_hz: float
 ) -> Iterator[tuple[str, Array]]:
-    """Yield the force channels and their band-limited derivatives."""
-    names = _named(frame, "force_")
+    """Yield the forces and other input channels, and their band-limited derivatives."""
+    taken = ("trial_id", "t", *_named(frame, "q_"), *_named(frame, "brake_"))
+    names = [str(name) for name in frame.columns if name not in taken]
     forces = {name: grid.resample(frame[name].to_numpy(dtype=np.float64)) for name in names}
     cutoff = min(cutoff_hz, 0.2 * rate)
     slopes = {name: butterworth.zero_phase(force, rate, cutoff) for name, force in forces.items()}
     yield from forces.items()
     for name, (_, slope, _) in slopes.items():
-        yield name.replace("force_", "force_rate_", 1), slope
+        yield derivative(name, 1), slope
     for name, (_, _, curvature) in slopes.items():
-        yield name.replace("force_", "force_curvature_", 1), curvature
+        yield derivative(name, 2), curvature
 
 
 def _report(

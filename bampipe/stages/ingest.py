@@ -162,7 +162,7 @@ def _match(session: Session, device: Device) -> None:
             )
     given = {channel.name for channel in session.channels}
     given |= set(session.force.names) if session.force else set()
-    for name in device.forces:
+    for name in (*device.forces, *device.channels):
         if name not in given:
             raise InputError(
                 f"no channel for input '{name}' of device '{device.name}'",

@@ -13,6 +13,7 @@ from bampipe.data.store import read_parquet
 from bampipe.errors import InputError
 from bampipe.estimate.least_squares import Band, Problem, resting
 from bampipe.physics import System
+from bampipe.physics.device import derivative
 from bampipe.stages.base import RunFolder
 
 Array = NDArray[np.float64]
@@ -170,8 +171,7 @@ def _columns(frame: pd.DataFrame, names: Sequence[str], where: str) -> Array:
 def _rates(frame: pd.DataFrame, names: Sequence[str]) -> Array:
     rates = np.zeros((len(frame), len(names)))
     for place, name in enumerate(names):
-        head, _, component = name.rpartition("_")
-        column = f"{head}_rate_{component}"
-        if head == "force" and column in frame:
+        column = derivative(name, 1)
+        if column in frame:
             rates[:, place] = frame[column]
     return rates

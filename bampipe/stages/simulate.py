@@ -22,8 +22,8 @@ from bampipe.data import store
 from bampipe.errors import InputError
 from bampipe.estimate.simulation import Impedance, simulate_tracking
 from bampipe.physics import Model, registry
-from bampipe.physics.device import Coordinate, Device
-from bampipe.physics.effect import BoundEffect, Effect, derivative
+from bampipe.physics.device import Coordinate, Device, derivative
+from bampipe.physics.effect import BoundEffect, Effect
 from bampipe.physics.system import System, compile_model
 from bampipe.stages.base import Progress, silent
 

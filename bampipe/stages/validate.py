@@ -18,9 +18,10 @@ from bampipe.discover.replay import replay
 from bampipe.errors import InputError
 from bampipe.estimate import butterworth, kalman_smoother, savitzky_golay
 from bampipe.estimate.differentiation import Derivatives
+from bampipe.estimate.hysteresis import noise_of
 from bampipe.estimate.least_squares import Band, Problem, fit
 from bampipe.physics import System, compile_model
-from bampipe.physics.effect import derivative
+from bampipe.physics.device import derivative
 from bampipe.stages.base import Progress, RunFolder
 from bampipe.stages.modelfile import load_model, model_inputs
 from bampipe.stages.motions import Motion, free_trials, problem_of, read_motion
@@ -158,7 +159,7 @@ def _compare(
         thin = problem.band.thin
         resting = np.abs(thin(problem.resting[k].astype(float)))
         residual = thin(problem.residual(k, p))
-        push = np.linalg.pinv(system.input_map(motion.q[kept]))
+        push = np.linalg.pinv(system.input_map(motion.q[kept], u[kept], p[:n]))
         compared.append(
             _Compared(
                 trial_id=motion.trial_id,
@@ -200,7 +201,7 @@ def _noise_floor(
     filters and fits as the measurement.
     """
     settings = run.read_json("filter/filter.json")
-    noise = session.get("force", {}).get("noise_sd")
+    noise = session["force"]["noise_sd"]
     resolution = [session["axes"][axis].get("resolution") or 0.0 for axis in system.coordinates]
     quiet = [settings["axes"][axis]["measurement_noise_sd"] for axis in system.coordinates]
     sensors = Sensors(
@@ -208,7 +209,7 @@ def _noise_floor(
         resolution=np.where(
             np.array(resolution) > 0.0, resolution, np.sqrt(12.0) * np.array(quiet)
         ),
-        force_sd=np.full(len(system.model.device.forces), float(noise or 0.0)),
+        force_sd=_force_noise(system, motions, noise),
     )
     squares, counts = np.zeros(len(system.coordinates)), np.zeros(len(system.coordinates))
     parameters = p[: len(system.parameters)]
@@ -220,6 +221,8 @@ def _noise_floor(
             for axis in system.coordinates:
                 brake = system.model.device.brakes.get(axis)
                 channels.setdefault(brake or axis, np.zeros(len(motion.t)))
+            for name in system.model.device.channels:
+                channels.setdefault(name, np.zeros(len(motion.t)))
             driven = Driven(motion.trial_id, motion.t, motion.q, motion.qd, motion.qdd, channels)
             recording = replay(system, parameters, driven, sensors, rng)
             seen.append(_filtered(recording, motion, system, settings, band.rate_hz))
@@ -231,6 +234,15 @@ def _noise_floor(
             squares += np.sum(residual**2, axis=0)
             counts += used.sum(axis=0)
     return np.asarray(np.sqrt(squares / np.maximum(counts, 1.0)))
+
+
+def _force_noise(system: System, motions: Sequence[Motion], stated: float | None) -> Array:
+    """Return the noise (n_f,) of the force channels: as stated, else from the samples."""
+    forces = system.model.device.forces
+    if stated is not None:
+        return np.full(len(forces), float(stated))
+    columns = [system.inputs.index(name) for name in forces]
+    return np.median([[noise_of(m.u[:, c]) for c in columns] for m in motions], axis=0)
 
 
 def _filtered(
@@ -333,7 +345,7 @@ def _content(
         error = np.concatenate([c.force_residual[c.used.all(axis=1), column] for c in compared])
         forces[name] = {
             "rmse": float(np.sqrt(np.mean(error**2))) if error.size else 0.0,
-            "unit": "N",
+            "unit": system.model.device.force_unit,
         }
     best = ", ".join(f"{axis} {entry['fit_percent']:.1f} %" for axis, entry in axes.items())
     return {
