@@ -388,20 +388,15 @@ def test_an_effect_is_not_added_twice(ingested: Path, command: Command) -> None:
     assert "has stribeck:yaw already" in error
 
 
-def test_the_next_effect_is_the_first_of_an_axis_that_misses_one(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("selected", "effect"), [(["presliding:pitch", "force_delay"], "presliding:pitch"), ([], "")]
+)
+def test_the_next_effect_is_the_first_that_the_diagnosis_selects(
+    tmp_path: Path, selected: list[str], effect: str
+) -> None:
     from bampipe.cli.loop import next_effect
 
     path = tmp_path / "models" / "base" / "diagnose.json"
     path.parent.mkdir(parents=True)
-    content = {
-        "axes": {"yaw": {"verdict": "nothing_missing"}, "pitch": {"verdict": "missing"}},
-        "ranking": [
-            {"effect": "stribeck:yaw", "axis": "yaw"},
-            {"effect": "presliding:pitch", "axis": "pitch"},
-        ],
-    }
-    path.write_text(json.dumps(content))
-    assert next_effect(tmp_path, "base") == "presliding:pitch"
-    content["axes"] = {"yaw": {"verdict": "unknown_effect"}}
-    path.write_text(json.dumps(content))
-    assert next_effect(tmp_path, "base") == ""
+    path.write_text(json.dumps({"selected": selected}))
+    assert next_effect(tmp_path, "base") == effect
