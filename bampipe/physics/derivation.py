@@ -132,17 +132,19 @@ class _Derivation:
         return sp.sign(argument)
 
     def ddt(self, expr: Any) -> Any:
-        """Total time derivative by the chain rule over motion and measured channels."""
+        """Total time derivative by the chain rule over motion and measured forces.
+
+        Channels that are no forces, such as a supply voltage, count as slow: their rate is zero.
+        """
         last = [
             *self.qdd,
             *(self.channel[derivative(f, 2)] for f in self.model.device.forces),
         ]
         if expr.has(*last):
             raise InputError("ddt() of an acceleration, or of a force's curvature")
-        device = self.model.device
-        held = [self.channel[c] for c in (*device.brakes.values(), *device.channels)]
-        if expr.has(*self.z.values(), *held):
-            raise InputError("ddt() of an internal state, of a brake command or other channel")
+        brakes = [self.channel[b] for b in self.model.device.brakes.values()]
+        if expr.has(*self.z.values(), *brakes):
+            raise InputError("ddt() of an internal state or of a brake command")
         total = sp.S.Zero
         for a, b in (
             *zip(self.q, self.qd, strict=True),
@@ -355,14 +357,15 @@ def derive(model: Model, named_constants: bool = False) -> Equations:
             z_names.append(f"{item.prefix}.{state.name}")
             rates.append(d.own(item, state.rate, symbols, f"states.{state.name}.rate"))
             initial.append(d.own(item, state.initial, symbols, f"states.{state.name}.initial"))
-    free, u, force0 = [*d.p.values(), *constants], [*d.channel.values()], [*forces, d.channel["t"]]
+    others = [d.channel[c] for c in device.channels]
+    free, u = [*d.p.values(), *constants], [*d.channel.values()]
+    force0 = [*forces, *others, d.channel["t"]]
     motion, memory = [*d.q, *d.qd], [*d.z.values()]
     gains = [entry for row in input_map for entry in row]
     words = "motion, inputs, parameters and internal states"
     kinetics, potentials = zip(*energies, strict=True)
     _allow("the kinetic energy", [*kinetics], [*motion, *free], "positions, rates and parameters")
     _allow("the potential energy", [*potentials], [*d.q, *free], "positions and parameters")
-    others = [d.channel[c] for c in device.channels]
     _allow(
         "the effect of a force on the axes",
         gains,
