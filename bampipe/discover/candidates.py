@@ -189,7 +189,7 @@ class Scorer:
         count = _GRID if len(item.searched) == 1 else _GRID - 2
         grid = list(np.geomspace(low, high, count) if ratio else np.linspace(low, high, count))
         known = [cost(value) for value in grid]
-        if any(found is None for found in known):
+        if all(found is None for found in known):
             return None
         i = 0
         while i + 1 < len(grid) and len(grid) < _DENSEST:
@@ -219,6 +219,8 @@ class Scorer:
         columns, change = self._columns(item, searched)
         if all(not c.any() for c in columns) and all(not c.any() for c in change):
             return None
+        if not all(np.isfinite(c).all() for c in (*columns, *change)):
+            return None  # an internal state too stiff to be integrated at this sampling rate
         x = [
             np.concatenate([j, c], axis=2)
             for j, c in zip(self.evidence.jacobian, columns, strict=True)
