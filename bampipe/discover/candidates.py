@@ -29,6 +29,8 @@ _REFINE = 3
 _ALIKE = 0.7
 _DENSEST = 48
 _WORTH = 4.0
+_DIVERGED = 1e30
+"""An internal state that is too stiff to be integrated at the sampling rate ends above this."""
 
 
 @dataclass(frozen=True)
@@ -219,8 +221,8 @@ class Scorer:
         columns, change = self._columns(item, searched)
         if all(not c.any() for c in columns) and all(not c.any() for c in change):
             return None
-        if not all(np.isfinite(c).all() for c in (*columns, *change)):
-            return None  # an internal state too stiff to be integrated at this sampling rate
+        if not all((np.abs(c) < _DIVERGED).all() for c in (*columns, *change)):
+            return None
         x = [
             np.concatenate([j, c], axis=2)
             for j, c in zip(self.evidence.jacobian, columns, strict=True)
