@@ -26,7 +26,7 @@ MODEL = 'schema = "bampipe.model/1"\nname = "base"\ndevice = "bam"\neffects = []
 
 
 def simulated_run(
-    root: Path, *, trials: int = 2, seconds: float = 12.0, scramble: bool = False
+    root: Path, *, trials: int = 2, seconds: float = 10.0, scramble: bool = False
 ) -> RunFolder:
     """Simulate the BAM under a hand, read by its sensors, up to the filter stage.
 

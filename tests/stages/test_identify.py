@@ -100,7 +100,7 @@ def test_tables_and_determinism(simulated: RunFolder, tmp_path: Path) -> None:
 
 
 def test_filterpy_gives_the_same_numbers(tmp_path: Path) -> None:
-    run = simulated_run(tmp_path / "short", trials=1, seconds=2.0)
+    run = simulated_run(tmp_path / "short", trials=1, seconds=1.2)
     numbers = []
     for engine in identify.ENGINES:
         content = identified(run, replace(FAST, engine=engine, block_s=0.1))
