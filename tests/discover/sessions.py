@@ -1,0 +1,74 @@
+"""A short session made from the device itself, with effects, for tests of the diagnosis."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from bampipe.discover.chance import Recipe, Session, system_of
+from bampipe.discover.evidence import Band
+from bampipe.discover.recording import Motion, Sensors, observe
+from bampipe.discover.replay import replay
+from bampipe.estimate.butterworth import zero_phase
+from bampipe.physics import registry
+
+RATE = 250.0
+TRUTH = {
+    "viscous.yaw": 4.2,
+    "coulomb.yaw": 1.1,
+    "viscous.pitch": 3.7,
+    "coulomb.pitch": 2.2,
+    "viscous.extension": 13.4,
+    "coulomb.extension": 3.6,
+    "mass": 3.56,
+}
+SENSORS = Sensors(
+    RATE, np.array([1 / 21333.3333, 1 / 10191.0828, 1 / 33333.3333]), np.full(3, 0.05)
+)
+
+
+def bam(effects: Sequence[str] = (), extra: Sequence[Mapping[str, Any]] = ()) -> Recipe:
+    """The BAM with ``effects``."""
+    return Recipe(registry.device("bam").declaration, tuple(effects), tuple(extra))
+
+
+def made(
+    recipe: Recipe, values: Mapping[str, float], trials: int = 4, seconds: float = 8.0
+) -> Session:
+    """Replay designed motions with the model of ``recipe`` at TRUTH and ``values``."""
+    system = system_of(recipe)
+    known = TRUTH | dict(values)
+    p = np.array([known[q.name] for q in system.parameters])
+    rng = np.random.default_rng(7)
+    t = np.arange(int(seconds * RATE)) / RATE
+    motions = []
+    for trial in range(trials):
+        q = np.zeros((len(t), 3))
+        middle, size = np.array([0.0, 0.05, 1.1]), np.array([0.6, 0.35, 0.25])
+        for axis in range(3):
+            for frequency in (0.15, 0.35, 0.7, 1.3):
+                phase = rng.uniform(0.0, 2.0 * np.pi)
+                q[:, axis] += np.sin(2.0 * np.pi * frequency * t + phase) / (1.0 + 4.0 * frequency)
+        q = middle + size * q / np.abs(q).max(axis=0)
+        qd = np.gradient(q, t, axis=0)
+        qdd = np.gradient(qd, t, axis=0)
+        channels = {name: np.zeros(len(t)) for name in system.inputs} | {"t": t}
+        for axis in system.coordinates:
+            channels[f"brake_{axis}"] = np.zeros(len(t))
+        u = np.column_stack([channels[name] for name in system.inputs])
+        z = system.memory(q, qd, qdd, u, p, t)
+        need = system.required(q, qd, qdd, z, u, p)
+        # A hand has no step in its force where friction changes sign: the arm lags instead.
+        need = np.column_stack([zero_phase(column, RATE, 8.0)[0] for column in need.T])
+        lever = np.column_stack([q[:, 2] * np.cos(q[:, 1]), q[:, 2], np.ones(len(t))])
+        for k, name in enumerate(("force_x", "force_y", "force_z")):
+            channels[name] = need[:, k] / lever[:, k]
+            head, _, component = name.rpartition("_")
+            channels[f"{head}_rate_{component}"] = np.gradient(channels[name], t)
+            channels[f"{head}_curvature_{component}"] = np.zeros(len(t))
+        wanted = Motion(f"t{trial + 1:02d}", t, q, qd, qdd, channels)
+        recording = replay(system, p, wanted, SENSORS, np.random.default_rng([11, trial]))
+        motions.append(observe(recording, SENSORS, system))
+    return Session(tuple(motions), SENSORS, Band(RATE))

@@ -1,0 +1,88 @@
+"""The diagnosis on short sessions with known truth: named, unknown, and nothing missing."""
+
+import numpy as np
+import pytest
+
+from bampipe.discover.chance import Session, system_of
+from bampipe.discover.diagnosis import Settings, diagnose
+from bampipe.discover.shape import describe
+from tests.discover.sessions import bam, made
+
+QUICK = Settings(replicates=5, final_replicates=4, jobs=2)
+
+SNAG = {
+    "name": "snag",
+    "summary": "A cable snags near one yaw position",
+    "scope": "axis",
+    "kind": "torque",
+    "torque": "-height*exp(-((q - place)/width)**2)",
+    "looks_like": "a bump at one position",
+    "source": "made up for a test",
+    "parameters": {
+        "height": {"unit": "N.m", "prior": 0.0, "sd": 1.0, "strength": True},
+        "place": {"unit": "rad", "prior": 0.0, "sd": 0.3, "lower": -0.6, "upper": 0.6},
+        "width": {"unit": "rad", "prior": 0.05, "sd": 0.05, "lower": 0.02, "upper": 0.2},
+    },
+}
+SNAGGED = {"snag.yaw.height": 1.6, "snag.yaw.place": 0.22, "snag.yaw.width": 0.07}
+
+
+def verdicts(found):
+    return [axis.verdict for axis in found.axes]
+
+
+def run(session, recipe=None):
+    recipe = recipe or bam()
+    return diagnose(session, recipe, system_of(recipe).prior, QUICK)
+
+
+def test_nothing_missing_is_said():
+    found = run(made(bam(), {}))
+    assert verdicts(found) == ["nothing_missing"] * 3
+    assert found.selected == ()
+    assert all(axis.rmse_after < 1.3 * axis.noise_floor for axis in found.axes)
+
+
+def test_a_stribeck_effect_is_named_and_adding_it_reaches_the_floor():
+    recipe = bam(["stribeck:yaw"])
+    found = run(made(recipe, {"stribeck.yaw.force": 0.8, "stribeck.yaw.speed": 0.05}))
+    assert found.selected == ("stribeck:yaw",)
+    assert verdicts(found) == ["missing", "nothing_missing", "nothing_missing"]
+    assert found.ranking[0].effect == "stribeck:yaw"
+    assert found.ranking[0].p_value < 0.01
+    yaw = found.axes[0]
+    assert yaw.rmse_after < 1.15 * yaw.noise_floor + 2 * yaw.floor_sd
+    assert yaw.rmse_before > 1.5 * yaw.rmse_after
+    assert yaw.explainable_share > 0.2
+
+
+def test_an_effect_outside_the_library_is_unknown_until_its_file_is_given():
+    session = made(bam(["snag:yaw"], [SNAG]), SNAGGED)
+    found = run(session)
+    assert verdicts(found)[0] == "unknown_effect"
+    assert found.selected == ()
+    words = describe(found.evidence, 0)
+    assert "position" in words and "bump" in words
+    with_file = run(session, bam([], [SNAG]))
+    assert with_file.selected == ("snag:yaw",)
+    values = with_file.ranking[0].values
+    assert values["snag.yaw.place"] == pytest.approx(0.22, abs=0.02)
+    assert with_file.axes[0].rmse_after < 1.2 * with_file.axes[0].noise_floor
+
+
+def test_one_trial_cannot_be_diagnosed():
+    session = made(bam(), {}, trials=1)
+    with pytest.raises(ValueError, match="two trials"):
+        diagnose(Session(session.motions, session.sensors, session.band), bam(), np.zeros(7))
+
+
+def test_the_same_session_gives_the_same_numbers_with_one_process_or_two():
+    session = made(bam(), {}, trials=2, seconds=5.0)
+    one = diagnose(
+        session, bam(), system_of(bam()).prior, Settings(replicates=4, final_replicates=2, jobs=1)
+    )
+    two = diagnose(
+        session, bam(), system_of(bam()).prior, Settings(replicates=4, final_replicates=2, jobs=2)
+    )
+    assert [r.p_value for r in one.ranking] == [r.p_value for r in two.ranking]
+    assert [a.noise_floor for a in one.axes] == [a.noise_floor for a in two.axes]
