@@ -1,0 +1,89 @@
+"""The measured positioning axis against what its makers published (see its SOURCE.md).
+
+Published, all samples, friction alike in both directions: M 95.1089 kg, Fv 203.5034 N.s/m,
+Fc 20.3935 N, offset -3.1648 N, relative error 4.0834 %; friction by direction: 3.1117 %.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+from measured import ROOT, bampipe, estimates, result
+
+SESSION = ROOT / "sample_runs" / "positioning_axis"
+PUBLISHED = {
+    "mass": 95.1089,
+    "viscous.carriage": 203.5034,
+    "coulomb.carriage": 20.3935,
+    "offset": -3.1648,
+}
+BY_DIRECTION = "base+asymmetric_coulomb.carriage"
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> Path:
+    """The run of the whole record as one trial, with the published filters."""
+    folder = tmp_path_factory.mktemp("whole")
+    shutil.copytree(SESSION, folder / "session")
+    text = (SESSION / "session.toml").read_text()
+    head = text[: text.index("[[trials]]")]
+    trial = '[[trials]]\nfile = "trials/record.mat"\nkind = "free"\n'
+    (folder / "session" / "session.toml").write_text(head + trial)
+    runs = ("--runs", folder / "runs")
+    bampipe("run", folder / "session", "--pipeline", SESSION / "published.toml", *runs)
+    run = folder / "runs" / "positioning_axis"
+    bampipe("extend", run, "asymmetric_coulomb:carriage")
+    return run
+
+
+@pytest.fixture(scope="module")
+def stretches(tmp_path_factory) -> Path:
+    """The run of the session as it ships, defaults throughout."""
+    runs = tmp_path_factory.mktemp("stretches")
+    bampipe("run", SESSION, "--runs", runs, "--until", "validate")
+    return runs / "positioning_axis"
+
+
+def test_least_squares_gives_the_published_parameters(whole):
+    assert estimates(whole) == pytest.approx(PUBLISHED, rel=0.01)
+
+
+def test_least_squares_gives_the_published_relative_error(whole):
+    axis = result(whole, "models/base/validate.json")["axes"]["carriage"]
+    assert axis["relative_error_percent"] == pytest.approx(4.0834, abs=0.1)
+
+
+def test_friction_by_direction_gives_the_published_relative_error(whole):
+    axis = result(whole, f"models/{BY_DIRECTION}/validate.json")["axes"]["carriage"]
+    assert axis["relative_error_percent"] == pytest.approx(3.1117, abs=0.01)
+    found = estimates(whole, BY_DIRECTION)
+    half = found["asymmetric_coulomb.carriage.viscous_difference"]
+    assert found["viscous.carriage"] + half == pytest.approx(166.7061, rel=0.01)
+    assert found["viscous.carriage"] - half == pytest.approx(240.4236, rel=0.01)
+
+
+def test_the_filter_agrees_within_its_uncertainty(stretches):
+    parameters = result(stretches, "models/base/identify.json")["parameters"]
+    for name, published in PUBLISHED.items():
+        entry = parameters[name]
+        assert abs(entry["estimate"] - published) < 2.0 * entry["sd"], name
+
+
+def test_the_diagnosis_finds_friction_by_direction_unaided(stretches):
+    bampipe("diagnose", stretches, "--set", "replicates=4", "--set", "jobs=2")
+    found = result(stretches, "models/base/diagnose.json")
+    best = found["ranking"][0]
+    assert best["effect"] == "asymmetric_coulomb:carriage"
+    assert found["axes"]["carriage"]["verdict"] == "missing"
+    assert best["held_out_rmse_after"] < 0.6 * best["held_out_rmse_before"]
+    half = best["parameters"]["asymmetric_coulomb.carriage.viscous_difference"]
+    assert half == pytest.approx((166.7061 - 240.4236) / 2.0, rel=0.05)
+
+
+def test_every_stretch_is_held_out_once(stretches):
+    trials = result(stretches, "models/base/validate.json")["trials"]
+    assert len(trials) == len(re.findall(r"\[\[trials\]\]", (SESSION / "session.toml").read_text()))
+    assert all(trial["held_out"] for trial in trials.values())

@@ -1,0 +1,109 @@
+"""A servo with a motor model, from its raw JSON logs; one position gain is held out throughout."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from measured import REAL, bampipe, estimates, need, result
+
+from bampipe.data.store import read_parquet
+from bampipe.estimate.least_squares import Band, fit
+from bampipe.physics import Model, compile_model, registry
+from bampipe.stages.base import RunFolder
+from bampipe.stages.motions import free_trials, problem_of, read_motion
+
+HELD_OUT_GAIN = 200
+HEAD = """
+schema = "bampipe.session/1"
+session_id = "{name}"
+device = "servo_pendulum"
+sample_rate_hz = 188.0
+[time]
+column = "timestamp"
+unit = "s"
+[encoders]
+joint = {{ column = "position", unit = "rad", resolution = 1.5339807878853584e-3 }}
+[channels]
+duty = {{ column = "load", unit = "", scale = {duty!r}, wrap_bits = 16, signed = true }}
+supply = {{ column = "input_volts", unit = "V" }}
+"""
+BAND = Band(188.0, 8.0)
+
+
+def write_session(folder: Path, logs: list[Path], name: str) -> Path:
+    folder.mkdir()
+    text = HEAD.format(name=name, duty=1.0 / 885.0)
+    for log in logs:
+        shutil.copy(log, folder / log.name)
+        text += f'[[trials]]\nfile = "{log.name}"\nkind = "free"\n'
+    (folder / "session.toml").write_text(text)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory) -> tuple[Path, Path]:
+    """Runs of the logs to learn from, and of those at the gain held out.
+
+    Logs in which the motor is let go are left out: a motor without current is another device.
+    """
+    folder = need(REAL / "servo_pendulum" / "raw")
+    root = tmp_path_factory.mktemp("servo")
+    logs: dict[bool, list[Path]] = {False: [], True: []}
+    for log in sorted(folder.glob("*.json")):
+        content = json.loads(log.read_text())
+        if all(entry["torque_enable"] for entry in content["entries"]):
+            logs[content["kp"] == HELD_OUT_GAIN].append(log)
+    for name, held in (("learnt", False), ("held", True)):
+        session = write_session(root / f"session_{name}", logs[held], name)
+        bampipe("run", session, "--runs", root, "--until", "filter")
+    bampipe("identify", root / "learnt", "--method", "least-squares")
+    return root / "learnt", root / "held"
+
+
+def test_logs_come_in_with_their_signed_register(runs):
+    learnt, _ = runs
+    trials = read_parquet(learnt / "ingest/trials.parquet")
+    assert len(trials) == 9 and (trials.status == "ok").all()
+    samples = read_parquet(learnt / "ingest/samples.parquet")
+    assert samples.duty.min() == pytest.approx(-1.0) and samples.duty.max() == pytest.approx(1.0)
+    assert samples.supply.between(4.0, 10.0).all()
+
+
+def test_the_motor_model_lifts_the_mass_that_was_weighed(runs):
+    found = estimates(runs[0])
+    # 0.49 kg weighed; the stall torque of the data sheet leaves room for a factor.
+    assert 0.7 < found["load_mass"] / 0.49 < 1.4
+    assert 0.0 <= found["armature"] < 0.02 and found["coulomb.joint"] > 0.0
+
+
+def test_the_diagnosis_ranks_load_dependent_friction_first(runs):
+    bampipe("diagnose", runs[0], "--set", "replicates=4", "--set", "jobs=2")
+    best = result(runs[0], "models/base/diagnose.json")["ranking"][0]
+    assert best["effect"] == "load_dependent_friction:joint" and best["p_value"] < 0.01
+    assert best["held_out_rmse_after"] < 0.75 * best["held_out_rmse_before"]
+
+
+def held_out_error(runs: tuple[Path, Path], *effects: str) -> float:
+    """Error at the held-out gain, N.m, of a model fitted to the other gains."""
+    system = compile_model(Model(registry.device("servo_pendulum"), effects))
+    problems = []
+    for folder in runs:
+        run = RunFolder(folder)
+        motions = [read_motion(run, trial, system) for trial in free_trials(run)]
+        problems.append(problem_of(system, motions, BAND))
+    found = fit(problems[0], np.append(system.prior, 0.0))
+    errors = []
+    for k, resting in enumerate(problems[1].resting):
+        moving = np.abs(BAND.thin(resting.astype(float))) < 0.02
+        errors.append(BAND.thin(problems[1].residual(k, found.p))[moving])
+    return float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))
+
+
+def test_load_dependent_friction_helps_at_a_gain_not_seen(runs):
+    plain = held_out_error(runs)
+    loaded = held_out_error(runs, "load_dependent_friction:joint")
+    assert loaded < 0.95 * plain
