@@ -69,7 +69,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     """Diagnose one model and write ``models/<model>/diagnose.json``.
 
     Raises:
-        InputError: fewer than two free trials, or a setting out of range.
+        InputError: fewer than two moving trials, or a setting out of range.
     """
     if config.replicates < 4:
         raise InputError("must be 4 or more", where="diagnose.replicates")
@@ -78,7 +78,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     sensors, motions = read_session(run, system, config.kinematics_cutoff_hz)
     if len(motions) < 2:
         raise InputError(
-            f"a diagnosis needs at least two free trials, found {len(motions)}",
+            f"a diagnosis needs at least two moving trials, found {len(motions)}",
             where=str(run.root),
             remedy="one trial is held out to judge the others; record more free trials",
         )

@@ -1,4 +1,4 @@
-"""Free trials of a run folder as the sensors gave them, for comparing and replaying models."""
+"""Moving trials of a run folder as the sensors gave them, for comparing and replaying models."""
 
 from __future__ import annotations
 
@@ -19,11 +19,14 @@ def recipe_of(run: RunFolder, name: str, model: Model) -> Recipe:
     own = [read_toml(run.path(path)) for path in run.glob(f"models/{name}/effects/*.toml")]
     return Recipe(model.device.declaration, tuple(e.name for e in model.effects), tuple(own))
 
+MOVING = ("free", "viscous")
+"""Kinds of trial in which the arm moves; only with commanded brakes do effects of brakes show."""
+
 
 def read_session(
     run: RunFolder, system: System, cutoff_hz: float = 25.0
 ) -> tuple[Sensors, list[Motion]]:
-    """Free trials of a run folder on uniform grids, filtered for the diagnosis, and the sensors.
+    """Moving trials of a run folder on uniform grids, filtered for the diagnosis, and the sensors.
 
     Raises:
         InputError: a file or channel that the model needs is missing.
@@ -32,7 +35,7 @@ def read_session(
     rate = float(about["sample_rate_hz"])
     device = system.model.device
     trials = read_parquet(run.require("ingest/trials.parquet", "ingest"))
-    sound = trials[(trials["kind"] == "free") & (trials["status"] != "set_aside")]
+    sound = trials[(trials["kind"].isin(MOVING)) & (trials["status"] != "set_aside")]
     samples = run.require("ingest/samples.parquet", "ingest")
     recordings = []
     for trial_id in sound["trial_id"].astype(str):
