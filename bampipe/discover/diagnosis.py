@@ -26,6 +26,7 @@ from bampipe.discover.chance import (
     ReplicateTask,
     ScoreTask,
     Session,
+    candidates_of,
     prepare,
     run_replicate,
     run_scores,
@@ -368,6 +369,7 @@ class _Search:
         bare_floor = np.array([r.error for r in chance.replicates]).mean(axis=0)
         shares = np.array([r.share for r in final])
         main = {n: int(np.argmax(chance.excess(first[n]))) if n in first else 0 for n in selected}
+        reach = {n: self._reach(chance, first, n) for n in selected}
         findings = []
         unknown = set()
         for axis in range(len(before)):
@@ -375,11 +377,7 @@ class _Search:
             luck = float(shares[:, axis].max())
             given = _beyond(explainable_share(self.initial, axis), luck)
             share = _beyond(explainable_share(evidence, axis), luck) if selected else given
-            here = tuple(
-                n
-                for n in selected
-                if main[n] == axis or n.endswith(f":{evidence.system.coordinates[axis]}")
-            )
+            here = tuple(n for n in selected if main[n] == axis or axis in reach[n])
             excess = before[axis] ** 2 - min(floor, bare_floor[axis]) ** 2
             left = max(after[axis] ** 2 - floor**2, 0.0)
             lacking = after[axis] > s.above_floor * floor + 3.0 * scatter and share > 0.05
@@ -406,6 +404,15 @@ class _Search:
         return Diagnosis(
             tuple(findings), tuple(ranking), tuple(kept), groups, evidence, self.initial
         )
+
+    def _reach(self, chance: _Chance, first: Mapping[str, Score], name: str) -> set[int]:
+        """Axes on which an effect acts and whose error it lowers."""
+        item = candidates_of(self.recipe, (name,))[0].system
+        acts = range(len(item.coordinates)) if item.moves_sensors else item.touched
+        if name not in first:
+            return set()
+        drop = chance.excess(first[name]) / Scorer(self.initial).independent
+        return {axis for axis in acts if drop[axis] > self.settings.worth}
 
     def _ranking(
         self,

@@ -19,6 +19,7 @@ def recipe_of(run: RunFolder, name: str, model: Model) -> Recipe:
     own = [read_toml(run.path(path)) for path in run.glob(f"models/{name}/effects/*.toml")]
     return Recipe(model.device.declaration, tuple(e.name for e in model.effects), tuple(own))
 
+
 MOVING = ("free", "viscous")
 """Kinds of trial in which the arm moves; only with commanded brakes do effects of brakes show."""
 
