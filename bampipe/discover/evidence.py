@@ -154,16 +154,11 @@ def fit(
     evidence = _linearise(system, motions, used, band, p, free)
     cost = np.inf
     for _ in range(iterations):
-        r, j, weight = _stack(evidence)
         new_cost = float(np.sum(np.log(evidence.rmse())))
         if new_cost > cost - 1e-9:
             break
         cost = new_cost
-        a = (j * weight[None, :, None]).reshape(-1, len(free))
-        b = (r * weight).reshape(-1)
-        scale = np.linalg.norm(a, axis=0)
-        scale[scale == 0.0] = 1.0
-        step = -np.linalg.lstsq(a / scale, b, rcond=1e-9)[0] / scale
+        step = _bounded_step(evidence, p[list(free)], lower, upper)
         accepted = evidence
         for share in (1.0, 0.5, 0.25, 0.1):
             trial = p.copy()
@@ -179,6 +174,30 @@ def fit(
         if all(system.linear[i] for i in free):
             cost = -np.inf
     return evidence
+
+
+def _bounded_step(evidence: Evidence, value: Array, lower: Array, upper: Array) -> Array:
+    """Least-squares step of the free parameters, (n_free,), that stays within their bounds.
+
+    A parameter that would leave its range is held at the bound and the others are solved again:
+    clipping the unbounded solution instead can make the fit worse than it was.
+    """
+    r, j, weight = _stack(evidence)
+    a = (j * weight[None, :, None]).reshape(-1, len(value))
+    b = (r * weight).reshape(-1)
+    scale = np.linalg.norm(a, axis=0)
+    scale[scale == 0.0] = 1.0
+    step, open_ = np.zeros(len(value)), np.ones(len(value), dtype=bool)
+    while open_.any():
+        rest = b + a[:, ~open_] @ step[~open_]
+        solved = np.linalg.lstsq((a / scale)[:, open_], rest, rcond=1e-9)[0]
+        step[open_] = -solved / scale[open_]
+        outside = open_ & ((value + step < lower) | (value + step > upper))
+        if not outside.any():
+            break
+        step[outside] = (np.clip(value + step, lower, upper) - value)[outside]
+        open_ &= ~outside
+    return step
 
 
 def _stack(evidence: Evidence) -> tuple[Array, Array, Array]:

@@ -106,4 +106,4 @@ def held_out_error(runs: tuple[Path, Path], *effects: str) -> float:
 def test_load_dependent_friction_helps_at_a_gain_not_seen(runs):
     plain = held_out_error(runs)
     loaded = held_out_error(runs, "load_dependent_friction:joint")
-    assert loaded < 0.95 * plain
+    assert loaded < 0.75 * plain
