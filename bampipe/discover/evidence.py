@@ -29,13 +29,17 @@ class Band:
 
     Attributes:
         rate_hz: sampling rate of what comes in.
-        cutoff_hz: half-power frequency of one of the two passes.
+        cutoff_hz: half-power frequency of one of the two passes; a fifth of the sampling
+            rate where that is lower.
         margin_s: left out at both ends of a trial, where filters have no past or future.
     """
 
     rate_hz: float
     cutoff_hz: float = 8.0
     margin_s: float = 0.2
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "cutoff_hz", min(self.cutoff_hz, 0.2 * self.rate_hz))
 
     @property
     def step(self) -> int:

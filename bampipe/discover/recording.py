@@ -23,13 +23,17 @@ class Sensors:
         rate_hz: sampling rate.
         resolution: of each encoder, (n_q,), rad or m.
         force_sd: noise of the force channels, (n_f,), N; zero where it is not known.
-        cutoff_hz: of the filter that velocities, accelerations and force rates go through.
+        cutoff_hz: of the filter that velocities, accelerations and force rates go through; a
+            fifth of the sampling rate where that is lower.
     """
 
     rate_hz: float
     resolution: Array
     force_sd: Array
     cutoff_hz: float = 25.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "cutoff_hz", min(self.cutoff_hz, 0.2 * self.rate_hz))
 
 
 @dataclass(frozen=True)

@@ -115,7 +115,8 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
             floor = _noise_floor(run, session, system, motions, band, p, config)
         except InputError as error:
             notes.append(f"No noise floor: simulating the fitted model failed ({error}).")
-    content = _content(system, compared, floor, notes, config)
+    used = replace(config, cutoff_hz=band.cutoff_hz)
+    content = _content(system, compared, floor, notes, used)
     write_json(out / f"models/{config.model}/validate.json", content)
     write_parquet(
         out / f"models/{config.model}/residuals.parquet", _table(system, compared, len(motions) > 1)

@@ -156,3 +156,10 @@ def test_too_short_a_record_is_refused() -> None:
     )
     with pytest.raises(ValueError, match="fewer samples"):
         fit(short, TRUTH)
+
+
+def test_the_low_pass_ends_at_a_fifth_of_a_low_sampling_rate():
+    assert Band(500.0).cutoff_hz == 8.0
+    slow = Band(20.0)
+    assert slow.cutoff_hz == 4.0 and slow.step == 1
+    assert np.isfinite(slow.thin(np.ones((100, 1)))).all()
