@@ -40,7 +40,7 @@ SINGLES = (
     "transmission_compliance:yaw", "transmission_compliance:pitch", "backlash:yaw",
     "force_bias:x", "force_bias:z", "force_gain:x", "force_gain:z", "force_crosstalk:xy",
     "force_crosstalk:zx", "force_delay", "force_drift:y", "force_application_point",
-    "encoder_scale:yaw", "encoder_scale:extension",
+    "encoder_scale:yaw", "encoder_scale:extension", "brake_lag", "brake_residual_torque:yaw",
 )  # fmt: skip
 PAIRS = (
     ("stribeck:yaw", "gravity_compensator_lag"),
@@ -92,7 +92,7 @@ def run_case(case: Case) -> Outcome:
         root = Path(folder)
         config = simulate.Config(
             effects=case.effects, strength=case.strength, seed=case.seed,
-            viscous_trials=0, locked_trials=False,
+            viscous_trials=3 * any(e.startswith("brake") for e in case.effects), locked_trials=False,
         )  # fmt: skip
         simulate.simulate_session(root / "session", config, silent)
         for part in ("ingest",):

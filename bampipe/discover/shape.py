@@ -111,17 +111,17 @@ def _since_reversal(motion: Motion, axis: int) -> tuple[Array, Array]:
     return motion.t - motion.t[last], np.abs(motion.q[:, axis] - motion.q[last, axis])
 
 
-def residual_map(evidence: Evidence, axis: int, variable: Variable) -> Map:
-    """Bin the residual of ``axis`` by ``variable`` into parts of equal count."""
+def residual_map(evidence: Evidence, axis: int, variable: Variable, bins: int = _BINS) -> Map:
+    """Bin the residual of ``axis`` by ``variable`` into ``bins`` parts of equal count."""
     use = np.concatenate([u[:, axis] for u in evidence.used]) > 0
     r = np.concatenate([x[:, axis] for x in evidence.residual])[use]
     v = np.concatenate(variable.values)[use]
     levels = np.unique(v)
-    if len(levels) <= _BINS:
+    if len(levels) <= bins:
         which = np.searchsorted(levels, v)
         count = len(levels)
     else:
-        edges = np.unique(np.quantile(v, np.linspace(0.0, 1.0, _BINS + 1)))
+        edges = np.unique(np.quantile(v, np.linspace(0.0, 1.0, bins + 1)))
         which = np.clip(np.searchsorted(edges, v, side="right") - 1, 0, len(edges) - 2)
         count = len(edges) - 1
     rows = [
@@ -196,16 +196,17 @@ def _doing(motion: Motion, rows: Sequence[int] | Array, axis: int, unit: str) ->
 def describe(evidence: Evidence, axis: int) -> str:
     """The residual's shape in one sentence: what it varies with most, and where it peaks."""
     skip = {"trial", "direction"}
-    maps = [residual_map(evidence, axis, v) for v in variables(evidence, axis)]
+    maps = [residual_map(evidence, axis, v, 3 * _BINS) for v in variables(evidence, axis)]
     maps = [m for m in maps if m.variable not in skip]
     best = max(maps, key=lambda m: m.share)
     unit = evidence.system.torque_units[axis]
     peak = int(np.argmax(np.abs(best.mean)))
     half = np.abs(best.mean) > 0.5 * np.abs(best.mean[peak])
     inside = best.center[half]
+    middle = float(np.average(inside, weights=np.abs(best.mean[half])))
     form = "a bump" if half.sum() <= len(best.center) / 3 else "a broad change"
     return (
-        f"{form} of {best.mean[peak]:+.2g} {unit} near {best.variable} {best.center[peak]:.3g} "
+        f"{form} of {best.mean[peak]:+.2g} {unit} near {best.variable} {middle:.3g} "
         f"{best.unit} (between {inside.min():.3g} and {inside.max():.3g} {best.unit}), "
         f"which carries {100 * best.share:.0f} % of the residual's variance"
     )
