@@ -92,7 +92,8 @@ def run_case(case: Case) -> Outcome:
         root = Path(folder)
         config = simulate.Config(
             effects=case.effects, strength=case.strength, seed=case.seed,
-            viscous_trials=3 * any(e.startswith("brake") for e in case.effects), locked_trials=False,
+            viscous_trials=3 * any(e.startswith("brake") for e in case.effects),
+            locked_trials=False,
         )  # fmt: skip
         simulate.simulate_session(root / "session", config, silent)
         for part in ("ingest",):

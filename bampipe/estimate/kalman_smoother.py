@@ -193,7 +193,7 @@ def _smooth(
 def _evidence(
     y: Array, seen: Flags, step: Array, noise: Array, x: Array, p: Array, skip: int
 ) -> tuple[float, float, int]:
-    """Return sums of log S and of v²/S over the innovations but the first ``skip``, and their count.
+    """Return sums of log S and v²/S over the innovations after ``skip``, and their count.
 
     Once the covariance has settled it is kept until a sample is missing.
     """
