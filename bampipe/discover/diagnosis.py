@@ -77,7 +77,7 @@ class Settings:
     worth_at_floor: float = 0.16
     at_floor: float = 1.12
     above_floor: float = 1.3
-    explained: float = 0.7
+    explained: float = 0.5
     jobs: int = 2
     seed: int = 0
 
