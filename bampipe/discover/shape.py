@@ -194,19 +194,51 @@ def _doing(motion: Motion, rows: Sequence[int] | Array, axis: int, unit: str) ->
 
 
 def describe(evidence: Evidence, axis: int) -> str:
-    """The residual's shape in one sentence: what it varies with most, and where it peaks."""
-    skip = {"trial", "direction"}
-    maps = [residual_map(evidence, axis, v, 3 * _BINS) for v in variables(evidence, axis)]
-    maps = [m for m in maps if m.variable not in skip]
+    """The residual's shape in one sentence: what it varies with most, where, which way."""
+    known = [v for v in variables(evidence, axis) if v.name not in ("trial", "direction")]
+    maps = [residual_map(evidence, axis, v, 3 * _BINS) for v in known]
     best = max(maps, key=lambda m: m.share)
-    unit = evidence.system.torque_units[axis]
-    peak = int(np.argmax(np.abs(best.mean)))
-    half = np.abs(best.mean) > 0.5 * np.abs(best.mean[peak])
-    inside = best.center[half]
-    middle = float(np.average(inside, weights=np.abs(best.mean[half])))
-    form = "a bump" if half.sum() <= len(best.center) / 3 else "a broad change"
+    unit = f"{evidence.system.torque_units[axis]} near {best.variable}"
+    strong = np.abs(best.mean) > 0.5 * np.max(np.abs(best.mean))
+    places = []
+    for side in (strong & (best.mean < 0.0), strong & (best.mean > 0.0)):
+        if side.any():
+            weight = np.abs(best.mean[side])
+            middle = float(np.average(best.center[side], weights=weight))
+            peak = best.mean[side][int(np.argmax(weight))]
+            places.append((middle, f"{peak:+.2g} {unit} {middle:.3g} {best.unit}".strip()))
+    places.sort()
+    narrow = strong.sum() <= len(strong) / 3
+    form = "a bump of" if narrow else "a broad change,"
+    if len(places) == 2:
+        form = "opposite bumps of" if narrow else "a change of sign,"
+    inside = best.center[strong]
+    variable = known[maps.index(best)]
     return (
-        f"{form} of {best.mean[peak]:+.2g} {unit} near {best.variable} {middle:.3g} "
-        f"{best.unit} (between {inside.min():.3g} and {inside.max():.3g} {best.unit}), "
-        f"which carries {100 * best.share:.0f} % of the residual's variance"
+        f"{form} {' and '.join(words for _, words in places)} (between {inside.min():.3g} and "
+        f"{inside.max():.3g} {best.unit}), {_by_direction(evidence, axis, variable)}; "
+        f"{best.variable} carries {100 * best.share:.0f} % of the residual's variance"
     )
+
+
+def _by_direction(evidence: Evidence, axis: int, variable: Variable) -> str:
+    """Whether the residual keeps its sign when the motion turns round, as friction does not."""
+    r = np.concatenate([x[:, axis] for x in evidence.residual])
+    v = np.concatenate(variable.values)
+    kept = [evidence.band.kept(len(m.t)) for m in evidence.motions]
+    rate = np.concatenate([m.qd[k, axis] for m, k in zip(evidence.motions, kept, strict=True)])
+    edges = np.unique(np.quantile(v, np.linspace(0.0, 1.0, 3 * _BINS + 1)))
+    which = np.clip(np.searchsorted(edges, v, side="right") - 1, 0, len(edges) - 2)
+    means = []
+    for b in range(len(edges) - 1):
+        up, down = r[(which == b) & (rate > 0.0)], r[(which == b) & (rate < 0.0)]
+        if len(up) >= 4 and len(down) >= 4:
+            means.append((up.mean(), down.mean()))
+    if len(means) < 4:
+        return "seen in one direction of motion only"
+    likeness = float(np.corrcoef(np.array(means).T)[0, 1])
+    if likeness > 0.6:
+        return "the same in both directions of motion, as of a spring"
+    if likeness < -0.6:
+        return "opposite in the two directions of motion, as of friction"
+    return "different in the two directions of motion"
