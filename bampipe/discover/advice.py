@@ -13,7 +13,7 @@ from bampipe.discover.chance import Recipe, Session
 from bampipe.discover.evidence import Evidence
 from bampipe.discover.recording import Motion
 from bampipe.physics import System
-from bampipe.physics.device import derivative
+from bampipe.physics.device import INPUT_ORDERS, derivative
 from bampipe.physics.registry import device_from, effect_from
 
 Array = NDArray[np.float64]
@@ -162,14 +162,15 @@ def _motion(session: Session, system: System, p: Array, axis: int, design: _Desi
         typical = np.median(np.concatenate([m.channels[name] for m in session.motions]))
         channels[name] = np.full(len(t), typical)
     for f in device.forces:
-        channels |= {derivative(f, k): np.zeros(len(t)) for k in (0, 1, 2)}
+        channels |= {derivative(f, k): np.zeros(len(t)) for k in range(len(INPUT_ORDERS))}
     u = np.column_stack([channels[name] for name in system.inputs])
     z = system.memory(q, qd, qdd, u, p, t)
     need = system.required(q, qd, qdd, z, u, p)
     gains = system.input_map(q, u, p)
     force = np.einsum("tfq,tq->tf", np.linalg.pinv(gains), need)
     for k, f in enumerate(device.forces):
-        first = np.gradient(force[:, k], t)
-        channels |= {f: force[:, k], derivative(f, 1): first}
-        channels[derivative(f, 2)] = np.gradient(first, t)
+        value = force[:, k]
+        for order in range(len(INPUT_ORDERS)):
+            channels[derivative(f, order)] = value
+            value = np.gradient(value, t)
     return Motion("design", t, q, qd, qdd, channels)

@@ -96,10 +96,13 @@ def observe(recording: Recording, sensors: Sensors, system: System) -> Motion:
     channels: dict[str, Array] = {"t": t, **recording.other}
     for name, column in zip(device.forces, recording.force.T, strict=True):
         _, first, second = zero_phase(column, rate, cutoff)
+        _, third, fourth = zero_phase(second, rate, cutoff)
         channels |= {
             name: column,
             derivative(name, 1): first,
             derivative(name, 2): second,
+            derivative(name, 3): third,
+            derivative(name, 4): fourth,
         }
     for i, axis in enumerate(system.coordinates):
         if axis in device.brakes:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.physics import Model, compile_model
-from bampipe.physics.device import Coordinate, Device, derivative
+from bampipe.physics.device import INPUT_ORDERS, Coordinate, Device, derivative
 from bampipe.physics.effect import Effect
 from bampipe.physics.parameter import Parameter
 from bampipe.physics.system import System
@@ -91,9 +91,10 @@ def _along(device: Device, bare: System, full: System, braked: bool) -> Signatur
     force = _smooth(np.einsum("tij,tj->ti", np.linalg.pinv(map_), needed - applied))
     for number, label in enumerate(device.forces):
         channels[label] = force[:, number]
-        rate = np.gradient(force[:, number], t)
-        channels[derivative(label, 1)] = rate
-        channels[derivative(label, 2)] = np.gradient(rate, t)
+        rate = force[:, number]
+        for order in range(1, len(INPUT_ORDERS)):
+            rate = np.gradient(rate, t)
+            channels[derivative(label, order)] = rate
     left = _residual(bare, q, qd, qdd, channels, t, p)
     values = np.array([_typical(item) for item in full.parameters])
     values[: len(p)] = p

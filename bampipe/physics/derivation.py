@@ -18,11 +18,13 @@ import sympy as sp
 
 from bampipe.errors import InputError
 from bampipe.physics import expression
-from bampipe.physics.device import derivative
+from bampipe.physics.device import INPUT_ORDERS, derivative
 from bampipe.physics.effect import BoundEffect
 from bampipe.physics.model import Model
 
 Symbols = dict[str, Any]
+
+LAST_ORDER = len(INPUT_ORDERS) - 1
 
 
 @dataclass(frozen=True)
@@ -88,7 +90,7 @@ class _Derivation:
             [sp.Symbol(f"{kind}{i}", real=True) for i in range(len(self.axes))]
             for kind in ("q", "qd", "qdd")
         )
-        self.channels = [derivative(f, k) for k in (0, 1, 2) for f in device.forces]
+        self.channels = [derivative(f, k) for k in range(len(INPUT_ORDERS)) for f in device.forces]
         self.channels += [*device.brakes.values(), *device.channels, "t"]
         self.channel = {name: sp.Symbol(f"u{i}", real=True) for i, name in enumerate(self.channels)}
         self.p = {p.name: sp.Symbol(f"p{i}", real=True) for i, p in enumerate(model.parameters)}
@@ -138,10 +140,10 @@ class _Derivation:
         """
         last = [
             *self.qdd,
-            *(self.channel[derivative(f, 2)] for f in self.model.device.forces),
+            *(self.channel[derivative(f, LAST_ORDER)] for f in self.model.device.forces),
         ]
         if expr.has(*last):
-            raise InputError("ddt() of an acceleration, or of a force's curvature")
+            raise InputError("ddt() of an acceleration, or of a force's last derivative")
         brakes = [self.channel[b] for b in self.model.device.brakes.values()]
         if expr.has(*self.z.values(), *brakes):
             raise InputError("ddt() of an internal state or of a brake command")
@@ -152,7 +154,7 @@ class _Derivation:
         ):
             total += sp.diff(expr, a) * b
         for force in self.model.device.forces:
-            for k in (0, 1):
+            for k in range(LAST_ORDER):
                 low, high = (
                     self.channel[derivative(force, k)],
                     self.channel[derivative(force, k + 1)],

@@ -119,9 +119,13 @@ class Device:
         return tuple(name.removeprefix("force_") for name in self.forces)
 
 
+INPUT_ORDERS = ("", "rate", "curvature", "third", "fourth")
+"""Time derivatives of a measured input that effects may use, by order."""
+
+
 def derivative(force: str, order: int) -> str:
     """Name of the time derivative of an input: ``force_x`` -> ``force_rate_x``, ``duty_rate``."""
-    kind = ("", "rate", "curvature")[order]
+    kind = INPUT_ORDERS[order]
     if not kind:
         return force
     if force.startswith("force_"):
@@ -293,7 +297,7 @@ def _known(entry: Mapping[str, Any], keys: tuple[str, ...], where: str) -> None:
 def _check_names(device: Device, where: str) -> None:
     """Raise InputError where a name cannot stand in an expression or means two things."""
     axes = [c.name for c in device.coordinates]
-    rates = [derivative(f, k) for f in device.forces for k in (1, 2)]
+    rates = [derivative(f, k) for f in device.forces for k in range(1, len(INPUT_ORDERS))]
     taken = dict.fromkeys(["t", *(f"qd_{a}" for a in axes), *rates], "a built-in symbol")
     for label, names in (
         ("coordinates", axes),

@@ -9,7 +9,7 @@ from typing import Any
 
 from bampipe.errors import InputError
 from bampipe.physics import expression
-from bampipe.physics.device import Device, derivative
+from bampipe.physics.device import INPUT_ORDERS, Device, derivative
 from bampipe.physics.parameter import Parameter, parameter_from
 
 # What an effect of each kind must give, where it may apply.
@@ -96,7 +96,7 @@ class Effect:
         known = set(device.definitions) | set(device.constants) | {"t"}
         known |= {c.name for c in device.coordinates} | {p.name for p in device.parameters}
         for force in device.forces:
-            known |= {force, derivative(force, 1), derivative(force, 2)}
+            known |= {derivative(force, k) for k in range(len(INPUT_ORDERS))}
         known |= set(device.channels)
         known |= set(device.brakes.values()) | set(self.parameters) | {s.name for s in self.states}
         for c in device.coordinates:

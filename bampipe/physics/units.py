@@ -18,7 +18,7 @@ from fractions import Fraction
 
 from bampipe.errors import InputError
 from bampipe.physics import expression
-from bampipe.physics.device import Device, derivative
+from bampipe.physics.device import INPUT_ORDERS, Device, derivative
 from bampipe.physics.effect import BoundEffect, Effect, bind
 
 BASE = ("kg", "m", "s", "A", "K")
@@ -246,7 +246,7 @@ def _device_symbols(device: Device, check: _Check) -> dict[str, Found]:
             symbols[device.brakes[axis]] = torque
     force = check.unit(device.force_unit, "inputs.force_unit")
     for channel in device.forces:
-        for order in (0, 1, 2):
+        for order in range(len(INPUT_ORDERS)):
             known = None if force is None else force / second**order
             symbols[derivative(channel, order)] = known
     for name, unit_text in device.channels.items():

@@ -291,6 +291,9 @@ def _forces(
         yield derivative(name, 1), slope
     for name, (_, _, curvature) in slopes.items():
         yield derivative(name, 2), curvature
+        _, third, fourth = butterworth.zero_phase(curvature, rate, cutoff)
+        yield derivative(name, 3), third
+        yield derivative(name, 4), fourth
 
 
 def _report(

@@ -22,7 +22,7 @@ from bampipe.data import store
 from bampipe.errors import InputError
 from bampipe.estimate.simulation import Impedance, simulate_tracking
 from bampipe.physics import Model, registry
-from bampipe.physics.device import Coordinate, Device, derivative
+from bampipe.physics.device import INPUT_ORDERS, Coordinate, Device, derivative
 from bampipe.physics.effect import BoundEffect, Effect
 from bampipe.physics.system import System, compile_model
 from bampipe.stages.base import Progress, silent
@@ -55,6 +55,7 @@ LOCKED_LOAD = {"rotary": 50.0, "linear": 120.0}
 
 LOCKED_BRAKE = 200.0
 LOCKED_PERIOD, LOCKED_CYCLES = 4.0, 6
+_TOO_HIGH = range(3, len(INPUT_ORDERS))
 BAND = (0.1, 2.0)
 """Frequencies of the motion that the hand wants, Hz (Section II-E)."""
 
@@ -504,6 +505,8 @@ def _sensed_force(plant: Plant, true: Recording) -> Array:
 
     zero = _inputs(system, true, np.zeros_like(late))
     constant = corrected(zero)
+    if any(_column(system, derivative(f, k)) >= 0 for f in names for k in _TOO_HIGH):
+        raise InputError("an input effect with a third derivative cannot be simulated")
     response = np.zeros((3, len(late), nf, nf))
     for order in range(3):
         for j, f in enumerate(names):

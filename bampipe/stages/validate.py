@@ -264,7 +264,8 @@ def _filtered(
     for column, name in enumerate(system.model.device.forces):
         _, first, second = butterworth.zero_phase(recording.force[:, column], rate, cutoff)
         u[:, at[name]], u_rate[:, at[name]] = recording.force[:, column], first
-        for order, values in ((1, first), (2, second)):
+        _, third, fourth = butterworth.zero_phase(second, rate, cutoff)
+        for order, values in enumerate((first, second, third, fourth), start=1):
             if derivative(name, order) in at:
                 u[:, at[derivative(name, order)]] = values
     return replace(

@@ -67,7 +67,8 @@ def made(
             channels[name] = need[:, k] / lever[:, k]
             head, _, component = name.rpartition("_")
             channels[f"{head}_rate_{component}"] = np.gradient(channels[name], t)
-            channels[f"{head}_curvature_{component}"] = np.zeros(len(t))
+            for order in ("curvature", "third", "fourth"):
+                channels[f"{head}_{order}_{component}"] = np.zeros(len(t))
         wanted = Motion(f"t{trial + 1:02d}", t, q, qd, qdd, channels)
         recording = replay(system, p, wanted, SENSORS, np.random.default_rng([11, trial]))
         motions.append(observe(recording, SENSORS, system))

@@ -80,6 +80,9 @@ def inputs_of(system, force, force_rate, force_curvature, brake, t):
         columns[f"force_{c}"] = force[:, j]
         columns[f"force_rate_{c}"] = force_rate[:, j]
         columns[f"force_curvature_{c}"] = force_curvature[:, j]
+        # 250 Hz, the rate of `smooth_motion`.
+        columns[f"force_third_{c}"] = 250.0 * np.gradient(force_curvature[:, j])
+        columns[f"force_fourth_{c}"] = 250.0 * np.gradient(columns[f"force_third_{c}"])
     columns |= {f"brake_{a}": brake[:, i] for i, a in enumerate(AXES)}
     return np.column_stack([columns[name] for name in system.inputs])
 
@@ -205,7 +208,7 @@ def symbols_of(case):
     known = {c.name: dimension(c.unit) for c in BAM.coordinates}
     known |= {name: dimension(c.unit) for name, c in BAM.constants.items()}
     known |= {"rho": dimension("m"), "mass": dimension("kg"), "t": dimension("s")}
-    for k, order in enumerate(("", "rate_", "curvature_")):
+    for k, order in enumerate(("", "rate_", "curvature_", "third_", "fourth_")):
         slope = tuple(np.subtract(newton, (0, 0, k)))
         known |= {f"force_{order}{c}": slope for c in "xyz"}
         if bound.effect.scope in ("force_component", "force_pair"):

@@ -149,7 +149,10 @@ def fit(out, effects, start):
         columns = {"t": t} | {f"brake_{a}": 0 * t for a in AXES}
         for j, c in enumerate("xyz"):
             columns[f"force_{c}"], columns[f"force_rate_{c}"] = force[:, j], rate[:, j]
-            columns[f"force_curvature_{c}"] = np.gradient(rate[:, j], t)
+            slope = rate[:, j]
+            for order in ("curvature", "third", "fourth"):
+                slope = np.gradient(slope, t)
+                columns[f"force_{order}_{c}"] = slope
         u = np.column_stack([columns[name] for name in system.inputs])
         trials.append((q, qd, np.gradient(qd, t, axis=0), u, t))
 
