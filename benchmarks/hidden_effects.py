@@ -21,7 +21,7 @@ import numpy as np
 
 from bampipe.discover.chance import Recipe, Session
 from bampipe.discover.diagnosis import Settings, diagnose
-from bampipe.discover.evidence import Band
+from bampipe.estimate.low_pass import Band
 from bampipe.physics import Model, compile_model, registry
 from bampipe.stages import ingest, simulate
 from bampipe.stages.base import RunFolder, silent

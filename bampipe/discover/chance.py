@@ -17,10 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.discover.candidates import Candidate, Score, Scorer, candidate
-from bampipe.discover.evidence import Band, Evidence, fit
+from bampipe.discover.evidence import Evidence, fit
 from bampipe.discover.recording import Motion, Sensors, observe
 from bampipe.discover.replay import replay
 from bampipe.discover.shape import explainable_share
+from bampipe.estimate.low_pass import Band
 from bampipe.physics import Model, System, compile_model
 from bampipe.physics.registry import device_from, effect_from
 
@@ -101,6 +102,11 @@ def system_of(recipe: Recipe) -> System:
     if model.key not in _systems:
         _systems[model.key] = compile_model(model)
     return _systems[model.key]
+
+
+def fit_session(session: Session, recipe: Recipe, start: Array) -> Evidence:
+    """Least squares of the model of ``recipe`` on the measured trials; see `fit`."""
+    return fit(system_of(recipe), session.motions, session.sensors, session.band, start)
 
 
 def candidates_of(recipe: Recipe, names: Sequence[str]) -> list[Candidate]:

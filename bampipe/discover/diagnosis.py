@@ -27,13 +27,13 @@ from bampipe.discover.chance import (
     ScoreTask,
     Session,
     candidates_of,
+    fit_session,
     prepare,
     run_replicate,
     run_scores,
-    system_of,
     workers,
 )
-from bampipe.discover.evidence import Evidence, fit
+from bampipe.discover.evidence import Evidence
 from bampipe.discover.shape import explainable_share
 from bampipe.discover.start import with_effect
 from bampipe.physics.parameter import Parameter
@@ -215,15 +215,11 @@ class _Search:
     ) -> None:
         self.session, self.recipe, self.settings = session, recipe, settings
         self.pool, self.progress = pool, progress
-        self.initial = self._fit(recipe, start)
+        self.initial = fit_session(self.session, recipe, start)
         model = recipe.model()
         extra = [effect_from(e) for e in recipe.extra]
         self.names = library(model.device, recipe.effects, extra)
         self.groups: dict[str, tuple[str, ...]] = {}
-
-    def _fit(self, recipe: Recipe, start: Array) -> Evidence:
-        s = self.session
-        return fit(system_of(recipe), s.motions, s.sensors, s.band, start)
 
     def run(self) -> Diagnosis:
         s = self.settings
@@ -254,7 +250,9 @@ class _Search:
             selected.append(best)
             self.progress(0.45 + 0.1 * len(selected), f"added {best}, looking for more")
             recipe = replace(self.recipe, effects=(*self.recipe.effects, *selected))
-            evidence = self._fit(recipe, with_effect(recipe, evidence, scores[best]))
+            evidence = fit_session(
+                self.session, recipe, with_effect(recipe, evidence, scores[best])
+            )
             replayed = self._replicas(recipe, evidence.p, s.rival_replicates, (), (3,))
             rest = [n for n in self.names if n not in selected]
             scores = self._scores(recipe, evidence.p, rest)
@@ -334,7 +332,7 @@ class _Search:
         for k, name in enumerate(rivals):
             self.progress(0.5, f"replaying {name} to tell it from {len(rivals) - 1} rival(s)")
             wider = replace(recipe, effects=(*recipe.effects, name))
-            fitted = self._fit(wider, with_effect(wider, evidence, scores[name]))
+            fitted = fit_session(self.session, wider, with_effect(wider, evidence, scores[name]))
             replicas = self._replicas(
                 wider,
                 fitted.p,

@@ -14,46 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.discover.recording import Motion, Sensors
-from bampipe.estimate.low_pass import low_pass_at
+from bampipe.estimate.low_pass import Band
 from bampipe.physics import System
 
 Array = NDArray[np.float64]
 
 REST_S = 0.03
 REST_SPEED = 5.0
-
-
-@dataclass(frozen=True)
-class Band:
-    """The low-pass that residuals go through.
-
-    Attributes:
-        rate_hz: sampling rate of what comes in.
-        cutoff_hz: half-power frequency of one of the two passes; a fifth of the sampling
-            rate where that is lower.
-        margin_s: left out at both ends of a trial, where filters have no past or future.
-    """
-
-    rate_hz: float
-    cutoff_hz: float = 8.0
-    margin_s: float = 0.2
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "cutoff_hz", min(self.cutoff_hz, 0.2 * self.rate_hz))
-
-    @property
-    def step(self) -> int:
-        """Samples from one kept value to the next: five values a cut-off period."""
-        return max(1, int(self.rate_hz / (5.0 * self.cutoff_hz)))
-
-    def kept(self, count: int) -> NDArray[np.int64]:
-        """Indices of the samples that `thin` keeps of ``count``."""
-        margin = int(self.margin_s * self.rate_hz)
-        return np.arange(margin, count - margin, self.step, dtype=np.int64)
-
-    def thin(self, values: Array) -> Array:
-        """Low-pass (T, k) without phase and keep every `step`-th row, margins left out."""
-        return low_pass_at(values, self.cutoff_hz, self.rate_hz, self.kept(len(values)))
 
 
 def moving(motion: Motion, sensors: Sensors, band: Band) -> Array:

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.discover.candidates import Score, Scorer, candidate
-from bampipe.discover.chance import Recipe, Session, system_of
-from bampipe.discover.evidence import Evidence, fit
+from bampipe.discover.chance import Recipe, Session, fit_session, system_of
+from bampipe.discover.evidence import Evidence
 from bampipe.physics.registry import device_from, effect_from
 
 Array = NDArray[np.float64]
@@ -45,7 +45,7 @@ def search_start(session: Session, recipe: Recipe) -> Array:
     over its range, where a descent from the prior would stay in the nearest valley.
     """
     bare = replace(recipe, effects=())
-    evidence = _fit(session, bare, system_of(bare).prior)
+    evidence = fit_session(session, bare, system_of(bare).prior)
     device = device_from(recipe.device)
     extra = [effect_from(e) for e in recipe.extra]
     for count, name in enumerate(recipe.effects, start=1):
@@ -57,9 +57,5 @@ def search_start(session: Session, recipe: Recipe) -> Array:
             start = prior
         else:
             start = with_effect(wider, evidence, score)
-        evidence = _fit(session, wider, start)
+        evidence = fit_session(session, wider, start)
     return evidence.p
-
-
-def _fit(session: Session, recipe: Recipe, start: Array) -> Evidence:
-    return fit(system_of(recipe), session.motions, session.sensors, session.band, start)

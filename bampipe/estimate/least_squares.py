@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bampipe.estimate.low_pass import low_pass_at
+from bampipe.estimate.low_pass import Band
 
 Array = NDArray[np.float64]
 Residual = Callable[[int, Array], Array]
@@ -24,39 +24,6 @@ Residual = Callable[[int, Array], Array]
 
 _REACH = 0.02
 """Share that a rest may have in a low-passed sample before the sample is left out."""
-
-
-@dataclass(frozen=True)
-class Band:
-    """The low-pass that residuals go through.
-
-    Attributes:
-        rate_hz: sampling rate of what comes in.
-        cutoff_hz: half-power frequency of each of the two passes; a fifth of the sampling
-            rate where that is lower.
-        margin_s: left out at both ends of a trial, where the filter has no past or future.
-    """
-
-    rate_hz: float
-    cutoff_hz: float = 8.0
-    margin_s: float = 0.2
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "cutoff_hz", min(self.cutoff_hz, 0.2 * self.rate_hz))
-
-    @property
-    def step(self) -> int:
-        """Samples from one kept value to the next: five a period of the cut-off frequency."""
-        return max(1, int(self.rate_hz / (5.0 * self.cutoff_hz)))
-
-    def kept(self, count: int) -> NDArray[np.int64]:
-        """Indices of the samples kept of ``count``."""
-        margin = int(self.margin_s * self.rate_hz)
-        return np.arange(margin, count - margin, self.step, dtype=np.int64)
-
-    def thin(self, values: Array) -> Array:
-        """Low-pass (T, k) without phase and keep the rows `kept`."""
-        return low_pass_at(values, self.cutoff_hz, self.rate_hz, self.kept(len(values)))
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
@@ -68,3 +69,36 @@ def low_pass_at(values: Array, cutoff_hz: float, rate_hz: float, kept: NDArray[n
     """
     section, start = _design(cutoff_hz, rate_hz)
     return _run(np.ascontiguousarray(values), section, start, kept)
+
+
+@dataclass(frozen=True)
+class Band:
+    """The low-pass that residuals go through.
+
+    Attributes:
+        rate_hz: sampling rate of what comes in.
+        cutoff_hz: half-power frequency of each of the two passes; a fifth of the sampling
+            rate where that is lower.
+        margin_s: left out at both ends of a trial, where the filter has no past or future.
+    """
+
+    rate_hz: float
+    cutoff_hz: float = 8.0
+    margin_s: float = 0.2
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "cutoff_hz", min(self.cutoff_hz, 0.2 * self.rate_hz))
+
+    @property
+    def step(self) -> int:
+        """Samples from one kept value to the next: five a period of the cut-off frequency."""
+        return max(1, int(self.rate_hz / (5.0 * self.cutoff_hz)))
+
+    def kept(self, count: int) -> NDArray[np.int64]:
+        """Indices of the samples kept of ``count``."""
+        margin = int(self.margin_s * self.rate_hz)
+        return np.arange(margin, count - margin, self.step, dtype=np.int64)
+
+    def thin(self, values: Array) -> Array:
+        """Low-pass (T, k) without phase and keep the rows `kept`."""
+        return low_pass_at(values, self.cutoff_hz, self.rate_hz, self.kept(len(values)))

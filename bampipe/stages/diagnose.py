@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +14,9 @@ from bampipe.data.store import write_json
 from bampipe.discover.advice import advise
 from bampipe.discover.chance import Recipe, Session
 from bampipe.discover.diagnosis import Diagnosis, Settings, diagnose
-from bampipe.discover.evidence import Band
 from bampipe.discover.shape import describe, residual_map, variables, worst_windows
 from bampipe.errors import InputError
+from bampipe.estimate.low_pass import Band
 from bampipe.physics import compile_model
 from bampipe.stages.base import Progress, RunFolder
 from bampipe.stages.modelfile import load_model, model_inputs
@@ -237,8 +237,7 @@ def _suggestion(found: Diagnosis, session: Session, recipe: Recipe) -> dict[str,
         axis = ranked[name].axis
         values = {n: np.array(list(ranked[n].values.values())) for n in (name, group[0])}
         floor = found.axes[axis].noise_floor
-        kept = replace(recipe)
-        advice = advise(session, kept, found.initial, axis, name, group[0], values, floor)
+        advice = advise(session, recipe, found.initial, axis, name, group[0], values, floor)
         return {
             "between": [name, group[0]],
             "axis": found.initial.system.coordinates[axis],

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from bampipe.data.store import read_parquet, write_json, write_parquet
 from bampipe.discover.chance import Session
-from bampipe.discover.evidence import Band as ResidualBand
 from bampipe.discover.start import search_start
 from bampipe.errors import InputError
 from bampipe.estimate.filter_uncertainty import climb, sandwich_covariance
-from bampipe.estimate.least_squares import Band, LeastSquares, Problem, fit
+from bampipe.estimate.least_squares import LeastSquares, Problem, fit
+from bampipe.estimate.low_pass import Band
 from bampipe.estimate.unscented import (
     FilteredTrial,
     FilterFailure,
@@ -170,7 +170,7 @@ def _start(run: RunFolder, system: System, rate: float, config: Config) -> Array
     if system.model.effects:
         sensors, motions = read_session(run, system)
         recipe = recipe_of(run, config.model, system.model)
-        session = Session(tuple(motions), sensors, ResidualBand(rate, config.cutoff_hz))
+        session = Session(tuple(motions), sensors, Band(rate, config.cutoff_hz))
         found = search_start(session, recipe)
         count = len(system.model.device.parameters)
         start[count:] = found[count:]

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from bampipe.data.store import read_parquet
 from bampipe.errors import InputError
-from bampipe.estimate.least_squares import Band, Problem, resting
+from bampipe.estimate.least_squares import Problem, resting
+from bampipe.estimate.low_pass import Band
 from bampipe.physics import System
 from bampipe.physics.device import derivative
 from bampipe.stages.base import RunFolder

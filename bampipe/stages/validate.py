@@ -19,7 +19,8 @@ from bampipe.errors import InputError
 from bampipe.estimate import butterworth, kalman_smoother, savitzky_golay
 from bampipe.estimate.differentiation import Derivatives
 from bampipe.estimate.hysteresis import noise_of
-from bampipe.estimate.least_squares import Band, Problem, fit
+from bampipe.estimate.least_squares import Problem, fit
+from bampipe.estimate.low_pass import Band
 from bampipe.physics import System, compile_model
 from bampipe.physics.device import derivative
 from bampipe.stages.base import Progress, RunFolder

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from bampipe.discover.chance import Recipe, Session, system_of
-from bampipe.discover.evidence import Band
 from bampipe.discover.recording import Motion, Sensors, observe
 from bampipe.discover.replay import replay
 from bampipe.estimate.butterworth import zero_phase
+from bampipe.estimate.low_pass import Band
 from bampipe.physics import registry
 
 RATE = 250.0

@@ -5,8 +5,9 @@ import pytest
 from scipy.signal import butter, sosfiltfilt
 
 from bampipe.discover.chance import system_of
-from bampipe.discover.evidence import Band, fit, moving, velocity_sd
+from bampipe.discover.evidence import fit, moving, velocity_sd
 from bampipe.discover.recording import Motion
+from bampipe.estimate.low_pass import Band
 from tests.discover.sessions import RATE, SENSORS, TRUTH, bam, made
 
 

@@ -9,7 +9,8 @@ import pytest
 from slider import RATE, TRUTH, record
 
 from bampipe.estimate.butterworth import zero_phase
-from bampipe.estimate.least_squares import Band, Problem, fit, refit, resting, stacked_residual
+from bampipe.estimate.least_squares import Problem, fit, refit, resting, stacked_residual
+from bampipe.estimate.low_pass import Band
 
 BOUNDS = (np.array([0.0, 0.0, 0.01]), np.array([np.inf, np.inf, np.inf]))
 

@@ -11,7 +11,8 @@ import pytest
 from measured import REAL, bampipe, estimates, need, result
 
 from bampipe.data.store import read_parquet
-from bampipe.estimate.least_squares import Band, fit
+from bampipe.estimate.least_squares import fit
+from bampipe.estimate.low_pass import Band
 from bampipe.physics import Model, compile_model, registry
 from bampipe.stages.base import RunFolder
 from bampipe.stages.motions import free_trials, problem_of, read_motion
