@@ -17,7 +17,9 @@ import install_toys  # noqa: E402
 
 import bampipe.stages  # noqa: E402
 from bampipe.run import pipeline as pipelines  # noqa: E402
-from bampipe.run.runner import Event, Outcome, Request, run_session  # noqa: E402
+from bampipe.run.events import Event  # noqa: E402
+from bampipe.run.request import Outcome, Request  # noqa: E402
+from bampipe.run.runner import run_session  # noqa: E402
 from bampipe.stages import base  # noqa: E402
 
 

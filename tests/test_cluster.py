@@ -18,7 +18,9 @@ from conftest import TOYS, Toy, contents
 
 from bampipe.errors import InputError
 from bampipe.run.cluster import run_on_cluster
-from bampipe.run.runner import Request, run_session, unheard
+from bampipe.run.events import unheard
+from bampipe.run.request import Request
+from bampipe.run.runner import run_session
 
 distributed = pytest.importorskip("distributed", reason="the dask extra is not installed")
 

@@ -20,8 +20,12 @@ from conftest import TOYS, Toy, contents
 from bampipe.errors import InputError
 from bampipe.run import batch, gates, models, record
 from bampipe.run import pipeline as pipelines
-from bampipe.run.runner import Outcome, run_session, session_id, status, verify
+from bampipe.run.request import Outcome
+from bampipe.run.runner import run_session
+from bampipe.run.session_name import session_id
 from bampipe.run.settings import configure, parse_assignment
+from bampipe.run.status import status
+from bampipe.run.verify import verify
 
 ALL = ["toy_read", "toy_double", "toy_fit:base", "toy_sum"]
 

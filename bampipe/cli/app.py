@@ -16,8 +16,12 @@ from bampipe.cli import places, show
 from bampipe.errors import InputError
 from bampipe.run import batch, gates, models, record
 from bampipe.run import pipeline as pipelines
-from bampipe.run.runner import Outcome, Request, run_session, session_id, status, verify
+from bampipe.run.request import Outcome, Request
+from bampipe.run.runner import run_session
+from bampipe.run.session_name import session_id
 from bampipe.run.settings import parse_assignment
+from bampipe.run.status import status
+from bampipe.run.verify import verify
 from bampipe.stages import base
 
 app = typer.Typer(
@@ -702,7 +706,7 @@ def simulate(
     Example: bampipe simulate sessions/trial --effect stribeck:yaw --seed 1
     """
     batch.limit_threads(1)
-    from bampipe.run.runner import Event
+    from bampipe.run.events import Event
     from bampipe.stages.simulate import Config, simulate_session
 
     parameters: dict[str, float] = {}

@@ -14,8 +14,11 @@ import bampipe
 from bampipe.cli import places
 from bampipe.errors import InputError
 from bampipe.run import models, pipeline
+from bampipe.run.events import Listener
 from bampipe.run.pipeline import Pipeline
-from bampipe.run.runner import Listener, Request, run_session, session_id
+from bampipe.run.request import Request
+from bampipe.run.runner import run_session
+from bampipe.run.session_name import session_id
 from bampipe.stages import base
 
 MOST_EFFECTS = 5

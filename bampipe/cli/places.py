@@ -8,7 +8,7 @@ from pathlib import Path
 
 from bampipe.errors import InputError
 from bampipe.run import record
-from bampipe.run.runner import session_id
+from bampipe.run.session_name import session_id
 from bampipe.run.settings import did_you_mean
 
 

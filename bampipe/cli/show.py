@@ -8,7 +8,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from types import TracebackType
 from typing import Any
 
-from bampipe.run.runner import Event, Outcome
+from bampipe.run.events import Event
+from bampipe.run.request import Outcome
 
 LARGEST_TABLE = 40
 FIRST_COLUMNS = ("", "trial_id", "estimate", "sd", "unit", "rmse", "held_out_rmse", "noise_floor")

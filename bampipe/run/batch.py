@@ -10,7 +10,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from bampipe.errors import InputError
-from bampipe.run.runner import Event, Listener, Outcome, Request, run_session
+from bampipe.run.events import Event, Listener
+from bampipe.run.request import Outcome, Request
+from bampipe.run.runner import run_session
 
 THREAD_VARIABLES = (
     "OMP_NUM_THREADS",

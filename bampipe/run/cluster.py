@@ -11,7 +11,8 @@ from dataclasses import replace
 
 from bampipe.errors import InputError
 from bampipe.run.batch import guarded
-from bampipe.run.runner import Event, Listener, Outcome, Request, unheard
+from bampipe.run.events import Event, Listener, unheard
+from bampipe.run.request import Outcome, Request
 
 
 def run_on_cluster(requests: Sequence[Request], scheduler: str, listen: Listener) -> list[Outcome]:

@@ -1,0 +1,32 @@
+"""What happens in a run, told to whoever shows it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something that happened in a run, for whoever shows it.
+
+    Attributes:
+        run: name of the run folder.
+        step: a stage, or ``stage:model``.
+        kind: "waiting", "start", "progress", "done", "unchanged" or "failed".
+        fraction: how much of the step is done, 0 to 1.
+        message: what is under way, why the step runs, or what went wrong.
+    """
+
+    run: str
+    step: str
+    kind: str
+    fraction: float = 0.0
+    message: str = ""
+
+
+Listener = Callable[[Event], None]
+
+
+def unheard(event: Event) -> None:
+    """A listener that shows nothing."""

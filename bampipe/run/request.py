@@ -1,0 +1,144 @@
+"""What is asked of the runner, and what it answers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from bampipe.errors import InputError
+from bampipe.run.gates import Verdict
+from bampipe.run.pipeline import Pipeline
+from bampipe.stages import base
+
+
+@dataclass(frozen=True)
+class Step:
+    """One stage, for one model where the stage runs once for each.
+
+    Attributes:
+        stage: name of the stage.
+        model: name of the model, or "".
+    """
+
+    stage: str
+    model: str = ""
+
+    @property
+    def name(self) -> str:
+        """The key of the step in ``run.json``."""
+        return f"{self.stage}:{self.model}" if self.model else self.stage
+
+
+@dataclass(frozen=True)
+class Request:
+    """What is asked of the runner.
+
+    Attributes:
+        root: the run folder.
+        pipeline: the pipeline.
+        session: the session folder; None takes the one recorded in the run folder.
+        settings: settings by stage and field, before those of the pipeline.
+        first: first stage that runs; earlier ones are taken as they stand. "" for the first.
+        last: last stage that runs, "" for the last.
+        force: run every selected step, changed or not.
+        model: the only model to run; "" for the base model and what was run of the others.
+        judged: the model the gates judge; "" for no gates.
+        wait: wait while another process holds the run folder, else refuse.
+    """
+
+    root: Path
+    pipeline: Pipeline
+    session: Path | None = None
+    settings: Mapping[str, Mapping[str, object]] = field(default_factory=dict)
+    first: str = ""
+    last: str = ""
+    force: bool = False
+    model: str = ""
+    judged: str = ""
+    wait: bool = True
+
+
+@dataclass(frozen=True)
+class StepResult:
+    """What came of one step.
+
+    Attributes:
+        step: name of the step.
+        state: "done", "unchanged" or "failed".
+        reason: why it ran.
+        seconds: how long it took.
+        summary: what the stage returned.
+    """
+
+    step: str
+    state: str
+    reason: str
+    seconds: float
+    summary: dict[str, object]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of a run.
+
+    Attributes:
+        root: the run folder.
+        state: "done", "refused" (bad input) or "crashed" (a fault of bampipe).
+        steps: the steps in order.
+        verdicts: of the gates.
+        error: one line on what went wrong, or "".
+        traceback: where bampipe itself failed, or "".
+    """
+
+    root: Path
+    state: str
+    steps: tuple[StepResult, ...] = ()
+    verdicts: tuple[Verdict, ...] = ()
+    error: str = ""
+    traceback: str = ""
+
+    @property
+    def exit_code(self) -> int:
+        """0 done, 1 a gate failed, 2 bad input, 3 a fault of bampipe."""
+        if self.state != "done":
+            return {"refused": 2, "crashed": 3}[self.state]
+        return int(any(verdict.state == "failed" for verdict in self.verdicts))
+
+    def content(self) -> dict[str, object]:
+        """Return the outcome as a table that JSON can hold."""
+        return {
+            "run": str(self.root),
+            "state": self.state,
+            "error": self.error,
+            "steps": {
+                result.step: {"state": result.state, "summary": result.summary}
+                for result in self.steps
+            },
+            "gates": [verdict.content() for verdict in self.verdicts],
+        }
+
+
+def selected(request: Request) -> tuple[str, ...]:
+    """Return the stages between ``first`` and ``last`` of ``request``, in order.
+
+    Raises:
+        InputError: the pipeline has no such stage, or nothing lies between the two.
+    """
+    stages = request.pipeline.stages
+    for name in (request.first, request.last):
+        if name:
+            base.check_name(name)
+        if name and name not in stages:
+            raise InputError(
+                f"pipeline {request.pipeline.name!r} has no stage {name!r}",
+                remedy=f"it has {', '.join(stages)}",
+            )
+    start = stages.index(request.first) if request.first else 0
+    stop = stages.index(request.last) + 1 if request.last else len(stages)
+    if start >= stop:
+        raise InputError(
+            f"--from {request.first} comes after --until {request.last}",
+            remedy=f"the order is {', '.join(stages)}",
+        )
+    return stages[start:stop]

@@ -1,0 +1,45 @@
+"""The name of a session, after which its run folder is called."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from pathlib import Path
+
+from bampipe.errors import InputError
+
+
+def session_id(session: Path) -> str:
+    """Return the name of the run folder for ``session``: the id in its session file.
+
+    Raises:
+        InputError: there is no session, or its id is no name for a folder.
+    """
+    path = session / "session.toml"
+    if not path.is_file():
+        if not session.exists():
+            raise InputError("no such session folder", where=str(session))
+        if session.is_dir() and any(session.glob("*/session.toml")):
+            raise InputError(
+                "this is a folder of sessions",
+                where=str(session),
+                remedy=f"give them one by one, or as '{session}/*'",
+            )
+        raise InputError(
+            "no session.toml here",
+            where=str(session),
+            remedy="give the folder of a session",
+        )
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"not valid TOML: {error}", where=str(path)) from error
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror}", where=str(path)) from error
+    name = content.get("session_id")
+    if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9._+-]{0,127}", name):
+        raise InputError(
+            f"session_id must be a name of letters, digits, '.', '_', '+' or '-', not {name!r}",
+            where=str(path),
+        )
+    return name

@@ -1,0 +1,104 @@
+"""Where a step writes before it counts: results reach the run folder whole or not at all.
+
+A step writes below ``.bampipe/staging/``. Once it is done, a commit file says what it made; from
+then on a kill loses nothing, since the next run repeats the moves that the commit file names.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+from bampipe.run import hashing, record
+from bampipe.run.request import Step
+from bampipe.run.state import RunState
+
+COMMIT = ".commit.json"
+
+
+def folder(root: Path, step: Step) -> Path:
+    """Return the staging folder of ``step`` in the run folder ``root``."""
+    return root / record.PRIVATE / "staging" / step.name.replace(":", "@")
+
+
+def prepare(root: Path, step: Step, outputs: tuple[str, ...]) -> Path:
+    """Make an empty staging folder with the parents of all declared ``outputs``."""
+    staging = folder(root, step)
+    shutil.rmtree(staging, ignore_errors=True)
+    staging.mkdir(parents=True)
+    for pattern in outputs:
+        fixed = pattern.partition("*")[0]
+        (staging / fixed).parent.mkdir(parents=True, exist_ok=True)
+        if fixed.endswith("/"):
+            (staging / fixed).mkdir(parents=True, exist_ok=True)
+    return staging
+
+
+def written(staging: Path, declared: tuple[str, ...], step: Step) -> dict[str, str]:
+    """Hash what a stage wrote, and hold it to what it declared."""
+    files = {
+        path.relative_to(staging).as_posix(): path
+        for path in sorted(staging.rglob("*"))
+        if path.is_file()
+    }
+    allowed: set[str] = set()
+    for pattern in declared:
+        if "*" in pattern:
+            allowed |= {
+                path.relative_to(staging).as_posix()
+                for path in staging.glob(pattern)
+                if path.is_file()
+            }
+        elif pattern in files:
+            allowed.add(pattern)
+        else:
+            raise RuntimeError(f"stage {step.name} did not write {pattern}, which it declares")
+    undeclared = sorted(files.keys() - allowed)
+    if undeclared:
+        raise RuntimeError(f"stage {step.name} wrote {undeclared[0]}, which it does not declare")
+    return {name: hashing.digest_file(path) for name, path in files.items()}
+
+
+def seal(
+    staging: Path, step: Step, made: dict[str, Any], timing: dict[str, Any], remove: list[str]
+) -> None:
+    """Write the commit file: from here on the step counts as done.
+
+    Args:
+        staging: the staging folder of the step.
+        step: the step.
+        made: its record for ``run.json``.
+        timing: when it ran and how long.
+        remove: outputs of its last run that it no longer has.
+    """
+    entry = {"step": step.name, "record": made, "timing": timing, "remove": remove}
+    record.replace_json(staging / COMMIT, entry)
+
+
+def commit(state: RunState, staging: Path) -> None:
+    """Move the outputs of a sealed step into the run folder; may be repeated."""
+    entry = json.loads((staging / COMMIT).read_text(encoding="utf-8"))
+    for relative in entry["record"]["outputs"]:
+        source, target = staging / relative, state.root / relative
+        if source.is_file():
+            target.parent.mkdir(parents=True, exist_ok=True)
+            source.replace(target)
+    for relative in entry["remove"]:
+        (state.root / relative).unlink(missing_ok=True)
+    state.records[entry["step"]] = entry["record"]
+    state.failures.pop(entry["step"], None)
+    state.timings[entry["step"]] = entry["timing"]
+    state.save()
+    shutil.rmtree(staging)
+
+
+def recover(state: RunState) -> None:
+    """Finish what a killed run had completed, drop what it had not."""
+    parent = state.root / record.PRIVATE / "staging"
+    for staging in sorted(parent.glob("*")):
+        if (staging / COMMIT).is_file():
+            commit(state, staging)
+        else:
+            shutil.rmtree(staging)

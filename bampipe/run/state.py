@@ -1,0 +1,228 @@
+"""What a run folder records, what each step depends on, and whether it must run again."""
+
+from __future__ import annotations
+
+import copy
+import platform
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from bampipe.errors import InputError
+from bampipe.run import hashing, models, record
+from bampipe.run.gates import Verdict
+from bampipe.run.request import Request, Step
+from bampipe.run.settings import configure, plain
+from bampipe.stages import base
+
+NEUTRAL = ("session", "jobs")
+"""Fields of a configuration that no result depends on: a place, and a number of processes."""
+
+
+class RunState:
+    """What a run folder records, what its steps depend on, and which of them must run.
+
+    Args:
+        request: what is asked of the runner.
+    """
+
+    def __init__(self, request: Request) -> None:
+        self.request = request
+        self.root = request.root
+        self.folder = base.RunFolder(request.root)
+        self.content = record.read(request.root)
+        self.written = copy.deepcopy(self.content)
+        self.records: dict[str, dict[str, Any]] = self.content.setdefault("stages", {})
+        self.timings: dict[str, Any] = self.content.setdefault("timings", {})
+        self.failures: dict[str, str] = self.content.setdefault("failures", {})
+        self.place: dict[str, Any] = self.content.setdefault("place", {})
+        self.digests: dict[tuple[str, int, int, int], str] = {}
+        self.memory = hashing.HashMemory(self.root / record.PRIVATE / "hashes.json")
+        self.session = request.session
+
+    # What a step depends on
+
+    def digest(self, relative: str) -> str:
+        """Hash of a file in the run folder, read once as long as it is the same file."""
+        path = self.root / relative
+        status = path.stat()
+        key = (relative, status.st_ino, status.st_size, status.st_mtime_ns)
+        if key not in self.digests:
+            self.digests[key] = hashing.digest_file(path)
+        return self.digests[key]
+
+    def settings(self, step: Step) -> dict[str, object]:
+        """Settings of the step as given, without the session: its content counts, not its place."""
+        settings = dict(self.request.pipeline.settings.get(step.stage, {}))
+        settings.update(self.request.settings.get(step.stage, {}))
+        if step.model:
+            settings["model"] = step.model
+        return settings
+
+    def session_folder(self) -> Path:
+        if self.session is None:
+            place = self.place.get("session")
+            if not isinstance(place, str) or not Path(place).is_dir():
+                raise InputError(
+                    "the session of this run is not known or no longer there",
+                    where=str(self.root),
+                    remedy="name the session folder, or start later with --from",
+                )
+            self.session = Path(place)
+        return self.session
+
+    def configure(self, step: Step, settings: Mapping[str, object]) -> Any:
+        where = self.request.pipeline.where
+        if step.stage in self.request.settings:
+            where = ""
+        if step.stage in base.READS_SESSION:
+            settings = {**settings, "session": str(self.session_folder().resolve())}
+        return configure(step.stage, settings, where)
+
+    def inputs(self, step: Step, declared: tuple[str, ...]) -> dict[str, str]:
+        """Hashes of all inputs, by path relative to the run folder."""
+        found: dict[str, str] = {}
+        for pattern in declared:
+            if "*" in pattern:
+                names = self.folder.glob(pattern)
+            else:
+                name = pattern.removesuffix("?")
+                if not self.folder.exists(name):
+                    if pattern.endswith("?"):
+                        continue
+                    raise self.missing(name)
+                names = (name,)
+            for name in names:
+                self.check_untouched(name)
+                path = self.root / name
+                is_text = path.suffix == ".toml"
+                found[name] = hashing.digest_input(path) if is_text else self.digest(name)
+        if step.stage in base.READS_SESSION:
+            found.update(hashing.digest_session(self.session_folder(), self.memory))
+        return dict(sorted(found.items()))
+
+    def missing(self, name: str) -> InputError:
+        maker = _maker(name)
+        remedy = f"run `bampipe {maker}` first" if maker else ""
+        return InputError(f"{name} is missing", where=str(self.root), remedy=remedy)
+
+    def check_untouched(self, name: str) -> None:
+        for step, made in self.records.items():
+            written = made.get("outputs", {}).get(name)
+            if written is not None and self.digest(name) != written:
+                raise InputError(
+                    f"{name} was changed since {step} wrote it",
+                    where=str(self.root),
+                    remedy=f"run `bampipe {step.partition(':')[0]}` again to rebuild it",
+                )
+
+    def key(self, step: Step, config: Mapping[str, object], inputs: Mapping[str, str]) -> str:
+        return hashing.digest_content(
+            {
+                "stage": step.stage,
+                "config": config,
+                "inputs": inputs,
+                "code": hashing.digest_code(step.stage),
+                "versions": hashing.versions(),
+            }
+        )
+
+    # Whether a step must run
+
+    def declared(self, step: Step) -> tuple[dict[str, object], tuple[str, ...], Any]:
+        """Configuration as recorded, declared inputs, and the configuration itself.
+
+        Where the same settings met the same code before, the record answers, and the module of
+        the stage (which may import much) stays unloaded; the configuration is then None.
+        """
+        made = self.records.get(step.name, {})
+        if made.get("settings") == self.settings(step) and made.get("code") == hashing.digest_code(
+            step.stage
+        ):
+            return made["config"], tuple(made["declared_inputs"]), None
+        config = self.configure(step, self.settings(step))
+        return lasting(config), base.load(step.stage).inputs(config), config
+
+    def reason(self, step: Step) -> str:
+        """Why the step must run; "" if it need not."""
+        made = self.records.get(step.name)
+        if made is None:
+            return "never run"
+        if self.request.force:
+            return "forced"
+        for name, written in made["outputs"].items():
+            if not self.folder.exists(name):
+                return f"{name} is gone"
+            if self.digest(name) != written:
+                return f"{name} was changed since it was written"
+        config, declared, _ = self.declared(step)
+        inputs = self.inputs(step, declared)
+        if self.key(step, config, inputs) == made["key"]:
+            return ""
+        if config != made["config"]:
+            return "settings changed"
+        for name in sorted(inputs.keys() | made["inputs"].keys()):
+            if inputs.get(name) != made["inputs"].get(name):
+                return f"{name.removeprefix('session:')} changed"
+        if dict(hashing.versions()) != made["versions"]:
+            return "versions changed"
+        return "the code of the stage changed"
+
+    def steps(self, stage: str) -> tuple[Step, ...]:
+        if stage not in base.PER_MODEL:
+            return (Step(stage),)
+        if self.request.model:
+            return (Step(stage, self.request.model),)
+        children = (
+            name
+            for name in models.names(self.root)
+            if name != models.BASE and Step(stage, name).name in self.records
+        )
+        return (Step(stage, models.BASE), *(Step(stage, name) for name in children))
+
+    # What is kept of it
+
+    def save(self) -> None:
+        """Write ``run.json``."""
+        self.content["schema"] = record.SCHEMA
+        self.content["run"] = self.root.name
+        self.content["versions"] = dict(hashing.versions())
+        self.place["machine"] = platform.platform()
+        if self.session is not None:
+            self.place["session"] = str(self.session.resolve())
+        record.write(self.root, self.content)
+
+    def close(self, verdicts: Iterable[Verdict]) -> None:
+        """Write ``run.json`` with the verdicts of the gates, unless it says the same already."""
+        noted = {**self.content, "failures": dict(self.failures)}
+        if self.request.judged:
+            noted["pipeline"] = self.request.pipeline.content()
+            noted["gates"] = [verdict.content() for verdict in verdicts]
+        if self.session is not None:
+            noted["place"] = {**self.place, "session": str(self.session.resolve())}
+        if noted != self.written:
+            self.content.update(noted)
+            self.place = self.content["place"]
+            self.save()
+        if self.memory.changed:
+            record.replace_json(self.memory.path, self.memory.notes)
+
+
+def _maker(name: str) -> str:
+    """Return the stage that writes the file ``name``, or ""."""
+    head, _, rest = name.partition("/")
+    if head != "models":
+        return head if head in base.STAGES else ""
+    model = rest.partition("/")[0]
+    for stage in base.PER_MODEL:
+        if name in base.load(stage).outputs(configure(stage, {"model": model})):
+            return stage
+    return ""
+
+
+def lasting(config: object) -> dict[str, object]:
+    """Return the fields of a configuration that a result depends on.
+
+    Not the session's place (its content counts) nor the number of processes.
+    """
+    return {name: value for name, value in plain(config).items() if name not in NEUTRAL}

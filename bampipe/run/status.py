@@ -1,0 +1,74 @@
+"""Where each step of a run stands, without running anything."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from bampipe.errors import InputError
+from bampipe.run.pipeline import Pipeline
+from bampipe.run.request import Request
+from bampipe.run.state import RunState
+from bampipe.stages import base
+
+
+@dataclass(frozen=True)
+class StepStatus:
+    """Where one step of a run stands.
+
+    Attributes:
+        step: name of the step.
+        state: "current", "stale", "failed" or "not run".
+        reason: why it would run again, or what went wrong.
+        started_at: when it last ran, UTC, or "".
+        seconds: how long it took, or None.
+    """
+
+    step: str
+    state: str
+    reason: str
+    started_at: str
+    seconds: float | None
+
+
+def status(root: Path, pipeline: Pipeline) -> list[StepStatus]:
+    """Return where each step of the run ``root`` stands; changes nothing.
+
+    Args:
+        root: the run folder.
+        pipeline: the pipeline whose settings count.
+    """
+    run = RunState(Request(root, pipeline))
+    found = []
+    shown = [
+        stage
+        for stage in base.STAGES
+        if stage in pipeline.stages or any(name.startswith(stage) for name in run.records)
+    ]
+    stale = False
+    for stage in shown:
+        for step in run.steps(stage):
+            timing = run.timings.get(step.name, {})
+            if step.name in run.failures:
+                state, reason = "failed", run.failures[step.name]
+            elif step.name not in run.records:
+                state, reason = "not run", ""
+            else:
+                try:
+                    reason = run.reason(step)
+                except InputError as error:
+                    reason = str(error)
+                if not reason and stale:
+                    reason = "an earlier stage is stale"
+                state = "stale" if reason else "current"
+            stale = stale or state != "current"
+            found.append(
+                StepStatus(
+                    step.name,
+                    state,
+                    reason,
+                    timing.get("started_at", ""),
+                    timing.get("seconds"),
+                )
+            )
+    return found

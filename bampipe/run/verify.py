@@ -1,0 +1,61 @@
+"""Every hash that a run records, computed again."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from bampipe.run import hashing, record
+from bampipe.stages import base
+
+
+def verify(root: Path) -> list[tuple[str, str]]:
+    """Recompute every hash that ``run.json`` records.
+
+    Args:
+        root: the run folder.
+
+    Returns:
+        Pairs of a file and what became of it: "changed", "gone", or "unknown" for a file that no
+        stage recorded. Empty where all is as it was written.
+    """
+    content = record.read(root)
+    found: dict[str, str] = {}
+    recorded: set[str] = {record.FILE}
+    for made in content["stages"].values():
+        for name, written in made.get("outputs", {}).items():
+            recorded.add(name)
+            path = root / name
+            if not path.is_file():
+                found[name] = "gone"
+            elif hashing.digest_file(path) != written:
+                found[name] = "changed"
+        for name, written in made.get("inputs", {}).items():
+            if name.startswith("session:"):
+                continue
+            recorded.add(name)
+            path = root / name
+            if name in found:
+                continue
+            if not path.is_file():
+                found[name] = "gone"
+            elif hashing.digest_input(path) != written and path.suffix == ".toml":
+                found[name] = "changed"
+    place = content.get("place", {}).get("session")
+    for stage in base.READS_SESSION:
+        noted = content["stages"].get(stage, {}).get("inputs", {})
+        if not noted:
+            continue
+        if not isinstance(place, str) or not Path(place).is_dir():
+            found["session"] = "gone"
+            continue
+        now = hashing.digest_session(Path(place))
+        for name in sorted(noted.keys() | now.keys()):
+            if name.startswith("session:") and noted.get(name) != now.get(name):
+                gone = now.get(name) in (None, hashing.ABSENT)
+                found[name] = "gone" if gone else "changed"
+    for path in sorted(root.rglob("*")):
+        relative = path.relative_to(root)
+        private = relative.parts[0] == record.PRIVATE
+        if path.is_file() and not private and relative.as_posix() not in recorded:
+            found[relative.as_posix()] = "unknown"
+    return sorted(found.items())
