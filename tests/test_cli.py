@@ -265,7 +265,7 @@ def test_one_effect_in_full(command: Command) -> None:
     [
         ("stribek", "did you mean 'stribeck'"),
         ("stribeck:yow", "did you mean 'yaw'"),
-        ("absent.toml", "cannot be read"),
+        ("absent.toml", "no such file"),
     ],
 )
 def test_wrong_effect(command: Command, name: str, message: str) -> None:

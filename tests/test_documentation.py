@@ -33,8 +33,9 @@ def test_example_effect_is_consistent_and_compiles_on_every_axis():
 def test_example_device_is_consistent_and_has_the_equations_shown():
     device = registry.device_from(tomllib.loads(blocks("devices.md")[0]), "rail.toml")
     assert check_device(device) == []
-    shown = re.findall(r"^ {6}(\S+ = .*)$", (ROOT / "docs/devices.md").read_text(), re.M)
-    assert len(shown) == 3
+    text = (ROOT / "docs/devices.md").read_text(encoding="utf-8")
+    shown = re.findall(r"^ {6}([xMhQ]\S* = .*)$", text, re.M)
+    assert len(shown) == 4
     derived = [line.strip() for line in describe_equations(device).splitlines()]
     assert all(line in derived for line in shown)
     for name in ("stribeck:position", "force_bias:x", "inertia_mismatch:position"):

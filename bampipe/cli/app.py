@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import typer
 
 import bampipe
-from bampipe.cli import places, show
+from bampipe.cli import device, places, show
 from bampipe.errors import InputError
 from bampipe.run import batch, gates, models, record
 from bampipe.run import pipeline as pipelines
@@ -34,6 +34,8 @@ app = typer.Typer(
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
+
+app.add_typer(device.app, name="device")
 
 Session = Annotated[str, typer.Argument(help="Folder of a session: session.toml and its trials.")]
 Run = Annotated[
@@ -650,20 +652,34 @@ def report(
 @app.command()
 def effects(
     name: Annotated[
-        str | None, typer.Argument(help="An effect, name[:target], or an effect file.")
+        str | None, typer.Argument(help="An effect, name[:target], or an effect file; or check.")
     ] = None,
-    device: Annotated[str, typer.Option(help="Device the effect is shown on.")] = "bam",
+    file: Annotated[
+        str | None, typer.Argument(metavar="[FILE]", help="After check: the effect file.")
+    ] = None,
+    device: Annotated[
+        str, typer.Option(help="Device the effect is shown or checked on; a name or a file.")
+    ] = "bam",
     json: Json = False,
 ) -> None:
-    """The effects a model can have; with a name, one of them in full.
+    """The effects a model can have; with a name, one of them in full; or an effect file checked.
 
     Example: bampipe effects
 
     Example: bampipe effects stribeck:yaw
+
+    Example: bampipe effects check snag.toml --device rail.toml
     """
+    from bampipe.cli.device import check_effect_file
     from bampipe.cli.effects import list_all, show_one
 
-    if name is None:
+    if name == "check":
+        if file is None:
+            raise InputError("which effect file?", remedy="bampipe effects check FILE")
+        check_effect_file(file, device, json)
+    elif file is not None:
+        raise InputError(f"{file!r} is one argument too many", remedy="bampipe effects NAME")
+    elif name is None:
         list_all(json)
     else:
         show_one(name, device, json)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 from bampipe.cli import show
@@ -40,18 +38,19 @@ def show_one(text: str, device_name: str, json: bool) -> None:
 
     Args:
         text: ``name[:target]`` or ``file.toml[:target]``.
-        device_name: the built-in device it is shown on.
+        device_name: the built-in device, or the device file, it is shown on.
         json: print JSON instead.
 
     Raises:
         InputError: no such effect, device or target.
     """
     from bampipe.physics import registry
+    from bampipe.stages.declarations import read_device, read_effect
 
     name, _, target = text.partition(":")
-    device = registry.device(device_name)
+    device = registry.device_from(*read_device(device_name))
     if name.endswith(".toml"):
-        effect = registry.effect_from(_read(Path(name)), name)
+        effect = registry.effect_from(read_effect(name), name)
     else:
         effect = registry.effect(name)
     targets = effect.targets(device)
@@ -115,15 +114,6 @@ def show_one(text: str, device_name: str, json: bool) -> None:
     )
     for line in plot(found.abscissa.tolist(), found.residual.tolist()):
         show.say(line)
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}", where=str(path)) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"not valid TOML: {error}", where=str(path)) from error
 
 
 def _formulas(declaration: Mapping[str, Any]) -> list[str]:

@@ -69,36 +69,49 @@ def validate(value: object, name: str, where: str) -> None:
         InputError: names the file, the field (dotted), what was found, what is expected, and
             how many other fields are wrong.
     """
+    found = faults(value, name, where)
+    if not found:
+        return
+    first, others = found[0], len(found) - 1
+    more = f" (and {others} more)" if others else ""
+    raise InputError(first.what + more, where=first.where, remedy=first.remedy)
+
+
+def faults(value: object, name: str, where: str) -> list[InputError]:
+    """Everything that keeps ``value`` from fitting the schema ``name``, as `validate` takes them.
+
+    Returns:
+        One error a field, in the order of the fields; none where the value fits.
+    """
     from jsonschema import Draft202012Validator  # heavy: only when a file is checked
+    from jsonschema.exceptions import best_match
 
     errors = sorted(Draft202012Validator(load(name)).iter_errors(value), key=_order)
-    if not errors:
-        return
-    first = errors[0]
-    others = len(errors) - 1
-    place = dotted(first.absolute_path)
-    if first.validator == "required":
-        missing = next(key for key in first.validator_value if key not in first.instance)
-        what, remedy = f"'{missing}' is missing", _described(first.schema, missing)
-    elif first.validator == "additionalProperties":
-        known = first.schema["properties"]
-        unknown = next(key for key in first.instance if key not in known)
+    chosen = (best_match([e]) if e.validator == "anyOf" else e for e in errors)
+    return [_fault(error, where) for error in chosen]
+
+
+def _fault(error: Any, where: str) -> InputError:
+    """One error of jsonschema in plain words."""
+    place = dotted(error.absolute_path)
+    remedy = ""
+    if error.validator == "required":
+        missing = next(key for key in error.validator_value if key not in error.instance)
+        what, remedy = f"'{missing}' is missing", _described(error.schema, missing)
+    elif error.validator == "additionalProperties":
+        known = error.schema["properties"]
+        unknown = next(key for key in error.instance if key not in known)
         what = f"unknown key {_shown(unknown)}{did_you_mean(unknown, known)}"
         remedy = "" if "did you mean" in what else f"known keys: {', '.join(known)}"
     else:
-        describe = _KEYWORDS.get(first.validator, lambda bound: first.message)
-        expected = describe(first.validator_value)
-        if first.validator == "pattern":
-            expected = first.schema.get("description", expected)
-        found = f"found {_shown(first.instance)}, expected {expected}"
-        what, remedy = found, ""
-        if first.validator == "enum" and isinstance(first.instance, str):
-            what += did_you_mean(first.instance, first.validator_value)
-    raise InputError(
-        what + (f" (and {others} more)" if others else ""),
-        where=f"{where}: {place}" if place else where,
-        remedy=remedy,
-    )
+        describe = _KEYWORDS.get(error.validator, lambda bound: error.message)
+        expected = describe(error.validator_value)
+        if error.validator == "pattern":
+            expected = error.schema.get("description", expected)
+        what = f"found {_shown(error.instance)}, expected {expected}"
+        if error.validator == "enum" and isinstance(error.instance, str):
+            what += did_you_mean(error.instance, error.validator_value)
+    return InputError(what, where=f"{where}: {place}" if place else where, remedy=remedy)
 
 
 def dotted(path: Iterable[str | int]) -> str:

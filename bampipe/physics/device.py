@@ -31,7 +31,6 @@ _KEYS = frozenset(
         "parameters",
         "limits",
         "default_effects",
-        "motor",
     ]
 )
 UNITS = MappingProxyType({"rotary": "rad", "linear": "m"})

@@ -1,0 +1,152 @@
+"""``bampipe device``: devices, their equations of motion, and device files checked."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated
+
+import typer
+
+from bampipe.cli import show
+
+app = typer.Typer(
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    help="The devices there are, their equations of motion, and device files checked.\n\n"
+    "Example: bampipe device check rail.toml",
+)
+
+Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Faults only.")]
+
+
+@app.command("list")
+def list_(json: Json = False) -> None:
+    """The built-in devices.
+
+    Example: bampipe device list
+    """
+    from bampipe.physics import registry
+
+    found = [registry.device(name) for name in registry.device_names()]
+    if json:
+        show.as_json(
+            [
+                {"name": d.name, "axes": [c.name for c in d.coordinates], "summary": d.summary}
+                for d in found
+            ]
+        )
+        return
+    show.table(
+        ["device", "axes", "summary"],
+        [[d.name, ", ".join(c.name for c in d.coordinates), d.summary] for d in found],
+    )
+    show.say("")
+    show.say("one in full: bampipe device show NAME")
+
+
+@app.command("show")
+def show_(
+    device: Annotated[str, typer.Argument(help="A built-in device, or a device file.")],
+    json: Json = False,
+) -> None:
+    """A device in full: equations of motion, numbers, inputs, the effects it can have.
+
+    Example: bampipe device show slider
+    """
+    from bampipe.physics import registry
+    from bampipe.stages.declarations import device_faults, read_device
+
+    declaration, where = read_device(device)
+    equations, faults = device_faults(declaration, where)
+    if not equations:
+        report_faults(faults)
+    found = registry.device_from(declaration, where)
+    names = [
+        f"{effect.name}:{target}" if target else effect.name
+        for effect in map(registry.effect, registry.effect_names())
+        for target in effect.targets(found)
+    ]
+    inputs = [f"{name} ({found.force_unit or 'a pure number'})" for name in found.forces]
+    inputs += [f"{name} (brake of {axis})" for axis, name in found.brakes.items()]
+    inputs += [f"{name} ({unit or 'a pure number'})" for name, unit in found.channels.items()]
+    if json:
+        show.as_json(
+            {
+                "declaration": dict(declaration),
+                "equations": equations.splitlines(),
+                "inputs": inputs,
+                "effects": names,
+                "faults": faults,
+            }
+        )
+        return
+    show.say(equations)
+    show.say(f"inputs: {', '.join(inputs) or 'none'}")
+    show.say(f"effects it can have: {', '.join(names) or 'none'}")
+    if faults:
+        report_faults(faults)
+
+
+@app.command()
+def check(
+    file: Annotated[str, typer.Argument(help="A device file, or the name of a built-in device.")],
+    json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """The equations of motion that follow from a device file, and what is wrong with it.
+
+    Names, units, expressions and the derivation are checked. Exit 2 with one line a fault.
+
+    Example: bampipe device check rail.toml
+    """
+    from bampipe.stages.declarations import device_faults, read_device
+
+    declaration, where = read_device(file)
+    equations, faults = device_faults(declaration, where)
+    if json:
+        show.as_json({"file": where, "equations": equations.splitlines(), "faults": faults})
+        if faults:
+            raise typer.Exit(2)
+        return
+    if equations and not quiet:
+        show.say(equations)
+    if faults:
+        report_faults(faults)
+    if not quiet:
+        show.say(f"{where}: names, units and equations fit together")
+        show.say("")
+        show.say(f'next: device = "{file}" in session.toml, then bampipe run SESSION')
+
+
+def report_faults(faults: Sequence[str]) -> None:
+    """Print one line a fault on standard error, and leave with exit code 2."""
+    for line in faults:
+        show.note(f"bampipe: error: {' '.join(line.split())}")
+    raise typer.Exit(2)
+
+
+def check_effect_file(text: str, device_name: str, json: bool) -> None:
+    """Print what is wrong with the effect file ``text`` (``file.toml[:target]``), one line a fault.
+
+    Raises:
+        InputError: there is no such file or device.
+        typer.Exit: something is wrong with it.
+    """
+    from bampipe.physics import registry
+    from bampipe.stages.declarations import effect_faults, read_device, read_effect
+
+    file, _, target = text.partition(":")
+    declaration, where = read_device(device_name)
+    device = registry.device_from(declaration, where)
+    tried, faults = effect_faults(read_effect(file), file, device, target)
+    if json:
+        show.as_json({"file": file, "device": device_name, "targets": tried, "faults": faults})
+        if faults:
+            raise typer.Exit(2)
+        return
+    if faults:
+        report_faults(faults)
+    show.say(f"{file}: names and units fit on {device_name}, as {', '.join(tried)}")
+    show.say("")
+    show.say(f"next: bampipe effects {file}")

@@ -1,0 +1,155 @@
+"""Device and effect files held to everything that can be known before there are data.
+
+First the schema, then every expression by itself, then names and units, at last the derivation of
+the equations of motion: each step is taken only where the one before found nothing, and tells all
+that it finds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from bampipe.data import schema
+from bampipe.data.store import read_toml
+from bampipe.errors import InputError
+from bampipe.physics import expression, registry
+from bampipe.physics.device import Device
+from bampipe.physics.effect import Effect
+from bampipe.physics.readable import describe_equations
+from bampipe.physics.units import check_device, check_effect
+
+_DEVICE_TABLES = ("definitions", "energy", "torque", "applied", "side_load")
+_EFFECT_KEYS = ("torque", "input", "offset", "kinetic", "potential")
+
+
+def read_device(text: str) -> tuple[Mapping[str, Any], str]:
+    """The declaration of a built-in device, or of the device file at the path ``text``.
+
+    Returns:
+        The parsed file, and what to call it in messages.
+
+    Raises:
+        InputError: there is neither.
+    """
+    if text.endswith(".toml") or Path(text).is_file():
+        return read_toml(Path(text)), text
+    return registry.device(text).declaration, f"devices/{text}.toml"
+
+
+def read_effect(text: str) -> Mapping[str, Any]:
+    """The declaration of the effect file at the path ``text``, or of a built-in effect.
+
+    Raises:
+        InputError: there is neither.
+    """
+    if text.endswith(".toml") or Path(text).is_file():
+        return read_toml(Path(text))
+    return registry.effect(text).declaration
+
+
+def device_faults(declaration: Mapping[str, Any], where: str) -> tuple[str, list[str]]:
+    """The equations of motion of a device file, and what is wrong with it.
+
+    Args:
+        declaration: the parsed file.
+        where: its name, for messages.
+
+    Returns:
+        Text of several lines, empty where the equations cannot be derived; and one line a fault.
+    """
+    faults = [str(fault) for fault in schema.faults(declaration, "device", where)]
+    faults = faults or _unreadable(_device_expressions(declaration), where)
+    if faults:
+        return "", faults
+    try:
+        device = registry.device_from(declaration, where)
+    except InputError as error:
+        return "", [str(error)]
+    faults = [f"{where}: {line}" for line in check_device(device)]
+    if any("unknown symbol" in line for line in faults):
+        return "", faults
+    try:
+        return describe_equations(device), faults
+    except InputError as error:
+        return "", [*faults, _named(error, where)]
+
+
+def effect_faults(
+    declaration: Mapping[str, Any], where: str, device: Device, target: str = ""
+) -> tuple[list[str], list[str]]:
+    """Where an effect file can act on ``device``, and what is wrong with it.
+
+    Args:
+        declaration: the parsed file.
+        where: its name, for messages.
+        device: on which it is tried.
+        target: axis, force component or pair; all that make sense where empty.
+
+    Returns:
+        Names ``effect[:target]`` that were tried, and one line a fault.
+    """
+    faults = [str(fault) for fault in schema.faults(declaration, "effect", where)]
+    faults = faults or _unreadable(_effect_expressions(declaration), where)
+    if faults:
+        return [], faults
+    try:
+        effect = registry.effect_from(declaration, where)
+    except InputError as error:
+        return [], [str(error)]
+    targets = (target,) if target else effect.targets(device)
+    if not targets:
+        return [], [f"{where}: {_unfit(effect, device)}"]
+    found: dict[str, None] = {}
+    for place in targets:
+        try:
+            lines = check_effect(effect, device, place)
+        except InputError as error:
+            lines = [str(error)]
+        found |= dict.fromkeys(f"{where}: {line}" for line in lines)
+    return [f"{effect.name}:{place}" if place else effect.name for place in targets], list(found)
+
+
+def _unfit(effect: Effect, device: Device) -> str:
+    if effect.devices and device.name not in effect.devices:
+        return f"made for {', '.join(effect.devices)}, not for device '{device.name}'"
+    return f"device '{device.name}' has nothing that it can act on, or lacks a name that it uses"
+
+
+def _named(error: InputError, where: str) -> str:
+    """The error with the file in front, in place of what the derivation calls the device."""
+    place = error.where.partition(": ")[2]
+    return str(InputError(error.what, where=f"{where}: {place}" if place else where,
+                          remedy=error.remedy))  # fmt: skip
+
+
+def _unreadable(expressions: Iterator[tuple[str, object]], where: str) -> list[str]:
+    """One line for each expression that does not parse."""
+    faults = []
+    for field, text in expressions:
+        try:
+            expression.parse(text, f"{where}: {field}")
+        except InputError as error:
+            faults.append(str(error))
+    return faults
+
+
+def _device_expressions(declaration: Mapping[str, Any]) -> Iterator[tuple[str, object]]:
+    for table in _DEVICE_TABLES:
+        for key, text in declaration.get(table, {}).items():
+            yield f"{table}.{key}", text
+    for name, entry in declaration.get("process_noise", {}).items():
+        for axis, text in entry["torque"].items():
+            yield f"process_noise.{name}.torque.{axis}", text
+
+
+def _effect_expressions(declaration: Mapping[str, Any]) -> Iterator[tuple[str, object]]:
+    for key in _EFFECT_KEYS:
+        value = declaration.get(key, {})
+        for place, text in value.items() if isinstance(value, Mapping) else [("", value)]:
+            yield f"{key}.{place}" if place else key, text
+    for name, entry in declaration.get("states", {}).items():
+        for key in ("rate", "initial"):
+            if key in entry:
+                yield f"states.{name}.{key}", entry[key]
