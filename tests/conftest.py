@@ -46,7 +46,7 @@ class Toy:
         """Names of the toys that ran since the last call."""
         if not self.log.exists():
             return []
-        names = [line.strip('"\n') for line in self.log.open()]
+        names = [line.strip('"') for line in self.log.read_text().splitlines()]
         self.log.unlink()
         return names
 

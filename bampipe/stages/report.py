@@ -34,11 +34,7 @@ class Config:
 
 
 def inputs(config: Config) -> tuple[str, ...]:
-    """Return the paths the stage reads.
-
-    ``run.json`` is read too, for the page on provenance. It is not declared, for it changes with
-    every run: whatever in it bears on a result comes through the other files.
-    """
+    """Return the paths the stage reads; of ``run.json`` the keys of the other stages."""
     return (
         "ingest/session.json",
         "ingest/trials.parquet",
@@ -49,6 +45,7 @@ def inputs(config: Config) -> tuple[str, ...]:
         "stiffness/loops.parquet?",
         *(f"models/*/{name}" for name in _PER_MODEL),
         "compare.json?",
+        "run.json?",
     )
 
 

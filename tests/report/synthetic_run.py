@@ -326,13 +326,15 @@ def write_comparison(root: Path) -> None:
 def write_record(root: Path) -> None:
     """Write run.json."""
     hashes = {f"session/trials/{name}.csv": f"{number:x}" * 64 for number, name in enumerate(FREE)}
+    order = ("ingest", "filter", "stiffness", "identify:base")
     stages = {
         name: {
             "key": f"{number}bcdef0123456789", "config": {"model": "base"},
-            "inputs": {"session/session.toml": "a" * 64, **hashes} if name == "ingest" else {},
-            "outputs": {"x": "y"}, "versions": {"bampipe": "0.1.0"},
+            "inputs": {f"{order[number - 1]}/x": "y"} if number else
+            {"session/session.toml": "a" * 64, **hashes},
+            "outputs": {f"{name}/x": "y"}, "versions": {"bampipe": "0.1.0", "python": "3.11.9"},
         }
-        for number, name in enumerate(("ingest", "filter", "stiffness", "identify:base"))
+        for number, name in enumerate(order)
     }  # fmt: skip
     timings = {
         name: {"started_at": "2026-11-21T07:00:00+00:00", "seconds": 1.25 + number}
@@ -340,7 +342,5 @@ def write_record(root: Path) -> None:
     }
     content = {
         "schema": "bampipe.run/1", "stages": stages, "timings": timings,
-        "failures": {"diagnose:base": "one free trial only"},
-        "versions": {"bampipe": "0.1.0", "python": "3.11.9"},
     }  # fmt: skip
     write_json(root / "run.json", content)

@@ -1,11 +1,14 @@
-"""Provenance: inputs by hash, versions, settings and timings, on the last page."""
+"""Provenance: inputs by hash, versions, settings and keys, on the last page.
+
+Nothing here depends on when or where the stages ran: equal results give equal reports. Times and
+the machine stand in ``run.json``, and ``bampipe status`` prints them.
+"""
 
 from __future__ import annotations
 
 from typing import Any
 
-from bampipe.report import wording
-from bampipe.report.document import Block, Bullets, Section, Subheading, Table, Text
+from bampipe.report.document import Block, Section, Subheading, Table, Text
 from bampipe.report.results import Results
 
 TITLE = "Provenance"
@@ -18,35 +21,28 @@ def section(results: Results) -> Section:
     if content is None:
         text = "This run folder has no run.json: what was run on what is not recorded."
         return Section(TITLE, (Text(text),), new_page=True)
-    stages: dict[str, Any] = content.get("stages", {})
-    blocks: list[Block] = [Text(_versions(content, stages))]
+    stages: dict[str, Any] = {
+        name: made for name, made in content.get("stages", {}).items() if name != "report"
+    }
+    blocks: list[Block] = [Text(_versions(stages))]
     inputs = _inputs(stages)
     if inputs is not None:
         blocks.append(inputs)
-    blocks.append(_stages(stages, content.get("timings", {})))
-    failures = content.get("failures") or {}
-    if failures:
-        blocks.append(
-            Bullets(
-                tuple(f"`{name}` failed when last tried: {why}" for name, why in failures.items())
-            )
-        )
+    blocks.append(_stages(stages))
     settings = _settings(stages)
     if settings is not None:
         blocks += [Subheading("Settings"), settings]
     return Section(TITLE, tuple(blocks), new_page=True)
 
 
-def _versions(content: dict[str, Any], stages: dict[str, Any]) -> str:
-    versions = content.get("versions") or {}
-    if not versions:
-        versions = next((made["versions"] for made in stages.values() if made.get("versions")), {})
-    shown = ", ".join(f"{name} {version}" for name, version in sorted(versions.items()))
-    text = f"Made with {shown}." if shown else ""
-    machine = (content.get("place") or {}).get("machine")
-    if machine:
-        text += f" Machine: {machine}."
-    return f"{text} Full hashes are in `run.json`; equal inputs and versions give equal results."
+def _versions(stages: dict[str, Any]) -> str:
+    found: dict[str, set[str]] = {}
+    for made in stages.values():
+        for name, version in (made.get("versions") or {}).items():
+            found.setdefault(name, set()).add(version)
+    shown = ", ".join(f"{name} {' and '.join(sorted(found[name]))}" for name in sorted(found))
+    text = f"Made with {shown}. " if shown else ""
+    return f"{text}Full hashes are in `run.json`; equal inputs and versions give equal results."
 
 
 def _inputs(stages: dict[str, Any]) -> Table | None:
@@ -62,39 +58,46 @@ def _inputs(stages: dict[str, Any]) -> Table | None:
     )
 
 
-def _stages(stages: dict[str, Any], timings: dict[str, Any]) -> Table:
-    rows = []
-    order = sorted(stages, key=lambda name: str(timings.get(name, {}).get("started_at", "")))
-    for name in order:
-        if name == "report":
-            continue
-        made = stages[name]
-        timing = timings.get(name, {})
-        seconds = timing.get("seconds")
-        rows.append(
-            (
-                f"`{name}`",
-                str(timing.get("started_at", "–")).replace("T", " ").removesuffix("+00:00"),
-                "–" if seconds is None else wording.plain(float(seconds), 1),
-                str(len(made.get("outputs") or ())),
-                f"`{str(made.get('key') or '–')[:_DIGITS]}`",
-            )
+def _stages(stages: dict[str, Any]) -> Table:
+    rows = tuple(
+        (
+            f"`{name}`",
+            str(len(made.get("outputs") or ())),
+            f"`{str(made.get('key') or '–')[:_DIGITS]}`",
         )
+        for name, made in _in_order(stages)
+    )
     return Table(
         "Stages",
-        ("Stage", "Started (UTC)", "Seconds", "Files", "Key"),
-        tuple(rows),
-        "llrrl",
-        note="Key: hash of everything the stage depends on (inputs, settings, code, versions).",
+        ("Stage", "Files", "Key"),
+        rows,
+        "lrl",
+        note="Key: hash of everything the stage depends on (inputs, settings, code, versions). "
+        "When each ran, and for how long, `bampipe status` says.",
     )
+
+
+def _in_order(stages: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:
+    """Return the steps, a stage before those that read what it wrote."""
+    made_by = {name: step for step, made in stages.items() for name in made.get("outputs") or ()}
+    ranks: dict[str, int] = {}
+
+    def rank(step: str) -> int:
+        if step not in ranks:
+            ranks[step] = 0  # a record that was tampered with may go round in circles
+            before = {made_by.get(name, step) for name in stages[step].get("inputs") or ()} - {step}
+            ranks[step] = 1 + max(map(rank, before), default=0)
+        return ranks[step]
+
+    return sorted(stages.items(), key=lambda item: (rank(item[0]), item[0]))
 
 
 def _settings(stages: dict[str, Any]) -> Table | None:
     rows = []
-    for name, made in stages.items():
+    for name, made in _in_order(stages):
         values = made.get("config") or {}
         shown = ", ".join(f"{key} = {_value(value)}" for key, value in values.items())
-        if shown and name != "report":
+        if shown:
             rows.append((f"`{name}`", shown))
     if not rows:
         return None
