@@ -179,6 +179,11 @@ def array_source(e: Equations, added: Sequence[Any]) -> str:
         _function("initial_memory", {"q": e.q, "u": e.u, "p": e.p}, e.initial),
         _function("mass_matrix", {"q": e.q, "p": e.p}, [m for row in e.mass for m in row]),
         _function("energy", {"q": e.q, "qd": e.qd, "p": e.p}, [e.kinetic, e.potential]),
+        _function(
+            "compensation",
+            {"q": e.q, "qd": e.qd, "z": e.z, "u": e.u, "p": e.p},
+            [expr for expr in e.compensation if expr != 0],
+        ),
     ]
     return "".join(parts)
 

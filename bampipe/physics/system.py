@@ -36,6 +36,8 @@ class System:
         linear: per parameter, whether the residual is linear in it.
         touched: axes whose equation the effects change, measurement effects aside.
         moves_sensors: whether an effect of kind ``measurement`` is present.
+        compensated: axes on which the device has something against gravity; see `compensation`.
+        delays: names of the parameters that shift measured forces in time.
     """
 
     def __init__(self, model: Model, folder: Path, meta: dict[str, Any]) -> None:
@@ -58,6 +60,8 @@ class System:
         self.linear: tuple[bool, ...] = tuple(meta["linear"])
         self.touched: tuple[int, ...] = tuple(meta["touched"])
         self.moves_sensors: bool = meta["moves_sensors"]
+        self.compensated: tuple[int, ...] = tuple(meta["compensated"])
+        self.delays: tuple[str, ...] = tuple(meta["delays"])
 
     @property
     def prior(self) -> Array:
@@ -173,6 +177,18 @@ class System:
         both = _stack(self._arrays.energy(q.T, qd.T, p), len(q))
         return both[:, 0], both[:, 1]
 
+    def compensation(self, q: Array, qd: Array, z: Array, u: Array, p: Array) -> Array:
+        """Generalised force of what the device has against gravity (eq 16), (T, n_q), N.m or N.
+
+        Effects that change it (a carriage that lags) are included. Arguments as in `required`;
+        columns of axes not in `compensated` are zero.
+        """
+        out = np.zeros((len(q), len(self.coordinates)))
+        columns = self._arrays.compensation(q.T, qd.T, z.T, u.T, p)
+        for axis, column in zip(self.compensated, columns, strict=True):
+            out[:, axis] = column
+        return out
+
     def initial_memory(self, q: Array, u: Array, p: Array) -> Array:
         """Internal states at the start of a trial, (n_z,), from the first q (n_q,) and u (n_u,)."""
         return np.array([float(v) for v in self._arrays.initial_memory(q, u, p)])
@@ -229,6 +245,8 @@ def compile_model(model: Model) -> System:
         "linear": equations.linear,
         "touched": [i for i, e in enumerate(added) if e != 0],
         "moves_sensors": any(e != 0 for e in equations.offset),
+        "compensated": [i for i, e in enumerate(equations.compensation) if e != 0],
+        "delays": equations.delays,
     }
     _write(folder / f"columns_{key}.py", array_source(equations, added))
     _write(folder / f"compiled_{key}.py", scalar_source(equations))

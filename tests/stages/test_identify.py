@@ -15,6 +15,7 @@ from bampipe.data.store import read_json, read_parquet, sha256_file
 from bampipe.errors import InputError
 from bampipe.stages import identify
 from bampipe.stages.base import RunFolder, silent
+from bampipe.stages.filter_choice import ENGINES
 
 TOLERANCE = {"viscous": 0.03, "coulomb": 0.05, "mass": 0.01}
 FAST = identify.Config(longest_step_s=2e-3)
@@ -102,7 +103,7 @@ def test_tables_and_determinism(simulated: RunFolder, tmp_path: Path) -> None:
 def test_filterpy_gives_the_same_numbers(tmp_path: Path) -> None:
     run = simulated_run(tmp_path / "short", trials=1, seconds=1.2)
     numbers = []
-    for engine in identify.ENGINES:
+    for engine in ENGINES:
         content = identified(run, replace(FAST, engine=engine, block_s=0.1))
         numbers.append([entry["estimate"] for entry in content["parameters"].values()])
     np.testing.assert_allclose(numbers[0], numbers[1], rtol=1e-8)

@@ -1,0 +1,223 @@
+"""Raw samples through the unscented filter: a search for the region of the answer, then all."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.data.store import read_parquet
+from bampipe.errors import InputError
+from bampipe.estimate.unscented import (
+    FilteredTrial,
+    FilterFailure,
+    FilterModel,
+    FilterResult,
+    FilterSettings,
+    Trial,
+    filter_trials,
+)
+from bampipe.physics import System
+from bampipe.stages.base import RunFolder
+from bampipe.stages.filter_choice import FilterChoice
+from bampipe.stages.motions import Motion, input_columns
+from bampipe.stages.sensor_noise import Noise
+
+Array = NDArray[np.float64]
+
+_STORED = 20_000
+"""Most distributions stored of one trial: memory must not grow with the log."""
+_COARSE = 300.0
+"""Factor on the process noise of the search for the region of the answer."""
+_LARGEST_NIS = 10.0
+"""Mean normalised innovation squared from which on the filter is taken to have lost the motion."""
+
+Attempt = tuple[Array, Array, float]
+"""Parameters to start from (nt,), their sd (nt,), both physical, and a factor on process noise."""
+
+
+@dataclass(frozen=True)
+class FilterRun:
+    """A filter that followed all trials.
+
+    Attributes:
+        search: the first pass over the first trial; main: all trials in ``order``.
+        settings: noise levels of the main pass.
+        order: places of the trials of ``main`` in the session.
+        restarts: attempts that failed before.
+    """
+
+    search: FilterResult
+    main: FilterResult
+    settings: FilterSettings
+    order: tuple[int, ...]
+    restarts: int
+
+    @property
+    def passes(self) -> tuple[FilteredTrial, ...]:
+        """All passes over trials, the search first."""
+        return (*self.search.trials, *self.main.trials)
+
+    @property
+    def steps(self) -> tuple[int, ...]:
+        """Places in the session of the trials of `passes`."""
+        return (0, *self.order)
+
+
+def stride_of(motions: Sequence[Motion]) -> int:
+    """Return every how many samples the filter stores its distribution."""
+    return -(-max(motion.t.size for motion in motions) // _STORED)
+
+
+def trial_of(
+    run: RunFolder, motion: Motion, system: System, noise: Noise, stride: int, choice: FilterChoice
+) -> Trial:
+    """Return the raw samples of one trial as the filter wants them."""
+    path = run.require("ingest/samples.parquet", "ingest")
+    frame = read_parquet(path, trial=motion.trial_id)
+    n = len(system.coordinates)
+    stamps = frame["t"].to_numpy(dtype=float)
+    t = stamps - stamps[0]
+    brakes = system.model.device.brakes.values()
+    for place, name in enumerate(system.inputs):
+        if name not in frame and name != "t" and name not in brakes:
+            frame[name] = np.interp(t, motion.t, motion.u[:, place])
+    u = input_columns(frame, system.inputs, system.model.device.brakes, t, str(path))
+    for column in u.T:
+        lost = np.isnan(column)
+        if lost.any():
+            column[lost] = np.interp(t[lost], t[~lost], column[~lost])
+    # A copy: a table's only column would come out read-only, which compiled code refuses.
+    y = frame[[f"q_{axis}" for axis in system.coordinates]].to_numpy(dtype=float, copy=True)
+    if choice.measure == "position_velocity":
+        velocity = [np.interp(t, motion.t, column) for column in motion.qd.T]
+        y = np.hstack([y, np.stack(velocity, axis=1)])
+    first = int(np.flatnonzero(np.isfinite(y).all(axis=1))[0])
+    memory = system.initial_memory(motion.q[0], motion.u[0], system.prior)
+    x = np.concatenate([y[first, :n], motion.qd[0], memory])
+    speed = np.maximum(motion.qd_sd[0], np.sqrt(np.mean(motion.qd**2, axis=0)) * 0.1)
+    x_sd = np.concatenate([2.0 * noise.reading_sd[:n], speed, np.zeros(len(memory))])
+    # The last stored distribution must be that of the last sample.
+    last = first + (t.size - 1 - first) // stride * stride + 1
+    return Trial(t[first:last], u[first:last], y[first:last], x, x_sd)
+
+
+def filter_model(
+    system: System, trials: Sequence[Trial], start: Array, timing: bool
+) -> FilterModel:
+    """Return the model as the filter wants it.
+
+    Args:
+        system: the model; trials: whose sampling interval bounds the timing.
+        start: (n_p,) values of the parameters, those that are not estimated included.
+        timing: whether the timing of the inputs is estimated, as the last parameter. A model
+            that has a delay of its own cannot tell the two apart.
+    """
+    places = [i for i, item in enumerate(system.parameters) if not item.fixed]
+    lower = [system.parameters[i].lower for i in places]
+    upper = [system.parameters[i].upper for i in places]
+    if timing:
+        half = 0.5 * float(np.median(np.diff(trials[0].t)))
+        places, lower, upper = [*places, len(system.parameters)], [*lower, -half], [*upper, half]
+    return FilterModel(
+        derivative=system.derivative,
+        measure=system.measure,
+        n_states=len(system.states),
+        parameters=np.append(start, 0.0),
+        free=np.array(places, dtype=np.int64),
+        lower=np.array(lower),
+        upper=np.array(upper),
+    )
+
+
+def run_filter(
+    model: FilterModel,
+    trials: Sequence[Trial],
+    attempts: Sequence[Attempt],
+    settings: FilterSettings,
+    choice: FilterChoice,
+    told: Callable[[int, int], None],
+    lost: Callable[[str, int], InputError],
+    axes: Sequence[str],
+) -> FilterRun:
+    """Converge on the first trial, then filter all trials; the first attempt that holds counts.
+
+    A filter that trusts its model far from the truth does not find back. The first trial is
+    filtered with much process noise, which adds next to no information, and filtered again at
+    the end in its own right.
+
+    Args:
+        model, trials, settings: as `filter_trials` takes them.
+        attempts: where to start, one after the other.
+        choice: which engine.
+        told: called with the number of trials done and the place of the next.
+        lost: makes the error from what happened and the place of the trial.
+        axes: names of the readings, for messages.
+
+    Raises:
+        InputError: no attempt followed the motion.
+    """
+    engine = _engine(choice)
+    order = (*range(1, len(trials)), 0)
+    failure: FilterFailure | None = None
+    found: FilterRun | None = None
+    for restarts, (value, sd, factor) in enumerate(attempts):
+        mean, spread = model.to_estimated(value, sd)
+        level = replace(settings, noise_sd=factor * settings.noise_sd)
+        told(0, 0)
+        try:
+            search = engine(
+                model, trials[:1], mean, np.diag(spread**2),
+                replace(level, noise_sd=_COARSE * level.noise_sd),
+            )  # fmt: skip
+            main = engine(
+                model, [trials[i] for i in order], search.theta, search.covariance, level,
+                lambda done: told(done, order[done - 1]),
+            )  # fmt: skip
+        except FilterFailure as error:
+            failure = error
+            continue
+        found = FilterRun(search, main, level, order, restarts)
+        if _worst_nis(main) < _LARGEST_NIS:
+            return found
+    if found is not None:
+        raise _not_followed(found, lost, axes)
+    if failure is None:
+        raise RuntimeError("no attempt was made")
+    number = order[failure.trial] if failure.trial < len(order) else 0
+    t = trials[number].t[min(failure.sample, trials[number].t.size - 1)]
+    what = f"the filter lost the motion of trial {{}} at {t:.2f} s: {failure.reason}"
+    raise lost(what, number)
+
+
+def _engine(choice: FilterChoice) -> Callable[..., FilterResult]:
+    if choice.engine == "filterpy":
+        from bampipe.estimate.filterpy_oracle import filter_trials_by_filterpy
+
+        return filter_trials_by_filterpy
+    return filter_trials
+
+
+def _not_followed(
+    found: FilterRun, lost: Callable[[str, int], InputError], axes: Sequence[str]
+) -> InputError:
+    """Say in physical words which trial and axis the filter does not follow."""
+    nis = [float(np.nanmean(trial.nis)) for trial in found.main.trials]
+    worst = int(np.argmax(nis))
+    trial = found.main.trials[worst]
+    ratio = np.sqrt(np.nanmean((trial.innovation / trial.innovation_sd) ** 2, axis=0))
+    axis = (*axes, *axes)[int(np.argmax(ratio))]
+    return lost(
+        f"the filter does not follow trial {{}}: its prediction of {axis} one sample ahead errs "
+        f"{ratio.max():.0f} times more than noise explains",
+        found.order[worst],
+    )
+
+
+def _worst_nis(found: FilterResult) -> float:
+    """Return the mean normalised innovation squared of the worst trial; 1 is consistent."""
+    size = found.trials[0].innovation.shape[1]
+    worst = max(float(np.nanmean(trial.nis)) for trial in found.trials)
+    return worst / size if np.isfinite(worst) else np.inf
