@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from identified_run import TRUTH, session_truth, shared_run, simulated_run
+from identified_run import MODEL, TRUTH, session_truth, shared_run, simulated_run
 
 from bampipe.data.schema import validate
-from bampipe.data.store import read_json, read_parquet, sha256_file
+from bampipe.data.store import read_json, read_parquet, sha256_file, write_text
 from bampipe.errors import InputError
 from bampipe.stages import identify
 from bampipe.stages.base import RunFolder, silent
@@ -125,3 +125,22 @@ def test_a_motion_that_no_noise_explains_is_refused(tmp_path: Path) -> None:
     run = simulated_run(tmp_path / "wrong", scramble=True)
     with pytest.raises(InputError, match=r"does not follow trial|lost the motion"):
         identified(run, replace(FAST, force_noise=1e-4))
+
+
+def test_torque_against_gravity_is_stored(simulated: RunFolder) -> None:
+    identified(simulated)
+    states = read_parquet(simulated.path("models/base/states.parquet"))
+    balanced = 3.56 * 9.81 * (states["q_extension"] - 0.461) * np.cos(states["q_pitch"])
+    np.testing.assert_allclose(states["torque_gravity_pitch"], balanced, atol=0.02)
+    assert not {"torque_gravity_yaw", "torque_gravity_extension"} & set(states)
+
+
+def test_a_model_with_a_delay_gets_no_timing_of_its_own(simulated: RunFolder) -> None:
+    """The two shift the forces alike: together neither would be known."""
+    late = MODEL.replace("[]", '["force_delay"]').replace('"base"', '"base+force_delay"', 1)
+    write_text(simulated.path("models/base+force_delay/model.toml"), late)
+    content = identified(simulated, replace(FAST, model="base+force_delay"))
+    assert content["input_timing"] == {"estimate": 0.0, "sd": 0.0, "unit": "s"}
+    delay = content["parameters"]["force_delay.delay"]
+    assert abs(delay["estimate"]) < 2e-4
+    assert_recovered(content, TRUTH)
