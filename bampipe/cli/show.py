@@ -161,7 +161,35 @@ def _ladder(value: object) -> None:
     say("")
     say("ladder: error on held-out trials, and over its noise floor")
     table(head, body)
+    _free_runs(rows)
     say("")
+
+
+def _free_runs(rows: list[dict[str, Any]]) -> None:
+    """Print how far each model version, left to itself, ends up from the measured positions."""
+    if not any(row.get("free_run") for row in rows):
+        return
+    axes = list(dict.fromkeys(axis for row in rows for axis in row.get("free_run") or ()))
+    body = []
+    for row in rows:
+        found = row.get("free_run") or {}
+        cells = [row["model"], str(row.get("free_run_mode") or "").replace("_", " ")]
+        for axis in axes:
+            entry = found.get(axis) or {}
+            cells += [
+                number(entry[key]) if key in entry else ""
+                for key in ("mean_absolute", "rmse", "relative_error_percent")
+            ]
+        body.append(cells)
+    head = ["model", "loop"]
+    for axis in axes:
+        unit = next(
+            (r["free_run"][axis]["unit"] for r in rows if axis in r.get("free_run", {})), ""
+        )
+        head += [f"{axis}, mean abs., {unit}", f"RMS, {unit}", "%"]
+    say("")
+    say("free run: position error of the model left to itself over held-out trials")
+    table(head, body)
 
 
 def outcome(result: Outcome) -> None:

@@ -499,11 +499,13 @@ def _read_mat(path: Path, columns: Sequence[str], name: str, largest: int) -> Ra
         raise InputError(
             "not a sound MATLAB file", where=name, remedy="save it again from MATLAB"
         ) from error
-    lengths = {column: len(value) for column, value in values.items()}
-    for column, length in lengths.items():
-        if length != lengths[columns[0]]:
+    count = len(values[columns[0]])
+    for column, value in values.items():
+        if len(value) == 1 < count:  # a single number stands for a column that does not change
+            values[column] = np.repeat(value, count)
+        elif len(value) != count:
             raise InputError(
-                f"{length} values, where '{columns[0]}' has {lengths[columns[0]]}",
+                f"{len(value)} values, where '{columns[0]}' has {count}",
                 where=f"{name}, variable '{column}'",
             )
     return RawTrial(values, first_row=1)

@@ -9,3 +9,6 @@ DERIVATIVE = types.FunctionType(types.void(_vector, _vector, _vector, _vector, _
 
 MEASURE = types.FunctionType(types.void(_vector, _vector, _vector, _vector))
 """h(x, u, p, y) -> None: measurement of the state written into y."""
+
+COMMAND = MEASURE
+"""c(y, r, none, out) -> None: commands of a controller from readings and references."""

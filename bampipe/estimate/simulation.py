@@ -219,7 +219,7 @@ def simulate(
         derivative, x, inputs, p, np.zeros(n_noise), len(width), width,
         dt, max_step, int(hold), work,
     )  # fmt: skip
-    _require_finite(x, dt)
+    require_finite(x, dt)
     return x
 
 
@@ -285,11 +285,12 @@ def simulate_tracking(
         np.array(curvature, dtype=np.int64), np.array(brakes, dtype=np.int64), gain, brake_time,
         np.array([arm.natural_frequency, arm.damping_ratio, arm.bandwidth]), work,
     )  # fmt: skip
-    _require_finite(x, dt)
+    require_finite(x, dt)
     return x, total
 
 
-def _require_finite(x: Array, dt: float) -> None:
+def require_finite(x: Array, dt: float) -> None:
+    """Raise InputError where a simulated motion (T, nx), sampled every ``dt`` s, has diverged."""
     bad = np.flatnonzero(~np.isfinite(x).all(axis=1))
     if len(bad):
         raise InputError(

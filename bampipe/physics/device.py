@@ -10,6 +10,7 @@ from typing import Any
 
 from bampipe.errors import InputError
 from bampipe.physics import expression
+from bampipe.physics.controller import Controller, controller_from
 from bampipe.physics.parameter import Parameter, parameter_from
 
 _KEYS = frozenset(
@@ -31,6 +32,7 @@ _KEYS = frozenset(
         "parameters",
         "limits",
         "default_effects",
+        "controller",
     ]
 )
 UNITS = MappingProxyType({"rotary": "rad", "linear": "m"})
@@ -95,6 +97,7 @@ class Device:
     parameters: tuple[Parameter, ...]
     frictional: tuple[str, ...]
     limits: Mapping[str, tuple[float, float]]
+    controller: Controller | None
     declaration: Mapping[str, Any] = field(repr=False, compare=False)
 
     def coordinate(self, name: str) -> Coordinate:
@@ -263,6 +266,9 @@ def device_from(declaration: Mapping[str, Any], where: str = "device file") -> D
         parameters=tuple(parameters),
         frictional=tuple(frictional),
         limits=limits,
+        controller=controller_from(
+            declaration.get("controller"), tuple(forces), f"{where}: controller"
+        ),
         declaration=declaration,
     )
     for label, table in (
@@ -303,6 +309,7 @@ def _check_names(device: Device, where: str) -> None:
         ("inputs.force", device.forces),
         ("inputs.brakes", device.brakes.values()),
         ("inputs.channels", device.channels),
+        ("controller.channels", device.controller.channels if device.controller else ()),
         ("constants", device.constants),
         ("definitions", device.definitions),
         ("parameters", [p.name for p in device.parameters if "." not in p.name]),

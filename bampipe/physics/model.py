@@ -72,14 +72,14 @@ class Model:
     @property
     def key(self) -> str:
         """Hash of everything that the generated code depends on."""
-        content: list[Any] = [_code_version(), self.device.declaration]
+        content: list[Any] = [code_version(), self.device.declaration]
         content += [[effect.name, effect.effect.declaration] for effect in self.effects]
         text = json.dumps(content, sort_keys=True, default=str)
         return hashlib.sha256(text.encode()).hexdigest()[:24]
 
 
 @cache
-def _code_version() -> str:
+def code_version() -> str:
     """Hash of this package's source, so that generated code never outlives its generator."""
     digest = hashlib.sha256()
     for path in sorted(Path(__file__).parent.glob("*.py")):

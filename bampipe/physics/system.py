@@ -81,11 +81,11 @@ class System:
 
     @cached_property
     def _arrays(self) -> ModuleType:
-        return _load(self._folder / f"columns_{self._key}.py")
+        return load_generated(self._folder / f"columns_{self._key}.py")
 
     @cached_property
     def _compiled(self) -> ModuleType:
-        return _load(self._folder / f"compiled_{self._key}.py")
+        return load_generated(self._folder / f"compiled_{self._key}.py")
 
     @property
     def derivative(self) -> Callable[..., None]:
@@ -208,7 +208,7 @@ class System:
         z0 = self.initial_memory(a[0], u[0], p)
         arrays = [np.ascontiguousarray(x, dtype=np.float64) for x in (a, b, u, p, t)]
         out = np.empty((len(q), len(z0)))
-        module = _load(self._folder / f"memory_{self._key}.py")
+        module = load_generated(self._folder / f"memory_{self._key}.py")
         module.memory(*arrays, z0, _MEMORY_STEPS, out)
         return out
 
@@ -248,11 +248,11 @@ def compile_model(model: Model) -> System:
         "compensated": [i for i, e in enumerate(equations.compensation) if e != 0],
         "delays": equations.delays,
     }
-    _write(folder / f"columns_{key}.py", array_source(equations, added))
-    _write(folder / f"compiled_{key}.py", scalar_source(equations))
+    write_generated(folder / f"columns_{key}.py", array_source(equations, added))
+    write_generated(folder / f"compiled_{key}.py", scalar_source(equations))
     if equations.z:
-        _write(folder / f"memory_{key}.py", memory_source(equations))
-    _write(path, json.dumps(meta))
+        write_generated(folder / f"memory_{key}.py", memory_source(equations))
+    write_generated(path, json.dumps(meta))
     return System(model, folder, meta)
 
 
@@ -267,7 +267,7 @@ def cache_folder() -> Path:
     return folder
 
 
-def _write(path: Path, text: str) -> None:
+def write_generated(path: Path, text: str) -> None:
     """Write whole or not at all: several processes may generate the same model at once."""
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=path.name)
     with os.fdopen(handle, "w") as file:
@@ -275,7 +275,8 @@ def _write(path: Path, text: str) -> None:
     os.replace(name, path)
 
 
-def _load(path: Path) -> ModuleType:
+def load_generated(path: Path) -> ModuleType:
+    """The module of generated code at ``path``, imported once a process."""
     name = f"bampipe_generated_{path.stem}"
     if name in sys.modules:
         return sys.modules[name]

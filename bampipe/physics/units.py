@@ -292,7 +292,19 @@ def check_device(device: Device) -> list[str]:
                 term, _, place = p.name.partition(".")
                 if place == axis:
                     check.named(p.unit, f"friction.{axis}.{term}", wanted_units[term])
+    _check_controller(device, symbols, check)
     return list(dict.fromkeys(check.found))
+
+
+def _check_controller(device: Device, symbols: Mapping[str, Found], check: _Check) -> None:
+    """Hold the control law's expressions to the unit of the forces that they command."""
+    if device.controller is None:
+        return
+    known = {n: d for n, d in symbols.items() if n not in [p.name for p in device.parameters]}
+    for name, unit in device.controller.channels.items():
+        known[name] = check.unit(unit, f"controller.channels.{name}")
+    for force, tree in device.controller.command.items():
+        check.expression(tree, known, f"controller.command.{force}", symbols[force])
 
 
 def _effect_symbols(item: BoundEffect, device: Device, check: _Check) -> dict[str, Found]:

@@ -86,11 +86,12 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
 def _rung(
     run: RunFolder, name: str, content: Mapping[str, Any], models: Mapping[str, Mapping[str, Any]]
 ) -> dict[str, object]:
-    axes = run.read_json(f"models/{name}/validate.json")["axes"]
+    validated = run.read_json(f"models/{name}/validate.json")
+    axes = validated["axes"]
     parent = str(content.get("parent", ""))
     had = models.get(parent, {}).get("effects", []) if parent else []
     added = [e for e in content.get("effects", []) if e not in had]
-    return {
+    rung: dict[str, object] = {
         "model": name,
         "parent": parent or None,
         "added": ", ".join(added) or None,
@@ -99,6 +100,12 @@ def _rung(
         "noise_floor": {a: entry.get("noise_floor") for a, entry in axes.items()},
         "unit": {a: entry["unit"] for a, entry in axes.items()},
     }
+    free = validated.get("free_run", {})
+    if "axes" in free:
+        kept = ("mean_absolute", "rmse", "relative_error_percent", "unit")
+        rung["free_run_mode"] = free["mode"]
+        rung["free_run"] = {a: {k: e[k] for k in kept} for a, e in free["axes"].items()}
+    return rung
 
 
 def _moved(

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from bampipe.data.store import write_json, write_parquet
+from bampipe.data.store import read_parquet, write_json, write_parquet
 from bampipe.discover.recording import Motion as Driven
 from bampipe.discover.recording import Recording, Sensors
 from bampipe.discover.replay import replay
@@ -24,6 +24,7 @@ from bampipe.estimate.low_pass import Band
 from bampipe.physics import System, compile_model
 from bampipe.physics.device import derivative
 from bampipe.stages.base import Progress, RunFolder
+from bampipe.stages.free_run import free_runs
 from bampipe.stages.modelfile import load_model, model_inputs
 from bampipe.stages.motions import Motion, free_trials, problem_of, read_motion
 
@@ -43,6 +44,9 @@ class Config:
         noise_floor: whether to compute what sensors and filters alone would leave.
         repeats: simulated sessions for the noise floor.
         seed: of their sensor noise.
+        free_run: whether to run the model freely over every trial.
+        hold_out_by: a channel that is constant in each trial, such as a gain or a supply voltage:
+            trials at one value of it are held out together. Empty: one trial at a time.
     """
 
     model: str = "base"
@@ -50,6 +54,8 @@ class Config:
     noise_floor: bool = True
     repeats: int = 1
     seed: int = 0
+    free_run: bool = True
+    hold_out_by: str = ""
 
 
 def inputs(config: Config) -> tuple[str, ...]:
@@ -57,6 +63,7 @@ def inputs(config: Config) -> tuple[str, ...]:
     return (
         "ingest/trials.parquet",
         "ingest/session.json",
+        "ingest/samples.parquet",
         "filter/kinematics.parquet",
         "filter/filter.json",
         *model_inputs(config.model),
@@ -105,19 +112,26 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     problem = problem_of(system, motions, band, timing=timing)
     p = _identified(system, identified, run)
     progress(0.1, "held-out fits")
-    compared = _compare(system, motions, problem, p)
+    groups = _groups(run, motions, config.hold_out_by)
+    held_out = _held_out(problem, p, groups)
+    compared = _compare(system, motions, problem, p, held_out)
     notes = []
-    if len(motions) == 1:
-        notes.append("One free trial: nothing is held out; its error is that of the fit itself.")
+    if len(set(groups)) == 1:
+        notes.append(
+            "One free trial, or one group: nothing is held out; the error is that of the fit."
+        )
     floor: Array | None = None
     if config.noise_floor:
         progress(0.4, "noise floor")
         try:
-            floor = _noise_floor(run, session, system, motions, band, p, config)
+            floor = _noise_floor(run, session, system, motions, band, p, config, groups)
         except InputError as error:
             notes.append(f"No noise floor: simulating the fitted model failed ({error}).")
     used = replace(config, cutoff_hz=band.cutoff_hz)
     content = _content(system, compared, floor, notes, used)
+    if config.free_run:
+        progress(0.8, "free runs")
+        content["free_run"] = free_runs(run, system, motions, held_out)
     write_json(out / f"models/{config.model}/validate.json", content)
     write_parquet(
         out / f"models/{config.model}/residuals.parquet", _table(system, compared, len(motions) > 1)
@@ -142,14 +156,17 @@ def _identified(system: System, content: Mapping[str, Any], run: RunFolder) -> A
 
 
 def _compare(
-    system: System, motions: Sequence[Motion], problem: Problem, p: Array
+    system: System,
+    motions: Sequence[Motion],
+    problem: Problem,
+    p: Array,
+    held_out: Sequence[Array],
 ) -> list[_Compared]:
     """Compare every trial with the model as identified, held out, and without friction."""
     frictionless = p.copy()
     for i, item in enumerate(system.parameters):
         if item.name.startswith(("viscous.", "coulomb.")):
             frictionless[i] = 0.0
-    held_out = _held_out(problem, p)
     compared = []
     for k, motion in enumerate(motions):
         n = len(system.parameters)
@@ -178,13 +195,41 @@ def _compare(
     return compared
 
 
-def _held_out(problem: Problem, p: Array) -> list[Array]:
-    """Return, for each trial, the parameters that the other trials give."""
-    everything = range(problem.n_trials)
-    if problem.n_trials == 1:
-        return [p]
+def _groups(run: RunFolder, motions: Sequence[Motion], channel: str) -> list[int]:
+    """Return the number of the group of each trial; trials of a group are held out together.
+
+    Raises:
+        InputError: the channel is not recorded, or changes within a trial.
+    """
+    if not channel:
+        return list(range(len(motions)))
+    path = run.require("ingest/samples.parquet", "ingest")
+    values = []
+    for motion in motions:
+        frame = read_parquet(path, trial=motion.trial_id)
+        if channel not in frame:
+            raise InputError(f"no channel {channel!r} is recorded", where="validate.hold_out_by")
+        column = frame[channel].to_numpy(dtype=float)
+        if np.ptp(column) > 1e-9 * np.abs(column).max():
+            raise InputError(
+                f"channel {channel!r} changes within trial {motion.trial_id}",
+                where="validate.hold_out_by",
+                remedy="name a channel that is constant in each trial",
+            )
+        values.append(float(column[0]))
+    return [sorted(set(values)).index(value) for value in values]
+
+
+def _held_out(problem: Problem, p: Array, groups: Sequence[int]) -> list[Array]:
+    """Return, for each trial, the parameters that the trials of other groups give."""
+    if len(set(groups)) == 1:
+        return [p] * problem.n_trials
     start = fit(problem, p).p
-    return [fit(problem, start, trials=[i for i in everything if i != k]).p for k in everything]
+    found = {
+        group: fit(problem, start, trials=[i for i, g in enumerate(groups) if g != group]).p
+        for group in sorted(set(groups))
+    }
+    return [found[group] for group in groups]
 
 
 def _noise_floor(
@@ -195,6 +240,7 @@ def _noise_floor(
     band: Band,
     p: Array,
     config: Config,
+    groups: Sequence[int],
 ) -> Array:
     """Return the held-out error (n_q,) that the identified model leaves when it is the truth.
 
@@ -230,7 +276,7 @@ def _noise_floor(
             seen.append(_filtered(recording, motion, system, settings, band.rate_hz))
         problem = problem_of(system, seen, band)
         start = np.append(parameters, 0.0)
-        for k, held in enumerate(_held_out(problem, start)):
+        for k, held in enumerate(_held_out(problem, start, groups)):
             used = np.abs(band.thin(problem.resting[k].astype(float))) < 0.02
             residual = band.thin(problem.residual(k, held)) * used
             squares += np.sum(residual**2, axis=0)

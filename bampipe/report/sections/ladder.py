@@ -21,6 +21,8 @@ def section(results: Results) -> Section | None:
     if content is None or len(rungs) < 2:
         return None
     blocks: list[Block] = [_steps(results, rungs), _picture(results, rungs)]
+    if any(rung.get("free_run") for rung in rungs):
+        blocks.append(_free_runs(results, rungs))
     parameters = content.get("parameters") or {}
     if parameters:
         blocks.append(_parameters(results, rungs, parameters))
@@ -60,6 +62,34 @@ def _steps(results: Results, rungs: list[dict[str, Any]]) -> Table:
         ("Version", "Added", *units),
         tuple(rows),
         "ll" + "r" * len(axes),
+    )
+
+
+def _free_runs(results: Results, rungs: list[dict[str, Any]]) -> Table:
+    """Position error of each version left to itself: mean absolute, and relative to the motion."""
+    axes = _axes(results, rungs)
+    rows = []
+    for rung in rungs:
+        cells = []
+        for axis in axes:
+            entry = (rung.get("free_run") or {}).get(axis)
+            if entry is None:
+                cells += ["–", "–"]
+                continue
+            cells.append(wording.significant(entry["mean_absolute"]))
+            cells.append(wording.significant(entry["relative_error_percent"]))
+        loop = str(rung.get("free_run_mode") or "–").replace("_", " ")
+        rows.append((_version(rungs, rung), loop, *cells))
+    units = [
+        column
+        for axis in axes
+        for column in (f"{axis} ({wording.unit(results.unit(axis))})", "relative (%)")
+    ]
+    return Table(
+        "Free run over held-out trials: mean absolute error of the position, and relative error",
+        ("Version", "Loop", *units),
+        tuple(rows),
+        "ll" + "rr" * len(axes),
     )
 
 

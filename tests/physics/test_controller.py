@@ -1,0 +1,78 @@
+"""Controllers in device files: the law that comes out, and mistakes that are named."""
+
+from __future__ import annotations
+
+import copy
+
+import numpy as np
+import pytest
+
+from bampipe.errors import InputError
+from bampipe.physics import registry
+from bampipe.physics.control_law import compile_law
+from bampipe.physics.units import check_device
+
+
+def declared(**controller: object):
+    content = copy.deepcopy(dict(registry.device("slider").declaration))
+    content["controller"] = {**content["controller"], **controller}
+    return registry.device_from(content, "axis.toml")
+
+
+def test_the_servo_saturates_at_full_duty():
+    law = compile_law(registry.device("servo_pendulum"))
+    assert law is not None and law.inputs == ("goal", "gain", "supply", "t")
+    out = np.empty(1)
+    for goal, duty in (
+        (0.02, 0.02 * 400 / 256 * 4096 / (2 * np.pi) / 885),
+        (1.0, 1.0),
+        (-1.0, -1.0),
+    ):
+        r = np.array([goal, 400.0, 7.4, 0.0])
+        law.command(np.zeros(2), r, np.empty(0), out)
+        assert out[0] == pytest.approx(duty, rel=1e-6)
+
+
+def test_the_cascade_of_the_slider_damps_with_its_measured_rate():
+    law = compile_law(registry.device("slider"))
+    out = np.empty(1)
+    law.command(np.array([0.1, 0.5]), np.array([0.2, 10.0, 3.0, 0.0]), np.empty(0), out)
+    assert out[0] == pytest.approx(3.0 * (10.0 * 0.1 - 0.5))
+
+
+def test_a_device_without_a_controller_has_no_law():
+    assert compile_law(registry.device("bam")) is None
+
+
+def test_built_in_controllers_have_consistent_units():
+    for name in ("slider", "servo_pendulum"):
+        assert check_device(registry.device(name)) == []
+
+
+def test_a_law_of_the_wrong_unit_is_said():
+    device = declared(command={"force_motor": "position_gain*(goal - carriage)"})
+    assert any(line.startswith("controller.command.force_motor") for line in check_device(device))
+
+
+@pytest.mark.parametrize(
+    ("controller", "words"),
+    [
+        ({"command": {"force_engine": "1"}}, "one expression for each of force_motor"),
+        ({"gains": {}}, "unknown key 'gains'"),
+        ({"channels": ["goal"]}, "channels must be a table"),
+        ({"channels": {"mass": "kg"}}, "'mass' is the name of"),
+        ({"rate_hz": -5}, "rate_hz must be"),
+    ],
+)
+def test_mistakes_are_named(controller, words):
+    with pytest.raises(InputError, match=words):
+        declared(**controller)
+
+
+@pytest.mark.parametrize(
+    ("law", "words"),
+    [("mass*goal", "unknown symbol 'mass'"), ("ddt(carriage)", "has no ddt")],
+)
+def test_a_controller_knows_neither_parameters_nor_derivatives(law, words):
+    with pytest.raises(InputError, match=words):
+        compile_law(declared(command={"force_motor": law}))
