@@ -13,6 +13,7 @@ import typer
 
 import bampipe
 from bampipe.cli import device, places, show
+from bampipe.cli.lab import lab, refresh
 from bampipe.errors import InputError
 from bampipe.run import batch, gates, models, record
 from bampipe.run import pipeline as pipelines
@@ -235,6 +236,7 @@ def run(
     if junit is not None:
         _write_junit(junit, outcomes)
     _report_runs(outcomes, several, json)
+    refresh(runs, several, quiet or json)
     if not several:
         name = places.next_to(requests[0].root, runs)
         _advise(quiet, json, _after_run(outcomes[0], name))
@@ -772,6 +774,9 @@ def demo(
     batch.limit_threads(1)
     with show.Watcher(quiet) as watcher:
         demonstrate(runs, force, watcher, show.say)
+
+
+app.command("lab")(lab)
 
 
 @app.command("status")

@@ -1,0 +1,134 @@
+"""`bampipe lab`: all runs side by side, and what is printed of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from bampipe.cli import show
+from bampipe.errors import InputError
+
+if TYPE_CHECKING:
+    from bampipe.lab.collect import Lab
+
+MOST_SESSIONS = 60
+
+
+def lab(
+    runs: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[RUNS]", help="Folder that holds the run folders; runs/ if omitted."
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder to write to; lab/ beside the runs if omitted.")
+    ] = None,
+    json: Annotated[bool, typer.Option("--json", help="Print the trends as JSON.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no advice.")] = False,
+) -> None:
+    """All sessions side by side: one data set, control charts, and which session drifted and why.
+
+    Collects what has been run, and runs nothing.
+
+    Example: bampipe lab
+
+    Example: bampipe lab /data/runs --out /data/lab
+    """
+    folder = runs or Path("runs")
+    if not folder.is_dir():
+        raise InputError("no such folder of runs", where=str(folder))
+    found = gather(folder, out, quiet or json)
+    if json:
+        show.as_json(found.content)
+        return
+    table(found)
+    if not quiet:
+        show.say("")
+        show.say(f"next: {advice(found)}")
+
+
+def gather(runs: Path, out: Path | None = None, quiet: bool = False) -> Lab:
+    """Write the lab's folder for the runs in ``runs``."""
+    from bampipe.lab.collect import beside, collect
+    from bampipe.run.events import Event
+
+    folder = out or beside(runs)
+    with show.Watcher(quiet) as watcher:
+
+        def progress(fraction: float, message: str) -> None:
+            watcher(Event(str(folder), "lab", "progress", fraction, message))
+
+        return collect(runs, folder, progress=progress)
+
+
+def refresh(runs: Path, several: bool, quiet: bool) -> None:
+    """Bring the lab's folder up to date after a run, if there is one or there should be.
+
+    Args:
+        runs: the folder of runs.
+        several: whether several sessions were run: that makes a lab.
+        quiet: print nothing.
+    """
+    from bampipe.lab.collect import FILE, beside, is_current, run_folders
+
+    folder = beside(runs)
+    wanted = several or (folder / FILE).is_file()
+    if not wanted or not run_folders(runs) or is_current(runs, folder):
+        return
+    found = gather(runs, None, quiet)
+    if not quiet and several:
+        show.say("")
+        table(found)
+
+
+def table(found: Lab) -> None:
+    """Print the sessions that stand out, else that none does; then the trends."""
+    sessions = found.content["sessions"]
+    odd = [one for one in sessions if one["verdict"] != "in control"]
+    show.say(f"{found.folder}: {len(sessions)} sessions, {len(odd)} stand out")
+    rows = [
+        [
+            one["session"],
+            one["recorded"][:16].replace("T", " "),
+            f"{one['worst'][0]:.3g} {one['worst'][1]}" if one["worst"] else None,
+            one["verdict"],
+            _first(one),
+        ]
+        for one in (sessions if len(sessions) <= MOST_SESSIONS else odd)
+    ]
+    if rows:
+        show.table(["session", "recorded", "error / floor", "verdict", ""], rows)
+    for line in _trend_lines(found.content["series"]):
+        show.say(line)
+    fewest = found.content["fewest_sessions"]
+    if len(sessions) < fewest:
+        show.say(f"no control limits yet: they need {fewest} sessions of a device")
+    for line in found.skipped:
+        show.say(f"left out: {line}")
+
+
+def _first(one: dict[str, Any]) -> str:
+    return str(one["sentence"])
+
+
+def _trend_lines(series: list[dict[str, Any]]) -> list[str]:
+    lines = []
+    for chart in series:
+        if chart["drifts"]:
+            percent = 100.0 * chart["slope_per_session"] / abs(chart["centre"] or 1.0)
+            lines.append(f"trend: {chart['name']} {percent:+.2g} % a session")
+        if chart["run"]:
+            first, last = chart["run"]
+            lines.append(f"shift: {chart['name']} on one side of its median, {first} to {last}")
+    return lines
+
+
+def advice(found: Lab) -> str:
+    """Return the command to go on with."""
+    for one in found.content["sessions"]:
+        if one["remedy"]:
+            return str(one["remedy"])
+    return f"open {found.folder / 'report.pdf'}"

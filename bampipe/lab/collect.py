@@ -1,0 +1,145 @@
+"""Collect the runs of a lab: tables, trends and a report, from whatever has been run."""
+
+from __future__ import annotations
+
+import fcntl
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from bampipe.data import lab_tables, store
+from bampipe.errors import InputError
+from bampipe.lab import rows, trends
+from bampipe.run import record
+from bampipe.stages.base import Progress, silent
+
+FILE = "lab.json"
+SCHEMA = "bampipe.lab/1"
+TRENDS = "trends.json"
+_EARLIEST = datetime.min.replace(tzinfo=UTC)
+
+
+@dataclass(frozen=True)
+class Lab:
+    """What was collected.
+
+    Attributes:
+        folder: the lab's folder.
+        content: what ``trends.json`` holds.
+        sessions: ids of the sessions, in the order of recording.
+        skipped: one line on each run folder that could not be read.
+        tables: number of rows of each table.
+    """
+
+    folder: Path
+    content: dict[str, Any]
+    sessions: tuple[str, ...]
+    skipped: tuple[str, ...]
+    tables: Mapping[str, int]
+
+
+def beside(runs: Path) -> Path:
+    """Return the lab's folder for a folder of runs: ``lab`` next to it."""
+    return runs.resolve().parent / "lab" if runs.name in ("", "..") else runs.parent / "lab"
+
+
+def run_folders(runs: Path) -> list[Path]:
+    """Return the run folders in ``runs``, by name."""
+    return sorted(path.parent for path in runs.glob(f"*/{record.FILE}"))
+
+
+def collect(runs: Path, folder: Path, *, report: bool = True, progress: Progress = silent) -> Lab:
+    """Read every run in ``runs`` and write the lab's folder anew.
+
+    A run that cannot be read is left out and named. Every file is replaced whole; ``lab.json``
+    comes last.
+
+    Args:
+        runs: folder of run folders.
+        folder: the lab's folder.
+        report: whether to write report.pdf and report.html too.
+        progress: told the share done.
+
+    Raises:
+        InputError: there is no run in ``runs``, or a file cannot be written.
+    """
+    roots = run_folders(runs)
+    if not roots:
+        raise InputError(f"no run in {runs}", remedy="start with `bampipe run 'sessions/*'`")
+    found: list[rows.SessionRows] = []
+    skipped: list[str] = []
+    for number, root in enumerate(roots):
+        progress(0.6 * number / len(roots), root.name)
+        try:
+            found.append(rows.of_run(root))
+        except InputError as error:
+            skipped.append(f"{root.name}: {error}")
+    if not found:
+        raise InputError(f"no run in {runs} has got as far as ingest", remedy=skipped[0])
+    found.sort(key=lambda one: (one.key["recorded_at"] or _EARLIEST, one.key["session_id"]))
+    tables = {
+        name: [row for one in found for row in one.tables.get(name, ())]
+        for name in lab_tables.TABLES
+    }
+    charts = trends.series(tables)
+    content = trends.content(charts, trends.judge(tables, charts))
+    with _alone(folder):
+        counts = lab_tables.write(folder, tables)
+        store.write_json(folder / TRENDS, content)
+        if report:
+            progress(0.7, "report")
+            _report(folder)
+        sessions = tuple(str(one.key["session_id"]) for one in found)
+        about = {
+            "schema": SCHEMA,
+            "sessions": list(sessions),
+            "skipped": skipped,
+            "tables": counts,
+        }
+        store.write_json(folder / FILE, about)
+    return Lab(folder, content, sessions, tuple(skipped), counts)
+
+
+def is_current(runs: Path, folder: Path) -> bool:
+    """Whether ``folder`` holds the runs in ``runs``, none younger than it: nothing to collect."""
+    about = folder / FILE
+    if not about.is_file():
+        return False
+    written = about.stat().st_mtime_ns
+    roots = run_folders(runs)
+    if any((root / record.FILE).stat().st_mtime_ns > written for root in roots):
+        return False
+    kept = store.read_json(about)
+    known: Sequence[str] = [*kept["sessions"], *(line.split(":")[0] for line in kept["skipped"])]
+    return sorted(known) == sorted(root.name for root in roots)
+
+
+def _report(folder: Path) -> None:
+    # matplotlib is slow to import: only here
+    from bampipe.report.lab import build
+
+    made = build(folder)
+    with store.atomic_writer(folder / "report.pdf") as stream:
+        stream.write(made.pdf)
+    store.write_text(folder / "report.html", made.html)
+    for name, svg in made.figures.items():
+        store.write_text(folder / "figures" / f"{name}.svg", svg)
+    for old in (folder / "figures").glob("*.svg"):
+        if old.stem not in made.figures:
+            old.unlink()
+
+
+@contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """Hold the lab's folder: two collections at once take turns."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        handle = (folder / ".lock").open("a")
+    except OSError as error:
+        raise InputError(f"cannot be written: {error.strerror}", where=str(folder)) from error
+    with handle:
+        fcntl.flock(handle, fcntl.LOCK_EX)
+        yield

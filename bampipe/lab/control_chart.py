@@ -1,0 +1,126 @@
+"""Control charts of estimates that each come with a standard deviation of their own.
+
+An individuals chart (Shewhart) whose scatter is estimated from moving ranges, after which a slow
+drift or a step between two levels hardly widens the limits. The moving range holds both the
+scatter between sessions, tau, and the uncertainty within each, s_i; limits of session i are
+
+    centre +/- factor(n) * sqrt(tau^2 + s_i^2),    tau^2 = max(0, sigma_MR^2 - median(s^2)),
+
+so that a session known only roughly is given its room. sigma_MR is the median moving range over
+0.954 (Montgomery, Introduction to Statistical Quality Control, section 6.4; the median is that of
+Clifford 1959): up to a quarter of the sessions may be off without hiding one another.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+FEWEST = 6
+"""With fewer sessions their scatter is not known well enough for limits."""
+
+RUN_LENGTH = 9
+"""So many sessions in a row on one side of the centre are a shift (Nelson 1984, test 2)."""
+
+FALSE_ALARM = 0.0027
+"""Share of sessions beyond the limits where nothing has changed: that of three sigma."""
+
+MEDIAN_RANGE = 0.9539
+"""Median of the range of two standard normal numbers, sqrt(2) * 0.6745."""
+
+_FACTORS = (
+    (6, 6.95), (7, 5.30), (8, 5.63), (9, 4.80), (10, 4.95), (11, 4.46), (12, 4.54), (13, 4.21),
+    (14, 4.27), (15, 4.05), (16, 4.09), (17, 3.92), (18, 3.94), (19, 3.81), (20, 3.83),
+    (22, 3.75), (24, 3.69), (26, 3.63), (28, 3.58), (30, 3.53), (40, 3.40), (60, 3.26),
+    (100, 3.15),
+)  # fmt: skip
+"""Number of sessions and factor for FALSE_ALARM: quantiles of |x - median| / sigma_MR over 1.2e7
+normal numbers; the test suite draws some of them again. Three only for very many sessions."""
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A control chart of n sessions, in their order.
+
+    Attributes:
+        centre: median of the estimates.
+        between_sd: scatter between sessions, tau; the uncertainty within them is taken out.
+        lower: lower limit for each session, (n,); NaN where there are too few sessions.
+        upper: upper limit for each session, (n,).
+        beyond: whether each session lies outside its limits, (n,).
+        run: first and last session of the longest run on one side of the centre, if it is a
+            shift; else None.
+        slope: median slope a session (Theil and Sen), unit of the estimates.
+        slope_p: probability of a trend this clear by chance (Kendall); 1 where there are too few.
+    """
+
+    centre: float
+    between_sd: float
+    lower: Array
+    upper: Array
+    beyond: NDArray[np.bool_]
+    run: tuple[int, int] | None
+    slope: float
+    slope_p: float
+
+    @property
+    def drifts(self) -> bool:
+        """Whether there is a trend: less likely by chance than a point beyond the limits."""
+        return self.slope_p < FALSE_ALARM
+
+
+def factor(sessions: int) -> float:
+    """Return the half width of the limits in standard deviations, for so many sessions."""
+    counts, values = zip(*_FACTORS, strict=True)
+    if sessions > counts[-1]:
+        return float(3.0 + (values[-1] - 3.0) * counts[-1] / sessions)
+    return float(np.interp(sessions, counts, values))
+
+
+def chart(estimates: Sequence[float] | Array, sds: Sequence[float] | Array) -> Chart:
+    """Return the control chart of ``estimates``.
+
+    Args:
+        estimates: of the sessions in the order of their recording, (n,).
+        sds: standard deviation of each, (n,); 0 where it is not known.
+    """
+    x, s = np.asarray(estimates, dtype=float), np.asarray(sds, dtype=float)
+    n = len(x)
+    centre = float(np.median(x))
+    if n < FEWEST:
+        unknown = np.full(n, np.nan)
+        return Chart(centre, float("nan"), unknown, unknown, np.zeros(n, bool), None, 0.0, 1.0)
+    sigma = float(np.median(np.abs(np.diff(x)))) / MEDIAN_RANGE
+    between = float(np.sqrt(max(0.0, sigma**2 - float(np.median(s**2)))))
+    half = factor(n) * np.sqrt(between**2 + s**2)
+    beyond = np.abs(x - centre) > half
+    slope, chance = _trend(x)
+    return Chart(centre, between, centre - half, centre + half, beyond, _run(x), slope, chance)
+
+
+def _run(x: Array) -> tuple[int, int] | None:
+    """Return the longest run of RUN_LENGTH or more on one side of the median."""
+    side = np.sign(x - np.median(x))
+    best: tuple[int, int] | None = None
+    start = 0
+    for i in range(1, len(x) + 1):
+        if i == len(x) or side[i] != side[start]:
+            longest = 0 if best is None else best[1] - best[0] + 1
+            if side[start] != 0 and i - start >= max(RUN_LENGTH, longest + 1):
+                best = (start, i - 1)
+            start = i
+    return best
+
+
+def _trend(x: Array) -> tuple[float, float]:
+    from scipy.stats import kendalltau, theilslopes
+
+    order = np.arange(len(x), dtype=float)
+    if np.ptp(x) == 0.0:
+        return 0.0, 1.0
+    return float(theilslopes(x, order).slope), float(kendalltau(order, x).pvalue)

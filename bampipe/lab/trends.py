@@ -1,0 +1,286 @@
+"""Which session drifted, and why: the device itself, or an effect that its model lacks.
+
+A parameter of the base model is charted over all sessions, since only the same model can be
+compared. A session beyond the limits is then asked what its diagnosis says. Nothing missing: the
+parameter itself moved. An effect missing: it biases the parameters, so the parameter is looked up
+in the session's own model with that effect; back within the limits, the device has not changed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from bampipe.lab.control_chart import FEWEST, Chart, chart
+from bampipe.run.models import BASE
+
+Row = Mapping[str, Any]
+
+IN_CONTROL = "in control"
+DEVICE = "device drifted"
+EFFECT = "missing effect"
+BOTH = "device drifted, and missing effect"
+UNKNOWN = "not diagnosed"
+
+ABOVE_FLOOR = 1.5
+"""A held-out error so many noise floors high asks for a diagnosis (the gate of the pipelines)."""
+
+
+@dataclass(frozen=True)
+class Series:
+    """One quantity of one device over its sessions.
+
+    Attributes:
+        device: the device.
+        name: parameter of the base model, or ``stiffness.<axis>``.
+        unit: its unit.
+        sessions: session ids in the order of recording.
+        estimates: one a session.
+        sds: their standard deviations.
+        chart: the control chart.
+    """
+
+    device: str
+    name: str
+    unit: str
+    sessions: tuple[str, ...]
+    estimates: tuple[float, ...]
+    sds: tuple[float, ...]
+    chart: Chart
+
+    def within(self, session: str, value: float, sd: float) -> bool:
+        """Whether ``value``, in place of the estimate of ``session``, lies inside the limits."""
+        place = self.sessions.index(session)
+        room = (self.chart.upper[place] - self.chart.centre) ** 2
+        widened = float(room * _ratio(self.chart.between_sd, sd, self.sds[place])) ** 0.5
+        return bool(abs(value - self.chart.centre) <= widened)
+
+
+def _ratio(between: float, sd: float, old: float) -> float:
+    variance = between**2 + old**2
+    return (between**2 + sd**2) / variance if variance > 0.0 else 1.0
+
+
+@dataclass
+class Judged:
+    """What is said of one session.
+
+    Attributes:
+        session: its id.
+        device: the device.
+        recorded: when it was recorded, ISO 8601, or "".
+        verdict: one of the module's five.
+        moved: parameter beyond its limits: {parameter, estimate, centre, percent, unit}.
+        effects: those its diagnosis names; without one, those its models add to the base model.
+        unexplained: axes on which something unknown is missing.
+        diagnosed: whether a diagnosis was made.
+        worst: largest held-out error of the base model over its floor, and its axis.
+        sentence: the verdict in words.
+        remedy: a command that would say more, or "".
+    """
+
+    session: str
+    device: str
+    recorded: str
+    verdict: str = IN_CONTROL
+    moved: list[dict[str, Any]] = field(default_factory=list)
+    effects: tuple[str, ...] = ()
+    unexplained: tuple[str, ...] = ()
+    diagnosed: bool = False
+    worst: tuple[float, str] | None = None
+    sentence: str = ""
+    remedy: str = ""
+
+
+def series(tables: Mapping[str, Sequence[Row]]) -> list[Series]:
+    """Return the charts of every parameter of the base models, and of every stiffness.
+
+    Args:
+        tables: rows of the lab's tables, sessions in the order of their recording.
+    """
+    found: dict[tuple[str, str, str], list[tuple[str, float, float]]] = {}
+    for row in tables.get("parameters", ()):
+        if row["model"] == BASE and row["estimate"] is not None:
+            key = (str(row["device"]), str(row["parameter"]), str(row["unit"] or ""))
+            entry = (str(row["session_id"]), float(row["estimate"]), float(row["sd"] or 0.0))
+            found.setdefault(key, []).append(entry)
+    for row in tables.get("stiffness", ()):
+        if row["stiffness"] is not None:
+            key = (str(row["device"]), f"stiffness.{row['axis']}", str(row["unit"] or ""))
+            entry = (str(row["session_id"]), float(row["stiffness"]), float(row["sd"] or 0.0))
+            found.setdefault(key, []).append(entry)
+    charts = []
+    for (device, name, unit), entries in sorted(found.items()):
+        ids, values, sds = zip(*entries, strict=True)
+        charts.append(Series(device, name, unit, ids, values, sds, chart(values, sds)))
+    return charts
+
+
+def judge(tables: Mapping[str, Sequence[Row]], charts: Sequence[Series]) -> list[Judged]:
+    """Return what is to be said of each session, in the order of recording.
+
+    Args:
+        tables: rows of the lab's tables.
+        charts: what :func:`series` returns for them.
+    """
+    return [_judge(row, tables, charts) for row in tables["sessions"]]
+
+
+def _judge(row: Row, tables: Mapping[str, Sequence[Row]], charts: Sequence[Series]) -> Judged:
+    session, device = str(row["session_id"]), str(row["device"])
+    when = row["recorded_at"]
+    judged = Judged(session, device, when.isoformat() if when is not None else "")
+    mine = {
+        name: [r for r in tables.get(name, ()) if r["session_id"] == session]
+        for name in ("parameters", "errors", "verdicts")
+    }
+    ratios = [
+        (float(r["error_over_floor"]), str(r["axis"]))
+        for r in mine["errors"]
+        if r["model"] == BASE and r["error_over_floor"] is not None
+    ]
+    judged.worst = max(ratios, default=None)
+    named = [effect for r in mine["verdicts"] for effect in r["effects"]]
+    first = [r for r in mine["verdicts"] if r["model"] == BASE]
+    judged.effects = tuple(dict.fromkeys(named if first else row["effects"]))
+    judged.unexplained = tuple(r["axis"] for r in first if r["verdict"] == "unknown_effect")
+    judged.diagnosed = bool(first)
+    beyond = [c for c in charts if c.device == device and _is_beyond(c, session)]
+    judged.moved = [_moved(c, session) for c in beyond]
+    _decide(judged, beyond, mine)
+    return judged
+
+
+def _is_beyond(c: Series, session: str) -> bool:
+    return session in c.sessions and bool(c.chart.beyond[c.sessions.index(session)])
+
+
+def _moved(c: Series, session: str) -> dict[str, Any]:
+    value, centre = c.estimates[c.sessions.index(session)], c.chart.centre
+    percent = 100.0 * (value - centre) / abs(centre) if centre else None
+    return {
+        "parameter": c.name,
+        "estimate": value,
+        "centre": centre,
+        "percent": percent,
+        "unit": c.unit,
+    }
+
+
+def _decide(judged: Judged, beyond: Sequence[Series], mine: Mapping[str, Sequence[Row]]) -> None:
+    """Set verdict, sentence and remedy."""
+    lacks = [*judged.effects, *(f"something unknown on {axis}" for axis in judged.unexplained)]
+    what = " and ".join(lacks)
+    moved = ", ".join(_in_words(entry) for entry in judged.moved)
+    if not beyond:
+        if lacks:
+            judged.verdict = EFFECT
+            judged.sentence = f"lacks {what}; no parameter is beyond its limits"
+        elif not judged.diagnosed and judged.worst and judged.worst[0] > ABOVE_FLOOR:
+            judged.verdict = UNKNOWN
+            judged.sentence = (
+                f"error on unseen trials {judged.worst[0]:.3g} times the floor on "
+                f"{judged.worst[1]}: something is missing, not yet asked what"
+            )
+            judged.remedy = f"bampipe diagnose {judged.session} --model {BASE}"
+        return
+    if not lacks:
+        judged.verdict = DEVICE if judged.diagnosed else UNKNOWN
+        judged.sentence = f"{moved}; its diagnosis finds nothing missing: the device changed"
+        if not judged.diagnosed:
+            judged.sentence = f"{moved}; whether an effect is missing has not been asked"
+            judged.remedy = f"bampipe diagnose {judged.session} --model {BASE}"
+        return
+    back, still = _with_the_effect(judged, beyond, mine)
+    if still:
+        judged.verdict = BOTH
+        judged.sentence = (
+            f"{moved}; lacks {what}, which does not account for {', '.join(still)}: the device "
+            "changed too"
+        )
+    elif back:
+        judged.verdict = EFFECT
+        judged.sentence = (
+            f"{moved}; with {what} in the model {'they are' if len(back) > 1 else 'it is'} back "
+            "within the limits: the device has not changed"
+        )
+    else:
+        judged.verdict = EFFECT
+        judged.sentence = f"{moved}; lacks {what}, which biases the parameters"
+        judged.remedy = f"bampipe extend {judged.session} --auto, then bampipe lab"
+
+
+def _with_the_effect(
+    judged: Judged, beyond: Sequence[Series], mine: Mapping[str, Sequence[Row]]
+) -> tuple[list[str], list[str]]:
+    """Return which parameters the missing effect brings back, and which it cannot account for.
+
+    With a model that has the effect, its estimates decide; without one, a parameter of an axis on
+    which nothing is missing, or a stiffness (which no model enters), counts as unaccounted for.
+    """
+    models = {str(r["model"]) for r in mine["parameters"]} - {BASE}
+    largest = max(models, key=lambda name: (name.count("+"), name), default="")
+    child = {r["parameter"]: r for r in mine["parameters"] if r["model"] == largest}
+    clean = {
+        r["axis"]
+        for r in mine["verdicts"]
+        if r["model"] == BASE and r["verdict"] == "nothing_missing"
+    }
+    back: list[str] = []
+    still: list[str] = []
+    for c in beyond:
+        row = child.get(c.name)
+        if row is not None and row["estimate"] is not None:
+            inside = c.within(judged.session, float(row["estimate"]), float(row["sd"] or 0.0))
+            (back if inside else still).append(c.name)
+        elif c.name.startswith("stiffness.") or c.name.rpartition(".")[2] in clean:
+            still.append(c.name)
+    return back, still
+
+
+def _in_words(entry: Mapping[str, Any]) -> str:
+    percent = entry["percent"]
+    if percent is None:
+        return f"{entry['parameter']} {entry['estimate']:.4g} {entry['unit']}"
+    return f"{entry['parameter']} {percent:+.2g} %".replace("-", "−")
+
+
+def content(charts: Sequence[Series], judged: Sequence[Judged]) -> dict[str, object]:
+    """Return charts and verdicts as a table that JSON can hold."""
+    return {
+        "schema": "bampipe.trends/1",
+        "fewest_sessions": FEWEST,
+        "series": [_series_content(c) for c in charts],
+        "sessions": [
+            {**vars(j), "worst": None if j.worst is None else list(j.worst)} for j in judged
+        ],
+    }
+
+
+def _series_content(c: Series) -> dict[str, object]:
+    known = len(c.sessions) >= FEWEST
+    k = c.chart
+    run = None if k.run is None else [c.sessions[k.run[0]], c.sessions[k.run[1]]]
+    return {
+        "device": c.device,
+        "name": c.name,
+        "unit": c.unit,
+        "centre": k.centre,
+        "between_sd": k.between_sd if known else None,
+        "slope_per_session": k.slope if known else None,
+        "slope_p": k.slope_p if known else None,
+        "drifts": k.drifts,
+        "run": run,
+        "points": [
+            {
+                "session": session,
+                "estimate": c.estimates[i],
+                "sd": c.sds[i],
+                "lower": float(k.lower[i]) if known else None,
+                "upper": float(k.upper[i]) if known else None,
+                "beyond": bool(k.beyond[i]),
+            }
+            for i, session in enumerate(c.sessions)
+        ],
+    }

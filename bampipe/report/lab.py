@@ -1,0 +1,329 @@
+"""The report over all sessions of a lab: verdicts, control charts, errors, trials."""
+
+from __future__ import annotations
+
+import json
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+
+from bampipe.report import page, style, typeset, wording
+from bampipe.report.build import Report
+from bampipe.report.document import Block, Callout, Document, Figure, Section, Table, Text
+from bampipe.report.verdicts import NEAR_FLOOR
+
+_COLUMNS = 3
+_MOST_PANELS = 12
+_MOST_NAMES = 12
+
+
+def build(folder: Path) -> Report:
+    """Return the report of the lab's folder.
+
+    Args:
+        folder: where ``trends.json`` and the tables are.
+    """
+    trends = json.loads((folder / "trends.json").read_text(encoding="utf-8"))
+    with style.look():
+        sections = [
+            section
+            for section in (
+                _summary(trends),
+                *_charts(trends),
+                _errors(folder, trends),
+                _trials(folder),
+            )
+            if section is not None
+        ]
+    document = Document("All sessions", _subtitle(trends), tuple(sections))
+    figures = {
+        block.name: block.svg
+        for section in sections
+        for block in section.blocks
+        if isinstance(block, Figure)
+    }
+    moments = [datetime.fromisoformat(one["recorded"]) for one in _dated(trends)]
+    stamp = max((int(moment.timestamp()) for moment in moments), default=0)
+    printed = typeset.pdf(document, max(0, stamp))
+    titles = tuple(section.title for section in sections)
+    return Report(printed, page.page(document), figures, titles)
+
+
+def _dated(trends: dict[str, Any]) -> list[dict[str, Any]]:
+    return [one for one in trends["sessions"] if one["recorded"]]
+
+
+def _subtitle(trends: dict[str, Any]) -> str:
+    devices = sorted({one["device"] for one in trends["sessions"]})
+    parts = [wording.count(len(trends["sessions"]), "session")]
+    parts.append(f"device{'s' if len(devices) > 1 else ''} {wording.listing(devices)}")
+    days = sorted({one["recorded"][:10] for one in _dated(trends)})
+    if days:
+        parts.append(days[0] if len(days) == 1 else f"recorded {days[0]} to {days[-1]}")
+    return ", ".join(parts)
+
+
+def _summary(trends: dict[str, Any]) -> Section:
+    sessions = trends["sessions"]
+    odd = [one for one in sessions if one["verdict"] != "in control"]
+    blocks: list[Block] = []
+    if not odd:
+        blocks.append(Callout("good", "No session stands out", _limits_in_words(trends)))
+    for one in odd[:6]:
+        remedy = f" To go on: `{one['remedy']}`." if one["remedy"] else ""
+        title = f"{one['session']}: {one['verdict']}"
+        text = _sentence(one["sentence"]) + remedy
+        blocks.append(
+            Callout("unknown" if one["verdict"] == "not diagnosed" else "attention", title, text)
+        )
+    if len(odd) > 6:
+        more = wording.count(len(odd) - 6, "session")
+        blocks.append(Text(f"Besides these, {more} in the table below."))
+    rows = [
+        (
+            one["session"],
+            one["recorded"][:16].replace("T", " ") or "–",
+            f"{wording.significant(one['worst'][0])} ({one['worst'][1]})" if one["worst"] else "–",
+            ", ".join(entry["parameter"] for entry in one["moved"]) or "–",
+            one["verdict"],
+        )
+        for one in sessions
+    ]
+    blocks.append(
+        Table(
+            "Sessions in the order of recording",
+            (
+                "Session",
+                "Recorded (UTC)",
+                "Error / floor, worst axis",
+                "Beyond its limits",
+                "Verdict",
+            ),
+            tuple(rows),
+            "llrll",
+            (0.0, 0.0, 0.0, 1.0, 1.0),
+            "Error on unseen trials by the base model, over what sensors and filters leave.",
+        )
+    )
+    return Section("Summary", tuple(blocks))
+
+
+def _sentence(text: str) -> str:
+    return f"{text[:1].upper()}{text[1:]}."
+
+
+def _limits_in_words(trends: dict[str, Any]) -> str:
+    few = [c for c in trends["series"] if len(c["points"]) < trends["fewest_sessions"]]
+    if few and len(few) == len(trends["series"]):
+        return (
+            f"Control limits need {trends['fewest_sessions']} sessions of a device; until then "
+            "only the diagnoses of single sessions count."
+        )
+    return "Every parameter lies within its control limits, and no diagnosis names an effect."
+
+
+def _charts(trends: dict[str, Any]) -> list[Section]:
+    sections = []
+    devices = sorted({c["device"] for c in trends["series"]})
+    for place, device in enumerate(devices, start=1):
+        charts = [c for c in trends["series"] if c["device"] == device]
+        title = "Parameters over time" + (f", {device}" if len(devices) > 1 else "")
+        blocks: list[Block] = [
+            Text(
+                "Each point is a session's estimate with two standard deviations. The line is the "
+                "median, the band the control limits: from the scatter between neighbouring "
+                "sessions and each session's own uncertainty, so wide that a session of an "
+                "unchanged device leaves them once in 370 times."
+            )
+        ]
+        blocks.append(_chart_table(charts))
+        for start in range(0, len(charts), _MOST_PANELS):
+            part = charts[start : start + _MOST_PANELS]
+            number = f"-{start // _MOST_PANELS + 1}" if len(charts) > _MOST_PANELS else ""
+            blocks.append(_picture(part, f"charts-{place}{number}"))
+        sections.append(Section(title, tuple(blocks), new_page=True))
+    return sections
+
+
+def _picture(charts: list[dict[str, Any]], name: str) -> Figure:
+    rows = -(-len(charts) // _COLUMNS)
+    figure, panels = style.panels(rows, _COLUMNS, 1.75 * rows + 0.25)
+    for panel, chart in zip(panels.ravel(), charts, strict=False):
+        _panel(panel, chart)
+    for panel in panels.ravel()[len(charts) :]:
+        panel.set_axis_off()
+    caption = "Control charts of the base model's parameters; sessions beyond the limits are named."
+    return Figure(name, caption, style.svg(figure))
+
+
+def _panel(panel: Axes, chart: dict[str, Any]) -> None:
+    points = chart["points"]
+    x = np.arange(len(points))
+    y = np.array([point["estimate"] for point in points])
+    error = 2.0 * np.array([point["sd"] for point in points])
+    scale, unit = wording.scale(list(np.abs(y)), chart["unit"])
+    y, error = y * scale, error * scale
+    panel.axhline(chart["centre"] * scale, color=style.FAINT, lw=0.9)
+    shown = [y - error, y + error]
+    if points[0]["lower"] is not None:
+        low = scale * np.array([point["lower"] for point in points])
+        high = scale * np.array([point["upper"] for point in points])
+        edges = np.concatenate([[-0.5], np.repeat(x[1:] - 0.5, 2), [len(x) - 0.5]])
+        panel.fill_between(
+            edges, np.repeat(low, 2), np.repeat(high, 2), color=style.SKY, alpha=0.22, lw=0
+        )
+        shown += [low, high]
+    beyond = np.array([point["beyond"] for point in points])
+    for chosen, colour, mark in ((~beyond, style.BLUE, "o"), (beyond, style.VERMILLION, "D")):
+        panel.errorbar(
+            x[chosen], y[chosen], error[chosen], fmt=mark, ms=3.2, color=colour, elinewidth=0.8
+        )
+    middle = float(np.median(y))
+    for place in np.flatnonzero(beyond):
+        above = y[place] > middle
+        left = place > len(x) / 2
+        panel.annotate(
+            points[place]["session"], (x[place], y[place]), (-5 if left else 5, 0),
+            textcoords="offset points", fontsize=7, color=style.VERMILLION,
+            ha="right" if left else "left", va="center_baseline" if above else "center",
+        )  # fmt: skip
+    style.limits(panel, shown)
+    panel.set_xlim(-0.5, len(x) - 0.5)
+    _name_sessions(panel, [point["session"] for point in points])
+    panel.set_title(wording.parameter(chart["name"]))
+    panel.set_ylabel(unit)
+
+
+def _name_sessions(panel: Axes, names: list[str]) -> None:
+    """Name every so-manieth session below a panel, upright where names are long."""
+    step = -(-len(names) // _MOST_NAMES)
+    places = range(0, len(names), step)
+    shown = [names[place] for place in places]
+    long = sum(map(len, shown)) > 24
+    panel.set_xticks(list(places), shown, rotation=90 if long else 0)
+    panel.tick_params(axis="x", labelsize=6)
+
+
+def _chart_table(charts: list[dict[str, Any]]) -> Table:
+    rows = []
+    for chart in charts:
+        sds = [point["sd"] for point in chart["points"]]
+        within, centre = float(np.median(sds)), chart["centre"]
+        slope, chance = chart["slope_per_session"], chart["slope_p"]
+        trend = "–"
+        if slope is not None and centre:
+            trend = f"{wording.significant(100.0 * slope / abs(centre), 2)} %"
+            trend += f" (p {wording.probability(chance)})"
+        outside = [point["session"] for point in chart["points"] if point["beyond"]]
+        signs = [f"beyond: {', '.join(outside)}"] if outside else []
+        if chart["drifts"]:
+            signs.append("trend")
+        if chart["run"]:
+            signs.append(f"shift from {chart['run'][0]} to {chart['run'][1]}")
+        rows.append(
+            (
+                wording.parameter(chart["name"]),
+                wording.with_sd(centre, chart["between_sd"] or within),
+                wording.unit(chart["unit"]),
+                wording.significant(chart["between_sd"], 2),
+                wording.significant(within, 2),
+                trend,
+                "; ".join(signs) or "–",
+            )
+        )
+    return Table(
+        "Centre and scatter of each parameter",
+        ("Parameter", "Centre", "Unit", "Between", "Within", "Trend a session", "Signs"),
+        tuple(rows),
+        "lrlrrrl",
+        (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0),
+        "Between: scatter between sessions, the uncertainty within them taken out. Within: median "
+        "standard deviation of a session's estimate. Trend: median slope (Theil and Sen), and how "
+        "likely one so clear is by chance (Kendall).",
+    )
+
+
+def _errors(folder: Path, trends: dict[str, Any]) -> Section | None:
+    frame = pd.read_parquet(folder / "errors")
+    frame = frame[frame["error_over_floor"].notna()]
+    if frame.empty:
+        return None
+    order = [one["session"] for one in trends["sessions"]]
+    sessions = [name for name in order if name in set(frame["session_id"])]
+    axes = list(dict.fromkeys(frame["axis"]))
+    columns = min(_COLUMNS, len(axes))
+    rows = -(-len(axes) // columns)
+    figure, panels = style.panels(rows, columns, 1.9 * rows + 0.35)
+    for panel, axis in zip(panels.ravel(), axes, strict=False):
+        here = frame[frame["axis"] == axis]
+        base = here[here["model"] == "base"].set_index("session_id")["error_over_floor"]
+        others = here[here["model"] != "base"].groupby("session_id")["error_over_floor"].min()
+        place = {name: number for number, name in enumerate(sessions)}
+        panel.axhspan(0.0, NEAR_FLOOR, color=style.GREEN, alpha=0.12, lw=0)
+        for values, colour, mark, name in (
+            (base, style.BLUE, "o", "base model"),
+            (others, style.VERMILLION, "D", "best extended model"),
+        ):
+            x = [place[session] for session in values.index]
+            panel.plot(x, values.to_numpy(), mark, ms=3.6, color=colour, label=name)
+        panel.set_yscale("log")
+        low, high = here["error_over_floor"].min(), here["error_over_floor"].max()
+        panel.set_ylim(0.85 * min(1.0, low), 1.2 * max(high, 1.5))
+        ticks = [t for t in (0.5, 1, 2, 5, 10, 20, 50, 100) if 0.85 * min(1.0, low) <= t]
+        panel.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
+        panel.minorticks_off()
+        panel.set_ylim(0.85 * min(1.0, low), 1.2 * max(high, 1.5))
+        panel.set_xlim(-0.5, len(sessions) - 0.5)
+        _name_sessions(panel, sessions)
+        panel.set_title(axis)
+        panel.set_ylabel("error / floor")
+    for panel in panels.ravel()[len(axes) :]:
+        panel.set_axis_off()
+    style.legend_below(figure, panels[0][0])
+    caption = "Error on unseen trials over the noise floor, session by session."
+    said = (
+        "The noise floor is what sensors and filters leave if the model is exactly right. In the "
+        f"green band, below {NEAR_FLOOR:g}, a model leaves nothing that the session could show."
+    )
+    picture = Figure("errors", caption, style.svg(figure))
+    return Section("Prediction", (Text(said), picture))
+
+
+def _trials(folder: Path) -> Section | None:
+    frame = pd.read_parquet(folder / "quality")
+    if frame.empty:
+        return None
+    odd = frame[frame["status"] != "ok"]
+    sessions = wording.count(frame["session_id"].nunique(), "session")
+    said = (
+        f"{wording.count(len(frame), 'trial')} in {sessions}: "
+        f"{int((frame['status'] == 'repaired').sum())} repaired, "
+        f"{int((frame['status'] == 'set_aside').sum())} set aside."
+    )
+    blocks: list[Block] = [Text(said)]
+    if not odd.empty:
+        rows = [
+            (
+                str(row["session_id"]),
+                str(row["trial_id"]),
+                wording.words(str(row["status"])),
+                str(row["reason"] or row["repairs"] or "–"),
+            )
+            for row in odd.head(40).to_dict("records")
+        ]
+        note = f"{len(odd) - 40} more in the table `quality`." if len(odd) > 40 else ""
+        blocks.append(
+            Table(
+                "Trials that were not sound as recorded",
+                ("Session", "Trial", "Status", "What"),
+                tuple(rows),
+                "llll",
+                (0.0, 0.0, 0.0, 1.0),
+                note,
+            )
+        )
+    return Section("Trials", tuple(blocks))

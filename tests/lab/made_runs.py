@@ -1,0 +1,128 @@
+"""Run folders with results of known content, for what reads many of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from bampipe.data import store
+
+AXES = ("yaw", "pitch")
+
+
+@dataclass(frozen=True)
+class Made:
+    """What a made run says.
+
+    Attributes:
+        name: session id.
+        recorded: ISO 8601, or None.
+        parameters: estimates of the base model, by name.
+        sd: of each of them.
+        child: effect added, and estimates with it.
+        verdicts: verdict and effects by axis; None where no diagnosis was made.
+        error: held-out error over the floor, by axis.
+        stiffness: of yaw, or None.
+        device: name of the device.
+    """
+
+    name: str
+    recorded: str | None = None
+    parameters: Mapping[str, float] = field(default_factory=dict)
+    sd: float = 0.01
+    child: tuple[str, Mapping[str, float]] | None = None
+    verdicts: Mapping[str, tuple[str, Sequence[str]]] | None = None
+    error: Mapping[str, float] = field(default_factory=lambda: {"yaw": 1.0, "pitch": 1.0})
+    stiffness: float | None = None
+    device: str = "bam"
+
+    def write(self, runs: Path) -> Path:
+        root = runs / self.name
+        session = {
+            "session_id": self.name,
+            "device": self.device,
+            "recorded_at": self.recorded,
+            "sample_rate_hz": 500.0,
+            "axes": {axis: {"unit": "rad", "resolution": 1e-4} for axis in AXES},
+        }
+        store.write_json(root / "ingest/session.json", session)
+        trials = {
+            "trial_id": ["t1", "t2"],
+            "kind": ["free", "free"],
+            "status": ["ok", "set_aside"],
+            "reason": ["", "t2.csv, row 7: time goes backwards"],
+            "repairs": ["", ""],
+            "n_samples": [8000, 0],
+            "duration_s": [16.0, 0.0],
+            "sample_rate_hz": [500.0, 500.0],
+        }
+        store.write_parquet(root / "ingest/trials.parquet", trials)  # type: ignore[arg-type]
+        axes = {} if self.stiffness is None else {"yaw": _stiffness(self.stiffness)}
+        store.write_json(root / "stiffness/stiffness.json", {"axes": axes})
+        self._model(root, "base", [], self.parameters, self.error)
+        if self.verdicts is not None:
+            told = {
+                axis: {
+                    "verdict": verdict,
+                    "effects": list(effects),
+                    "explainable_share": 0.4 if effects else 0.01,
+                    "sentence": f"{axis}: {verdict}",
+                    "unit": "N.m",
+                }
+                for axis, (verdict, effects) in self.verdicts.items()
+            }
+            store.write_json(root / "models/base/diagnose.json", {"axes": told})
+        if self.child is not None:
+            effect, parameters = self.child
+            name = f"base+{effect.replace(':', '.')}"
+            self._model(root, name, [effect], parameters, {axis: 1.0 for axis in AXES})
+        record = {"schema": "bampipe.run/1", "stages": {}, "gates": [], "failures": {}}
+        store.write_json(root / "run.json", record)
+        return root
+
+    def _model(
+        self,
+        root: Path,
+        name: str,
+        effects: list[str],
+        parameters: Mapping[str, float],
+        error: Mapping[str, float],
+    ) -> None:
+        listed = ", ".join(f'"{effect}"' for effect in effects)
+        text = (
+            f'schema = "bampipe.model/1"\nname = "{name}"\ndevice = "bam"\neffects = [{listed}]\n'
+        )
+        store.write_text(root / f"models/{name}/model.toml", text)
+        entries = {
+            key: {"estimate": value, "sd": self.sd, "unit": "N.m", "at_bound": False}
+            for key, value in parameters.items()
+        }
+        content = {"method": "ukf", "parameters": entries, "nis": {"by_trial": {"t1": 1.1}}}
+        store.write_json(root / f"models/{name}/identify.json", content)
+        store.write_json(
+            root / f"models/{name}/validate.json",
+            {
+                "axes": {
+                    axis: {
+                        "rmse": 0.1,
+                        "rmse_without_friction": 2.0,
+                        "held_out_rmse": 0.02 * ratio,
+                        "noise_floor": 0.02,
+                        "fit_percent": 99.0,
+                        "unit": "N.m",
+                    }
+                    for axis, ratio in error.items()
+                }
+            },
+        )
+
+
+def _stiffness(value: float) -> dict[str, object]:
+    return {
+        "stiffness": value,
+        "sd": 1.0,
+        "unit": "N.m/rad",
+        "bandwidth_hz": 4.0,
+        "n_cycles": 6,
+    }

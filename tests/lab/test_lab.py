@@ -1,0 +1,204 @@
+"""A lab's data set, its verdicts and its report, from run folders of known content."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from made_runs import Made
+
+from bampipe.data import lab_tables
+from bampipe.errors import InputError
+from bampipe.lab.collect import collect, is_current
+
+ROOT = Path(__file__).parent.parent.parent
+CLEAN = {"yaw": ("nothing_missing", ()), "pitch": ("nothing_missing", ())}
+MISSING = {"yaw": ("missing", ["stribeck:yaw"]), "pitch": ("nothing_missing", ())}
+NAMES = ("viscous.yaw", "coulomb.yaw", "viscous.pitch", "mass")
+
+
+def estimates(number: int, **changes: float) -> dict[str, float]:
+    draws = np.random.default_rng(number).normal(size=len(NAMES))
+    found = {name: 4.0 + 0.02 * float(draw) for name, draw in zip(NAMES, draws, strict=True)}
+    return found | {name.replace("__", "."): value for name, value in changes.items()}
+
+
+def make_lab(folder: Path, changed: dict[int, Made] | None = None, sessions: int = 9) -> Path:
+    """Runs of a lab, all in order but those in ``changed``; recorded in the order of numbers."""
+    for number in range(1, sessions + 1):
+        plain = Made(
+            f"s{number:02d}",
+            f"2026-09-{number:02d}T09:30:00+00:00",
+            estimates(number),
+            verdicts=CLEAN,
+            stiffness=2300.0 + number,
+        )
+        (changed or {}).get(number, plain).write(folder / "runs")
+    return folder / "runs"
+
+
+def changed(number: int, parameters: dict[str, float], **more: object) -> Made:
+    when = f"2026-09-{number:02d}T09:30:00+00:00"
+    return Made(f"s{number:02d}", when, parameters, **more)  # type: ignore[arg-type]
+
+
+def verdicts(runs: Path) -> dict[str, dict[str, object]]:
+    found = collect(runs, runs.parent / "lab", report=False)
+    return {one["session"]: one for one in found.content["sessions"]}
+
+
+def test_a_parameter_that_moved_with_nothing_missing_is_the_device(tmp_path: Path) -> None:
+    drifted = changed(5, estimates(5, coulomb__yaw=4.9), verdicts=CLEAN)
+    found = verdicts(make_lab(tmp_path, {5: drifted}))
+    assert found["s05"]["verdict"] == "device drifted"
+    assert found["s05"]["moved"][0]["parameter"] == "coulomb.yaw"  # type: ignore[index]
+    assert {one["verdict"] for name, one in found.items() if name != "s05"} == {"in control"}
+
+
+def test_a_parameter_that_comes_back_with_the_effect_is_the_effect(tmp_path: Path) -> None:
+    biased = changed(
+        7,
+        estimates(7, coulomb__yaw=4.9),
+        verdicts=MISSING,
+        child=("stribeck:yaw", estimates(7, coulomb__yaw=4.01)),
+    )
+    one = verdicts(make_lab(tmp_path, {7: biased}))["s07"]
+    assert one["verdict"] == "missing effect"
+    assert "back within the limits" in str(one["sentence"])
+
+
+def test_a_parameter_that_stays_out_with_the_effect_is_both(tmp_path: Path) -> None:
+    both = changed(
+        7,
+        estimates(7, coulomb__yaw=4.9),
+        verdicts=MISSING,
+        child=("stribeck:yaw", estimates(7, coulomb__yaw=4.8)),
+    )
+    one = verdicts(make_lab(tmp_path, {7: both}))["s07"]
+    assert one["verdict"] == "device drifted, and missing effect"
+
+
+def test_an_effect_on_another_axis_does_not_account_for_a_parameter(tmp_path: Path) -> None:
+    other = changed(7, estimates(7, viscous__pitch=4.9), verdicts=MISSING)
+    one = verdicts(make_lab(tmp_path, {7: other}))["s07"]
+    assert one["verdict"] == "device drifted, and missing effect"
+    own = changed(7, estimates(7, viscous__yaw=4.9), verdicts=MISSING)
+    one = verdicts(make_lab(tmp_path, {7: own}))["s07"]
+    assert one["verdict"] == "missing effect"
+    assert one["remedy"] == "bampipe extend s07 --auto, then bampipe lab"
+
+
+def test_what_was_not_diagnosed_is_said(tmp_path: Path) -> None:
+    unasked = changed(3, estimates(3, mass=5.0))
+    above = changed(4, estimates(4), error={"yaw": 3.0, "pitch": 1.0})
+    found = verdicts(make_lab(tmp_path, {3: unasked, 4: above}))
+    assert found["s03"]["verdict"] == found["s04"]["verdict"] == "not diagnosed"
+    assert found["s04"]["remedy"] == "bampipe diagnose s04 --model base"
+
+
+def test_every_table_in_one_line(tmp_path: Path) -> None:
+    lab = collect(make_lab(tmp_path), tmp_path / "lab", report=False).folder
+    for table, columns in lab_tables.TABLES.items():
+        frame = pd.read_parquet(lab / table)
+        assert list(frame.columns) == [*columns, "device"]
+    frame = pd.read_parquet(lab / "parameters")
+    assert len(frame) == 9 * len(NAMES)
+    assert ((frame["upper"] - frame["lower"]) / frame["sd"]).to_numpy() == pytest.approx(3.92, 1e-3)
+    assert set(frame[frame["parameter"] == "coulomb.yaw"]["axis"]) == {"yaw"}
+    assert frame[frame["parameter"] == "mass"]["axis"].isna().all()
+    quality = pd.read_parquet(lab / "quality")
+    assert quality["status"].tolist() == ["ok", "set_aside"] * 9
+
+
+def test_the_lines_in_the_documents_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every Python line of docs/lab.md runs on a lab, and finds rows."""
+    make_lab(tmp_path)
+    collect(tmp_path / "runs", tmp_path / "lab", report=False)
+    monkeypatch.chdir(tmp_path)
+    text = (ROOT / "docs/lab.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"```python\n(.*?)```", text, re.S)
+    assert len(blocks) == 2
+    for block in blocks:
+        if "duckdb" in block:
+            pytest.importorskip("duckdb", reason="duckdb is not installed")
+        scope: dict[str, object] = {}
+        exec(block, scope)
+        assert len(scope["found"]) > 0  # type: ignore[arg-type]
+
+
+def test_the_same_runs_give_the_same_bytes_and_a_lost_device_goes(tmp_path: Path) -> None:
+    runs = make_lab(tmp_path)
+    changed(10, {"mass": 1.0}, device="rail/2").write(runs)
+    lab = tmp_path / "lab"
+
+    def contents() -> dict[str, bytes]:
+        return {str(p.relative_to(lab)): p.read_bytes() for p in lab.rglob("*") if p.is_file()}
+
+    collect(runs, lab)
+    first = contents()
+    assert "parameters/device=rail%2F2/data.parquet" in first
+    assert set(pd.read_parquet(lab / "sessions")["device"]) == {"bam", "rail/2"}
+    collect(runs, lab)
+    assert contents() == first
+    (runs / "s10" / "run.json").unlink()
+    collect(runs, lab)
+    assert not list(lab.glob("*/device=rail*"))
+
+
+def test_sessions_without_a_date_come_first_and_a_damaged_run_is_named(tmp_path: Path) -> None:
+    runs = make_lab(tmp_path, sessions=3)
+    Made("undated", None, estimates(4)).write(runs)
+    (runs / "s02" / "models/base/identify.json").write_text("{")
+    found = collect(runs, tmp_path / "lab", report=False)
+    assert found.sessions == ("undated", "s01", "s03")
+    assert len(found.skipped) == 1
+    assert re.match(r"s02: .*identify\.json: not readable as JSON", found.skipped[0])
+
+
+def test_nothing_to_collect_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no run in"):
+        collect(tmp_path, tmp_path / "lab")
+
+
+def test_current_until_a_run_changes(tmp_path: Path) -> None:
+    runs, lab = make_lab(tmp_path), tmp_path / "lab"
+    assert not is_current(runs, lab)
+    collect(runs, lab, report=False)
+    assert is_current(runs, lab)
+    changed(11, estimates(11)).write(runs)
+    assert not is_current(runs, lab)
+
+
+def test_the_report_says_what_the_trends_say(tmp_path: Path) -> None:
+    drifted = changed(5, estimates(5, coulomb__yaw=4.9), verdicts=CLEAN)
+    runs = make_lab(tmp_path, {5: drifted})
+    collect(runs, tmp_path / "lab")
+    page = (tmp_path / "lab/report.html").read_text(encoding="utf-8")
+    assert "s05: device drifted" in page
+    assert "t2.csv, row 7" in page
+    assert (tmp_path / "lab/report.pdf").read_bytes().startswith(b"%PDF")
+    assert (tmp_path / "lab/figures/charts-1.svg").is_file()
+
+
+def test_the_command(
+    tmp_path: Path, command: Callable[..., tuple[int, str, str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drifted = changed(5, estimates(5, coulomb__yaw=4.9), verdicts=CLEAN)
+    make_lab(tmp_path, {5: drifted})
+    monkeypatch.chdir(tmp_path)
+    code, out, _ = command("lab")
+    assert code == 0
+    assert "lab: 9 sessions, 1 stand out" in out
+    assert re.search(r"s05 .*device drifted +coulomb\.yaw \+2\d %", out)
+    code, out, _ = command("lab", "runs", "--out", "elsewhere", "--json")
+    assert code == 0
+    content = json.loads(out)
+    assert content["sessions"][4]["verdict"] == "device drifted"
+    assert (tmp_path / "elsewhere/parameters").is_dir()
+    code, _, err = command("lab", "nowhere")
+    assert code == 2 and "no such folder of runs" in err
