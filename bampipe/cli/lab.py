@@ -72,11 +72,16 @@ def refresh(runs: Path, several: bool, quiet: bool) -> None:
         several: whether several sessions were run: that makes a lab.
         quiet: print nothing.
     """
-    from bampipe.lab.collect import FILE, beside, is_current, run_folders
+    from bampipe.lab.collect import FILE, beside, is_current, is_foreign, run_folders
 
     folder = beside(runs)
     wanted = several or (folder / FILE).is_file()
-    if not wanted or not run_folders(runs) or is_current(runs, folder):
+    begun = any((root / "ingest" / "session.json").is_file() for root in run_folders(runs))
+    if not wanted or not begun or is_current(runs, folder):
+        return
+    if is_foreign(folder):
+        if not quiet:
+            show.note(f"bampipe: {folder} holds other files; collect with `bampipe lab --out`")
         return
     found = gather(runs, None, quiet)
     if not quiet and several:

@@ -17,6 +17,7 @@ from bampipe.run import record
 from bampipe.stages.base import Progress, silent
 
 FILE = "lab.json"
+LOCK = ".lock"
 SCHEMA = "bampipe.lab/1"
 TRENDS = "trends.json"
 _EARLIEST = datetime.min.replace(tzinfo=UTC)
@@ -49,6 +50,11 @@ def beside(runs: Path) -> Path:
 def run_folders(runs: Path) -> list[Path]:
     """Return the run folders in ``runs``, by name."""
     return sorted(path.parent for path in runs.glob(f"*/{record.FILE}"))
+
+
+def is_foreign(folder: Path) -> bool:
+    """Whether ``folder`` holds something that is not a lab's: it is left alone."""
+    return folder.is_dir() and not (folder / LOCK).exists() and any(folder.iterdir())
 
 
 def collect(runs: Path, folder: Path, *, report: bool = True, progress: Progress = silent) -> Lab:
@@ -86,6 +92,10 @@ def collect(runs: Path, folder: Path, *, report: bool = True, progress: Progress
     }
     charts = trends.series(tables)
     content = trends.content(charts, trends.judge(tables, charts))
+    if is_foreign(folder):
+        raise InputError(
+            "holds other files", where=str(folder), remedy="choose another folder with --out"
+        )
     with _alone(folder):
         counts = lab_tables.write(folder, tables)
         store.write_json(folder / TRENDS, content)
@@ -137,7 +147,7 @@ def _alone(folder: Path) -> Iterator[None]:
     """Hold the lab's folder: two collections at once take turns."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        handle = (folder / ".lock").open("a")
+        handle = (folder / LOCK).open("a")
     except OSError as error:
         raise InputError(f"cannot be written: {error.strerror}", where=str(folder)) from error
     with handle:

@@ -165,6 +165,15 @@ def test_nothing_to_collect_is_one_line(tmp_path: Path) -> None:
         collect(tmp_path, tmp_path / "lab")
 
 
+def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
+    runs = make_lab(tmp_path, sessions=2)
+    (tmp_path / "lab").mkdir()
+    (tmp_path / "lab" / "notes.txt").write_text("mine")
+    with pytest.raises(InputError, match="holds other files"):
+        collect(runs, tmp_path / "lab")
+    assert [path.name for path in (tmp_path / "lab").iterdir()] == ["notes.txt"]
+
+
 def test_current_until_a_run_changes(tmp_path: Path) -> None:
     runs, lab = make_lab(tmp_path), tmp_path / "lab"
     assert not is_current(runs, lab)
