@@ -44,7 +44,7 @@ def of_run(root: Path) -> SessionRows:
     session = run.read_json("ingest/session.json")
     try:
         recorded = lab_tables.moment(session.get("recorded_at"))
-        key = {"session_id": str(session["session_id"]), "device": str(session["device"])}
+        key = {"session_id": root.name, "device": str(session["device"])}
     except (KeyError, ValueError) as error:
         raise InputError(
             f"no description of a session ({error})",
