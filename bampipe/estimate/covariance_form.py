@@ -10,8 +10,8 @@ from bampipe.estimate.filter_signature import (
     NOT_FINITE,
     STATE_NOT_POSITIVE,
 )
-from bampipe.estimate.propagation import measure_points, propagate_points
-from bampipe.estimate.triangular import cholesky, forward_substitute
+from bampipe.estimate.propagation import measure_points, propagate_points, scratch
+from bampipe.estimate.triangular import cholesky, forward_substitute, product
 
 
 @njit(KERNEL, cache=True)
@@ -49,16 +49,16 @@ def filter_covariance(  # type: ignore[no-untyped-def]
     ny = observed.shape[0]
     spread, centre, other = weights[0], weights[2], weights[3]
     reach = spread**0.5
-    rows = 1 + 2 * (n + nw)
-    points = np.empty((rows, n))
-    images = np.empty((1 + 2 * n, ny))
+    pairs = n + nw
+    points = np.empty((nx, 1 + 2 * pairs))
+    images = np.empty((ny, 1 + 2 * n))
     factor = np.zeros((n, n))
     gain = np.empty((n, ny))
     innovation_covariance = np.empty((ny, ny))
     innovation_factor = np.zeros((ny, ny))
     predicted = np.empty(ny)
     whitened = np.empty(ny)
-    work = np.empty((10, n + nw + 2 * u.shape[1] + 2 * nx + ny))
+    work = scratch(nx, u.shape[1], p.shape[0], nw)
     means[0] = mean
     covariances[0] = covariance
     for k in range(1, t.shape[0]):
@@ -68,42 +68,31 @@ def filter_covariance(  # type: ignore[no-untyped-def]
             reason[0] = STATE_NOT_POSITIVE
             return k
         propagate_points(
-            derivative,
-            mean,
-            factor,
-            reach,
-            noise_sd,
-            nx,
-            p,
-            free,
-            logarithmic,
-            lower,
-            upper,
-            u[k - 1],
-            u[k],
-            dt,
-            substeps,
-            points,
-            work,
-        )
-        for i in range(n):
+            derivative, mean, factor, reach, noise_sd, nx, p, free, logarithmic, lower, upper,
+            u[k - 1], u[k], dt, substeps, points, work,
+        )  # fmt: skip
+        for i in range(nx):
+            middle = points[i, 2 * pairs]
             total = 0.0
-            for row in range(1, rows):
-                total += points[row, i] - points[0, i]
-            mean[i] = points[0, i] + other * total
-        for row in range(rows):
-            for i in range(n):
-                points[row, i] -= mean[i]
+            for row in range(2 * pairs):
+                total += points[i, row] - middle
+            mean[i] = middle + other * total
+            for row in range(1 + 2 * pairs):
+                points[i, row] -= mean[i]
         for i in range(n):
-            for j in range(i + 1):
-                total = 0.0
-                for row in range(1, rows):
-                    total += points[row, i] * points[row, j]
-                covariance[i, j] = other * total + centre * points[0, i] * points[0, j]
+            for j in range(min(i + 1, nx)):
+                if i < nx:
+                    middle = centre * points[i, 2 * pairs] * points[j, 2 * pairs]
+                    covariance[i, j] = middle + other * product(points[i], points[j], 2 * pairs)
+                else:
+                    # The parameters of opposite points differ by twice the root's row.
+                    total = 0.0
+                    for pair in range(i + 1):
+                        total += factor[i, pair] * (points[j, pair] - points[j, pairs + pair])
+                    covariance[i, j] = other * reach * total
+                covariance[j, i] = covariance[i, j]
             if i >= nx:
                 covariance[i, i] += walk_sd[i - nx] ** 2 * dt
-            for j in range(i):
-                covariance[j, i] = covariance[i, j]
             if not np.isfinite(covariance[i, i]):
                 reason[0] = NOT_FINITE
                 return k
@@ -119,47 +108,32 @@ def filter_covariance(  # type: ignore[no-untyped-def]
                 reason[0] = STATE_NOT_POSITIVE
                 return k
             measure_points(
-                measure,
-                mean,
-                factor,
-                reach,
-                nx,
-                p,
-                free,
-                logarithmic,
-                lower,
-                upper,
-                u[k],
-                observed,
-                images,
-                work,
-            )
+                measure, mean, factor, reach, nx, p, free, logarithmic, lower, upper, u[k],
+                observed, images, work,
+            )  # fmt: skip
             for i in range(ny):
+                middle = images[i, 2 * n]
                 total = 0.0
-                for row in range(1, 1 + 2 * n):
-                    total += images[row, i] - images[0, i]
-                predicted[i] = images[0, i] + other * total
+                for row in range(2 * n):
+                    total += images[i, row] - middle
+                predicted[i] = middle + other * total
                 innovations[k, i] = y[k, i] - predicted[i]
-            for row in range(1 + 2 * n):
-                for i in range(ny):
-                    images[row, i] -= predicted[i]
+                for row in range(1 + 2 * n):
+                    images[i, row] -= predicted[i]
             for i in range(ny):
                 for j in range(i + 1):
                     # The points that move the process noise alone coincide with the centre.
-                    total = (centre / other + 2 * nw) * images[0, i] * images[0, j]
-                    for row in range(1, 1 + 2 * n):
-                        total += images[row, i] * images[row, j]
-                    innovation_covariance[i, j] = other * total
-                    innovation_covariance[j, i] = other * total
+                    middle = (centre + 2 * nw * other) * images[i, 2 * n] * images[j, 2 * n]
+                    total = middle + other * product(images[i], images[j], 2 * n)
+                    innovation_covariance[i, j] = total
+                    innovation_covariance[j, i] = total
                 innovation_covariance[i, i] += reading_sd[i] ** 2
                 innovation_sd[k, i] = innovation_covariance[i, i] ** 0.5
             for i in range(n):
                 for j in range(ny):
                     total = 0.0
-                    for pair in range(n):
-                        total += factor[i, pair] * (
-                            images[1 + 2 * pair, j] - images[2 + 2 * pair, j]
-                        )
+                    for pair in range(i + 1):
+                        total += factor[i, pair] * (images[j, pair] - images[j, n + pair])
                     gain[i, j] = other * reach * total
             if not cholesky(innovation_covariance, innovation_factor):
                 reason[0] = INNOVATION_NOT_POSITIVE

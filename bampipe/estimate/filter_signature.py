@@ -7,7 +7,7 @@ sample computes what the batch filter computes.
 
 from numba import boolean, float64, int64
 
-from bampipe.estimate.signatures import DERIVATIVE, MEASURE
+from bampipe.estimate.signatures import DERIVATIVE_ROWS, MEASURE_ROWS
 
 DONE = -1
 NOT_FINITE = 1
@@ -15,8 +15,8 @@ STATE_NOT_POSITIVE = 2
 INNOVATION_NOT_POSITIVE = 3
 
 KERNEL = int64(
-    DERIVATIVE,  # f(x, u, p, w, dx)
-    MEASURE,  # h(x, u, p, y)
+    DERIVATIVE_ROWS,  # f(count, x, u, p, w, dx)
+    MEASURE_ROWS,  # h(count, x, u, p, y)
     float64[::1],  # t (T,) s
     float64[:, ::1],  # u (T, nu)
     float64[:, ::1],  # y (T, ny), NaN where a reading is missing

@@ -3,7 +3,7 @@
 import numpy as np
 from numba import boolean, float64, int64, njit, void
 
-from bampipe.estimate.signatures import DERIVATIVE, MEASURE
+from bampipe.estimate.signatures import DERIVATIVE, DERIVATIVE_ROWS, MEASURE_ROWS, ROWS
 
 
 @njit(
@@ -23,7 +23,7 @@ from bampipe.estimate.signatures import DERIVATIVE, MEASURE
 def runge_kutta(derivative, x, u0, u1, p, w, dt, substeps, work):  # type: ignore[no-untyped-def]
     """Advance ``x`` in place by ``dt``: classical fourth order, eq 22 with k4 at x + delta k3.
 
-    The input runs linlate from ``u0`` to ``u1`` over the interval; held constant instead, it
+    The input runs linearly from ``u0`` to ``u1`` over the interval; held constant instead, it
     would lag the motion by half a sample, which at human forces exceeds the sensor noise.
 
     Args:
@@ -77,140 +77,201 @@ def place_parameters(point, nx, free, logarithmic, lower, upper, p):  # type: ig
         p[free[j]] = np.exp(value) if logarithmic[j] else value
 
 
+@njit(float64[:, ::1](int64, int64, int64, int64), cache=True)
+def scratch(nx, nu, n_parameters, nw):  # type: ignore[no-untyped-def]
+    """Scratch of `propagate_points` and `measure_points`; zeros, so that nothing in it is NaN."""
+    return np.zeros((8, ROWS * max(2 * nx, nu, n_parameters, nw)))
+
+
+@njit(
+    void(float64[::1], int64, float64, float64, float64[::1], int64, int64, int64, int64, int64),
+    cache=True,
+    fastmath={"contract"},
+)
+def _spread(out, offset, centre, reach, root, n, pairs, first, count, padded):  # type: ignore[no-untyped-def]
+    """Write one coordinate of the sigma points ``first`` to ``first + count`` of all."""
+    for r in range(padded):
+        out[offset + r] = centre
+    for row in range(first, min(first + count, n)):
+        out[offset + row - first] = centre + reach * root[row]
+    for row in range(max(first, pairs), min(first + count, pairs + n)):
+        out[offset + row - first] = centre - reach * root[row - pairs]
+
+
 @njit(
     void(
-        DERIVATIVE,
-        float64[::1],
-        float64[:, ::1],
-        float64,
-        float64[::1],
-        int64,
-        float64[::1],
-        int64[::1],
-        boolean[::1],
-        float64[::1],
-        float64[::1],
-        float64[::1],
-        float64[::1],
-        float64,
-        int64,
-        float64[:, ::1],
-        float64[:, ::1],
+        float64[::1], float64[:, ::1], float64, int64, int64, float64[::1], int64[::1],
+        boolean[::1], float64[::1], float64[::1], int64, int64, int64, float64[::1], float64[::1],
     ),
     cache=True,
-)
-def propagate_points(  # type: ignore[no-untyped-def]
-    derivative,
-    mean,
-    factor,
-    reach,
-    noise_sd,
-    nx,
-    p,
-    free,
-    logarithmic,
-    lower,
-    upper,
-    u0,
-    u1,
-    dt,
-    substeps,
-    points,
-    work,
+    fastmath={"contract"},
+)  # fmt: skip
+def _place_rows(  # type: ignore[no-untyped-def]
+    mean, factor, reach, nx, pairs, p, free, logarithmic, lower, upper, first, count, padded, x, q
 ):
+    """Write state ``x`` and parameters ``q`` of sigma points, parameters within their range."""
+    n = mean.shape[0]
+    for i in range(nx):
+        _spread(x, i * ROWS, mean[i], reach, factor[i], n, pairs, first, count, padded)
+    for i in range(p.shape[0]):
+        for r in range(padded):
+            q[i * ROWS + r] = p[i]
+    for j in range(free.shape[0]):
+        at = free[j] * ROWS
+        _spread(q, at, mean[nx + j], reach, factor[nx + j], n, pairs, first, count, padded)
+        if lower[j] > -np.inf:
+            for r in range(padded):
+                q[at + r] = max(q[at + r], lower[j])
+        if upper[j] < np.inf:
+            for r in range(padded):
+                q[at + r] = min(q[at + r], upper[j])
+        if logarithmic[j]:
+            for r in range(padded):
+                q[at + r] = np.exp(q[at + r])
+
+
+@njit(
+    void(
+        DERIVATIVE_ROWS, int64, int64, int64, float64, int64, float64[::1], float64[:, ::1]
+    ),
+    cache=True,
+    fastmath={"contract"},
+)  # fmt: skip
+def _runge_kutta_rows(derivative, count, nx, nu, dt, substeps, slope, work):  # type: ignore[no-untyped-def]
+    """Advance many states by ``dt``; see `runge_kutta`.
+
+    Args:
+        derivative: f(count, x, u, p, w, dx).
+        count: of the rows; nx, nu: lengths of state and input.
+        dt: s; substeps: number of steps.
+        slope: (nu,) what the input gains over the interval.
+        work: x, probe, sum, rate, u, start of the input, p, w: x in and out.
+    """
+    x, probe, total, rate = work[0], work[1], work[2], work[3]
+    u, start, p, w = work[4], work[5], work[6], work[7]
+    delta = dt / substeps
+    for step in range(substeps):
+        for stage in range(4):
+            if stage == 0 or stage == 1 or stage == 3:
+                share = (step + 0.5 * ((stage + 1) // 2)) / substeps
+                for i in range(nu):
+                    rise = slope[i] * share
+                    for r in range(i * ROWS, i * ROWS + count):
+                        u[r] = start[r] + rise
+            derivative(count, x if stage == 0 else probe, u, p, w, rate)
+            ahead = delta if stage == 2 else 0.5 * delta
+            weight = delta / 3.0 if stage == 1 or stage == 2 else delta / 6.0
+            for i in range(nx):
+                if stage == 0:
+                    for r in range(i * ROWS, i * ROWS + count):
+                        total[r] = x[r] + weight * rate[r]
+                        probe[r] = x[r] + ahead * rate[r]
+                elif stage == 3:
+                    for r in range(i * ROWS, i * ROWS + count):
+                        x[r] = total[r] + weight * rate[r]
+                else:
+                    for r in range(i * ROWS, i * ROWS + count):
+                        total[r] += weight * rate[r]
+                        probe[r] = x[r] + ahead * rate[r]
+
+
+@njit(
+    void(
+        DERIVATIVE_ROWS, float64[::1], float64[:, ::1], float64, float64[::1], int64,
+        float64[::1], int64[::1], boolean[::1], float64[::1], float64[::1], float64[::1],
+        float64[::1], float64, int64, float64[:, ::1], float64[:, ::1],
+    ),
+    cache=True,
+)  # fmt: skip
+def propagate_points(  # type: ignore[no-untyped-def]
+    derivative, mean, factor, reach, noise_sd, nx, p, free, logarithmic, lower, upper,
+    u0, u1, dt, substeps, points, work,
+):  # fmt: skip
     """Draw the sigma points of (state, parameters, process noise) and carry each over ``dt``.
 
     Args:
-        derivative: f(x, u, p, w, dx).
+        derivative: f(count, x, u, p, w, dx).
         mean: (n,) state then free parameters; factor: (n, n) lower root of their covariance.
         reach: distance of the points, in standard deviations.
         noise_sd: (nw,) of the process noise, independent of the state: its root is diagonal,
             which is why the (n + nw) root never needs to be formed.
         nx: length of the state.
         p: (np + 1,) all parameters, then the time by which the inputs were sampled after the
-            positions, s, at most a fraction of ``dt``; those in ``free`` are overwritten.
+            positions, s, at most a fraction of ``dt``; those in ``free`` are not read.
         free: (n - nx,) places of the estimated parameters in ``p``.
         logarithmic: (n - nx,) which of them are estimated as logarithms.
         lower, upper: (n - nx,) range of the estimated parameters, logarithms where so estimated.
         u0, u1: (nu,) input at both ends; dt: s; substeps: of the Runge-Kutta method.
-        points: (1 + 2 (n + nw), n) result: the centre, then each pair of opposite points.
-        work: (10, >= longest of the vectors) scratch.
+        points: (nx, 1 + 2 (n + nw)) result, states only, for parameters stay: the points ahead
+            of the mean along each column of the joint root, those behind it, the centre.
+        work: (8, ROWS * longest of the vectors) scratch, from `scratch`.
     """
     n = mean.shape[0]
     nw = noise_sd.shape[0]
-    w = work[6, :nw]
-    x = work[7, :nx]
     nu = u0.shape[0]
-    start = work[8, :nu]
-    end = work[9, :nu]
-    for row in range(points.shape[0]):
-        pair = (row - 1) // 2
-        distance = reach if row % 2 == 1 else -reach
+    pairs = n + nw
+    rows = 1 + 2 * pairs
+    slope = u1 - u0
+    x, start, q, w = work[0], work[5], work[6], work[7]
+    timing = (p.shape[0] - 1) * ROWS
+    for first in range(0, rows, ROWS):
+        count = min(ROWS, rows - first)
+        padded = (count + 3) // 4 * 4
+        _place_rows(
+            mean, factor, reach, nx, pairs, p, free, logarithmic, lower, upper,
+            first, count, padded, x, q,
+        )  # fmt: skip
         for i in range(nw):
-            w[i] = 0.0
-        if row == 0 or pair >= n:
-            for i in range(n):
-                points[row, i] = mean[i]
-            if row > 0:
-                w[pair - n] = distance * noise_sd[pair - n]
-        else:
-            for i in range(n):
-                points[row, i] = mean[i] + distance * factor[i, pair]
-        place_parameters(points[row], nx, free, logarithmic, lower, upper, p)
-        for i in range(nx):
-            x[i] = points[row, i]
-        late = p[p.shape[0] - 1] / dt
+            for r in range(padded):
+                w[i * ROWS + r] = 0.0
+            for row in (n + i, pairs + n + i):
+                if first <= row < first + count:
+                    distance = reach if row < pairs else -reach
+                    w[i * ROWS + row - first] = distance * noise_sd[i]
         for i in range(nu):
-            start[i] = u0[i] - late * (u1[i] - u0[i])
-            end[i] = u1[i] - late * (u1[i] - u0[i])
-        runge_kutta(derivative, x, start, end, p, w, dt, substeps, work)
+            for r in range(padded):
+                start[i * ROWS + r] = u0[i] - q[timing + r] * (slope[i] / dt)
+        _runge_kutta_rows(derivative, padded, nx, nu, dt, substeps, slope, work)
         for i in range(nx):
-            points[row, i] = x[i]
+            for r in range(count):
+                points[i, first + r] = x[i * ROWS + r]
 
 
 @njit(
     void(
-        MEASURE,
-        float64[::1],
-        float64[:, ::1],
-        float64,
-        int64,
-        float64[::1],
-        int64[::1],
-        boolean[::1],
-        float64[::1],
-        float64[::1],
-        float64[::1],
-        int64[::1],
-        float64[:, ::1],
+        MEASURE_ROWS, float64[::1], float64[:, ::1], float64, int64, float64[::1], int64[::1],
+        boolean[::1], float64[::1], float64[::1], float64[::1], int64[::1], float64[:, ::1],
         float64[:, ::1],
     ),
     cache=True,
-)
+)  # fmt: skip
 def measure_points(  # type: ignore[no-untyped-def]
     measure, mean, factor, reach, nx, p, free, logarithmic, lower, upper, u, observed, images, work
 ):
     """Draw sigma points of (state, parameters) afresh and take the measurement of each.
 
     Args:
-        measure: h(x, u, p, y).
+        measure: h(count, x, u, p, y).
         mean, factor, reach, nx, p, free, logarithmic, lower, upper: as in `propagate_points`.
         u: (nu,) input at the time of the measurement.
         observed: (ny,) which elements of the model's measurement are used.
-        images: (1 + 2 n, ny) result.
-        work: (2, >= longest of the vectors) scratch.
+        images: (ny, 1 + 2 n) result, in the order of `propagate_points`.
+        work: scratch, from `scratch`.
     """
     n = mean.shape[0]
-    point = work[0, :n]
-    y = work[1]
-    for row in range(1 + 2 * n):
-        pair = (row - 1) // 2
-        distance = reach if row % 2 == 1 else -reach
-        for i in range(n):
-            point[i] = mean[i]
-            if row > 0:
-                point[i] += distance * factor[i, pair]
-        place_parameters(point, nx, free, logarithmic, lower, upper, p)
-        measure(point[:nx], u, p, y)
+    rows = 1 + 2 * n
+    x, y, inputs, q = work[0], work[1], work[4], work[6]
+    for first in range(0, rows, ROWS):
+        count = min(ROWS, rows - first)
+        padded = (count + 3) // 4 * 4
+        _place_rows(
+            mean, factor, reach, nx, n, p, free, logarithmic, lower, upper,
+            first, count, padded, x, q,
+        )  # fmt: skip
+        for i in range(u.shape[0]):
+            for r in range(padded):
+                inputs[i * ROWS + r] = u[i]
+        measure(padded, x, inputs, q, y)
         for i in range(observed.shape[0]):
-            images[row, i] = y[observed[i]]
+            for r in range(count):
+                images[i, first + r] = y[observed[i] * ROWS + r]

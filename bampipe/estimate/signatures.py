@@ -12,3 +12,12 @@ MEASURE = types.FunctionType(types.void(_vector, _vector, _vector, _vector))
 
 COMMAND = MEASURE
 """c(y, r, none, out) -> None: commands of a controller from readings and references."""
+
+ROWS = 64
+"""Most rows of one call of a function over rows; quantity i of row r is at [i*ROWS + r]."""
+
+DERIVATIVE_ROWS = types.FunctionType(types.void(types.int64, *[_vector] * 5))
+"""f(count, x, u, p, w, dx) -> None: `DERIVATIVE` of the first ``count`` rows at once."""
+
+MEASURE_ROWS = types.FunctionType(types.void(types.int64, *[_vector] * 4))
+"""h(count, x, u, p, y) -> None: `MEASURE` of the first ``count`` rows at once."""

@@ -6,8 +6,8 @@ import numpy as np
 from numba import boolean, float64, int64, njit, void
 from numpy.typing import NDArray
 
-from bampipe.estimate.propagation import propagate_points
-from bampipe.estimate.signatures import DERIVATIVE
+from bampipe.estimate.propagation import propagate_points, scratch
+from bampipe.estimate.signatures import DERIVATIVE_ROWS
 from bampipe.estimate.unscented import (
     FilteredTrial,
     FilterModel,
@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 @njit(
     void(
-        DERIVATIVE,
+        DERIVATIVE_ROWS,
         float64[::1],
         float64[::1],
         float64[::1],
@@ -51,27 +51,30 @@ def _predict(  # type: ignore[no-untyped-def]
     """Repeat one prediction; also its covariance with the state that it starts from."""
     n = mean.shape[0]
     nw = noise_sd.shape[0]
-    rows = 1 + 2 * (n + nw)
-    points = np.empty((rows, n))
-    work = np.empty((10, n + nw + 2 * u0.shape[0] + 2 * nx))
+    pairs = n + nw
+    reach = spread**0.5
+    states = np.empty((nx, 1 + 2 * pairs))
+    work = scratch(nx, u0.shape[0], p.shape[0], nw)
     propagate_points(
-        derivative, mean, factor, spread**0.5, noise_sd, nx, p, free, logarithmic, lower, upper,
-        u0, u1, dt, substeps, points, work,
+        derivative, mean, factor, reach, noise_sd, nx, p, free, logarithmic, lower, upper,
+        u0, u1, dt, substeps, states, work,
     )  # fmt: skip
-    predicted[:] = points[0]
-    for row in range(1, rows):
-        predicted += other * (points[row] - points[0])
-    for row in range(rows):
-        points[row] -= predicted
-    covariance[:] = centre * np.outer(points[0], points[0])
-    cross[:] = 0.0
-    for row in range(1, rows):
+    points = np.zeros((1 + 2 * pairs, n))  # as deviations from the mean
+    predicted[:] = mean
+    for i in range(nx):
+        middle = states[i, 2 * pairs]
+        predicted[i] = middle + other * (states[i] - middle).sum()
+        points[:, i] = states[i] - predicted[i]
+    for pair in range(n):
+        points[pair, nx:] = reach * factor[nx:, pair]
+        points[pairs + pair, nx:] = -reach * factor[nx:, pair]
+    covariance[:] = centre * np.outer(points[2 * pairs], points[2 * pairs])
+    for row in range(2 * pairs):
         covariance += other * np.outer(points[row], points[row])
-        pair = (row - 1) // 2
-        if pair < n:
-            sign = 1.0 if row % 2 == 1 else -1.0
-            start = np.ascontiguousarray(factor[:, pair]) * (sign * spread**0.5)
-            cross += other * np.outer(start, points[row])
+    cross[:] = 0.0
+    for pair in range(n):
+        start = np.ascontiguousarray(factor[:, pair]) * (other * reach)
+        cross += np.outer(start, points[pair] - points[pairs + pair])
 
 
 def smooth_trial(
@@ -103,7 +106,8 @@ def smooth_trial(
         dt = float(trial.t[k + 1] - trial.t[k])
         substeps = max(1, int(np.ceil(dt / settings.longest_step - 1e-6)))
         _predict(
-            model.derivative, u[k], u[k + 1], filtered.mean[k], lower_root(filtered.covariance[k]),
+            model.derivative_rows, u[k], u[k + 1], filtered.mean[k],
+            lower_root(filtered.covariance[k]),
             spread, centre, other, settings.noise_sd, nx, p, model.free, model.logarithmic,
             lower, upper, dt, substeps, predicted, spread_after, cross,
         )  # fmt: skip

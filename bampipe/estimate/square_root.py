@@ -10,11 +10,18 @@ from bampipe.estimate.filter_signature import (
     NOT_FINITE,
     STATE_NOT_POSITIVE,
 )
-from bampipe.estimate.propagation import measure_points, propagate_points
-from bampipe.estimate.triangular import factor_of_rows, forward_substitute, rank_one_update
+from bampipe.estimate.propagation import measure_points, propagate_points, scratch
+from bampipe.estimate.triangular import (
+    append_rows,
+    condition,
+    covariance_of,
+    forward_substitute,
+    rank_one_update,
+    transpose,
+)
 
 
-@njit(KERNEL, cache=True)
+@njit(KERNEL, cache=True, fastmath={"contract"})
 def filter_square_root(  # type: ignore[no-untyped-def]
     derivative,
     measure,
@@ -45,9 +52,11 @@ def filter_square_root(  # type: ignore[no-untyped-def]
 ):
     """Filter one trial, propagating the lower root of the covariance.
 
-    The prediction is one QR factorisation of the weighted deviations (Van der Merwe and Wan
-    2001); the update triangularises the joint root of measurement and state, so that it needs no
-    downdate and cannot lose positive definiteness. Returns the sample of failure or DONE.
+    The prediction is a QR factorisation of the weighted deviations (Van der Merwe and Wan 2001),
+    by differences and sums of opposite points: parameters stay where they are, so that in the
+    sums, and in the points that move the noise, only the state is not zero. The update rotates
+    the joint root of measurement and state, so that it needs no downdate and cannot lose positive
+    definiteness. Returns the sample of failure or DONE.
     """
     n = mean.shape[0]
     nw = noise_sd.shape[0]
@@ -55,61 +64,71 @@ def filter_square_root(  # type: ignore[no-untyped-def]
     nt = n - nx
     spread, centre, other = weights[0], weights[2], weights[3]
     reach = spread**0.5
-    root_other = other**0.5
-    rows = 1 + 2 * (n + nw)
-    points = np.empty((rows, n))
-    images = np.empty((1 + 2 * n, ny))
-    deviations = np.empty((n, rows - 1 + nt))
-    noise_rows = np.empty((ny, n + ny + 1))
-    noise_factor = np.zeros((ny, ny))
-    joint_rows = np.empty((ny + n, ny + n))
-    joint = np.zeros((ny + n, ny + n))
+    half = (0.5 * other) ** 0.5
+    pairs = n + nw
+    points = np.empty((nx, 1 + 2 * pairs))
+    images = np.empty((ny, 1 + 2 * n))
+    root = np.empty((n, n))  # R = L^T, so that what is rotated together is contiguous
+    columns = np.empty((n, max(n, pairs + nw)))
+    noise_columns = np.empty((ny, n))
+    noise = np.empty((ny, ny))
+    cross = np.empty((ny, n))
+    gain = np.empty((ny, n))
+    cosine, sine = np.empty(n + 1), np.empty(n + 1)
     single = np.empty(max(n, ny))
     predicted = np.empty(ny)
     whitened = np.empty(ny)
-    work = np.empty((10, n + nw + 2 * u.shape[1] + 2 * nx + ny))
+    work = scratch(nx, u.shape[1], p.shape[0], nw)
     centre_image = centre + 2 * nw * other
+    log_normal = 0.5 * ny * np.log(2.0 * np.pi)
+    walking = False
+    for j in range(nt):
+        walking = walking or walk_sd[j] != 0.0
+    for i in range(n):
+        for j in range(n):
+            root[i, j] = factor[j, i] if i <= j else 0.0
     means[0] = mean
-    covariances[0] = factor @ factor.T
+    covariance_of(root, covariances[0])
     for k in range(1, t.shape[0]):
         dt = t[k] - t[k - 1]
         substeps = max(1, int(np.ceil(dt / longest_step - 1e-6)))
         propagate_points(
-            derivative,
-            mean,
-            factor,
-            reach,
-            noise_sd,
-            nx,
-            p,
-            free,
-            logarithmic,
-            lower,
-            upper,
-            u[k - 1],
-            u[k],
-            dt,
-            substeps,
-            points,
-            work,
-        )
-        for i in range(n):
+            derivative, mean, factor, reach, noise_sd, nx, p, free, logarithmic, lower, upper,
+            u[k - 1], u[k], dt, substeps, points, work,
+        )  # fmt: skip
+        for i in range(nx):
+            middle = points[i, 2 * pairs]
             total = 0.0
-            for row in range(1, rows):
-                total += points[row, i] - points[0, i]
-            mean[i] = points[0, i] + other * total
+            for row in range(2 * pairs):
+                total += points[i, row] - middle
+            mean[i] = middle + other * total
             if not np.isfinite(mean[i]):
                 reason[0] = NOT_FINITE
                 return k
-            for row in range(1, rows):
-                deviations[i, row - 1] = root_other * (points[row, i] - mean[i])
-            for j in range(nt):
-                deviations[i, rows - 1 + j] = 0.0
-            if i >= nx:
-                deviations[i, rows - 1 + i - nx] = walk_sd[i - nx] * dt**0.5
-            single[i] = abs(centre) ** 0.5 * (points[0, i] - mean[i])
-        factor_of_rows(deviations, rows - 1 + nt, factor)
-        if centre != 0.0 and not rank_one_update(factor, 1.0 if centre > 0.0 else -1.0, single[:n]):
+            for pair in range(pairs):
+                columns[i, pair] = half * (
+                    points[i, pair] + points[i, pairs + pair] - 2.0 * mean[i]
+                )
+            for pair in range(n, pairs):
+                columns[i, pairs + pair - n] = half * (points[i, pair] - points[i, pairs + pair])
+            single[i] = abs(centre) ** 0.5 * (middle - mean[i])
+            for j in range(n):
+                root[i, j] = 0.0
+        append_rows(root, nx, columns, pairs + nw)
+        for i in range(n):
+            for pair in range(n):
+                columns[i, pair] = (
+                    half * (points[i, pair] - points[i, pairs + pair])
+                    if i < nx
+                    else (factor[i, pair] if pair <= i else 0.0)
+                )
+        for i in range(nx, n):
+            single[i] = 0.0
+            for j in range(n):
+                root[i, j] = walk_sd[i - nx] * dt**0.5 if i == j else 0.0
+        # Columns of the state first; then the parameters' rows start from their random walk.
+        append_rows(root, n, columns, n)
+        if centre != 0.0 and not rank_one_update(root, n, 1.0 if centre > 0.0 else -1.0, single):
             reason[0] = STATE_NOT_POSITIVE
             return k
         missing = False
@@ -120,87 +139,61 @@ def filter_square_root(  # type: ignore[no-untyped-def]
         consistency[k, 0] = np.nan
         consistency[k, 1] = np.nan
         if not missing:
+            transpose(root, factor)
             measure_points(
-                measure,
-                mean,
-                factor,
-                reach,
-                nx,
-                p,
-                free,
-                logarithmic,
-                lower,
-                upper,
-                u[k],
-                observed,
-                images,
-                work,
-            )
+                measure, mean, factor, reach, nx, p, free, logarithmic, lower, upper, u[k],
+                observed, images, work,
+            )  # fmt: skip
             for i in range(ny):
+                middle = images[i, 2 * n]
                 total = 0.0
-                for row in range(1, 1 + 2 * n):
-                    total += images[row, i] - images[0, i]
-                predicted[i] = images[0, i] + other * total
+                for row in range(2 * n):
+                    total += images[i, row] - middle
+                predicted[i] = middle + other * total
                 innovations[k, i] = y[k, i] - predicted[i]
                 # A pair of opposite points splits into its sum, which only curvature moves,
                 # and its difference, which is correlated with the state.
                 for pair in range(n):
-                    noise_rows[i, pair] = (other / 2.0) ** 0.5 * (
-                        images[1 + 2 * pair, i] + images[2 + 2 * pair, i] - 2.0 * predicted[i]
+                    noise_columns[i, pair] = half * (
+                        images[i, pair] + images[i, n + pair] - 2.0 * predicted[i]
                     )
+                    cross[i, pair] = half * (images[i, pair] - images[i, n + pair])
                 for j in range(ny):
-                    noise_rows[i, n + j] = reading_sd[i] if i == j else 0.0
-                single[i] = abs(centre_image) ** 0.5 * (images[0, i] - predicted[i])
-            factor_of_rows(noise_rows, n + ny, noise_factor)
-            if not rank_one_update(noise_factor, 1.0 if centre_image >= 0.0 else -1.0, single[:ny]):
+                    noise[i, j] = reading_sd[i] if i == j else 0.0
+                single[i] = abs(centre_image) ** 0.5 * (middle - predicted[i])
+            append_rows(noise, ny, noise_columns, n)
+            if not rank_one_update(noise, ny, 1.0 if centre_image >= 0.0 else -1.0, single):
                 reason[0] = INNOVATION_NOT_POSITIVE
                 return k
             for i in range(ny):
-                for j in range(ny):
-                    joint_rows[i, j] = noise_factor[i, j]
-                for pair in range(n):
-                    joint_rows[i, ny + pair] = (other / 2.0) ** 0.5 * (
-                        images[1 + 2 * pair, i] - images[2 + 2 * pair, i]
-                    )
-            for i in range(n):
-                for j in range(ny):
-                    joint_rows[ny + i, j] = 0.0
-                for j in range(n):
-                    joint_rows[ny + i, ny + j] = factor[i, j]
-            factor_of_rows(joint_rows, ny + n, joint)
+                for j in range(i):
+                    noise[i, j] = noise[j, i]
+            condition(root, noise, cross, gain, cosine, sine)
             nis = 0.0
-            log_likelihood = 0.0
+            log_likelihood = -log_normal
             for i in range(ny):
                 whitened[i] = innovations[k, i]
                 total = 0.0
                 for j in range(i + 1):
-                    total += joint[i, j] * joint[i, j]
+                    total += noise[i, j] * noise[i, j]
                 innovation_sd[k, i] = total**0.5
-                if not joint[i, i] > 0.0:
+                if not noise[i, i] > 0.0:
                     reason[0] = INNOVATION_NOT_POSITIVE
                     return k
-            forward_substitute(joint, ny, whitened)
+            forward_substitute(noise, ny, whitened)
             for i in range(ny):
                 nis += whitened[i] ** 2
-                log_likelihood -= np.log(joint[i, i]) + 0.5 * np.log(2.0 * np.pi)
+                log_likelihood -= np.log(noise[i, i])
+                for j in range(n):
+                    mean[j] += gain[i, j] * whitened[i]
             consistency[k, 0] = nis
             consistency[k, 1] = log_likelihood - 0.5 * nis
-            for i in range(n):
-                for j in range(ny):
-                    mean[i] += joint[ny + i, j] * whitened[j]
-                for j in range(i + 1):
-                    factor[i, j] = joint[ny + i, ny + j]
             for j in range(nt):
                 mean[nx + j] = min(max(mean[nx + j], lower[j]), upper[j])
+        transpose(root, factor)
         if k % stride == 0:
             means[k // stride] = mean
-            for i in range(n):
-                for j in range(i + 1):
-                    total = 0.0
-                    for m in range(j + 1):
-                        total += factor[i, m] * factor[j, m]
-                    covariances[k // stride, i, j] = total
-                    covariances[k // stride, j, i] = total
+            covariance_of(root, covariances[k // stride])
     for i in range(n):
         if not np.isfinite(mean[i]):
             reason[0] = NOT_FINITE

@@ -1,4 +1,4 @@
-"""Triangular factors of covariances, compiled: Cholesky, QR, substitution.
+"""Triangular factors of covariances, compiled: Cholesky, QR, rotations, substitution.
 
 All matrices are float64 and C-contiguous; factors are lower triangular. The loops replace
 LAPACK because at 13 x 13 the call and its allocations cost more than the arithmetic.
@@ -43,41 +43,100 @@ def cholesky(covariance, factor):  # type: ignore[no-untyped-def]
     return True
 
 
-@njit(void(float64[:, ::1], int64, float64[:, ::1]), cache=True, fastmath=_REASSOCIATE)
-def factor_of_rows(columns, n_rows, factor):  # type: ignore[no-untyped-def]
-    """Write the lower L with L L^T = A^T A into ``factor`` (n, n), by Householder reflections.
+@njit(void(float64[:, ::1], int64, float64[:, ::1], int64), cache=True, fastmath=_REASSOCIATE)
+def append_rows(upper, n, columns, n_rows):  # type: ignore[no-untyped-def]
+    """Replace the triangular R by that of R^T R + A^T A, by Householder reflections.
+
+    Each reflection touches one row of R and the rows of A: what is zero in R stays out of it.
 
     Args:
-        columns: (n, >= n_rows) A transposed, so that each column of A is contiguous; destroyed.
-        n_rows: number of rows of A in use, at least n.
-        factor: (n, n) result, its diagonal not negative.
+        upper: (>= n, >= n) R, upper triangular; its leading (n, n) block is replaced, diagonal
+            not negative.
+        n: number of columns.
+        columns: (>= n, >= n_rows) A transposed, so that each column of A is contiguous;
+            destroyed.
+        n_rows: number of rows of A.
     """
-    n = columns.shape[0]
     for j in range(n):
         square = 0.0
-        for i in range(j, n_rows):
+        for i in range(n_rows):
             square += columns[j, i] * columns[j, i]
-        for i in range(j):
-            factor[i, j] = 0.0
         if square == 0.0:
-            for i in range(j, n):
-                factor[i, j] = 0.0
+            if upper[j, j] < 0.0:
+                for k in range(j, n):
+                    upper[j, k] = -upper[j, k]
             continue
-        norm = square**0.5
-        head = columns[j, j]
-        reflected = -norm if head > 0.0 else norm
-        sign = -1.0 if head > 0.0 else 1.0
-        columns[j, j] = head - reflected
+        head = upper[j, j]
+        norm = (head * head + square) ** 0.5
+        # The row is reflected to the side away from its head, then its sign is turned.
+        sign = 1.0 if head < 0.0 else -1.0
+        pivot = head - sign * norm
         scale = 1.0 / (norm * (norm + abs(head)))
-        factor[j, j] = norm
+        upper[j, j] = norm
         for k in range(j + 1, n):
             projection = 0.0
-            for i in range(j, n_rows):
+            for i in range(n_rows):
                 projection += columns[j, i] * columns[k, i]
-            projection *= scale
-            for i in range(j, n_rows):
+            projection = scale * (projection + pivot * upper[j, k])
+            for i in range(n_rows):
                 columns[k, i] -= projection * columns[j, i]
-            factor[k, j] = sign * columns[k, j]
+            upper[j, k] = sign * (upper[j, k] - projection * pivot)
+
+
+@njit(
+    void(
+        float64[:, ::1], float64[:, ::1], float64[:, ::1], float64[:, ::1], float64[::1],
+        float64[::1],
+    ),
+    cache=True,
+    fastmath={"contract"},
+)  # fmt: skip
+def condition(upper, noise, cross, gain, cosine, sine):  # type: ignore[no-untyped-def]
+    """Triangularise the joint root of readings and state, by Givens rotations.
+
+    The joint root ``[[noise, cross], [0, R^T]]`` is rotated, column by column, until the block at
+    ``cross`` is zero: its diagonal blocks then are the roots of the covariances of the innovation
+    and of the state given the reading. Each sweep leaves R triangular (Carlson 1973), and nothing
+    is subtracted, so that positive definiteness cannot be lost.
+
+    Args:
+        upper: (n, n) R with R^T R the covariance of the state, in and out.
+        noise: (ny, ny) lower root of what the state leaves open of the readings; becomes the
+            lower root of the innovation's covariance.
+        cross: (ny, n) readings along the columns of R^T; destroyed.
+        gain: (ny, n) result: transposed gain for the innovation divided by its root.
+        cosine, sine: (n + 1,) scratch.
+    """
+    n = upper.shape[0]
+    ny = noise.shape[0]
+    for i in range(ny):
+        square = noise[i, i] * noise[i, i]
+        cosine[n] = square
+        for j in range(n - 1, -1, -1):
+            square += cross[i, j] * cross[i, j]
+            cosine[j] = square
+        for j in range(n + 1):
+            cosine[j] = cosine[j] ** 0.5
+        noise[i, i] = cosine[0]
+        for j in range(n):
+            root = cosine[j]
+            turned = root > 0.0
+            sine[j] = cross[i, j] / root if turned else 0.0
+            cosine[j] = cosine[j + 1] / root if turned else 1.0
+        for k in range(n):
+            gain[i, k] = 0.0
+        for j in range(n - 1, -1, -1):
+            s, c = sine[j], cosine[j]
+            if s == 0.0:
+                continue
+            for k in range(j, n):
+                old = upper[j, k]
+                upper[j, k] = c * old - s * gain[i, k]
+                gain[i, k] = s * old + c * gain[i, k]
+            for k in range(i + 1, ny):
+                old = cross[k, j]
+                cross[k, j] = c * old - s * noise[k, i]
+                noise[k, i] = s * old + c * noise[k, i]
 
 
 @njit(void(float64[:, ::1], int64, float64[::1]), cache=True)
@@ -90,26 +149,19 @@ def forward_substitute(factor, n, vector):  # type: ignore[no-untyped-def]
         vector[i] = total / factor[i, i]
 
 
-@njit(void(float64[:, ::1], int64, float64[::1]), cache=True)
-def back_substitute(factor, n, vector):  # type: ignore[no-untyped-def]
-    """Replace ``vector`` (>= n,) by L^-T vector, L the leading (n, n) block of ``factor``."""
-    for i in range(n - 1, -1, -1):
-        total = vector[i]
-        for k in range(i + 1, n):
-            total -= factor[k, i] * vector[k]
-        vector[i] = total / factor[i, i]
+@njit(boolean(float64[:, ::1], int64, float64, float64[::1]), cache=True)
+def rank_one_update(upper, n, sign, vector):  # type: ignore[no-untyped-def]
+    """Replace R by the factor of R^T R + sign vector vector^T; ``vector`` (n,) is destroyed.
 
-
-@njit(boolean(float64[:, ::1], float64, float64[::1]), cache=True)
-def rank_one_update(factor, sign, vector):  # type: ignore[no-untyped-def]
-    """Replace L by the factor of L L^T + sign vector vector^T; ``vector`` (n,) is destroyed.
+    Args:
+        upper: (>= n, >= n) R, upper triangular; its leading (n, n) block is replaced.
+        n: size; sign: 1 or -1; vector: (>= n,).
 
     Returns:
         Whether the result is positive definite (always for ``sign`` = 1).
     """
-    n = vector.shape[0]
     for k in range(n):
-        diagonal = factor[k, k]
+        diagonal = upper[k, k]
         square = diagonal * diagonal + sign * vector[k] * vector[k]
         if vector[k] == 0.0:
             continue
@@ -118,15 +170,47 @@ def rank_one_update(factor, sign, vector):  # type: ignore[no-untyped-def]
         updated = square**0.5
         if diagonal == 0.0:
             # Sigma points leave the centre behind along a direction of no spread.
-            factor[k, k] = updated
+            upper[k, k] = updated
             for i in range(k + 1, n):
-                factor[i, k] = sign * vector[i] * vector[k] / updated
+                upper[k, i] = sign * vector[i] * vector[k] / updated
                 vector[i] = 0.0
             continue
         cosine = updated / diagonal
         sine = vector[k] / diagonal
-        factor[k, k] = updated
+        upper[k, k] = updated
         for i in range(k + 1, n):
-            factor[i, k] = (factor[i, k] + sign * sine * vector[i]) / cosine
-            vector[i] = cosine * vector[i] - sine * factor[i, k]
+            upper[k, i] = (upper[k, i] + sign * sine * vector[i]) / cosine
+            vector[i] = cosine * vector[i] - sine * upper[k, i]
     return True
+
+
+@njit(void(float64[:, ::1], float64[:, ::1]), cache=True)
+def transpose(upper, factor):  # type: ignore[no-untyped-def]
+    """Write the transpose of the upper triangular R (n, n) into ``factor`` (n, n)."""
+    n = upper.shape[0]
+    for i in range(n):
+        for j in range(i + 1):
+            factor[i, j] = upper[j, i]
+        for j in range(i + 1, n):
+            factor[i, j] = 0.0
+
+
+@njit(void(float64[:, ::1], float64[:, ::1]), cache=True, fastmath=_REASSOCIATE)
+def covariance_of(upper, covariance):  # type: ignore[no-untyped-def]
+    """Write R^T R into ``covariance`` (n, n), R upper triangular (n, n) with zeros below."""
+    n = upper.shape[0]
+    for i in range(n):
+        for j in range(n):
+            covariance[i, j] = upper[0, i] * upper[0, j]
+        for m in range(1, i + 1):
+            for j in range(n):
+                covariance[i, j] += upper[m, i] * upper[m, j]
+
+
+@njit(float64(float64[::1], float64[::1], int64), cache=True, fastmath=_REASSOCIATE)
+def product(a, b, count):  # type: ignore[no-untyped-def]
+    """Return the inner product of the first ``count`` elements of ``a`` and ``b``."""
+    total = 0.0
+    for i in range(count):
+        total += a[i] * b[i]
+    return total

@@ -61,6 +61,9 @@ class FilterModel:
     Attributes:
         derivative: compiled f(x, u, p, w, dx), of type ``signatures.DERIVATIVE``.
         measure: compiled h(x, u, p, y), of type ``signatures.MEASURE``.
+        derivative_rows, measure_rows: the same of many states at once, of types
+            ``signatures.DERIVATIVE_ROWS`` and ``signatures.MEASURE_ROWS``: what the compiled
+            filter calls, with all its sigma points.
         n_states: length of x.
         parameters: (np + 1,) values of all parameters, then the timing of the inputs: the time
             by which they were sampled after the positions, s. Channels of one sample are never
@@ -73,6 +76,8 @@ class FilterModel:
 
     derivative: Callable[..., Any]
     measure: Callable[..., Any]
+    derivative_rows: Callable[..., Any]
+    measure_rows: Callable[..., Any]
     n_states: int
     parameters: Array
     free: NDArray[np.int64]
@@ -240,8 +245,8 @@ def filter_trials(
         consistency = np.full((size, 2), np.nan)
         reason = np.zeros(1, dtype=np.int64)
         failed = kernel(
-            model.derivative,
-            model.measure,
+            model.derivative_rows,
+            model.measure_rows,
             np.ascontiguousarray(trial.t, dtype=float),
             np.ascontiguousarray(trial.u, dtype=float),
             np.ascontiguousarray(trial.y, dtype=float),

@@ -97,6 +97,24 @@ class System:
         """h(x, u, p, y): numba-compiled encoder readings, positions then rates."""
         return self._compiled.measure
 
+    @cached_property
+    def _rows(self) -> ModuleType:
+        return _load(self._folder / f"rows_{self._key}.py")
+
+    @property
+    def derivative_rows(self) -> Callable[..., None]:
+        """f(count, x, u, p, w, dx): `derivative` of many states at once, in vector registers.
+
+        Quantity i of row r is at ``[i*signatures.ROWS + r]``; equal to `derivative` but for
+        rounding.
+        """
+        return self._rows.derivative_rows
+
+    @property
+    def measure_rows(self) -> Callable[..., None]:
+        """h(count, x, u, p, y): `measure` of many states at once; see `derivative_rows`."""
+        return self._rows.measure_rows
+
     def true_motion(self, q: Array, qd: Array, qdd: Array, u: Array, p: Array) -> tuple[Array, ...]:
         """Motion of the mechanism from what the encoders read; each (T, n_q)."""
         n = len(self.coordinates)
@@ -232,8 +250,9 @@ def compile_model(model: Model) -> System:
     path = folder / f"meta_{key}.json"
     if path.exists():
         return System(model, folder, json.loads(path.read_text()))
-    from bampipe.physics.codegen import array_source, memory_source, scalar_source
+    from bampipe.physics.codegen import array_source, memory_source, rows_source, scalar_source
     from bampipe.physics.derivation import contribution, derive
+    from bampipe.physics.signatures import ROWS
 
     equations = derive(model)
     added = contribution(equations, derive(Model(model.device)))
@@ -250,6 +269,7 @@ def compile_model(model: Model) -> System:
     }
     write_generated(folder / f"columns_{key}.py", array_source(equations, added))
     write_generated(folder / f"compiled_{key}.py", scalar_source(equations))
+    write_generated(folder / f"rows_{key}.py", rows_source(equations, ROWS))
     if equations.z:
         write_generated(folder / f"memory_{key}.py", memory_source(equations))
     write_generated(path, json.dumps(meta))

@@ -124,6 +124,8 @@ def filter_model(
     return FilterModel(
         derivative=system.derivative,
         measure=system.measure,
+        derivative_rows=system.derivative_rows,
+        measure_rows=system.measure_rows,
         n_states=len(system.states),
         parameters=np.append(start, 0.0),
         free=np.array(places, dtype=np.int64),

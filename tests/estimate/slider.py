@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numba import njit
 
-from bampipe.estimate.signatures import DERIVATIVE, MEASURE
+from bampipe.estimate.signatures import DERIVATIVE, DERIVATIVE_ROWS, MEASURE, MEASURE_ROWS, ROWS
 from bampipe.estimate.unscented import FilterModel, FilterSettings, Trial
 
 TRUTH = np.array([4.0, 1.1, 2.0])
@@ -27,6 +27,21 @@ def derivative(x, u, p, w, dx):
 def measure(x, u, p, y):
     y[0] = x[0]
     y[1] = x[1]
+
+
+@njit(DERIVATIVE_ROWS.signature, cache=True)
+def derivative_rows(count, x, u, p, w, dx):
+    for r in range(count):
+        friction = p[r] * x[ROWS + r] + p[ROWS + r] * math.tanh(x[ROWS + r] / 1e-3)
+        dx[r] = x[ROWS + r]
+        dx[ROWS + r] = (u[r] + w[r] - friction) / p[2 * ROWS + r]
+
+
+@njit(MEASURE_ROWS.signature, cache=True)
+def measure_rows(count, x, u, p, y):
+    for r in range(count):
+        y[r] = x[r]
+        y[ROWS + r] = x[ROWS + r]
 
 
 def record(seed: int, seconds: float = 8.0, truth=TRUTH, resolution: float = RESOLUTION):
@@ -81,6 +96,8 @@ def model(start=TRUTH, *, timing: bool = False) -> FilterModel:
     return FilterModel(
         derivative=derivative,
         measure=measure,
+        derivative_rows=derivative_rows,
+        measure_rows=measure_rows,
         n_states=2,
         parameters=np.append(start, 0.0),
         free=np.array(free),

@@ -14,6 +14,7 @@ from motions import (
 )
 
 from bampipe.physics import Model, compile_model, registry
+from bampipe.physics.signatures import ROWS
 
 BAM = registry.device("bam")
 
@@ -55,6 +56,40 @@ def test_columns_and_compiled_functions_agree(name):
         again = system.residual(*row, rate[None, n : 2 * n], z[i][None], u[i][None], p)
         inertia = np.abs(system.mass_matrix(row[0], p)[0] @ rate[n : 2 * n]).max()
         np.testing.assert_allclose(again, 0.0, atol=1e-12 * max(scale, inertia))
+
+
+@pytest.mark.parametrize("name", registry.effect_names())
+def test_rows_and_single_states_agree(name):
+    """The functions for many states at once are those for one, but for rounding."""
+    system = compile_model(Model(BAM, (canonical(name),)))
+    count = 30
+    q, qd, _ = random_motion(BAM, count, 41, speed=0.5)
+    qd[::4] *= 1e-3
+    u, z = random_inputs(system, count, 42), memory_within_reason(system, count, 43)
+    x = np.hstack([q, qd, z])
+    p = typical_parameters(system) * np.random.default_rng(44).uniform(0.9, 1.1, (count, 1))
+    w = np.random.default_rng(45).normal(size=(count, len(system.noise)))
+
+    def laid_out(values):
+        flat = np.zeros((values.shape[1], ROWS))
+        flat[:, :count] = values.T
+        return flat.ravel()
+
+    rates, readings = np.zeros(x.shape[1] * ROWS), np.zeros(2 * q.shape[1] * ROWS)
+    system.derivative_rows(count, laid_out(x), laid_out(u), laid_out(p), laid_out(w), rates)
+    system.measure_rows(count, laid_out(x), laid_out(u), laid_out(p), readings)
+    one, reading = np.empty(x.shape[1]), np.empty(2 * q.shape[1])
+    expected_rates, expected_readings = [], []
+    for i in range(count):
+        system.derivative(x[i], u[i], p[i], w[i], one)
+        system.measure(x[i], u[i], p[i], reading)
+        expected_rates.append(one.copy())
+        expected_readings.append(reading.copy())
+    rates = rates.reshape(-1, ROWS)[:, :count].T
+    scale = np.abs(expected_rates).max(axis=0)
+    assert np.all(np.abs(rates - expected_rates) <= 1e-12 * scale)
+    readings = readings.reshape(-1, ROWS)[:, :count].T
+    np.testing.assert_allclose(readings, expected_readings, rtol=1e-12, atol=1e-14)
 
 
 @pytest.mark.parametrize("name", registry.effect_names())
@@ -111,7 +146,7 @@ def test_generated_code_is_the_same_text_again(tmp_path, monkeypatch):
         compile_model(Model(BAM, ("presliding:pitch", "force_delay")))
         files = sorted((tmp_path / folder).rglob("*_*.*"))
         texts.append([(f.name, f.read_text()) for f in files])
-    assert len(texts[0]) == 4
+    assert len(texts[0]) == 5
     assert texts[0] == texts[1]
 
 
@@ -147,7 +182,7 @@ def test_generated_code_holds_no_name_from_a_file(tmp_path, monkeypatch):
     device = awkward(("wandering", "pushing", "heaviness"))
     compile_model(Model(device, ("presliding:wandering", "force_drift:pushing")))
     sources = [f.read_text() for f in tmp_path.rglob("*.py")]
-    assert len(sources) == 3
+    assert len(sources) == 4
     for word in ("wandering", "pushing", "heaviness", "presliding", "deflection", "drift"):
         assert not any(word in text for text in sources)
     assert all(set(text) <= set(string.printable) for text in sources)

@@ -1,0 +1,57 @@
+"""Triangular factors against dense algebra."""
+
+import numpy as np
+import pytest
+
+from bampipe.estimate.signatures import ROWS
+from bampipe.estimate.triangular import append_rows, condition, covariance_of, rank_one_update
+from bampipe.physics import signatures as of_physics
+
+RNG = np.random.default_rng(2)
+
+
+@pytest.mark.parametrize("rows", [0, 1, 3, 9])
+def test_appended_rows_add_their_squares(rows):
+    upper = np.triu(RNG.normal(size=(6, 6)))
+    upper[2] = 0.0
+    added = RNG.normal(size=(rows, 6))
+    expected = upper.T @ upper + added.T @ added
+    append_rows(upper, 6, np.ascontiguousarray(added.T), rows)
+    np.testing.assert_allclose(upper.T @ upper, expected, atol=1e-13)
+    assert np.all(np.diag(upper) >= 0.0)
+    assert not np.tril(upper, -1).any()
+
+
+def test_conditioning_is_the_kalman_update():
+    """With S = C P C^T + R: the root of S, the gain times it, the root of P - K S K^T."""
+    n, ny = 7, 3
+    upper = np.triu(RNG.normal(size=(n, n)))
+    upper[np.diag_indices(n)] = np.abs(np.diag(upper))
+    noise = np.tril(RNG.normal(size=(ny, ny)))
+    noise[np.diag_indices(ny)] = np.abs(np.diag(noise))
+    measured = RNG.normal(size=(ny, n))
+    covariance, other = upper.T @ upper, noise @ noise.T
+    s = measured @ covariance @ measured.T + other
+    gain = np.linalg.solve(s, measured @ covariance).T
+    root, turned, found = upper.copy(), noise.copy(), np.empty((ny, n))
+    condition(root, turned, measured @ upper.T, found, np.empty(n + 1), np.empty(n + 1))
+    np.testing.assert_allclose(turned @ turned.T, s, atol=1e-12)
+    np.testing.assert_allclose(found.T, gain @ turned, atol=1e-12)
+    np.testing.assert_allclose(root.T @ root, covariance - gain @ s @ gain.T, atol=1e-12)
+    assert not np.tril(root, -1).any()
+
+
+def test_a_downdate_that_leaves_nothing_is_refused():
+    upper = np.triu(RNG.normal(size=(4, 4))) + 3.0 * np.eye(4)
+    small, large = 0.1 * upper[0].copy(), 1.5 * upper[0].copy()
+    expected = upper.T @ upper - np.outer(small, small)
+    lowered = upper.copy()
+    assert rank_one_update(lowered, 4, -1.0, small)
+    product = np.empty((4, 4))
+    covariance_of(lowered, product)
+    np.testing.assert_allclose(product, expected, atol=1e-13)
+    assert not rank_one_update(upper, 4, -1.0, large)
+
+
+def test_both_layers_lay_rows_out_alike():
+    assert ROWS == of_physics.ROWS
