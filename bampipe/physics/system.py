@@ -99,7 +99,7 @@ class System:
 
     @cached_property
     def _rows(self) -> ModuleType:
-        return _load(self._folder / f"rows_{self._key}.py")
+        return load_generated(self._folder / f"rows_{self._key}.py")
 
     @property
     def derivative_rows(self) -> Callable[..., None]:
