@@ -89,7 +89,7 @@ class _Table:
         length = len(raw.columns[self.clock])
         self.rows = np.arange(raw.first_row, raw.first_row + length, dtype=np.int64)
         self.repairs = list(raw.notes)
-        self.notes: list[str] = []
+        self.notes = list(raw.remarks)
 
     def __len__(self) -> int:
         return len(self.rows)

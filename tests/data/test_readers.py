@@ -15,8 +15,8 @@ import scipy.io
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from bampipe.data import readers
-from bampipe.data.readers import read_trial
+from bampipe.data.readers import parquet, read_trial
+from bampipe.data.readers import text as text_reader
 from bampipe.errors import InputError
 
 TABLE = {
@@ -94,8 +94,8 @@ def test_missing_parquet_values_are_nan(tmp_path):
 
 
 def test_many_blocks_are_joined_in_order(tmp_path, monkeypatch):
-    monkeypatch.setattr(readers, "_BLOCK", 1024)
-    monkeypatch.setattr(readers, "_BATCH_ROWS", 100)
+    monkeypatch.setattr(text_reader, "BLOCK", 1024)
+    monkeypatch.setattr(parquet, "BATCH_ROWS", 100)
     table = {"a": np.arange(5000), "b": np.arange(5000) * 0.5}
     for name, content in (("a.csv", as_csv(table)), ("a.parquet", as_parquet(table))):
         columns = read(tmp_path / name, content, ("b", "a")).columns
@@ -105,7 +105,7 @@ def test_many_blocks_are_joined_in_order(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("blank", [0, 3])
 def test_a_bad_cell_is_found_in_any_block(tmp_path, monkeypatch, blank):
-    monkeypatch.setattr(readers, "_BLOCK", 1024)
+    monkeypatch.setattr(text_reader, "BLOCK", 1024)
     lines = ["a,b"] + ["1,2"] * 10 + [""] * blank + ["1,2"] * 2000 + ["1,x"] + ["1,2"] * 2000
     with pytest.raises(InputError, match=f"row {2012 + blank}, column 'b': found 'x'"):
         read(tmp_path / "a.csv", "\n".join(lines).encode() + b"\n", ("a", "b"))

@@ -348,17 +348,18 @@ ASIDE: dict[str, tuple[Damage, str]] = {
         text(lambda s: s[:70000].encode() + b"\xff\xfe\x00\x01" * 20 + s[70000:].encode()),
         "row ",
     ),
-    "UTF-16 with mark": (text(lambda s: s.encode("utf-16")), "UTF-16 text; save it as UTF-8"),
-    "UTF-16 without mark": (text(lambda s: s.encode("utf-16-be")), "UTF-16 text"),
+    "UTF-16, cut in a character": (text(lambda s: s.encode("utf-16")[:-1]), "not sound UTF-16"),
     "header in Latin-1": (
         text(lambda s: b"gr\xf6\xdfe," + s.encode()),
         "row 1: the header is not UTF-8",
     ),
-    "semicolons": (text(lambda s: s.replace(",", ";")), "separated by semicolons"),
-    "tabs": (text(lambda s: s.replace(",", "\t")), "separated by tabs"),
-    "semicolons and decimal commas": (
-        text(lambda s: s.replace(",", ";").replace(".", ",")),
-        "row 1: columns are separated by semicolons",
+    "semicolons, and a decimal comma among points": (
+        text(lambda s: s.replace(",", ";").replace(".", ",", 1)),
+        "has a decimal comma, '.*' in row .* a point; export with one decimal sign",
+    ),
+    "semicolons, and thousands": (
+        text(lambda s: s.replace(",", ";").replace(";0.", ";1,000.", 1)),
+        "'1,000.* groups its digits in thousands",
     ),
     "decimal commas": (
         text(lambda s: s.split("\n")[0] + "\n" + s.split("\n", 1)[1].replace(".", ",")),
@@ -609,6 +610,19 @@ SOUND: dict[str, tuple[Damage, str]] = {
     "Windows line ends": (text(lambda s: s.replace("\n", "\r\n")), ""),
     "blank lines at the end": (text(lambda s: s + "\n\n"), ""),
     "blanks after commas": (text(lambda s: s.replace(",", ", ")), ""),
+    "UTF-16 with mark": (text(lambda s: s.encode("utf-16")), ""),
+    "UTF-16 without mark": (text(lambda s: s.encode("utf-16-be")), ""),
+    "semicolons": (text(lambda s: s.replace(",", ";")), "columns are separated by semicolons"),
+    "tabs": (text(lambda s: s.replace(",", "\t")), "columns are separated by tabs"),
+    "blanks": (text(lambda s: s.replace(",", "   ")), "columns are separated by blanks"),
+    "semicolons and decimal commas": (
+        text(lambda s: s.replace(",", ";").replace(".", ",")),
+        "columns are separated by semicolons; decimal commas",
+    ),
+    "remarks above the header": (
+        text(lambda s: "Logger 3\n# by hand\n\n" + s),
+        "2 lines above the header passed over",
+    ),
     "quoted names": (renamed(",".join(f'"{name}"' for name in COLUMNS)), ""),
     "columns in another order": (
         lambda made: made.files.update({T01: csv_text(made.tables[T01], COLUMNS[::-1])}),

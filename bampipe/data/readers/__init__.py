@@ -1,0 +1,136 @@
+"""Readers of trial files, one module a format; :func:`read_trial` chooses by the file's ending.
+
+Every reader returns the wanted columns as float64, with NaN where a cell is empty, and raises
+:class:`bampipe.errors.InputError` naming file, row and column where the file cannot be trusted.
+Rows of a text file are counted as an editor does (the first line is row 1); samples of the other
+files are counted from 1. Memory stays below three times what is returned; JSON and ROS bags apart,
+whose samples have to be held as objects.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+from bampipe.data.readers import bag, hdf5, mat, objects, parquet, tdms, text
+from bampipe.data.readers.trial import LARGEST_BYTES, Dialect, RawTrial, Wanted
+from bampipe.errors import InputError
+
+__all__ = ["ENDINGS", "LARGEST_BYTES", "Dialect", "RawTrial", "Wanted", "columns_of", "read_trial"]
+
+_READERS: dict[str, Callable[[Path, Wanted, str], RawTrial]] = {
+    **dict.fromkeys((".csv", ".tsv", ".txt", ".dat", ".asc", ".log"), text.read),
+    ".parquet": parquet.read,
+    ".mat": mat.read,
+    **dict.fromkeys((".h5", ".hdf5", ".hdf"), hdf5.read),
+    **dict.fromkeys((".json", ".jsonl", ".ndjson"), objects.read),
+    ".tdms": tdms.read,
+    **dict.fromkeys((".bag", ".mcap", ".db3"), bag.read),
+}
+ENDINGS = tuple(_READERS)
+"""Endings of the files that can be read."""
+
+_HEAD = 1 << 10
+_KINDS = (
+    (b"PAR1", (".parquet",), "a Parquet file"),
+    (b"TDSm", (".tdms",), "a TDMS file"),
+    (b"#ROSBAG", (".bag",), "a ROS bag"),
+    (b"\x89MCAP0", (".mcap",), "an MCAP file"),
+    (b"SQLite format 3", (".db3",), "an SQLite file"),
+    (b"PK\x03\x04", (), "a zip archive or spreadsheet"),
+    (b"\x1f\x8b", (), "a gzip archive"),
+    (hdf5.SIGNATURE, (".h5", ".hdf5", ".hdf", ".mat"), "an HDF5 file"),
+)
+
+
+def read_trial(
+    path: Path,
+    columns: Sequence[str],
+    *,
+    name: str = "",
+    largest_bytes: int = LARGEST_BYTES,
+    datetimes: Mapping[str, str] | None = None,
+    dialect: Dialect | None = None,
+) -> RawTrial:
+    """Read the wanted columns of one trial file; its ending says what kind of file it is.
+
+    Args:
+        path: the file.
+        columns: names of the columns, the time first; see each format's module for how they are
+            called there.
+        name: what to call the file in messages (default: its path).
+        largest_bytes: refuse a trial that takes more than this in memory.
+        datetimes: columns that hold dates and times, with their format as of ``strptime``, ""
+            for ISO 8601; returned as s since the first.
+        dialect: what is known about the layout of a text file.
+
+    Raises:
+        InputError: empty, of another kind, cut off, too large, a column missing or twice, a
+            cell that is not a number, or a library that is not installed.
+    """
+    path, name = Path(path), name or str(path)
+    ending = _checked_ending(path, name)
+    wanted = Wanted(tuple(columns), datetimes or {}, dialect or Dialect(), largest_bytes)
+    try:
+        trial = _READERS[ending](path, wanted, name)
+    except MemoryError as error:
+        raise InputError("does not fit into memory", where=name) from error
+    if len(trial.columns[columns[0]]) == 0:
+        raise InputError("a header but no samples", where=name)
+    return trial
+
+
+def columns_of(path: Path, *, name: str = "", dialect: Dialect | None = None) -> dict[str, str]:
+    """Names of what one trial file holds that can be read as a column, with units it states.
+
+    The unit is "datetime" for dates and times, "" where the file does not say.
+
+    Raises:
+        InputError: as :func:`read_trial`.
+    """
+    path, name = Path(path), name or str(path)
+    ending = _checked_ending(path, name)
+    if _READERS[ending] is text.read:
+        return text.columns(path, dialect or Dialect(), name)[0]
+    if ending == ".parquet":
+        return parquet.columns(path, name)
+    if ending == ".mat":
+        return mat.columns(path, name)
+    if _READERS[ending] is hdf5.read:
+        return hdf5.columns(path, name)
+    if _READERS[ending] is objects.read:
+        return objects.columns(path, LARGEST_BYTES, name)
+    return tdms.columns(path, name) if ending == ".tdms" else bag.columns(path, name)
+
+
+def _checked_ending(path: Path, name: str) -> str:
+    """Ending of the file, after a look at whether its first bytes agree with it.
+
+    Raises:
+        InputError: cannot be read, empty, of no known ending, or of another kind.
+    """
+    ending = path.suffix.lower()
+    try:
+        size = path.stat().st_size
+        with path.open("rb") as stream:
+            head = stream.read(_HEAD)
+    except OSError as error:
+        raise InputError(
+            f"cannot be read: {(error.strerror or 'error').lower()}", where=name
+        ) from error
+    if ending not in _READERS:
+        raise InputError(
+            f"ending '{ending}' is of no file that can be read",
+            where=name,
+            remedy=f"give {', '.join(ENDINGS)}",
+        )
+    if size == 0:
+        raise InputError("the file is empty", where=name)
+    matlab = head.startswith(b"MATLAB") or head[512:520] == hdf5.SIGNATURE
+    kinds = [(magic, right, words) for magic, right, words in _KINDS if head.startswith(magic)]
+    kinds += [(b"", (".mat",), "a MATLAB file")] if matlab else []
+    for _, right, words in kinds:
+        if ending not in right:
+            remedy = f"name it *{right[0]}" if right else "unpack it, or export it as CSV"
+            raise InputError(f"this is {words}, not *{ending}", where=name, remedy=remedy)
+    return ending

@@ -1,0 +1,55 @@
+"""Variables that are vectors, or columns of a matrix named as ``X[0]``."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Container
+
+import numpy as np
+
+from bampipe.errors import InputError
+
+LARGEST_WIDTH = 64
+
+
+def split_index(column: str, names: Container[str]) -> tuple[str, int | None]:
+    """``("X", 2)`` for ``X[2]``, where there is no variable of that whole name."""
+    match = re.fullmatch(r"(.+)\[(\d{1,3})\]", column)
+    if column in names or match is None:
+        return column, None
+    return match[1], int(match[2])
+
+
+def pick(values: np.ndarray, index: int | None, where: str) -> np.ndarray:
+    """The vector, or column ``index`` of a matrix (counted along its shorter side, from 0).
+
+    Raises:
+        InputError: a matrix without an index, or an index that is too large.
+    """
+    sides = [extent for extent in values.shape if extent != 1] if 0 not in values.shape else []
+    if index is None:
+        if len(sides) > 1:
+            shown = " by ".join(map(str, values.shape))
+            raise InputError(
+                f"a {shown} array, expected a vector",
+                where=where,
+                remedy="name one of its columns, as in X[0]" if len(sides) == 2 else "",
+            )
+        return values.ravel()
+    if len(sides) > 2 or not sides:
+        raise InputError("has no columns to choose from", where=where)
+    table = values.reshape(sides) if len(sides) == 2 else values.reshape(-1, 1)
+    table = table if table.shape[0] >= table.shape[1] else table.T
+    if index >= table.shape[1]:
+        raise InputError(f"has {table.shape[1]} columns, [{index}] is not among them", where=where)
+    return np.ascontiguousarray(table[:, index])
+
+
+def labels(name: str, shape: tuple[int, ...]) -> list[str]:
+    """What the columns of a variable are called: its name, or ``name[0]``, ``name[1]``, ..."""
+    sides = [extent for extent in shape if extent != 1]
+    if 0 in shape or len(sides) > 2:
+        return []
+    if len(sides) < 2:
+        return [name]
+    return [f"{name}[{k}]" for k in range(min(sides))] if min(sides) <= LARGEST_WIDTH else []

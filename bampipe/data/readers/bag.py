@@ -1,0 +1,208 @@
+"""ROS bags (1 and 2) and MCAP files, by rosbags and mcap (the extra ``bampipe[ros]``).
+
+A column is ``/topic:field``, where the field is a path in the message:
+``/joint_states:position[0]``, ``/joint_states:position[elbow]`` (by the message's list ``name``),
+``/wrench:wrench.force.x``.
+``/topic:@time`` is when the message was recorded, ``/topic:header.stamp`` when it was stamped; both
+are returned in s since the first. The topic of the time column gives the samples; columns of other
+topics are interpolated linearly at its times.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bampipe.data.readers import moments
+from bampipe.data.readers.extras import need
+from bampipe.data.readers.messages import RECORDED, STAMP, Field, leaves
+from bampipe.data.readers.trial import RawTrial, Wanted, check_columns, check_size
+from bampipe.errors import InputError
+
+_DAMAGED = (
+    OSError, EOFError, ValueError, TypeError, KeyError, IndexError, AttributeError,
+    AssertionError, OverflowError, RuntimeError,
+)  # fmt: skip
+
+
+def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
+    """The wanted fields at the times of the first column, which is the time.
+
+    Raises:
+        InputError: a library is not installed, the file is damaged, a topic or field is missing or
+            not a number.
+    """
+    fields = {column: _field(column, name) for column in wanted.columns}
+    topics = tuple(dict.fromkeys(field.topic for field in fields.values()))
+    recorded: dict[str, list[int]] = {topic: [] for topic in topics}
+    stamped: dict[str, list[int | None]] = {topic: [] for topic in topics}
+    cells: dict[str, list[float]] = {column: [] for column in wanted.columns}
+    for number, (topic, moment, message) in enumerate(_messages(path, topics, name), 1):
+        check_size(number, wanted, name)
+        recorded[topic].append(moment)
+        stamped[topic].append(Field(topic, STAMP).moment(message))
+        for column, field in fields.items():
+            if field.topic == topic and not field.is_time:
+                place = f"{name}, column '{column}', message {len(recorded[topic])}"
+                cells[column].append(field.number(message, place))
+    clock = fields[wanted.columns[0]]
+    if not clock.is_time:
+        raise InputError(
+            "is no time",
+            where=f"{name}, column '{wanted.columns[0]}'",
+            remedy=f"give {clock.topic}:{RECORDED} or {clock.topic}:{STAMP} under [time]",
+        )
+    times = {
+        topic: _times(clock, recorded[topic], stamped[topic], topic == clock.topic, name)
+        for topic in topics
+    }
+    base = times[clock.topic]
+    values, remarks = {}, []
+    for column, field in fields.items():
+        if field.is_time:
+            values[column] = moments.seconds(base)
+        elif field.topic == clock.topic:
+            values[column] = np.array(cells[column], dtype=np.float64)
+        else:
+            values[column] = _interpolated(base, times[field.topic], cells[column])
+    for topic in topics:
+        if topic != clock.topic:
+            gap = float(np.max(np.diff(times[topic]), initial=0)) / moments.NANOSECONDS
+            remarks.append(
+                f"{topic} interpolated linearly at the times of {clock.topic}"
+                f" (at most {gap:.3g} s between its messages)"
+            )
+    return RawTrial(values, first_row=1, remarks=tuple(remarks))
+
+
+def columns(path: Path, name: str) -> dict[str, str]:
+    """Names of the numbers in the first message of each topic; times have the unit s.
+
+    Raises:
+        InputError: as :func:`read`.
+    """
+    found: dict[str, str] = {}
+    seen: set[str] = set()
+    for topic, _, message in _messages(path, (), name):
+        if topic in seen:
+            continue
+        seen.add(topic)
+        found[f"{topic}:{RECORDED}"] = "s"
+        for leaf in leaves(message):
+            found[f"{topic}:{leaf}"] = "s" if leaf == STAMP else ""
+    return found
+
+
+def _field(column: str, name: str) -> Field:
+    topic, colon, path = column.partition(":")
+    if not colon or not path:
+        raise InputError(
+            f"'{column}' does not say which field of which topic",
+            where=name,
+            remedy="write /topic:field, as in /joint_states:position[0]",
+        )
+    return Field(topic, path)
+
+
+def _times(
+    clock: Field,
+    recorded: Sequence[int],
+    stamped: Sequence[int | None],
+    leads: bool,
+    name: str,
+) -> np.ndarray:
+    """Times of a topic's messages, ns, by the clock that the time column names if it has that."""
+    known = [moment for moment in stamped if moment is not None]
+    if clock.path == RECORDED or (not leads and len(known) < len(stamped)):
+        return np.array(recorded, dtype=np.int64)
+    if len(known) < len(stamped):
+        raise InputError(
+            f"{len(stamped) - len(known)} messages have no {STAMP}",
+            where=f"{name}, topic {clock.topic}",
+            remedy=f"give {clock.topic}:{RECORDED} under [time]",
+        )
+    return np.array(known, dtype=np.int64)
+
+
+def _interpolated(base: np.ndarray, times: np.ndarray, cells: list[float]) -> np.ndarray:
+    """Values at the times ``base``, NaN before the first and after the last."""
+    order = np.argsort(times, kind="stable")
+    since = (times[order] - base[0]) / moments.NANOSECONDS
+    at = (base - base[0]) / moments.NANOSECONDS
+    values = np.array(cells, dtype=np.float64)[order]
+    return np.interp(at, since, values, left=np.nan, right=np.nan)
+
+
+def _messages(path: Path, topics: Sequence[str], name: str) -> Iterator[tuple[str, int, Any]]:
+    """Topic, time of recording (ns) and message, in the order of recording; all if no topics.
+
+    Raises:
+        InputError: not installed, damaged, or a topic is missing.
+    """
+    source = _json_messages if _holds_json(path, name) else _ros_messages
+    try:
+        yield from source(path, topics, name)
+    except _DAMAGED as error:
+        raise InputError(
+            "not a sound bag", where=name, remedy="copy it again from the robot"
+        ) from error
+
+
+def _ros_messages(path: Path, topics: Sequence[str], name: str) -> Iterator[tuple[str, int, Any]]:
+    highlevel = need("rosbags.highlevel", "ros", name)
+    try:
+        with highlevel.AnyReader([path]) as reader:
+            check_columns(sorted(reader.topics), topics, name)
+            chosen = [c for c in reader.connections if not topics or c.topic in topics]
+            if not chosen:
+                raise InputError("holds no messages", where=name)
+            for connection, moment, raw in reader.messages(connections=chosen):
+                yield connection.topic, moment, reader.deserialize(raw, connection.msgtype)
+    except highlevel.AnyReaderError as error:
+        raise InputError(
+            f"not a bag that can be read ({' '.join(map(str, error.args))[:120]})",
+            where=name,
+            remedy="copy it again, or record with the message definitions in it",
+        ) from error
+
+
+def _holds_json(path: Path, name: str) -> bool:
+    """Whether an MCAP file holds JSON messages rather than those of ROS."""
+    if path.suffix.lower() != ".mcap":
+        return False
+    reader = need("mcap.reader", "ros", name)
+    exceptions = need("mcap.exceptions", "ros", name)
+    try:
+        with path.open("rb") as stream:
+            summary = reader.make_reader(stream).get_summary()
+    except (exceptions.McapError, *_DAMAGED) as error:
+        raise InputError(
+            "not a sound MCAP file", where=name, remedy="copy it again from the robot"
+        ) from error
+    channels = summary.channels.values() if summary else ()
+    return any(channel.message_encoding == "json" for channel in channels)
+
+
+def _json_messages(path: Path, topics: Sequence[str], name: str) -> Iterator[tuple[str, int, Any]]:
+    reader = need("mcap.reader", "ros", name)
+    exceptions = need("mcap.exceptions", "ros", name)
+    try:
+        with path.open("rb") as stream:
+            source = reader.make_reader(stream)
+            known = {
+                channel.topic
+                for channel in source.get_summary().channels.values()
+                if channel.message_encoding == "json"
+            }
+            check_columns(sorted(known), topics, name)
+            for _, channel, message in source.iter_messages(topics=list(topics) or None):
+                if channel.topic in known:
+                    yield channel.topic, message.log_time, json.loads(message.data)
+    except exceptions.McapError as error:
+        raise InputError(
+            "not a sound MCAP file", where=name, remedy="copy it again from the robot"
+        ) from error

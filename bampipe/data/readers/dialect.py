@@ -1,0 +1,357 @@
+"""How a text file of numbers is laid out: found in its first lines, or refused.
+
+Labs write tables with commas, semicolons, tabs, bars or blanks between columns, with points or
+commas as decimal signs, with lines of remarks above the header and a line of units below it. What
+can be read in two ways is refused, with the setting that decides: a guess must not change numbers.
+"""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from bampipe.data.readers.trial import Dialect, check_columns
+from bampipe.data.units import unit
+from bampipe.errors import InputError
+
+HEAD = 1 << 16
+NULLS = ("", "nan", "NaN", "NAN", "NA", "N/A", "#N/A", "null", "NULL", "None")
+"""Cells that mean: no number here."""
+
+DELIMITERS = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", " ": "blanks"}
+_POINT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?\Z")
+_COMMA = re.compile(r"[-+]?(\d+,\d*|,\d+)([eE][-+]?\d+)?\Z")
+_THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2}(,\d{3})+\Z")
+_GROUPED = re.compile(r"[-+]?(\d{1,3}(,\d{3})+\.\d*|\d{1,3}(\.\d{3})+,\d*)\Z")
+_UNIT = re.compile(r"[\[(]?\s*(?=.*[A-Za-z%°Ωµμ1\-])[A-Za-z0-9%°Ωµμ./*^²³· _\-]{0,16}\s*[\])]?\Z")
+_NAME_WITH_UNIT = re.compile(r"(?P<name>.*?)\s*[\[(]\s*(?P<unit>[^\[\]()]{1,16}?)\s*[\])]\s*\Z")
+_REMARK = re.compile(r"\s*(#|%|//|\"#)+\s?")
+_SEARCHED = 200
+_TRIED = 400
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where the samples of a text file start and how they are written.
+
+    Attributes:
+        delimiter: between columns.
+        decimal: decimal sign.
+        header: names of the columns.
+        first_line: number of the line with the first sample, as an editor counts.
+        start: bytes before that line.
+        remarks: what is unlike a plain table with commas, a sentence each.
+        units: units that the header or a line below it gives, by column.
+    """
+
+    delimiter: str
+    decimal: str
+    header: tuple[str, ...]
+    first_line: int
+    start: int
+    remarks: tuple[str, ...] = ()
+    units: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class _Line:
+    number: int
+    end: int
+    text: str
+
+
+def cells(text: str, delimiter: str) -> list[str]:
+    """The cells of one line, without the blanks around them."""
+    if delimiter == " ":
+        return text.split()
+    return [cell.strip() for cell in next(csv.reader([text], delimiter=delimiter), [])]
+
+
+def find_layout(head: bytes, columns: Sequence[str], dialect: Dialect, name: str) -> Layout:
+    """Layout of the text file that begins with ``head``.
+
+    Args:
+        head: its first 64 kB, or all of it where it is shorter, as UTF-8.
+        columns: names that the header must have; empty to take any header.
+        dialect: what the session says about it.
+        name: what to call the file in messages.
+
+    Raises:
+        InputError: no header, a column missing, or a layout that can be read in two ways.
+    """
+    lines = _lines(head, name)
+    delimiters = [dialect.delimiter] if dialect.delimiter else list(DELIMITERS)
+    place, delimiter, header = _header(lines, columns, dialect, delimiters, name)
+    body = lines[place + 1 :]
+    units = _units_in(header)
+    remarks = []
+    if delimiter != "," and not dialect.delimiter:
+        remarks.append(f"columns are separated by {DELIMITERS[delimiter]}")
+    above = sum(bool(line.text.strip()) for line in lines[: max(place, 0)])
+    if above:
+        remarks.append(f"{above} lines above the header passed over")
+    passed = place
+    for line in body:
+        row = cells(line.text, delimiter)
+        if line.text.strip() and not _is_remark(line.text):
+            if _is_unit_row(row, header, columns) and not dialect.names:
+                units |= {h: _bare(u) for h, u in zip(header, row, strict=False) if _bare(u)}
+                remarks.append(f"row {line.number} gives units")
+                passed += 1
+            break
+        passed += 1
+    body = lines[passed + 1 :]
+    header = _padded(header, body, delimiter)
+    decimal = dialect.decimal or _decimal(body, header, columns, delimiter, name)
+    if decimal == "," and not dialect.decimal:
+        remarks.append("decimal commas")
+    start = lines[passed].end if passed >= 0 else _mark(head)
+    number = lines[passed].number + 1 if passed >= 0 else 1
+    return Layout(delimiter, decimal, tuple(header), number, start, tuple(remarks), units)
+
+
+def numeric_columns(head: bytes, layout: Layout) -> tuple[str, ...]:
+    """Names of the columns that hold numbers in nearly all of the first lines."""
+    good: Counter[int] = Counter()
+    rows = 0
+    for line in _lines(head, "")[: layout.first_line + _TRIED]:
+        if line.number < layout.first_line or not line.text.strip():
+            continue
+        rows += 1
+        row = cells(line.text, layout.delimiter)
+        good.update(n for n, cell in enumerate(row) if _is_number(cell, layout.decimal))
+    return tuple(
+        name
+        for n, name in enumerate(layout.header)
+        if name and rows and good[n] > 0.5 * rows and layout.header.count(name) == 1
+    )
+
+
+def first_cells(head: bytes, layout: Layout, column: str) -> list[str]:
+    """What stands in ``column`` in the first lines, as text."""
+    place = layout.header.index(column)
+    rows = [
+        cells(line.text, layout.delimiter)
+        for line in _lines(head, "")
+        if line.number >= layout.first_line and line.text.strip()
+    ]
+    return [row[place] for row in rows[:_TRIED] if len(row) > place]
+
+
+def _is_number(cell: str, decimal: str) -> bool:
+    return bool((_POINT if decimal == "." else _COMMA).match(cell) or _POINT.match(cell))
+
+
+def _mark(head: bytes) -> int:
+    return 3 if head.startswith(b"\xef\xbb\xbf") else 0
+
+
+def _lines(head: bytes, name: str) -> list[_Line]:
+    """The whole lines of ``head``, and the last one where it is all there is."""
+    found = []
+    start = _mark(head)
+    for number, match in enumerate(re.finditer(rb"[^\r\n]*(\r\n|\n|\r|\Z)", head[start:]), 1):
+        end = start + match.end()
+        if (end == len(head) and len(head) >= HEAD and found) or match.start() == match.end():
+            break
+        try:
+            text = match[0].decode("utf-8")
+        except UnicodeDecodeError as error:
+            if number <= 2 and not any(line.text.strip() for line in found):
+                raise InputError(
+                    "the header is not UTF-8 text",
+                    where=f"{name}, row {number}",
+                    remedy='save it as UTF-8, or say encoding = "latin-1" under [csv]',
+                ) from error
+            text = match[0].decode("utf-8", "replace")
+        found.append(_Line(number, end, text.rstrip("\r\n")))
+    return found
+
+
+def _header(
+    lines: list[_Line],
+    columns: Sequence[str],
+    dialect: Dialect,
+    delimiters: list[str],
+    name: str,
+) -> tuple[int, str, list[str]]:
+    """Place of the header among the lines (-1 where the session gives the names), and its cells."""
+    if dialect.names:
+        check_columns(dialect.names, columns, f"{name}: csv.names")
+        place, delimiter = _guess(lines, delimiters)[0]
+        above = [n for n, line in enumerate(lines[:place]) if line.text.strip()]
+        return (above[-1] if above else -1), delimiter, list(dialect.names)
+    for place, line in enumerate(lines[:_SEARCHED]) if columns else ():
+        for delimiter in delimiters:
+            row = _names(line.text, delimiter, lines[place + 1 :])
+            if set(columns) <= set(row):
+                check_columns(row, columns, f"{name}, row {line.number}")
+                return place, delimiter, row
+    guesses = _guess(lines, delimiters)
+    found = [(_above(lines, first, delimiter), delimiter) for first, delimiter in guesses]
+    place, delimiter = next((each for each in found if each[0] >= 0), (-1, ""))
+    if place < 0:
+        shown = ",".join(columns) or "time,position,..."
+        raise InputError(
+            "no header: the first line holds numbers",
+            where=f"{name}, row {lines[0].number}",
+            remedy=f"add a line {shown}, or give names under [csv]",
+        )
+    row = _names(lines[place].text, delimiter, lines[place + 1 :])
+    check_columns(row, columns, f"{name}, row {lines[place].number}")
+    return place, delimiter, row
+
+
+def _names(text: str, delimiter: str, below: list[_Line]) -> list[str]:
+    """Names in a header, which may be written as a remark: ``# t x`` has two names or three."""
+    plain, bare = (cells(t, delimiter) for t in (text, _REMARK.sub("", text, count=1)))
+    if len(plain) == len(bare):
+        return bare if _is_remark(text) and plain[0].strip("#%/") else plain
+    rows = [line.text for line in below if line.text.strip() and not _is_remark(line.text)]
+    return plain if rows and len(cells(rows[0], delimiter)) == len(plain) else bare
+
+
+def _guess(lines: list[_Line], delimiters: list[str]) -> list[tuple[int, str]]:
+    """Where the samples start and what separates their columns; several where that is equal."""
+    ranked = []
+    tried = [line for line in lines[-_TRIED:] if line.text.strip()]
+    for delimiter in delimiters:
+        rows = [cells(line.text, delimiter) for line in tried]
+        width = Counter(map(len, rows)).most_common(1)[0][0] if rows else 0
+        alike = [row for row in rows if len(row) == width]
+        numbers = sum(_number_cells(row, delimiter) for row in alike)
+        share = numbers / (width * len(rows)) if width else 0.0
+        ranked.append((share * width if width > 1 else 0.0, -len(ranked), width, delimiter))
+    found = []
+    best = max(ranked)[0]
+    for score, _, width, delimiter in sorted(ranked, reverse=True):
+        if score < best:
+            break
+        first = len(lines)
+        for place, line in enumerate(lines):
+            row = cells(line.text, delimiter)
+            if len(row) == width and _number_cells(row, delimiter) > 0.5 * width:
+                first = place
+                break
+        found.append((first, delimiter))
+    return found
+
+
+def _number_cells(row: list[str], delimiter: str) -> int:
+    """How many cells of a line are numbers; a comma inside one is a decimal sign."""
+    signs = (_POINT,) if delimiter == "," else (_POINT, _COMMA)
+    return sum(any(sign.match(cell) for sign in signs) for cell in row)
+
+
+def _above(lines: list[_Line], first: int, delimiter: str) -> int:
+    """Place of the header above the first sample, -1 where there is none."""
+    if first >= len(lines):
+        return next((n for n, line in enumerate(lines) if line.text.strip()), -1)
+    width = len(cells(lines[first].text, delimiter))
+    above = [n for n in range(first) if lines[n].text.strip()]
+    rows = {n: cells(_REMARK.sub("", lines[n].text, count=1), delimiter) for n in above[-4:]}
+    fitting = [n for n, row in rows.items() if width - 1 <= len(row) <= width]
+    if len(fitting) > 1 and _are_units(rows[fitting[-1]]) and len(rows[fitting[-2]]) == width:
+        return fitting[-2]
+    return fitting[-1] if fitting else -1
+
+
+def _padded(header: list[str], body: list[_Line], delimiter: str) -> list[str]:
+    """The header with one more, nameless column where every line ends with a delimiter."""
+    rows = [cells(line.text, delimiter) for line in body[:_TRIED] if line.text.strip()]
+    longer = rows and all(len(row) == len(header) + 1 and not row[-1] for row in rows)
+    return [*header, ""] if longer else header
+
+
+def _decimal(
+    body: list[_Line], header: list[str], columns: Sequence[str], delimiter: str, name: str
+) -> str:
+    """Decimal sign of the first lines.
+
+    Raises:
+        InputError: both signs, or digits that may be grouped in thousands.
+    """
+    places = [n for n, column in enumerate(header) if column in columns or not columns]
+    seen: dict[str, tuple[str, int]] = {}
+    grouped = plain = 0
+    for line in body[:_TRIED]:
+        row = cells(line.text, delimiter)
+        for place in places:
+            cell = row[place] if place < len(row) else ""
+            at = f"{name}, row {line.number}, column '{header[place]}'"
+            if _GROUPED.match(cell):
+                raise InputError(
+                    f"'{cell}' groups its digits in thousands",
+                    where=at,
+                    remedy="export without thousands separators",
+                )
+            if _COMMA.match(cell):
+                seen.setdefault(",", (cell, line.number))
+                grouped += bool(_THOUSANDS.match(cell))
+                plain += not _THOUSANDS.match(cell)
+            elif _POINT.match(cell) and "." in cell:
+                seen.setdefault(".", (cell, line.number))
+    if "," not in seen or (delimiter == "," and "." in seen):
+        return "."
+    if "." in seen:
+        (comma, row_1), (point, row_2) = seen[","], seen["."]
+        raise InputError(
+            f"'{comma}' in row {row_1} has a decimal comma, '{point}' in row {row_2} a point",
+            where=name,
+            remedy='export with one decimal sign, or say decimal = "," or "." under [csv]',
+        )
+    if not plain:
+        raise InputError(
+            f"'{seen[','][0]}' may be a decimal comma or digits in thousands",
+            where=f"{name}, row {seen[','][1]}",
+            remedy='say decimal = "," under [csv], or export without thousands separators',
+        )
+    return ","
+
+
+# Remarks and units
+
+
+def _is_remark(text: str) -> bool:
+    return bool(_REMARK.match(text))
+
+
+def _is_unit_row(row: list[str], header: list[str], columns: Sequence[str]) -> bool:
+    """Whether a line below the header names units: no number in it, a unit for what is wanted."""
+    wanted = [
+        row[n] for n, name in enumerate(header) if n < len(row) and (name in columns or not columns)
+    ]
+    return bool(wanted) and len(row) == len(header) and _looks_like_units(wanted)
+
+
+def _looks_like_units(row: list[str]) -> bool:
+    said = [cell for cell in row if cell]
+    return (
+        2 * len(said) >= len(row)
+        and bool(said)
+        and all(_UNIT.match(cell) and cell not in NULLS for cell in said)
+        and not any(_POINT.match(cell) and cell != "1" for cell in said)
+        and any(re.search(r"[A-Za-z%°Ωµμ]", cell) and len(_bare(cell)) <= 10 for cell in said)
+    )
+
+
+def _are_units(row: list[str]) -> bool:
+    """Whether every cell is a unit that is known, or stands in brackets."""
+    return any(row) and all(re.match(r"[\[(]", cell) or unit(cell) is not None for cell in row)
+
+
+def _units_in(header: list[str]) -> dict[str, str]:
+    """Units in names such as ``force [N]``."""
+    found = {}
+    for name in header:
+        match = _NAME_WITH_UNIT.match(name)
+        if match and match["name"]:
+            found[name] = match["unit"]
+    return found
+
+
+def _bare(unit: str) -> str:
+    return unit.strip().strip("[]()").strip()

@@ -1,0 +1,180 @@
+"""HDF5 files, and MATLAB files of version 7.3, which are HDF5 inside.
+
+A column is the path of a dataset (``log/force``), a field of a compound one (``log/samples.force``)
+or a column of a matrix (``log/pose[2]``). What lies outside the file is not followed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bampipe.data.readers import moments
+from bampipe.data.readers.arrays import labels, pick, split_index
+from bampipe.data.readers.trial import RawTrial, Wanted, aligned, check_columns, check_size
+from bampipe.errors import InputError
+
+SIGNATURE = b"\x89HDF\r\n\x1a\n"
+FAULTS = (
+    OSError,
+    ValueError,
+    TypeError,
+    KeyError,
+    NotImplementedError,
+    OverflowError,
+    RuntimeError,
+)
+"""What reading a damaged file raises: h5py has no one error type for it."""
+
+_MOST_DATASETS = 2000
+
+
+def read(path: Path, wanted: Wanted, name: str, what: str = "dataset") -> RawTrial:
+    """The wanted columns of an HDF5 file.
+
+    Args:
+        path: the file.
+        wanted: columns.
+        name: what to call the file in messages.
+        what: what its parts are called in messages.
+
+    Raises:
+        InputError: damaged, a column missing, not a vector, or not of numbers.
+    """
+    import h5py  # heavy: only for these files
+
+    matlab = what == "variable"
+    try:
+        with h5py.File(path, "r") as file:
+            values, units = {}, {}
+            for column in wanted.columns:
+                place = f"{name}, {what} '{column}'"
+                data, field, index = _found(file, column, wanted.columns, name, place)
+                kind = data.dtype if field is None else data.dtype[field]
+                moment = column in wanted.datetimes
+                _check(data, kind, moment, place)
+                check_size(int(data.size), wanted, name)
+                cells = data[()] if field is None else data[field]
+                vector = pick(cells, index, place)
+                if moment:
+                    text = [x.decode("utf-8", "replace") if isinstance(x, bytes) else str(x)
+                            for x in vector]  # fmt: skip
+                    stamps = moments.nanoseconds(text, wanted.datetimes[column], place)
+                    values[column] = moments.seconds(stamps)
+                else:
+                    values[column] = np.asarray(vector, dtype=np.float64)
+                unit = "" if matlab else _unit(data)
+                units |= {column: unit} if unit else {}
+    except FAULTS as error:
+        words = "MATLAB" if matlab else "HDF5"
+        raise InputError(
+            f"not a sound {words} file",
+            where=name,
+            remedy="save it again from MATLAB" if matlab else "copy it again from the logger",
+        ) from error
+    return RawTrial(aligned(values, name, what), first_row=1, units=units)
+
+
+def columns(path: Path, name: str) -> dict[str, str]:
+    """Names and units of the vectors of numbers in the file.
+
+    Raises:
+        InputError: not a sound HDF5 file.
+    """
+    import h5py  # heavy: only for these files
+
+    found = {}
+    try:
+        with h5py.File(path, "r") as file:
+            for label, data in _datasets(file):
+                for field in data.dtype.names or (None,):
+                    kind = data.dtype if field is None else data.dtype[field]
+                    if kind.kind in "iufb" and data.attrs.get("MATLAB_class") != b"char":
+                        whole = label if field is None else f"{label}.{field}"
+                        found |= dict.fromkeys(labels(whole, data.shape), _unit(data))
+    except FAULTS as error:
+        raise InputError("not a sound HDF5 file", where=name) from error
+    return found
+
+
+def _datasets(group: Any, prefix: str = "", depth: int = 0) -> Iterator[tuple[str, Any]]:
+    """Every dataset of the file itself, by its path; links are not followed."""
+    import h5py
+
+    for count, key in enumerate(group):
+        if count > _MOST_DATASETS or key.startswith("#"):
+            continue
+        if not isinstance(group.get(key, getlink=True), h5py.HardLink):
+            continue
+        item = group[key]
+        label = f"{prefix}{key}"
+        if isinstance(item, h5py.Dataset):
+            if not item.external and not item.is_virtual:
+                yield label, item
+        elif depth < 8:
+            yield from _datasets(item, f"{label}/", depth + 1)
+
+
+def _found(
+    file: Any, column: str, wanted: tuple[str, ...], name: str, place: str
+) -> tuple[Any, str | None, int | None]:
+    """The dataset of a column, and which field and which column of it."""
+    import h5py
+
+    path, index = split_index(column, file)
+    field = None
+    if path not in file and "." in path and path.rpartition(".")[0] in file:
+        path, _, field = path.rpartition(".")
+    if path not in file:
+        known = [
+            f"{label}.{part}" if part else label
+            for label, data in _datasets(file)
+            for part in data.dtype.names or ("",)
+        ]
+        check_columns(known, [column], name)
+    parts = path.split("/")
+    for end in range(1, len(parts) + 1):
+        if not isinstance(file.get("/".join(parts[:end]), getlink=True), h5py.HardLink):
+            raise InputError("a link, expected numbers in this file", where=place)
+    data = file[path]
+    if not isinstance(data, h5py.Dataset):
+        inside = [f"{path}/{key}" for key in data][:6]
+        raise InputError(
+            "a structure, expected a vector of numbers",
+            where=place,
+            remedy=f"name what is in it: {', '.join(inside)}" if inside else "",
+        )
+    if field is not None and field not in (data.dtype.names or ()):
+        raise InputError(
+            f"no field '{field}'",
+            where=place,
+            remedy=f"it has {', '.join(data.dtype.names or ['none'])}",
+        )
+    return data, field, index
+
+
+def _check(data: Any, kind: Any, moment: bool, place: str) -> None:
+    if data.external or data.is_virtual:
+        raise InputError("stored outside this file", where=place)
+    text = kind.kind in "OS" or data.attrs.get("MATLAB_class") == b"char"
+    if moment != text or (not moment and kind.kind not in "iufb"):
+        raise InputError(
+            "not text, expected dates and times"
+            if moment
+            else "not numbers, expected a vector of real numbers",
+            where=place,
+        )
+
+
+def _unit(data: Any) -> str:
+    """Unit that the file states for a dataset."""
+    for key in ("unit", "units", "Unit", "Units"):
+        value = data.attrs.get(key)
+        if isinstance(value, bytes):
+            value = value.decode("utf-8", "replace")
+        if isinstance(value, str):
+            return value
+    return ""

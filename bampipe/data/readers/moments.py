@@ -1,0 +1,64 @@
+"""Dates and times as seconds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pandas as pd
+
+from bampipe.errors import InputError
+
+NANOSECONDS = 1_000_000_000
+
+
+def nanoseconds(
+    values: Sequence[str | None] | np.ndarray, form: str, where: str, first_row: int = 1
+) -> np.ndarray:
+    """Moments as whole nanoseconds since 1970 (UTC), (T,) int64; the least one where missing.
+
+    Args:
+        values: text, or numpy datetime64.
+        form: as of ``strptime``; "" for ISO 8601.
+        where: file and column, for messages.
+        first_row: number of the first row, for messages.
+
+    Raises:
+        InputError: a cell is no date and time of that form.
+    """
+    if isinstance(values, np.ndarray) and values.dtype.kind == "M":
+        return values.astype("datetime64[ns]").astype(np.int64)
+    text = pd.Series(values, dtype="string").str.strip()
+    if not form:
+        text = text.str.replace(",", ".")  # ISO 8601 takes either as decimal sign
+    try:
+        moments = pd.to_datetime(text, format=form or "ISO8601", utc=True, errors="coerce")
+    except (ValueError, OverflowError) as error:
+        raise InputError(
+            f"'{form}' is no form of a date and time", where=where, remedy="as of strptime"
+        ) from error
+    wrong = (moments.isna() & text.notna() & (text != "")).to_numpy()
+    if wrong.any():
+        at = int(np.argmax(wrong))
+        raise InputError(
+            f"row {first_row + at}: found '{str(text.iloc[at])[:40]}', expected a date and time"
+            + (f" like {form}" if form else " like 2026-10-03T10:12:00.125"),
+            where=where,
+            remedy="" if form else 'give its form: format = "%d.%m.%Y %H:%M:%S.%f" under [time]',
+        )
+    return moments.dt.tz_localize(None).to_numpy(dtype="datetime64[ns]").astype(np.int64)
+
+
+def seconds(moments: np.ndarray) -> np.ndarray:
+    """Seconds since the first moment, (T,) float64, NaN where missing.
+
+    Args:
+        moments: from :func:`nanoseconds`.
+    """
+    missing = moments == np.iinfo(np.int64).min
+    known = np.flatnonzero(~missing)
+    if len(known) == 0:
+        return np.full(len(moments), np.nan)
+    # Whole numbers first: a double has no room for 1 us since 1970.
+    since = (moments - moments[known[0]]) / NANOSECONDS
+    return np.where(missing, np.nan, since)

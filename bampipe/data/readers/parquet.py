@@ -1,0 +1,98 @@
+"""Parquet files: one row a sample."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from bampipe.data.readers import moments
+from bampipe.data.readers.trial import RawTrial, Wanted, check_columns, check_size
+from bampipe.errors import InputError
+
+BATCH_ROWS = 1 << 16
+_BUFFER = 1 << 20
+_NUMBERS = (pa.types.is_integer, pa.types.is_floating, pa.types.is_decimal, pa.types.is_boolean)
+_MOMENTS = (pa.types.is_timestamp, pa.types.is_date, pa.types.is_string, pa.types.is_large_string)
+
+
+def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
+    """The wanted columns of a Parquet file.
+
+    Raises:
+        InputError: damaged, too large, a column missing or not of numbers.
+    """
+    try:
+        with pq.ParquetFile(path, memory_map=False, buffer_size=_BUFFER) as file:
+            schema = file.schema_arrow
+            check_columns(schema.names, wanted.columns, name)
+            for column in wanted.columns:
+                _check_kind(schema.field(column).type, column in wanted.datetimes, name, column)
+            rows = file.metadata.num_rows
+            check_size(rows, wanted, name)
+            values = {
+                column: np.empty(rows, np.int64 if column in wanted.datetimes else np.float64)
+                for column in wanted.columns
+            }
+            done = 0
+            for batch in file.iter_batches(BATCH_ROWS, columns=list(wanted.columns)):
+                for column in wanted.columns:
+                    cells = batch.column(column)
+                    values[column][done : done + batch.num_rows] = _numbers(
+                        cells, wanted.datetimes.get(column), f"{name}, column '{column}'", done + 1
+                    )
+                done += batch.num_rows
+    except (pa.ArrowException, OSError, ValueError) as error:
+        raise InputError(
+            "not a sound Parquet file", where=name, remedy="copy it again from the logger"
+        ) from error
+    if done != rows:
+        raise InputError(f"{done} rows, where it claims {rows}", where=name)
+    for column in wanted.datetimes:
+        values[column] = moments.seconds(values[column])
+    return RawTrial(values, first_row=1)
+
+
+def columns(path: Path, name: str) -> dict[str, str]:
+    """Names of the columns that hold numbers or moments; the unit is "datetime" for these.
+
+    Raises:
+        InputError: not a sound Parquet file.
+    """
+    try:
+        schema = pq.read_schema(path)
+    except (pa.ArrowException, OSError, ValueError) as error:
+        raise InputError("not a sound Parquet file", where=name) from error
+    found = {}
+    for field in schema:
+        if any(check(field.type) for check in _NUMBERS):
+            stated = (field.metadata or {}).get(b"unit") or b""
+            found[field.name] = stated.decode("utf-8", "replace")
+        elif pa.types.is_timestamp(field.type):
+            found[field.name] = "datetime"
+    return found
+
+
+def _check_kind(kind: pa.DataType, moment: bool, name: str, column: str) -> None:
+    if not any(check(kind) for check in (_MOMENTS if moment else _NUMBERS)):
+        stamped = pa.types.is_timestamp(kind)
+        raise InputError(
+            f"holds {kind}, expected {'dates and times' if moment else 'numbers'}",
+            where=f"{name}, column '{column}'",
+            remedy='is it the time? then say unit = "datetime" under [time]' if stamped else "",
+        )
+
+
+def _numbers(cells: pa.Array, form: str | None, where: str, first: int) -> np.ndarray:
+    if form is None:
+        if pa.types.is_boolean(cells.type):
+            cells = cells.cast(pa.uint8())
+        return cells.cast(pa.float64(), safe=False).to_numpy(zero_copy_only=False)
+    if pa.types.is_timestamp(cells.type) or pa.types.is_date(cells.type):
+        stamps = cells.cast(pa.timestamp("ns", getattr(cells.type, "tz", None)), safe=False)
+        return moments.nanoseconds(
+            stamps.to_numpy(zero_copy_only=False).astype("datetime64[ns]"), form, where
+        )
+    return moments.nanoseconds(cells.to_pylist(), form, where, first)

@@ -1,0 +1,111 @@
+"""LabVIEW TDMS files, by npTDMS (the extra ``bampipe[tdms]``).
+
+A column is ``Group/Channel``; ``Group/Channel@time`` is the time of its samples, s, as its waveform
+properties give it, for files without a time channel.
+"""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bampipe.data.readers import moments
+from bampipe.data.readers.extras import need
+from bampipe.data.readers.trial import RawTrial, Wanted, aligned, check_columns, check_size
+from bampipe.errors import InputError
+
+TIME = "@time"
+_FAULTS = (
+    OSError, EOFError, ValueError, TypeError, KeyError, IndexError, AttributeError,
+    OverflowError, RuntimeError, struct.error,
+)  # fmt: skip
+"""What npTDMS raises on a damaged file: it has no one error type for it."""
+
+
+def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
+    """The wanted channels of a TDMS file, scaled as the file says.
+
+    Raises:
+        InputError: npTDMS is not installed, the file is damaged, a channel is missing, not of
+            numbers, or not as long as the others.
+    """
+    library = need("nptdms", "tdms", name)
+    values: dict[str, np.ndarray] = {}
+    units = {}
+    try:
+        with library.TdmsFile.open(path) as file:
+            known = _channels(file)
+            timed = [label + TIME for label, channel in known.items() if _increment(channel)]
+            check_columns([*known, *timed], wanted.columns, name)
+            for column in wanted.columns:
+                channel = known[column.removesuffix(TIME)]
+                check_size(len(channel), wanted, name)
+                if column not in known:
+                    values[column] = np.asarray(channel.time_track(), dtype=np.float64)
+                    continue
+                place = f"{name}, channel '{column}'"
+                values[column] = _values(channel, wanted.datetimes.get(column), place)
+                units |= {column: _unit(channel)} if _unit(channel) else {}
+    except _FAULTS as error:
+        raise _unsound(name) from error
+    return RawTrial(aligned(values, name, "channel"), first_row=1, units=units)
+
+
+def columns(path: Path, name: str) -> dict[str, str]:
+    """Names and units of the channels of numbers, moments (unit "datetime") and waveform times.
+
+    Raises:
+        InputError: as :func:`read`.
+    """
+    library = need("nptdms", "tdms", name)
+    found = {}
+    try:
+        with library.TdmsFile.open(path) as file:
+            for label, channel in _channels(file).items():
+                if channel.dtype.kind == "M":
+                    found[label] = "datetime"
+                elif channel.dtype.kind in "iufb" and len(channel):
+                    found[label] = _unit(channel)
+                    if _increment(channel):
+                        found[label + TIME] = "s"
+    except _FAULTS as error:
+        raise _unsound(name) from error
+    return found
+
+
+def _channels(file: Any) -> dict[str, Any]:
+    return {f"{g.name}/{c.name}": c for g in file.groups() for c in g.channels()}
+
+
+def _increment(channel: Any) -> bool:
+    """Whether the channel says how far apart its samples are."""
+    step = channel.properties.get("wf_increment", 0.0)
+    return isinstance(step, int | float) and step > 0.0
+
+
+def _unit(channel: Any) -> str:
+    return str(channel.properties.get("unit_string", "")).strip()
+
+
+def _values(channel: Any, form: str | None, place: str) -> np.ndarray:
+    data = np.asarray(channel[:])
+    if form is not None:
+        if data.dtype.kind not in "MOU":
+            raise InputError("not text, expected dates and times", where=place)
+        stamps = data if data.dtype.kind == "M" else [str(x) for x in data]
+        return moments.seconds(moments.nanoseconds(stamps, form, place))
+    if data.dtype.kind not in "iufb":
+        stamped = data.dtype.kind == "M"
+        raise InputError(
+            "holds dates and times, expected numbers" if stamped else "not numbers",
+            where=place,
+            remedy='is it the time? then say unit = "datetime" under [time]' if stamped else "",
+        )
+    return data.astype(np.float64)
+
+
+def _unsound(name: str) -> InputError:
+    return InputError("not a sound TDMS file", where=name, remedy="copy it again from the logger")

@@ -1,0 +1,130 @@
+"""What a reader is asked for and what it returns, and the checks that all readers share."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from bampipe.data.schema import did_you_mean
+from bampipe.errors import InputError
+
+LARGEST_BYTES = 4 << 30
+"""A trial larger than this in memory is refused unless the caller allows more."""
+
+
+@dataclass(frozen=True)
+class Dialect:
+    """What a session says about its text files; what it leaves open is found in the file.
+
+    Attributes:
+        delimiter: what stands between columns: ``,`` ``;`` a tab, ``|`` or a blank (any number).
+        decimal: decimal sign, ``.`` or ``,``.
+        encoding: of the text, ``utf-8``, ``utf-16``, ``latin-1`` or ``cp1252``.
+        names: names of the columns, for files without a header.
+    """
+
+    delimiter: str = ""
+    decimal: str = ""
+    encoding: str = ""
+    names: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What to read of a file.
+
+    Attributes:
+        columns: names of the columns.
+        datetimes: columns that hold dates and times, with their format as of ``strptime``; ""
+            for ISO 8601. They are returned as s since the first.
+        dialect: of text files.
+        largest_bytes: refuse a trial that takes more than this in memory.
+    """
+
+    columns: tuple[str, ...]
+    datetimes: Mapping[str, str] = field(default_factory=dict)
+    dialect: Dialect = Dialect()
+    largest_bytes: int = LARGEST_BYTES
+
+
+@dataclass(frozen=True)
+class RawTrial:
+    """The samples of one trial as they stand in its file.
+
+    Attributes:
+        columns: (T,) float64 a column, NaN where a cell is empty.
+        first_row: number that the first sample has in the file, for messages.
+        notes: what was left out, one sentence each.
+        remarks: what was found out about the file, one sentence each.
+        units: units that the file itself gives to its columns.
+    """
+
+    columns: dict[str, np.ndarray]
+    first_row: int
+    notes: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
+    units: Mapping[str, str] = field(default_factory=dict)
+
+
+def check_size(rows: int, wanted: Wanted, name: str) -> None:
+    """Raise InputError where ``rows`` samples of the wanted columns take too much memory."""
+    if rows * len(wanted.columns) * 8 > wanted.largest_bytes:
+        raise InputError(
+            f"{rows} rows of {len(wanted.columns)} columns are more than the"
+            f" {wanted.largest_bytes >> 20} MB allowed",
+            where=name,
+            remedy="split the trial, or allow more (largest_trial_mb)",
+        )
+
+
+def check_columns(found: Sequence[str], wanted: Sequence[str], name: str) -> None:
+    """Raise InputError where a wanted column is missing or stands twice."""
+    for column in wanted:
+        if column not in found:
+            shown = ", ".join(found[:12]) + (", ..." if len(found) > 12 else "")
+            others = [other for other in found if other not in wanted]
+            raise InputError(
+                f"no column '{column}'{did_you_mean(column, others)}",
+                where=name,
+                remedy=f"it has {shown}" if shown else "",
+            )
+        if list(found).count(column) > 1:
+            first, second = [n for n, other in enumerate(found, 1) if other == column][:2]
+            raise InputError(
+                f"column '{column}' stands twice, as columns {first} and {second}",
+                where=name,
+                remedy="keep the right one",
+            )
+
+
+def aligned(values: dict[str, np.ndarray], name: str, what: str) -> dict[str, np.ndarray]:
+    """The columns, all as long as the first; a single number is a column that does not change.
+
+    Args:
+        values: (T,) or (1,) a column.
+        name: the file, for messages.
+        what: what its columns are called.
+
+    Raises:
+        InputError: a column is of another length.
+    """
+    first = next(iter(values))
+    count = len(values[first])
+    for column, value in values.items():
+        if len(value) not in (1, count):
+            raise InputError(
+                f"{len(value)} values, where '{first}' has {count}",
+                where=f"{name}, {what} '{column}'",
+            )
+    return {c: np.repeat(v, count) if len(v) == 1 < count else v for c, v in values.items()}
+
+
+def joined(parts: dict[str, list[np.ndarray]]) -> dict[str, np.ndarray]:
+    """Concatenate column by column, letting go of the parts, so that only one column is double."""
+    whole = {}
+    for column in list(parts):
+        chunks = parts.pop(column)
+        whole[column] = np.concatenate(chunks) if chunks else np.empty(0)
+    return whole

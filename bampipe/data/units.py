@@ -1,0 +1,94 @@
+"""Units that logs are written in, and what makes coherent SI units of them."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Unit:
+    """How a unit becomes SI: value in ``si`` = scale * value + offset."""
+
+    si: str
+    scale: float = 1.0
+    offset: float = 0.0
+
+
+_TURN = 2 * math.pi
+_POUND = 4.4482216152605
+_BASE: dict[str, Unit] = {
+    "s": Unit("s"),
+    "min": Unit("s", 60.0),
+    "m": Unit("m"),
+    "rad": Unit("rad"),
+    "deg": Unit("rad", math.pi / 180),
+    "rev": Unit("rad", _TURN),
+    "rad/s": Unit("rad/s"),
+    "deg/s": Unit("rad/s", math.pi / 180),
+    "rev/s": Unit("rad/s", _TURN),
+    "rev/min": Unit("rad/s", _TURN / 60),
+    "m/s": Unit("m/s"),
+    "m/min": Unit("m/s", 1 / 60),
+    "m/s2": Unit("m/s2"),
+    "rad/s2": Unit("rad/s2"),
+    "deg/s2": Unit("rad/s2", math.pi / 180),
+    "N": Unit("N"),
+    "N.m": Unit("N.m"),
+    "N.cm": Unit("N.m", 1e-2),
+    "N.mm": Unit("N.m", 1e-3),
+    "kgf": Unit("N", 9.80665),
+    "lbf": Unit("N", _POUND),
+    "lbf.ft": Unit("N.m", _POUND * 0.3048),
+    "lbf.in": Unit("N.m", _POUND * 0.0254),
+    "in": Unit("m", 0.0254),
+    "ft": Unit("m", 0.3048),
+    "in/s": Unit("m/s", 0.0254),
+    "A": Unit("A"),
+    "V": Unit("V"),
+    "W": Unit("W"),
+    "Hz": Unit("Hz"),
+    "Pa": Unit("Pa"),
+    "bar": Unit("Pa", 1e5),
+    "T": Unit("T"),
+    "K": Unit("K"),
+    "degC": Unit("K", 1.0, 273.15),
+    "kg": Unit("kg"),
+    "g": Unit("kg", 1e-3),
+    "%": Unit("", 1e-2),
+    "": Unit(""),
+}
+_PREFIXES = {"n": 1e-9, "u": 1e-6, "m": 1e-3, "c": 1e-2, "k": 1e3, "M": 1e6}
+_PREFIXED = ("s", "m", "rad", "N", "N.m", "A", "V", "W", "Hz", "Pa", "m/s", "T", "m/s2")
+_SPELLINGS = {
+    "sec": "s", "second": "s", "seconds": "s", "msec": "ms", "usec": "us", "hz": "Hz",
+    "degree": "deg", "degrees": "deg", "°": "deg", "°/s": "deg/s", "deg/sec": "deg/s",
+    "rads": "rad", "radian": "rad", "radians": "rad", "rad/sec": "rad/s", "rpm": "rev/min",
+    "r/min": "rev/min", "1/min": "rev/min", "rps": "rev/s", "turn": "rev", "turns": "rev",
+    "nm": "nm", "n": "N", "volt": "V", "volts": "V", "v": "V", "amp": "A", "amps": "A",
+    "ampere": "A", "a": "A", "newton": "N", "meter": "m", "meters": "m", "metre": "m",
+    "lb": "lbf", "lbs": "lbf", "°c": "degC", "c": "degC", "degc": "degC", "percent": "%",
+    "-": "", "1": "", "none": "", "inch": "in", "kgf": "kgf",
+}  # fmt: skip
+_SQUEEZED = {"Nm": "N.m", "Ncm": "N.cm", "Nmm": "N.mm", "mNm": "mN.m", "kNm": "kN.m"}
+
+
+def unit(text: str) -> Unit | None:
+    """What ``text`` stands for, None where that is not known.
+
+    ``Nm``, ``N*m``, ``N·m`` and ``N.m`` are the same, ``mA``, ``kN`` and the like are put together
+    from their prefix. ``nm`` is a nanometre, not a torque.
+    """
+    plain = text.strip().strip("[]()").strip()
+    plain = re.sub(r"\s*[*·⋅ ]\s*", ".", plain)
+    plain = plain.replace("µ", "u").replace("μ", "u").replace("²", "2").replace("^", "")
+    plain = plain.replace("s**2", "s2")
+    for spelling in (plain, _SQUEEZED.get(plain, ""), _SPELLINGS.get(plain.lower(), "")):
+        if spelling in _BASE and (spelling or plain in ("", "-", "1", "none")):
+            return _BASE[spelling]
+        prefix, rest = spelling[:1], spelling[1:]
+        if prefix in _PREFIXES and rest in _PREFIXED:
+            base = _BASE[rest]
+            return Unit(base.si, base.scale * _PREFIXES[prefix])
+    return None

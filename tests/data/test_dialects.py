@@ -1,0 +1,182 @@
+"""Text tables as labs write them: the same numbers, or one line that says what to decide."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bampipe.data.readers import Dialect, columns_of, read_trial
+from bampipe.errors import InputError
+
+T = np.arange(40) / 100.0
+X = np.round(np.sin(3 * T), 4)
+N = np.arange(40) - 20
+
+
+def table(delimiter=",", decimal=".", header="t,x,n", end="\n", row=None):
+    """Lines of a table with three columns."""
+    lines = [header.replace(",", delimiter)] if header else []
+    for t, x, n in zip(T, X, N, strict=True):
+        cells = [f"{t:.3f}", f"{x:.4f}", str(n)]
+        cells = [cell.replace(".", decimal) for cell in cells]
+        lines.append(row(cells) if row else delimiter.join(cells))
+    return end.join(lines) + end
+
+
+def read(tmp_path, text, columns=("t", "x", "n"), ending=".csv", encoding="utf-8", **options):
+    path = tmp_path / f"a{ending}"
+    path.write_bytes(text.encode(encoding))
+    return read_trial(path, columns, name=path.name, **options)
+
+
+def check(trial, columns=("t", "x", "n")):
+    for column, values in zip(columns, (T, X, N), strict=True):
+        np.testing.assert_array_equal(
+            trial.columns[column], np.round(values, 4) if column != "n" else values
+        )
+
+
+PREAMBLE = "LabVIEW Measurement\nOperator;A. B.\n\n"
+WRITTEN = {
+    "plain": table(),
+    "semicolons": table(";"),
+    "semicolons, decimal commas": table(";", ","),
+    "tabs, decimal commas": table("\t", ","),
+    "bars": table("|"),
+    "blanks": table(" "),
+    "several blanks": table(" ", row=lambda c: "  " + "   ".join(c) + " "),
+    "blanks, decimal commas": table(" ", ","),
+    "blanks and tabs": table(" ", row=" \t ".join),
+    "quoted decimal commas": table(row=lambda c: ",".join(f'"{x.replace(".", ",")}"' for x in c)),
+    "Windows line ends": table(";", ",", end="\r\n"),
+    "blanks, Windows line ends": table(" ", end="\r\n", row=lambda c: " ".join(c) + " "),
+    "byte order mark": "\ufeff" + table(";", ","),
+    "remarks above": "# logger 7\n# 2026-10-03\n" + table(),
+    "other lines above": PREAMBLE + table(";", ","),
+    "header in a remark": "# " + table(" "),
+    "MATLAB remark": "% made by hand\n" + table("\t"),
+    "unit row": table().replace("t,x,n\n", "t,x,n\ns,deg,1\n"),
+    "unit row in brackets": table(";", ",").replace("t;x;n\n", "t;x;n\n[s];[mm];[-]\n"),
+    "unit row, blanks": table("\t").replace("t\tx\tn\n", "t\tx\tn\ns\tN.m\t\n"),
+    "delimiter at the end of lines": table(";", row=lambda c: ";".join(c) + ";"),
+    "same, header too": table(";", header="t,x,n,", row=lambda c: ";".join(c) + ";"),
+    "exponents": table(row=lambda c: ",".join(f"{float(x):.6E}" for x in c)),
+    "a column of text with commas": table(
+        ";", header="t,x,n,note", row=lambda c: ";".join([*c, "slow, 1,5 turns"])
+    ),
+}
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+def test_tables_as_labs_write_them(tmp_path, name):
+    check(read(tmp_path, WRITTEN[name]))
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le", "utf-16-be", "utf-8-sig"])
+def test_encodings_that_show_themselves(tmp_path, encoding):
+    check(read(tmp_path, table(";", ","), encoding=encoding))
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+def test_columns_are_found_without_being_asked_for(tmp_path, name):
+    (tmp_path / "a.csv").write_text(WRITTEN[name], newline="")
+    assert list(columns_of(tmp_path / "a.csv"))[:3] == ["t", "x", "n"]
+
+
+@pytest.mark.parametrize("ending", [".txt", ".dat", ".tsv", ".asc", ".log"])
+def test_endings_of_text(tmp_path, ending):
+    check(read(tmp_path, table("\t"), ending=ending))
+
+
+def test_units_are_taken_from_names_and_from_the_line_below(tmp_path):
+    text = table(";", header="t [s],x (mm),n")
+    assert read(tmp_path, text, ("t [s]", "x (mm)", "n")).units == {"t [s]": "s", "x (mm)": "mm"}
+    trial = read(tmp_path, WRITTEN["unit row in brackets"])
+    assert trial.units == {"t": "s", "x": "mm", "n": "-"}
+    assert trial.first_row == 3 and "row 2 gives units" in trial.remarks
+
+
+def test_what_was_found_is_said(tmp_path):
+    trial = read(tmp_path, PREAMBLE + table(";", ","))
+    assert trial.remarks == (
+        "columns are separated by semicolons",
+        "2 lines above the header passed over",
+        "decimal commas",
+    )
+    assert trial.first_row == 5 and trial.notes == ()
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("t;x;n\n1,234;2;3\n1,235;2;3\n", "row 2: '1,234' may be a decimal comma or digits in"),
+        ("t;x;n\n1,5;2.5;3\n1,6;2.6;3\n", "'1,5' in row 2 has a decimal comma, '2.5' in row 2 a"),
+        ("t;x;n\n1,234.5;2;3\n", "row 2, column 't': '1,234.5' groups its digits in thousands"),
+        ("t;x;n\n1.234,5;2;3\n", "'1.234,5' groups its digits in thousands"),
+        ("t,x,n\n0,1,2,5,3\n0,2,2,5,3\n", "row 2: 5 cells, where the header has 3; decimal"),
+        ("t;x\n0,1;2\n", "row 1: no column 'n'"),
+        ("0;1;2\n1;2;3\n", "no header: the first line holds numbers"),
+        (table(";", ",") + "0,41;1.5;3\n0,42;1,5;3\n", "'1.5' in row 42 a point"),
+        (table(";") + "0.41;1,5;3\n0.42;1.5;3\n", "'1,5' in row 42 has a decimal comma"),
+    ],
+)  # fmt: skip
+def test_what_can_be_read_in_two_ways_is_refused(tmp_path, text, said):
+    with pytest.raises(InputError) as caught:
+        read(tmp_path, text)
+    assert said in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_sign_that_changes_far_below_is_refused_not_read(tmp_path):
+    text = "t;x;n\n" + "1;2;3\n" * 20_000 + "4;5,5;6\n" + "1;2;3\n" * 20_000
+    with pytest.raises(InputError, match=r"row 20002, column 'x': found '5,5', expected a number"):
+        read(tmp_path, text)
+
+
+def test_the_session_decides_what_the_file_leaves_open(tmp_path):
+    text = "t;x;n\n1,234;2;3\n1,235;2;3\n"
+    trial = read(tmp_path, text, dialect=Dialect(decimal=","))
+    np.testing.assert_array_equal(trial.columns["t"], [1.234, 1.235])
+    trial = read(tmp_path, "0 1,5 2\n1 2,5 3\n", dialect=Dialect(names=("t", "x", "n")))
+    np.testing.assert_array_equal(trial.columns["x"], [1.5, 2.5])
+    assert trial.first_row == 1
+    text = "gr\xf6\xdfe,t,x,n\n1,2,3,4\n"
+    with pytest.raises(InputError, match='say encoding = "latin-1" under'):
+        read(tmp_path, text, encoding="latin-1")
+    trial = read(tmp_path, text, encoding="latin-1", dialect=Dialect(encoding="latin-1"))
+    np.testing.assert_array_equal(trial.columns["n"], [4.0])
+
+
+def test_a_fault_in_a_table_of_blanks_is_found_at_its_line(tmp_path):
+    lines = table(" ", row="  ".join).split("\n")
+    lines[30] = "  0.290  x1  9"
+    with pytest.raises(InputError, match="row 31, column 'x': found 'x1', expected a number"):
+        read(tmp_path, "\n".join(lines))
+
+
+def test_a_cut_last_line_of_any_dialect_is_dropped_and_said(tmp_path):
+    for text in (table(";", ","), table(" ", row="   ".join), table("\t", ",")):
+        trial = read(tmp_path, text.rstrip("\n")[:-3])
+        assert len(trial.columns["t"]) == 39
+        assert trial.notes == ("last line is cut off: 1 row dropped",)
+
+
+@pytest.mark.parametrize(
+    ("stamps", "form"),
+    [
+        ("2026-10-03T10:12:0{0:.3f}", ""),
+        ("2026-10-03 10:12:0{0:.3f}+02:00", ""),
+        ("03.10.2026 10:12:0{0:.3f}", "%d.%m.%Y %H:%M:%S.%f"),
+        ("10:12:0{0:.3f}", "%H:%M:%S.%f"),
+    ],
+)
+def test_dates_and_times_become_seconds(tmp_path, stamps, form):
+    lines = ["when;x", *(f"{stamps.format(t)};{x}" for t, x in zip(T, X, strict=True))]
+    trial = read(tmp_path, "\n".join(lines) + "\n", ("when", "x"), datetimes={"when": form})
+    np.testing.assert_array_equal(trial.columns["when"], T)
+
+
+def test_a_date_that_could_be_two_is_refused(tmp_path):
+    with pytest.raises(InputError) as caught:
+        read(tmp_path, "when,x\n03/10/2026 10:12,1\n", ("when", "x"), datetimes={"when": ""})
+    assert "row 2: found '03/10/2026 10:12'" in str(caught.value)
+    assert "give its form" in str(caught.value)

@@ -1,0 +1,301 @@
+"""HDF5, JSON, TDMS, ROS bags and MCAP: files that the libraries of their makers wrote."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pandas as pd
+import pytest
+import scipy.io
+
+from bampipe.data.readers import columns_of, read_trial
+from bampipe.errors import InputError
+
+T = np.arange(50) / 100.0
+Q = np.sin(T)
+F = np.cos(2 * T)
+STARTED = 1_790_000_000_000_000_000
+
+
+def refused(path, columns, **options):
+    """The one line by which a file is refused."""
+    with pytest.raises(InputError) as caught:
+        read_trial(path, columns, name=path.name, **options)
+    line = str(caught.value)
+    assert "\n" not in line and line.startswith(path.name)
+    return line
+
+
+# HDF5
+
+
+@pytest.fixture
+def hdf5(tmp_path) -> Path:
+    path = tmp_path / "a.h5"
+    with h5py.File(path, "w") as file:
+        file["log/t"] = T
+        file["log/force"] = F
+        file["log/force"].attrs["unit"] = "N"
+        file["log/pose"] = np.column_stack([Q, F, T])
+        file["log/text"] = ["x"] * 50
+        rows = np.zeros(50, dtype=[("q", "f8"), ("count", "i4")])
+        rows["q"], rows["count"] = Q, np.arange(50)
+        file["samples"] = rows
+        file["soft"] = h5py.SoftLink("/log/t")
+        file["far"] = h5py.ExternalLink("/etc/passwd", "/")
+        file["short"] = T[:-1]
+        file["when"] = [f"2026-10-03T10:12:00.{n:02}0" for n in range(50)]
+    return path
+
+
+def test_hdf5(hdf5):
+    columns = ("log/t", "log/force", "samples.q", "samples.count", "log/pose[1]")
+    trial = read_trial(hdf5, columns)
+    for column, values in zip(columns, (T, F, Q, np.arange(50), F), strict=True):
+        np.testing.assert_array_equal(trial.columns[column], values)
+    assert trial.units == {"log/force": "N"}
+    found = columns_of(hdf5)
+    assert found["log/force"] == "N" and {*columns, "log/pose[0]", "log/pose[2]"} <= set(found)
+    assert not {"soft", "far", "log/text"} & set(found)
+    np.testing.assert_array_equal(
+        read_trial(hdf5, ("when", "log/t"), datetimes={"when": ""}).columns["when"], T
+    )
+
+
+@pytest.mark.parametrize(
+    ("column", "said"),
+    [
+        ("log/farce", "no column 'log/farce', did you mean 'log/force'?"),
+        ("log", "a structure, expected a vector of numbers; name what is in it: log/force"),
+        ("log/pose", "a 50 by 3 array, expected a vector; name one of its columns, as in X[0]"),
+        ("log/pose[3]", "has 3 columns, [3] is not among them"),
+        ("log/text", "not numbers"),
+        ("samples.w", "no field 'w'; it has q, count"),
+        ("soft", "a link, expected numbers in this file"),
+        ("far", "a link, expected numbers in this file"),
+        ("short", "49 values, where 'log/t' has 50"),
+    ],
+)
+def test_hdf5_refused(hdf5, column, said):
+    assert said in refused(hdf5, ("log/t", column))
+
+
+def test_columns_of_matrices_in_matlab_files(tmp_path):
+    path = tmp_path / "a.mat"
+    scipy.io.savemat(path, {"X": np.column_stack([T, Q, F]), "s": {"q": Q}})
+    trial = read_trial(path, ("X[0]", "X[2]"))
+    np.testing.assert_array_equal(trial.columns["X[2]"], F)
+    assert list(columns_of(path)) == ["X[0]", "X[1]", "X[2]"]
+    assert "save(file, '-struct', 'S')" in refused(path, ("X[0]", "s"))
+
+
+# JSON
+
+
+def test_values_inside_others(tmp_path):
+    path = tmp_path / "a.jsonl"
+    lines = [
+        {"when": f"2026-10-03T10:12:00.{n:02}0Z", "state": {"q": [q, -q]}, "a.b": n}
+        for n, q in enumerate(Q)
+    ]
+    path.write_text("\n".join(map(json.dumps, lines)))
+    trial = read_trial(path, ("when", "state.q[1]", "a.b"), datetimes={"when": ""})
+    np.testing.assert_array_equal(trial.columns["state.q[1]"], -Q)
+    np.testing.assert_array_equal(trial.columns["a.b"], np.arange(50))
+    np.testing.assert_array_equal(trial.columns["when"], T)
+    assert columns_of(path) == {
+        "when": "datetime", "state.q[0]": "", "state.q[1]": "", "a.b": "",
+    }  # fmt: skip
+    assert "no column 'state.q[2]'" in refused(path, ("when", "state.q[2]"), datetimes={"when": ""})
+
+
+# Parquet
+
+
+def test_moments_in_parquet(tmp_path):
+    path = tmp_path / "a.parquet"
+    when = pd.to_datetime(STARTED + (T * 1e9).astype(np.int64), utc=True)
+    pd.DataFrame({"when": when, "q": Q}).to_parquet(path)
+    trial = read_trial(path, ("when", "q"), datetimes={"when": ""})
+    np.testing.assert_allclose(trial.columns["when"], T, atol=1e-9)
+    assert columns_of(path) == {"when": "datetime", "q": ""}
+    assert 'say unit = "datetime" under [time]' in refused(path, ("when", "q"))
+
+
+# TDMS
+
+
+@pytest.fixture
+def tdms(tmp_path) -> Path:
+    nptdms = pytest.importorskip("nptdms")
+    path = tmp_path / "a.tdms"
+    wave = {"wf_increment": 0.01, "wf_start_offset": 0.0, "unit_string": "N"}
+    start = np.datetime64("2026-10-03T10:12:00", "us")
+    with nptdms.TdmsWriter(str(path)) as writer:
+        for part in (slice(0, 30), slice(30, None)):
+            writer.write_segment(
+                [
+                    nptdms.ChannelObject("Log", "Time", T[part]),
+                    nptdms.ChannelObject("Log", "Angle", np.arange(50, dtype=np.int32)[part]),
+                    nptdms.ChannelObject("DAQ", "Force", F[part], properties=wave),
+                    nptdms.ChannelObject("Log", "When", start + (T * 1e6).astype(int)[part]),
+                ]
+            )
+    return path
+
+
+def test_tdms(tdms):
+    columns = ("Log/Time", "Log/Angle", "DAQ/Force", "DAQ/Force@time")
+    trial = read_trial(tdms, columns)
+    for column, values in zip(columns, (T, np.arange(50), F, T), strict=True):
+        np.testing.assert_allclose(trial.columns[column], values, atol=1e-12)
+    assert trial.units == {"DAQ/Force": "N"}
+    found = columns_of(tdms)
+    assert set(found) == {*columns, "Log/When"} and found["Log/When"] == "datetime"
+    trial = read_trial(tdms, ("Log/When", "Log/Angle"), datetimes={"Log/When": ""})
+    np.testing.assert_allclose(trial.columns["Log/When"], T, atol=1e-6)
+
+
+def test_tdms_refused(tdms):
+    assert "no column 'Log/Angel', did you mean" in refused(tdms, ("Log/Time", "Log/Angel"))
+    assert "no column 'Log/Time@time'" in refused(tdms, ("Log/Time@time",))
+    assert 'say unit = "datetime"' in refused(tdms, ("Log/When", "Log/Angle"))
+    content = tdms.read_bytes()
+    tdms.write_bytes(content[:100])
+    refused(tdms, ("Log/Time",))
+    tdms.with_suffix(".csv").write_bytes(content)
+    assert "this is a TDMS file, not *.csv" in refused(tdms.with_suffix(".csv"), ("t",))
+
+
+# ROS and MCAP
+
+
+def write_ros(path: Path, kind: str) -> Path:
+    """Joint states at 100 Hz, wrenches at 250 Hz; returns the file to read."""
+    pytest.importorskip("rosbags")
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC if kind == "ros1" else Stores.ROS2_HUMBLE)
+    types = store.types
+    second = 1_000_000_000
+
+    def header(moment):
+        more = {"seq": 0} if kind == "ros1" else {}
+        stamp = types["builtin_interfaces/msg/Time"](moment // second, moment % second)
+        return types["std_msgs/msg/Header"](stamp=stamp, frame_id="", **more)
+
+    messages = []
+    for n, (q, f) in enumerate(zip(Q, F, strict=True)):
+        moment = STARTED + 10_000_000 * n
+        effort = np.array([f, 0.0])
+        state = types["sensor_msgs/msg/JointState"](
+            header(moment), ["elbow", "wrist"], np.array([q, 0.0]), np.empty(0), effort
+        )
+        messages.append((moment + 1_000_000, "/joint_states", state))
+    vector, pair = types["geometry_msgs/msg/Vector3"], types["geometry_msgs/msg/Wrench"]
+    for n in range(125):
+        moment = STARTED + 4_000_000 * n
+        wrench = pair(vector(0.004 * n, 0.0, 0.0), vector(0.0, 0.0, 0.0))
+        stamped = types["geometry_msgs/msg/WrenchStamped"](header(moment), wrench)
+        messages.append((moment + 2_000_000, "/ft/wrench", stamped))
+    messages.sort(key=lambda item: item[0])
+    if kind == "ros1":
+        from rosbags.rosbag1 import Writer
+
+        writer, write, result = Writer(path / "a.bag"), store.serialize_ros1, path / "a.bag"
+    else:
+        from rosbags.rosbag2 import StoragePlugin, Writer
+
+        plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
+        writer = Writer(path / "bag", version=9, storage_plugin=plugin)
+        write = store.serialize_cdr
+        result = path / "bag" / f"bag.{'mcap' if kind == 'mcap' else 'db3'}"
+    with writer:
+        links = {}
+        for moment, topic, message in messages:
+            if topic not in links:
+                links[topic] = writer.add_connection(topic, message.__msgtype__, typestore=store)
+            writer.write(links[topic], moment, write(message, message.__msgtype__))
+    return result
+
+
+@pytest.mark.parametrize("kind", ["ros1", "sqlite", "mcap"])
+def test_ros(tmp_path, kind):
+    path = write_ros(tmp_path, kind)
+    columns = (
+        "/joint_states:header.stamp",
+        "/joint_states:position[elbow]",
+        "/joint_states:effort[0]",
+        "/ft/wrench:wrench.force.x",
+    )
+    trial = read_trial(path, columns)
+    for column, values in zip(columns, (T, Q, F, T), strict=True):
+        np.testing.assert_allclose(trial.columns[column], values, atol=1e-9)
+    assert trial.remarks == (
+        "/ft/wrench interpolated linearly at the times of /joint_states"
+        " (at most 0.004 s between its messages)",
+    )
+    found = columns_of(path)
+    assert {"/joint_states:@time", "/joint_states:position[wrist]", *columns[3:]} <= set(found)
+    recorded = read_trial(path, ("/joint_states:@time", "/ft/wrench:wrench.force.x")).columns
+    # Recorded 1 ms and 2 ms after the stamps; before the first wrench there is none.
+    force = recorded["/ft/wrench:wrench.force.x"]
+    assert np.isnan(force[0])
+    np.testing.assert_allclose(force[1:], T[1:] - 1e-3, atol=1e-9)
+
+
+def test_ros_refused(tmp_path):
+    path = write_ros(tmp_path, "ros1")
+    state = "/joint_states:header.stamp"
+    assert "no column '/joint_stats', did you mean '/joint_states'?" in refused(
+        path, ("/joint_stats:@time",)
+    )
+    line = refused(path, (state, "/joint_states:position[knee]"))
+    assert "no field 'position[knee]'; it has " in line and "position[elbow]" in line
+    assert "does not say which field" in refused(path, ("/joint_states",))
+    assert "is no time; give /joint_states:@time" in refused(path, ("/joint_states:effort[0]",))
+    path.write_bytes(path.read_bytes()[:3000])
+    refused(path, (state,))
+
+
+def test_mcap_of_json(tmp_path):
+    writer_module = pytest.importorskip("mcap.writer")
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as stream:
+        writer = writer_module.Writer(stream)
+        writer.start()
+        schema = writer.register_schema("state", "jsonschema", b'{"type": "object"}')
+        channel = writer.register_channel("/state", "json", schema)
+        for n, q in enumerate(Q):
+            moment = STARTED + 10_000_000 * n
+            data = json.dumps({"q": [q], "ok": True}).encode()
+            writer.add_message(channel, moment, data, moment)
+        writer.finish()
+    trial = read_trial(path, ("/state:@time", "/state:q[0]", "/state:ok"))
+    np.testing.assert_allclose(trial.columns["/state:@time"], T, atol=1e-12)
+    np.testing.assert_array_equal(trial.columns["/state:q[0]"], Q)
+    assert columns_of(path) == {"/state:@time": "s", "/state:q[0]": "", "/state:ok": ""}
+    assert "no column '/stat'" in refused(path, ("/stat:@time",))
+    path.write_bytes(path.read_bytes()[:200])
+    assert "not a sound MCAP file" in refused(path, ("/state:@time",))
+
+
+@pytest.mark.parametrize(
+    ("ending", "module", "extra"),
+    [
+        (".tdms", "nptdms", "tdms"),
+        (".bag", "rosbags.highlevel", "ros"),
+        (".mcap", "mcap.reader", "ros"),
+    ],
+)
+def test_a_missing_extra_names_the_command(tmp_path, monkeypatch, ending, module, extra):
+    monkeypatch.setitem(sys.modules, module, None)
+    path = tmp_path / f"a{ending}"
+    path.write_bytes(b"something")
+    line = refused(path, ("t",) if ending == ".tdms" else ("/a:b",))
+    package = module.partition(".")[0]
+    assert f"needs {package}, which is not installed; pip install 'bampipe[{extra}]'" in line
