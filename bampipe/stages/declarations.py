@@ -139,6 +139,8 @@ def _device_expressions(declaration: Mapping[str, Any]) -> Iterator[tuple[str, o
     for table in _DEVICE_TABLES:
         for key, text in declaration.get(table, {}).items():
             yield f"{table}.{key}", text
+    for key, text in declaration.get("controller", {}).get("command", {}).items():
+        yield f"controller.command.{key}", text
     for name, entry in declaration.get("process_noise", {}).items():
         for axis, text in entry["torque"].items():
             yield f"process_noise.{name}.torque.{axis}", text
