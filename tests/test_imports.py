@@ -18,8 +18,16 @@ HEAVY = ("h5py", "matplotlib", "numba", "numpy", "pandas", "pyarrow", "scipy", "
 
 # What each layer may import beside the standard library and itself.
 LAWS = {
-    "physics": {"numpy", "sympy", "numba", "llvmlite", "bampipe.errors"},
-    "estimate": {"numpy", "scipy", "numba", "llvmlite", "filterpy", "bampipe.errors"},
+    "physics": {"numpy", "sympy", "numba", "llvmlite", "bampipe.compiled", "bampipe.errors"},
+    "estimate": {
+        "numpy",
+        "scipy",
+        "numba",
+        "llvmlite",
+        "filterpy",
+        "bampipe.compiled",
+        "bampipe.errors",
+    },
     "discover": {
         "numpy",
         "scipy",
@@ -144,6 +152,23 @@ def test_a_layer_imports_only_what_the_law_allows(layer: str) -> None:
 def test_every_layer_is_under_the_law() -> None:
     layers = {path.name for path in PACKAGE.iterdir() if (path / "__init__.py").is_file()}
     assert layers == set(LAWS)
+
+
+def test_what_is_compiled_is_kept_where_it_is_checked() -> None:
+    for path in sorted(PACKAGE.rglob("*.py")):
+        if path.name != "compiled.py":
+            names = imported(path) | {f"numba.{text}" for text in _attributes_of_numba(path)}
+            assert not names & {"numba.njit", "numba.jit"}, f"{path}: take njit of bampipe.compiled"
+
+
+def _attributes_of_numba(path: Path) -> set[str]:
+    return {
+        node.attr
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Attribute)
+        and isinstance(node.value, ast.Name)
+        and node.value.id == "numba"
+    }
 
 
 def test_no_stage_imports_another() -> None:

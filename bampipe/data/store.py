@@ -384,5 +384,7 @@ def _read_trial(file: pq.ParquetFile, wanted: list[str], trial: str) -> pa.Table
         limits = file.metadata.row_group(group).column(column).statistics
         if limits is None or not limits.has_min_max or limits.min <= trial <= limits.max:
             groups.append(group)
+    if not groups:
+        return file.schema_arrow.empty_table().select(wanted)
     table = file.read_row_groups(groups, columns=list(dict.fromkeys([*wanted, "trial_id"])))
     return table.filter(pc.equal(table.column("trial_id"), trial)).select(wanted)

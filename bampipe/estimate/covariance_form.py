@@ -1,8 +1,8 @@
 """The unscented filter in its covariance form: the oracle of the square-root form."""
 
 import numpy as np
-from numba import njit
 
+from bampipe.compiled import njit
 from bampipe.estimate.filter_signature import (
     DONE,
     INNOVATION_NOT_POSITIVE,

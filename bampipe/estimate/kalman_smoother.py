@@ -17,10 +17,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from math import factorial
 
-import numba
 import numpy as np
 from scipy.optimize import minimize_scalar
 
+from bampipe.compiled import njit
 from bampipe.estimate.differentiation import Array, Derivatives, Flags
 
 ORDERS = (3, 4)
@@ -54,7 +54,7 @@ def ratio_for(bandwidth_hz: float, order: int, rate_hz: float) -> float:
     return float((2.0 * np.pi * bandwidth_hz / rate_hz) ** (2 * order))
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _predict(x: Array, p: Array, step: Array, noise: Array, work: Array) -> None:
     """Advance state ``x`` (n,) and covariance ``p`` (n, n) by one sample, in place."""
     n = x.shape[0]
@@ -78,7 +78,7 @@ def _predict(x: Array, p: Array, step: Array, noise: Array, work: Array) -> None
             p[j, i] = total
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _update(x: Array, p: Array, y: float, gain: Array) -> tuple[float, float]:
     """Take in one sample ``y`` of noise 1, in place; return innovation and its variance."""
     n = x.shape[0]
@@ -96,7 +96,7 @@ def _update(x: Array, p: Array, y: float, gain: Array) -> tuple[float, float]:
     return innovation, spread
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _filter(
     y: Array,
     seen: Flags,
@@ -121,7 +121,7 @@ def _filter(
         covariances[t] = p
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _smooth(
     seen: Flags,
     step: Array,
@@ -189,7 +189,7 @@ def _smooth(
                 weight[j, i] = total
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _evidence(
     y: Array, seen: Flags, step: Array, noise: Array, x: Array, p: Array, skip: int
 ) -> tuple[float, float, int]:

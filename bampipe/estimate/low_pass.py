@@ -6,9 +6,11 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from numba import float64, int64, njit
+from numba import float64, int64
 from numpy.typing import NDArray
 from scipy.signal import butter, sosfilt_zi
+
+from bampipe.compiled import njit
 
 Array = NDArray[np.float64]
 

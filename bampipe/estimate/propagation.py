@@ -1,8 +1,9 @@
 """Sigma points carried over one sampling interval by the equations of motion, compiled."""
 
 import numpy as np
-from numba import boolean, float64, int64, njit, void
+from numba import boolean, float64, int64, void
 
+from bampipe.compiled import njit
 from bampipe.estimate.signatures import DERIVATIVE, DERIVATIVE_ROWS, MEASURE_ROWS, ROWS
 
 

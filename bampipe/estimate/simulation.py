@@ -14,9 +14,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import float64, int64, njit, void
+from numba import float64, int64, void
 from numpy.typing import NDArray
 
+from bampipe.compiled import njit
 from bampipe.errors import InputError
 from bampipe.estimate.propagation import runge_kutta
 from bampipe.estimate.signatures import DERIVATIVE

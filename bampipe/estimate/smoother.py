@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import boolean, float64, int64, njit, void
+from numba import boolean, float64, int64, void
 from numpy.typing import NDArray
 
+from bampipe.compiled import njit
 from bampipe.estimate.propagation import propagate_points, scratch
 from bampipe.estimate.signatures import DERIVATIVE_ROWS
 from bampipe.estimate.unscented import (

@@ -1,8 +1,8 @@
 """The unscented filter in its square-root form (section V-C), the default."""
 
 import numpy as np
-from numba import njit
 
+from bampipe.compiled import njit
 from bampipe.estimate.filter_signature import (
     DONE,
     INNOVATION_NOT_POSITIVE,

@@ -4,7 +4,9 @@ All matrices are float64 and C-contiguous; factors are lower triangular. The loo
 LAPACK because at 13 x 13 the call and its allocations cost more than the arithmetic.
 """
 
-from numba import boolean, float64, int64, njit, void
+from numba import boolean, float64, int64, void
+
+from bampipe.compiled import njit
 
 _REASSOCIATE = {"reassoc", "nsz", "contract"}  # lets sums use vector registers; NaN stays NaN
 

@@ -8,10 +8,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from bampipe.errors import InputError
-from bampipe.physics import expression
+from bampipe.physics import expression, generated
 from bampipe.physics.device import Device
 from bampipe.physics.model import code_version
-from bampipe.physics.system import cache_folder, load_generated, write_generated
 
 
 @dataclass(frozen=True)
@@ -45,10 +44,13 @@ def compile_law(device: Device) -> ControlLaw | None:
     inputs = (*controller.channels, *device.channels, "t")
     content = json.dumps([code_version(), device.declaration], sort_keys=True, default=str)
     key = hashlib.sha256(content.encode()).hexdigest()[:24]
-    path = cache_folder() / f"law_{key}.py"
-    if not path.exists():
-        write_generated(path, _source(device, inputs))
-    return ControlLaw(inputs, device.forces, controller.rate_hz, load_generated(path).command)
+    folder = generated.folder_of_user()
+    code = generated.read(folder, key)
+    if code is None:
+        code = generated.Generated(key, folder, {}, {"law": _source(device, inputs)})
+        code.write()
+    command = code.module("law").command
+    return ControlLaw(inputs, device.forces, controller.rate_hz, command)
 
 
 def _source(device: Device, inputs: tuple[str, ...]) -> str:

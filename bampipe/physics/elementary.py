@@ -10,8 +10,10 @@ the C library does; NaN stays NaN.
 from math import inf
 from typing import Any
 
-from numba import njit, types
+from numba import types
 from numba.extending import intrinsic
+
+from bampipe.compiled import njit
 
 # Adding 1.5 * 2^52 rounds to the nearest integer and leaves it in the lowest bits.
 _ROUND = 6755399441055744.0

@@ -1,8 +1,9 @@
 """Loops of compiled functions over the samples of a trial."""
 
 import numpy as np
-from numba import njit, types
+from numba import types
 
+from bampipe.compiled import njit
 from bampipe.physics.signatures import RESIDUAL
 
 _V = types.float64[::1]

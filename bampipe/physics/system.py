@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import importlib.util
-import json
-import os
-import sys
-import tempfile
 from collections.abc import Callable
 from functools import cached_property
-from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bampipe.physics import generated
 from bampipe.physics.model import Model
 from bampipe.physics.parameter import Parameter
 
@@ -40,10 +35,10 @@ class System:
         delays: names of the parameters that shift measured forces in time.
     """
 
-    def __init__(self, model: Model, folder: Path, meta: dict[str, Any]) -> None:
+    def __init__(self, model: Model, code: generated.Generated) -> None:
         self.model = model
-        self._folder = folder
-        self._key = str(meta["key"])
+        self._code = code
+        meta = code.facts
         axes = model.device.coordinates
         self.coordinates: tuple[str, ...] = tuple(c.name for c in axes)
         self.coordinate_units: tuple[str, ...] = tuple(c.unit for c in axes)
@@ -81,11 +76,11 @@ class System:
 
     @cached_property
     def _arrays(self) -> ModuleType:
-        return load_generated(self._folder / f"columns_{self._key}.py")
+        return self._code.module("columns")
 
     @cached_property
     def _compiled(self) -> ModuleType:
-        return load_generated(self._folder / f"compiled_{self._key}.py")
+        return self._code.module("compiled")
 
     @property
     def derivative(self) -> Callable[..., None]:
@@ -99,7 +94,7 @@ class System:
 
     @cached_property
     def _rows(self) -> ModuleType:
-        return load_generated(self._folder / f"rows_{self._key}.py")
+        return self._code.module("rows")
 
     @property
     def derivative_rows(self) -> Callable[..., None]:
@@ -226,7 +221,7 @@ class System:
         z0 = self.initial_memory(a[0], u[0], p)
         arrays = [np.ascontiguousarray(x, dtype=np.float64) for x in (a, b, u, p, t)]
         out = np.empty((len(q), len(z0)))
-        module = load_generated(self._folder / f"memory_{self._key}.py")
+        module = self._code.module("memory")
         module.memory(*arrays, z0, _MEMORY_STEPS, out)
         return out
 
@@ -243,21 +238,19 @@ def compile_model(model: Model) -> System:
     """The system of ``model``, derived and printed once, then read from the cache.
 
     Raises:
-        InputError: an expression of the model is wrong.
+        InputError: an expression of the model is wrong, or the cache cannot be used.
     """
-    folder = cache_folder()
-    key = model.key
-    path = folder / f"meta_{key}.json"
-    if path.exists():
-        return System(model, folder, json.loads(path.read_text()))
+    folder = generated.folder_of_user()
+    known = generated.read(folder, model.key)
+    if known is not None:
+        return System(model, known)
     from bampipe.physics.codegen import array_source, memory_source, rows_source, scalar_source
     from bampipe.physics.derivation import contribution, derive
     from bampipe.physics.signatures import ROWS
 
     equations = derive(model)
     added = contribution(equations, derive(Model(model.device)))
-    meta = {
-        "key": key,
+    facts = {
         "memory": equations.z_names,
         "inputs": equations.inputs,
         "noise": equations.noise,
@@ -267,43 +260,13 @@ def compile_model(model: Model) -> System:
         "compensated": [i for i, e in enumerate(equations.compensation) if e != 0],
         "delays": equations.delays,
     }
-    write_generated(folder / f"columns_{key}.py", array_source(equations, added))
-    write_generated(folder / f"compiled_{key}.py", scalar_source(equations))
-    write_generated(folder / f"rows_{key}.py", rows_source(equations, ROWS))
+    sources = {
+        "columns": array_source(equations, added),
+        "compiled": scalar_source(equations),
+        "rows": rows_source(equations, ROWS),
+    }
     if equations.z:
-        write_generated(folder / f"memory_{key}.py", memory_source(equations))
-    write_generated(path, json.dumps(meta))
-    return System(model, folder, meta)
-
-
-def cache_folder() -> Path:
-    """Folder of generated code: ``BAMPIPE_CACHE_DIR``, else the user's cache folder."""
-    root = os.environ.get("BAMPIPE_CACHE_DIR")
-    if not root:
-        base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-        root = str(Path(base) / "bampipe")
-    folder = Path(root) / f"python{sys.version_info.major}.{sys.version_info.minor}"
-    folder.mkdir(parents=True, exist_ok=True)
-    return folder
-
-
-def write_generated(path: Path, text: str) -> None:
-    """Write whole or not at all: several processes may generate the same model at once."""
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=path.name)
-    with os.fdopen(handle, "w") as file:
-        file.write(text)
-    os.replace(name, path)
-
-
-def load_generated(path: Path) -> ModuleType:
-    """The module of generated code at ``path``, imported once a process."""
-    name = f"bampipe_generated_{path.stem}"
-    if name in sys.modules:
-        return sys.modules[name]
-    spec = importlib.util.spec_from_file_location(name, path)
-    if spec is None or spec.loader is None:
-        raise ImportError(f"cannot load generated code {path}")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module
-    spec.loader.exec_module(module)
-    return module
+        sources["memory"] = memory_source(equations)
+    made = generated.Generated(model.key, folder, facts, sources)
+    made.write()
+    return System(model, made)

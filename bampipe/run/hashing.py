@@ -192,7 +192,7 @@ def digest_code(stage: str) -> str:
     """
     package = Path(bampipe.__file__).parent
     parts = [package / name for name in SHARED_CODE]
-    parts.append(package / "errors.py")
+    parts += [package / "compiled.py", package / "errors.py"]
     if stage == "report":
         parts.append(package / "report")
     stages = package / "stages"
