@@ -18,7 +18,7 @@ import pytest
 from conftest import TOYS, Toy, contents
 
 from bampipe.errors import InputError
-from bampipe.run import batch, gates, models, record
+from bampipe.run import batch, gates, junit, models, record
 from bampipe.run import pipeline as pipelines
 from bampipe.run.request import Outcome
 from bampipe.run.runner import run_session
@@ -500,7 +500,7 @@ def judged(tmp_path: Path, content: object, **changes: object) -> list[gates.Ver
     path = tmp_path / "models" / "base" / "v.json"
     path.parent.mkdir(parents=True)
     path.write_text(json.dumps(content))
-    return gates.judge(gate(**changes), tmp_path, "base")
+    return gates.judge(gate(**changes), tmp_path, "base", tmp_path / "accepted")
 
 
 def test_gate_judges_each_axis(tmp_path: Path) -> None:
@@ -526,7 +526,9 @@ def test_gate_without_a_number(tmp_path: Path, content: object, optional: bool) 
 
 
 def test_gate_without_a_result(tmp_path: Path) -> None:
-    assert [v.state for v in gates.judge(gate(), tmp_path, "base")] == ["failed"]
+    assert [v.state for v in gates.judge(gate(), tmp_path, "base", tmp_path / "accepted")] == [
+        "failed"
+    ]
 
 
 def test_failed_gate_decides_the_exit_code(toy: Toy) -> None:
@@ -539,12 +541,12 @@ def test_failed_gate_decides_the_exit_code(toy: Toy) -> None:
 
 def test_junit_counts(tmp_path: Path) -> None:
     verdicts = judged(tmp_path, {"axes": {"yaw": {"a": 1.0}, "pitch": {"a": 3}}})
-    suites = [gates.Suite("s1", tuple(verdicts)), gates.Suite("s2", (), "no\x07 session")]
-    top = ElementTree.fromstring(gates.junit(suites))
+    suites = [junit.Suite("s1", tuple(verdicts)), junit.Suite("s2", (), "no\x07 session")]
+    top = ElementTree.fromstring(junit.junit(suites))
     assert [s.get("failures") for s in top] == ["1", "0"]
     assert [s.get("errors") for s in top] == ["0", "1"]
     assert top.find(".//failure") is not None
-    assert gates.junit(suites) == gates.junit(suites)
+    assert junit.junit(suites) == junit.junit(suites)
 
 
 # Pipelines

@@ -13,9 +13,11 @@ import typer
 
 import bampipe
 from bampipe.cli import device, places, show
+from bampipe.cli.accept import accept
 from bampipe.cli.lab import lab, refresh
 from bampipe.errors import InputError
-from bampipe.run import batch, gates, models, record
+from bampipe.run import batch, models, record
+from bampipe.run import junit as junit_xml
 from bampipe.run import pipeline as pipelines
 from bampipe.run.request import Outcome, Request
 from bampipe.run.runner import run_session
@@ -172,6 +174,14 @@ def run(
     junit: Annotated[
         Path | None, typer.Option(help="Write the gates' verdicts as JUnit XML to this file.")
     ] = None,
+    markdown: Annotated[
+        Path | None,
+        typer.Option(help="Add a summary in Markdown to this file ($GITHUB_STEP_SUMMARY)."),
+    ] = None,
+    accepted: Annotated[
+        Path | None,
+        typer.Option(help="Folder of accepted values; accepted/ beside the runs if omitted."),
+    ] = None,
     runs: Runs = RUNS,
     no_wait: NoWait = False,
     json: Json = False,
@@ -220,6 +230,8 @@ def run(
                 force=force,
                 model=model,
                 judged=model or models.BASE,
+                accepted=accepted,
+                processes=batch.share(min(jobs, len(folders))),
                 wait=not no_wait,
             )
         )
@@ -235,6 +247,8 @@ def run(
             outcomes.append(run_session(requests[0], watcher))
     if junit is not None:
         _write_junit(junit, outcomes)
+    if markdown is not None:
+        _add_markdown(markdown, outcomes, model or models.BASE)
     _report_runs(outcomes, several, json)
     refresh(runs, several, quiet or json)
     if not several:
@@ -259,10 +273,21 @@ def _stage_settings(given: Sequence[str] | None) -> dict[str, dict[str, object]]
 
 
 def _write_junit(path: Path, outcomes: Sequence[Outcome]) -> None:
-    suites = [gates.Suite(item.root.name, item.verdicts, item.error) for item in outcomes]
+    suites = [junit_xml.Suite(item.root.name, item.verdicts, item.error) for item in outcomes]
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(gates.junit(suites))
+        path.write_bytes(junit_xml.junit(suites))
+    except OSError as error:
+        raise InputError(f"cannot be written: {error.strerror}", where=str(path)) from error
+
+
+def _add_markdown(path: Path, outcomes: Sequence[Outcome], model: str) -> None:
+    from bampipe.run.markdown import summary
+
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("a", encoding="utf-8") as stream:
+            stream.write(summary(outcomes, model))
     except OSError as error:
         raise InputError(f"cannot be written: {error.strerror}", where=str(path)) from error
 
@@ -777,6 +802,7 @@ def demo(
 
 
 app.command("lab")(lab)
+app.command("accept")(accept)
 
 
 @app.command("status")

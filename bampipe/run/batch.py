@@ -22,6 +22,11 @@ THREAD_VARIABLES = (
 )
 
 
+def share(jobs: int) -> int:
+    """Return how many cores each of ``jobs`` processes may use."""
+    return max(1, (os.cpu_count() or 1) // max(1, jobs))
+
+
 def limit_threads(jobs: int) -> None:
     """Give each of ``jobs`` processes its share of the cores, unless the user has said otherwise.
 
@@ -31,10 +36,10 @@ def limit_threads(jobs: int) -> None:
     Args:
         jobs: number of processes.
     """
-    share = str(max(1, (os.cpu_count() or 1) // jobs))
+    threads = str(share(jobs))
     for name in THREAD_VARIABLES:
         single = name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-        os.environ.setdefault(name, "1" if single else share)
+        os.environ.setdefault(name, "1" if single else threads)
 
 
 def guarded(request: Request, listen: Listener) -> Outcome:

@@ -1,14 +1,15 @@
-"""Quality gates: results held against the limits of a pipeline, and their JUnit form."""
+"""Quality gates: results held against the limits of a pipeline."""
 
 from __future__ import annotations
 
 import json
 import math
-import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
+from bampipe.run import accepted
 from bampipe.run.pipeline import Gate
 
 
@@ -63,13 +64,17 @@ def _missing(gate: Gate, key: str, what: str) -> Verdict:
     return Verdict(gate.name, key, "failed" if gate.level == "fail" else "warned", None, what)
 
 
-def judge(gate: Gate, root: Path, model: str) -> list[Verdict]:
+def judge(gate: Gate, root: Path, model: str, baseline: Path) -> list[Verdict]:
     """Return the verdicts of ``gate`` on the run folder ``root``.
 
     Args:
         gate: the gate.
         root: the run folder.
         model: name of the model that is judged.
+        baseline: folder of the values last accepted.
+
+    Raises:
+        InputError: the file of accepted values is damaged.
     """
     relative = gate.result.replace("{model}", model)
     path = root / relative
@@ -80,6 +85,8 @@ def judge(gate: Gate, root: Path, model: str) -> list[Verdict]:
     divisors = _pick(content, gate.divide_by) if gate.divide_by else {}
     if not values:
         return [_missing(gate, "", f"{relative} has no {gate.value}")]
+    if gate.against == accepted.ACCEPTED:
+        return _against_accepted(gate, root, model, baseline, content)
     verdicts = []
     for key, raw in values.items():
         value = _number(raw)
@@ -89,67 +96,53 @@ def judge(gate: Gate, root: Path, model: str) -> list[Verdict]:
         if value is None:
             verdicts.append(_missing(gate, key, f"{relative} has no number at {gate.value}"))
             continue
-        limits = []
-        if gate.max is not None and value > gate.max:
-            limits.append(f"{value:.4g} is above {gate.max:g}")
-        if gate.min is not None and value < gate.min:
-            limits.append(f"{value:.4g} is below {gate.min:g}")
-        if limits:
-            state = "failed" if gate.level == "fail" else "warned"
-            text = "; ".join([*limits, gate.advice] if gate.advice else limits)
-            verdicts.append(Verdict(gate.name, key, state, value, text))
-        else:
-            verdicts.append(Verdict(gate.name, key, "passed", value, f"{value:.4g}"))
+        verdicts.append(_hold(gate, key, value, ""))
     return verdicts
 
 
-@dataclass(frozen=True)
-class Suite:
-    """The verdicts on one session.
-
-    Attributes:
-        name: the session.
-        verdicts: of all gates.
-        error: why the session has no result, or "".
-    """
-
-    name: str
-    verdicts: tuple[Verdict, ...]
-    error: str = ""
-
-
-def _printable(text: str) -> str:
-    return "".join(c for c in text if c in "\t\n\r" or ord(c) >= 0x20)
+def _hold(gate: Gate, key: str, value: float, said: str) -> Verdict:
+    """Return the verdict on ``value``; ``said`` follows the number in the message."""
+    limits = []
+    if gate.max is not None and value > gate.max:
+        limits.append(f"{value:.4g}{said} is above {gate.max:g}")
+    if gate.min is not None and value < gate.min:
+        limits.append(f"{value:.4g}{said} is below {gate.min:g}")
+    if not limits:
+        return Verdict(gate.name, key, "passed", value, f"{value:.4g}{said}")
+    state = "failed" if gate.level == "fail" else "warned"
+    text = "; ".join([*limits, gate.advice] if gate.advice else limits)
+    return Verdict(gate.name, key, state, value, text)
 
 
-def junit(suites: Iterable[Suite]) -> bytes:
-    """Return the verdicts as JUnit XML: a session is a test suite, a gate on an axis a test."""
-    top = ElementTree.Element("testsuites", name="bampipe")
-    for suite in suites:
-        tests = len(suite.verdicts) + bool(suite.error)
-        element = ElementTree.SubElement(
-            top,
-            "testsuite",
-            name=suite.name,
-            tests=str(tests),
-            failures=str(sum(v.state == "failed" for v in suite.verdicts)),
-            errors=str(int(bool(suite.error))),
-            skipped=str(sum(v.state == "absent" for v in suite.verdicts)),
+def _against_accepted(
+    gate: Gate, root: Path, model: str, baseline: Path, content: Mapping[str, Any]
+) -> list[Verdict]:
+    """Hold the change since the accepted values, beyond its uncertainty, against the limit."""
+    kept = accepted.read(baseline, accepted.device_of(root))
+    if kept is None:
+        return [_missing(gate, "", f"nothing accepted yet in {baseline}: run `bampipe accept`")]
+    if kept["model"] != model:
+        what = f"the accepted values are those of model {kept['model']!r}, not of {model!r}"
+        return [_missing(gate, "", what)]
+    old = kept["results"].get(gate.result, {})
+    parent, _, last = gate.value.rpartition(".")
+    now, before = _pick(content, gate.value), _pick(old, gate.value)
+    sds, old_sds = (_pick(of, f"{parent}.sd") for of in (content, old))
+    verdicts = []
+    for key in [*now, *(key for key in before if key not in now)]:
+        value, kept_value = _number(now.get(key)), _number(before.get(key))
+        if value is None or kept_value is None:
+            where = "this run" if value is None else "the accepted values"
+            verdicts.append(_missing(gate, key, f"no {last} in {where}"))
+            continue
+        sd = math.hypot(_number(sds.get(key)) or 0.0, _number(old_sds.get(key)) or 0.0)
+        beyond = max(0.0, abs(value - kept_value) - 2.0 * sd)
+        if kept_value == 0.0:
+            verdicts.append(_missing(gate, key, "the accepted value is 0: no change in percent"))
+            continue
+        change = 100.0 * (value - kept_value) / abs(kept_value)
+        said = (
+            f" % beyond two standard deviations ({kept_value:.4g} to {value:.4g}, {change:+.3g} %)"
         )
-        if suite.error:
-            case = ElementTree.SubElement(
-                element, "testcase", classname=suite.name, name="the pipeline finishes"
-            )
-            ElementTree.SubElement(case, "error", message=_printable(suite.error))
-        for verdict in suite.verdicts:
-            name = f"{verdict.gate}: {verdict.key}" if verdict.key else verdict.gate
-            case = ElementTree.SubElement(element, "testcase", classname=suite.name, name=name)
-            if verdict.state == "failed":
-                ElementTree.SubElement(case, "failure", message=_printable(verdict.message))
-            elif verdict.state == "absent":
-                ElementTree.SubElement(case, "skipped", message=_printable(verdict.message))
-            elif verdict.state == "warned":
-                ElementTree.SubElement(case, "system-out").text = _printable(verdict.message)
-    ElementTree.indent(top)
-    text: bytes = ElementTree.tostring(top, encoding="utf-8", xml_declaration=True)
-    return text + b"\n"
+        verdicts.append(_hold(gate, key, 100.0 * beyond / abs(kept_value), said))
+    return verdicts

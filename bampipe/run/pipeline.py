@@ -24,6 +24,8 @@ class Gate:
         result: file in the run folder, JSON; ``{model}`` stands for the model that is judged.
         value: dotted path of the number; one ``*`` stands for every key at that place.
         divide_by: dotted path of a second number that the first is divided by, or "".
+        against: "accepted" to judge by how many percent the value has changed since it was last
+            accepted, two standard deviations of the change taken off; "" to judge the value.
         max: largest value that passes, or None.
         min: smallest value that passes, or None.
         level: "fail" (exit code 1) or "warn" (said, but the run counts as good).
@@ -35,6 +37,7 @@ class Gate:
     result: str
     value: str
     divide_by: str = ""
+    against: str = ""
     max: float | None = None
     min: float | None = None
     level: str = "fail"

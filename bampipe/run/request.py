@@ -44,6 +44,8 @@ class Request:
         force: run every selected step, changed or not.
         model: the only model to run; "" for the base model and what was run of the others.
         judged: the model the gates judge; "" for no gates.
+        accepted: folder of accepted values; None for ``accepted`` beside the folder of runs.
+        processes: share of the machine for stages that use several processes; 0 for all of it.
         wait: wait while another process holds the run folder, else refuse.
     """
 
@@ -56,6 +58,8 @@ class Request:
     force: bool = False
     model: str = ""
     judged: str = ""
+    accepted: Path | None = None
+    processes: int = 0
     wait: bool = True
 
 

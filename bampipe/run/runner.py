@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 from bampipe.errors import InputError
-from bampipe.run import hashing, models, record, staging
+from bampipe.run import accepted, hashing, models, record, staging
 from bampipe.run.events import Event, Listener, unheard
 from bampipe.run.gates import Verdict, judge
 from bampipe.run.request import Outcome, Request, Step, StepResult, selected
@@ -112,8 +112,9 @@ class _Runner:
                 results.append(self.step(step))
         verdicts: list[Verdict] = []
         if self.request.judged:
+            baseline = self.request.accepted or accepted.beside(self.root.parent)
             for gate in pipeline.gates:
-                verdicts += judge(gate, self.root, self.request.judged)
+                verdicts += judge(gate, self.root, self.request.judged, baseline)
         self.state.close(verdicts)
         return Outcome(self.root, "done", tuple(results), tuple(verdicts))
 

@@ -83,6 +83,9 @@ class RunState:
             where = ""
         if step.stage in base.READS_SESSION:
             settings = {**settings, "session": str(self.session_folder().resolve())}
+        fields = base.load(step.stage).Config.__dataclass_fields__
+        if self.request.processes and "jobs" in fields:
+            settings = {"jobs": self.request.processes, **settings}
         return configure(step.stage, settings, where)
 
     def inputs(self, step: Step, declared: tuple[str, ...]) -> dict[str, str]:

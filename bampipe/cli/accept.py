@@ -1,0 +1,42 @@
+"""`bampipe accept`: keep a session's values as those that later ones are held against."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from bampipe.cli import places, show
+from bampipe.run import accepted, models
+
+
+def accept(
+    run: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="[RUN]",
+            help="Run folder, or its name under runs/; the most recent run if omitted.",
+        ),
+    ] = None,
+    model: Annotated[str, typer.Option(help="Model whose parameters count.")] = models.BASE,
+    force: Annotated[bool, typer.Option("--force", help="Even if a gate failed.")] = False,
+    folder: Annotated[
+        Path | None,
+        typer.Option("--accepted", help="Folder to write to; accepted/ beside runs if omitted."),
+    ] = None,
+    runs: Annotated[
+        Path, typer.Option("--runs", envvar="BAMPIPE_RUNS", help="Folder of the run folders.")
+    ] = Path("runs"),
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No advice.")] = False,
+) -> None:
+    """Keep a session's parameters as the device's accepted ones, for the gates of later runs.
+
+    Example: bampipe accept 2026-10-03_s01
+    """
+    root = places.find_run(run, runs)
+    path = accepted.accept(root, model, folder or accepted.beside(root.parent), force)
+    show.say(f"{path}: the values of {root.name}, model {model}")
+    if not quiet:
+        show.say("")
+        show.say(f"next: put {path} under version control; later runs are held against it")

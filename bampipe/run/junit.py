@@ -1,0 +1,61 @@
+"""The verdicts of the gates as JUnit XML, which every continuous integration reads."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from bampipe.run.gates import Verdict
+
+
+@dataclass(frozen=True)
+class Suite:
+    """The verdicts on one session.
+
+    Attributes:
+        name: the session.
+        verdicts: of all gates.
+        error: why the session has no result, or "".
+    """
+
+    name: str
+    verdicts: tuple[Verdict, ...]
+    error: str = ""
+
+
+def _printable(text: str) -> str:
+    return "".join(c for c in text if c in "\t\n\r" or ord(c) >= 0x20)
+
+
+def junit(suites: Iterable[Suite]) -> bytes:
+    """Return the verdicts as JUnit XML: a session is a test suite, a gate on an axis a test."""
+    top = ElementTree.Element("testsuites", name="bampipe")
+    for suite in suites:
+        tests = len(suite.verdicts) + bool(suite.error)
+        element = ElementTree.SubElement(
+            top,
+            "testsuite",
+            name=suite.name,
+            tests=str(tests),
+            failures=str(sum(v.state == "failed" for v in suite.verdicts)),
+            errors=str(int(bool(suite.error))),
+            skipped=str(sum(v.state == "absent" for v in suite.verdicts)),
+        )
+        if suite.error:
+            case = ElementTree.SubElement(
+                element, "testcase", classname=suite.name, name="the pipeline finishes"
+            )
+            ElementTree.SubElement(case, "error", message=_printable(suite.error))
+        for verdict in suite.verdicts:
+            name = f"{verdict.gate}: {verdict.key}" if verdict.key else verdict.gate
+            case = ElementTree.SubElement(element, "testcase", classname=suite.name, name=name)
+            if verdict.state == "failed":
+                ElementTree.SubElement(case, "failure", message=_printable(verdict.message))
+            elif verdict.state == "absent":
+                ElementTree.SubElement(case, "skipped", message=_printable(verdict.message))
+            elif verdict.state == "warned":
+                ElementTree.SubElement(case, "system-out").text = _printable(verdict.message)
+    ElementTree.indent(top)
+    text: bytes = ElementTree.tostring(top, encoding="utf-8", xml_declaration=True)
+    return text + b"\n"

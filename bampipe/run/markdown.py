@@ -1,0 +1,114 @@
+"""What came of a run, in Markdown: for a pull request or the summary of a CI job."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+from bampipe.errors import InputError
+from bampipe.run.gates import Verdict
+from bampipe.run.models import BASE
+from bampipe.run.request import Outcome
+from bampipe.stages.base import RunFolder
+
+STATES = {0: "passed", 1: "**gate failed**", 2: "**bad input**", 3: "**crashed**"}
+MOST = 30
+"""So many lines of one table are shown; a summary that nobody reads to its end is none."""
+
+
+def summary(outcomes: Sequence[Outcome], model: str = BASE) -> str:
+    """Return the summary of a run as GitHub-flavoured Markdown.
+
+    Args:
+        outcomes: what came of each session.
+        model: the model that was judged.
+    """
+    codes = [outcome.exit_code for outcome in outcomes]
+    lines = [f"## bampipe: {_headline(codes)}", ""]
+    lines += _table(
+        ("session", "result", "error / floor", "what"),
+        [_session(outcome, model) for outcome in outcomes],
+    )
+    marked = [
+        (outcome.root.name, verdict)
+        for outcome in outcomes
+        for verdict in outcome.verdicts
+        if verdict.state in ("failed", "warned")
+    ]
+    if marked:
+        lines += ["", "### Gates that did not pass", ""]
+        lines += _table(
+            ("session", "gate", "", "verdict", ""),
+            [
+                (name, verdict.gate, verdict.key, verdict.state, verdict.message)
+                for name, verdict in sorted(marked, key=lambda one: one[1].state)
+            ],
+        )
+    return "\n".join(lines) + "\n"
+
+
+def _headline(codes: Sequence[int]) -> str:
+    total = f"{len(codes)} session" + ("s" if len(codes) != 1 else "")
+    parts = [
+        f"{codes.count(code)} {word}"
+        for code, word in ((1, "failed a gate"), (2, "could not be read"), (3, "crashed"))
+        if code in codes
+    ]
+    return f"{total}, " + (", ".join(parts) if parts else "all gates passed")
+
+
+def _session(outcome: Outcome, model: str) -> tuple[str, ...]:
+    if outcome.error:
+        return outcome.root.name, STATES[outcome.exit_code], "", outcome.error
+    counts = [
+        f"{number} {word}"
+        for word in ("failed", "warned")
+        if (number := _count(outcome.verdicts, word))
+    ]
+    return (
+        outcome.root.name,
+        STATES[outcome.exit_code],
+        _errors(RunFolder(outcome.root), model),
+        f"gates: {', '.join(counts)}" if counts else "",
+    )
+
+
+def _count(verdicts: Iterable[Verdict], state: str) -> int:
+    return sum(verdict.state == state for verdict in verdicts)
+
+
+def _errors(run: RunFolder, model: str) -> str:
+    """Return held-out error over floor, axis by axis."""
+    path = f"models/{model}/validate.json"
+    if not run.exists(path):
+        return ""
+    try:
+        axes = run.read_json(path)["axes"]
+    except (InputError, KeyError):
+        return "not readable"
+    shown = []
+    for axis, entry in axes.items():
+        error, floor = entry.get("held_out_rmse"), entry.get("noise_floor")
+        if error is not None and floor:
+            shown.append(f"{axis} {error / floor:.2f}")
+    return ", ".join(shown)
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    lines = [_line(head), "|" + "---|" * len(head)]
+    lines += [_line(row) for row in rows[:MOST]]
+    if len(rows) > MOST:
+        lines += ["", f"and {len(rows) - MOST} more"]
+    return lines
+
+
+def _line(cells: Sequence[str]) -> str:
+    return "| " + " | ".join(_cell(cell) for cell in cells) + " |"
+
+
+def _cell(text: str) -> str:
+    """Return ``text`` so that it cannot break the table or become markup."""
+    if text in STATES.values():
+        return text
+    for mark in "\\|`*_<>[]":
+        text = text.replace(mark, f"\\{mark}")
+    return " ".join(text.split())

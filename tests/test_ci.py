@@ -1,0 +1,199 @@
+"""What a lab's continuous integration uses: accepted values, summaries, documented scripts."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from bampipe.errors import InputError
+from bampipe.run import accepted, gates, pipeline
+from bampipe.run.gates import Verdict
+from bampipe.run.markdown import summary
+from bampipe.run.request import Outcome
+
+ROOT = Path(__file__).parent.parent
+CHANGE = pipeline.Gate(
+    "change",
+    "models/{model}/identify.json",
+    "parameters.*.estimate",
+    against="accepted",
+    max=5.0,
+    optional=True,
+)
+
+
+def write(path: Path, content: object) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(content))
+
+
+def made(root: Path, sd: float = 0.01, **estimates: float) -> Path:
+    """A run folder with these parameters; ``viscous__yaw`` stands for ``viscous.yaw``."""
+    entries = {
+        name.replace("__", "."): {"estimate": value, "sd": sd, "unit": "N.m"}
+        for name, value in estimates.items()
+    }
+    write(root / "ingest/session.json", {"device": "bam", "recorded_at": None})
+    write(root / "models/base/identify.json", {"parameters": entries, "headline": "long"})
+    write(root / "run.json", {"schema": "bampipe.run/1", "stages": {}, "gates": []})
+    return root
+
+
+def states(root: Path, folder: Path, gate: pipeline.Gate = CHANGE) -> dict[str, str]:
+    return {v.key: v.state for v in gates.judge(gate, root, "base", folder)}
+
+
+def test_parameters_are_held_against_those_accepted(tmp_path: Path) -> None:
+    folder = tmp_path / "accepted"
+    old = made(tmp_path / "runs/old", viscous__yaw=4.0, coulomb__yaw=2.0)
+    assert states(old, folder) == {"": "absent"}
+    path = accepted.accept(old, "base", folder)
+    assert path == folder / "bam.json"
+    assert states(old, folder) == {"coulomb.yaw": "passed", "viscous.yaw": "passed"}
+    new = made(tmp_path / "runs/new", viscous__yaw=4.1, coulomb__yaw=2.2, mass=3.5)
+    assert states(new, folder) == {
+        "coulomb.yaw": "failed",
+        "viscous.yaw": "passed",
+        "mass": "absent",
+    }
+    # 10 % less two standard deviations of the difference, 2 sqrt(0.01^2 + 0.01^2) / 2.0
+    verdict = next(v for v in gates.judge(CHANGE, new, "base", folder) if v.key == "coulomb.yaw")
+    assert verdict.value == pytest.approx(10.0 - 100 * 2 * 0.01 * 2**0.5 / 2.0)
+    assert "2 to 2.2, +10 %" in verdict.message
+
+
+def test_a_session_that_says_little_cannot_fail(tmp_path: Path) -> None:
+    folder = tmp_path / "accepted"
+    accepted.accept(made(tmp_path / "runs/old", mass=2.0), "base", folder)
+    assert states(made(tmp_path / "runs/a", sd=0.2, mass=2.2), folder) == {"mass": "passed"}
+
+
+def test_accepted_values_of_another_model_do_not_count(tmp_path: Path) -> None:
+    folder = tmp_path / "accepted"
+    root = made(tmp_path / "runs/old", mass=2.0)
+    accepted.accept(root, "base", folder)
+    (root / "models/base").rename(root / "models/base+x")
+    found = gates.judge(CHANGE, root, "base+x", folder)
+    assert [v.state for v in found] == ["absent"]
+    assert "of model 'base'" in found[0].message
+
+
+def test_a_damaged_file_of_accepted_values_is_named(tmp_path: Path) -> None:
+    root = made(tmp_path / "runs/old", mass=2.0)
+    path = accepted.accept(root, "base", tmp_path / "accepted")
+    path.write_text("{")
+    with pytest.raises(InputError, match=r"bam\.json"):
+        states(root, tmp_path / "accepted")
+    path.write_text('{"schema": "bampipe.accepted/1"}')
+    with pytest.raises(InputError, match="device"):
+        states(root, tmp_path / "accepted")
+
+
+def test_accept_refuses_what_failed(
+    tmp_path: Path, command: Callable[..., tuple[int, str, str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    root = made(tmp_path / "runs/s1", mass=2.0)
+    failed = {"gate": "error", "key": "", "state": "failed", "message": "", "value": 3.0}
+    write(root / "run.json", {"schema": "bampipe.run/1", "stages": {}, "gates": [failed]})
+    code, _, err = command("accept", "s1")
+    assert code == 2 and "the gate 'error' failed" in err
+    code, out, _ = command("accept", "s1", "--force")
+    assert code == 0 and "accepted/bam.json" in out
+    assert json.loads((tmp_path / "accepted/bam.json").read_text())["session"] == "s1"
+    code, _, err = command("accept", "s1", "--force", "--model", "base+snag")
+    assert code == 2 and "models/base+snag/identify.json is missing" in err
+
+
+def test_the_summary_is_a_table_that_no_text_breaks(tmp_path: Path) -> None:
+    bad = Verdict("error | floor", "yaw", "failed", 2.0, "2 is above 1.15;\nsee <b>")
+    root = made(tmp_path / "runs/s1", mass=2.0)
+    axes = {"yaw": {"held_out_rmse": 0.2, "noise_floor": 0.1}}
+    write(root / "models/base/validate.json", {"axes": axes})
+    text = summary(
+        [
+            Outcome(root, "done", (), (bad,)),
+            Outcome(tmp_path / "s2", "refused", error="t1.csv, row 3: not a number"),
+            Outcome(tmp_path / "s3", "done"),
+        ]
+    )
+    assert text.startswith("## bampipe: 3 sessions, 1 failed a gate, 1 could not be read\n")
+    rows = [line for line in text.splitlines() if line.startswith("|")]
+    assert len(rows) == 2 + 3 + 2 + 1
+    for row in rows:
+        assert len(re.findall(r"(?<!\\)\|", row)) in (5, 6)
+    assert "| s1 | **gate failed** | yaw 2.00 | gates: 1 failed |" in text
+    assert r"error \| floor" in text and r"\<b\>" in text
+
+
+def blocks(language: str) -> list[str]:
+    text = (ROOT / "docs/ci.md").read_text(encoding="utf-8")
+    return re.findall(rf"```{language}\n(.*?)```", text, re.S)
+
+
+def test_the_workflow_is_yaml_with_steps() -> None:
+    yaml = pytest.importorskip("yaml", reason="PyYAML is not installed")
+    content = yaml.safe_load(blocks("yaml")[0])
+    steps = content["jobs"]["bampipe"]["steps"]
+    assert any("bampipe run" in step.get("run", "") for step in steps)
+    assert all(("run" in step) != ("uses" in step) for step in steps)
+
+
+def test_the_documented_gate_is_valid(tmp_path: Path) -> None:
+    path = tmp_path / "own.toml"
+    head = 'schema = "bampipe.pipeline/1"\nname = "own"\nstages = ["ingest"]\n'
+    path.write_text(head + blocks("toml")[0])
+    assert pipeline.load(str(path)).gates[0].max == 1.2
+
+
+@pytest.mark.slow
+def test_the_shell_script_runs(tmp_path: Path) -> None:
+    """On a sample session: gates passed, then one that cannot be, then a session that is none."""
+    (tmp_path / "bin").mkdir()
+    program = tmp_path / "bin/bampipe"
+    program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m bampipe "$@"\n')
+    program.chmod(0o755)
+    script = tmp_path / "ci.sh"
+    script.write_text(blocks("sh")[0])
+    lab = tmp_path / "lab-repository"
+    (lab / "sessions").mkdir(parents=True)
+    (lab / "sessions/first").symlink_to(ROOT / "sample_runs/first")
+    own = tmp_path / "own.toml"
+    text = (ROOT / "pipelines/default.toml").read_text(encoding="utf-8")
+    own.write_text(text.replace('"compare", "report"', '"compare"'))
+    settings = {
+        "PATH": f"{tmp_path / 'bin'}{os.pathsep}{os.environ['PATH']}",
+        "PYTHONPATH": str(ROOT),
+        "PIPELINE": str(own),
+        "JOBS": "1",
+    }
+
+    def run() -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            ["sh", str(script), str(lab)],
+            env=os.environ | settings,
+            capture_output=True,
+            text=True,
+        )
+
+    done = run()
+    assert done.returncode == 0, done.stderr
+    assert "all gates passed" in done.stdout
+    assert "## bampipe: 1 session, all gates passed" in done.stdout
+    assert (lab / "gates.xml").is_file()
+    own.write_text(own.read_text().replace("min = 50.0", "min = 100.5"))
+    done = run()
+    assert done.returncode == 1
+    assert "1 failed a gate" in done.stdout and "a gate failed" in done.stderr
+    (lab / "sessions/second").mkdir()
+    (lab / "sessions/second/session.toml").write_text("session_id = 'second'\n")
+    done = run()
+    assert done.returncode == 2
+    assert "| second | **bad input** |" in done.stdout
