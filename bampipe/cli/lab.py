@@ -52,7 +52,8 @@ def lab(
 
 def gather(runs: Path, out: Path | None = None, quiet: bool = False) -> Lab:
     """Write the lab's folder for the runs in ``runs``."""
-    from bampipe.lab.collect import beside, collect
+    from bampipe.lab.collect import collect
+    from bampipe.lab.place import beside
     from bampipe.run.events import Event
 
     folder = out or beside(runs)
@@ -72,7 +73,7 @@ def refresh(runs: Path, several: bool, quiet: bool) -> None:
         several: whether several sessions were run: that makes a lab.
         quiet: print nothing.
     """
-    from bampipe.lab.collect import FILE, beside, is_current, is_foreign, run_folders
+    from bampipe.lab.place import FILE, beside, is_current, is_foreign, run_folders
 
     folder = beside(runs)
     wanted = several or (folder / FILE).is_file()

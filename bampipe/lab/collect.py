@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import fcntl
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -13,11 +13,9 @@ from typing import Any
 from bampipe.data import lab_tables, store
 from bampipe.errors import InputError
 from bampipe.lab import rows, trends
-from bampipe.run import record
+from bampipe.lab.place import FILE, LOCK, is_foreign, run_folders
 from bampipe.stages.base import Progress, silent
 
-FILE = "lab.json"
-LOCK = ".lock"
 SCHEMA = "bampipe.lab/1"
 TRENDS = "trends.json"
 _EARLIEST = datetime.min.replace(tzinfo=UTC)
@@ -40,21 +38,6 @@ class Lab:
     sessions: tuple[str, ...]
     skipped: tuple[str, ...]
     tables: Mapping[str, int]
-
-
-def beside(runs: Path) -> Path:
-    """Return the lab's folder for a folder of runs: ``lab`` next to it."""
-    return runs.resolve().parent / "lab" if runs.name in ("", "..") else runs.parent / "lab"
-
-
-def run_folders(runs: Path) -> list[Path]:
-    """Return the run folders in ``runs``, by name."""
-    return sorted(path.parent for path in runs.glob(f"*/{record.FILE}"))
-
-
-def is_foreign(folder: Path) -> bool:
-    """Whether ``folder`` holds something that is not a lab's: it is left alone."""
-    return folder.is_dir() and not (folder / LOCK).exists() and any(folder.iterdir())
 
 
 def collect(runs: Path, folder: Path, *, report: bool = True, progress: Progress = silent) -> Lab:
@@ -111,20 +94,6 @@ def collect(runs: Path, folder: Path, *, report: bool = True, progress: Progress
         }
         store.write_json(folder / FILE, about)
     return Lab(folder, content, sessions, tuple(skipped), counts)
-
-
-def is_current(runs: Path, folder: Path) -> bool:
-    """Whether ``folder`` holds the runs in ``runs``, none younger than it: nothing to collect."""
-    about = folder / FILE
-    if not about.is_file():
-        return False
-    written = about.stat().st_mtime_ns
-    roots = run_folders(runs)
-    if any((root / record.FILE).stat().st_mtime_ns > written for root in roots):
-        return False
-    kept = store.read_json(about)
-    known: Sequence[str] = [*kept["sessions"], *(line.split(":")[0] for line in kept["skipped"])]
-    return sorted(known) == sorted(root.name for root in roots)
 
 
 def _report(folder: Path) -> None:

@@ -14,7 +14,8 @@ from made_runs import Made
 
 from bampipe.data import lab_tables
 from bampipe.errors import InputError
-from bampipe.lab.collect import collect, is_current
+from bampipe.lab.collect import collect
+from bampipe.lab.place import is_current
 
 ROOT = Path(__file__).parent.parent.parent
 CLEAN = {"yaw": ("nothing_missing", ()), "pitch": ("nothing_missing", ())}

@@ -1,0 +1,43 @@
+"""Where a lab's folder is, and whether it is up to date; imports nothing slow."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from bampipe.run import record
+
+FILE = "lab.json"
+LOCK = ".lock"
+
+
+def beside(runs: Path) -> Path:
+    """Return the lab's folder for a folder of runs: ``lab`` next to it."""
+    return runs.resolve().parent / "lab" if runs.name in ("", "..") else runs.parent / "lab"
+
+
+def run_folders(runs: Path) -> list[Path]:
+    """Return the run folders in ``runs``, by name."""
+    return sorted(path.parent for path in runs.glob(f"*/{record.FILE}"))
+
+
+def is_foreign(folder: Path) -> bool:
+    """Whether ``folder`` holds something that is not a lab's: it is left alone."""
+    return folder.is_dir() and not (folder / LOCK).exists() and any(folder.iterdir())
+
+
+def is_current(runs: Path, folder: Path) -> bool:
+    """Whether ``folder`` holds the runs in ``runs``, none younger than it: nothing to collect."""
+    about = folder / FILE
+    if not about.is_file():
+        return False
+    written = about.stat().st_mtime_ns
+    roots = run_folders(runs)
+    if any((root / record.FILE).stat().st_mtime_ns > written for root in roots):
+        return False
+    try:
+        kept = json.loads(about.read_text(encoding="utf-8"))
+    except (json.JSONDecodeError, UnicodeDecodeError):
+        return False
+    known: list[str] = [*kept["sessions"], *(line.split(":")[0] for line in kept["skipped"])]
+    return sorted(known) == sorted(root.name for root in roots)
