@@ -17,10 +17,12 @@ import pytest
 from conftest import TOYS, Toy, contents
 
 from bampipe.errors import InputError
-from bampipe.run.cluster import run_on_cluster
+from bampipe.run import pipeline as pipelines
+from bampipe.run.cluster import _placed, run_on_cluster
 from bampipe.run.events import unheard
-from bampipe.run.request import Request
+from bampipe.run.request import Request, Step
 from bampipe.run.runner import run_session
+from bampipe.run.state import RunState
 
 distributed = pytest.importorskip("distributed", reason="the dask extra is not installed")
 
@@ -85,6 +87,35 @@ def test_a_worker_killed_in_mid_run_loses_nothing(toy: Toy, cluster: Any) -> Non
     outcomes = run_on_cluster(given, cluster.scheduler_address, unheard)
     thread.join()
     check(toy, given, [outcome.state for outcome in outcomes])
+
+
+@pytest.mark.slow
+def test_workers_publish_what_they_have_run(toy: Toy, cluster: Any) -> None:
+    pytest.importorskip("fsspec", reason="the remote extra is not installed")
+    from bampipe.run.publish import fetch, published
+
+    url = f"file://{toy.folder / 'far'}"
+    given = [replace(request, publish=url) for request in requests(toy)]
+    outcomes = run_on_cluster(given, cluster.scheduler_address, unheard)
+    check(toy, given, [outcome.state for outcome in outcomes])
+    assert published(url) == sorted(
+        request.root.name for request in given if request is not given[1]
+    )
+    back = fetch(url, given[0].root.name, toy.folder / "back")
+    assert contents(back) == contents(given[0].root)
+
+
+def test_a_stage_on_a_worker_starts_no_processes(tmp_path: Path) -> None:
+    """Dask's workers are daemons, and a daemon may have no children: a diagnosis must know."""
+    request = replace(
+        Request(tmp_path / "runs/s", pipelines.load("diagnose")),
+        processes=1,
+        accepted=Path("accepted"),
+    )
+    step = Step("diagnose", "base")
+    assert _placed(request).accepted == Path.cwd() / "accepted"
+    state = RunState(_placed(replace(request, processes=2)))
+    assert state.configure(step, state.settings(step)).jobs == 1
 
 
 def test_no_scheduler_is_one_line(toy: Toy) -> None:

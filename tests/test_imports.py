@@ -65,6 +65,7 @@ LAWS = {
     "run": {
         "dask",
         "distributed",
+        "fsspec",
         "bampipe",
         "bampipe.errors",
         "bampipe.data",

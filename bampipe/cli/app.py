@@ -14,6 +14,7 @@ import typer
 import bampipe
 from bampipe.cli import device, places, show
 from bampipe.cli.accept import accept
+from bampipe.cli.fetch import fetch
 from bampipe.cli.lab import lab, refresh
 from bampipe.errors import InputError
 from bampipe.run import batch, models, record
@@ -182,6 +183,12 @@ def run(
         Path | None,
         typer.Option(help="Folder of accepted values; accepted/ beside the runs if omitted."),
     ] = None,
+    publish: Annotated[
+        str,
+        typer.Option(
+            metavar="URL", help="Also publish finished runs there: s3://bucket/runs, file://..."
+        ),
+    ] = "",
     runs: Runs = RUNS,
     no_wait: NoWait = False,
     json: Json = False,
@@ -231,6 +238,7 @@ def run(
                 model=model,
                 judged=model or models.BASE,
                 accepted=accepted,
+                publish=publish,
                 processes=batch.share(min(jobs, len(folders))),
                 wait=not no_wait,
             )
@@ -244,7 +252,7 @@ def run(
         elif several:
             outcomes += batch.run_sessions(requests, jobs, watcher)
         else:
-            outcomes.append(run_session(requests[0], watcher))
+            outcomes.append(batch.run_and_publish(requests[0], watcher))
     if junit is not None:
         _write_junit(junit, outcomes)
     if markdown is not None:
@@ -803,6 +811,7 @@ def demo(
 
 app.command("lab")(lab)
 app.command("accept")(accept)
+app.command("fetch")(fetch)
 
 
 @app.command("status")

@@ -10,7 +10,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from bampipe.errors import InputError
+from bampipe.run import record
 from bampipe.run.events import Event, Listener
+from bampipe.run.publish import publish
 from bampipe.run.request import Outcome, Request
 from bampipe.run.runner import run_session
 
@@ -42,6 +44,19 @@ def limit_threads(jobs: int) -> None:
         os.environ.setdefault(name, "1" if single else threads)
 
 
+def run_and_publish(request: Request, listen: Listener) -> Outcome:
+    """Run one session and, where asked, publish its run folder.
+
+    Raises:
+        InputError: bad input, or it could not be published.
+    """
+    outcome = run_session(request, listen)
+    if request.publish:
+        with record.lock(request.root, request.wait, lambda: None):
+            publish(request.root, request.publish)
+    return outcome
+
+
 def guarded(request: Request, listen: Listener) -> Outcome:
     """Run one session; whatever goes wrong becomes part of its outcome.
 
@@ -50,7 +65,7 @@ def guarded(request: Request, listen: Listener) -> Outcome:
         listen: told of every event.
     """
     try:
-        return run_session(request, listen)
+        return run_and_publish(request, listen)
     except InputError as error:
         return Outcome(request.root, "refused", error=str(error))
     except Exception as error:

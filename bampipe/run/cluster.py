@@ -1,7 +1,8 @@
 """Sessions on the workers of a Dask cluster: one session is one task.
 
 Workers read sessions and write run folders themselves, so both must lie on a file system that
-every worker sees under the same path.
+every worker sees under the same path. Where only the sessions do, a request's ``publish`` takes
+the finished run folders elsewhere (see :mod:`bampipe.run.publish`).
 """
 
 from __future__ import annotations
@@ -48,9 +49,7 @@ def run_on_cluster(requests: Sequence[Request], scheduler: str, listen: Listener
     with client:
         tasks = {}
         for number, request in enumerate(requests):
-            session = None if request.session is None else request.session.resolve()
-            placed = replace(request, root=request.root.resolve(), session=session)
-            tasks[client.submit(guarded, placed, unheard, pure=False)] = number
+            tasks[client.submit(guarded, _placed(request), unheard, pure=False)] = number
         for task in as_completed(tasks):
             number = tasks[task]
             root = requests[number].root
@@ -60,3 +59,14 @@ def run_on_cluster(requests: Sequence[Request], scheduler: str, listen: Listener
                 outcomes[number] = Outcome(root, "crashed", error=f"its workers died: {error}")
             listen(Event(root.name, "", "done", 1.0))
     return [outcomes[number] for number in range(len(requests))]
+
+
+def _placed(request: Request) -> Request:
+    """Return the request as a worker needs it: absolute paths, and no processes of its own.
+
+    A Dask worker is a daemon, which may have no children; its cores are used by other sessions.
+    """
+    session = None if request.session is None else request.session.resolve()
+    accepted = None if request.accepted is None else request.accepted.resolve()
+    root = request.root.resolve()
+    return replace(request, root=root, session=session, accepted=accepted, processes=1)

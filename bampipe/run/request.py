@@ -46,6 +46,7 @@ class Request:
         judged: the model the gates judge; "" for no gates.
         accepted: folder of accepted values; None for ``accepted`` beside the folder of runs.
         processes: share of the machine for stages that use several processes; 0 for all of it.
+        publish: where to publish the run folder once it is done, a URL for fsspec; "" for nowhere.
         wait: wait while another process holds the run folder, else refuse.
     """
 
@@ -60,6 +61,7 @@ class Request:
     judged: str = ""
     accepted: Path | None = None
     processes: int = 0
+    publish: str = ""
     wait: bool = True
 
 

@@ -1,0 +1,47 @@
+"""`bampipe fetch`: published runs back into a folder of runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from bampipe.cli import show
+from bampipe.errors import InputError
+from bampipe.run import publish
+from bampipe.run.settings import did_you_mean
+
+
+def fetch(
+    url: Annotated[str, typer.Argument(metavar="URL", help="Where runs were published.")],
+    sessions: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[SESSION...]", help="Sessions to fetch; all if omitted."),
+    ] = None,
+    runs: Annotated[
+        Path, typer.Option("--runs", envvar="BAMPIPE_RUNS", help="Folder to fetch into.")
+    ] = Path("runs"),
+    force: Annotated[bool, typer.Option("--force", help="Replace runs that differ.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No advice.")] = False,
+) -> None:
+    """Fetch runs that `bampipe run --publish URL` published, every file checked.
+
+    Example: bampipe fetch s3://lab/runs
+
+    Example: bampipe fetch file:///mnt/lab/runs 2026-10-03_s01
+    """
+    known = publish.published(url)
+    if not known:
+        raise InputError("nothing is published here", where=url)
+    for session in sessions or known:
+        if session not in known:
+            raise InputError(
+                f"no session {session!r} is published",
+                where=url,
+                remedy=did_you_mean(session, known),
+            )
+        show.say(str(publish.fetch(url, session, runs, force)))
+    if not quiet:
+        show.say("")
+        show.say(f"next: bampipe lab {runs}")

@@ -1,0 +1,209 @@
+"""Finished runs on any file system that fsspec knows: object stores, HDFS, SFTP, a plain folder.
+
+A run needs renames and locks while it is made, which object stores lack, so it is made on a local
+or shared folder and published whole:
+
+    <url>/<session>/<version>/...     every file of the run; a version is named by its content
+    <url>/<session>/current.json      which version counts, and the hash of each of its files
+
+``current.json`` is written last, in one piece. Whoever reads it first sees the old version or the
+new one, never a mixture; an upload that was cut short is not seen at all, and the next one
+completes it. Versions that no longer count are left: somebody may be reading them.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from bampipe.errors import InputError
+from bampipe.run import hashing, record
+
+SCHEMA = "bampipe.published/1"
+CURRENT = "current.json"
+
+
+def publish(root: Path, url: str) -> str:
+    """Publish the run folder ``root`` below ``url``.
+
+    A version that is there already, whole, is not sent again.
+
+    Args:
+        root: the run folder; nobody may be at work in it.
+        url: a folder as fsspec names it, such as ``s3://bucket/runs`` or ``file:///mnt/runs``.
+
+    Returns:
+        The version.
+
+    Raises:
+        InputError: fsspec or the driver of that file system is not installed, or it refuses.
+    """
+    files = {
+        path.relative_to(root).as_posix(): path
+        for path in sorted(root.rglob("*"))
+        if path.is_file() and path.relative_to(root).parts[0] != record.PRIVATE
+    }
+    hashes = {name: hashing.digest_file(path) for name, path in files.items()}
+    version = hashing.digest_content(hashes)[:16]
+    system, base = _open(url)
+    here = f"{base}/{root.name}"
+    try:
+        current = _current(system, here)
+        if current is not None and current["version"] == version:
+            return version
+        for name, path in files.items():
+            target = f"{here}/{version}/{name}"
+            if _size(system, target) != path.stat().st_size:
+                system.makedirs(target.rpartition("/")[0], exist_ok=True)
+                system.put_file(str(path), target)
+        content = {"schema": SCHEMA, "session": root.name, "version": version, "files": hashes}
+        text = json.dumps(content, sort_keys=True, indent=1, ensure_ascii=False) + "\n"
+        # The transaction renames or completes the upload: no half-written file is ever seen.
+        with system.transaction, system.open(f"{here}/{CURRENT}", "wb") as stream:
+            stream.write(text.encode())
+    except _faults() as error:
+        raise InputError(f"cannot be published: {_first_line(error)}", where=url) from error
+    return version
+
+
+def published(url: str) -> list[str]:
+    """Return the sessions published below ``url``, sorted.
+
+    Raises:
+        InputError: as :func:`publish`.
+    """
+    system, base = _open(url)
+    try:
+        if not system.exists(base):
+            return []
+        system.invalidate_cache()
+        names = [str(path).rstrip("/").rpartition("/")[2] for path in system.ls(base, detail=False)]
+        return sorted(name for name in names if system.exists(f"{base}/{name}/{CURRENT}"))
+    except _faults() as error:
+        raise InputError(f"cannot be read: {_first_line(error)}", where=url) from error
+
+
+def fetch(url: str, session: str, runs: Path, force: bool = False) -> Path:
+    """Fetch the published run of ``session`` into ``runs``, every file held against its hash.
+
+    Args:
+        url: as for :func:`publish`.
+        session: its id.
+        runs: folder of run folders.
+        force: replace a run folder that says something else.
+
+    Returns:
+        The run folder.
+
+    Raises:
+        InputError: nothing published, a file does not match its hash, or there is another run.
+    """
+    system, base = _open(url)
+    here, root = f"{base}/{session}", runs / session
+    try:
+        current = _current(system, here)
+        if current is None:
+            raise InputError(f"no session {session!r} is published", where=url)
+        if root.exists() and _is_same(root, current["files"]):
+            return root
+        if root.exists() and not force:
+            raise InputError(
+                "there is another run of this session",
+                where=str(root),
+                remedy="fetch into another folder with --runs, or replace it with --force",
+            )
+        runs.mkdir(parents=True, exist_ok=True)
+        draft = Path(tempfile.mkdtemp(prefix=f".{session}.", dir=runs))
+        try:
+            for name, known in current["files"].items():
+                target = _inside(draft, name, url)
+                target.parent.mkdir(parents=True, exist_ok=True)
+                system.get_file(f"{here}/{current['version']}/{name}", str(target))
+                if hashing.digest_file(target) != known:
+                    raise InputError(f"{name} is not as it was published", where=f"{url}/{session}")
+            draft.chmod(0o777 & ~_umask())
+            if root.exists():
+                old = Path(tempfile.mkdtemp(prefix=f".{session}.", dir=runs))
+                root.replace(old / session)
+                draft.replace(root)
+                shutil.rmtree(old)
+            else:
+                draft.replace(root)
+        finally:
+            shutil.rmtree(draft, ignore_errors=True)
+    except _faults() as error:
+        raise InputError(f"cannot be fetched: {_first_line(error)}", where=url) from error
+    return root
+
+
+def _open(url: str) -> tuple[Any, str]:
+    """Return the file system and the path on it."""
+    try:
+        from fsspec.core import url_to_fs
+    except ImportError as error:
+        raise InputError(
+            "publishing needs fsspec", remedy="pip install 'bampipe[remote]'"
+        ) from error
+    try:
+        system, path = url_to_fs(url)
+    except (ImportError, ValueError) as error:
+        raise InputError(f"no such file system: {_first_line(error)}", where=url) from error
+    except _faults() as error:
+        raise InputError(f"cannot be reached: {_first_line(error)}", where=url) from error
+    return system, str(path).rstrip("/")
+
+
+def _faults() -> tuple[type[BaseException], ...]:
+    """What a file system raises: drivers derive their errors from OSError or from these."""
+    return (OSError, RuntimeError, TimeoutError)
+
+
+def _current(system: Any, here: str) -> dict[str, Any] | None:
+    try:
+        system.invalidate_cache(here)
+        content = json.loads(system.cat_file(f"{here}/{CURRENT}"))
+    except FileNotFoundError:
+        return None
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise InputError(
+            f"not readable as JSON ({error})", where=f"{here}/{CURRENT}", remedy="publish anew"
+        ) from error
+    if not isinstance(content, dict) or content.get("schema") != SCHEMA:
+        raise InputError("not a published run", where=f"{here}/{CURRENT}")
+    return content
+
+
+def _size(system: Any, path: str) -> int | None:
+    try:
+        return int(system.info(path)["size"])
+    except FileNotFoundError:
+        return None
+
+
+def _is_same(root: Path, files: dict[str, str]) -> bool:
+    return all(
+        (root / name).is_file() and hashing.digest_file(root / name) == known
+        for name, known in files.items()
+    )
+
+
+def _inside(folder: Path, name: str, url: str) -> Path:
+    """Return ``folder / name``; a name that leads out of it is refused."""
+    path = folder / name
+    if not path.resolve().is_relative_to(folder.resolve()):
+        raise InputError(f"the name {name!r} leads out of the run folder", where=url)
+    return path
+
+
+def _umask() -> int:
+    value = os.umask(0)
+    os.umask(value)
+    return value
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error) or type(error).__name__).splitlines()[0]
