@@ -6,6 +6,7 @@ import json
 import shutil
 import tomllib
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,8 +14,8 @@ from typing import Any
 import bampipe
 from bampipe.cli import places
 from bampipe.errors import InputError
-from bampipe.run import models, pipeline
-from bampipe.run.events import Listener
+from bampipe.run import models, pipeline, record
+from bampipe.run.events import Event, Listener
 from bampipe.run.pipeline import Pipeline
 from bampipe.run.request import Request
 from bampipe.run.runner import run_session
@@ -44,6 +45,11 @@ class Options:
     force: bool
     wait: bool
     listen: Listener
+
+    def lock(self) -> AbstractContextManager[None]:
+        """Hold the run folder, as a run does; not while one of :meth:`run` is under way."""
+        event = Event(self.root.name, "", "waiting")
+        return record.lock(self.root, self.wait, lambda: self.listen(event))
 
     def run(self, first: str, last: str, model: str) -> None:
         """Run the stages from ``first`` to ``last`` on ``model``."""
@@ -126,38 +132,52 @@ def extend(options: Options, parent: str, effect: str) -> str:
         InputError: no such parent or effect, one the device cannot have, or one that the parent
             has already; nothing is left behind.
     """
-    from bampipe.stages.modelfile import load_model
-
     root = options.root
-    models.ensure_base(root, options.pipeline.device, options.pipeline.effects)
-    before = models.read(root, parent)
     name, file = _named(effect)
-    if name in before.effects:
-        raise InputError(f"model {parent!r} has {name} already", where=str(root))
+    with options.lock():
+        models.ensure_base(root, options.pipeline.device, options.pipeline.effects)
+        if name in models.read(root, parent).effects:
+            raise InputError(f"model {parent!r} has {name} already", where=str(root))
+    options.run("identify", "validate", parent)
     child = models.child_name(parent, name)
-    folder = root / "models" / child
-    fresh = not folder.exists()
+    fresh = not (root / "models" / child).exists()
     try:
-        for own in sorted((root / "models" / parent / "effects").glob("*.toml")):
-            _copy(own, folder / "effects" / own.name)
-        if file is not None:
-            _copy(file, folder / "effects" / f"{name.partition(':')[0]}.toml")
-        models.write(root, models.ModelFile(child, parent, before.device, (*before.effects, name)))
-        load_model(base.RunFolder(root), child)
-        options.run("identify", "validate", parent)
+        with options.lock():
+            _write_child(root, parent, name, file)
         options.run("identify", "validate", child)
     except InputError:
         if fresh:
-            shutil.rmtree(folder, ignore_errors=True)
+            with options.lock():
+                shutil.rmtree(root / "models" / child, ignore_errors=True)
         raise
     options.run("compare", "compare", "")
     return child
 
 
-def _copy(source: Path, target: Path) -> None:
-    target.parent.mkdir(parents=True, exist_ok=True)
-    if source.resolve() != target.resolve():
-        target.write_bytes(source.read_bytes())
+def _write_child(root: Path, parent: str, effect: str, file: Path | None) -> None:
+    """Write the child of ``parent`` with ``effect`` too, its ``model.toml`` last: then it counts.
+
+    Args:
+        root: the run folder, held.
+        parent: name of a model.
+        effect: ``name[:target]``.
+        file: where the effect comes from, if it is a lab's own.
+
+    Raises:
+        InputError: the device cannot have the effect.
+    """
+    from bampipe.stages.modelfile import load_model
+
+    before = models.read(root, parent)
+    child = models.child_name(parent, effect)
+    own = {path.name: path for path in (root / "models" / parent / "effects").glob("*.toml")}
+    if file is not None:
+        own[f"{effect.partition(':')[0]}.toml"] = file
+    for name, source in sorted(own.items()):
+        text = source.read_text(encoding="utf-8")
+        record.replace_text(root / "models" / child / "effects" / name, text)
+    models.write(root, models.ModelFile(child, parent, before.device, (*before.effects, effect)))
+    load_model(base.RunFolder(root), child)
 
 
 def follow(options: Options, model: str, tell: Callable[[str], None]) -> str:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bampipe.errors import InputError
+from bampipe.run import record
 from bampipe.run.settings import did_you_mean
 
 SCHEMA = "bampipe.model/1"
@@ -78,10 +79,7 @@ def write(root: Path, model: ModelFile) -> None:
                 return
         except (tomllib.TOMLDecodeError, UnicodeDecodeError):
             path.unlink()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_name(".model.toml.part")
-    draft.write_text(text, encoding="utf-8")
-    draft.replace(path)
+    record.replace_text(path, text)
 
 
 def ensure_base(root: Path, device: str, effects: tuple[str, ...]) -> None:

@@ -6,10 +6,11 @@ import contextlib
 import errno
 import fcntl
 import json
+import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from bampipe.errors import InputError
 from bampipe.stages.base import write_json
@@ -17,29 +18,112 @@ from bampipe.stages.base import write_json
 SCHEMA = "bampipe.run/1"
 FILE = "run.json"
 PRIVATE = ".bampipe"
+STORAGE_FAULTS = {
+    errno.ENOSPC: "the disk is full",
+    errno.EDQUOT: "the disk quota is used up",
+    errno.EROFS: "the file system is read-only",
+    errno.EACCES: "no permission to write",
+    errno.EPERM: "no permission to write",
+    errno.EFBIG: "a file would be larger than this system allows",
+    errno.ENOTDIR: "a file is in the way of a folder",
+    errno.EEXIST: "a file is in the way of a folder",
+}
+"""What the disk may refuse, in words."""
+
+_TABLES = ("stages", "timings", "failures", "place")
+_FIELDS = {
+    "key": str,
+    "config": dict,
+    "settings": dict,
+    "declared_inputs": list,
+    "inputs": dict,
+    "outputs": dict,
+    "code": str,
+    "versions": dict,
+    "summary": dict,
+}
 
 
 def read(root: Path) -> dict[str, Any]:
     """Return the contents of ``run.json`` in ``root``; of an empty run where there is none.
 
-    A damaged file counts as none: every stage then runs again, and the file is rebuilt.
+    What is damaged counts as not there: its stages run again, and the file is rebuilt.
     """
-    empty: dict[str, Any] = {"schema": SCHEMA, "stages": {}}
+    found = _content(root)
+    if found is None:
+        return {"schema": SCHEMA, "stages": {}}
+    stages = found.get("stages")
+    kept = stages.items() if isinstance(stages, dict) else ()
+    sound: dict[str, Any] = {"stages": {name: made for name, made in kept if is_sound(made)}}
+    for name in ("timings", "failures", "place"):
+        if isinstance(found.get(name), dict):
+            sound[name] = found[name]
+    others = {name: value for name, value in found.items() if name not in _TABLES}
+    return {**others, **sound}
+
+
+def is_damaged(root: Path) -> bool:
+    """Whether there is a ``run.json`` in ``root`` that is not whole."""
+    if not (root / FILE).exists():
+        return False
+    found = _content(root)
+    return found is None or found.get("stages", {}).keys() != read(root)["stages"].keys()
+
+
+def _content(root: Path) -> dict[str, Any] | None:
     try:
         content = json.loads((root / FILE).read_text(encoding="utf-8"))
-    except (FileNotFoundError, json.JSONDecodeError, UnicodeDecodeError):
-        return empty
+    except (FileNotFoundError, ValueError, RecursionError):
+        return None
     if not isinstance(content, dict) or content.get("schema") != SCHEMA:
-        return empty
-    return content
+        return None
+    return content if isinstance(content.get("stages"), dict) else None
+
+
+def is_sound(made: object) -> bool:
+    """Whether the record of a step has every field that the runner reads, of its type."""
+    if not isinstance(made, dict):
+        return False
+    if not all(isinstance(made.get(name), kind) for name, kind in _FIELDS.items()):
+        return False
+    hashes = {**made["inputs"], **made["outputs"]}
+    texts = [*made["declared_inputs"], *hashes.values()]
+    return all(isinstance(text, str) for text in texts) and are_inside(hashes)
+
+
+def are_inside(names: Iterable[str]) -> bool:
+    """Whether paths stay in the folder they are relative to."""
+    return not any(Path(name).is_absolute() or ".." in Path(name).parts for name in names)
 
 
 def replace_json(path: Path, content: dict[str, Any]) -> None:
     """Write ``content`` to ``path``, whole or not at all."""
+    with _drafted(path) as draft:
+        write_json(draft, content)
+
+
+def replace_text(path: Path, text: str) -> None:
+    """Write ``text`` to ``path``, whole or not at all."""
+    with _drafted(path) as draft:
+        draft.write_text(text, encoding="utf-8")
+
+
+@contextlib.contextmanager
+def _drafted(path: Path) -> Iterator[Path]:
+    """A file that takes the place of ``path`` once the block has written it."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_name(f".{path.name}.part")
-    write_json(draft, content)
-    draft.replace(path)
+    draft = draft_of(path)
+    try:
+        yield draft
+        draft.replace(path)
+    except OSError:
+        draft.unlink(missing_ok=True)
+        raise
+
+
+def draft_of(path: Path) -> Path:
+    """Return where ``path`` is written before it counts."""
+    return path.with_name(f".{path.name}.part")
 
 
 def write(root: Path, content: dict[str, Any]) -> None:
@@ -49,7 +133,7 @@ def write(root: Path, content: dict[str, Any]) -> None:
 
 @contextlib.contextmanager
 def lock(root: Path, wait: bool, waiting: Callable[[], None]) -> Iterator[None]:
-    """Hold the run folder ``root`` alone.
+    """Hold the run folder ``root`` alone; what the disk refuses meanwhile is a user's matter.
 
     Args:
         root: the run folder; made if it is not there.
@@ -57,27 +141,42 @@ def lock(root: Path, wait: bool, waiting: Callable[[], None]) -> Iterator[None]:
         waiting: called once before waiting.
 
     Raises:
-        InputError: another process holds it and ``wait`` is false.
+        InputError: another process holds it and ``wait`` is false; or the disk is full, read-only
+            or the like.
     """
-    (root / PRIVATE).mkdir(parents=True, exist_ok=True)
-    with (root / PRIVATE / "lock").open("a") as handle:
-        told = False
-        while True:
-            try:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError as error:
-                if error.errno not in (errno.EWOULDBLOCK, errno.EACCES):
-                    raise
-            else:
-                break
-            if not wait:
-                raise InputError(
-                    "another bampipe is at work in this run folder",
-                    where=str(root),
-                    remedy="wait until it is done, or leave out --no-wait",
-                )
-            if not told:
-                waiting()
-                told = True
-            time.sleep(0.1)
-        yield
+    try:
+        (root / PRIVATE).mkdir(parents=True, exist_ok=True)
+        with (root / PRIVATE / "lock").open("a") as handle:
+            _hold(handle, root, wait, waiting)
+            yield
+    except OSError as error:
+        if error.errno not in STORAGE_FAULTS:
+            raise
+        raise InputError(
+            STORAGE_FAULTS[error.errno],
+            where=os.fspath(error.filename or root),
+            remedy="earlier results are untouched",
+        ) from error
+
+
+def _hold(handle: IO[str], root: Path, wait: bool, waiting: Callable[[], None]) -> None:
+    """Take the lock that ``handle`` stands for; closing it, or dying, gives it back."""
+    told = False
+    while True:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            if error.errno not in (errno.EWOULDBLOCK, errno.EACCES):
+                raise
+        else:
+            return
+        if not wait:
+            raise InputError(
+                "another bampipe is at work in this run folder",
+                where=str(root),
+                remedy="wait until it is done, or leave out --no-wait",
+            )
+        if not told:
+            waiting()
+            told = True
+        time.sleep(0.1)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import errno
 import json
-import os
 import shutil
 import time
 from datetime import UTC, datetime
@@ -17,14 +15,6 @@ from bampipe.run.gates import Verdict, judge
 from bampipe.run.request import Outcome, Request, Step, StepResult, selected
 from bampipe.run.state import RunState, lasting
 from bampipe.stages import base
-
-STORAGE_FAULTS = {
-    errno.ENOSPC: "the disk is full",
-    errno.EDQUOT: "the disk quota is used up",
-    errno.EROFS: "the file system is read-only",
-    errno.EACCES: "no permission to write",
-    errno.EPERM: "no permission to write",
-}
 
 
 class _Runner:
@@ -143,25 +133,13 @@ def run_session(request: Request, listen: Listener = unheard) -> Outcome:
     """
     selected(request)
     fresh = not request.root.exists()
-    try:
-        with record.lock(
-            request.root,
-            request.wait,
-            lambda: listen(Event(request.root.name, "", "waiting")),
-        ):
-            runner = _Runner(request, listen)
-            staging.recover(runner.state)
-            try:
-                return runner.run()
-            except InputError:
-                if fresh and not runner.state.records:
-                    shutil.rmtree(request.root)
-                raise
-    except OSError as error:
-        if error.errno not in STORAGE_FAULTS:
+    event = Event(request.root.name, "", "waiting")
+    with record.lock(request.root, request.wait, lambda: listen(event)):
+        runner = _Runner(request, listen)
+        staging.recover(runner.state)
+        try:
+            return runner.run()
+        except InputError:
+            if fresh and not runner.state.records:
+                shutil.rmtree(request.root)
             raise
-        raise InputError(
-            STORAGE_FAULTS[error.errno],
-            where=os.fspath(error.filename or request.root),
-            remedy="earlier results are untouched",
-        ) from error

@@ -96,9 +96,27 @@ def commit(state: RunState, staging: Path) -> None:
 
 def recover(state: RunState) -> None:
     """Finish what a killed run had completed, drop what it had not."""
+    record.draft_of(state.root / record.FILE).unlink(missing_ok=True)
+    for draft in state.root.glob("models/*/.model.toml.part"):
+        draft.unlink()
     parent = state.root / record.PRIVATE / "staging"
     for staging in sorted(parent.glob("*")):
-        if (staging / COMMIT).is_file():
+        if (staging / COMMIT).is_file() and _is_whole(staging):
             commit(state, staging)
         else:
             shutil.rmtree(staging)
+
+
+def _is_whole(staging: Path) -> bool:
+    """Whether the commit file, and what it names and is still here, is as it was sealed."""
+    try:
+        entry = json.loads((staging / COMMIT).read_text(encoding="utf-8"))
+        if not record.is_sound(entry["record"]) or not record.are_inside(entry["remove"]):
+            return False
+        return all(
+            hashing.digest_file(staging / name) == digest
+            for name, digest in entry["record"]["outputs"].items()
+            if (staging / name).is_file()
+        )
+    except (ValueError, KeyError, TypeError, AttributeError):
+        return False

@@ -30,6 +30,7 @@ class RunState:
         self.request = request
         self.root = request.root
         self.folder = base.RunFolder(request.root)
+        self.damaged = record.is_damaged(request.root)
         self.content = record.read(request.root)
         self.written = copy.deepcopy(self.content)
         self.records: dict[str, dict[str, Any]] = self.content.setdefault("stages", {})
@@ -115,7 +116,9 @@ class RunState:
 
     def missing(self, name: str) -> InputError:
         maker = _maker(name)
-        remedy = f"run `bampipe {maker}` first" if maker else ""
+        model = name.split("/")[1] if name.startswith("models/") else models.BASE
+        option = "" if model == models.BASE else f" --model {model}"
+        remedy = f"run `bampipe {maker}{option}` first" if maker else ""
         return InputError(f"{name} is missing", where=str(self.root), remedy=remedy)
 
     def check_untouched(self, name: str) -> None:
@@ -159,7 +162,7 @@ class RunState:
         """Why the step must run; "" if it need not."""
         made = self.records.get(step.name)
         if made is None:
-            return "never run"
+            return "run.json was damaged" if self.damaged else "never run"
         if self.request.force:
             return "forced"
         for name, written in made["outputs"].items():

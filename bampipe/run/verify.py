@@ -16,10 +16,10 @@ def verify(root: Path) -> list[tuple[str, str]]:
 
     Returns:
         Pairs of a file and what became of it: "changed", "gone", or "unknown" for a file that no
-        stage recorded. Empty where all is as it was written.
+        stage recorded; ``run.json`` itself may be "damaged". Empty where all is as it was written.
     """
     content = record.read(root)
-    found: dict[str, str] = {}
+    found: dict[str, str] = {record.FILE: "damaged"} if record.is_damaged(root) else {}
     recorded: set[str] = {record.FILE}
     for made in content["stages"].values():
         for name, written in made.get("outputs", {}).items():
