@@ -42,7 +42,7 @@ def compile_law(device: Device) -> ControlLaw | None:
     if controller is None:
         return None
     inputs = (*controller.channels, *device.channels, "t")
-    content = json.dumps([code_version(), device.declaration], sort_keys=True, default=str)
+    content = json.dumps(["law", code_version(), device.declaration], sort_keys=True, default=str)
     key = hashlib.sha256(content.encode()).hexdigest()[:24]
     folder = generated.folder_of_user()
     code = generated.read(folder, key)
