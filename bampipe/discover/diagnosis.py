@@ -11,7 +11,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,6 +110,7 @@ class AxisFinding:
         explainable_after: the same with the effects found.
         explainable_chance: share that it predicts on replays of the final model, the largest.
         effects: effects found that act on this axis.
+        remains: whether the effects found leave something that no effect explains.
     """
 
     verdict: str
@@ -121,6 +122,7 @@ class AxisFinding:
     explainable_after: float
     explainable_chance: float
     effects: tuple[str, ...] = ()
+    remains: bool = False
 
 
 @dataclass(frozen=True)
@@ -144,37 +146,57 @@ class Diagnosis:
     initial: Evidence
 
 
-@dataclass
 class _Chance:
-    """Mean and scatter of every candidate's score on replays of the bare model."""
+    """Mean and scatter of candidates' scores on replays of the bare model, found as needed.
 
-    replicates: list[Replicate]
-    names: Sequence[str]
-    independent: float
-    gains: dict[str, Array] = field(init=False)
+    A candidate that gains nothing on the measured trials needs no chance level; most gain nothing.
+    """
 
-    def __post_init__(self) -> None:
-        n = len(self.replicates[0].error)
-        self.gains = {
-            name: np.array(
-                [r.scores[name].gain if name in r.scores else np.zeros(n) for r in self.replicates]
+    def __init__(
+        self,
+        replay: Callable[[Sequence[str]], list[Replicate]],
+        asked: Sequence[str],
+        tests: int,
+        independent: float,
+    ) -> None:
+        self._replay, self._tests, self._independent = replay, tests, independent
+        self._gains: dict[str, Array] = {}
+        self.replicates = self._learn(asked)
+
+    def _learn(self, names: Sequence[str]) -> list[Replicate]:
+        replicates = self._replay(names)
+        nothing = np.zeros(len(replicates[0].error))
+        for name in names:
+            self._gains[name] = np.array(
+                [r.scores[name].gain if name in r.scores else nothing for r in replicates]
             )
-            for name in self.names
-        }
+        return replicates
+
+    def ask(self, names: Sequence[str]) -> None:
+        """Replay again for those of ``names`` whose chance level is not known yet."""
+        unknown = [name for name in names if name not in self._gains]
+        if unknown:
+            self._learn(unknown)
 
     def p_value(self, score: Score) -> float:
-        """Chance that any candidate scores this high with nothing missing (Bonferroni)."""
+        """Chance that any candidate scores this high with nothing missing (Bonferroni).
+
+        One for a candidate that was not worth a chance level.
+        """
+        if score.name not in self._gains:
+            return 1.0
         count = len(self.replicates)
-        totals = self.gains[score.name].sum(axis=1)
+        totals = self._gains[score.name].sum(axis=1)
         spread = np.hypot(
-            totals.std(ddof=1) * np.sqrt(1.0 + 1.0 / count), REPLAY_ERROR * self.independent
+            totals.std(ddof=1) * np.sqrt(1.0 + 1.0 / count), REPLAY_ERROR * self._independent
         )
         z = (score.total - totals.mean()) / spread
-        return float(min(1.0, len(self.names) * student.sf(z, count - 1)))
+        return float(min(1.0, self._tests * student.sf(z, count - 1)))
 
     def excess(self, score: Score) -> Array:
-        """Gain beyond the mean on replays, by axis."""
-        return np.asarray(score.gain - self.gains[score.name].mean(axis=0))
+        """Gain beyond the mean on replays, by axis; the gain itself where that is not known."""
+        gains = self._gains.get(score.name)
+        return np.asarray(score.gain if gains is None else score.gain - gains.mean(axis=0))
 
 
 def diagnose(
@@ -231,14 +253,16 @@ class _Search:
                 [PrepareTask(self.recipe, self.names[k::parts]) for k in range(parts)],
             )
         )
-        self.progress(0.05, "replaying the model for chance levels")
-        chance = _Chance(
-            self._replicas(self.recipe, self.initial.p, s.replicates, self.names, (0,)),
-            self.names,
-            float(Scorer(self.initial).independent.mean()),
-        )
-        self.progress(0.4, "scoring every candidate on the measured trials")
+        self.progress(0.05, "scoring every candidate on the measured trials")
         first = self._scores(self.recipe, self.initial.p, self.names)
+        self.progress(0.15, "replaying the model for chance levels")
+        scorer = Scorer(self.initial)
+        chance = _Chance(
+            lambda names: self._replicas(self.recipe, self.initial.p, s.replicates, names, (0,)),
+            self._gaining(first, scorer),
+            len(self.names),
+            float(scorer.independent.mean()),
+        )
         recipe, evidence, scores = self.recipe, self.initial, first
         selected: list[str] = []
         replayed = chance.replicates
@@ -287,6 +311,11 @@ class _Search:
             merged |= found
         return merged
 
+    def _gaining(self, scores: Mapping[str, Score], scorer: Scorer) -> list[str]:
+        """Candidates whose gain could be worth having; chance lowers it at most by half of that."""
+        least = 0.5 * self.settings.worth
+        return [n for n, s in scores.items() if np.any(s.gain / scorer.independent > least)]
+
     def _able(
         self,
         scores: Mapping[str, Score],
@@ -296,6 +325,7 @@ class _Search:
     ) -> list[tuple[float, str]]:
         """Candidates that beat chance and are worth having, best first."""
         scorer, s = Scorer(evidence), self.settings
+        chance.ask(self._gaining(scores, scorer))
         errors = np.array([r.error for r in replayed])
         ceiling = s.at_floor * errors.mean(axis=0) + 2.0 * errors.std(axis=0, ddof=1)
         worth = np.where(scorer.before.error > ceiling, s.worth, s.worth_at_floor)
@@ -378,7 +408,7 @@ class _Search:
             here = tuple(n for n in selected if main[n] == axis or axis in reach[n])
             excess = before[axis] ** 2 - min(floor, bare_floor[axis]) ** 2
             left = max(after[axis] ** 2 - floor**2, 0.0)
-            lacking = after[axis] > s.above_floor * floor + 3.0 * scatter and share > 0.05
+            lacking = bool(after[axis] > s.above_floor * floor + 3.0 * scatter and share > 0.05)
             verdict = "missing" if here else "nothing_missing"
             if lacking and (not here or left > (1.0 - s.explained) * max(excess, 1e-30)):
                 verdict = "unknown_effect"
@@ -394,6 +424,7 @@ class _Search:
                     share,
                     luck,
                     here if verdict == "missing" else (),
+                    lacking and verdict == "missing",
                 )
             )
         kept = [n for n in selected if n not in unknown]

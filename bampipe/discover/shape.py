@@ -154,7 +154,7 @@ def explainable_share(evidence: Evidence, axis: int, seed: int = 0) -> float:
     for k in range(len(x)):
         others = [i for i in range(len(x)) if i != k]
         trees = ExtraTreesRegressor(
-            n_estimators=40, min_samples_leaf=8, max_features=0.6, random_state=seed, n_jobs=1
+            n_estimators=20, min_samples_leaf=8, max_features=0.6, random_state=seed, n_jobs=1
         )
         trees.fit(np.concatenate([x[i] for i in others]), np.concatenate([y[i] for i in others]))
         left += float(np.sum((y[k] - trees.predict(x[k])) ** 2))

@@ -125,7 +125,7 @@ def _result(found: Diagnosis, session: Session, recipe: Recipe, model: str) -> d
     shapes = {
         axis: describe(found.evidence, i)
         for i, axis in enumerate(names)
-        if found.axes[i].verdict == "unknown_effect"
+        if found.axes[i].verdict == "unknown_effect" or found.axes[i].remains
     }
     axes = {}
     for i, axis in enumerate(names):
@@ -141,6 +141,7 @@ def _result(found: Diagnosis, session: Session, recipe: Recipe, model: str) -> d
             "noise_floor_sd": a.floor_sd,
             "unit": units[i],
             "effects": list(a.effects),
+            "remains": a.remains,
             "sentence": _sentence(axis, i, found, shapes.get(axis, "")),
         }
     ranking = [
@@ -194,6 +195,10 @@ def _sentence(axis: str, i: int, found: Diagnosis, shape: str) -> str:
             f"{axis.capitalize()}: {words} is missing{also}; adding it takes the held-out error "
             f"from {a.rmse_before:.3g} to {a.rmse_after:.3g} {unit}, {ratio:.2f} times the noise "
             f"floor."
+        ) + (
+            f" What is left no effect in the library explains; its shape: {shape}."
+            if a.remains
+            else ""
         )
     if a.verdict == "unknown_effect":
         return (

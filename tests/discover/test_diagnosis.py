@@ -72,6 +72,18 @@ def test_an_effect_outside_the_library_is_unknown_until_its_file_is_given():
     assert with_file.axes[0].rmse_after < 1.2 * with_file.axes[0].noise_floor
 
 
+def test_what_a_named_effect_leaves_is_said_to_remain():
+    recipe = bam(["return_spring:yaw", "snag:yaw"], [SNAG])
+    values = SNAGGED | {
+        "snag.yaw.height": 0.5,
+        "return_spring.yaw.stiffness": 7.0,
+        "return_spring.yaw.offset": 0.5,
+    }
+    found = run(made(recipe, values))
+    assert found.selected == ("return_spring:yaw",)
+    assert [axis.remains for axis in found.axes] == [True, False, False]
+
+
 def test_one_trial_cannot_be_diagnosed():
     session = made(bam(), {}, trials=1)
     with pytest.raises(ValueError, match="two trials"):
