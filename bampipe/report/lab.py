@@ -113,7 +113,9 @@ def _summary(trends: dict[str, Any]) -> Section:
 
 
 def _sentence(text: str) -> str:
-    return f"{text[:1].upper()}{text[1:]}."
+    """Return ``text`` as a sentence; one that begins with a parameter's name leaves it as it is."""
+    first = text.partition(" ")[0]
+    return f"{text}." if "." in first else f"{text[:1].upper()}{text[1:]}."
 
 
 def _limits_in_words(trends: dict[str, Any]) -> str:
@@ -145,7 +147,7 @@ def _charts(trends: dict[str, Any]) -> list[Section]:
             part = charts[start : start + _MOST_PANELS]
             number = f"-{start // _MOST_PANELS + 1}" if len(charts) > _MOST_PANELS else ""
             blocks.append(_picture(part, f"charts-{place}{number}"))
-        sections.append(Section(title, tuple(blocks), new_page=True))
+        sections.append(Section(title, tuple(blocks)))
     return sections
 
 
