@@ -8,16 +8,22 @@ noticed is a sentence in ``notes``. Nothing is altered without one.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 
+from bampipe.data import velocity
 from bampipe.data.readers import RawTrial
 from bampipe.data.session import SECONDS, Channel, Encoder, Session, TrialEntry
+from bampipe.data.units import unit
 from bampipe.errors import InputError
 
 FASTEST = {"rad": 20.0, "m": 4.0}
 """Speed below which a step is never taken for a wild reading, rad/s and m/s."""
+
+VELOCITY_RATIO = 1.5
+"""A recorded velocity further than this factor from the change of position is in another unit."""
 
 LARGEST_VALUE = 1e6
 """No angle, force, torque or other input is as large as this in SI units."""
@@ -131,6 +137,7 @@ def clean(raw: RawTrial, session: Session, entry: TrialEntry, limits: Limits) ->
         InputError: the trial must be set aside; says why, and where in the file.
     """
     table = _Table(raw, session, entry, limits)
+    _refuse_other_units(table, raw.units)
     _time_to_seconds(table)
     _drop_backward_stamps(table)
     _cut_stretch(table)
@@ -146,6 +153,8 @@ def clean(raw: RawTrial, session: Session, entry: TrialEntry, limits: Limits) ->
     table.t -= table.t[0]
     _refuse_short(table)
     _note_clock(table)
+    for encoder in session.encoders:
+        _hold_against_velocity(table, encoder)
     if session.force is not None and session.force.volts:
         for column in session.force.columns:
             _refuse_frozen(table, column)
@@ -155,6 +164,27 @@ def clean(raw: RawTrial, session: Session, entry: TrialEntry, limits: Limits) ->
     _refuse_wrong_brakes(table, columns)
     rate = float(1.0 / np.median(np.diff(table.t)))
     return CleanTrial(table.t, columns, rate, table.repairs, table.notes)
+
+
+# Units
+
+
+def _refuse_other_units(table: _Table, stated: Mapping[str, str]) -> None:
+    """Refuse a column whose unit in the file is not that of the session file."""
+    clock = table.session.clock
+    declared = {**table.session.raw_units}
+    if not clock.datetime:
+        declared[clock.column] = {v: k for k, v in SECONDS.items()}.get(clock.seconds, "")
+    for column, text in stated.items():
+        found, expected = unit(text), unit(declared.get(column, ""))
+        if found is None or expected is None or "" in (found.si, expected.si):
+            continue
+        if (found.si, found.scale) != (expected.si, expected.scale):
+            raise table.fault(
+                f"the file gives the unit {text}, session.toml {declared[column]}",
+                column=column,
+                remedy="correct session.toml",
+            )
 
 
 # Time
@@ -315,7 +345,11 @@ def _note_clock(table: _Table) -> None:
         )
     jitter = float(np.std(steps[~gaps]))
     if jitter > 0.05 * median:
-        table.notes.append(f"time stamps jitter by {jitter * 1e3:.3g} ms (standard deviation)")
+        table.notes.append(
+            f"time stamps jitter by {jitter * 1e3:.3g} ms (standard deviation), from"
+            f" {steps.min() * 1e3:.3g} to {steps[~gaps].max() * 1e3:.3g} ms between samples:"
+            " put on a uniform grid by monotone cubic interpolation when filtered"
+        )
     nominal = table.session.sample_rate
     if abs(1 / median - nominal) > 0.02 * nominal:
         table.notes.append(f"sampled at {1 / median:.4g} Hz, announced {nominal:g} Hz")
@@ -418,6 +452,34 @@ def _mend_jumps(table: _Table, encoder: Encoder) -> None:
         f"column '{encoder.column}': {_counted(int(wild.sum()), 'wild reading')} taken out"
     )
     _fill_missing(table)
+
+
+def _hold_against_velocity(table: _Table, encoder: Encoder) -> None:
+    """Refuse an axis whose recorded velocity is in another unit, or of another sign."""
+    if encoder.velocity is None:
+        return
+    speed = table.columns.pop(encoder.velocity.column) * encoder.velocity.scale
+    position = (table.columns[encoder.column] - encoder.zero) * encoder.scale
+    found = velocity.compare(table.t, position, speed)
+    if found is None:
+        return
+    place = encoder.velocity.column
+    if abs(found.correlation) < 0.9:
+        table.notes.append(
+            f"column '{place}' is not the velocity of {encoder.axis} by its position"
+            f" (correlation {found.correlation:.2f}); it is not used"
+        )
+        return
+    if not 1 / VELOCITY_RATIO < found.ratio < VELOCITY_RATIO:
+        raise table.fault(
+            f"is {found.ratio:.3g} times the change of '{encoder.column}'",
+            column=place,
+            remedy="check the units and signs of both in session.toml",
+        )
+    if not 0.95 < found.ratio < 1.05:
+        table.notes.append(
+            f"column '{place}' is {found.ratio:.3g} times the change of '{encoder.column}'"
+        )
 
 
 # Missing samples

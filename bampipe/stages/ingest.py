@@ -7,7 +7,7 @@ cannot be trusted is set aside with a reason (file, row, column), and the others
 from __future__ import annotations
 
 from collections import defaultdict
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +21,7 @@ from bampipe.data.store import ParquetAppender, read_toml, sha256_file, write_js
 from bampipe.errors import InputError
 from bampipe.physics import registry
 from bampipe.physics.device import Device
+from bampipe.physics.units import parse_unit
 from bampipe.stages.base import Progress, RunFolder
 
 NAME = "ingest"
@@ -169,11 +170,30 @@ def _match(session: Session, device: Device) -> None:
                 where=f"{where}: force",
                 remedy=f"these are given: {', '.join(sorted(given)) or 'none'}",
             )
+    wanted = {**dict.fromkeys(device.forces, device.force_unit), **device.channels}
+    for channel in session.channels:
+        unit = wanted.get(channel.name, channel.unit)
+        if not _alike(channel.unit, unit):
+            raise InputError(
+                f"a unit of {channel.unit or 'a pure number'}, but device '{device.name}' takes"
+                f" {unit or 'a pure number'}",
+                where=f"{where}: channels.{channel.name}.unit",
+            )
     if session.force and not session.force.volts and session.force.unit != device.force_unit:
         raise InputError(
             f"found \"{session.force.unit}\", but device '{device.name}' takes {device.force_unit}",
             where=f"{where}: force.unit",
         )
+
+
+def _alike(one: str, other: str) -> bool:
+    """Whether two units have the same dimension, as far as they can be read."""
+    if one == other:
+        return True
+    try:
+        return parse_unit(one, "") == parse_unit(other, "")
+    except InputError:
+        return False
 
 
 def _refused(session: Session) -> list[str]:
@@ -214,9 +234,23 @@ def _trial(session: Session, entry: TrialEntry, config: Config, reason: str) -> 
     if reason:
         raise InputError(reason, where=entry.file)
     path = inside(session.root, entry.file, where=entry.file)
+    clock = session.clock
     raw = read_trial(
-        path, session.columns, name=entry.file, largest_bytes=config.largest_trial_mb << 20
+        path,
+        session.columns,
+        name=entry.file,
+        largest_bytes=config.largest_trial_mb << 20,
+        datetimes={clock.column: clock.form} if clock.datetime else {},
+        dialect=session.dialect,
     )
+    if not clock.column:
+        count = len(raw.columns[session.columns[0]])
+        said = f"no time stamps: samples counted at {session.sample_rate:g} Hz"
+        raw = replace(
+            raw,
+            columns={clock.column: np.arange(count, dtype=float), **raw.columns},
+            remarks=(*raw.remarks, said),
+        )
     return clean(raw, session, entry, config)
 
 
@@ -237,6 +271,7 @@ def _row(entry: TrialEntry, trial: CleanTrial | None, reason: str) -> dict[str, 
         "kind": entry.kind,
         "locked_axis": entry.locked_axis,
         "viscous_n_s_per_m": np.nan if entry.viscous is None else entry.viscous,
+        "hold_out": entry.hold_out,
         "n_samples": 0 if trial is None else len(trial.t),
         "duration_s": np.nan if trial is None else float(trial.t[-1]),
         "sample_rate_hz": np.nan if trial is None else trial.sample_rate,
