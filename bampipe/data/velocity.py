@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 WINDOW_S = 0.1
-"""Motion is compared over stretches of this length, s, so that neither noise nor lag counts much."""
+"""Length of the stretches that are compared, s: neither noise nor lag counts much."""
 
 
 @dataclass(frozen=True)

@@ -45,7 +45,11 @@ class _Run:
 
 
 def free_runs(
-    run: RunFolder, system: System, motions: Sequence[Motion], parameters: Sequence[Array]
+    run: RunFolder,
+    system: System,
+    motions: Sequence[Motion],
+    parameters: Sequence[Array],
+    judged: Sequence[bool],
 ) -> dict[str, object]:
     """Run the model freely over every trial and say how far it ends up from the measurement.
 
@@ -54,6 +58,7 @@ def free_runs(
         system: the model.
         motions: the trials.
         parameters: for each trial, (>= n_p,) parameters that have not seen it.
+        judged: which trials count for the whole; all where none does.
 
     Returns:
         ``mode`` (``closed_loop`` or ``open_loop``), ``axes.<axis>`` and
@@ -83,7 +88,7 @@ def free_runs(
         return {"reason": f"{mode.replace('_', ' ')}: {error}"}
     content: dict[str, object] = {
         "mode": mode,
-        "axes": _axes(system, runs),
+        "axes": _axes(system, [r for r, j in zip(runs, judged, strict=True) if j] or runs),
         "trials": {r.trial_id: _axes(system, [r]) for r in runs},
     }
     if mode == CLOSED:

@@ -118,7 +118,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     session = run.read_json("ingest/session.json")
     system = compile_model(load_model(run, config.model))
     progress(0.0, "reading the trials")
-    motions = [read_motion(run, trial, system) for trial in free_trials(run)]
+    motions = [read_motion(run, trial, system) for trial in free_trials(run, fitted=True)]
     rate = float(session["sample_rate_hz"])
     # Filtered accelerations fall short at high frequency, which least squares takes for a delay
     # of the force: the filter alone can tell the two apart.

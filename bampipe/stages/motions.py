@@ -41,14 +41,28 @@ class Motion:
     u_rate: Array
 
 
-def free_trials(run: RunFolder) -> tuple[str, ...]:
+def held_out_trials(run: RunFolder) -> frozenset[str]:
+    """Return the trials that the session holds out: never fitted, only for judging."""
+    trials = read_parquet(run.require("ingest/trials.parquet", "ingest"))
+    if "hold_out" not in trials:
+        return frozenset()
+    return frozenset(trials.loc[trials["hold_out"].astype(bool), "trial_id"].astype(str))
+
+
+def free_trials(run: RunFolder, *, fitted: bool = False) -> tuple[str, ...]:
     """Return the free trials that were differentiated, in the order of the session.
+
+    Args:
+        run: the run folder.
+        fitted: without those that the session holds out.
 
     Raises:
         InputError: there is none.
     """
     trials = read_parquet(run.require("ingest/trials.parquet", "ingest"))
     usable = trials[(trials["kind"] == "free") & (trials["status"] != "set_aside")]
+    if fitted:
+        usable = usable[~usable["trial_id"].isin(held_out_trials(run))]
     path = run.require("filter/kinematics.parquet", "filter")
     moving = set(read_parquet(path, columns=["trial_id"])["trial_id"].astype(str))
     found = tuple(str(name) for name in usable["trial_id"] if str(name) in moving)

@@ -12,6 +12,7 @@ from bampipe.estimate.differentiation import uniform_grid
 from bampipe.estimate.hysteresis import noise_of
 from bampipe.physics import Model, System
 from bampipe.stages.base import RunFolder
+from bampipe.stages.motions import held_out_trials
 
 
 def recipe_of(run: RunFolder, name: str, model: Model) -> Recipe:
@@ -29,6 +30,8 @@ def read_session(
 ) -> tuple[Sensors, list[Motion]]:
     """Moving trials of a run folder on uniform grids, filtered for the diagnosis, and the sensors.
 
+    Trials that the session holds out are left alone: no model is chosen by them.
+
     Raises:
         InputError: a file or channel that the model needs is missing.
     """
@@ -37,6 +40,7 @@ def read_session(
     device = system.model.device
     trials = read_parquet(run.require("ingest/trials.parquet", "ingest"))
     sound = trials[(trials["kind"].isin(MOVING)) & (trials["status"] != "set_aside")]
+    sound = sound[~sound["trial_id"].isin(held_out_trials(run))]
     samples = run.require("ingest/samples.parquet", "ingest")
     recordings = []
     for trial_id in sound["trial_id"].astype(str):

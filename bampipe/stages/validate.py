@@ -26,10 +26,19 @@ from bampipe.physics.device import derivative
 from bampipe.stages.base import Progress, RunFolder
 from bampipe.stages.free_run import free_runs
 from bampipe.stages.modelfile import load_model, model_inputs
-from bampipe.stages.motions import Motion, free_trials, problem_of, read_motion
+from bampipe.stages.motions import (
+    Motion,
+    free_trials,
+    held_out_trials,
+    problem_of,
+    read_motion,
+)
 
 NAME = "validate"
 SUMMARY = "Predicted against measured torque and force, on trials that the fit has not seen"
+
+HELD_OUT = -1
+"""Group of the trials that the session holds out."""
 
 Array = NDArray[np.float64]
 
@@ -99,6 +108,7 @@ class _Compared:
     residual_without_friction: Array
     force: Array
     force_residual: Array
+    judged: bool
 
 
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
@@ -118,8 +128,9 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     p = _identified(system, identified, run)
     progress(0.1, "held-out fits")
     groups = _groups(run, motions, config.hold_out_by)
+    judged = _judged(groups)
     held_out = _held_out(problem, p, groups)
-    compared = _compare(system, motions, problem, p, held_out)
+    compared = _compare(system, motions, problem, p, held_out, judged)
     notes = []
     if len(set(groups)) == 1:
         notes.append(
@@ -136,11 +147,9 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     content = _content(system, compared, floor, notes, used)
     if config.free_run:
         progress(0.8, "free runs")
-        content["free_run"] = free_runs(run, system, motions, held_out)
+        content["free_run"] = free_runs(run, system, motions, held_out, judged)
     write_json(out / f"models/{config.model}/validate.json", content)
-    write_parquet(
-        out / f"models/{config.model}/residuals.parquet", _table(system, compared, len(motions) > 1)
-    )
+    write_parquet(out / f"models/{config.model}/residuals.parquet", _table(system, compared))
     return content
 
 
@@ -166,6 +175,7 @@ def _compare(
     problem: Problem,
     p: Array,
     held_out: Sequence[Array],
+    judged: Sequence[bool],
 ) -> list[_Compared]:
     """Compare every trial with the model as identified, held out, and without friction."""
     frictionless = p.copy()
@@ -195,6 +205,7 @@ def _compare(
                 residual_without_friction=thin(problem.residual(k, frictionless)),
                 force=thin(motion.u[:, force]),
                 force_residual=np.einsum("tfq,tq->tf", push, residual),
+                judged=judged[k],
             )
         )
     return compared
@@ -203,11 +214,17 @@ def _compare(
 def _groups(run: RunFolder, motions: Sequence[Motion], channel: str) -> list[int]:
     """Return the number of the group of each trial; trials of a group are held out together.
 
+    Trials that the session holds out are in the group `HELD_OUT`, which no fit sees.
+
     Raises:
         InputError: the channel is not recorded, or changes within a trial.
     """
+    unseen = held_out_trials(run)
     if not channel:
-        return [number % MOST_GROUPS for number in range(len(motions))]
+        return [
+            HELD_OUT if motion.trial_id in unseen else number % MOST_GROUPS
+            for number, motion in enumerate(motions)
+        ]
     path = run.require("ingest/samples.parquet", "ingest")
     values = []
     for motion in motions:
@@ -222,18 +239,26 @@ def _groups(run: RunFolder, motions: Sequence[Motion], channel: str) -> list[int
                 remedy="name a channel that is constant in each trial",
             )
         values.append(float(column[0]))
-    return [sorted(set(values)).index(value) for value in values]
+    numbers = [sorted(set(values)).index(value) for value in values]
+    return [HELD_OUT if m.trial_id in unseen else k for m, k in zip(motions, numbers, strict=True)]
+
+
+def _judged(groups: Sequence[int]) -> list[bool]:
+    """Return which trials count as held out: those of the session, else all by turns."""
+    if HELD_OUT in groups:
+        return [group == HELD_OUT for group in groups]
+    return [len(set(groups)) > 1] * len(groups)
 
 
 def _held_out(problem: Problem, p: Array, groups: Sequence[int]) -> list[Array]:
     """Return, for each trial, the parameters that the trials of other groups give."""
     if len(set(groups)) == 1:
         return [p] * problem.n_trials
-    start = fit(problem, p).p
-    found = {
-        group: fit(problem, start, trials=[i for i, g in enumerate(groups) if g != group]).p
-        for group in sorted(set(groups))
-    }
+    start = fit(problem, p, trials=[i for i, g in enumerate(groups) if g != HELD_OUT]).p
+    found = {}
+    for group in sorted(set(groups)):
+        others = [i for i, g in enumerate(groups) if g not in (group, HELD_OUT)]
+        found[group] = fit(problem, start, trials=others).p if others else p
     return [found[group] for group in groups]
 
 
@@ -282,6 +307,8 @@ def _noise_floor(
         problem = problem_of(system, seen, band)
         start = np.append(parameters, 0.0)
         for k, held in enumerate(_held_out(problem, start, groups)):
+            if HELD_OUT in groups and groups[k] != HELD_OUT:
+                continue
             used = np.abs(band.thin(problem.resting[k].astype(float))) < 0.02
             residual = band.thin(problem.residual(k, held)) * used
             squares += np.sum(residual**2, axis=0)
@@ -362,12 +389,15 @@ def _entries(
     """Return the numbers of each axis over some trials."""
     used = [c.used for c in compared]
     rmse = _rms([c.residual for c in compared], used)
-    held_out = _rms([c.residual_held_out for c in compared], used)
     without = _rms([c.residual_without_friction for c in compared], used)
-    count = np.maximum(sum(keep.sum(axis=0) for keep in used), 1)
-    mean = sum(np.sum(c.measured * c.used, axis=0) for c in compared) / count
-    spread = _rms([c.measured - mean for c in compared], used)
     size = _rms([c.measured for c in compared], used)
+    unseen = [c for c in compared if c.judged] or compared
+    where = [c.used for c in unseen]
+    held_out = _rms([c.residual_held_out for c in unseen], where)
+    count = np.maximum(sum(keep.sum(axis=0) for keep in where), 1)
+    mean = sum(np.sum(c.measured * c.used, axis=0) for c in unseen) / count
+    spread = _rms([c.measured - mean for c in unseen], where)
+    unseen_size = _rms([c.measured for c in unseen], where)
     entries: dict[str, dict[str, object]] = {}
     for i, axis in enumerate(system.coordinates):
         share = held_out[i] / spread[i] if spread[i] > 0.0 else 1.0
@@ -376,7 +406,7 @@ def _entries(
             "rmse_without_friction": float(without[i]),
             "held_out_rmse": float(held_out[i]),
             "relative_error_percent": _percent(rmse[i], size[i]),
-            "held_out_relative_error_percent": _percent(held_out[i], size[i]),
+            "held_out_relative_error_percent": _percent(held_out[i], unseen_size[i]),
             "fit_percent": float(100.0 * (1.0 - share)),
             "unit": system.torque_units[i],
         }
@@ -406,8 +436,7 @@ def _content(
         "model": config.model,
         "axes": axes,
         "trials": {
-            c.trial_id: _entries(system, [c], None) | {"held_out": len(compared) > 1}
-            for c in compared
+            c.trial_id: _entries(system, [c], None) | {"held_out": c.judged} for c in compared
         },
         "forces": forces,
         "cutoff_hz": config.cutoff_hz,
@@ -416,11 +445,11 @@ def _content(
     }
 
 
-def _table(system: System, compared: Sequence[_Compared], held_out: bool) -> pd.DataFrame:
+def _table(system: System, compared: Sequence[_Compared]) -> pd.DataFrame:
     """Return residuals.parquet: predictions by parameters that have not seen the trial."""
     frames = []
     for c in compared:
-        columns: dict[str, object] = {"trial_id": c.trial_id, "t": c.t, "held_out": held_out}
+        columns: dict[str, object] = {"trial_id": c.trial_id, "t": c.t, "held_out": c.judged}
         for i, axis in enumerate(system.coordinates):
             measured = c.measured[:, i]
             columns[f"torque_measured_{axis}"] = measured

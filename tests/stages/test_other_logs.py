@@ -1,0 +1,217 @@
+"""Ingest over logs as other labs keep them: units, clocks, velocities, dialects."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from bampipe.data.store import read_json, read_parquet
+from bampipe.data.units import unit
+from bampipe.errors import InputError
+from bampipe.stages import ingest
+from bampipe.stages.base import RunFolder, silent
+
+DEVICE = """
+schema = "bampipe.device/1"
+name = "joint"
+[coordinates.joint]
+kind = "rotary"
+[constants]
+torque_constant = { value = 1.5, unit = "N.m/A" }
+[energy]
+kinetic = "inertia*ddt(joint)**2/2"
+[inputs]
+force = ["current"]
+force_unit = "A"
+[applied]
+joint = "torque_constant*current"
+[friction.joint]
+viscous = { unit = "N.m.s/rad", prior = 0.1, sd = 0.1, lower = 0.0 }
+coulomb = { unit = "N.m", prior = 0.1, sd = 0.1, lower = 0.0 }
+[parameters.inertia]
+unit = "kg.m2"
+prior = 0.05
+sd = 0.05
+"""
+HEAD = """
+schema = "bampipe.session/1"
+session_id = "arm"
+device = "joint.toml"
+sample_rate_hz = {rate}
+{more}
+[time]
+{time}
+[encoders]
+joint = {{ {encoder} }}
+[channels]
+current = {{ {current} }}
+[[trials]]
+file = "log.csv"
+kind = "free"
+"""
+RATE = 100.0
+RNG = np.random.default_rng(5)
+JITTER = np.cumsum(0.01 + RNG.uniform(-0.003, 0.003, 1000))
+T = JITTER - JITTER[0]
+Q, QD = 0.5 * np.sin(2 * T), np.cos(2 * T)
+I = 1.2 * np.sin(3 * T)  # noqa: E741
+
+
+def ingested(
+    folder: Path, text: str, *, time: str, encoder: str, current: str, more: str = "", rate=RATE
+) -> tuple[pd.DataFrame, pd.Series, dict]:
+    """Samples, the trial's row and session.json of a session over one log."""
+    folder.mkdir(exist_ok=True)
+    (folder / "joint.toml").write_text(DEVICE)
+    (folder / "log.csv").write_text(text)
+    session = HEAD.format(rate=rate, time=time, encoder=encoder, current=current, more=more)
+    (folder / "session.toml").write_text(session)
+    out = folder / "out"
+    ingest.execute(RunFolder(out), out, ingest.Config(session=str(folder)), silent)
+    trials = read_parquet(out / "ingest/trials.parquet")
+    samples = read_parquet(out / "ingest/samples.parquet")
+    return samples, trials.iloc[0], read_json(out / "ingest/session.json")
+
+
+def log(columns: dict[str, np.ndarray], delimiter=",", decimal=".", form="{:.6f}") -> str:
+    rows = [delimiter.join(columns)]
+    for cells in zip(*columns.values(), strict=True):
+        row = [c if isinstance(c, str) else form.format(c).replace(".", decimal) for c in cells]
+        rows.append(delimiter.join(row))
+    return "\n".join(rows) + "\n"
+
+
+PLAIN = {"encoder": 'column = "q", unit = "rad"', "current": 'column = "i", unit = "A"'}
+
+
+def check(samples: pd.DataFrame) -> None:
+    np.testing.assert_allclose(samples["t"], T, atol=2e-6)
+    np.testing.assert_allclose(samples["q_joint"], Q, atol=2e-5)
+    np.testing.assert_allclose(samples["current"], I, atol=2e-5)
+
+
+def test_degrees_milliamperes_and_decimal_commas(tmp_path):
+    columns = {"zeit [ms]": T * 1e3, "winkel [deg]": np.rad2deg(Q), "strom [mA]": 1e3 * I}
+    samples, trial, about = ingested(
+        tmp_path,
+        log(columns, ";", ","),
+        time='column = "zeit [ms]"\nunit = "ms"',
+        encoder='column = "winkel [deg]", unit = "deg"',
+        current='column = "strom [mA]", unit = "mA"',
+    )
+    check(samples)
+    assert about["channels"]["current"]["unit"] == "A"
+    assert trial["status"] == "ok" and "decimal commas" in trial["repairs"]
+    assert "time stamps jitter by" in trial["repairs"] and "monotone cubic" in trial["repairs"]
+
+
+@pytest.mark.parametrize(
+    ("stamps", "time"),
+    [
+        (T, 'column = "t"\nunit = "s"'),
+        (1.79e9 + T, 'column = "t"\nunit = "s"'),
+        (np.rint(T * 1e9), 'column = "t"\nunit = "ns"'),
+        (1_790_000_000_000_000 + np.rint(T * 1e6), 'column = "t"\nunit = "us"'),
+        (
+            [f"2026-10-03T10:12:{t:09.6f}" for t in T],
+            'column = "t"\nunit = "datetime"',
+        ),
+        (
+            [f"03.10.2026 10:12:{t:09.6f}" for t in T],
+            'column = "t"\nunit = "datetime"\nformat = "%d.%m.%Y %H:%M:%S.%f"',
+        ),
+    ],
+)
+def test_clocks(tmp_path, stamps, time):
+    text = log({"t": stamps, "q": Q, "i": I})
+    samples, trial, _ = ingested(tmp_path, text, time=time, **PLAIN)
+    check(samples)
+    assert trial["status"] == "ok"
+
+
+def test_samples_that_are_counted(tmp_path):
+    samples, trial, _ = ingested(tmp_path, log({"q": Q, "i": I}), time='unit = "samples"', **PLAIN)
+    np.testing.assert_allclose(samples["t"], np.arange(1000) / RATE, atol=1e-12)
+    assert trial["repairs"] == "no time stamps: samples counted at 100 Hz"
+
+
+@pytest.mark.parametrize(
+    ("velocity", "said"),
+    [
+        ('{ column = "v", unit = "rad/s" }', ""),
+        ('{ column = "v", unit = "deg/s" }', "set aside: .*is 0.017.* times the change of 'q'"),
+        ('{ column = "i", unit = "rad/s" }', "is used for 2 channels"),
+        ('{ column = "w", unit = "rad/s" }', "set aside: .*is -1.* times the change of 'q'"),
+        ('{ column = "n", unit = "rad/s" }', "is not the velocity of joint"),
+        ('{ column = "v", unit = "m/s" }', 'found "m/s", expected a unit of velocity'),
+    ],
+)
+def test_a_recorded_velocity_checks_the_position(tmp_path, velocity, said):
+    noise = RNG.normal(size=1000)
+    text = log({"t": T, "q": Q, "v": QD, "w": -QD, "n": noise, "i": I})
+    encoder = f'column = "q", unit = "rad", velocity = {velocity}'
+    options = {"time": 'column = "t"\nunit = "s"', "encoder": encoder, "current": PLAIN["current"]}
+    if said.startswith(("set aside", "is used", "found")):
+        with pytest.raises(InputError, match=said.removeprefix("set aside: ")):
+            ingested(tmp_path, text, **options)
+        return
+    samples, trial, _ = ingested(tmp_path, text, **options)
+    check(samples)
+    assert list(samples) == ["trial_id", "t", "q_joint", "current"]
+    assert (said in trial["repairs"]) and ("velocity" in trial["repairs"]) == bool(said)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"encoder": 'column = "q [deg]", unit = "rad"'}, "gives the unit deg, session.toml rad"),
+        ({"current": 'column = "i [mA]", unit = "A"'}, "gives the unit mA, session.toml A"),
+        ({"time": 'column = "t [s]"\nunit = "ms"'}, "gives the unit s, session.toml ms"),
+        ({"current": 'column = "i [mA]", unit = "V"'}, "channels.current.unit: a unit of V, but"),
+        ({"time": 'column = "t [s]"\nunit = "samples"'}, "time.column: given although unit"),
+        ({"time": 'unit = "s"'}, "time: 'column' is missing"),
+        ({"time": 'column = "t [s]"\nunit = "s"\nformat = "%S"'}, 'only for unit = "datetime"'),
+        ({"encoder": 'column = "q [deg]", unit = "degree"'}, 'expected "rad" or "deg"'),
+    ],
+)
+def test_units_that_contradict_the_file_are_refused(tmp_path, change, said):
+    text = log({"t [s]": T, "q [deg]": np.rad2deg(Q), "i [mA]": 1e3 * I})
+    right = {
+        "time": 'column = "t [s]"\nunit = "s"',
+        "encoder": 'column = "q [deg]", unit = "deg"',
+        "current": 'column = "i [mA]", unit = "mA"',
+    }
+    check(ingested(tmp_path / "right", text, **right)[0])
+    with pytest.raises(InputError) as caught:
+        ingested(tmp_path / "wrong", text, **{**right, **change})
+    assert said in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_the_layout_that_a_session_declares(tmp_path):
+    text = "".join(f"{t:.6f} {q:.6f} {i:.6f}\n" for t, q, i in zip(T, Q, I, strict=True))
+    more = '[csv]\nnames = ["t", "q", "i"]'
+    check(ingested(tmp_path, text, time='column = "t"\nunit = "s"', more=more, **PLAIN)[0])
+
+
+@pytest.mark.parametrize(
+    ("text", "si", "scale"),
+    [
+        ("Nm", "N.m", 1.0), ("mNm", "N.m", 1e-3), ("N*mm", "N.m", 1e-3), ("kN", "N", 1e3),
+        ("mm/s", "m/s", 1e-3), ("°", "rad", np.pi / 180), ("rpm", "rad/s", np.pi / 30),
+        ("[deg/s]", "rad/s", np.pi / 180), ("µs", "s", 1e-6), ("mA", "A", 1e-3),
+        ("degC", "K", 1.0), ("-", "", 1.0), ("%", "", 0.01), ("m/s²", "m/s2", 1.0),
+        ("nm", "m", 1e-9), ("MN", "N", 1e6), ("lbf", "N", 4.4482216152605),
+    ],
+)  # fmt: skip
+def test_units_of_logs(text, si, scale):
+    found = unit(text)
+    assert found is not None
+    assert found.si == si and found.scale == pytest.approx(scale)
+
+
+@pytest.mark.parametrize("text", ["counts", "ticks", "furlong", "N.m.s/rad", "q", "m m m"])
+def test_units_that_are_not_known(text):
+    assert unit(text) is None
