@@ -37,6 +37,7 @@ COMMANDS = [
     "status",
     "verify",
     "version",
+    "init",
 ]
 
 

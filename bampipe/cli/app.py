@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import typer
 
 import bampipe
-from bampipe.cli import device, places, show
+from bampipe.cli import device, init, places, show
 from bampipe.cli.accept import accept
 from bampipe.cli.fetch import fetch
 from bampipe.cli.lab import lab, refresh
@@ -40,6 +40,7 @@ app = typer.Typer(
 )
 
 app.add_typer(device.app, name="device")
+app.command("init")(init.init)
 
 Session = Annotated[str, typer.Argument(help="Folder of a session: session.toml and its trials.")]
 Run = Annotated[

@@ -1,0 +1,68 @@
+"""``bampipe init``: a session file proposed for a folder of logs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from bampipe.cli import show
+
+
+def init(
+    folder: Annotated[Path, typer.Argument(help="Folder of logs; sub-folders are looked through.")],
+    device: Annotated[
+        str,
+        typer.Option(help="A built-in device, or a device file in the folder; guessed if omitted."),
+    ] = "",
+    dry: Annotated[
+        bool, typer.Option("--dry", help="Print the session file instead of writing it.")
+    ] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No advice.")] = False,
+) -> None:
+    """Propose a session.toml for a folder of logs, every guess marked; nothing is overwritten.
+
+    Example: bampipe init logs/2026-10-03
+
+    Example: bampipe init logs/2026-10-03 --device slider --dry
+    """
+    from bampipe.stages.proposal import propose, write_proposal
+
+    proposal = propose(folder, device)
+    written = [] if dry else write_proposal(folder, proposal)
+    if json:
+        show.as_json(
+            {
+                "session": proposal.session,
+                "device": proposal.device,
+                "written": [str(path) for path in written],
+                "fill_in": proposal.fill_in,
+                "check": proposal.check,
+                "left_out": proposal.passed,
+            }
+        )
+        return
+    if dry:
+        show.say(proposal.session.rstrip())
+        if proposal.device:
+            show.say("")
+            show.say(proposal.device.rstrip())
+    for path in written:
+        show.say(f"wrote {path}")
+    if quiet:
+        return
+    for title, lines in (
+        ("fill in, or the session is refused:", proposal.fill_in),
+        ("check, these are guesses:", proposal.check),
+        ("left out:", proposal.passed),
+    ):
+        if lines:
+            show.say("")
+            show.say(title)
+            for line in lines:
+                show.say(f"  {line}")
+    show.say("")
+    after = f"bampipe ingest {folder}" if not proposal.fill_in else f"edit {folder}/session.toml"
+    show.say(f"next: {after}")

@@ -1,0 +1,177 @@
+"""What a folder of logs holds, before anyone has said what its columns mean."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from bampipe.data.readers import ENDINGS, columns_of, read_trial
+from bampipe.data.units import unit
+from bampipe.errors import InputError
+
+MOST_FILES = 500
+_WORDS = {
+    "time": "t time timestamp stamp zeit clock seconds sec secs",
+    "reference": "goal ref reference setpoint target desired des cmd command soll demand wanted",
+    "brake": "brake bremse",
+    "velocity": "vel velocity speed qd dq qdot omega geschwindigkeit rate",
+    "force": "force f fx fy fz torque tau trq kraft moment loadcell wrench effort",
+    "current": "current curr i iq amp amps ampere strom coil",
+    "voltage": "volt volts voltage pwm duty supply vin",
+    "position": "pos position angle theta phi psi q enc encoder disp displacement x stroke winkel"
+    " weg joint deflection yaw pitch extension carriage counts",
+}
+_BY_UNIT = {
+    "s": "time", "datetime": "time", "rad": "position", "m": "position", "rad/s": "velocity",
+    "m/s": "velocity", "N": "force", "N.m": "force", "A": "current", "V": "voltage",
+}  # fmt: skip
+_UNIT_WORDS = {
+    "time": ("us", "ms", "ns", "s"),
+    "position": ("rad", "deg", "mm", "cm", "m"),
+    "velocity": ("rad/s", "deg/s", "mm/s", "m/s"),
+    "force": ("Nm", "kN", "N", "V"),
+    "current": ("mA", "A"),
+    "voltage": ("mV", "V"),
+}
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column that all logs of a folder have.
+
+    Attributes:
+        name: as the reader calls it.
+        stated: unit that the file gives, "" where it gives none.
+        role: time, position, velocity, force, current, voltage, brake, reference, or "".
+        unit: unit by the file, else by the name, "" where neither says.
+        values: (T,) of the first log.
+    """
+
+    name: str
+    stated: str
+    role: str
+    unit: str
+    values: np.ndarray
+
+    @property
+    def whole(self) -> bool:
+        """Whether all values are whole numbers, as counts are."""
+        known = self.values[np.isfinite(self.values)]
+        return bool(len(known)) and bool(np.all(known == np.rint(known)))
+
+    @property
+    def constant(self) -> bool:
+        """Whether the value never changes."""
+        known = self.values[np.isfinite(self.values)]
+        return len(known) == 0 or bool(np.ptp(known) == 0.0)
+
+
+@dataclass(frozen=True)
+class Survey:
+    """The logs of a folder.
+
+    Attributes:
+        files: paths relative to the folder, of the logs that have the same columns.
+        columns: what they hold, from the first of them.
+        remarks: what was found out about the layout of the first.
+        passed: other files, and why each is left out.
+    """
+
+    files: tuple[str, ...]
+    columns: tuple[Column, ...]
+    remarks: tuple[str, ...]
+    passed: tuple[tuple[str, str], ...]
+
+    def of(self, *roles: str) -> list[Column]:
+        """The columns with one of these roles."""
+        return [column for column in self.columns if column.role in roles]
+
+
+def survey(folder: Path) -> Survey:
+    """Look through the logs in ``folder`` and the folders in it.
+
+    Raises:
+        InputError: no such folder, no log in it, too many, or none that can be read.
+    """
+    if not folder.is_dir():
+        raise InputError("no such folder", where=str(folder))
+    paths = sorted(
+        path
+        for path in folder.rglob("*")
+        if path.suffix.lower() in ENDINGS
+        and path.is_file()
+        and not any(part.startswith(".") for part in path.relative_to(folder).parts)
+    )
+    if not paths:
+        raise InputError(
+            "no log in this folder",
+            where=str(folder),
+            remedy=f"logs end in {', '.join(ENDINGS)}",
+        )
+    if len(paths) > MOST_FILES:
+        raise InputError(f"{len(paths)} logs are more than {MOST_FILES}", where=str(folder))
+    found: dict[str, dict[str, str]] = {}
+    passed = []
+    for path in paths:
+        name = path.relative_to(folder).as_posix()
+        try:
+            found[name] = columns_of(path, name=name)
+        except InputError as error:
+            passed.append((name, str(error)))
+    if not found:
+        raise InputError("no log that can be read", where=str(folder), remedy=passed[0][1])
+    common = Counter(tuple(sorted(columns)) for columns in found.values()).most_common(1)[0][0]
+    files = [name for name, columns in found.items() if set(common) <= set(columns)]
+    passed += [(name, "has other columns") for name in found if name not in files]
+    columns, remarks = _columns(folder / files[0], files[0], found[files[0]], common)
+    return Survey(tuple(files), columns, remarks, tuple(passed))
+
+
+def _columns(
+    path: Path, name: str, stated: dict[str, str], common: tuple[str, ...]
+) -> tuple[tuple[Column, ...], tuple[str, ...]]:
+    wanted = [column for column in stated if column in common]
+    datetimes = {column: "" for column in wanted if stated[column] == "datetime"}
+    # A reader of several topics takes the first column for the time.
+    wanted.sort(key=lambda column: _role(column, stated[column]) != "time")
+    raw = read_trial(path, wanted, name=name, datetimes=datetimes)
+    found = []
+    for column in wanted:
+        said = raw.units.get(column, stated[column])
+        role = _role(column, said)
+        found.append(Column(column, said, role, _unit(column, said, role), raw.columns[column]))
+    return tuple(found), raw.remarks
+
+
+def words(name: str) -> list[str]:
+    """The words in the name of a column, in lower case."""
+    bare = re.sub(r"[\[(].*?[\])]", " ", name)
+    parts = re.split(r"[^A-Za-z]+", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", bare))
+    return [part.lower() for part in parts if part]
+
+
+def _role(name: str, stated: str) -> str:
+    if stated == "datetime":
+        return "time"
+    said = set(words(name))
+    first = [role for role in ("reference", "brake") if said & set(_WORDS[role].split())]
+    if first:
+        return first[0]
+    known = unit(stated)
+    if known is not None and known.si in _BY_UNIT:
+        return _BY_UNIT[known.si]
+    return next((role for role, text in _WORDS.items() if said & set(text.split())), "")
+
+
+def _unit(name: str, stated: str, role: str) -> str:
+    """Unit by the file, or by a last word of the name such as ``_us``."""
+    if stated:
+        return stated
+    parts = re.split(r"[_\W]+", name)
+    ending = parts[-1] if len(parts) > 1 else ""
+    matches = [u for u in _UNIT_WORDS.get(role, ()) if u.lower() == ending.lower()]
+    return matches[0] if matches else ""

@@ -1,0 +1,149 @@
+"""``bampipe init``: what is proposed for folders of logs, and that it is then a session."""
+
+from __future__ import annotations
+
+import shutil
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from other_labs import damper_log, joint_log, write_damper_logs, write_joint_logs
+
+from bampipe.data.store import read_parquet
+from bampipe.errors import InputError
+from bampipe.physics import registry
+from bampipe.physics.units import check_device
+from bampipe.stages import ingest
+from bampipe.stages.base import RunFolder, silent
+from bampipe.stages.proposal import propose, write_proposal
+
+ROOT = Path(__file__).resolve().parents[2]
+Command = Callable[..., tuple[int, str, str]]
+
+
+def samples(folder: Path, out: Path, trial: str):
+    """What ingest makes of a trial of the session in ``folder``."""
+    ingest.execute(RunFolder(out), out, ingest.Config(session=str(folder)), silent)
+    trials = read_parquet(out / "ingest/trials.parquet")
+    assert (trials["status"] != "set_aside").all(), trials["reason"].tolist()
+    return read_parquet(out / "ingest/samples.parquet", trial=trial)
+
+
+def proposed(folder: Path, device: str = "") -> tuple[dict, object]:
+    """Propose and write; the session as read back, and the proposal."""
+    proposal = propose(folder, device)
+    write_proposal(folder, proposal)
+    return tomllib.loads((folder / "session.toml").read_text()), proposal
+
+
+def test_a_joint_with_motor_current(tmp_path):
+    write_joint_logs(tmp_path / "arm")
+    session, proposal = proposed(tmp_path / "arm")
+    assert session["sample_rate_hz"] == 100 and proposal.fill_in == []
+    assert session["encoders"]["joint"] == {"column": "joint_angle", "unit": "deg"}
+    assert session["channels"]["motor_current"] == {"column": "motor_current", "unit": "mA"}
+    device = registry.device_from(tomllib.loads((tmp_path / "arm/device.toml").read_text()))
+    assert check_device(device) == [] and device.force_unit == "A"
+    found = samples(tmp_path / "arm", tmp_path / "out", "run_1")
+    truth = joint_log(1)
+    np.testing.assert_allclose(found["q_joint"], np.deg2rad(truth["joint_angle"]), atol=1e-7)
+    np.testing.assert_allclose(found["motor_current"], 1e-3 * truth["motor_current"], atol=1e-8)
+    np.testing.assert_allclose(found["t"], truth["stamp"] - truth["stamp"][0], atol=2e-6)
+
+
+def test_a_damper_with_a_coil(tmp_path):
+    write_damper_logs(tmp_path / "damper")
+    session, proposal = proposed(tmp_path / "damper")
+    assert session["sample_rate_hz"] == 1000 and proposal.fill_in == []
+    (axis,) = session["encoders"].values()
+    assert axis["column"] == "Displacement" and axis["unit"] == "mm"
+    assert axis["velocity"] == {"column": "Velocity", "unit": "mm/s"}
+    assert session["force"]["columns"] == ["Force"] and session["force"]["unit"] == "N"
+    assert session["channels"]["coil_current"] == {"column": "Current", "unit": "A"}
+    found = samples(tmp_path / "damper", tmp_path / "out", "versuch2")
+    truth = damper_log(2)
+    np.testing.assert_allclose(found["q_carriage"], 1e-3 * truth["Displacement"], atol=1e-8)
+    np.testing.assert_allclose(found["force_drive"], truth["Force"], atol=1e-5)
+
+
+def test_the_measured_axis_is_understood_from_its_motion(tmp_path):
+    shutil.copytree(ROOT / "sample_runs/positioning_axis/trials", tmp_path / "axis")
+    session, proposal = proposed(tmp_path / "axis", "slider")
+    shipped = tomllib.loads((ROOT / "sample_runs/positioning_axis/session.toml").read_text())
+    assert session["time"] == shipped["time"]
+    column = shipped["encoders"]["carriage"]["column"]
+    assert session["encoders"]["carriage"]["column"] == column
+    assert session["force"]["columns"] == shipped["force"]["columns"]
+    assert any("since the motion follows it" in line for line in proposal.check)
+    assert len(session["trials"]) >= 4
+    assert len(samples(tmp_path / "axis", tmp_path / "out", "record_2")) > 3000
+
+
+def test_a_signed_register_is_seen(tmp_path):
+    logs = ROOT.parent / "shared/real/servo_pendulum/raw"
+    if not logs.is_dir():
+        pytest.skip(f"{logs} is not here")
+    shutil.copytree(logs, tmp_path / "servo/raw")
+    session, _ = proposed(tmp_path / "servo", "servo_pendulum")
+    assert session["encoders"]["joint"]["column"] == "position"
+    duty, supply = session["channels"]["duty"], session["channels"]["supply"]
+    assert duty["column"] == "load" and duty["wrap_bits"] == 16 and duty["signed"]
+    assert supply["column"] == "input_volts"
+    assert len(session["trials"]) == 16
+
+
+def test_what_only_a_person_knows_is_left_open(tmp_path):
+    session = ROOT.parent / "shared/sessions/open-01"
+    if not session.is_dir():
+        pytest.skip(f"{session} is not here")
+    shutil.copytree(session / "trials", tmp_path / "arm/trials")
+    read, proposal = proposed(tmp_path / "arm")
+    assert read["device"] == "bam" and read["time"] == {"column": "time_us", "unit": "us"}
+    assert [t["kind"] for t in read["trials"]] == ["free"] * 5 + ["locked"] * 3
+    assert len(proposal.fill_in) == 5
+    text = (tmp_path / "arm/session.toml").read_text()
+    assert text.count("# fill in: ") == 5 and "# guess: " in text
+    with pytest.raises(InputError, match="counts_per_unit: found 0, expected the number of counts"):
+        ingest.execute(
+            RunFolder(tmp_path), tmp_path, ingest.Config(session=str(tmp_path / "arm")), silent
+        )
+
+
+def test_nothing_is_overwritten(tmp_path, command: Command):
+    write_joint_logs(tmp_path, 1)
+    (tmp_path / "device.toml").write_text("x = 1\n")
+    code, out, err = command("init", tmp_path)
+    assert (code, out) == (2, "") and "device.toml: is there already and is left alone" in err
+    assert not (tmp_path / "session.toml").exists()
+    (tmp_path / "device.toml").unlink()
+    assert command("init", tmp_path, "--dry")[0] == 0 and not (tmp_path / "session.toml").exists()
+    code, out, _ = command("init", tmp_path)
+    assert code == 0 and out.rstrip().splitlines()[-1].startswith("next: bampipe ")
+    before = (tmp_path / "session.toml").read_bytes()
+    code, _, err = command("init", tmp_path)
+    assert code == 2 and "there is a session.toml already; it is left alone" in err
+    assert (tmp_path / "session.toml").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("files", "device", "said"),
+    [
+        (None, "", "no such folder"),
+        ({}, "", "no log in this folder"),
+        ({"a.csv": "", "b.txt": "\0"}, "", "no log that can be read"),
+        ({"a.csv": "t,q,force\n" + "0,1,2\n" * 9}, "bma", "did you mean 'bam'"),
+        ({"a.csv": "t,q,force\n" + "0,1,2\n" * 9}, "x.toml", "x.toml: no such file"),
+        ({"a.csv": "t,a,b\n0,1,2\n1,2,3\n"}, "", "no column looks like a position"),
+    ],
+)
+def test_folders_that_cannot_be_proposed_for(tmp_path, command: Command, files, device, said):
+    folder = tmp_path / "logs"
+    if files is not None:
+        folder.mkdir()
+        for name, text in files.items():
+            (folder / name).write_text(text)
+    code, out, err = command("init", folder, *(["--device", device] if device else []))
+    assert (code, out) == (2, "") and said in err and len(err.splitlines()) == 1
+    assert not (folder / "session.toml").exists()
