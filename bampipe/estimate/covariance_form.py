@@ -22,6 +22,7 @@ def filter_covariance(  # type: ignore[no-untyped-def]
     u,
     y,
     observed,
+    reads_parameters,
     nx,
     mean,
     covariance,
@@ -58,7 +59,8 @@ def filter_covariance(  # type: ignore[no-untyped-def]
     innovation_factor = np.zeros((ny, ny))
     predicted = np.empty(ny)
     whitened = np.empty(ny)
-    work = scratch(nx, u.shape[1], p.shape[0], nw)
+    timing = p.shape[0] - 1
+    work = scratch(nx, u.shape[1], p, nw)
     means[0] = mean
     covariances[0] = covariance
     for k in range(1, t.shape[0]):
@@ -68,7 +70,7 @@ def filter_covariance(  # type: ignore[no-untyped-def]
             reason[0] = STATE_NOT_POSITIVE
             return k
         propagate_points(
-            derivative, mean, factor, reach, noise_sd, nx, p, free, logarithmic, lower, upper,
+            derivative, mean, factor, reach, noise_sd, nx, timing, free, logarithmic, lower, upper,
             u[k - 1], u[k], dt, substeps, points, work,
         )  # fmt: skip
         for i in range(nx):
@@ -108,8 +110,8 @@ def filter_covariance(  # type: ignore[no-untyped-def]
                 reason[0] = STATE_NOT_POSITIVE
                 return k
             measure_points(
-                measure, mean, factor, reach, nx, p, free, logarithmic, lower, upper, u[k],
-                observed, images, work,
+                measure, mean, factor, reach, nx, free, logarithmic, lower, upper, u[k], observed,
+                reads_parameters, images, work,
             )  # fmt: skip
             for i in range(ny):
                 middle = images[i, 2 * n]

@@ -21,6 +21,7 @@ KERNEL = int64(
     float64[:, ::1],  # u (T, nu)
     float64[:, ::1],  # y (T, ny), NaN where a reading is missing
     int64[::1],  # observed (ny,): which elements of h are in y
+    boolean,  # whether h depends on estimated parameters
     int64,  # nx
     float64[::1],  # mean (n,), in and out
     float64[:, ::1],  # covariance, or its lower root (n, n), in and out

@@ -33,8 +33,13 @@ def filter_trials_by_filterpy(
     covariance: Array,
     settings: FilterSettings,
     progress: Callable[[int], None] | None = None,
+    advance: Callable[..., None] = runge_kutta,
 ) -> FilterResult:
     """Filter trials in sequence, as `unscented.filter_trials` does; same arguments and result.
+
+    Args:
+        model, trials, theta, covariance, settings, progress: as there.
+        advance: carries one point over an interval, with the arguments of `runge_kutta`.
 
     Raises:
         FilterFailure: the covariance lost positive definiteness.
@@ -43,7 +48,9 @@ def filter_trials_by_filterpy(
     theta, covariance = np.asarray(theta, dtype=float), np.array(covariance, dtype=float)
     found = []
     for index, trial in enumerate(trials):
-        filtered, theta, covariance = _filter(model, index, trial, theta, covariance, settings)
+        filtered, theta, covariance = _filter(
+            model, index, trial, theta, covariance, settings, advance
+        )
         found.append(filtered)
         if progress is not None:
             progress(index + 1)
@@ -57,6 +64,7 @@ def _filter(
     theta: Array,
     covariance: Array,
     settings: FilterSettings,
+    advance: Callable[..., None],
 ) -> tuple[FilteredTrial, Array, Array]:
     """Filter one trial; return it and the parameters with their covariance after it."""
     try:
@@ -84,7 +92,7 @@ def _filter(
         late = p[-1] / dt * (u[k] - u[k - 1])
         start, end = u[k - 1] - late, u[k] - late
         substeps = max(1, int(np.ceil(dt / settings.longest_step - 1e-6)))
-        runge_kutta(model.derivative, x, start, end, p, w, dt, substeps, work)
+        advance(model.derivative, x, start, end, p, w, dt, substeps, work)
         return np.concatenate([x, point[nx:n], np.zeros(nw)])
 
     def read(point: Array, k: int) -> Array:

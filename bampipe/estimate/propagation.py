@@ -78,10 +78,13 @@ def place_parameters(point, nx, free, logarithmic, lower, upper, p):  # type: ig
         p[free[j]] = np.exp(value) if logarithmic[j] else value
 
 
-@njit(float64[:, ::1](int64, int64, int64, int64), cache=True)
-def scratch(nx, nu, n_parameters, nw):  # type: ignore[no-untyped-def]
-    """Scratch of `propagate_points` and `measure_points`; zeros, so that nothing in it is NaN."""
-    return np.zeros((8, ROWS * max(2 * nx, nu, n_parameters, nw)))
+@njit(float64[:, ::1](int64, int64, float64[::1], int64), cache=True)
+def scratch(nx, nu, p, nw):  # type: ignore[no-untyped-def]
+    """Scratch of `propagate_points` and `measure_points`, the parameters ``p`` in every row."""
+    work = np.zeros((8, ROWS * max(2 * nx, nu, p.shape[0], nw)))
+    for i in range(p.shape[0]):
+        work[6, i * ROWS : (i + 1) * ROWS] = p[i]
+    return work
 
 
 @njit(
@@ -101,34 +104,29 @@ def _spread(out, offset, centre, reach, root, n, pairs, first, count, padded):  
 
 @njit(
     void(
-        float64[::1], float64[:, ::1], float64, int64, int64, float64[::1], int64[::1],
-        boolean[::1], float64[::1], float64[::1], int64, int64, int64, float64[::1], float64[::1],
+        float64[::1], float64[:, ::1], float64, int64, int64, int64[::1], boolean[::1],
+        float64[::1], float64[::1], int64, int64, int64, float64[::1],
     ),
     cache=True,
     fastmath={"contract"},
 )  # fmt: skip
 def _place_rows(  # type: ignore[no-untyped-def]
-    mean, factor, reach, nx, pairs, p, free, logarithmic, lower, upper, first, count, padded, x, q
+    mean, factor, reach, nx, pairs, free, logarithmic, lower, upper, first, count, padded, q
 ):
-    """Write state ``x`` and parameters ``q`` of sigma points, parameters within their range."""
+    """Write the estimated parameters of sigma points into ``q``, within their range."""
     n = mean.shape[0]
-    for i in range(nx):
-        _spread(x, i * ROWS, mean[i], reach, factor[i], n, pairs, first, count, padded)
-    for i in range(p.shape[0]):
-        for r in range(padded):
-            q[i * ROWS + r] = p[i]
     for j in range(free.shape[0]):
         at = free[j] * ROWS
         _spread(q, at, mean[nx + j], reach, factor[nx + j], n, pairs, first, count, padded)
         if lower[j] > -np.inf:
-            for r in range(padded):
-                q[at + r] = max(q[at + r], lower[j])
+            for r in range(at, at + padded):
+                q[r] = max(q[r], lower[j])
         if upper[j] < np.inf:
-            for r in range(padded):
-                q[at + r] = min(q[at + r], upper[j])
+            for r in range(at, at + padded):
+                q[r] = min(q[r], upper[j])
         if logarithmic[j]:
-            for r in range(padded):
-                q[at + r] = np.exp(q[at + r])
+            for r in range(at, at + padded):
+                q[r] = np.exp(q[r])
 
 
 @njit(
@@ -178,14 +176,14 @@ def _runge_kutta_rows(derivative, count, nx, nu, dt, substeps, slope, work):  # 
 
 @njit(
     void(
-        DERIVATIVE_ROWS, float64[::1], float64[:, ::1], float64, float64[::1], int64,
-        float64[::1], int64[::1], boolean[::1], float64[::1], float64[::1], float64[::1],
+        DERIVATIVE_ROWS, float64[::1], float64[:, ::1], float64, float64[::1], int64, int64,
+        int64[::1], boolean[::1], float64[::1], float64[::1], float64[::1],
         float64[::1], float64, int64, float64[:, ::1], float64[:, ::1],
     ),
     cache=True,
 )  # fmt: skip
 def propagate_points(  # type: ignore[no-untyped-def]
-    derivative, mean, factor, reach, noise_sd, nx, p, free, logarithmic, lower, upper,
+    derivative, mean, factor, reach, noise_sd, nx, timing, free, logarithmic, lower, upper,
     u0, u1, dt, substeps, points, work,
 ):  # fmt: skip
     """Draw the sigma points of (state, parameters, process noise) and carry each over ``dt``.
@@ -197,15 +195,15 @@ def propagate_points(  # type: ignore[no-untyped-def]
         noise_sd: (nw,) of the process noise, independent of the state: its root is diagonal,
             which is why the (n + nw) root never needs to be formed.
         nx: length of the state.
-        p: (np + 1,) all parameters, then the time by which the inputs were sampled after the
-            positions, s, at most a fraction of ``dt``; those in ``free`` are not read.
-        free: (n - nx,) places of the estimated parameters in ``p``.
+        timing: place among the parameters of the time by which the inputs were sampled after
+            the positions, s, at most a fraction of ``dt``.
+        free: (n - nx,) places of the estimated parameters among all.
         logarithmic: (n - nx,) which of them are estimated as logarithms.
         lower, upper: (n - nx,) range of the estimated parameters, logarithms where so estimated.
         u0, u1: (nu,) input at both ends; dt: s; substeps: of the Runge-Kutta method.
         points: (nx, 1 + 2 (n + nw)) result, states only, for parameters stay: the points ahead
             of the mean along each column of the joint root, those behind it, the centre.
-        work: (8, ROWS * longest of the vectors) scratch, from `scratch`.
+        work: from `scratch`, which has put the other parameters in place.
     """
     n = mean.shape[0]
     nw = noise_sd.shape[0]
@@ -214,13 +212,14 @@ def propagate_points(  # type: ignore[no-untyped-def]
     rows = 1 + 2 * pairs
     slope = u1 - u0
     x, start, q, w = work[0], work[5], work[6], work[7]
-    timing = (p.shape[0] - 1) * ROWS
     for first in range(0, rows, ROWS):
         count = min(ROWS, rows - first)
         padded = (count + 3) // 4 * 4
+        for i in range(nx):
+            _spread(x, i * ROWS, mean[i], reach, factor[i], n, pairs, first, count, padded)
         _place_rows(
-            mean, factor, reach, nx, pairs, p, free, logarithmic, lower, upper,
-            first, count, padded, x, q,
+            mean, factor, reach, nx, pairs, free, logarithmic, lower, upper,
+            first, count, padded, q,
         )  # fmt: skip
         for i in range(nw):
             for r in range(padded):
@@ -231,7 +230,7 @@ def propagate_points(  # type: ignore[no-untyped-def]
                     w[i * ROWS + row - first] = distance * noise_sd[i]
         for i in range(nu):
             for r in range(padded):
-                start[i * ROWS + r] = u0[i] - q[timing + r] * (slope[i] / dt)
+                start[i * ROWS + r] = u0[i] - q[timing * ROWS + r] * (slope[i] / dt)
         _runge_kutta_rows(derivative, padded, nx, nu, dt, substeps, slope, work)
         for i in range(nx):
             for r in range(count):
@@ -240,24 +239,38 @@ def propagate_points(  # type: ignore[no-untyped-def]
 
 @njit(
     void(
-        MEASURE_ROWS, float64[::1], float64[:, ::1], float64, int64, float64[::1], int64[::1],
-        boolean[::1], float64[::1], float64[::1], float64[::1], int64[::1], float64[:, ::1],
-        float64[:, ::1],
+        MEASURE_ROWS, float64[::1], float64[:, ::1], float64, int64, int64[::1],
+        boolean[::1], float64[::1], float64[::1], float64[::1], int64[::1], boolean,
+        float64[:, ::1], float64[:, ::1],
     ),
     cache=True,
 )  # fmt: skip
 def measure_points(  # type: ignore[no-untyped-def]
-    measure, mean, factor, reach, nx, p, free, logarithmic, lower, upper, u, observed, images, work
+    measure,
+    mean,
+    factor,
+    reach,
+    nx,
+    free,
+    logarithmic,
+    lower,
+    upper,
+    u,
+    observed,
+    reads_parameters,
+    images,
+    work,
 ):
     """Draw sigma points of (state, parameters) afresh and take the measurement of each.
 
     Args:
         measure: h(count, x, u, p, y).
-        mean, factor, reach, nx, p, free, logarithmic, lower, upper: as in `propagate_points`.
+        mean, factor, reach, nx, free, logarithmic, lower, upper: as in `propagate_points`.
         u: (nu,) input at the time of the measurement.
         observed: (ny,) which elements of the model's measurement are used.
+        reads_parameters: whether h depends on estimated parameters.
         images: (ny, 1 + 2 n) result, in the order of `propagate_points`.
-        work: scratch, from `scratch`.
+        work: from `scratch`.
     """
     n = mean.shape[0]
     rows = 1 + 2 * n
@@ -265,10 +278,13 @@ def measure_points(  # type: ignore[no-untyped-def]
     for first in range(0, rows, ROWS):
         count = min(ROWS, rows - first)
         padded = (count + 3) // 4 * 4
-        _place_rows(
-            mean, factor, reach, nx, n, p, free, logarithmic, lower, upper,
-            first, count, padded, x, q,
-        )  # fmt: skip
+        for i in range(nx):
+            _spread(x, i * ROWS, mean[i], reach, factor[i], n, n, first, count, padded)
+        if reads_parameters:
+            _place_rows(
+                mean, factor, reach, nx, n, free, logarithmic, lower, upper,
+                first, count, padded, q,
+            )  # fmt: skip
         for i in range(u.shape[0]):
             for r in range(padded):
                 inputs[i * ROWS + r] = u[i]

@@ -55,10 +55,10 @@ def _predict(  # type: ignore[no-untyped-def]
     pairs = n + nw
     reach = spread**0.5
     states = np.empty((nx, 1 + 2 * pairs))
-    work = scratch(nx, u0.shape[0], p.shape[0], nw)
+    work = scratch(nx, u0.shape[0], p, nw)
     propagate_points(
-        derivative, mean, factor, reach, noise_sd, nx, p, free, logarithmic, lower, upper,
-        u0, u1, dt, substeps, states, work,
+        derivative, mean, factor, reach, noise_sd, nx, p.shape[0] - 1, free, logarithmic,
+        lower, upper, u0, u1, dt, substeps, states, work,
     )  # fmt: skip
     points = np.zeros((1 + 2 * pairs, n))  # as deviations from the mean
     predicted[:] = mean

@@ -16,6 +16,7 @@ from bampipe.estimate.triangular import (
     condition,
     covariance_of,
     forward_substitute,
+    padded,
     rank_one_update,
     transpose,
 )
@@ -29,6 +30,7 @@ def filter_square_root(  # type: ignore[no-untyped-def]
     u,
     y,
     observed,
+    reads_parameters,
     nx,
     mean,
     factor,
@@ -68,17 +70,18 @@ def filter_square_root(  # type: ignore[no-untyped-def]
     pairs = n + nw
     points = np.empty((nx, 1 + 2 * pairs))
     images = np.empty((ny, 1 + 2 * n))
-    root = np.empty((n, n))  # R = L^T, so that what is rotated together is contiguous
-    columns = np.empty((n, max(n, pairs + nw)))
-    noise_columns = np.empty((ny, n))
+    root = np.zeros((n, padded(n)))  # R = L^T, so that what is rotated together is contiguous
+    columns = np.zeros((n, padded(pairs + nw)))
+    noise_columns = np.zeros((ny, padded(n)))
     noise = np.empty((ny, ny))
     cross = np.empty((ny, n))
-    gain = np.empty((ny, n))
+    gain = np.empty((ny, padded(n)))
     cosine, sine = np.empty(n + 1), np.empty(n + 1)
     single = np.empty(max(n, ny))
     predicted = np.empty(ny)
     whitened = np.empty(ny)
-    work = scratch(nx, u.shape[1], p.shape[0], nw)
+    timing = p.shape[0] - 1
+    work = scratch(nx, u.shape[1], p, nw)
     centre_image = centre + 2 * nw * other
     log_normal = 0.5 * ny * np.log(2.0 * np.pi)
     walking = False
@@ -93,7 +96,7 @@ def filter_square_root(  # type: ignore[no-untyped-def]
         dt = t[k] - t[k - 1]
         substeps = max(1, int(np.ceil(dt / longest_step - 1e-6)))
         propagate_points(
-            derivative, mean, factor, reach, noise_sd, nx, p, free, logarithmic, lower, upper,
+            derivative, mean, factor, reach, noise_sd, nx, timing, free, logarithmic, lower, upper,
             u[k - 1], u[k], dt, substeps, points, work,
         )  # fmt: skip
         for i in range(nx):
@@ -114,8 +117,10 @@ def filter_square_root(  # type: ignore[no-untyped-def]
             single[i] = abs(centre) ** 0.5 * (middle - mean[i])
             for j in range(n):
                 root[i, j] = 0.0
-        append_rows(root, nx, columns, pairs + nw)
+        append_rows(root, nx, columns, padded(pairs + nw))
         for i in range(n):
+            for pair in range(n, padded(n)):
+                columns[i, pair] = 0.0
             for pair in range(n):
                 columns[i, pair] = (
                     half * (points[i, pair] - points[i, pairs + pair])
@@ -127,7 +132,7 @@ def filter_square_root(  # type: ignore[no-untyped-def]
             for j in range(n):
                 root[i, j] = walk_sd[i - nx] * dt**0.5 if i == j else 0.0
         # Columns of the state first; then the parameters' rows start from their random walk.
-        append_rows(root, n, columns, n)
+        append_rows(root, n, columns, padded(n))
         if centre != 0.0 and not rank_one_update(root, n, 1.0 if centre > 0.0 else -1.0, single):
             reason[0] = STATE_NOT_POSITIVE
             return k
@@ -141,8 +146,8 @@ def filter_square_root(  # type: ignore[no-untyped-def]
         if not missing:
             transpose(root, factor)
             measure_points(
-                measure, mean, factor, reach, nx, p, free, logarithmic, lower, upper, u[k],
-                observed, images, work,
+                measure, mean, factor, reach, nx, free, logarithmic, lower, upper, u[k], observed,
+                reads_parameters, images, work,
             )  # fmt: skip
             for i in range(ny):
                 middle = images[i, 2 * n]
@@ -161,7 +166,7 @@ def filter_square_root(  # type: ignore[no-untyped-def]
                 for j in range(ny):
                     noise[i, j] = reading_sd[i] if i == j else 0.0
                 single[i] = abs(centre_image) ** 0.5 * (middle - predicted[i])
-            append_rows(noise, ny, noise_columns, n)
+            append_rows(noise, ny, noise_columns, padded(n))
             if not rank_one_update(noise, ny, 1.0 if centre_image >= 0.0 else -1.0, single):
                 reason[0] = INNOVATION_NOT_POSITIVE
                 return k

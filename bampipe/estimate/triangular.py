@@ -1,7 +1,7 @@
 """Triangular factors of covariances, compiled: Cholesky, QR, rotations, substitution.
 
-All matrices are float64 and C-contiguous; factors are lower triangular. The loops replace
-LAPACK because at 13 x 13 the call and its allocations cost more than the arithmetic.
+All matrices are float64 and C-contiguous. The loops replace LAPACK because at 13 x 13 the call
+and its allocations cost more than the arithmetic.
 """
 
 from numba import boolean, float64, int64, void
@@ -9,6 +9,19 @@ from numba import boolean, float64, int64, void
 from bampipe.compiled import njit
 
 _REASSOCIATE = {"reassoc", "nsz", "contract"}  # lets sums use vector registers; NaN stays NaN
+
+
+_LANES = 16
+
+
+@njit(int64(int64), cache=True)
+def padded(n):  # type: ignore[no-untyped-def]
+    """Return the least length from ``n`` on that fills whole vector registers, unrolled.
+
+    Loops over rows padded with zeros to this length are faster than shorter ones with a
+    remainder.
+    """
+    return (n + _LANES - 1) // _LANES * _LANES
 
 
 @njit(boolean(float64[:, ::1], float64[:, ::1]), cache=True, fastmath=_REASSOCIATE)
@@ -102,14 +115,15 @@ def condition(upper, noise, cross, gain, cosine, sine):  # type: ignore[no-untyp
     is subtracted, so that positive definiteness cannot be lost.
 
     Args:
-        upper: (n, n) R with R^T R the covariance of the state, in and out.
+        upper: (n, width) R with R^T R the covariance of the state, in and out; zeros below the
+            diagonal and beyond column n (`padded`).
         noise: (ny, ny) lower root of what the state leaves open of the readings; becomes the
             lower root of the innovation's covariance.
         cross: (ny, n) readings along the columns of R^T; destroyed.
-        gain: (ny, n) result: transposed gain for the innovation divided by its root.
+        gain: (ny, width) result: transposed gain for the innovation divided by its root.
         cosine, sine: (n + 1,) scratch.
     """
-    n = upper.shape[0]
+    n, width = upper.shape
     ny = noise.shape[0]
     for i in range(ny):
         square = noise[i, i] * noise[i, i]
@@ -125,13 +139,13 @@ def condition(upper, noise, cross, gain, cosine, sine):  # type: ignore[no-untyp
             turned = root > 0.0
             sine[j] = cross[i, j] / root if turned else 0.0
             cosine[j] = cosine[j + 1] / root if turned else 1.0
-        for k in range(n):
+        for k in range(width):
             gain[i, k] = 0.0
         for j in range(n - 1, -1, -1):
             s, c = sine[j], cosine[j]
             if s == 0.0:
                 continue
-            for k in range(j, n):
+            for k in range(width):
                 old = upper[j, k]
                 upper[j, k] = c * old - s * gain[i, k]
                 gain[i, k] = s * old + c * gain[i, k]
@@ -188,7 +202,7 @@ def rank_one_update(upper, n, sign, vector):  # type: ignore[no-untyped-def]
 
 @njit(void(float64[:, ::1], float64[:, ::1]), cache=True)
 def transpose(upper, factor):  # type: ignore[no-untyped-def]
-    """Write the transpose of the upper triangular R (n, n) into ``factor`` (n, n)."""
+    """Write the transpose of the upper triangular R (n, >= n) into ``factor`` (n, n)."""
     n = upper.shape[0]
     for i in range(n):
         for j in range(i + 1):
@@ -199,7 +213,7 @@ def transpose(upper, factor):  # type: ignore[no-untyped-def]
 
 @njit(void(float64[:, ::1], float64[:, ::1]), cache=True, fastmath=_REASSOCIATE)
 def covariance_of(upper, covariance):  # type: ignore[no-untyped-def]
-    """Write R^T R into ``covariance`` (n, n), R upper triangular (n, n) with zeros below."""
+    """Write R^T R into ``covariance`` (n, n), R upper triangular (n, >= n), zeros below."""
     n = upper.shape[0]
     for i in range(n):
         for j in range(n):

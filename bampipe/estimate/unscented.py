@@ -72,6 +72,8 @@ class FilterModel:
         free: (nt,) places of the estimated parameters in ``parameters``.
         lower, upper: (nt,) physical range of the estimated parameters; infinite where none; see
             the module docstring on when it is kept.
+        reads_parameters: whether the measurement depends on estimated parameters; where it does
+            not, the filter need not work them out twice a step.
     """
 
     derivative: Callable[..., Any]
@@ -83,6 +85,7 @@ class FilterModel:
     free: NDArray[np.int64]
     lower: Array
     upper: Array
+    reads_parameters: bool = True
 
     @property
     def logarithmic(self) -> NDArray[np.bool_]:
@@ -247,21 +250,22 @@ def filter_trials(
         failed = kernel(
             model.derivative_rows,
             model.measure_rows,
-            np.ascontiguousarray(trial.t, dtype=float),
-            np.ascontiguousarray(trial.u, dtype=float),
-            np.ascontiguousarray(trial.y, dtype=float),
-            np.ascontiguousarray(settings.observed, dtype=np.int64),
+            _array(trial.t),
+            _array(trial.u),
+            _array(trial.y),
+            _array(settings.observed, np.int64),
+            model.reads_parameters,
             nx,
             mean,
             joint,
             parameters,
-            np.ascontiguousarray(model.free, dtype=np.int64),
-            np.ascontiguousarray(model.logarithmic),
+            _array(model.free, np.int64),
+            _array(model.logarithmic, np.bool_),
             lower,
             upper,
-            np.ascontiguousarray(settings.noise_sd, dtype=float),
-            np.ascontiguousarray(settings.walk_sd, dtype=float),
-            np.ascontiguousarray(settings.reading_sd, dtype=float),
+            _array(settings.noise_sd),
+            _array(settings.walk_sd),
+            _array(settings.reading_sd),
             weights,
             float(settings.longest_step),
             int(settings.stride),
@@ -330,6 +334,11 @@ def _kernel(square_root: bool) -> Callable[..., int]:
     from bampipe.estimate.covariance_form import filter_covariance
 
     return filter_covariance
+
+
+def _array(values: Any, kind: type = np.float64) -> NDArray[Any]:
+    """``values`` as compiled code takes them: table columns, for one, are read-only."""
+    return np.require(values, dtype=kind, requirements=["C", "W"])
 
 
 def lower_root(covariance: Array) -> Array:

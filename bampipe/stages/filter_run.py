@@ -131,6 +131,7 @@ def filter_model(
         free=np.array(places, dtype=np.int64),
         lower=np.array(lower),
         upper=np.array(upper),
+        reads_parameters=system.moves_sensors,
     )
 
 

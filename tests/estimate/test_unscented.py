@@ -191,7 +191,7 @@ def test_continued_in_parts_is_the_same() -> None:
         filter_covariance(
             slider.derivative_rows, slider.measure_rows,
             trial.t[part], trial.u[part], trial.y[part],
-            chosen.observed, 2, state, covariance, slider.parameters.copy(), slider.free,
+            chosen.observed, True, 2, state, covariance, slider.parameters.copy(), slider.free,
             slider.logarithmic, lower, upper, chosen.noise_sd, chosen.walk_sd, chosen.reading_sd,
             weights, chosen.longest_step, 1, np.empty((2, 5)), np.empty((2, 5, 5)),
             np.empty((2, 1)), np.empty((2, 1)), np.empty((2, 2)), np.zeros(1, dtype=np.int64),
