@@ -154,7 +154,7 @@ def _unpack(group: str, symbols: Sequence[Any], used: set[Any], place: str = "{}
     return [f"{s} = {group}[{place.format(i)}]" for i, s in enumerate(symbols) if s in used]
 
 
-def _function(name: str, groups: dict[str, Sequence[Any]], results: Sequence[Any]) -> str:
+def function_source(name: str, groups: dict[str, Sequence[Any]], results: Sequence[Any]) -> str:
     """A function of groups of columns that returns one column a result."""
     used = set().union(*(sp.sympify(e).free_symbols for e in results)) if results else set()
     lines, values = _block(results)
@@ -178,23 +178,23 @@ def array_source(e: Equations, added: Sequence[Any]) -> str:
     ]
     parts = [
         ARRAY_HEADER,
-        _function("required", {**motion, "z": e.z, "u": e.u, "p": e.p}, required),
-        _function("applied", {**motion, "z": e.z, "u": e.u, "p": e.p}, e.applied),
-        _function(
+        function_source("required", {**motion, "z": e.z, "u": e.u, "p": e.p}, required),
+        function_source("applied", {**motion, "z": e.z, "u": e.u, "p": e.p}, e.applied),
+        function_source(
             "contribution",
             {**motion, "z": e.z, "u": e.u, "p": e.p},
             [expr for expr in added if expr != 0],
         ),
-        _function("true_motion", {**motion, "u": e.u, "p": e.p}, true),
-        _function(
+        function_source("true_motion", {**motion, "u": e.u, "p": e.p}, true),
+        function_source(
             "input_map",
             {"q": e.q, "u": e.u, "p": e.p},
             [entry for row in e.input_map for entry in row],
         ),
-        _function("initial_memory", {"q": e.q, "u": e.u, "p": e.p}, e.initial),
-        _function("mass_matrix", {"q": e.q, "p": e.p}, [m for row in e.mass for m in row]),
-        _function("energy", {"q": e.q, "qd": e.qd, "p": e.p}, [e.kinetic, e.potential]),
-        _function(
+        function_source("initial_memory", {"q": e.q, "u": e.u, "p": e.p}, e.initial),
+        function_source("mass_matrix", {"q": e.q, "p": e.p}, [m for row in e.mass for m in row]),
+        function_source("energy", {"q": e.q, "qd": e.qd, "p": e.p}, [e.kinetic, e.potential]),
+        function_source(
             "compensation",
             {"q": e.q, "qd": e.qd, "z": e.z, "u": e.u, "p": e.p},
             [expr for expr in e.compensation if expr != 0],

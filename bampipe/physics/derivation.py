@@ -43,7 +43,7 @@ class Equations:
         input_map: d applied / d force of the device itself.
         rates, initial: of the internal states.
         offset, offset_rate, offset_acceleration: q_true - q_measured and its derivatives.
-        kinetic, potential: energies.
+        kinetic, potential: energies, as declared, definitions put in.
         linear: for each parameter, whether the residual is linear in it.
         compensation: per coordinate, the part of Q_other that balances gravity there: see
             `_compensation`; zero where nothing does.

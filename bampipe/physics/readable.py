@@ -23,6 +23,12 @@ class _Notation(StrPrinter):  # type: ignore[misc]
         return super()._print_Mul(expr).replace("*", " ")
 
 
+def notation(expr: Any, names: Mapping[Any, str]) -> str:
+    """``expr`` as text, its symbols by ``names``."""
+    plain = {symbol: sp.Symbol(name, real=True) for symbol, name in names.items()}
+    return str(_Notation().doprint(expr.xreplace(plain)))
+
+
 def describe_equations(device: Device) -> str:
     """The derived equations of motion, line by line.
 

@@ -12,17 +12,10 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from bampipe.data.store import read_parquet, write_json, write_parquet
-from bampipe.discover.recording import Motion as Driven
-from bampipe.discover.recording import Recording, Sensors
-from bampipe.discover.replay import replay
 from bampipe.errors import InputError
-from bampipe.estimate import butterworth, kalman_smoother, savitzky_golay
-from bampipe.estimate.differentiation import Derivatives
-from bampipe.estimate.hysteresis import noise_of
 from bampipe.estimate.least_squares import Problem, fit
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import System, compile_model
-from bampipe.physics.device import derivative
 from bampipe.stages.base import Progress, RunFolder
 from bampipe.stages.free_run import free_runs
 from bampipe.stages.modelfile import load_model, model_inputs
@@ -33,6 +26,7 @@ from bampipe.stages.motions import (
     problem_of,
     read_motion,
 )
+from bampipe.stages.replayed import replayed
 
 NAME = "validate"
 SUMMARY = "Predicted against measured torque and force, on trials that the fit has not seen"
@@ -279,31 +273,11 @@ def _noise_floor(
     filters and fits as the measurement.
     """
     settings = run.read_json("filter/filter.json")
-    noise = session["force"]["noise_sd"]
-    resolution = [session["axes"][axis].get("resolution") or 0.0 for axis in system.coordinates]
-    quiet = [settings["axes"][axis]["measurement_noise_sd"] for axis in system.coordinates]
-    sensors = Sensors(
-        rate_hz=band.rate_hz,
-        resolution=np.where(
-            np.array(resolution) > 0.0, resolution, np.sqrt(12.0) * np.array(quiet)
-        ),
-        force_sd=_force_noise(system, motions, noise),
-    )
     squares, counts = np.zeros(len(system.coordinates)), np.zeros(len(system.coordinates))
     parameters = p[: len(system.parameters)]
     for repeat in range(config.repeats):
-        seen = []
-        for number, motion in enumerate(motions):
-            rng = np.random.default_rng([config.seed, repeat, number])
-            channels = dict(zip(system.inputs, motion.u.T, strict=True))
-            for axis in system.coordinates:
-                brake = system.model.device.brakes.get(axis)
-                channels.setdefault(brake or axis, np.zeros(len(motion.t)))
-            for name in system.model.device.channels:
-                channels.setdefault(name, np.zeros(len(motion.t)))
-            driven = Driven(motion.trial_id, motion.t, motion.q, motion.qd, motion.qdd, channels)
-            recording = replay(system, parameters, driven, sensors, rng)
-            seen.append(_filtered(recording, motion, system, settings, band.rate_hz))
+        seed = (config.seed, repeat)
+        seen = replayed(session, settings, system, motions, parameters, band.rate_hz, seed)
         problem = problem_of(system, seen, band)
         start = np.append(parameters, 0.0)
         for k, held in enumerate(_held_out(problem, start, groups)):
@@ -314,61 +288,6 @@ def _noise_floor(
             squares += np.sum(residual**2, axis=0)
             counts += used.sum(axis=0)
     return np.asarray(np.sqrt(squares / np.maximum(counts, 1.0)))
-
-
-def _force_noise(system: System, motions: Sequence[Motion], stated: float | None) -> Array:
-    """Return the noise (n_f,) of the force channels: as stated, else from the samples."""
-    forces = system.model.device.forces
-    if stated is not None:
-        return np.full(len(forces), float(stated))
-    columns = [system.inputs.index(name) for name in forces]
-    return np.median([[noise_of(m.u[:, c]) for c in columns] for m in motions], axis=0)
-
-
-def _filtered(
-    recording: Recording,
-    motion: Motion,
-    system: System,
-    settings: Mapping[str, Any],
-    rate: float,
-) -> Motion:
-    """Return a replayed trial after the filters that the measured one went through."""
-    moved = [
-        _differentiated(recording.q[:, i], settings["method"], settings["axes"][axis], rate)
-        for i, axis in enumerate(system.coordinates)
-    ]
-    u, u_rate = motion.u.copy(), np.zeros_like(motion.u)
-    cutoff = settings["force"]["derivative_cutoff_hz"]
-    at = {name: place for place, name in enumerate(system.inputs)}
-    for column, name in enumerate(system.model.device.forces):
-        _, first, second = butterworth.zero_phase(recording.force[:, column], rate, cutoff)
-        u[:, at[name]], u_rate[:, at[name]] = recording.force[:, column], first
-        _, third, fourth = butterworth.zero_phase(second, rate, cutoff)
-        for order, values in enumerate((first, second, third, fourth), start=1):
-            if derivative(name, order) in at:
-                u[:, at[derivative(name, order)]] = values
-    return replace(
-        motion,
-        q=np.stack([m.position for m in moved], axis=1),
-        qd=np.stack([m.velocity for m in moved], axis=1),
-        qdd=np.stack([m.acceleration for m in moved], axis=1),
-        u=u,
-        u_rate=u_rate,
-    )
-
-
-def _differentiated(
-    position: Array, method: str, axis: Mapping[str, Any], rate: float
-) -> Derivatives:
-    """Differentiate as ``filter/filter.json`` says that the measured positions were."""
-    noise_sd, cutoff = float(axis["measurement_noise_sd"]), float(axis["bandwidth_hz"])
-    if method == "kalman":
-        order = int(axis["order"])
-        ratio = kalman_smoother.ratio_for(cutoff, order, rate)
-        model = kalman_smoother.MotionModel(order, noise_sd, ratio, rate)
-        return kalman_smoother.smooth(position, model)
-    smooth = butterworth.smooth if method == "butterworth" else savitzky_golay.smooth
-    return smooth(position, rate, cutoff, noise_sd)
 
 
 def _rms(values: Sequence[Array], used: Sequence[NDArray[np.bool_]]) -> Array:

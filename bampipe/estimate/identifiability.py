@@ -1,0 +1,155 @@
+"""What data can say of parameters at best: information, its weak directions, its share by trial.
+
+The residual of the inverse dynamics, e = D(theta) y - B u, is linear in what the sensors add to
+the motion y and the force u. With white sensor noise its spectrum is known, and the information on
+theta is that of a regression in coloured noise (Whittle 1953): the sum over frequencies of slope
+times slope over spectrum. Its inverse is the Cramér-Rao bound on the covariance of any unbiased
+estimate. Everything here sees arrays and callables only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.estimate.least_squares import Problem
+
+Array = NDArray[np.float64]
+
+
+def slopes(problem: Problem, trial: int, p: Array) -> Array:
+    """Slope of the unfiltered residual of one trial by every free parameter, (T, n_q, n_free).
+
+    Args:
+        problem: the model as residuals.
+        trial: index of the trial.
+        p: (np,) parameters at which to take it, by forward differences.
+    """
+    base = problem.residual(trial, p)
+    found = np.empty((*base.shape, problem.free.size))
+    for k, place in enumerate(problem.free):
+        moved = p.copy()
+        moved[place] += problem.step[k]
+        if moved[place] > problem.upper[k]:
+            moved[place] = p[place] - problem.step[k]
+        found[:, :, k] = (problem.residual(trial, moved) - base) / (moved[place] - p[place])
+    return found
+
+
+def residual_spectrum(
+    count: int,
+    rate_hz: float,
+    inertia: Array,
+    damping: Array,
+    reading_sd: Array,
+    force_sd: Array,
+) -> Array:
+    """Spectrum of what sensor noise puts into the residual, (count // 2 + 1, n_q).
+
+    In squared units of the residual a sample, at the frequencies of a real discrete Fourier
+    transform of ``count`` samples.
+
+    Args:
+        count: samples; rate_hz: of them.
+        inertia, damping: (n_q,) of each axis: noise of a position reading acts through them.
+        reading_sd: (n_q,) of a position reading; force_sd: (n_q,) of the generalised force.
+    """
+    omega = 2.0 * np.pi * np.fft.rfftfreq(count, 1.0 / rate_hz)[:, None]
+    gain = (inertia * omega**2) ** 2 + (damping * omega) ** 2
+    return np.asarray(force_sd**2 + reading_sd**2 * gain)
+
+
+def information(slope: Array, spectrum: Array) -> Array:
+    """Fisher information of one trial, (n, n).
+
+    Args:
+        slope: (T, n_q, n) of the residual, zero where an axis stands still.
+        spectrum: (T // 2 + 1, n_q) of the residual's noise, positive.
+    """
+    transformed = np.fft.rfft(slope, axis=0, norm="ortho")
+    weight = np.full(len(spectrum), 2.0)  # each bin stands for itself and its negative
+    weight[0] = 1.0
+    if len(slope) % 2 == 0:
+        weight[-1] = 1.0
+    scaled = transformed * np.sqrt(weight[:, None] / spectrum)[:, :, None]
+    flat = scaled.reshape(-1, slope.shape[2])
+    return np.asarray((flat.conj().T @ flat).real)
+
+
+def bound(matrix: Array) -> Array:
+    """Cramér-Rao bound: inverse of the information, infinite for what it says nothing of.
+
+    Args:
+        matrix: (n, n), symmetric, not negative.
+
+    Returns:
+        (n, n) covariance; rows and columns of parameters in the null space are infinite.
+    """
+    scale = np.sqrt(np.diag(matrix))
+    silent = scale == 0.0
+    scale = np.where(silent, 1.0, scale)
+    value, vector = np.linalg.eigh(matrix / np.outer(scale, scale))
+    null = value < 1e-12 * max(value[-1], 1e-300)
+    inverse = (vector[:, ~null] / value[~null]) @ vector[:, ~null].T / np.outer(scale, scale)
+    lost = silent | (np.abs(vector[:, null]) > 1e-6).any(axis=1)
+    inverse[lost] = inverse[:, lost] = 0.0
+    inverse[lost, lost] = np.inf
+    return np.asarray(inverse)
+
+
+@dataclass(frozen=True)
+class Weak:
+    """A direction in which parameters can move at little cost, as they hide each other.
+
+    Attributes:
+        members: places of the parameters that move, largest part first.
+        parts: (len(members),) by how much each moves, in its own standard deviations with all
+            others known; the largest is 1.
+        strength: share of information that is left in this direction, 0 to 1.
+    """
+
+    members: tuple[int, ...]
+    parts: tuple[float, ...]
+    strength: float
+
+
+def weak_directions(matrix: Array, limit: float = 0.1, smallest_part: float = 0.3) -> list[Weak]:
+    """Return the directions that hold less than ``limit`` of what each parameter alone would.
+
+    Args:
+        matrix: (n, n) information.
+        limit: on the eigenvalues of the information scaled to a unit diagonal.
+        smallest_part: parameters that move less than this share of the largest are left out.
+    """
+    scale = np.sqrt(np.diag(matrix))
+    scale[scale == 0.0] = 1.0
+    value, vector = np.linalg.eigh(matrix / np.outer(scale, scale))
+    found = []
+    for k in np.flatnonzero(value < limit):
+        parts = vector[:, k] / vector[np.argmax(np.abs(vector[:, k])), k]
+        order = [int(i) for i in np.argsort(-np.abs(parts)) if abs(parts[i]) >= smallest_part]
+        if len(order) > 1:
+            shown = tuple(float(parts[i]) for i in order)
+            found.append(Weak(tuple(order), shown, float(max(value[k], 0.0))))
+    return found
+
+
+def growth_without(parts: Sequence[Array]) -> Array:
+    """By how much each parameter's bound would grow without one of the trials, (trials, n).
+
+    0.1 stands for ten per cent; infinite where the others say nothing of it.
+
+    Args:
+        parts: by trial, (n, n) information.
+    """
+    total = np.sum(parts, axis=0)
+    with_all = np.sqrt(np.diag(bound(total)))
+    rows = []
+    for part in parts:
+        without = np.sqrt(np.diag(bound(total - part)))
+        known = np.isfinite(with_all) & (with_all > 0.0)
+        rows.append(np.where(known, without / np.where(known, with_all, 1.0) - 1.0, 0.0))
+    return np.array(rows)

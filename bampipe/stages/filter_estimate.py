@@ -1,0 +1,147 @@
+"""The unscented filter's estimate: noise levels, convergence, all trials, honest intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.errors import InputError
+from bampipe.estimate.filter_uncertainty import sandwich_covariance
+from bampipe.estimate.unscented import constrain
+from bampipe.physics import System
+from bampipe.stages.base import Progress, RunFolder
+from bampipe.stages.estimates import Estimate, timing_entry
+from bampipe.stages.filter_choice import FilterChoice
+from bampipe.stages.filter_run import (
+    Attempt,
+    filter_model,
+    run_filter,
+    stride_of,
+    trial_of,
+)
+from bampipe.stages.filter_tables import convergence, mean_nis, state_3sigma, states, trace
+from bampipe.stages.motions import Motion
+from bampipe.stages.sensor_noise import Noise, noise_report, tuned, untuned
+from bampipe.stages.squares_estimate import Squares, bias_details
+
+Array = NDArray[np.float64]
+
+_RESTARTS = 5
+"""Further searches, each with four times the process noise of the one before."""
+
+
+def estimate_by_filter(
+    run: RunFolder,
+    system: System,
+    motions: Sequence[Motion],
+    start: Array,
+    squares: Squares,
+    noise: Noise,
+    choice: FilterChoice,
+    model_name: str,
+    progress: Progress,
+) -> Estimate:
+    """Tune the noise, converge on the first trial, then filter all trials.
+
+    Args:
+        run: the run folder; system: the model; motions: the trials.
+        start: (n_p,) starting values.
+        squares: least squares, which gives the region of the answer and checks it.
+        noise: of the sensors; choice: of the filter; model_name: for messages.
+        progress: told how far it is.
+
+    Raises:
+        InputError: the filter does not follow the motion.
+    """
+    stride = stride_of(motions)
+    trials = [trial_of(run, motion, system, noise, stride, choice) for motion in motions]
+    problem = squares.problem
+    free = [item for item in system.parameters if not item.fixed]
+    kept = len(free)
+    timing = problem.free.size > kept
+    model = filter_model(system, trials, start, timing)
+    progress(0.15, "noise levels")
+    late_sd = model.upper[kept:] / np.sqrt(3.0)
+    late = np.zeros(late_sd.size)
+    settled = np.append(squares.raw.p[problem.free[:kept]], late)
+    known = np.append(np.sqrt(np.diag(squares.raw.covariance))[:kept], late_sd)
+    settings = untuned(system, noise, choice)
+    settings = replace(settings, walk_sd=np.append(settings.walk_sd, late))
+    settings = tuned(settings, model, trials, settled, known, noise, choice)
+    settings = replace(settings, stride=stride)
+    prior_sd = np.append([item.sd for item in free], late_sd)
+    first = np.append(start[problem.free[:kept]], late)
+    spread = np.hypot(prior_sd, first - np.append(system.prior[problem.free[:kept]], late))
+    # If the prior does not lead to the answer, the search starts from least squares, then with
+    # more and more process noise, as a model that lacks much needs.
+    attempts: list[Attempt] = [(first, spread, 1.0)]
+    attempts += [(settled, prior_sd, 4.0**k) for k in range(_RESTARTS)]
+
+    def told(done: int, place: int) -> None:
+        progress(0.35 + 0.6 * done / (len(trials) + 1), motions[place].trial_id)
+
+    def lost(what: str, place: int) -> InputError:
+        remedy = "try --method least-squares, or set the trial aside if its sensors jumped there"
+        said = what.format(motions[place].trial_id)
+        return InputError(said, where=f"model {model_name}", remedy=remedy)
+
+    found = run_filter(model, trials, attempts, settings, choice, told, lost, system.coordinates)
+    covariance, blocks = sandwich_covariance(
+        found.main.trials,
+        model.n_states,
+        found.search.theta,
+        found.search.covariance,
+        choice.block_s,
+    )
+    value, slope = model.to_physical(constrain(model, found.main.theta, covariance))
+    scaled = covariance * np.outer(slope, slope)
+    systematic = _systematic(value[:kept], scaled, squares)
+    scaled[:kept, :kept] += np.diag(systematic**2)
+    tight = slope * np.sqrt(np.diag(found.main.covariance))
+    near = (value - model.lower < tight) | (model.upper - value < tight)
+    p = np.append(start, 0.0)
+    p[problem.free] = value
+    names = [item.name for item in free]
+    details = [
+        {
+            "filter_sd": float(tight[k]),
+            "systematic_sd": float(systematic[k]),
+            "least_squares": float(squares.p[problem.free[k]]),
+            **bias,
+        }
+        for k, bias in enumerate(bias_details(squares, range(kept)))
+    ]
+    report: dict[str, object] = {
+        "nis": mean_nis(found, motions),
+        "noise": noise_report(system, found.settings, noise),
+        "input_timing": timing_entry(p, scaled[-1, -1] if timing else 0.0),
+        "blocks": blocks,
+        "restarts": found.restarts,
+        "state_3sigma": state_3sigma(system, found.main.trials),
+        "convergence": convergence(names, model, found, covariance),
+    }
+    return Estimate(
+        p=p,
+        problem=problem,
+        covariance=scaled[:kept, :kept],
+        at_bound=near[:kept],
+        details=details,
+        report=report,
+        states=states(system, motions, found, p[:-1], choice.trace_rows),
+        trace=trace(names, model, motions, found, choice.trace_rows),
+    )
+
+
+def _systematic(value: Array, covariance: Array, squares: Squares) -> Array:
+    """Return how far filter and least squares disagree beyond their standard deviations.
+
+    Both see the same data and err alike by noise, but not by what the model lacks: where the
+    model is right, their difference stays below the sum of their variances and adds nothing.
+    """
+    count = value.size
+    difference = value - squares.p[squares.problem.free[:count]]
+    variance = np.diag(covariance)[:count] + np.diag(squares.raw.covariance)[:count]
+    return np.asarray(np.sqrt(np.maximum(difference**2 - variance, 0.0)))
