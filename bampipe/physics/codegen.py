@@ -6,7 +6,7 @@ state at a time. Both are printed from one set of equations, so they cannot disa
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import sympy as sp
@@ -154,7 +154,7 @@ def _unpack(group: str, symbols: Sequence[Any], used: set[Any], place: str = "{}
     return [f"{s} = {group}[{place.format(i)}]" for i, s in enumerate(symbols) if s in used]
 
 
-def function_source(name: str, groups: dict[str, Sequence[Any]], results: Sequence[Any]) -> str:
+def function_source(name: str, groups: Mapping[str, Sequence[Any]], results: Sequence[Any]) -> str:
     """A function of groups of columns that returns one column a result."""
     used = set().union(*(sp.sympify(e).free_symbols for e in results)) if results else set()
     lines, values = _block(results)

@@ -109,7 +109,9 @@ def _split(model: Model, e: Equations) -> tuple[list[Together], list[Number], li
     motion = {*e.q, *e.qd, *e.z, *e.u}
     factors: list[Any] = []
     quiet = dict.fromkeys(e.w, 0)
-    for expr in (e.kinetic, e.potential, *e.applied, *e.other, *e.rates, *e.offset):
+    for expr in (e.kinetic, e.potential):  # where no motion is, there is no force
+        factors += _factors(expr - expr.subs(dict.fromkeys(motion, 0)), motion, set(names))
+    for expr in (*e.applied, *e.other, *e.rates, *e.offset):
         factors += _factors(sp.sympify(expr).subs(quiet), motion, set(names))
     known: set[Any] = set()
     while True:
@@ -164,7 +166,7 @@ def _pivot(combination: Any, group: Sequence[Any], constants: Mapping[Any, str])
 
 
 def _factors(expr: Any, motion: set[Any], numbers: set[Any]) -> list[Any]:
-    """Return the factor of each term that depends on the motion, like terms collected.
+    """Return the factor of each function of the motion in ``expr``, like terms collected.
 
     A number inside a function of the motion shapes that function and so enters on its own.
     """
@@ -178,9 +180,8 @@ def _factors(expr: Any, motion: set[Any], numbers: set[Any]) -> list[Any]:
     shapes: set[Any] = set()
     for term in sp.Add.make_args(sp.expand(squares)):
         factor, moving = term.as_independent(*motion, as_Add=False)
-        if moving != 1:
-            collected[moving] = collected.get(moving, 0) + factor
-            shapes |= moving.free_symbols & numbers
+        collected[moving] = collected.get(moving, 0) + factor
+        shapes |= moving.free_symbols & numbers
     return [*collected.values(), *shapes]
 
 

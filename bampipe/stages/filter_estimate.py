@@ -17,12 +17,14 @@ from bampipe.stages.estimates import Estimate, timing_entry
 from bampipe.stages.filter_choice import FilterChoice
 from bampipe.stages.filter_run import (
     Attempt,
+    calm,
     filter_model,
     run_filter,
     stride_of,
     trial_of,
 )
 from bampipe.stages.filter_tables import convergence, mean_nis, state_3sigma, states, trace
+from bampipe.stages.innovations import innovation_tests
 from bampipe.stages.motions import Motion
 from bampipe.stages.sensor_noise import Noise, noise_report, tuned, untuned
 from bampipe.stages.squares_estimate import Squares, bias_details
@@ -70,7 +72,9 @@ def estimate_by_filter(
     known = np.append(np.sqrt(np.diag(squares.raw.covariance))[:kept], late_sd)
     settings = untuned(system, noise, choice)
     settings = replace(settings, walk_sd=np.append(settings.walk_sd, late))
-    settings = tuned(settings, model, trials, settled, known, noise, choice)
+    moving = [calm(m, system, trial.t) for m, trial in zip(motions, trials, strict=True)]
+    clear = [every.all(axis=1) for every in moving]
+    settings = tuned(settings, model, trials, clear, settled, known, noise, choice)
     settings = replace(settings, stride=stride)
     prior_sd = np.append([item.sd for item in free], late_sd)
     first = np.append(start[problem.free[:kept]], late)
@@ -116,6 +120,7 @@ def estimate_by_filter(
     ]
     report: dict[str, object] = {
         "nis": mean_nis(found, motions),
+        "innovations": innovation_tests(system, found, trials, moving),
         "noise": noise_report(system, found.settings, noise),
         "input_timing": timing_entry(p, scaled[-1, -1] if timing else 0.0),
         "blocks": blocks,

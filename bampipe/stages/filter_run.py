@@ -34,6 +34,11 @@ _COARSE = 300.0
 _LARGEST_NIS = 10.0
 """Mean normalised innovation squared from which on the filter is taken to have lost the motion."""
 
+_CALM = 5.0
+"""Widths of the smoothed sign of the velocity within which an axis counts as reversing."""
+_MARGIN_S = 0.02
+"""Time around that, s, which counts too."""
+
 Attempt = tuple[Array, Array, float]
 """Parameters to start from (nt,), their sd (nt,), both physical, and a factor on process noise."""
 
@@ -102,6 +107,27 @@ def trial_of(
     # The last stored distribution must be that of the last sample.
     last = first + (t.size - 1 - first) // stride * stride + 1
     return Trial(t[first:last], u[first:last], y[first:last], x, x_sd)
+
+
+def calm(motion: Motion, system: System, t: Array) -> NDArray[np.bool_]:
+    """Tell where each axis moves well clear of standstill and reversal, (T, n_q).
+
+    Within a few widths of the smoothed sign, friction bends faster than the spread of the state,
+    and no Gaussian describes what an encoder reads of an axis that stands still: there the filter
+    makes no claim that its innovations could be tested against.
+
+    Args:
+        motion: the trial as the filter stage left it; system: the model.
+        t: (T,) times at which it is wanted, s since the start of the trial.
+    """
+    width = np.array([c.sign_width for c in system.model.device.coordinates])
+    slow = np.abs(motion.qd) < _CALM * width
+    rate = (len(motion.t) - 1) / float(motion.t[-1] - motion.t[0])
+    reach = int(np.ceil(_MARGIN_S * rate))
+    window = np.ones(2 * reach + 1)
+    near = np.stack([np.convolve(column, window, "same") for column in slow.T], axis=1)
+    place = np.clip(np.searchsorted(motion.t, t), 0, len(motion.t) - 1)
+    return np.asarray(near[place] < 0.5)
 
 
 def filter_model(

@@ -113,6 +113,7 @@ def tuned(
     settings: FilterSettings,
     model: FilterModel,
     trials: Sequence[Trial],
+    clear: Sequence[NDArray[np.bool_]],
     value: Array,
     sd: Array,
     noise: Noise,
@@ -121,10 +122,13 @@ def tuned(
     """Set the noise levels at the maximum of the filter's likelihood on part of one trial.
 
     The noise of a measured force is at least that of its sensor: what is more is model error.
+    Reversals are left out: there the filter's Gaussian fits whatever the noise, and noise of
+    twice its size would pay for them everywhere else.
 
     Args:
         settings: with the levels to start from.
         model: the filter's; trials: of which the longest is used.
+        clear: by trial, (T,) samples at which no axis reverses; all count where none is clear.
         value: (nt,) parameters near the answer, physical; sd: (nt,) how well they are known.
         noise: of the sensors.
         choice: fixes levels that are not to be found.
@@ -135,6 +139,8 @@ def tuned(
     part = replace(
         whole, t=whole.t[:_TUNING_SAMPLES], u=whole.u[:_TUNING_SAMPLES], y=whole.y[:_TUNING_SAMPLES]
     )
+    counts = clear[longest][:_TUNING_SAMPLES]
+    counts = counts if counts.any() else np.ones(part.t.size, dtype=bool)
     spread = np.maximum(sd, 1e-6 * np.abs(value))
     mean, sd = model.to_estimated(value, np.maximum(spread, np.finfo(float).tiny))
 
@@ -151,7 +157,7 @@ def tuned(
             found = filter_trials(model, [part], mean, np.diag(sd**2), with_levels(levels))
         except FilterFailure:
             return -np.inf
-        return float(np.nansum(found.trials[0].log_likelihood))
+        return float(np.nansum(found.trials[0].log_likelihood[counts]))
 
     count = noise.process_sd.size
     step = np.log(np.array([2.0**0.125, *np.full(count, 2.0)]))

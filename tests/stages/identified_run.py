@@ -26,11 +26,12 @@ MODEL = 'schema = "bampipe.model/1"\nname = "base"\ndevice = "bam"\neffects = []
 
 
 def simulated_run(
-    root: Path, *, trials: int = 2, seconds: float = 10.0, scramble: bool = False
+    root: Path, *, trials: int = 2, seconds: float = 10.0, scramble: bool = False, late: int = 0
 ) -> RunFolder:
     """Simulate the BAM under a hand, read by its sensors, up to the filter stage.
 
-    ``scramble`` turns the force channels round in time, so that no model explains the motion.
+    ``scramble`` turns the force channels round in time, so that no model explains the motion;
+    ``late`` reads them that many samples after the motion.
     """
     system = compile_model(Model(registry.device("bam")))
     p = np.array([TRUTH[item.name] for item in system.parameters])
@@ -41,7 +42,7 @@ def simulated_run(
         rng = np.random.default_rng([11, number])
         wanted = _wanted(rng, seconds, tuple(system.inputs), f"t{number:02d}")
         recording = replay(system, p, wanted, sensors, rng)
-        force = recording.force[::-1] if scramble else recording.force
+        force = recording.force[::-1] if scramble else np.roll(recording.force, late, axis=0)
         frame = pd.DataFrame({"t": wanted.t})
         for i, axis in enumerate(RESOLUTION):
             frame[f"q_{axis}"] = recording.q[:, i]

@@ -144,3 +144,60 @@ def test_a_model_with_a_delay_gets_no_timing_of_its_own(simulated: RunFolder) ->
     delay = content["parameters"]["force_delay.delay"]
     assert abs(delay["estimate"]) < 2e-4
     assert_recovered(content, TRUTH)
+
+
+def test_least_squares_intervals_hold_once_its_bias_is_off(simulated: RunFolder) -> None:
+    """Filtered motions move its mass by more than its interval; the replay says by how much."""
+    content = identified(simulated, replace(FAST, method="least-squares"))
+    z = []
+    for name, value in TRUTH.items():
+        entry = content["parameters"][name]
+        z.append((entry["estimate"] - value) / entry["sd"])
+        assert entry["bound_sd"] < 1.5 * entry["sd"]
+    assert np.max(np.abs(z)) < 3.5
+    assert np.sqrt(np.mean(np.square(z))) < 1.8
+    mass = content["parameters"]["mass"]
+    assert mass["least_squares_bias"] > mass["sd"]
+
+
+def test_bounds_agree_with_the_filter_where_noise_is_what_the_sensors_say(
+    simulated: RunFolder,
+) -> None:
+    content = identified(simulated)
+    for name in ("viscous.yaw", "coulomb.yaw", "viscous.extension", "coulomb.extension"):
+        entry = content["parameters"][name]
+        assert 0.75 < entry["filter_sd"] / entry["bound_sd"] < 1.5, name
+
+
+def test_what_cannot_be_identified_is_said(simulated: RunFolder, tmp_path: Path) -> None:
+    content = identified(simulated, replace(FAST, method="least-squares"))
+    said = content["identifiability"]
+    assert "N" in said["together"][0]["members"]
+    assert any("no motion tells the parts apart" in line for line in content["notes"])
+    assert set(said["trials"]) == {"t00", "t01"}
+    assert min(entry["growth"] for entry in said["trials"].values()) > 0.05
+    lever = next(number for number in said["numbers"] if number["name"] == "L")
+    assert abs(lever["moves_percent"]["viscous.pitch"]) > 0.3
+
+
+def test_two_terms_of_one_shape_are_said_to_move_together(simulated: RunFolder) -> None:
+    """Friction that grows with the rod's load and Coulomb friction: nearly the same here."""
+    text = MODEL.replace("[]", '["gravity_compensator_mistuned", "base_tilt"]')
+    write_text(simulated.path("models/two/model.toml"), text.replace('"base"', '"two"', 1))
+    content = identified(simulated, replace(FAST, method="least-squares", model="two"))
+    weak = content["identifiability"]["weak_directions"]
+    assert any("mass" in direction["members"] for direction in weak), weak
+    assert any("move together here" in line for line in content["notes"])
+
+
+def test_innovations_of_the_right_model_pass_and_those_of_a_late_force_do_not(
+    simulated: RunFolder, tmp_path: Path
+) -> None:
+    content = identified(simulated)
+    for axis, entry in content["innovations"].items():
+        assert entry["whiteness"]["white"], (axis, entry)
+        assert entry["inputs"]["independent"], (axis, entry)
+    late = simulated_run(tmp_path / "late", late=10)
+    told = identified(late)["innovations"]
+    assert not told["yaw"]["inputs"]["independent"]
+    assert "Not independent of the inputs" in told["yaw"]["sentence"]

@@ -1,0 +1,114 @@
+"""Are a filter's innovations white, and do they know nothing of the inputs? Two separate tests.
+
+A filter that has the right model leaves innovations that neither their own past nor any input
+predicts (Kailath 1968; Mehra 1970). With tens of thousands of samples a test of significance
+rejects every filter on earth, so each test also says how much is predictable: its share.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Test:
+    """Outcome of one test.
+
+    Attributes:
+        statistic: Ljung-Box Q, or F of the regression; degrees: of freedom.
+        p_value: chance of as much by chance.
+        share: of the variance that is predictable, beyond what chance alone would give.
+    """
+
+    statistic: float
+    degrees: int
+    p_value: float
+    share: float
+
+
+def averaged(values: Array, usable: NDArray[np.bool_], length: int) -> Array:
+    """Means of consecutive stretches, (T // length,), NaN where a sample is unusable or missing.
+
+    Args:
+        values: (T,), of unit variance if the filter is right; usable: (T,); length: samples.
+    """
+    count = len(values) // length
+    stretch = np.where(usable, values, np.nan)[: count * length].reshape(count, length)
+    return np.asarray(stretch.mean(axis=1))
+
+
+def whiteness(records: Sequence[Array], lags: int = 20) -> Test | None:
+    """Ljung and Box's test over records with gaps; None where there are too few values.
+
+    Args:
+        records: (K,) each, NaN at gaps; products reach over a gap, never over two records.
+        lags: how far back.
+    """
+    joined = np.concatenate(records)
+    size = int(np.isfinite(joined).sum())
+    if size < 5 * lags:
+        return None
+    centre = float(np.nanmean(joined))
+    variance = float(np.nanmean((joined - centre) ** 2))
+    products, counts = np.zeros(lags), np.zeros(lags)
+    for record in records:
+        for k in range(1, min(lags, len(record) - 1) + 1):
+            product = (record[k:] - centre) * (record[:-k] - centre)
+            found = np.isfinite(product)
+            products[k - 1] += product[found].sum()
+            counts[k - 1] += found.sum()
+    if variance == 0.0 or counts.min() == 0.0:
+        return None
+    correlation = products / counts / variance
+    statistic = float((size + 2.0) / size * np.sum(counts * correlation**2))
+    share = float(np.sum(correlation**2 - 1.0 / counts))
+    return Test(statistic, lags, float(stats.chi2.sf(statistic, lags)), min(max(share, 0.0), 1.0))
+
+
+def independence(
+    records: Sequence[Array], inputs: Sequence[Array], lags: Sequence[int]
+) -> Test | None:
+    """Regress innovations on present and past inputs; None where there is nothing to regress on.
+
+    Inputs of a hand change slowly, so that a correlation at one lag is one at all: a regression
+    on a few lags at once counts it once, which a table of cross-correlations would not.
+
+    Args:
+        records: (K,) each, NaN at gaps.
+        inputs: (K, m) each, beside them; those that never change are left out.
+        lags: by how many values back each input is taken.
+    """
+    reach = max(lags)
+    rows, targets = [], []
+    for record, given in zip(records, inputs, strict=True):
+        if len(record) <= reach:
+            continue
+        shifted = [given[reach - lag : len(given) - lag] for lag in lags]
+        rows.append(np.concatenate(shifted, axis=1))
+        targets.append(record[reach:])
+    if not rows:
+        return None
+    x, y = np.concatenate(rows), np.concatenate(targets)
+    found = np.isfinite(y)
+    x, y = x[found], y[found]
+    spread = x.std(axis=0) if len(x) else np.zeros(0)
+    x = (x - x.mean(axis=0))[:, spread > 0.0] / spread[spread > 0.0]
+    m = x.shape[1]
+    if m == 0 or len(y) < 10 * m:
+        return None
+    y = y - y.mean()
+    fitted = x @ np.linalg.lstsq(x, y, rcond=None)[0]
+    explained, total = float(fitted @ fitted), float(y @ y)
+    if total == 0.0:
+        return None
+    rest = len(y) - m - 1
+    statistic = (explained / m) / max((total - explained) / rest, 1e-300)
+    share = explained / total - m / len(y)
+    return Test(statistic, m, float(stats.f.sf(statistic, m, rest)), min(max(share, 0.0), 1.0))

@@ -1,0 +1,94 @@
+"""Whether the filter's innovations are white and independent of the inputs, channel by channel."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.estimate.innovations import Test, averaged, independence, whiteness
+from bampipe.estimate.unscented import Trial
+from bampipe.physics import System
+from bampipe.stages.filter_run import FilterRun
+
+_STRETCH_S = 0.05
+"""Innovations are averaged over this long: from sample to sample the counts of an encoder are no
+noise, and what a model lacks acts at the pace of a hand."""
+_LAGS_S = (0.0, 0.25, 0.5)
+"""Lags at which inputs are taken."""
+WHITE_SHARE = 0.2
+"""Share predictable from the past below which a channel counts as white (docs/identification.md)."""
+INPUT_SHARE = 0.05
+"""Share predictable from the inputs below which a channel counts as independent of them."""
+_SIGNIFICANT = 0.01
+
+
+def innovation_tests(
+    system: System,
+    found: FilterRun,
+    trials: Sequence[Trial],
+    moving: Sequence[NDArray[np.bool_]],
+) -> dict[str, object]:
+    """Return both tests for each position channel, and a sentence on each, for identify.json.
+
+    Args:
+        system: the model; found: the filter's; trials: as it was given them.
+        moving: by trial, (T, n_q) where each axis is clear of standstill and reversal.
+    """
+    n = len(system.coordinates)
+    channels = [i for i, name in enumerate(system.inputs) if name != "t"]
+    content: dict[str, object] = {}
+    for axis in range(n):
+        records, inputs = [], []
+        for place, trial in zip(found.order, found.main.trials, strict=True):
+            given = trials[place]
+            length = max(1, round(_STRETCH_S / float(np.median(np.diff(given.t)))))
+            value = trial.innovation[:, axis] / trial.innovation_sd[:, axis]
+            usable = moving[place][:, axis] & np.isfinite(value)
+            records.append(averaged(value, usable, length))
+            everywhere = np.ones(len(value), dtype=bool)
+            columns = [averaged(given.u[:, c], everywhere, length) for c in channels]
+            inputs.append(np.stack(columns, axis=1))
+        lags = [round(lag / _STRETCH_S) for lag in _LAGS_S]
+        own, driven = whiteness(records), independence(records, inputs, lags)
+        entry: dict[str, object] = {"sentence": _sentence(own, driven)}
+        if own is not None:
+            entry["whiteness"] = _entry(own) | {"white": not _fails(own, WHITE_SHARE)}
+        if driven is not None:
+            passed = not _fails(driven, INPUT_SHARE)
+            entry["inputs"] = _entry(driven) | {"independent": passed}
+        content[system.coordinates[axis]] = entry
+    return content
+
+
+def _fails(test: Test, limit: float) -> bool:
+    return test.p_value < _SIGNIFICANT and test.share > limit
+
+
+def _entry(test: Test) -> dict[str, object]:
+    return {
+        "statistic": test.statistic,
+        "degrees": test.degrees,
+        "p_value": test.p_value,
+        "share": test.share,
+    }
+
+
+def _sentence(own: Test | None, driven: Test | None) -> str:
+    """Say both outcomes in words."""
+    if own is None or driven is None:
+        return "Too little motion to test the innovations."
+    past = f"{100.0 * own.share:.0f} % of their variance follows from their past"
+    force = f"{100.0 * driven.share:.0f} % from the inputs"
+    if not _fails(own, WHITE_SHARE) and not _fails(driven, INPUT_SHARE):
+        return f"White and independent of the inputs: {past}, {force}; nothing points to a lack."
+    if _fails(driven, INPUT_SHARE):
+        return (
+            f"Not independent of the inputs: {force}, {past}. The model answers the force wrongly: "
+            "a delay, a gain, an inertia or what carries the load."
+        )
+    return (
+        f"Not white: {past}, {force}. Something acts that the model lacks and that does not follow "
+        "the force, such as friction of another shape."
+    )
