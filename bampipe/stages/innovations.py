@@ -18,7 +18,7 @@ noise, and what a model lacks acts at the pace of a hand."""
 _LAGS_S = (0.0, 0.25, 0.5)
 """Lags at which inputs are taken."""
 WHITE_SHARE = 0.2
-"""Share predictable from the past below which a channel counts as white (docs/identification.md)."""
+"""Share predictable from the past below which a channel counts as white: docs/identification."""
 INPUT_SHARE = 0.05
 """Share predictable from the inputs below which a channel counts as independent of them."""
 _SIGNIFICANT = 0.01
