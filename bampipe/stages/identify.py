@@ -24,7 +24,12 @@ from bampipe.stages.modelfile import load_model, model_inputs
 from bampipe.stages.motions import free_trials, problem_of, read_motion
 from bampipe.stages.recordings import read_session, recipe_of
 from bampipe.stages.sensor_noise import sensor_noise
-from bampipe.stages.squares_estimate import estimate_by_squares, problem_with, unbiased
+from bampipe.stages.squares_estimate import (
+    Squares,
+    estimate_by_squares,
+    problem_with,
+    unbiased,
+)
 
 NAME = "identify"
 SUMMARY = "Parameters of the model with uncertainties, from the free trials"
@@ -53,6 +58,8 @@ class Config(FilterChoice):
         force_noise: of a force sample, N, model error included; 0 takes it from the data.
         longest_step_s: longest Runge-Kutta step, s.
         cutoff_hz: low-pass of the least-squares residual, Hz.
+        input_timing: whether the time by which inputs were sampled after positions is estimated.
+        remove_bias: whether the bias that filters give least squares is measured and taken off.
         block_s: length of the blocks that are taken as independent of each other, s.
         trace_rows: most rows a trial in trace.parquet and states.parquet.
     """
@@ -61,6 +68,8 @@ class Config(FilterChoice):
     method: str = "ukf"
     start_factor: float = 1.0
     cutoff_hz: float = 8.0
+    input_timing: bool = True
+    remove_bias: bool = True
 
 
 def inputs(config: Config) -> tuple[str, ...]:
@@ -91,7 +100,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     rate = float(session["sample_rate_hz"])
     # A delay in the model and the timing of the inputs are one and the same to the data.
     free = {item.name for item in system.parameters if not item.fixed}
-    timing = free.isdisjoint(system.delays)
+    timing = config.input_timing and free.isdisjoint(system.delays)
     problem = problem_with(problem_of(system, motions, Band(rate, config.cutoff_hz)), timing)
     progress(0.1, "least squares")
     start = _start(run, system, rate, config)
@@ -104,7 +113,9 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
             f"the free trials are too short to identify from ({error})", where=str(run.root)
         ) from error
     settings = run.read_json("filter/filter.json")
-    squares = unbiased(session, settings, system, motions, problem, raw)
+    squares = Squares(raw, raw.p, None, problem)
+    if config.remove_bias:
+        squares = unbiased(session, settings, system, motions, problem, raw)
     noise = sensor_noise(session, system, motions, config)
     if config.method == "ukf":
         estimate = estimate_by_filter(
