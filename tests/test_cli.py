@@ -26,6 +26,8 @@ COMMANDS = [
     "filter",
     "stiffness",
     "identify",
+    "viscous",
+    "performance",
     "validate",
     "diagnose",
     "extend",

@@ -78,6 +78,8 @@ AFTER = {
     "filter": "stiffness",
     "stiffness": "identify",
     "identify": "validate",
+    "viscous": "report",
+    "performance": "report",
     "validate": "diagnose",
     "compare": "report",
 }
@@ -485,6 +487,70 @@ def identify(
         run,
         list_settings,
         given,
+        runs,
+        pipeline=pipeline,
+        model=model,
+        force=force,
+        no_wait=no_wait,
+        json=json,
+        quiet=quiet,
+    )
+
+
+@app.command()
+def viscous(
+    run: Run = None,
+    model: ModelName = "",
+    settings: Settings = None,
+    list_settings: ListSettings = False,
+    pipeline: PipelineName = "",
+    force: Force = False,
+    runs: Runs = RUNS,
+    no_wait: NoWait = False,
+    json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Damping at the handle that the brakes rendered in viscous trials, against the command.
+
+    Example: bampipe viscous 2026-10-03_s01
+    """
+    _plain_stage(
+        "viscous",
+        run,
+        list_settings,
+        _assignments(settings),
+        runs,
+        pipeline=pipeline,
+        model=model,
+        force=force,
+        no_wait=no_wait,
+        json=json,
+        quiet=quiet,
+    )
+
+
+@app.command()
+def performance(
+    run: Run = None,
+    model: ModelName = "",
+    settings: Settings = None,
+    list_settings: ListSettings = False,
+    pipeline: PipelineName = "",
+    force: Force = False,
+    runs: Runs = RUNS,
+    no_wait: NoWait = False,
+    json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Workspace, stiffness, friction, inertia and force at the handle.
+
+    Example: bampipe performance 2026-10-03_s01
+    """
+    _plain_stage(
+        "performance",
+        run,
+        list_settings,
+        _assignments(settings),
         runs,
         pipeline=pipeline,
         model=model,

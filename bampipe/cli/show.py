@@ -110,11 +110,11 @@ def summary(content: Mapping[str, object]) -> None:
 
     Args:
         content: the summary of a stage. ``headline`` is a line; ``axes``, ``parameters``,
-            ``trials``, ``ranking`` and ``ladder`` are tables; ``notes`` are lines.
+            ``directions``, ``trials``, ``ranking`` and ``ladder`` are tables; ``notes`` are lines.
     """
     if isinstance(content.get("headline"), str):
         say(str(content["headline"]))
-    for name in ("axes", "parameters", "trials", "ranking"):
+    for name in ("axes", "parameters", "directions", "trials", "ranking"):
         rows = _records(content.get(name))
         if rows is None or len(rows) > LARGEST_TABLE:
             continue

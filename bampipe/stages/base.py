@@ -136,6 +136,8 @@ STAGES: tuple[str, ...] = (
     "filter",
     "stiffness",
     "identify",
+    "viscous",
+    "performance",
     "validate",
     "diagnose",
     "compare",
@@ -146,7 +148,13 @@ STAGES: tuple[str, ...] = (
 READS_SESSION: tuple[str, ...] = ("ingest",)
 """Stages whose ``Config`` has a field ``session``."""
 
-PER_MODEL: tuple[str, ...] = ("identify", "validate", "diagnose")
+PER_MODEL: tuple[str, ...] = (
+    "identify",
+    "viscous",
+    "performance",
+    "validate",
+    "diagnose",
+)
 """Stages whose ``Config`` has a field ``model``: they run once for each model."""
 
 

@@ -1,0 +1,84 @@
+"""A Cartesian viscous field rendered by the brakes, as an effect: K_d = J^T K J (section IV)."""
+
+from __future__ import annotations
+
+import ast
+import copy
+
+from bampipe.errors import InputError
+from bampipe.physics.device import Device
+from bampipe.physics.effect import Effect, effect_from
+
+NAME = "viscous_field"
+
+
+class _Push(ast.NodeTransformer):
+    """Puts one for a force and nought for the others."""
+
+    def __init__(self, forces: tuple[str, ...], chosen: str) -> None:
+        self.forces, self.chosen = forces, chosen
+
+    def visit_Name(self, node: ast.Name) -> ast.expr:
+        if node.id not in self.forces:
+            return node
+        return ast.copy_location(ast.Constant(float(node.id == self.chosen)), node)
+
+
+def viscous_field(device: Device) -> Effect:
+    """Return the damping of the handle, one parameter for each component of the handle's force.
+
+    The force f at the handle does work at the rate f . v, and so do the generalised forces B f
+    that it is mapped to: the handle's velocity in the frame of the force is v = B^T q'. A field
+    f = -K v with diagonal K is then the generalised force -B K B^T q'.
+
+    Args:
+        device: with handle forces in N.
+
+    Raises:
+        InputError: the device has no brakes or no handle force.
+    """
+    if not device.brakes or device.force_unit != "N":
+        raise InputError(
+            f"device {device.name!r} has no brakes that could render a field at a handle"
+        )
+    gain = {
+        (axis, force): ast.unparse(_Push(device.forces, force).visit(copy.deepcopy(tree)))
+        for axis, tree in device.applied.items()
+        for force in device.forces
+    }
+    speed = {
+        force: " + ".join(f"({gain[axis, force]})*qd_{axis}" for axis in device.applied)
+        for force in device.forces
+    }
+    components = dict(zip(device.forces, device.components, strict=True))
+    torque = {
+        axis: "-("
+        + " + ".join(
+            f"damping_{components[force]}*({gain[axis, force]})*({speed[force]})"
+            for force in device.forces
+        )
+        + ")"
+        for axis in device.applied
+    }
+    return effect_from(
+        {
+            "name": NAME,
+            "summary": "The brakes resist the handle's motion in proportion to its speed",
+            "scope": "device",
+            "kind": "torque",
+            "looks_like": "residual in proportion to the handle's velocity",
+            "source": "Dellon and Matsuoka 2009, IEEE Transactions on Robotics 25(3), section IV",
+            "torque": torque,
+            "parameters": {
+                f"damping_{component}": {
+                    "unit": "N.s/m",
+                    "prior": 0.0,
+                    "sd": 100.0,
+                    "strength": True,
+                    "description": f"resistance to motion along {component}",
+                }
+                for component in device.components
+            },
+        },
+        NAME,
+    )

@@ -1,0 +1,188 @@
+"""Stage performance: what a hand feels at the handle, from what was identified (Table VIII)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.data.store import read_parquet, write_json
+from bampipe.physics import System, compile_model
+from bampipe.stages.base import Progress, RunFolder
+from bampipe.stages.modelfile import load_model, model_inputs
+
+NAME = "performance"
+SUMMARY = "Workspace, stiffness, friction, inertia and force at the handle"
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Config:
+    """What the stage can be told.
+
+    Attributes:
+        model: which model version.
+        points: poses along each axis at which the handle is looked at.
+    """
+
+    model: str = "base"
+    points: int = 15
+
+
+def inputs(config: Config) -> tuple[str, ...]:
+    """Return the paths the stage reads."""
+    return (
+        "ingest/session.json",
+        "ingest/samples.parquet",
+        "filter/kinematics.parquet",
+        "stiffness/stiffness.json?",
+        *model_inputs(config.model),
+        f"models/{config.model}/identify.json",
+    )
+
+
+def outputs(config: Config) -> tuple[str, ...]:
+    """Return the paths the stage writes."""
+    return (f"models/{config.model}/performance.json",)
+
+
+def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
+    """Map joint stiffness, friction and inertia to the handle over the poses of the session."""
+    run.require(f"models/{config.model}/identify.json", "identify")
+    identified = run.read_json(f"models/{config.model}/identify.json")["parameters"]
+    system = compile_model(load_model(run, config.model))
+    device = system.model.device
+    p = np.array(
+        [
+            identified[item.name]["estimate"] if item.name in identified else item.prior
+            for item in system.parameters
+        ]
+    )
+    reach = _reach(run, system)
+    content: dict[str, object] = {
+        "model": config.model,
+        "constants": {
+            name: {
+                "value": item.value,
+                "unit": item.unit,
+                "source": item.source,
+                "description": item.description,
+            }
+            for name, item in device.constants.items()
+        },
+        "range": {
+            axis: {"lower": float(low), "upper": float(high), "unit": unit}
+            for axis, unit, (low, high) in zip(
+                system.coordinates, system.coordinate_units, reach, strict=True
+            )
+        },
+        "resolution": {
+            axis: {"value": entry.get("resolution"), "unit": entry.get("unit", "")}
+            for axis, entry in run.read_json("ingest/session.json")["axes"].items()
+        },
+        "largest_force": _largest_force(run, system),
+    }
+    # Only a handle that can be pushed as many ways as there are axes has a stiffness of its own.
+    at_handle = device.force_unit == "N" and len(device.forces) == len(system.coordinates)
+    if at_handle:
+        content["handle"] = _handle(run, system, p, identified, reach, config.points)
+    told = content.get("handle")
+    content["headline"] = _headline(told) if isinstance(told, dict) else "No handle on this device."
+    write_json(out / f"models/{config.model}/performance.json", content)
+    return content
+
+
+def _reach(run: RunFolder, system: System) -> Array:
+    """Return the range of each axis that the moving trials covered, (n_q, 2)."""
+    columns = [f"q_{axis}" for axis in system.coordinates]
+    q = read_parquet(run.require("filter/kinematics.parquet", "filter"), columns=columns)
+    values = q.to_numpy(dtype=float)
+    return np.stack([np.nanmin(values, axis=0), np.nanmax(values, axis=0)], axis=1)
+
+
+def _largest_force(run: RunFolder, system: System) -> dict[str, object] | None:
+    """Return the largest force that the sensor read, its noise left out by the 99.9 % quantile."""
+    device = system.model.device
+    frame = read_parquet(run.require("ingest/samples.parquet", "ingest"), columns=[*device.forces])
+    size = np.linalg.norm(frame.to_numpy(dtype=float), axis=1)
+    size = size[np.isfinite(size)]
+    if not size.size:
+        return None
+    return {"value": float(np.quantile(size, 0.999)), "unit": device.force_unit}
+
+
+def _handle(
+    run: RunFolder,
+    system: System,
+    p: Array,
+    identified: Mapping[str, Any],
+    reach: Array,
+    points: int,
+) -> dict[str, object]:
+    """Return ranges over poses and directions of what acts at the handle.
+
+    With v = B^T q' the handle's velocity: its volume element is |det B| dq, joint stiffness K is
+    felt as B^-1 K B^-T, Coulomb friction c as B^-1 c, and the inertia M along direction j as
+    1 / (B^T M^-1 B)_jj.
+    """
+    device, axes = system.model.device, system.coordinates
+    limits = [device.limits.get(axis) for axis in axes]
+    grid = _grid(reach, points)
+    no_input = np.zeros((len(grid), len(system.inputs)))
+    gain = system.input_map(grid, no_input, p)
+    regular = np.abs(np.linalg.det(gain)) > 1e-9
+    back = np.linalg.inv(gain[regular])
+    entry: dict[str, object] = {
+        "directions": list(device.components),
+        "workspace": {"value": _volume(system, reach, p, points), "unit": "m3"},
+    }
+    if all(limit is not None for limit in limits):
+        whole = np.array(limits, dtype=float)
+        entry["workspace_limits"] = {"value": _volume(system, whole, p, points), "unit": "m3"}
+    coulomb = np.array(
+        [identified.get(f"coulomb.{axis}", {}).get("estimate", 0.0) for axis in axes]
+    )
+    entry["friction"] = _range(np.abs(back) @ coulomb, "N")
+    compliance = np.linalg.inv(system.mass_matrix(grid[regular], p))
+    mobility = np.einsum("tij,tik,tkl->tjl", gain[regular], compliance, gain[regular])
+    entry["inertia"] = _range(1.0 / np.diagonal(mobility, axis1=1, axis2=2), "kg")
+    if run.exists("stiffness/stiffness.json"):
+        found = run.read_json("stiffness/stiffness.json").get("axes", {})
+        if all(axis in found for axis in axes):
+            joint = np.diag([found[axis]["stiffness"] for axis in axes])
+            felt = np.einsum("tfi,ij,tfj->tf", back, joint, back)
+            entry["stiffness"] = _range(felt, "N/m")
+    return entry
+
+
+def _grid(reach: Array, points: int) -> Array:
+    """Return poses, every combination of ``points`` values an axis, (points^n_q, n_q)."""
+    return np.array(list(product(*(np.linspace(low, high, points) for low, high in reach))))
+
+
+def _volume(system: System, reach: Array, p: Array, points: int) -> float:
+    """Return the volume that the handle sweeps over ranges of the axes, m3, by the midpoint rule."""
+    width = (reach[:, 1] - reach[:, 0]) / points
+    inner = np.stack([reach[:, 0] + width / 2.0, reach[:, 1] - width / 2.0], axis=1)
+    grid = _grid(inner, points)
+    gain = system.input_map(grid, np.zeros((len(grid), len(system.inputs))), p)
+    return float(np.abs(np.linalg.det(gain)).sum() * np.prod(width))
+
+
+def _range(values: Array, unit: str) -> dict[str, object]:
+    return {"lower": float(values.min()), "upper": float(values.max()), "unit": unit}
+
+
+def _headline(handle: Mapping[str, Any]) -> str:
+    parts = [f"workspace moved through {handle['workspace']['value']:.2g} m3"]
+    for name, unit in (("stiffness", "N/m"), ("friction", "N"), ("inertia", "kg")):
+        if name in handle:
+            entry = handle[name]
+            parts.append(f"{name} {entry['lower']:.3g} to {entry['upper']:.3g} {unit}")
+    return "At the handle: " + ", ".join(parts)

@@ -1,0 +1,269 @@
+"""Stage viscous: the Cartesian damping that the brakes rendered, against the command (Fig. 8)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from scipy import stats
+
+from bampipe.data.store import read_parquet, write_json, write_parquet
+from bampipe.errors import InputError
+from bampipe.estimate.filter_uncertainty import sandwich_covariance
+from bampipe.estimate.unscented import Trial
+from bampipe.physics import Model, System, compile_model
+from bampipe.physics.viscous_field import NAME as FIELD
+from bampipe.physics.viscous_field import viscous_field
+from bampipe.stages.base import Progress, RunFolder
+from bampipe.stages.filter_choice import FilterChoice, check_choice
+from bampipe.stages.filter_run import Attempt, filter_model, run_filter, stride_of, trial_of
+from bampipe.stages.filter_tables import trace
+from bampipe.stages.modelfile import load_model, model_inputs
+from bampipe.stages.motions import Motion, read_motion
+from bampipe.stages.sensor_noise import sensor_noise, untuned
+
+NAME = "viscous"
+SUMMARY = "Cartesian damping that the brakes rendered in the viscous trials, against the command"
+
+Array = NDArray[np.float64]
+
+_SIGNIFICANT = 0.05
+_RESTARTS = 4
+
+
+@dataclass(frozen=True)
+class Config(FilterChoice):
+    """What the stage can be told.
+
+    Attributes:
+        model: which model version.
+        engine: ``compiled``, or ``filterpy``, slow, which gives the same numbers.
+        form: ``square_root`` or ``covariance`` form of the filter.
+        measure: ``position``, or ``position_velocity`` as in the paper.
+        random_walk: of the parameters, in prior standard deviations per square root of a second.
+        reading_noise: standard deviation of a position reading in encoder steps; 0 takes it
+            from the identification.
+        force_noise: of a force sample, N; 0 takes it from the identification.
+        longest_step_s: longest Runge-Kutta step, s.
+        block_s: length of the blocks that are taken as independent of each other, s.
+        trace_rows: most rows a trial in viscous.parquet.
+    """
+
+    model: str = "base"
+    longest_step_s: float = 2e-3
+    trace_rows: int = 1000
+
+
+def inputs(config: Config) -> tuple[str, ...]:
+    """Return the paths the stage reads."""
+    return (
+        "ingest/trials.parquet",
+        "ingest/samples.parquet",
+        "ingest/session.json",
+        "filter/kinematics.parquet",
+        *model_inputs(config.model),
+        f"models/{config.model}/identify.json",
+    )
+
+
+def outputs(config: Config) -> tuple[str, ...]:
+    """Return the paths the stage writes."""
+    folder = f"models/{config.model}"
+    return (f"{folder}/viscous.json", f"{folder}/viscous.parquet")
+
+
+def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
+    """Estimate the damping along each direction of the handle from the viscous trials.
+
+    The brakes' commands are taken out of the model and what they did is put into the filter's
+    state; friction and inertia stay as identified, with their uncertainty.
+    """
+    check_choice(config, "viscous")
+    trials = _viscous_trials(run)
+    target = f"models/{config.model}/viscous"
+    if trials.empty:
+        content: dict[str, object] = {
+            "model": config.model,
+            "directions": {},
+            "trials": [],
+            "headline": "No trials in a viscous field in this session.",
+        }
+        write_json(out / f"{target}.json", content)
+        write_parquet(out / f"{target}.parquet", _no_rows())
+        return content
+    run.require(f"models/{config.model}/identify.json", "identify")
+    identified = run.read_json(f"models/{config.model}/identify.json")
+    bare = load_model(run, config.model)
+    own = [item.effect for item in bare.effects]
+    names = [item.name for item in bare.effects]
+    system = compile_model(Model(bare.device, [*names, FIELD], [*own, viscous_field(bare.device)]))
+    progress(0.1, "reading the trials")
+    motions = [_unbraked(read_motion(run, str(t), system), system) for t in trials["trial_id"]]
+    commanded = trials["viscous_n_s_per_m"].to_numpy(dtype=float)
+    content, frame = _estimated(run, system, motions, commanded, identified, config, progress)
+    write_json(out / f"{target}.json", content)
+    write_parquet(out / f"{target}.parquet", frame)
+    return content
+
+
+def _viscous_trials(run: RunFolder) -> pd.DataFrame:
+    """Return the rows of the viscous trials that could be used."""
+    trials = read_parquet(run.require("ingest/trials.parquet", "ingest"))
+    usable = trials[(trials["kind"] == "viscous") & (trials["status"] != "set_aside")]
+    path = run.require("filter/kinematics.parquet", "filter")
+    moving = set(read_parquet(path, columns=["trial_id"])["trial_id"].astype(str))
+    return usable[usable["trial_id"].astype(str).isin(moving)]
+
+
+def _no_rows() -> pd.DataFrame:
+    """Return the trace without rows."""
+    kinds = {"t_total": "float64", "trial_id": "str"}
+    return pd.DataFrame({name: pd.Series(dtype=kind) for name, kind in kinds.items()})
+
+
+def _unbraked(motion: Motion, system: System) -> Motion:
+    """Return the trial as if no brake had been commanded."""
+    u = motion.u.copy()
+    u[:, _brakes(system)] = 0.0
+    return replace(motion, u=u)
+
+
+def _brakes(system: System) -> list[int]:
+    names = set(system.model.device.brakes.values())
+    return [i for i, name in enumerate(system.inputs) if name in names]
+
+
+def _estimated(
+    run: RunFolder,
+    system: System,
+    motions: Sequence[Motion],
+    commanded: Array,
+    identified: Mapping[str, Any],
+    config: Config,
+    progress: Progress,
+) -> tuple[dict[str, object], pd.DataFrame]:
+    """Return what viscous.json says, and how the estimates converged."""
+    session = run.read_json("ingest/session.json")
+    noise = sensor_noise(session, system, motions, config)
+    settings = untuned(system, noise, config)
+    levels = identified.get("noise")
+    if levels is not None and config.force_noise == 0.0:
+        found_sd = [levels["process_sd"][name] for name in system.noise]
+        settings = replace(settings, noise_sd=np.array(found_sd))
+    stride = stride_of(motions)
+    settings = replace(settings, stride=stride)
+    readings = []
+    for motion in motions:
+        trial = trial_of(run, motion, system, noise, stride, config)
+        u = trial.u.copy()
+        u[:, _brakes(system)] = 0.0
+        readings.append(Trial(trial.t, u, trial.y, trial.x, trial.x_sd))
+    free = [item for item in system.parameters if not item.fixed]
+    known = identified["parameters"]
+    start = np.array(
+        [
+            known[item.name]["estimate"] if item.name in known else item.prior
+            for item in system.parameters
+        ]
+    )
+    timing = float(identified["input_timing"]["estimate"])
+    model = filter_model(system, readings, start, timing=False)
+    model = replace(model, parameters=np.append(start, timing))
+    command = float(np.nanmean(commanded)) if np.isfinite(commanded).any() else None
+    value = np.array(
+        [known[item.name]["estimate"] if item.name in known else (command or 0.0) for item in free]
+    )
+    sd = np.array([known[item.name]["sd"] if item.name in known else item.sd for item in free])
+    sd = np.maximum(sd, 1e-9 * np.maximum(np.abs(value), 1e-6))
+
+    def told(done: int, place: int) -> None:
+        progress(0.2 + 0.75 * done / (len(readings) + 1), motions[place].trial_id)
+
+    def lost(what: str, place: int) -> InputError:
+        remedy = "set the trial aside, or identify with an effect of the brakes"
+        said = what.format(motions[place].trial_id)
+        return InputError(said, where=f"model {config.model}", remedy=remedy)
+
+    attempts: list[Attempt] = [(value, sd, 4.0**k) for k in range(_RESTARTS)]
+    found = run_filter(model, readings, attempts, settings, config, told, lost, system.coordinates)
+    covariance, blocks = sandwich_covariance(
+        found.main.trials,
+        model.n_states,
+        found.search.theta,
+        found.search.covariance,
+        config.block_s,
+    )
+    estimate, slope = model.to_physical(found.main.theta)
+    spread = slope * np.sqrt(np.diag(covariance))
+    names = [item.name for item in free]
+    felt_own = _own_damping(system, motions, start)
+    directions = {}
+    for k, component in enumerate(system.model.device.components):
+        place = names.index(f"{FIELD}.damping_{component}")
+        directions[component] = _direction(
+            estimate[place], spread[place], felt_own[k], command, blocks
+        )
+    frame = trace(names, model, motions, found, config.trace_rows)
+    kept = [c for c in frame if c in ("t_total", "trial_id") or str(c).startswith(f"{FIELD}.")]
+    frame = frame[kept].rename(columns=lambda c: str(c).removeprefix(f"{FIELD}."))
+    content: dict[str, object] = {
+        "model": config.model,
+        "trials": [motion.trial_id for motion in motions],
+        "directions": directions,
+        "blocks": blocks,
+        "process_noise_factor": float(attempts[found.restarts][2]),
+        "headline": "; ".join(
+            f"{name} {entry['estimate']:.4g} ± {entry['sd']:.2g} N.s/m"
+            + ("" if command is None else f" ({entry['verdict']})")
+            for name, entry in directions.items()
+        ),
+    }
+    return content, frame
+
+
+def _own_damping(system: System, motions: Sequence[Motion], p: Array) -> Array:
+    """Return the device's own viscous friction as felt along each direction, mean, (n_f,), N.s/m.
+
+    q' = B^-T v, so that joint damping D is felt as B^-1 D B^-T.
+    """
+    own = {item.name: value for item, value in zip(system.parameters, p, strict=True)}
+    joint = np.diag([own.get(f"viscous.{axis}", 0.0) for axis in system.coordinates])
+    total, count = 0.0, 0
+    for motion in motions:
+        rows = slice(None, None, max(1, len(motion.t) // 500))
+        back = np.linalg.pinv(system.input_map(motion.q[rows], motion.u[rows], p))
+        felt = np.einsum("tfi,ij,tfj->tf", back, joint, back)
+        total, count = total + felt.sum(axis=0), count + len(felt)
+    return np.asarray(total / count)
+
+
+def _direction(
+    estimate: float, sd: float, own: float, command: float | None, blocks: int
+) -> dict[str, Any]:
+    """Return what is stored of one direction; the test is two-sided, Student's t over blocks."""
+    entry: dict[str, Any] = {
+        "estimate": float(estimate),
+        "sd": float(sd),
+        "own_friction": float(own),
+        "felt": float(estimate + own),
+        "unit": "N.s/m",
+    }
+    if command is None:
+        return entry
+    degrees = max(blocks - 1, 1)
+    for name, value in (("", estimate), ("felt_", estimate + own)):
+        ratio = abs(value - command) / sd if sd > 0.0 else np.inf
+        entry[f"{name}p_value"] = float(2.0 * stats.t.sf(ratio, degrees))
+        entry[f"{name}differs"] = bool(entry[f"{name}p_value"] < _SIGNIFICANT)
+    entry["commanded"] = command
+    entry["verdict"] = (
+        f"differs from {command:.4g} commanded, p = {entry['p_value']:.2g}"
+        if entry["differs"]
+        else f"no difference from {command:.4g} commanded shown, p = {entry['p_value']:.2g}"
+    )
+    return entry
