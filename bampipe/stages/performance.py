@@ -167,7 +167,7 @@ def _grid(reach: Array, points: int) -> Array:
 
 
 def _volume(system: System, reach: Array, p: Array, points: int) -> float:
-    """Return the volume that the handle sweeps over ranges of the axes, m3, by the midpoint rule."""
+    """Return the volume that the handle sweeps, m3, by the midpoint rule."""
     width = (reach[:, 1] - reach[:, 0]) / points
     inner = np.stack([reach[:, 0] + width / 2.0, reach[:, 1] - width / 2.0], axis=1)
     grid = _grid(inner, points)

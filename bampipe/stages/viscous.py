@@ -21,7 +21,14 @@ from bampipe.physics.viscous_field import NAME as FIELD
 from bampipe.physics.viscous_field import viscous_field
 from bampipe.stages.base import Progress, RunFolder
 from bampipe.stages.filter_choice import FilterChoice, check_choice
-from bampipe.stages.filter_run import Attempt, filter_model, run_filter, stride_of, trial_of
+from bampipe.stages.filter_run import (
+    Attempt,
+    FilterRun,
+    filter_model,
+    run_filter,
+    stride_of,
+    trial_of,
+)
 from bampipe.stages.filter_tables import trace
 from bampipe.stages.modelfile import load_model, model_inputs
 from bampipe.stages.motions import Motion, read_motion
@@ -191,15 +198,9 @@ def _estimated(
 
     attempts: list[Attempt] = [(value, sd, 4.0**k) for k in range(_RESTARTS)]
     found = run_filter(model, readings, attempts, settings, config, told, lost, system.coordinates)
-    covariance, blocks = sandwich_covariance(
-        found.main.trials,
-        model.n_states,
-        found.search.theta,
-        found.search.covariance,
-        config.block_s,
-    )
     estimate, slope = model.to_physical(found.main.theta)
-    spread = slope * np.sqrt(np.diag(covariance))
+    scaled_sd, blocks = _block_sd(found, model.n_states, config.block_s)
+    spread = slope * scaled_sd
     names = [item.name for item in free]
     felt_own = _own_damping(system, motions, start)
     directions = {}
@@ -224,6 +225,29 @@ def _estimated(
         ),
     }
     return content, frame
+
+
+def _block_sd(found: FilterRun, n_states: int, block_s: float) -> tuple[Array, int]:
+    """Return standard deviations from the scatter of blocks, (nt,), and the number of blocks.
+
+    Identified parameters are known a million times better than the field: each is put on the
+    scale of its own uncertainty, or the inverses would lose it.
+    """
+    scale = np.sqrt(np.diag(found.main.covariance))
+    whole = np.concatenate([np.ones(n_states), scale])
+    both = np.outer(whole, whole)
+    trials = [
+        replace(trial, mean=trial.mean / whole, covariance=trial.covariance / both)
+        for trial in found.main.trials
+    ]
+    covariance, blocks = sandwich_covariance(
+        trials,
+        n_states,
+        found.search.theta / scale,
+        found.search.covariance / np.outer(scale, scale),
+        block_s,
+    )
+    return scale * np.sqrt(np.diag(covariance)), blocks
 
 
 def _own_damping(system: System, motions: Sequence[Motion], p: Array) -> Array:

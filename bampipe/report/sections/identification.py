@@ -44,6 +44,7 @@ def _parameters(results: Results, content: dict[str, Any]) -> Table:
     parameters = content.get("parameters", {})
     names = results.in_order(parameters)
     checked = any("least_squares" in parameters[name] for name in names)
+    bounded = any(parameters[name].get("bound_sd") is not None for name in names)
     rows = []
     for name in names:
         entry = parameters[name]
@@ -57,12 +58,15 @@ def _parameters(results: Results, content: dict[str, Any]) -> Table:
                 f"`{name}`",
                 wording.plain(value, decimals) + (" *" if entry.get("at_bound") else ""),
                 wording.significant(sd, 2) if sd else "fixed",
+                *((wording.significant(entry.get("bound_sd"), 2),) if bounded else ()),
                 wording.interval(value - half, value + half, sd) if sd else "–",
                 *(("–" if other is None else wording.plain(other, decimals),) if checked else ()),
                 wording.unit(str(entry.get("unit", ""))),
             )
         )
     note = "Interval: estimate ± 1.96 standard deviations."
+    if bounded:
+        note += " Bound: the least SD that these sensors allow on these trials (Cramér-Rao)."
     if checked:
         note += " Least squares on the inverse dynamics, for comparison."
     if any(parameters[name].get("at_bound") for name in names):
@@ -75,12 +79,13 @@ def _parameters(results: Results, content: dict[str, Any]) -> Table:
             "Name",
             "Estimate",
             "SD",
+            *(("Bound",) if bounded else ()),
             "95 % interval",
             *(("Least squares",) if checked else ()),
             "Unit",
         ),
         tuple(rows),
-        "llrrr" + ("r" if checked else "") + "l",
+        "llrrr" + "r" * (checked + bounded) + "l",
         note=note,
     )
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from bampipe.report import wording
-from bampipe.report.document import Block, Bullets, Section, Table
+from bampipe.report.document import Block, Bullets, Section, Subheading, Table
 from bampipe.report.results import Results
 
 
@@ -23,34 +23,23 @@ def section(results: Results) -> Section | None:
             "llrrl",
         )
     ]
-    comparison = paper.get("comparison")
-    if comparison:
-        blocks.append(
-            Table(
-                f"The device beside others, as published ({comparison['place']})",
-                ("", *comparison["devices"]),
-                tuple(tuple(row) for row in comparison["rows"]),
-                "lllll",
-                (0.9, 1.2, 1.0, 1.0, 1.0),
-            )
-        )
+    if "comparison" in paper:
+        blocks.append(_comparison(results, paper["comparison"]))
     notes = tuple(paper.get("notes", {}).get("text", ()))
     if notes:
-        blocks.append(Bullets(notes))
+        blocks += [Subheading("Where this differs from the paper, and why"), Bullets(notes)]
     return Section("Paper and this session", tuple(blocks), new_page=True)
 
 
 def _row(results: Results, row: dict[str, Any]) -> tuple[str, ...]:
-    content = results.json(row["file"].format(model=results.model)) or {}
-    value = _find(content, row["value"])
-    sd = _find(content, row["sd"]) if "sd" in row else None
-    factor = float(row.get("factor", 1.0))
+    value = _stored(results, row, "value")
+    sd = _stored(results, row, "sd")
     if value is None:
         shown = "–"
     elif sd is None:
-        shown = wording.significant(factor * value)
+        shown = wording.significant(value)
     else:
-        shown = wording.with_sd(factor * value, factor * sd)
+        shown = wording.with_sd(value, sd)
     return (
         row["quantity"],
         row["place"],
@@ -58,6 +47,44 @@ def _row(results: Results, row: dict[str, Any]) -> tuple[str, ...]:
         shown,
         wording.unit(row["unit"]),
     )
+
+
+def _comparison(results: Results, comparison: dict[str, Any]) -> Table:
+    """Return the device of this session beside others, as published."""
+    rows = []
+    for row in comparison["rows"]:
+        parts = [_range(results, place) for place in row["session"]]
+        own = "; ".join(part for part in parts if part) or "–"
+        rows.append((row["quantity"], own, *row["published"]))
+    return Table(
+        f"The device of this session beside others, as published ({comparison['place']})",
+        ("", "This session", *comparison["devices"]),
+        tuple(rows),
+        "llllll",
+        (0.9, 1.2, 1.2, 0.95, 0.95, 0.9),
+        comparison["note"],
+    )
+
+
+def _range(results: Results, place: dict[str, Any]) -> str:
+    """Return a stored number or range with its unit; "" where it is not stored."""
+    unit, digits = wording.unit(place["unit"]), int(place.get("digits", 3))
+    if "value" in place:
+        value = _stored(results, place, "value")
+        return "" if value is None else f"{wording.significant(value, digits)} {unit}"
+    low, high = _stored(results, place, "lower"), _stored(results, place, "upper")
+    if low is None or high is None:
+        return ""
+    return f"{wording.significant(low, digits)} to {wording.significant(high, digits)} {unit}"
+
+
+def _stored(results: Results, place: dict[str, Any], key: str) -> float | None:
+    """Return the number that ``place`` names under ``key``, times its factor."""
+    if key not in place:
+        return None
+    content = results.json(place["file"].format(model=results.model)) or {}
+    value = _find(content, place[key])
+    return None if value is None else float(place.get("factor", 1.0)) * value
 
 
 def _find(content: Any, dotted: str) -> float | None:
