@@ -199,15 +199,15 @@ def _estimated(
     attempts: list[Attempt] = [(value, sd, 4.0**k) for k in range(_RESTARTS)]
     found = run_filter(model, readings, attempts, settings, config, told, lost, system.coordinates)
     estimate, slope = model.to_physical(found.main.theta)
-    scaled_sd, blocks = _block_sd(found, model.n_states, config.block_s)
-    spread = slope * scaled_sd
     names = [item.name for item in free]
+    field = [i for i, name in enumerate(names) if name.startswith(f"{FIELD}.")]
+    field_sd, blocks = _block_sd(found, model.n_states, field, config.block_s)
+    spread = slope[field] * field_sd
     felt_own = _own_damping(system, motions, start)
     directions = {}
     for k, component in enumerate(system.model.device.components):
-        place = names.index(f"{FIELD}.damping_{component}")
         directions[component] = _direction(
-            estimate[place], spread[place], felt_own[k], command, blocks
+            estimate[field[k]], spread[k], felt_own[k], command, blocks
         )
     frame = trace(names, model, motions, found, config.trace_rows)
     kept = [c for c in frame if c in ("t_total", "trial_id") or str(c).startswith(f"{FIELD}.")]
@@ -227,11 +227,13 @@ def _estimated(
     return content, frame
 
 
-def _block_sd(found: FilterRun, n_states: int, block_s: float) -> tuple[Array, int]:
-    """Return standard deviations from the scatter of blocks, (nt,), and the number of blocks.
+def _block_sd(
+    found: FilterRun, n_states: int, field: Sequence[int], block_s: float
+) -> tuple[Array, int]:
+    """Return standard deviations of the ``field`` from the scatter of blocks, and their number.
 
-    Identified parameters are known a million times better than the field: each is put on the
-    scale of its own uncertainty, or the inverses would lose it.
+    Identified parameters are known so much better than the field that these trials hardly move
+    them: each is put on the scale of its own uncertainty, or the inverses would lose it.
     """
     scale = np.sqrt(np.diag(found.main.covariance))
     whole = np.concatenate([np.ones(n_states), scale])
@@ -247,7 +249,7 @@ def _block_sd(found: FilterRun, n_states: int, block_s: float) -> tuple[Array, i
         found.search.covariance / np.outer(scale, scale),
         block_s,
     )
-    return scale * np.sqrt(np.diag(covariance)), blocks
+    return scale[field] * np.sqrt(np.diag(covariance)[field]), blocks
 
 
 def _own_damping(system: System, motions: Sequence[Motion], p: Array) -> Array:

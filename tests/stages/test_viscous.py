@@ -1,0 +1,138 @@
+"""The viscous field and the performance at the handle, on a simulated session."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from identified_run import MODEL
+from run_folders import SESSIONS
+
+from bampipe.data.store import read_json, read_parquet, write_parquet, write_text
+from bampipe.errors import InputError
+from bampipe.physics import Model, compile_model, registry
+from bampipe.physics.viscous_field import viscous_field
+from bampipe.stages import filter as filter_stage
+from bampipe.stages import identify, ingest, performance, viscous
+from bampipe.stages import simulate as simulation
+from bampipe.stages.base import RunFolder, silent
+
+SQUARES = identify.Config(method="least-squares")
+
+
+def identified(root: Path, session: Path) -> RunFolder:
+    """Take a session up to its identification, by least squares, which is quick."""
+    run = RunFolder(root)
+    ingest.execute(run, root, ingest.Config(session=str(session)), silent)
+    filter_stage.execute(run, root, filter_stage.Config(), silent)
+    write_text(root / "models/base/model.toml", MODEL)
+    identify.execute(run, root, SQUARES, silent)
+    return run
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunFolder]:
+    folder = tmp_path_factory.mktemp("viscous")
+    config = simulation.Config(seed=31, trials=2, viscous_trials=2, duration=10.0)
+    simulation.simulate_session(folder / "session", config)
+    yield identified(folder / "run", folder / "session")
+
+
+def found(run: RunFolder, config: viscous.Config | None = None) -> dict:
+    viscous.execute(run, run.root, config or viscous.Config(), silent)
+    return read_json(run.path("models/base/viscous.json"))
+
+
+def test_the_field_is_that_of_the_grip() -> None:
+    """J^T K J at the distance r of the grip, one parameter a direction."""
+    device = registry.device("bam")
+    field = viscous_field(device)
+    system = compile_model(Model(device, ["viscous_field"], [field]))
+    q, qd = np.array([[0.3, 0.2, 1.2]]), np.array([[0.5, -0.4, 0.3]])
+    p, none = system.prior, np.zeros((1, 0))
+    bare = system.required(q, qd, 0 * q, none, np.zeros((1, len(system.inputs))), p)
+    p[-3:] = 40.0, 50.0, 60.0
+    with_field = system.required(q, qd, 0 * q, none, np.zeros((1, len(system.inputs))), p)
+    r = 1.2
+    expected = np.array([40.0 * (r * np.cos(0.2)) ** 2 * 0.5, 50.0 * r**2 * -0.4, 60.0 * 0.3])
+    np.testing.assert_allclose((with_field - bare)[0], expected)
+    with pytest.raises(InputError, match="no brakes"):
+        viscous_field(registry.device("slider"))
+
+
+def test_the_damping_rendered_is_found_and_does_not_differ(run: RunFolder) -> None:
+    content = found(run)
+    assert set(content["directions"]) == {"x", "y", "z"}
+    for name, entry in content["directions"].items():
+        assert entry["estimate"] == pytest.approx(40.0, rel=0.02), name
+        assert entry["commanded"] == 40.0
+        assert entry["p_value"] > 0.001, name
+        assert entry["felt"] == pytest.approx(entry["estimate"] + entry["own_friction"])
+        assert entry["felt_differs"], name
+    trace = read_parquet(run.path("models/base/viscous.parquet"))
+    assert {"t_total", "damping_x", "damping_x_sd", "damping_z"} <= set(trace)
+    assert not any(name.startswith("viscous.") for name in trace)
+
+
+def test_a_command_that_was_not_kept_is_found(run: RunFolder, tmp_path: Path) -> None:
+    path = run.path("ingest/trials.parquet")
+    trials = read_parquet(path)
+    kept = trials.copy()
+    trials.loc[trials["kind"] == "viscous", "viscous_n_s_per_m"] = 44.0
+    write_parquet(path, trials)
+    try:
+        directions = found(run)["directions"]
+    finally:
+        write_parquet(path, kept)
+    assert all(entry["differs"] for entry in directions.values())
+    assert "differs from 44 commanded" in directions["x"]["verdict"]
+
+
+def test_a_session_without_a_field_says_so(run: RunFolder) -> None:
+    path = run.path("ingest/trials.parquet")
+    trials = read_parquet(path)
+    write_parquet(path, trials[trials["kind"] == "free"])
+    try:
+        content = found(run)
+    finally:
+        write_parquet(path, trials)
+    assert content["directions"] == {}
+    assert "No trials" in content["headline"]
+    with pytest.raises(InputError, match="must be positive"):
+        found(run, replace(viscous.Config(), block_s=0.0))
+
+
+def test_performance_at_the_handle(run: RunFolder) -> None:
+    performance.execute(run, run.root, performance.Config(), silent)
+    content = read_json(run.path("models/base/performance.json"))
+    q = read_parquet(run.path("filter/kinematics.parquet"))
+    low, high = q.min(numeric_only=True), q.max(numeric_only=True)
+    volume = (
+        (high["q_extension"] ** 3 - low["q_extension"] ** 3) / 3.0
+        * (np.sin(high["q_pitch"]) - np.sin(low["q_pitch"]))
+        * (high["q_yaw"] - low["q_yaw"])
+    )  # fmt: skip
+    handle = content["handle"]
+    assert handle["workspace"]["value"] == pytest.approx(volume, rel=0.01)
+    identified = read_json(run.path("models/base/identify.json"))["parameters"]
+    top = max(identified["coulomb.extension"]["estimate"],
+              identified["coulomb.pitch"]["estimate"] / low["q_extension"])  # fmt: skip
+    assert handle["friction"]["upper"] == pytest.approx(top, rel=1e-6)
+    # Along the rod the hand moves the rod's mass alone.
+    mass = identified["mass"]["estimate"]
+    assert handle["inertia"]["lower"] <= mass * 1.001
+    assert handle["inertia"]["upper"] >= mass * 0.999
+    assert content["constants"]["L"]["source"] == "Table II"
+    assert "stiffness" not in handle
+
+
+def test_the_shared_session_renders_what_was_commanded(tmp_path: Path) -> None:
+    if not (SESSIONS / "open-09").is_dir():
+        pytest.skip("the shared sessions are not here")
+    directions = found(identified(tmp_path, SESSIONS / "open-09"))["directions"]
+    for name, entry in directions.items():
+        assert entry["estimate"] == pytest.approx(40.0, rel=0.01), name
+        assert not entry["differs"], name
