@@ -181,7 +181,7 @@ def _write_child(root: Path, parent: str, effect: str, file: Path | None) -> Non
 
 
 def follow(options: Options, model: str, tell: Callable[[str], None]) -> str:
-    """Diagnose and extend until the diagnosis says stop.
+    """Diagnose and extend until the diagnosis says stop, or an effect does not help after all.
 
     Args:
         options: run folder, settings, listener.
@@ -189,7 +189,7 @@ def follow(options: Options, model: str, tell: Callable[[str], None]) -> str:
         tell: told, in a line each, what was found and done.
 
     Returns:
-        The name of the last model.
+        The name of the last model that is better than its parent.
     """
     for _ in range(MOST_EFFECTS):
         options.run("diagnose", "diagnose", model)
@@ -199,11 +199,22 @@ def follow(options: Options, model: str, tell: Callable[[str], None]) -> str:
         if not effect:
             break
         tell(f"adding {effect}")
-        model = extend(options, model, effect)
+        child = extend(options, model, effect)
+        if not _better(options.root, model, child):
+            tell(f"{effect} does not lower the held-out error after all: stopped at {model}")
+            break
+        model = child
     else:
         tell(f"stopped after {MOST_EFFECTS} effects")
     options.run("compare", "compare", "")
     return model
+
+
+def _better(root: Path, parent: str, child: str) -> bool:
+    """Whether ``child`` has a lower held-out error than ``parent`` on some axis."""
+    run = base.RunFolder(root)
+    before, after = (run.read_json(f"models/{m}/validate.json")["axes"] for m in (parent, child))
+    return any(after[axis]["held_out_rmse"] < before[axis]["held_out_rmse"] for axis in before)
 
 
 def demonstrate(runs: Path, force: bool, listen: Listener, tell: Callable[[str], None]) -> None:

@@ -7,8 +7,8 @@ and strengths that act nonlinearly, are searched.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -29,6 +29,8 @@ _REFINE = 3
 _ALIKE = 0.7
 _DENSEST = 48
 _WORTH = 4.0
+_SHARES = (1.0, 0.9, 0.8, 0.65, 0.5, 0.35, 0.2, 0.1, 0.05)
+"""Shares of the least-squares strength tried where an effect weakens what the force does."""
 _DIVERGED = 1e30
 """An internal state that is too stiff to be integrated at the sampling rate ends above this."""
 
@@ -61,8 +63,10 @@ class Score:
         error: root mean square of the residual on trials left out, by axis, (n_q,), N.m or N.
         values: fitted parameters of the effect, in the order of `Candidate.own`.
         shift: change of the model's own free parameters that goes with it.
-        gain: log likelihood ratio on trials left out, by axis, (n_q,), in units of independent
-            samples: positive where the effect helps.
+        gain: log likelihood ratio of the measured force on trials left out, by axis, (n_q,), in
+            units of independent samples: positive where the effect helps. An effect that weakens
+            what the force does, such as friction in proportion to it, makes both sides of the
+            equation small, noise included; the slope of the residual by the force takes that off.
     """
 
     name: str
@@ -262,18 +266,66 @@ class Scorer:
         own[list(item.searched)] = searched
         start = len(self.evidence.free)
         own[list(item.linear)] = beta[start:]
-        error = self._held_out(sums, weight, item)
-        gain = self.independent * np.log(self.before.error / error)
-        return Score(item.name, error, own, beta[:start], gain)
+        if not item.system.driven:
+            error = self._held_out(sums, weight, item)
+            gain = self.independent * np.log(self.before.error / error)
+            return Score(item.name, error, own, beta[:start], gain)
+        best = None
+        for share in _SHARES if item.linear else (1.0,):
+            values = own.copy()
+            values[list(item.linear)] *= share
+            held = dict(enumerate(values[list(item.linear)], start)) if item.linear else None
+            error = self._held_out(sums, weight, item, held)
+            gain = np.log(self.before.error / error) + self._sensitivity(item, values)
+            if best is None or self.independent @ gain > self.independent @ best.gain:
+                shift = (
+                    _solve_held(sums.xx, sums.xy, weight, held)[:start] if held else beta[:start]
+                )
+                best = Score(item.name, error, values, shift, gain)
+        assert best is not None
+        return replace(best, gain=self.independent * best.gain)
 
-    def _held_out(self, sums: _Sums, weight: Array, item: Candidate | None = None) -> Array:
+    def _sensitivity(self, item: Candidate, own: Array) -> Array:
+        """Mean of log |d residual / d force| with the effect over without it, by axis, (n_q,)."""
+        e, system = self.evidence, item.system
+        p = np.concatenate([e.p[: len(system.model.device.parameters)], own])
+        total = np.zeros(len(system.coordinates))
+        for motion, used in zip(e.motions, e.used, strict=True):
+            kept = e.band.kept(len(motion.t))
+            u = motion.inputs(system.inputs)
+            z = system.memory(motion.q, motion.qd, motion.qdd, u, p, motion.t)
+            at = [x[kept] for x in (motion.q, motion.qd, motion.qdd, z)]
+            plain = system.input_map(at[0], u[kept], p)
+            here, slope = system.contribution(*at, u[kept], p), plain.copy()
+            for j, force in enumerate(system.model.device.forces):
+                moved, column = u[kept].copy(), system.inputs.index(force)
+                step = 1e-6 * max(float(np.abs(moved[:, column]).max()), 1e-6)
+                moved[:, column] += step
+                slope[:, :, j] += (system.contribution(*at, moved, p) - here) / step
+            bare = np.linalg.norm(plain, axis=2)
+            share = np.linalg.norm(slope, axis=2) / np.where(bare > 0.0, bare, 1.0)
+            total += np.sum(np.where(bare > 0.0, np.log(np.maximum(share, 1e-3)), 0.0) * used, 0)
+        return np.asarray(total / np.maximum(self.counts.sum(axis=0), 1.0))
+
+    def _held_out(
+        self,
+        sums: _Sums,
+        weight: Array,
+        item: Candidate | None = None,
+        held: Mapping[int, float] | None = None,
+    ) -> Array:
         squares = np.zeros(sums.yy.shape[1])
         for k in range(len(sums.yy)):
             rest = [i for i in range(len(sums.yy)) if i != k] or [k]
             part = _Sums(sums.xx[rest], sums.xy[rest], sums.yy[rest])
-            beta = (
-                _solve(part.xx, part.xy, weight) if item is None else _bounded(item, part, weight)
-            )
+            if held is not None:
+                beta = _solve_held(part.xx, part.xy, weight, held)
+            else:
+                beta = (
+                    _solve(part.xx, part.xy, weight)
+                    if item is None
+                    else _bounded(item, part, weight)
+                )
             squares += _squares(_Sums(sums.xx[[k]], sums.xy[[k]], sums.yy[[k]]), beta)[0]
         return np.asarray(np.sqrt(squares / np.maximum(self.counts.sum(axis=0), 1.0)))
 
@@ -346,15 +398,18 @@ def _bounded(item: Candidate, sums: _Sums, weight: Array) -> Array:
         bounded = float(np.clip(beta[start + k], item.own[i].lower, item.own[i].upper))
         if bounded != beta[start + k]:
             held[start + k] = bounded
-    if not held:
-        return beta
-    keep = [i for i in range(len(beta)) if i not in held]
+    return _solve_held(sums.xx, sums.xy, weight, held) if held else beta
+
+
+def _solve_held(xx: Array, xy: Array, weight: Array, held: Mapping[int, float]) -> Array:
+    """`_solve` with the coefficients ``held``, by position, at given values."""
+    keep = [i for i in range(xx.shape[2]) if i not in held]
     fixed = list(held)
     values = np.array(list(held.values()))
-    xy = sums.xy[..., keep] - np.einsum("kapq,q->kap", sums.xx[:, :, keep][..., fixed], values)
-    out = np.empty(len(beta))
+    rest = xy[..., keep] - np.einsum("kapq,q->kap", xx[:, :, keep][..., fixed], values)
+    out = np.empty(xx.shape[2])
     out[fixed] = values
-    out[keep] = _solve(sums.xx[:, :, keep][..., keep], xy, weight)
+    out[keep] = _solve(xx[:, :, keep][..., keep], rest, weight)
     return out
 
 

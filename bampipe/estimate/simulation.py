@@ -118,6 +118,9 @@ def _demand(  # type: ignore[no-untyped-def]
         u[force[j]] -= 1.0
         for i in range(n):
             response[i, j] = moved[n + i] - still[n + i]
+    if not np.isfinite(response).all():  # the motion has run away: the caller says so
+        out[:] = np.nan
+        return
     normal = response.T @ response
     side = np.zeros(nf)
     for i in range(n):

@@ -19,7 +19,7 @@ import sympy as sp
 from bampipe.errors import InputError
 from bampipe.physics import expression
 from bampipe.physics.device import INPUT_ORDERS, derivative
-from bampipe.physics.effect import BoundEffect
+from bampipe.physics.effect import EACH, BoundEffect
 from bampipe.physics.model import Model
 
 Symbols = dict[str, Any]
@@ -106,6 +106,7 @@ class _Derivation:
                 self.z[item.prefix, state.name] = symbol
         self.special = {"sgn": self._sgn, "ddt": self.ddt}
         self.sizes: dict[str, int] = {}
+        self.dry: list[Any] = [sp.S.Zero] * len(self.axes)
         self.base: Symbols = dict(zip(self.axes, self.q, strict=True))
         self.base |= {f"qd_{a}": s for a, s in zip(self.axes, self.qd, strict=True)}
         self.base |= {
@@ -187,11 +188,14 @@ class _Derivation:
             i, a = self.axes.index(item.target), item.target
             symbols |= {"q": self.q[i], "qd": self.qd[i], "side_load": side[i]}
             symbols |= {n: symbols[f"{n}_{a}"] for n in ("applied", "load", "viscous", "coulomb")}
+            symbols["dry"] = self.dry[i]
             symbols["brake"] = self.channel.get(device.brakes.get(a, ""), sp.S.Zero)
         elif item.effect.scope in ("force_component", "force_pair"):
             for letter, force in zip("fg", self.targeted(item), strict=False):
                 for k, suffix in enumerate(("", "_rate", "_curvature")):
                     symbols[letter + suffix] = self.channel[derivative(force, k)]
+        elif item.effect.scope == "channel":
+            symbols["f"] = self.channel[item.target]
         symbols |= {s.name: self.z[item.prefix, s.name] for s in item.effect.states}
         for p in item.parameters:
             symbols[p.name.removeprefix(f"{item.prefix}.")] = self.p[p.name]
@@ -308,31 +312,39 @@ def derive(model: Model, named_constants: bool = False) -> Equations:
     forces = [d.channel[f] for f in device.forces]
     input_map = [[sp.diff(e, f) for f in forces] for e in raw_applied]
 
-    corrections = dict.fromkeys(device.forces, sp.S.Zero)
+    corrections = dict.fromkeys((*device.forces, *device.channels), sp.S.Zero)
     for item in (e for e in model.effects if e.effect.kind == "input"):
-        symbols = d.effect_symbols(item, raw_applied, side)
         for key, tree in item.effect.expressions.items():
+            symbols = d.effect_symbols(item, raw_applied, side)
             force = key.partition(".")[2]
             if not force:
-                force = d.targeted(item)[0]
-            if force not in corrections:
-                raise InputError(f"effect {item.name!r}: device has no input {force!r}")
-            corrections[force] += d.own(item, tree, symbols, key) - d.channel[force]
-    true_force = {d.channel[f]: d.channel[f] + c for f, c in corrections.items()}
-    applied = [e.subs(true_force, simultaneous=True) for e in raw_applied]
+                force = item.target if item.effect.scope == "channel" else d.targeted(item)[0]
+            for name in device.forces if force == EACH else (force,):
+                if name not in corrections:
+                    raise InputError(f"effect {item.name!r}: device has no input {name!r}")
+                if force == EACH:
+                    orders = range(len(INPUT_ORDERS))
+                    symbols |= {derivative("f", k): d.channel[derivative(name, k)] for k in orders}
+                corrections[name] += d.own(item, tree, symbols, key) - d.channel[name]
+    truth = {d.channel[f]: d.channel[f] + c for f, c in corrections.items() if c != 0}
+    applied = [e.subs(truth, simultaneous=True) for e in raw_applied]
 
     noise = [*device.forces, *device.process_noise]
     w = [sp.Symbol(f"w{i}", real=True) for i in range(len(noise))]
-    noisy = {s: e + w[i] for i, (s, e) in enumerate(true_force.items())}
+    noisy = truth | {
+        d.channel[f]: d.channel[f] + corrections[f] + w[i] for i, f in enumerate(device.forces)
+    }
     applied_noise = [e.subs(noisy, simultaneous=True) for e in raw_applied]
 
     kinetic = d.build(device.kinetic, d.base, "energy.kinetic")
     potential = d.build(device.potential, d.base, "energy.potential")
-    other = d.table(device.torque, "torque")
+    other = [e.subs(truth, simultaneous=True) for e in d.table(device.torque, "torque")]
     for i, c in enumerate(device.coordinates):
         sign = d._sgn(d.qd[i])
         if c.name in device.frictional:
             other[i] -= d.p[f"viscous.{c.name}"] * d.qd[i] + d.p[f"coulomb.{c.name}"] * sign
+        slid = sp.Dummy()
+        d.dry[i] = -sp.diff(sp.sympify(other[i]).subs(sign, slid), slid)
         if c.name in device.brakes:
             other[i] -= d.channel[device.brakes[c.name]] * sign
     for k, name in enumerate(device.process_noise):
@@ -342,8 +354,11 @@ def derive(model: Model, named_constants: bool = False) -> Equations:
     energies = [(kinetic, potential)]
     offset = [sp.S.Zero] * n
     z, z_names, rates, initial = [], [], [], []
+    # An offset cannot follow the rates: what a motor's back EMF takes off is left out of its load.
+    still = [e.subs(dict.fromkeys(d.qd, 0)) for e in applied]
     for item in model.effects:
-        symbols = d.effect_symbols(item, applied, side)
+        loaded = still if item.effect.kind == "measurement" else applied
+        symbols = d.effect_symbols(item, loaded, side)
         for key, tree in item.effect.expressions.items():
             place = key.partition(".")[2] or item.target
             if item.effect.kind == "input":

@@ -89,6 +89,7 @@ class Device:
     torque: Mapping[str, ast.expr]
     forces: tuple[str, ...]
     force_unit: str
+    drive: bool
     brakes: Mapping[str, str]
     channels: Mapping[str, str]
     applied: Mapping[str, ast.expr]
@@ -114,6 +115,12 @@ class Device:
             f"device {self.name!r} has no axis {name!r}{expression.did_you_mean(name, known)}",
             remedy=f"its axes are {', '.join(known)}",
         )
+
+    def rubs(self, axis: str) -> bool:
+        """Whether the device adds dry friction of its own to ``axis``, beside the base term."""
+        tree = self.torque.get(axis)
+        calls = [n.func for n in ast.walk(tree) if isinstance(n, ast.Call)] if tree else []
+        return any(isinstance(f, ast.Name) and f.id == "sgn" for f in calls)
 
     @property
     def components(self) -> tuple[str, ...]:
@@ -235,7 +242,9 @@ def device_from(declaration: Mapping[str, Any], where: str = "device file") -> D
         isinstance(f, str) and f not in ("", "force_") for f in forces
     ):
         raise InputError("force must be a list of channel names", where=f"{where}: inputs")
-    _known(inputs, ("force", "force_unit", "brakes", "channels"), f"{where}: inputs")
+    _known(inputs, ("force", "force_unit", "drive", "brakes", "channels"), f"{where}: inputs")
+    if not isinstance(inputs.get("drive", False), bool):
+        raise InputError("drive must be true or false", where=f"{where}: inputs")
     channels = inputs.get("channels", {})
     if not isinstance(channels, Mapping) or not all(isinstance(u, str) for u in channels.values()):
         raise InputError("channels must be a table, name = unit", where=f"{where}: inputs")
@@ -256,6 +265,7 @@ def device_from(declaration: Mapping[str, Any], where: str = "device file") -> D
         torque=_expressions(_table(declaration, "torque", where, False), f"{where}: torque"),
         forces=tuple(forces),
         force_unit=str(inputs.get("force_unit", "N")),
+        drive=inputs.get("drive", False),
         brakes=dict(brakes),
         channels=dict(channels),
         applied=_expressions(_table(declaration, "applied", where, True), f"{where}: applied"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -15,11 +16,13 @@ from bampipe.physics.parameter import Parameter, parameter_from
 # What an effect of each kind must give, where it may apply.
 _EXPRESSIONS = {
     "torque": (("torque",), ("axis", "device")),
-    "input": (("input",), ("force_component", "force_pair", "device")),
+    "input": (("input",), ("force_component", "force_pair", "channel", "device")),
     "energy": (("kinetic", "potential"), ("axis", "device")),
     "measurement": (("offset",), ("axis", "device")),
 }
-SCOPES = ("axis", "force_component", "force_pair", "device")
+SCOPES = ("axis", "force_component", "force_pair", "channel", "device")
+EACH = "each"
+"""Place of a device-wide input effect that stands for every force channel."""
 KINDS = ("torque", "input", "energy", "measurement")
 _KEYS = frozenset(
     [
@@ -39,6 +42,7 @@ _KEYS = frozenset(
         "parameters",
         "states",
         "devices",
+        "drive",
     ]
 )
 
@@ -68,17 +72,23 @@ class Effect:
     looks_like: str
     source: str
     devices: tuple[str, ...]
+    drive: bool
     declaration: Mapping[str, Any] = field(repr=False, compare=False)
 
     def targets(self, device: Device) -> tuple[str, ...]:
         """Names after the colon that make sense for ``device``; ``("",)`` for a device effect."""
-        if self.devices and device.name not in self.devices:
+        if (self.devices and device.name not in self.devices) or (self.drive and not device.drive):
             return ()
         if self.scope == "axis":
-            braked = "brake" in self._names()
+            used = self._names()
             return tuple(
-                c.name for c in device.coordinates if not braked or c.name in device.brakes
+                c.name
+                for c in device.coordinates
+                if ("brake" not in used or c.name in device.brakes)
+                and ("dry" not in used or device.rubs(c.name))
             )
+        if self.scope == "channel":
+            return tuple(device.channels)
         if self.scope == "force_component":
             return device.components
         if self.scope == "force_pair":
@@ -105,6 +115,9 @@ class Effect:
             }
         keys = {key.partition(".")[2] for key in self.expressions} - {""}
         places = {c.name for c in device.coordinates} | set(device.forces)
+        if EACH in keys and device.forces:
+            places |= {EACH}
+            known |= {derivative("f", k) for k in range(len(INPUT_ORDERS))}
         return keys <= places and self._names() <= known
 
 
@@ -228,6 +241,7 @@ def effect_from(declaration: Mapping[str, Any], where: str = "effect file") -> E
         looks_like=declaration["looks_like"],
         source=declaration["source"],
         devices=tuple(devices),
+        drive=bool(declaration.get("drive", False)),
         declaration=declaration,
     )
 
@@ -263,5 +277,24 @@ def bind(effect: Effect, target: str, device: Device) -> BoundEffect:
             chosen = {**entry[kind]}
             if "description" in entry:
                 chosen.setdefault("description", entry["description"])
+        if isinstance(chosen, Mapping) and isinstance(chosen.get("unit"), str):
+            chosen = {**chosen, "unit": unit_of(chosen["unit"], effect, target, device)}
         bound.append(parameter_from(f"{prefix}.{name}", chosen, where))
     return BoundEffect(effect, target, tuple(bound))
+
+
+def unit_of(unit: str, effect: Effect, target: str, device: Device) -> str:
+    """``unit`` of a parameter or state with ``input`` replaced by that of the channel acted on."""
+    own = device.channels[target] if effect.scope == "channel" else device.force_unit
+    above: list[str] = []
+    below: list[str] = []
+    for sign, part in _factors(unit):
+        for inner, piece in _factors(own) if part == "input" else [("*", part)]:
+            (above if sign == inner or (sign, inner) == ("/", "/") else below).append(piece)
+    return (".".join(above) or ("1" if below else "")) + "".join(f"/{p}" for p in below)
+
+
+def _factors(unit: str) -> list[tuple[str, str]]:
+    """Factors of a unit text, each with ``*`` or ``/``."""
+    found = re.findall(r"([./]?)([^./]+)", unit)
+    return [("/" if sign == "/" else "*", part) for sign, part in found if part != "1"]

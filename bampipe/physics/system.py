@@ -15,7 +15,9 @@ from bampipe.physics.model import Model
 from bampipe.physics.parameter import Parameter
 
 Array = NDArray[np.float64]
-_MEMORY_STEPS = 3
+_MEMORY_STEPS = (3, 12, 48)
+"""Steps a sample tried in turn, until a stiff state is integrated without running away."""
+_RUNAWAY = 1e9
 
 
 class System:
@@ -31,6 +33,8 @@ class System:
         linear: per parameter, whether the residual is linear in it.
         touched: axes whose equation the effects change, measurement effects aside.
         moves_sensors: whether an effect of kind ``measurement`` is present.
+        driven: whether what the effects add to the residual depends on the measured force of
+            the same moment.
         compensated: axes on which the device has something against gravity; see `compensation`.
         delays: names of the parameters that shift measured forces in time.
     """
@@ -55,6 +59,7 @@ class System:
         self.linear: tuple[bool, ...] = tuple(meta["linear"])
         self.touched: tuple[int, ...] = tuple(meta["touched"])
         self.moves_sensors: bool = meta["moves_sensors"]
+        self.driven: bool = meta["driven"]
         self.compensated: tuple[int, ...] = tuple(meta["compensated"])
         self.delays: tuple[str, ...] = tuple(meta["delays"])
 
@@ -209,7 +214,8 @@ class System:
     def memory(self, q: Array, qd: Array, qdd: Array, u: Array, p: Array, t: Array) -> Array:
         """Internal states along a measured motion of one trial, (T, n_z).
 
-        Integrated by RK4 with inputs interpolated linearly between samples.
+        Integrated by RK4 with inputs interpolated linearly between samples, in finer steps where
+        a state would run away.
 
         Args:
             q, qd, qdd, u, p: as in `required`.
@@ -222,7 +228,10 @@ class System:
         arrays = [np.ascontiguousarray(x, dtype=np.float64) for x in (a, b, u, p, t)]
         out = np.empty((len(q), len(z0)))
         module = self._code.module("memory")
-        module.memory(*arrays, z0, _MEMORY_STEPS, out)
+        for steps in _MEMORY_STEPS:
+            module.memory(*arrays, z0, steps, out)
+            if np.all(np.abs(out) < _RUNAWAY):
+                break
         return out
 
 
@@ -250,6 +259,8 @@ def compile_model(model: Model) -> System:
 
     equations = derive(model)
     added = contribution(equations, derive(Model(model.device)))
+    channels = dict(zip(equations.inputs, equations.u, strict=True))
+    forces = [channels[name] for name in model.device.forces]
     facts = {
         "memory": equations.z_names,
         "inputs": equations.inputs,
@@ -257,6 +268,8 @@ def compile_model(model: Model) -> System:
         "linear": equations.linear,
         "touched": [i for i, e in enumerate(added) if e != 0],
         "moves_sensors": any(e != 0 for e in equations.offset),
+        "driven": any(e.has(*forces) for e in added)
+        and not any(e.has(*forces) for e in equations.rates),
         "compensated": [i for i, e in enumerate(equations.compensation) if e != 0],
         "delays": equations.delays,
     }

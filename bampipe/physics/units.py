@@ -19,7 +19,7 @@ from fractions import Fraction
 from bampipe.errors import InputError
 from bampipe.physics import expression
 from bampipe.physics.device import INPUT_ORDERS, Device, derivative
-from bampipe.physics.effect import BoundEffect, Effect, bind
+from bampipe.physics.effect import EACH, BoundEffect, Effect, bind, unit_of
 
 BASE = ("kg", "m", "s", "A", "K")
 
@@ -316,7 +316,7 @@ def _effect_symbols(item: BoundEffect, device: Device, check: _Check) -> dict[st
         symbols[f"viscous_{axis}"] = torque * second / unit
         if axis == item.target and item.effect.scope == "axis":
             symbols |= {"q": unit, "qd": unit / second, "brake": torque, "side_load": None}
-            symbols |= dict.fromkeys(("applied", "load", "coulomb"), torque)
+            symbols |= dict.fromkeys(("applied", "load", "coulomb", "dry"), torque)
             symbols["viscous"] = torque * second / unit
             if axis in device.side_load:
                 side = device.side_load[axis]
@@ -325,6 +325,11 @@ def _effect_symbols(item: BoundEffect, device: Device, check: _Check) -> dict[st
         for letter in "fg"[: 1 + (item.effect.scope == "force_pair")]:
             for order, suffix in enumerate(("", "_rate", "_curvature")):
                 symbols[letter + suffix] = symbols[derivative(device.forces[0], order)]
+    if item.effect.scope == "channel":
+        symbols["f"] = symbols[item.target]
+    if any(key.endswith(f".{EACH}") for key in item.effect.expressions):
+        for order in range(len(INPUT_ORDERS)):
+            symbols[derivative("f", order)] = symbols[derivative(device.forces[0], order)]
     for p in item.parameters:
         short = p.name.removeprefix(f"{item.prefix}.")
         symbols[short] = check.unit(p.unit, f"parameters.{short}.unit")
@@ -352,12 +357,13 @@ def check_effect(effect: Effect, device: Device, target: str = "") -> list[str]:
     for state in effect.states:
         entry = state.entry.get(kind, state.entry)
         unit = str(entry.get("unit", "")) if isinstance(entry, Mapping) else ""
+        unit = unit_of(unit, effect, target, device)
         symbols[state.name] = check.unit(unit, f"states.{state.name}.unit")
     force = symbols[device.forces[0]] if device.forces else None
     wanted: dict[str, Callable[[str], Found]] = {
         "torque": {axis: torque for axis, _, torque in _axes(device)}.get,
         "offset": {axis: unit for axis, unit, _ in _axes(device)}.get,
-        "input": lambda _: force,
+        "input": lambda _: symbols[target] if effect.scope == "channel" else force,
         "kinetic": lambda _: _UNITS["J"],
         "potential": lambda _: _UNITS["J"],
     }

@@ -213,6 +213,8 @@ def symbols_of(case):
         known |= {f"force_{order}{c}": slope for c in "xyz"}
         if bound.effect.scope in ("force_component", "force_pair"):
             known |= {f"{f}_{order}".rstrip("_"): slope for f in "fg"}
+        elif bound.effect.scope == "device":
+            known[f"f_{order}".rstrip("_")] = slope
     for c in BAM.coordinates:
         torque = dimension(c.torque_unit)
         known[f"brake_{c.name}"] = torque

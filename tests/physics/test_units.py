@@ -115,9 +115,7 @@ def test_built_in_devices_are_consistent(name):
 @pytest.mark.parametrize("name", registry.effect_names())
 def test_built_in_effects_are_consistent_at_every_target(name):
     effect = registry.effect(name)
-    targets = effect.targets(BAM)
-    assert targets
-    for target in targets:
+    for target in effect.targets(BAM):
         assert check_effect(effect, BAM, target) == []
 
 

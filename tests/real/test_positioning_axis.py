@@ -58,11 +58,28 @@ def test_least_squares_gives_the_published_relative_error(whole):
 
 def test_friction_by_direction_gives_the_published_relative_error(whole):
     axis = result(whole, f"models/{BY_DIRECTION}/validate.json")["axes"]["carriage"]
-    assert axis["relative_error_percent"] == pytest.approx(3.1117, abs=0.01)
+    assert axis["relative_error_percent"] <= 3.1117
+    assert axis["relative_error_percent"] == pytest.approx(3.1117, abs=0.15)
     found = estimates(whole, BY_DIRECTION)
     half = found["asymmetric_coulomb.carriage.viscous_difference"]
     assert found["viscous.carriage"] + half == pytest.approx(166.7061, rel=0.01)
     assert found["viscous.carriage"] - half == pytest.approx(240.4236, rel=0.01)
+
+
+def test_free_runs_stay_closer_than_published(whole):
+    """Published for the symmetric model in closed loop, relative to the measured quantity:
+    position 0.013752 %, velocity 0.22911 %, force 5.848 %."""
+    errors = []
+    for model in ("base", BY_DIRECTION):
+        free = result(whole, f"models/{model}/validate.json")["free_run"]
+        assert free["mode"] == "closed_loop"
+        axis = free["axes"]["carriage"]
+        assert axis["relative_error_percent"] < 0.013752
+        assert axis["velocity_relative_error_percent"] < 0.22911
+        errors.append(free["forces"]["force_motor"]["relative_error_percent"])
+    assert errors[1] < 0.9 * errors[0] < 5.848
+    rungs = result(whole, "compare.json")["ladder"]
+    assert [rung["free_run_mode"] for rung in rungs] == ["closed_loop", "closed_loop"]
 
 
 def test_the_filter_agrees_within_its_uncertainty(stretches):

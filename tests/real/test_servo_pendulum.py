@@ -31,6 +31,8 @@ joint = {{ column = "position", unit = "rad", resolution = 1.5339807878853584e-3
 [channels]
 duty = {{ column = "load", unit = "", scale = {duty!r}, wrap_bits = 16, signed = true }}
 supply = {{ column = "input_volts", unit = "V" }}
+goal = {{ column = "goal_position", unit = "rad" }}
+gain = {{ column = "kp", unit = "" }}
 """
 BAND = Band(188.0, 8.0)
 
@@ -86,6 +88,47 @@ def test_the_diagnosis_ranks_load_dependent_friction_first(runs):
     best = result(runs[0], "models/base/diagnose.json")["ranking"][0]
     assert best["effect"] == "load_dependent_friction:joint" and best["p_value"] < 0.01
     assert best["held_out_rmse_after"] < 0.75 * best["held_out_rmse_before"]
+
+
+@pytest.fixture(scope="module")
+def by_gain(runs, tmp_path_factory) -> Path:
+    """The run of all logs in which trials of one gain are held out together."""
+    root = tmp_path_factory.mktemp("by_gain")
+    logs = [log for folder in runs for log in sorted((folder.parent).glob("session_*/*.json"))]
+    session = write_session(root / "session", sorted(set(logs)), "all")
+    pipeline = root / "by_gain.toml"
+    pipeline.write_text(
+        'schema = "bampipe.pipeline/1"\nname = "by_gain"\n'
+        'stages = ["ingest", "filter", "identify", "validate"]\n'
+        '[settings.identify]\nmethod = "least-squares"\n'
+        '[settings.validate]\nhold_out_by = "gain"\nnoise_floor = false\n'
+    )
+    bampipe("run", session, "--pipeline", pipeline, "--runs", root)
+    bampipe("extend", root / "all", "load_dependent_friction:joint")
+    return root / "all"
+
+
+def free_run_error(run: Path, model: str) -> float:
+    """Mean absolute error of the free run over the logs at the held-out gain, rad."""
+    gains = read_parquet(run / "ingest/samples.parquet").groupby("trial_id").gain.first()
+    trials = result(run, f"models/{model}/validate.json")["free_run"]["trials"]
+    chosen = [name for name in trials if gains[name] == HELD_OUT_GAIN]
+    assert len(chosen) == 3
+    return float(np.mean([trials[name]["joint"]["mean_absolute"] for name in chosen]))
+
+
+def test_free_runs_at_a_gain_not_seen_come_closer_with_load_dependent_friction(by_gain):
+    """The makers' own models, fitted to free runs: 0.054 rad, load-dependent friction 0.035."""
+    plain = free_run_error(by_gain, "base")
+    loaded = free_run_error(by_gain, "base+load_dependent_friction.joint")
+    assert plain < 0.065
+    assert loaded < 0.045 and loaded < 0.75 * plain
+
+
+def test_load_dependent_friction_gives_the_weighed_mass(by_gain):
+    assert estimates(by_gain, "base+load_dependent_friction.joint")["load_mass"] == pytest.approx(
+        0.49, abs=0.03
+    )
 
 
 def held_out_error(runs: tuple[Path, Path], *effects: str) -> float:

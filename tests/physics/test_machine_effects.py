@@ -1,0 +1,155 @@
+"""Effects on machines other than the BAM: motors, channels, dry friction that a device commands."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from bampipe.physics import Model, compile_model, registry
+from bampipe.physics.effect import unit_of
+from bampipe.physics.units import check_effect
+
+MACHINES = ("slider", "servo_pendulum", "magnetic_damper")
+CASES = [
+    (machine, f"{name}:{target}" if target else name)
+    for machine in MACHINES
+    for name in registry.effect_names()
+    for target in registry.effect(name).targets(registry.device(machine))
+]
+RATE = 250.0
+
+
+def smooth(system, seed=5):
+    """A made-up smooth motion with inputs, 4 s: q, qd, qdd, u, t."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(1000) / RATE
+
+    def waves(size):
+        w = 2 * np.pi * rng.uniform(0.3, 1.5, 6)
+        phase, scale = rng.uniform(0, 6.28, 6), size * rng.normal(size=6)
+        angle = w[:, None] * t + phase[:, None]
+        return [scale @ (w[:, None] ** k * np.sin(angle + k * np.pi / 2)) for k in range(5)]
+
+    rotary = system.model.device.coordinates[0].kind == "rotary"
+    q, qd, qdd, _, _ = waves(0.3 if rotary else 0.02)
+    columns = {"t": t}
+    for force in system.model.device.forces:
+        for k, column in enumerate(waves(0.3 if rotary else 60.0)):
+            kind = ("", "rate", "curvature", "third", "fourth")[k]
+            stem = force.removeprefix("force_")
+            name = f"force_{kind}_{stem}" if force != stem else f"{force}_{kind}"
+            columns[name if kind else force] = column
+    for channel in system.model.device.channels:
+        columns[channel] = 1.0 + np.abs(waves(0.5)[0])
+    u = np.column_stack([columns[name] for name in system.inputs])
+    return q[:, None], qd[:, None], qdd[:, None], u, t
+
+
+def residual(system, p, motion):
+    q, qd, qdd, u, t = motion
+    z = system.memory(q, qd, qdd, u, p, t)
+    return (system.applied(q, qd, qdd, z, u, p) - system.required(q, qd, qdd, z, u, p))[:, 0]
+
+
+def typical(system, strength=1.0):
+    sizes = [p.prior if p.typical is None else p.typical for p in system.parameters]
+    return np.array(
+        [s * strength if p.strength else s for s, p in zip(sizes, system.parameters, strict=True)]
+    )
+
+
+@pytest.mark.parametrize("name", registry.effect_names())
+def test_every_effect_has_a_place_in_some_device(name):
+    effect = registry.effect(name)
+    assert any(effect.targets(registry.device(d)) for d in registry.device_names())
+
+
+@pytest.mark.parametrize(("machine", "case"), CASES)
+def test_units_are_consistent(machine, case):
+    name, _, target = case.partition(":")
+    assert check_effect(registry.effect(name), registry.device(machine), target) == []
+
+
+@pytest.mark.parametrize(
+    ("machine", "case"),
+    [
+        ("slider", "torque_ripple:carriage"),
+        ("slider", "actuator_lag:motor"),
+        ("slider", "force_delay"),
+        ("magnetic_damper", "channel_lag:current"),
+        ("magnetic_damper", "channel_saturation:current"),
+        ("magnetic_damper", "hysteresis:piston"),
+    ],
+)
+def test_is_absent_at_zero_and_recovered_from_a_wrong_guess(machine, case):
+    device = registry.device(machine)
+    bare, system = compile_model(Model(device)), compile_model(Model(device, [case]))
+    motion = smooth(system)
+    count = len(bare.parameters)
+    base = np.array([p.prior + 0.3 * p.sd for p in bare.parameters])
+    none, truth = typical(system, 0.0), typical(system)
+    none[:count] = truth[:count] = base
+    plain = residual(bare, base, smooth(bare))
+    # What keeps a lag's rate finite leaves its smallest time constant, 1 or 2 ms.
+    scale = np.abs(residual(system, truth, motion) - plain).max()
+    assert np.isfinite(scale) and scale > 0.0
+    np.testing.assert_allclose(residual(system, none, motion), plain, atol=0.05 * scale)
+    goal = residual(system, truth, motion)
+    free = [i for i in range(count, len(truth)) if not system.parameters[i].fixed]
+    sizes = np.abs(truth[free])
+
+    def error(x):
+        p = truth.copy()
+        p[free] = x * sizes
+        return (residual(system, p, motion) - goal) / scale
+
+    start = np.sign(truth[free]) * np.linspace(0.9, 1.1, len(free))
+    start[0] *= 0.7
+    found = least_squares(error, start, diff_step=1e-4)
+    np.testing.assert_allclose(found.x, np.sign(truth[free]), rtol=0.02)
+
+
+def test_motor_effects_are_offered_to_motors_only():
+    for name in ("torque_ripple", "actuator_lag"):
+        assert registry.effect(name).targets(registry.device("slider"))
+        assert not registry.effect(name).targets(registry.device("bam"))
+        assert not registry.effect(name).targets(registry.device("magnetic_damper"))
+
+
+def test_hysteresis_of_all_dry_friction_needs_a_device_that_adds_some():
+    effect = registry.effect("hysteresis")
+    assert effect.targets(registry.device("magnetic_damper")) == ("piston",)
+    assert effect.targets(registry.device("slider")) == ()
+
+
+def test_dry_friction_is_all_that_turns_with_the_motion():
+    device = registry.device("magnetic_damper")
+    system = compile_model(Model(device, ["hysteresis:piston"]))
+    names = [p.name for p in system.parameters]
+    p = typical(system, 0.0)
+    p[names.index("coulomb.piston")], p[names.index("coulomb_gain")] = 40.0, 200.0
+    p[names.index("hysteresis.piston.share")] = 1.0
+    u = np.array([[{"current": 1.5}.get(name, 0.0) for name in system.inputs]])
+    one = np.array([[0.1]])
+    gone = [system.required(0 * one, one, 0 * one, np.array([[z]]), u, p)[0, 0] for z in (0.0, 1.0)]
+    assert gone[1] - gone[0] == pytest.approx(40.0 + 1.5 * 200.0, rel=1e-6)
+
+
+def test_a_motor_load_taken_for_play_is_that_at_standstill():
+    """Back EMF depends on the rate, of which an offset of the encoder must be free."""
+    system = compile_model(Model(registry.device("servo_pendulum"), ["backlash:joint"]))
+    assert system.moves_sensors
+
+
+@pytest.mark.parametrize(
+    ("unit", "own", "result"),
+    [("input", "A", "A"), ("1/input", "A", "1/A"), ("input/s", "", "1/s"),
+     ("1/input", "m/s", "s/m"),
+     ("input/s", "N", "N/s"), ("N.m", "A", "N.m"), ("", "A", "")],
+)  # fmt: skip
+def test_units_follow_the_channel(unit, own, result):
+    content = dict(registry.device("slider").declaration)
+    content["inputs"] = {**content["inputs"], "force_unit": own}
+    device = registry.device_from(content)
+    assert unit_of(unit, registry.effect("force_bias"), "motor", device) == result
