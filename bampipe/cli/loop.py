@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import tomllib
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -103,17 +102,10 @@ def _named(text: str) -> tuple[str, Path | None]:
     if own is None:
         return text, None
     path, target = own
-    try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise InputError("no such effect file", where=str(path)) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"not valid TOML: {error}", where=str(path)) from error
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}", where=str(path)) from error
     from bampipe.physics import registry
+    from bampipe.stages.declarations import read_effect
 
-    effect = registry.effect_from(content, str(path))
+    effect = registry.effect_from(read_effect(str(path)), str(path))
     return f"{effect.name}:{target}" if target else effect.name, path
 
 

@@ -12,6 +12,7 @@ from bampipe.run.events import Event
 from bampipe.run.request import Outcome
 
 LARGEST_TABLE = 40
+MOST_TRIALS = 10
 FIRST_COLUMNS = ("", "trial_id", "estimate", "sd", "unit", "rmse", "held_out_rmse", "noise_floor")
 
 
@@ -134,11 +135,25 @@ def summary(content: Mapping[str, object]) -> None:
     for row in [*(_records(content.get("axes")) or []), *(_records(content.get("moved")) or [])]:
         if isinstance(row.get("sentence"), str):
             say(str(row["sentence"]))
+    trials(content)
     notes = content.get("notes")
     if isinstance(notes, list) and notes:
         say("")
         for line in notes:
             say(f"note: {line}")
+
+
+def trials(content: Mapping[str, object]) -> None:
+    """Print which trials were set aside, and what was repaired or noted in others, a line each."""
+    for name, word, reason in (
+        ("set_aside", "set aside", "reason"),
+        ("repaired", "note", "repairs"),
+    ):
+        rows = _records(content.get(name)) or []
+        for row in rows[:MOST_TRIALS]:
+            say(f"{word}: {row['trial_id']}: {row[reason]}")
+        if len(rows) > MOST_TRIALS:
+            say(f"{word}: {len(rows) - MOST_TRIALS} trials more; `bampipe ingest --json` lists all")
 
 
 def _ladder(value: object) -> None:
@@ -200,6 +215,8 @@ def outcome(result: Outcome) -> None:
         rows.append([step.step, step.state, took, _first_line(step.summary)])
     if rows:
         table(["step", "state", "time", ""], rows)
+    for step in result.steps:
+        trials(step.summary)
     shown = [verdict for verdict in result.verdicts if verdict.state != "absent"]
     if shown:
         say("")

@@ -9,7 +9,6 @@ import json
 import os
 import platform
 import time
-import tomllib
 from collections.abc import Iterable, Mapping
 from datetime import date, datetime
 from datetime import time as clock_time
@@ -17,6 +16,8 @@ from functools import cache
 from pathlib import Path
 
 import bampipe
+from bampipe.data.text import read_toml
+from bampipe.errors import InputError
 from bampipe.stages import base
 
 PACKAGES = (
@@ -72,11 +73,10 @@ def digest_input(path: Path) -> str:
     TOML counts by its bytes: the stage that reads it says what is wrong with it.
     """
     if path.suffix == ".toml":
-        content = path.read_bytes()
         try:
-            return digest_content(tomllib.loads(content.decode("utf-8")))
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError):
-            return digest_bytes(content)
+            return digest_content(read_toml(path))
+        except InputError:
+            return digest_file(path)
     return digest_file(path)
 
 
@@ -122,9 +122,11 @@ def _inside(folder: Path, name: object) -> Path | None:
     if not isinstance(name, str) or not name or "\0" in name:
         return None
     path = folder / name
-    if not path.resolve().is_relative_to(folder.resolve()):
+    try:
+        inside = path.resolve().is_relative_to(folder.resolve())
+    except (OSError, RuntimeError):  # a link to itself, a name that is too long
         return None
-    return path
+    return path if inside else None
 
 
 def session_files(folder: Path) -> dict[str, Path]:
@@ -139,8 +141,8 @@ def session_files(folder: Path) -> dict[str, Path]:
     session = folder / "session.toml"
     files = {"session.toml": session}
     try:
-        content = tomllib.loads(session.read_text(encoding="utf-8"))
-    except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError):
+        content = read_toml(session)
+    except InputError:  # ingest says what is wrong with it
         return files
     trials = content.get("trials")
     names = [trial.get("file") for trial in trials if isinstance(trial, dict)] if trials else []
@@ -150,7 +152,9 @@ def session_files(folder: Path) -> dict[str, Path]:
             files[str(name)] = path
     device = content.get("device")
     if isinstance(device, str) and device.endswith(".toml"):
-        files[device] = folder / device
+        path = _inside(folder, device)
+        if path is not None:
+            files[device] = path
     return files
 
 

@@ -7,6 +7,7 @@ import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 
+from bampipe.data.text import read_toml
 from bampipe.errors import InputError
 from bampipe.run import record
 from bampipe.run.settings import did_you_mean
@@ -57,10 +58,7 @@ def read(root: Path, name: str) -> ModelFile:
     if name not in names(root):
         known = names(root) or (BASE,)
         raise InputError(f"no model {name!r}", where=str(root), remedy=did_you_mean(name, known))
-    try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"not valid TOML: {error}", where=str(path)) from error
+    content = read_toml(path)
     device, effects = content.get("device"), content.get("effects", [])
     if not isinstance(device, str):
         raise InputError("device must be a text", where=str(path))

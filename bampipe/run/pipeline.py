@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Any
 
 import bampipe
 from bampipe.data.schema import validate
+from bampipe.data.text import read_toml
 from bampipe.errors import InputError
 from bampipe.run.settings import did_you_mean
 from bampipe.stages import base
@@ -130,10 +130,7 @@ def load(name: str = "default") -> Pipeline:
         InputError: there is none, it is not TOML, or it says something impossible.
     """
     path = find(name)
-    try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"not valid TOML: {error}", where=str(path)) from error
+    content = read_toml(path)
     stages = content.get("stages")
     for stage in stages if isinstance(stages, list) else []:
         if stage not in base.STAGES:

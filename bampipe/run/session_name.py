@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import re
-import tomllib
 from pathlib import Path
 
+from bampipe.data.text import read_toml
 from bampipe.errors import InputError
 
 
@@ -30,12 +30,11 @@ def session_id(session: Path) -> str:
             where=str(session),
             remedy="give the folder of a session",
         )
-    try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"not valid TOML: {error}", where=str(path)) from error
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}", where=str(path)) from error
+    content = read_toml(path)
+    if "session_id" not in content:
+        raise InputError(
+            "'session_id' is missing", where=str(path), remedy="give the session a name of its own"
+        )
     name = content.get("session_id")
     if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9._+-]{0,127}", name):
         raise InputError(

@@ -8,7 +8,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from bampipe.data import store
+from bampipe.data import store, text
 from bampipe.errors import InputError
 
 
@@ -57,7 +57,7 @@ def test_json_that_is_broken_is_named_with_its_line(tmp_path):
         ("a = 1\n".encode("utf-16"), "UTF-16"),
         (b"a = " + b"[" * 50_000, "nested too deeply"),
         (b".".join([b"a"] * 5_000) + b" = 1", "nested too deeply"),
-        (b"#" * (store.LARGEST_TOML_BYTES + 1), "larger than 4 MB"),
+        (b"#" * (text.LARGEST_TOML_BYTES + 1), "larger than 4 MB"),
     ],
 )
 def test_toml_that_is_broken_is_named_with_its_line(tmp_path, content, message):
