@@ -136,7 +136,8 @@ def test_several_sessions_end_in_a_table(toy: Toy, command: Command) -> None:
     options = ["--pipeline", toy.pipeline_file, "--runs", toy.runs, "--junit", junit]
     code, out, _ = command("run", pattern, *options)
     assert code == 2
-    table = {line.split()[0]: line for line in out.splitlines() if line.strip()}
+    shown = out.partition("\n\n")[0]
+    table = {line.split()[0]: line for line in shown.splitlines() if line.strip()}
     assert "done" in table["a"]
     assert "bad input" in table["b"]
     assert "write whole numbers" in table["b"]
@@ -365,7 +366,7 @@ def ingested(tmp_path: Path) -> Path:
         (["stribek:yaw"], "did you mean 'stribeck'"),
         (["stribeck:yow"], "yaw"),
         (["stribeck:yaw", "--model", "bse"], "did you mean 'base'"),
-        (["absent.toml:yaw"], "no such effect file"),
+        (["absent.toml:yaw"], "absent.toml: no such file"),
         (["stribeck:yaw", "--auto"], "--auto chooses the effects itself"),
         (["stribeck:yaw"], "is missing"),
     ],

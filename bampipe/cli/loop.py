@@ -126,21 +126,18 @@ def extend(options: Options, parent: str, effect: str) -> str:
     """
     root = options.root
     name, file = _named(effect)
-    with options.lock():
-        models.ensure_base(root, options.pipeline.device, options.pipeline.effects)
-        if name in models.read(root, parent).effects:
-            raise InputError(f"model {parent!r} has {name} already", where=str(root))
-    options.run("identify", "validate", parent)
     child = models.child_name(parent, name)
     fresh = not (root / "models" / child).exists()
     try:
         with options.lock():
+            models.ensure_base(root, options.pipeline.device, options.pipeline.effects)
             _write_child(root, parent, name, file)
+        options.run("identify", "validate", parent)
         options.run("identify", "validate", child)
     except InputError:
-        if fresh:
+        if fresh and (root / "models" / child).exists():
             with options.lock():
-                shutil.rmtree(root / "models" / child, ignore_errors=True)
+                shutil.rmtree(root / "models" / child)
         raise
     options.run("compare", "compare", "")
     return child
@@ -156,11 +153,13 @@ def _write_child(root: Path, parent: str, effect: str, file: Path | None) -> Non
         file: where the effect comes from, if it is a lab's own.
 
     Raises:
-        InputError: the device cannot have the effect.
+        InputError: the parent has the effect already, or the device cannot have it.
     """
     from bampipe.stages.modelfile import load_model
 
     before = models.read(root, parent)
+    if effect in before.effects:
+        raise InputError(f"model {parent!r} has {effect} already", where=str(root))
     child = models.child_name(parent, effect)
     own = {path.name: path for path in (root / "models" / parent / "effects").glob("*.toml")}
     if file is not None:
