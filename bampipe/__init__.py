@@ -1,3 +1,68 @@
-"""bampipe: from raw trial logs of a manipulator to a mechanical model that people trust."""
+"""bampipe: from raw trial logs of a manipulator to a mechanical model that people trust.
+
+For notebooks and programs, see docs/api.md::
+
+    import bampipe
+
+    run = bampipe.run_session("sessions/2026-10-03_s01")
+    run.parameters()
+
+What is exported here is loaded when it is first used: ``import bampipe`` itself imports nothing
+beyond the standard library.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+from bampipe.errors import InputError
+
+if TYPE_CHECKING:
+    from bampipe.api.actions import (
+        compare,
+        diagnose,
+        extend,
+        filter,
+        follow,
+        identify,
+        ingest,
+        run_session,
+        stiffness,
+        validate,
+        write_report,
+    )
+    from bampipe.api.opened import Picture, Run, open_run
 
 __version__ = "0.1.0"
+
+__all__ = [
+    "InputError",
+    "Picture",
+    "Run",
+    "compare",
+    "diagnose",
+    "extend",
+    "filter",
+    "follow",
+    "identify",
+    "ingest",
+    "open_run",
+    "run_session",
+    "stiffness",
+    "validate",
+    "write_report",
+]
+
+_OPENED = ("Picture", "Run", "open_run")
+
+
+def __getattr__(name: str) -> object:
+    if name not in __all__:
+        raise AttributeError(f"module 'bampipe' has no attribute {name!r}")
+    module = "bampipe.api.opened" if name in _OPENED else "bampipe.api.actions"
+    return getattr(import_module(module), name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])

@@ -398,7 +398,7 @@ def test_an_effect_is_not_added_twice(ingested: Path, command: Command) -> None:
 def test_the_next_effect_is_the_first_that_the_diagnosis_selects(
     tmp_path: Path, selected: list[str], effect: str
 ) -> None:
-    from bampipe.cli.loop import next_effect
+    from bampipe.api.loop import next_effect
 
     path = tmp_path / "models" / "base" / "diagnose.json"
     path.parent.mkdir(parents=True)

@@ -80,9 +80,18 @@ LAWS = {
         "bampipe.run",
         "bampipe.stages.base",
     },
+    "api": {
+        "pandas",
+        "bampipe.errors",
+        "bampipe.physics",
+        "bampipe.report",
+        "bampipe.run",
+        "bampipe.stages",
+    },
     "cli": {
         "typer",
         "rich",
+        "bampipe.api",
         "bampipe",
         "bampipe.errors",
         "bampipe.run",

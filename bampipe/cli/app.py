@@ -615,7 +615,7 @@ def diagnose(
     if list_settings:
         _list_settings("diagnose")
         return
-    from bampipe.cli.loop import current_model, next_effect
+    from bampipe.api.loop import current_model, next_effect
 
     root = places.find_run(run, runs)
     chosen = model or current_model(root)
@@ -668,7 +668,7 @@ def extend(
 
     Example: bampipe extend 2026-10-03_s01 --auto
     """
-    from bampipe.cli import loop
+    from bampipe.api import loop
 
     batch.limit_threads(1)
     if auto and second is not None:
@@ -869,7 +869,7 @@ def demo(
 
     Example: bampipe demo
     """
-    from bampipe.cli.loop import demonstrate
+    from bampipe.cli.demo import demonstrate
 
     batch.limit_threads(1)
     with show.Watcher(quiet) as watcher:

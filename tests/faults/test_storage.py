@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from conftest import TOYS, Toy
 
-from bampipe.cli import loop
+from bampipe.api import loop
 from bampipe.errors import InputError
 from bampipe.run import record
 from bampipe.run.events import Event

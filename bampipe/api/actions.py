@@ -1,0 +1,177 @@
+"""The stages as functions: each runs what is stale, through the same cache as the command line."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from bampipe.api import loop
+from bampipe.api.opened import Run, open_run
+from bampipe.run import batch, models, record, runner
+from bampipe.run import pipeline as pipelines
+from bampipe.run.events import unheard
+from bampipe.run.pipeline import Pipeline
+from bampipe.run.request import Request
+from bampipe.run.session_name import session_id
+from bampipe.stages import base
+
+Path_ = str | Path
+RUNS = "runs"
+
+
+def run_session(
+    session: Path_,
+    *,
+    runs: Path_ = RUNS,
+    pipeline: str = "default",
+    first: str = "",
+    last: str = "",
+    force: bool = False,
+    settings: Mapping[str, Mapping[str, object]] | None = None,
+) -> Run:
+    """From raw log to report: all stages of a pipeline, those that changed.
+
+    Args:
+        session: folder of the session.
+        runs: folder that holds the run folders.
+        pipeline: name of a pipeline, or a file of your own.
+        first, last: stages to start from and to stop after; all where empty.
+        force: run even what did not change.
+        settings: by stage, then by name: ``{"identify": {"method": "least-squares"}}``.
+
+    Raises:
+        InputError: bad input; earlier results stay as they were.
+    """
+    batch.limit_threads(1)
+    folder = Path(session)
+    root = Path(runs) / session_id(folder)
+    runner.run_session(
+        Request(
+            root=root,
+            pipeline=pipelines.load(pipeline),
+            session=folder,
+            settings=_settings(settings or {}),
+            first=first,
+            last=last,
+            force=force,
+            judged=models.BASE,
+        ),
+        unheard,
+    )
+    return Run(root)
+
+
+def ingest(session: Path_, *, runs: Path_ = RUNS, **settings: object) -> Run:
+    """Read a session's raw logs into SI units.
+
+    Raises:
+        InputError: a mistake in the session file, or no trial is sound.
+    """
+    return run_session(session, runs=runs, last="ingest", settings={"ingest": settings})
+
+
+def filter(run: Run | Path_, **settings: object) -> pd.DataFrame:
+    """Differentiate the motion; returns `Run.kinematics`."""
+    return _stage(run, "filter", "", settings).kinematics
+
+
+def stiffness(run: Run | Path_, **settings: object) -> pd.DataFrame:
+    """Stiffness of the locked axes; returns `Run.stiffness`."""
+    return _stage(run, "stiffness", "", settings).stiffness
+
+
+def identify(run: Run | Path_, model: str = "base", **settings: object) -> pd.DataFrame:
+    """Estimate a model's parameters; returns `Run.parameters`."""
+    return _stage(run, "identify", model, settings).parameters(model)
+
+
+def validate(run: Run | Path_, model: str = "base", **settings: object) -> pd.DataFrame:
+    """Predict trials that the fit has not seen; returns `Run.validation`."""
+    return _stage(run, "validate", model, settings).validation(model)
+
+
+def diagnose(run: Run | Path_, model: str = "", **settings: object) -> dict[str, Any]:
+    """Find what a model lacks (default: the one extended last); returns `Run.diagnosis`."""
+    chosen = model or _opened(run).model
+    return _stage(run, "diagnose", chosen, settings).diagnosis(chosen)
+
+
+def compare(run: Run | Path_, **settings: object) -> pd.DataFrame:
+    """Put the models beside one another; returns `Run.ladder`."""
+    return _stage(run, "compare", "", settings).ladder
+
+
+def write_report(run: Run | Path_, **settings: object) -> Path:
+    """Write the report; returns the path of the PDF."""
+    return _stage(run, "report", "", settings).root / "report" / "report.pdf"
+
+
+def extend(run: Run | Path_, effect: str, model: str = "") -> Run:
+    """Add an effect to a model, identify and validate it again, and compare.
+
+    Args:
+        run: a run, or its folder.
+        effect: ``name[:target]``, or ``file.toml[:target]`` for one of your own.
+        model: the parent; the one extended last where empty.
+
+    Returns:
+        The run, whose `Run.model` is now the child.
+
+    Raises:
+        InputError: no such effect or parent, or one that the device cannot have.
+    """
+    opened = _opened(run)
+    loop.extend(_options(opened), model or opened.model, effect)
+    return Run(opened.root)
+
+
+def follow(run: Run | Path_, model: str = "") -> Run:
+    """Diagnose and extend until the diagnosis says stop.
+
+    Returns:
+        The run, whose `Run.model` is the last one made.
+    """
+    opened = _opened(run)
+    loop.follow(_options(opened), model or opened.model, lambda line: None)
+    return Run(opened.root)
+
+
+def _settings(given: Mapping[str, Mapping[str, object]]) -> dict[str, Mapping[str, object]]:
+    """The settings of stages that have any."""
+    return {stage: values for stage, values in given.items() if values}
+
+
+def _opened(run: Run | Path_) -> Run:
+    return run if isinstance(run, Run) else open_run(run)
+
+
+def _whole(root: Path) -> Pipeline:
+    """The pipeline of a run, with every stage in it."""
+    return replace(pipelines.recorded(record.read(root)), stages=base.STAGES)
+
+
+def _options(run: Run) -> loop.Options:
+    batch.limit_threads(1)
+    return loop.Options(run.root, _whole(run.root), False, True, unheard)
+
+
+def _stage(run: Run | Path_, stage: str, model: str, settings: Mapping[str, object]) -> Run:
+    """Run one stage on what the earlier ones left; the run with its results."""
+    batch.limit_threads(1)
+    root = _opened(run).root
+    runner.run_session(
+        Request(
+            root=root,
+            pipeline=_whole(root),
+            settings=_settings({stage: settings}),
+            first=stage,
+            last=stage,
+            model=model,
+        ),
+        unheard,
+    )
+    return Run(root)

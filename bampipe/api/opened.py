@@ -1,0 +1,203 @@
+"""A run folder as an object: every result as a table or a plain record, read when asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from bampipe.api.loop import current_model
+from bampipe.errors import InputError
+from bampipe.report.results import Results
+from bampipe.run import record
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A figure of the report; notebooks show it.
+
+    Attributes:
+        path: the SVG file.
+    """
+
+    path: Path
+
+    def _repr_svg_(self) -> str:
+        return self.path.read_text(encoding="utf-8")
+
+
+class Run:
+    """The results of one session. Nothing here writes; results are read once, when first used.
+
+    All values are in SI units. Models are named as in the run folder: ``base``,
+    ``base+stribeck.yaw``; where a method takes a model, the default is the one extended last.
+
+    Args:
+        root: the run folder.
+
+    Raises:
+        InputError: there is no run; and from every attribute whose stage has not run, with the
+            command that does.
+    """
+
+    def __init__(self, root: str | Path) -> None:
+        self.root = Path(root)
+        if not (self.root / record.FILE).is_file():
+            raise InputError(
+                "no run here", where=str(self.root), remedy="make one: bampipe.run_session(SESSION)"
+            )
+        self._results = Results(self.root)
+
+    def __repr__(self) -> str:
+        return f"Run({str(self.root)!r})"
+
+    @property
+    def name(self) -> str:
+        """The id of the session."""
+        return self.root.name
+
+    @property
+    def session(self) -> dict[str, Any]:
+        """What ingest says of the session: axes, channels, units, sample rate."""
+        return self._results.session
+
+    @property
+    def trials(self) -> pd.DataFrame:
+        """One row a trial: kind, duration, whether it is sound, what was repaired."""
+        return self._results.trials
+
+    @cached_property
+    def samples(self) -> pd.DataFrame:
+        """All sound samples: trial_id, t (s), positions ``q_<axis>``, inputs."""
+        return self._table("ingest/samples.parquet", "ingest")
+
+    @cached_property
+    def kinematics(self) -> pd.DataFrame:
+        """Positions, velocities and accelerations on a uniform grid, with standard deviations."""
+        return self._table("filter/kinematics.parquet", "filter")
+
+    @cached_property
+    def stiffness(self) -> pd.DataFrame:
+        """One row an axis with a locked trial: stiffness, sd, bandwidth; empty without any."""
+        content = self._json("stiffness/stiffness.json", "stiffness")
+        return pd.DataFrame.from_dict(content["axes"], orient="index")
+
+    @property
+    def models(self) -> tuple[str, ...]:
+        """The models that have been identified, parents before children."""
+        return self._results.models
+
+    @property
+    def model(self) -> str:
+        """The model extended last, which the methods below take where none is named."""
+        return current_model(self.root)
+
+    def effects(self, model: str = "") -> tuple[str, ...]:
+        """The effects that a model has beyond the bare device."""
+        return self._results.effects(self._known(model))
+
+    def parameters(self, model: str = "") -> pd.DataFrame:
+        """One row a parameter: estimate, sd, unit, and what else identification says."""
+        content = self._json(f"models/{self._known(model)}/identify.json", "identify")
+        frame = pd.DataFrame.from_dict(content["parameters"], orient="index")
+        first = [name for name in ("estimate", "sd", "unit") if name in frame]
+        order = self._results.in_order(frame.index)
+        return frame.loc[list(order), first + [c for c in frame if c not in first]]
+
+    def covariance(self, model: str = "") -> pd.DataFrame:
+        """Covariance of the estimates, parameters by parameters."""
+        content = self._json(f"models/{self._known(model)}/identify.json", "identify")
+        found = content["covariance"]
+        return pd.DataFrame(found["matrix"], found["names"], found["names"])
+
+    def states(self, model: str = "") -> pd.DataFrame:
+        """The filtered motion with standard deviations."""
+        return self._table(f"models/{self._known(model)}/states.parquet", "identify")
+
+    def validation(self, model: str = "") -> pd.DataFrame:
+        """One row an axis: error on all and on unseen trials, noise floor, fit, unit."""
+        content = self._json(f"models/{self._known(model)}/validate.json", "validate")
+        return pd.DataFrame.from_dict(content["axes"], orient="index")
+
+    def free_run(self, model: str = "") -> dict[str, Any]:
+        """How far the model left to itself ends up from the measurement, or why it cannot be."""
+        content = self._json(f"models/{self._known(model)}/validate.json", "validate")
+        return dict(content.get("free_run", {}))
+
+    def residuals(self, model: str = "") -> pd.DataFrame:
+        """Measured and predicted torque and force, by parameters that have not seen the trial."""
+        return self._table(f"models/{self._known(model)}/residuals.parquet", "validate")
+
+    def diagnosis(self, model: str = "") -> dict[str, Any]:
+        """What the model lacks: verdict of each axis, ranking, residual maps, advice."""
+        return self._json(f"models/{self._known(model)}/diagnose.json", "diagnose")
+
+    def ranking(self, model: str = "") -> pd.DataFrame:
+        """The candidate effects, best first: error before and after, chance level."""
+        return pd.DataFrame(self.diagnosis(model)["ranking"])
+
+    @property
+    def ladder(self) -> pd.DataFrame:
+        """One row a model: what was added, and per axis the held-out error and noise floor."""
+        rows = []
+        for rung in self._json("compare.json", "compare")["ladder"]:
+            row = {"model": rung["model"], "added": rung.get("added") or ""}
+            for axis in rung["held_out_rmse"]:
+                row[f"held_out_rmse.{axis}"] = rung["held_out_rmse"][axis]
+                row[f"noise_floor.{axis}"] = rung["noise_floor"].get(axis)
+            rows.append(row)
+        return pd.DataFrame(rows).set_index("model")
+
+    @property
+    def figures(self) -> Mapping[str, Picture]:
+        """The figures of the report by name; empty where it has not been made."""
+        paths = sorted((self.root / "report" / "figures").glob("*.svg"))
+        return {path.stem: Picture(path) for path in paths}
+
+    def _known(self, model: str) -> str:
+        chosen = model or self.model
+        if model and chosen not in self.models:
+            raise InputError(
+                f"no results for model {model!r}",
+                where=str(self.root),
+                remedy=f"choose from {', '.join(self.models) or 'none: identify first'}",
+            )
+        return chosen
+
+    def _json(self, relative: str, stage: str) -> dict[str, Any]:
+        content = self._results.json(relative)
+        if content is None:
+            raise self._missing(relative, stage)
+        return content
+
+    def _table(self, relative: str, stage: str) -> pd.DataFrame:
+        frame = self._results.table(relative)
+        if frame is None:
+            raise self._missing(relative, stage)
+        return frame
+
+    def _missing(self, relative: str, stage: str) -> InputError:
+        return InputError(
+            f"{relative} is not there yet",
+            where=str(self.root),
+            remedy=f"`bampipe {stage} {self.root}` makes it, or bampipe.{stage}(run)",
+        )
+
+
+def open_run(path: str | Path) -> Run:
+    """Open a run folder, or the one in ``runs/`` that has this name.
+
+    Args:
+        path: as ``runs/2026-10-03_s01``, or ``2026-10-03_s01``.
+
+    Raises:
+        InputError: there is no such run.
+    """
+    for candidate in (Path(path), Path("runs") / path):
+        if (candidate / record.FILE).is_file():
+            return Run(candidate)
+    return Run(path)

@@ -1,0 +1,69 @@
+"""``bampipe demo``: the whole loop on the session that ships for it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import bampipe
+from bampipe.api.loop import Options, follow
+from bampipe.cli import places
+from bampipe.errors import InputError
+from bampipe.run import models, pipeline
+from bampipe.run.events import Listener
+from bampipe.run.pipeline import Pipeline
+from bampipe.run.request import Request
+from bampipe.run.runner import run_session
+from bampipe.run.session_name import session_id
+from bampipe.stages import base
+
+_PACKAGE = Path(bampipe.__file__).parent
+_SAMPLES = (_PACKAGE / "_sample_runs", _PACKAGE.parent / "sample_runs")
+
+
+def demonstrate(runs: Path, force: bool, listen: Listener, tell: Callable[[str], None]) -> None:
+    """Run the whole loop on the session that ships for it.
+
+    Args:
+        runs: folder of run folders.
+        force: run even if nothing changed.
+        listen: told of every event.
+        tell: told the story, line by line.
+
+    Raises:
+        InputError: the session does not ship with this installation.
+    """
+    samples = next((folder for folder in _SAMPLES if folder.is_dir()), None)
+    if samples is None:
+        raise InputError("this installation has no sample sessions", where=str(_SAMPLES[0]))
+    session = samples / "demo"
+    root = runs / session_id(session)
+    chosen = pipeline.load()
+    tell(f"1. {session}: an arm with something wrong that its model does not know.")
+    run_session(Request(root, chosen, session=session, force=force, judged=models.BASE), listen)
+    validated = base.RunFolder(root).read_json(f"models/{models.BASE}/validate.json")
+    for axis, entry in sorted(validated["axes"].items()):
+        tell(
+            f"   {axis}: error on unseen trials {entry['held_out_rmse']:.3g} {entry['unit']}, "
+            f"sensor noise alone would leave {entry['noise_floor']:.3g} {entry['unit']}"
+        )
+    tell("2. Which effect is missing? The diagnosis, then the model extended, until nothing is.")
+    options = Options(
+        root, Pipeline(**{**vars(chosen), "stages": base.STAGES}), force, True, listen
+    )
+    last = follow(options, models.BASE, lambda line: tell(f"   {line}"))
+    tell("3. The error on unseen trials, model by model.")
+    ladder = base.RunFolder(root).read_json("compare.json")["ladder"]
+    for rung in ladder:
+        errors = ", ".join(
+            f"{axis} {value:.3g} (floor {rung['noise_floor'][axis]:.3g})"
+            for axis, value in sorted(rung["held_out_rmse"].items())
+        )
+        tell(f"   {rung['model']}: {errors}")
+    options.run("report", "report", "")
+    truth = json.loads((samples / "demo.truth.json").read_text(encoding="utf-8"))
+    hidden = ", ".join(truth["configuration"]["effects"])
+    found = ", ".join(models.read(root, last).effects) or "nothing"
+    tell(f"4. Found: {found}. What was hidden: {hidden}.")
+    tell(f"   The story with its figures: {places.next_to(root, runs)}: {root}/report/report.pdf")
