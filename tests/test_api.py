@@ -105,11 +105,8 @@ def test_mistakes_are_one_line(run, ask, said):
     assert re.search(said, str(caught.value)) and "\n" not in str(caught.value)
 
 
-def test_every_stage_has_its_function():
-    from bampipe.stages import base
-
-    # `bampipe.report` is the package that writes it.
-    functions = {"report": bampipe.write_report}
-    for stage in base.STAGES:
-        function = functions.get(stage) or getattr(bampipe, stage)
-        assert inspect.signature(function).return_annotation is not inspect.Signature.empty
+def test_any_stage_runs_by_its_name(run):
+    found = bampipe.run_stage(run, "compare")
+    assert [rung["model"] for rung in found["ladder"]] == ["base"]
+    with pytest.raises(bampipe.InputError, match="no stage 'comper'; did you mean 'compare'"):
+        bampipe.run_stage(run, "comper")

@@ -159,11 +159,36 @@ def _options(run: Run) -> loop.Options:
     return loop.Options(run.root, _whole(run.root), False, True, unheard)
 
 
+def run_stage(run: Run | Path_, stage: str, model: str = "", **settings: object) -> dict[str, Any]:
+    """Run any stage on what the earlier ones left; returns what it reports, a plain record.
+
+    Args:
+        run: a run, or its folder.
+        stage: name of the stage, as of its command.
+        model: for stages that run once a model; base and what was run of the others where empty.
+        settings: those that ``bampipe STAGE --settings`` lists.
+
+    Raises:
+        InputError: no such stage, model or setting, or an earlier stage has not run.
+    """
+    base.check_name(stage)
+    steps = _ran(_opened(run).root, stage, model, settings)
+    return steps[0] if len(steps) == 1 else {"steps": steps}
+
+
 def _stage(run: Run | Path_, stage: str, model: str, settings: Mapping[str, object]) -> Run:
-    """Run one stage on what the earlier ones left; the run with its results."""
-    batch.limit_threads(1)
+    """Run one stage; the run with its results."""
     root = _opened(run).root
-    runner.run_session(
+    _ran(root, stage, model, settings)
+    return Run(root)
+
+
+def _ran(
+    root: Path, stage: str, model: str, settings: Mapping[str, object]
+) -> list[dict[str, Any]]:
+    """Run one stage, for one model or each; what it reports."""
+    batch.limit_threads(1)
+    outcome = runner.run_session(
         Request(
             root=root,
             pipeline=_whole(root),
@@ -174,4 +199,4 @@ def _stage(run: Run | Path_, stage: str, model: str, settings: Mapping[str, obje
         ),
         unheard,
     )
-    return Run(root)
+    return [step.summary for step in outcome.steps]
