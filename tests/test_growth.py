@@ -2,19 +2,81 @@
 
 from __future__ import annotations
 
+import tempfile
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
+import pytest
+
+from bampipe.data import store
+from bampipe.errors import InputError
 from bampipe.stages import validate
 from bampipe.stages.base import RunFolder
+from bampipe.stages.motions import Motion, put_aside
+from bampipe.stages.shelf import Shelf, in_order
 
 
-def test_trials_are_held_out_one_by_one_up_to_ten_then_in_ten_groups() -> None:
-    run = RunFolder(Path("nowhere"))
+def test_trials_are_held_out_one_by_one_up_to_ten_then_in_ten_groups(tmp_path: Path) -> None:
+    names = np.array([f"t{number}" for number in range(57)])
+    store.write_parquet(tmp_path / "ingest/trials.parquet", {"trial_id": names})
 
     def groups(trials: int) -> list[int]:
-        return validate._groups(run, [None] * trials, "")  # type: ignore[list-item]
+        motions = [SimpleNamespace(trial_id=name) for name in names[:trials]]
+        return validate._groups(RunFolder(tmp_path), motions, "")  # type: ignore[arg-type]
 
     assert groups(10) == list(range(10))
     many = groups(57)
     assert len(many) == 57 and set(many) == set(range(10))
     assert max(many.count(k) for k in range(10)) - min(many.count(k) for k in range(10)) <= 1
+
+
+def test_a_shelf_holds_no_more_than_it_may_and_fetches_the_rest_again() -> None:
+    fetched: list[int] = []
+
+    def fetch(place: int) -> list[int]:
+        fetched.append(place)
+        return [place] * 10
+
+    shelf = Shelf(fetch, 5, len, most=20)
+    assert [item[0] for item in shelf] == [0, 1, 2, 3, 4]
+    assert fetched == [0, 1, 2, 3, 4]
+    assert shelf[-1][0] == 4 and shelf[3][0] == 3 and len(fetched) == 5
+    assert shelf[0][0] == 0 and len(fetched) == 6
+    assert [item[0] for item in shelf[1:3]] == [1, 2]
+    assert [item[0] for item in in_order(shelf, [4, 0, 2])] == [4, 0, 2]
+    with pytest.raises(IndexError):
+        shelf[5]
+    one = Shelf(fetch, 1, len, most=1)
+    assert one[0] is one[0]
+
+
+def test_trials_put_aside_come_back_bit_by_bit_and_leave_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    rng = np.random.default_rng(0)
+    names = ("q", "qd", "qdd", "qd_sd", "u", "u_rate")
+    given = [
+        Motion(f"t{k} free", np.arange(7.0), **{name: rng.normal(size=(7, 2)) for name in names})
+        for k in range(3)
+    ]
+    shelf = put_aside(iter(given))
+    for motion, back in zip(given, shelf, strict=True):
+        assert back.trial_id == motion.trial_id
+        assert all(np.array_equal(getattr(motion, name), getattr(back, name)) for name in names)
+    assert len(list(tmp_path.iterdir())) == 1
+    del shelf
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_trials_of_a_table_with_and_without_a_row_group_each(tmp_path: Path) -> None:
+    one, several = tmp_path / "one.parquet", tmp_path / "several.parquet"
+    store.write_parquet(one, {"trial_id": np.array(["a", "a", "b"]), "t": np.arange(3.0)})
+    with store.ParquetAppender(several) as file:
+        file.append({"trial_id": np.array(["a", "b", "c"]), "t": np.arange(3.0)})
+    assert store.trial_ids(one) == {"a", "b"}
+    assert store.trial_ids(several) == {"a", "b", "c"}
+    store.write_parquet(tmp_path / "none.parquet", {"t": np.arange(3.0)})
+    with pytest.raises(InputError, match="no column 'trial_id'"):
+        store.trial_ids(tmp_path / "none.parquet")

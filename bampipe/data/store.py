@@ -185,6 +185,35 @@ def read_parquet(
     return table.to_pandas()
 
 
+def trial_ids(path: Path) -> frozenset[str]:
+    """The trials that a Parquet file has rows of; data are read only where its footer is silent.
+
+    Raises:
+        InputError: no such file, or not a sound Parquet file with ``trial_id``.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError("no such file", where=str(path))
+    found: set[str] = set()
+    try:
+        with pq.ParquetFile(path, memory_map=False) as file:
+            if "trial_id" not in file.schema_arrow.names:
+                raise InputError("no column 'trial_id'", where=str(path))
+            column = file.schema_arrow.names.index("trial_id")
+            for group in range(file.num_row_groups):
+                limits = file.metadata.row_group(group).column(column).statistics
+                if limits is not None and limits.has_min_max and limits.min == limits.max:
+                    found.add(str(limits.min))
+                else:
+                    table = file.read_row_group(group, columns=["trial_id"])
+                    found.update(map(str, table.column("trial_id").unique().to_pylist()))
+    except (pa.ArrowException, OSError) as error:
+        raise InputError(
+            "not a sound Parquet file", where=str(path), remedy="make it again (--force)"
+        ) from error
+    return frozenset(found)
+
+
 def sha256_file(path: Path) -> str:
     """SHA-256 of a file's bytes, hexadecimal.
 

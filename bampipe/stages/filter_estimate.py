@@ -27,6 +27,7 @@ from bampipe.stages.filter_tables import convergence, mean_nis, state_3sigma, st
 from bampipe.stages.innovations import innovation_tests
 from bampipe.stages.motions import Motion
 from bampipe.stages.sensor_noise import Noise, noise_report, tuned, untuned
+from bampipe.stages.shelf import Shelf
 from bampipe.stages.squares_estimate import Squares, bias_details
 
 Array = NDArray[np.float64]
@@ -59,7 +60,11 @@ def estimate_by_filter(
         InputError: the filter does not follow the motion.
     """
     stride = stride_of(motions)
-    trials = [trial_of(run, motion, system, noise, stride, choice) for motion in motions]
+    trials = Shelf(
+        lambda place: trial_of(run, motions[place], system, noise, stride, choice),
+        len(motions),
+        lambda trial: int(trial.t.size),
+    )
     problem = squares.problem
     free = [item for item in system.parameters if not item.fixed]
     kept = len(free)

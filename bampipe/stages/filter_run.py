@@ -24,6 +24,7 @@ from bampipe.stages.base import RunFolder
 from bampipe.stages.filter_choice import FilterChoice
 from bampipe.stages.motions import Motion, input_columns
 from bampipe.stages.sensor_noise import Noise
+from bampipe.stages.shelf import in_order
 
 Array = NDArray[np.float64]
 
@@ -202,7 +203,7 @@ def run_filter(
                 replace(level, noise_sd=_COARSE * level.noise_sd),
             )  # fmt: skip
             main = engine(
-                model, [trials[i] for i in order], search.theta, search.covariance, level,
+                model, in_order(trials, order), search.theta, search.covariance, level,
                 lambda done: told(done, order[done - 1]),
             )  # fmt: skip
         except FilterFailure as error:

@@ -21,7 +21,7 @@ from bampipe.stages.filter_choice import FilterChoice, check_among, check_choice
 from bampipe.stages.filter_estimate import estimate_by_filter
 from bampipe.stages.identifiability import identifiability
 from bampipe.stages.modelfile import load_model, model_inputs
-from bampipe.stages.motions import free_trials, problem_of, read_motion
+from bampipe.stages.motions import problem_of, read_motions
 from bampipe.stages.recordings import read_session, recipe_of
 from bampipe.stages.sensor_noise import sensor_noise
 from bampipe.stages.squares_estimate import (
@@ -96,7 +96,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     session = run.read_json("ingest/session.json")
     system = compile_model(load_model(run, config.model))
     progress(0.0, "reading the trials")
-    motions = [read_motion(run, trial, system) for trial in free_trials(run, fitted=True)]
+    motions = read_motions(run, system, fitted=True)
     rate = float(session["sample_rate_hz"])
     # A delay in the model and the timing of the inputs are one and the same to the data.
     free = {item.name for item in system.parameters if not item.fixed}

@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import shutil
+import tempfile
+import weakref
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from bampipe.data.store import read_parquet
+from bampipe.data.store import read_parquet, trial_ids
 from bampipe.errors import InputError
 from bampipe.estimate.least_squares import Problem, resting
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import System
 from bampipe.physics.device import derivative
 from bampipe.stages.base import RunFolder
+from bampipe.stages.shelf import Shelf
 
 Array = NDArray[np.float64]
 
@@ -64,7 +69,7 @@ def free_trials(run: RunFolder, *, fitted: bool = False) -> tuple[str, ...]:
     if fitted:
         usable = usable[~usable["trial_id"].isin(held_out_trials(run))]
     path = run.require("filter/kinematics.parquet", "filter")
-    moving = set(read_parquet(path, columns=["trial_id"])["trial_id"].astype(str))
+    moving = trial_ids(path)
     found = tuple(str(name) for name in usable["trial_id"] if str(name) in moving)
     if not found:
         raise InputError(
@@ -95,6 +100,50 @@ def read_motion(run: RunFolder, trial_id: str, system: System) -> Motion:
         u=input_columns(frame, system.inputs, system.model.device.brakes, t, str(path)),
         u_rate=_rates(frame, system.inputs),
     )
+
+
+def read_motions(run: RunFolder, system: System, *, fitted: bool = False) -> Sequence[Motion]:
+    """Return the free trials, each read from ``filter/kinematics.parquet`` when it is wanted.
+
+    Args:
+        run: the run folder.
+        system: the model, whose inputs are read.
+        fitted: without those that the session holds out.
+
+    Raises:
+        InputError: there is none; on reading one, as :func:`read_motion`.
+    """
+    names = free_trials(run, fitted=fitted)
+    return Shelf(lambda place: read_motion(run, names[place], system), len(names), n_samples)
+
+
+def put_aside(motions: Iterable[Motion]) -> Sequence[Motion]:
+    """Return trials that cannot be read again, from a folder that lasts as long as they do.
+
+    What comes back is bit by bit the same, and takes the memory of a few trials only.
+    """
+    folder = Path(tempfile.mkdtemp(prefix="bampipe-trials-"))
+    count = 0
+    try:
+        for count, motion in enumerate(motions, start=1):
+            np.savez(folder / f"{count - 1}.npz", **vars(motion))
+    except BaseException:
+        shutil.rmtree(folder)
+        raise
+    shelf = Shelf(lambda place: _put_back(folder / f"{place}.npz"), count, n_samples)
+    weakref.finalize(shelf, shutil.rmtree, folder)
+    return shelf
+
+
+def _put_back(path: Path) -> Motion:
+    with np.load(path) as kept:
+        arrays = {name: kept[name] for name in kept.files if name != "trial_id"}
+        return Motion(trial_id=str(kept["trial_id"]), **arrays)
+
+
+def n_samples(motion: Motion) -> int:
+    """Return the number of samples of a trial."""
+    return int(motion.t.size)
 
 
 def input_columns(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -17,7 +17,7 @@ from bampipe.estimate.differentiation import Derivatives
 from bampipe.estimate.hysteresis import noise_of
 from bampipe.physics import System
 from bampipe.physics.device import derivative
-from bampipe.stages.motions import Motion
+from bampipe.stages.motions import Motion, put_aside
 
 Array = NDArray[np.float64]
 
@@ -31,7 +31,7 @@ def replayed(
     rate_hz: float,
     seed: Sequence[int],
     force_noise: bool = True,
-) -> list[Motion]:
+) -> Sequence[Motion]:
     """Replay every trial by the model and filter it as the measured one was.
 
     The model is driven by the measured force and an arm that keeps the motion near the measured
@@ -58,7 +58,16 @@ def replayed(
         ),
         force_sd=force_sd if force_noise else np.zeros_like(force_sd),
     )
-    seen = []
+    replays = _replays(system, motions, p, sensors, seed)
+    return put_aside(
+        _filtered(recording, motion, system, settings, rate_hz)
+        for recording, motion in zip(replays, motions, strict=True)
+    )
+
+
+def _replays(
+    system: System, motions: Sequence[Motion], p: Array, sensors: Sensors, seed: Sequence[int]
+) -> Iterator[Recording]:
     for number, motion in enumerate(motions):
         rng = np.random.default_rng([*seed, number])
         channels = dict(zip(system.inputs, motion.u.T, strict=True))
@@ -68,9 +77,7 @@ def replayed(
         for name in system.model.device.channels:
             channels.setdefault(name, np.zeros(len(motion.t)))
         driven = Driven(motion.trial_id, motion.t, motion.q, motion.qd, motion.qdd, channels)
-        recording = replay(system, p, driven, sensors, rng)
-        seen.append(_filtered(recording, motion, system, settings, rate_hz))
-    return seen
+        yield replay(system, p, driven, sensors, rng)
 
 
 def _force_noise(system: System, motions: Sequence[Motion], stated: float | None) -> Array:

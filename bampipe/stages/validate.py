@@ -21,10 +21,9 @@ from bampipe.stages.free_run import free_runs
 from bampipe.stages.modelfile import load_model, model_inputs
 from bampipe.stages.motions import (
     Motion,
-    free_trials,
     held_out_trials,
     problem_of,
-    read_motion,
+    read_motions,
 )
 from bampipe.stages.replayed import replayed
 
@@ -115,7 +114,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     run.require(f"models/{config.model}/identify.json", "identify")
     identified = run.read_json(f"models/{config.model}/identify.json")
     system = compile_model(load_model(run, config.model))
-    motions = [read_motion(run, trial, system) for trial in free_trials(run)]
+    motions = read_motions(run, system)
     band = Band(float(session["sample_rate_hz"]), config.cutoff_hz)
     timing = identified["input_timing"]["sd"] > 0.0  # zero where it was not estimated
     problem = problem_of(system, motions, band, timing=timing)

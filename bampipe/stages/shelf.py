@@ -1,0 +1,69 @@
+"""Trials fetched when they are wanted: memory grows with the longest of them, not their number."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from typing import Any, Generic, TypeVar, overload
+
+Item = TypeVar("Item")
+
+MOST_SAMPLES = 500_000
+"""So many samples are kept at hand, those used last: all of a usual session (0.4 kB each)."""
+
+
+class Shelf(Sequence[Item], Generic[Item]):
+    """A sequence whose items are fetched by their place, and forgotten when others need the room.
+
+    Args:
+        fetch: returns the item at a place; the same one every time.
+        count: number of items.
+        samples: size of an item, in samples.
+        most: so many samples are kept; one item always is.
+    """
+
+    def __init__(
+        self,
+        fetch: Callable[[int], Item],
+        count: int,
+        samples: Callable[[Any], int],
+        most: int = MOST_SAMPLES,
+    ) -> None:
+        self._fetch = fetch
+        self._count = count
+        self._samples = samples
+        self._most = most
+        self._held = 0
+        self._kept: OrderedDict[int, Item] = OrderedDict()
+
+    def __len__(self) -> int:
+        return self._count
+
+    @overload
+    def __getitem__(self, place: int) -> Item: ...
+    @overload
+    def __getitem__(self, place: slice) -> list[Item]: ...
+
+    def __getitem__(self, place: int | slice) -> Item | list[Item]:
+        if isinstance(place, slice):
+            return [self[number] for number in range(*place.indices(self._count))]
+        if place < 0:
+            place += self._count
+        if not 0 <= place < self._count:
+            raise IndexError(place)
+        if place in self._kept:
+            self._kept.move_to_end(place)
+            return self._kept[place]
+        item = self._fetch(place)
+        size = self._samples(item)
+        while self._kept and self._held + size > self._most:
+            _, old = self._kept.popitem(last=False)
+            self._held -= self._samples(old)
+        self._kept[place] = item
+        self._held += size
+        return item
+
+
+def in_order(items: Sequence[Item], order: Sequence[int]) -> Sequence[Item]:
+    """Return ``items`` in another order, each fetched when it is wanted."""
+    return Shelf(lambda place: items[order[place]], len(order), lambda item: 0, most=-1)
