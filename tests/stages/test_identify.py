@@ -201,3 +201,19 @@ def test_innovations_of_the_right_model_pass_and_those_of_a_late_force_do_not(
     told = identified(late)["innovations"]
     assert not told["yaw"]["inputs"]["independent"]
     assert "Not independent of the inputs" in told["yaw"]["sentence"]
+
+
+def test_starts_five_times_off_either_way_do_not_matter(
+    simulated: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every other parameter starts five times too large, the rest five times too small."""
+    right = identify._start
+
+    def wrong(*given: object) -> np.ndarray:
+        start = right(*given)
+        return start * np.where(np.arange(start.size) % 2 == 0, 5.0, 0.2)
+
+    monkeypatch.setattr(identify, "_start", wrong)
+    content = identified(simulated)
+    assert_recovered(content, TRUTH)
+    assert content["convergence"]["converged"]
