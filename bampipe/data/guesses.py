@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -56,10 +57,24 @@ def follows(first: np.ndarray, second: np.ndarray) -> bool:
     return float((first - second) @ slope) > 0.0
 
 
-def driven_share(t: np.ndarray, q: np.ndarray, column: np.ndarray) -> float:
-    """Share of a column that acceleration, velocity, its sign and position explain, 0 to 1.
+@dataclass(frozen=True)
+class Driven:
+    """How a column goes with the motion of an axis, by least squares on one log.
 
-    That is what a force, a current or a voltage that moves a mass with friction looks like.
+    Attributes:
+        share: part of its variance that acceleration, velocity, its sign and position explain,
+            0 to 1; a force, a current or a voltage that moves a mass with friction has much.
+        inertia, viscous, coulomb: what multiplies acceleration, velocity and its sign.
+    """
+
+    share: float
+    inertia: float = 0.0
+    viscous: float = 0.0
+    coulomb: float = 0.0
+
+
+def driven(t: np.ndarray, q: np.ndarray, column: np.ndarray) -> Driven:
+    """Hold a column against the motion.
 
     Args:
         t: (T,) s; q: (T,) position; column: (T,).
@@ -74,9 +89,10 @@ def driven_share(t: np.ndarray, q: np.ndarray, column: np.ndarray) -> float:
     target = column[inner]
     spread = float(np.sum((target - target.mean()) ** 2)) if len(target) else 0.0
     if spread == 0.0 or len(target) < 20:
-        return 0.0
-    fitted = design @ np.linalg.lstsq(design, target, rcond=None)[0]
-    return max(0.0, 1.0 - float(np.sum((target - fitted) ** 2)) / spread)
+        return Driven(0.0)
+    found = np.linalg.lstsq(design, target, rcond=None)[0]
+    left = float(np.sum((target - design @ found) ** 2))
+    return Driven(max(0.0, 1.0 - left / spread), *(float(value) for value in found[:3]))
 
 
 def signed_register(values: np.ndarray) -> int:

@@ -114,7 +114,7 @@ class Matcher:
             bits = guesses.signed_register(values)
             if bits:
                 values = np.where(values >= 2.0 ** (bits - 1), values - 2.0**bits, values)
-            share[column.name] = guesses.driven_share(self.t, position.values, values)
+            share[column.name] = guesses.driven(self.t, position.values, values).share
         best = max(share, key=lambda name: share[name], default="")
         if not best or share[best] < _DRIVEN:
             return None

@@ -151,8 +151,13 @@ class _Writer:
             )
         linear = (unit(position.unit) or unit("rad")).si == "m"  # type: ignore[union-attr]
         driver, role = self.match.driver(position)
+        found = guesses.Driven(0.0)
+        if driver is not None:
+            si = {"current": "A", "voltage": "V"}.get(role, "N" if linear else "N.m")
+            drive = np.nan_to_num(_in_si(driver, si))
+            found = guesses.driven(self.match.t, _in_si(position, "m" if linear else "rad"), drive)
         text, name = starter_device(
-            position.name, linear, role, driver.name if driver else "", self._coil(role)
+            position.name, linear, role, driver.name if driver else "", self._coil(role), found
         )
         self.out.device = text
         self.name = DEVICE
@@ -365,6 +370,14 @@ class _Writer:
             ]
         else:
             self.lines.append('kind = "free"')
+
+
+def _in_si(column: Column, si: str) -> np.ndarray:
+    """Values of a column in ``si``, by its unit or by the likely one."""
+    known = unit(column.unit) if column.unit else None
+    if known is None or known.si != si:
+        known = unit(guesses.likely_unit(si, column.values) or si)
+    return column.values * (known.scale if known is not None else 1.0)
 
 
 def _increases(values: np.ndarray) -> bool:

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+from bampipe.data.guesses import Driven
 from bampipe.data.survey import words
 
 _ROTARY = {"unit": "rad", "torque": "N.m", "inertia": "kg.m2", "viscous": "N.m.s/rad"}
 _LINEAR = {"unit": "m", "torque": "N", "inertia": "kg", "viscous": "N.s/m"}
 _GAIN = {"current": ("A", "torque_per_ampere"), "voltage": ("V", "torque_per_volt")}
+_LINE = "  # guess\n"
 _TAKEN = frozenset(
     ["enc", "encoder", "pos", "position", "angle", "counts", "displacement", "disp", "stroke"]
 )
 
 
 def starter_device(
-    position: str, linear: bool, role: str, driver: str, coil: bool
+    position: str, linear: bool, role: str, driver: str, coil: bool, found: Driven
 ) -> tuple[str, str]:
     """Text of a device file, and the name of its axis.
 
@@ -23,6 +25,7 @@ def starter_device(
         role: what drives it: ``force``, ``current`` or ``voltage``.
         driver: column of that, for the comment.
         coil: whether the current of a coil that changes the friction is recorded too.
+        found: sizes by a rough fit, SI, from which the priors are taken.
     """
     units = _LINEAR if linear else _ROTARY
     names = [word for word in words(position) if word not in _TAKEN and len(word) > 2]
@@ -66,20 +69,19 @@ force_unit = "{si}"
 {axis} = "{applied}"
 
 [friction.{axis}]
-viscous = {{ unit = "{units["viscous"]}", prior = 1.0, sd = 100.0, lower = 0.0 }}  # guess
-coulomb = {{ unit = "{units["torque"]}", prior = 1.0, sd = 100.0, lower = 0.0 }}  # guess
+viscous = {{ unit = "{units["viscous"]}", {_prior(found.viscous)}, lower = 0.0 }}  # guess
+coulomb = {{ unit = "{units["torque"]}", {_prior(found.coulomb)}, lower = 0.0 }}  # guess
 
 [parameters.inertia]
 unit = "{units["inertia"]}"
-prior = 1.0                         # guess
-sd = 100.0
+{_prior(found.inertia).replace(", ", _LINE)}
 lower = 0.0
 description = "all that moves, reduced to this axis"
 
 [parameters.offset]
 unit = "{units["torque"]}"
 prior = 0.0
-sd = 20.0
+sd = {_rounded(3.0 * abs(found.coulomb) or 20.0):g}
 description = "needed to hold the axis where nothing else acts"
 '''
     if not coil:
@@ -97,3 +99,14 @@ lower = 0.0
 description = "friction that the coil adds, in proportion to its current"
 '''
     return lines, axis
+
+
+def _prior(size: float) -> str:
+    """A prior of the size found, five times as wide; a wide one where nothing was found."""
+    if size <= 0.0:
+        return "prior = 1.0, sd = 100.0"
+    return f"prior = {_rounded(size):g}, sd = {_rounded(5.0 * size):g}"
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.2g}")

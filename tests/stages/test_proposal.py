@@ -9,7 +9,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from other_labs import damper_log, joint_log, write_damper_logs, write_joint_logs
+from other_labs import (
+    COULOMB,
+    INERTIA,
+    PER_AMPERE,
+    VISCOUS,
+    damper_log,
+    joint_log,
+    write_damper_logs,
+    write_joint_logs,
+)
 
 from bampipe.data.store import read_parquet
 from bampipe.errors import InputError
@@ -46,6 +55,11 @@ def test_a_joint_with_motor_current(tmp_path):
     assert session["channels"]["motor_current"] == {"column": "motor_current", "unit": "mA"}
     device = registry.device_from(tomllib.loads((tmp_path / "arm/device.toml").read_text()))
     assert check_device(device) == [] and device.force_unit == "A"
+    # The priors come from a rough fit, here in A since the file leaves one ampere at one N.m.
+    for p in device.parameters:
+        truth = {"viscous.joint": VISCOUS, "coulomb.joint": COULOMB, "inertia": INERTIA}
+        if p.name in truth:
+            assert abs(truth[p.name] / PER_AMPERE - p.prior) < p.sd, p.name
     found = samples(tmp_path / "arm", tmp_path / "out", "run_1")
     truth = joint_log(1)
     np.testing.assert_allclose(found["q_joint"], np.deg2rad(truth["joint_angle"]), atol=1e-7)
