@@ -16,6 +16,7 @@ from bampipe.cli import device, init, places, show
 from bampipe.cli.accept import accept
 from bampipe.cli.fetch import fetch
 from bampipe.cli.lab import lab, refresh
+from bampipe.cli.monitor import monitor
 from bampipe.errors import InputError
 from bampipe.run import batch, models, record
 from bampipe.run import junit as junit_xml
@@ -879,6 +880,7 @@ def demo(
 app.command("lab")(lab)
 app.command("accept")(accept)
 app.command("fetch")(fetch)
+app.command("monitor")(monitor)
 
 
 @app.command("status")

@@ -224,13 +224,10 @@ def filter_trials(
         FilterFailure: the covariance lost positive definiteness or a number is not finite.
     """
     nx, nt = model.n_states, model.free.size
-    n, ny = nx + nt, settings.observed.size
+    n = nx + nt
     lower, upper = model.range
     theta = np.clip(np.asarray(theta, dtype=float), lower, upper)
     covariance = np.array(covariance, dtype=float)
-    weights = np.array(settings.points.weights(n + settings.noise_sd.size))
-    kernel = _kernel(settings.square_root)
-    parameters = np.array(model.parameters, dtype=float)
     found = []
     for index, trial in enumerate(trials):
         mean = np.concatenate([trial.x, theta])
@@ -239,62 +236,90 @@ def filter_trials(
         joint[nx:, nx:] = covariance
         if settings.square_root:
             joint = lower_root(joint)
-        size = trial.t.size
-        rows = -(-size // settings.stride)
-        means = np.empty((rows, n))
-        covariances = np.empty((rows, n, n))
-        innovation = np.full((size, ny), np.nan)
-        innovation_sd = np.full((size, ny), np.nan)
-        consistency = np.full((size, 2), np.nan)
-        reason = np.zeros(1, dtype=np.int64)
-        failed = kernel(
-            model.derivative_rows,
-            model.measure_rows,
-            _array(trial.t),
-            _array(trial.u),
-            _array(trial.y),
-            _array(settings.observed, np.int64),
-            model.reads_parameters,
-            nx,
-            mean,
-            joint,
-            parameters,
-            _array(model.free, np.int64),
-            _array(model.logarithmic, np.bool_),
-            lower,
-            upper,
-            _array(settings.noise_sd),
-            _array(settings.walk_sd),
-            _array(settings.reading_sd),
-            weights,
-            float(settings.longest_step),
-            int(settings.stride),
-            means,
-            covariances,
-            innovation,
-            innovation_sd,
-            consistency,
-            reason,
-        )
-        if failed != DONE:
-            raise FilterFailure(index, int(failed), _REASONS[int(reason[0])])
+        try:
+            found.append(
+                run_kernel(model, settings, trial.t, trial.u, trial.y, mean, joint, settings.stride)
+            )
+        except FilterFailure as failure:
+            raise FilterFailure(index, failure.sample, failure.reason) from None
         if settings.square_root:
             joint = joint @ joint.T
         theta, covariance = mean[nx:].copy(), joint[nx:, nx:].copy()
-        found.append(
-            FilteredTrial(
-                t=np.asarray(trial.t, dtype=float)[:: settings.stride],
-                mean=means,
-                covariance=covariances,
-                innovation=innovation,
-                innovation_sd=innovation_sd,
-                nis=consistency[:, 0],
-                log_likelihood=consistency[:, 1],
-            )
-        )
         if progress is not None:
             progress(index + 1)
     return FilterResult(theta, covariance, tuple(found))
+
+
+def run_kernel(
+    model: FilterModel,
+    settings: FilterSettings,
+    t: Array,
+    u: Array,
+    y: Array,
+    mean: Array,
+    joint: Array,
+    stride: int,
+) -> FilteredTrial:
+    """Filter samples that follow each other, from the distribution at the first one.
+
+    Args:
+        model, settings: as in `filter_trials`.
+        t, u, y: (T,), (T, nu), (T, ny) samples.
+        mean: (n,) state and parameters at the first sample, overwritten with those at the last.
+        joint: (n, n) their covariance, or its lower root in the square-root form, likewise.
+        stride: store the distribution of every so many samples.
+
+    Raises:
+        FilterFailure: of trial 0: the covariance lost positive definiteness or a number is not
+            finite.
+    """
+    n, size, ny = mean.size, t.size, settings.observed.size
+    lower, upper = model.range
+    rows = -(-size // stride)
+    filtered = FilteredTrial(
+        t=np.asarray(t, dtype=float)[::stride],
+        mean=np.empty((rows, n)),
+        covariance=np.empty((rows, n, n)),
+        innovation=np.full((size, ny), np.nan),
+        innovation_sd=np.full((size, ny), np.nan),
+        nis=np.full(size, np.nan),
+        log_likelihood=np.full(size, np.nan),
+    )
+    consistency = np.full((size, 2), np.nan)
+    reason = np.zeros(1, dtype=np.int64)
+    failed = _kernel(settings.square_root)(
+        model.derivative_rows,
+        model.measure_rows,
+        _array(t),
+        _array(u),
+        _array(y),
+        _array(settings.observed, np.int64),
+        model.reads_parameters,
+        model.n_states,
+        mean,
+        joint,
+        _array(model.parameters),
+        _array(model.free, np.int64),
+        _array(model.logarithmic, np.bool_),
+        lower,
+        upper,
+        _array(settings.noise_sd),
+        _array(settings.walk_sd),
+        _array(settings.reading_sd),
+        np.array(settings.points.weights(n + settings.noise_sd.size)),
+        float(settings.longest_step),
+        int(stride),
+        filtered.mean,
+        filtered.covariance,
+        filtered.innovation,
+        filtered.innovation_sd,
+        consistency,
+        reason,
+    )
+    if failed != DONE:
+        raise FilterFailure(0, int(failed), _REASONS[int(reason[0])])
+    filtered.nis[:], filtered.log_likelihood[:] = consistency.T
+    return filtered
 
 
 def constrain(model: FilterModel, theta: Array, covariance: Array) -> Array:

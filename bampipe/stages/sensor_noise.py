@@ -68,7 +68,7 @@ def sensor_noise(
         elif step > 0.0:
             reading.append(step / np.sqrt(12.0))
         else:
-            reading.append(_white_part([motion.q[:, place] for motion in motions]))
+            reading.append(white_part([motion.q[:, place] for motion in motions]))
     if choice.measure == "position_velocity":
         velocity = np.concatenate([motion.qd_sd for motion in motions])
         reading.extend(np.median(velocity, axis=0))
@@ -83,13 +83,13 @@ def sensor_noise(
             process[place] = float(given)
         elif name in forces:
             column = system.inputs.index(name)
-            process[place] = _white_part([motion.u[:, column] for motion in motions])
+            process[place] = white_part([motion.u[:, column] for motion in motions])
     smallest = process[is_force].min() if is_force.any() else 0.05
     process[process == 0.0] = smallest or np.finfo(float).eps
     return Noise(np.array(reading), process, is_force)
 
 
-def _white_part(records: Sequence[Array]) -> float:
+def white_part(records: Sequence[Array]) -> float:
     """Standard deviation of the white part of a smooth signal, from its second differences."""
     second = np.concatenate([np.diff(record, 2) for record in records])
     return float(np.median(np.abs(second)) / (0.6745 * np.sqrt(6.0)))

@@ -1,0 +1,212 @@
+"""`bampipe monitor`: the filter on samples as they come."""
+
+from __future__ import annotations
+
+import json as json_text
+import os
+import sys
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from bampipe.cli import places, show
+from bampipe.errors import InputError
+
+if TYPE_CHECKING:
+    from bampipe.data.stream import SampleStream
+    from bampipe.stages.monitoring import Monitor
+
+POLL_S = 0.02
+SCREEN_S = 0.25
+BLANK: Mapping[str, Any] = {}
+
+
+def monitor(
+    samples: Annotated[
+        str, typer.Argument(metavar="FILE", help="A text table that grows; - for standard input.")
+    ] = "-",
+    run: Annotated[
+        str, typer.Option("--run", help="Run folder or name; the most recent run if omitted.")
+    ] = "",
+    model: Annotated[str, typer.Option("--model", help="Which model version of the run.")] = "base",
+    device: Annotated[
+        str, typer.Option("--device", help="Without a run: a built-in device or a device file.")
+    ] = "",
+    session: Annotated[
+        Path | None,
+        typer.Option("--session", help="Session folder whose raw-log columns FILE has."),
+    ] = None,
+    every: Annotated[float, typer.Option("--every", help="Seconds of data per line.")] = 1.0,
+    window_s: Annotated[
+        float, typer.Option("--window", help="Length of the windows that the alarm judges, s.")
+    ] = 1.0,
+    false_alarms: Annotated[
+        float, typer.Option("--false-alarms", help="Of a consistent filter, per hour.")
+    ] = 1.0,
+    memory_s: Annotated[
+        float,
+        typer.Option("--memory", help="Time over which parameters may wander by their sd, s."),
+    ] = 60.0,
+    once: Annotated[
+        bool, typer.Option("--once", help="Stop at the end of the file; do not wait for more.")
+    ] = False,
+    strict: Annotated[
+        bool, typer.Option("--strict", help="Stop at the first bad line instead of skipping it.")
+    ] = False,
+    json: Annotated[bool, typer.Option("--json", help="JSON lines on a terminal too.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No remarks.")] = False,
+    runs: Annotated[
+        Path, typer.Option("--runs", envvar="BAMPIPE_RUNS", help="Folder of the run folders.")
+    ] = Path("runs"),
+) -> None:
+    """State, parameters with bounds and an alarm, from samples as they come.
+
+    Columns by name as in ingest/samples.parquet (t, q_yaw, force_x, brake_yaw, ...; SI), or with
+    --session those of its raw logs. Bad lines are skipped and counted. Stop with Ctrl-C.
+
+    Example: bampipe monitor log.csv --run 2026-10-03_s01
+
+    Example: logger | bampipe monitor - --run 2026-10-03_s01 --session sessions/2026-10-03_s01
+    """
+    from bampipe.stages.monitor_start import Options
+
+    options = Options(window_s, false_alarms, memory_s)
+    options.check()
+    if not every > 0.0:
+        raise InputError("must be positive", where="--every")
+    if device and run:
+        raise InputError("--device and --run exclude each other")
+
+    def remark(text: str) -> None:
+        if not quiet:
+            show.note(f"bampipe: {text}")
+
+    watch, stream = _prepare(samples, run, model, device, session, options, strict, remark, runs)
+    screen = sys.stdout.isatty() and not json
+    try:
+        with _Output(screen, every) as output:
+            follow(stream, watch, output, wait=not once and samples != "-")
+    finally:
+        if stream.descriptor != 0:
+            os.close(stream.descriptor)
+
+
+def _prepare(
+    samples: str,
+    run: str,
+    model: str,
+    device: str,
+    session: Path | None,
+    options: Any,
+    strict: bool,
+    remark: Any,
+    runs: Path,
+) -> tuple[Monitor, SampleStream]:
+    """Compile the model before the first sample is due, then open the stream."""
+    from bampipe.physics import Model, compile_model, registry
+    from bampipe.stages import monitor_start, monitoring
+    from bampipe.stages.base import RunFolder
+    from bampipe.stages.declarations import read_device
+
+    if device:
+        system = compile_model(Model(registry.device_from(*read_device(device))))
+        start = None
+    else:
+        folder = RunFolder(places.find_run(run or None, runs))
+        system, start = monitor_start.start_from_run(folder, model, options)
+    stream = monitor_start.open_stream(samples, system, session, strict, remark)
+    return monitoring.Monitor(system, start, options, remark), stream
+
+
+def follow(stream: SampleStream, watch: Monitor, output: _Output, wait: bool) -> None:
+    """Filter what comes until the end, or where ``wait``, until the user stops it."""
+    try:
+        while True:
+            values = stream.read(last=not wait)
+            if len(values):
+                watch.push(stream.names, values)
+                output.show(watch, stream)
+            if stream.ended:
+                if not wait:
+                    break
+                time.sleep(POLL_S)
+    except KeyboardInterrupt:
+        pass
+    output.show(watch, stream, final=True)
+
+
+class _Output:
+    """JSON lines, one an interval of data; on a terminal a table drawn a few times a second."""
+
+    def __init__(self, screen: bool, every: float) -> None:
+        self._every, self._next, self._drawn = every, -float("inf"), 0.0
+        self._screen: Any = None
+        if screen:
+            from rich.live import Live
+
+            self._screen = Live(auto_refresh=False)
+
+    def __enter__(self) -> _Output:
+        if self._screen:
+            self._screen.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._screen:
+            self._screen.stop()
+
+    def show(self, watch: Monitor, stream: SampleStream, final: bool = False) -> None:
+        """Show where things stand if it is time to."""
+        if self._screen:
+            if final or time.monotonic() - self._drawn > SCREEN_S:
+                self._drawn = time.monotonic()
+                self._screen.update(_table(watch.report(), stream.bad_lines), refresh=True)
+            return
+        content = watch.report()
+        t = content["t"]
+        if not final and not (isinstance(t, float) and t >= self._next):
+            return
+        if isinstance(t, float):
+            self._next = t + self._every
+        print(
+            json_text.dumps({**content, "bad_lines": stream.bad_lines}, sort_keys=True), flush=True
+        )
+
+
+def _table(content: Mapping[str, Any], bad_lines: int) -> Any:
+    """The screen: state and parameters, and below them whether all is well."""
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table.grid(padding=(0, 2))
+    for justify in ("left", "right", "right", "left"):
+        table.add_column(justify=justify)
+    for axis, state in content.get("state", BLANK).items():
+        table.add_row(
+            axis, f"{state['position']:.5f}", f"{state['velocity']:+.4f} /s",
+            f"± {2.0 * state['velocity_sd']:.2g}",
+        )  # fmt: skip
+    for name, item in content.get("parameters", BLANK).items():
+        table.add_row(
+            name, f"{item['estimate']:.4g}", f"{item['lower']:.4g} to {item['upper']:.4g}",
+            item["unit"],
+        )  # fmt: skip
+    nis = content.get("nis", BLANK)
+    ratio = nis.get("window")
+    if content["alarm"]:
+        said = Text(f"ALARM: {nis['worst']} is not explained ({ratio:.2f})", style="bold red")
+    elif ratio is None:
+        said = Text("waiting for a whole window")
+    else:
+        said = Text(f"consistent ({ratio:.2f}, alarm from {nis['threshold']:.2f})", style="green")
+    clock = "–" if content["t"] is None else f"{content['t']:.2f} s"
+    table.add_row("t", clock, f"{content['samples']} samples", "")
+    table.add_row("innovations", "", "", said)
+    table.add_row(
+        "alarms", str(content["alarms"]), f"{bad_lines} bad lines",
+        f"{content['restarts']} restarts",
+    )  # fmt: skip
+    return table

@@ -1,0 +1,256 @@
+"""Samples as they come: lines of a growing text file or of a pipe, checked and in SI units."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.data.session import Session
+from bampipe.errors import InputError
+
+Array = NDArray[np.float64]
+
+PORTION = 1 << 16
+"""Bytes read at once: what memory is bounded by, with `LONGEST_LINE`."""
+LONGEST_LINE = 1 << 20
+DELIMITERS = ",;\t"
+MOST_COMPLAINTS = 3
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What the columns of a stream mean: SI values = raw @ gain + offset, time first.
+
+    Attributes:
+        columns: (k,) columns needed, the time first.
+        names: (m,) what they become: ``t`` (s), ``q_<axis>``, ``force_<c>``, ``brake_<axis>``, ...
+        gain: (k, m); offset: (m,).
+        may_lack: (k,) columns that may be empty: positions, which the filter bridges.
+    """
+
+    columns: tuple[str, ...]
+    names: tuple[str, ...]
+    gain: Array
+    offset: Array
+    may_lack: NDArray[np.bool_]
+
+    @staticmethod
+    def in_si(names: Sequence[str]) -> Layout:
+        """Columns that are named and measured as in ``ingest/samples.parquet``."""
+        columns = ("t", *names)
+        return Layout(
+            columns, columns, np.eye(len(columns)), np.zeros(len(columns)),
+            np.array([name.startswith("q_") for name in columns]),
+        )  # fmt: skip
+
+    @staticmethod
+    def of_session(session: Session) -> Layout:
+        """Columns as a session file describes its raw logs.
+
+        Raises:
+            InputError: time as dates, counted samples, or registers that wrap.
+        """
+        where = str(session.root / "session.toml")
+        if session.clock.datetime or not session.clock.column:
+            raise InputError(
+                "a stream needs a time column that holds numbers",
+                where=f"{where}: time",
+                remedy="write seconds, or microseconds as time_us",
+            )
+        wrapped = [channel.name for channel in session.channels if channel.wrap_bits]
+        if wrapped:
+            raise InputError(
+                f"channel {wrapped[0]} is a register that wraps, which a stream cannot undo",
+                where=where,
+                remedy="log it as a signed number",
+            )
+        force = session.force
+        columns = [session.clock.column, *(e.column for e in session.encoders)]
+        columns += [*(b.column for b in session.brakes), *(c.column for c in session.channels)]
+        columns += list(force.columns) if force else []
+        names = ["t", *(f"q_{e.axis}" for e in session.encoders)]
+        names += [*(f"brake_{b.axis}" for b in session.brakes), *(c.name for c in session.channels)]
+        names += list(force.names) if force else []
+        gain, offset = np.zeros((len(columns), len(names))), np.zeros(len(names))
+        gain[0, 0] = session.clock.seconds
+        at = 1
+        scales = [(e.scale, -e.zero * e.scale) for e in session.encoders]
+        scales += [(1.0, 0.0) for _ in session.brakes]
+        scales += [(c.scale, c.offset) for c in session.channels]
+        for scale, shift in scales:
+            gain[at, at], offset[at] = scale, shift
+            at += 1
+        if force:
+            matrix = np.array(force.calibration).T
+            gain[at:, at:] = matrix
+            offset[at:] = -np.array(force.zero) @ matrix
+        may_lack = np.zeros(len(columns), dtype=bool)
+        may_lack[1 : 1 + len(session.encoders)] = True
+        return Layout(tuple(columns), tuple(names), gain, offset, may_lack)
+
+
+@dataclass
+class SampleStream:
+    """Lines of text turned into samples; a partial last line waits for its end.
+
+    Attributes:
+        descriptor: of the open file or pipe.
+        name: what messages call it.
+        layouts: what its header may look like, the first that fits counts.
+        strict: raise at the first bad line instead of skipping it.
+        complain: told of the first few lines that are skipped.
+        ended: whether the last read found no more bytes.
+        bad_lines: how many were skipped.
+    """
+
+    descriptor: int
+    name: str
+    layouts: Sequence[Layout]
+    strict: bool
+    complain: Callable[[str], None]
+    ended: bool = False
+    bad_lines: int = 0
+    _layout: Layout | None = None
+    _rest: bytes = b""
+    _line: int = 0
+    _delimiter: str = ","
+    _width: int = 0
+    _places: tuple[int, ...] = ()
+    _last: float = field(default=-np.inf)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What the columns of `read` are; empty before the header has come."""
+        return self._layout.names if self._layout else ()
+
+    def read(self, last: bool = False) -> Array:
+        """Return the samples, (T, m), of what has come since; T may be 0.
+
+        Args:
+            last: whether an unfinished line at the end is taken for whole.
+
+        Raises:
+            InputError: the header lacks a column, a line has no end, or, where strict, is bad.
+        """
+        data = os.read(self.descriptor, PORTION)
+        self.ended = not data
+        text = self._rest + data
+        if last and self.ended and text and not text.endswith(b"\n"):
+            text += b"\n"
+        cut = text.rfind(b"\n") + 1
+        self._rest = text[cut:]
+        if len(self._rest) > LONGEST_LINE:
+            raise InputError(
+                "a line without end: this is no text table", where=f"{self.name}: {self._line + 1}"
+            )
+        lines = text[:cut].decode("utf-8", errors="replace").splitlines()
+        if self._layout is None:
+            lines = self._header(lines)
+        if self._layout is None or not lines:
+            return np.empty((0, len(self.names)))
+        return self._samples(lines, self._layout)
+
+    def _header(self, lines: list[str]) -> list[str]:
+        """Take the header, after comments; return the lines below it."""
+        while lines and self._layout is None:
+            line = lines.pop(0).lstrip("\ufeff")
+            self._line += 1
+            if not line.strip() or line.startswith("#"):
+                continue
+            self._delimiter = max(DELIMITERS, key=line.count)
+            found = [cell.strip().strip("\"'") for cell in line.split(self._delimiter)]
+            for layout in self.layouts:
+                if set(layout.columns) <= set(found):
+                    self._layout = layout
+                    self._width = len(found)
+                    self._places = tuple(found.index(name) for name in layout.columns)
+                    break
+            else:
+                missing = [name for name in self.layouts[0].columns if name not in found]
+                raise InputError(
+                    f"no column {missing[0]!r} in the header",
+                    where=f"{self.name}: line {self._line}",
+                    remedy=f"the columns must be {', '.join(self.layouts[0].columns)}",
+                )
+        return lines
+
+    def _samples(self, lines: list[str], layout: Layout) -> Array:
+        rows: list[list[float]] = []
+        numbers: list[int] = []
+        places, width, delimiter = self._places, self._width, self._delimiter
+        for line in lines:
+            self._line += 1
+            cells = line.split(delimiter)
+            try:
+                if len(cells) != width:
+                    raise ValueError
+                row = [float(cells[place]) for place in places]
+            except ValueError:
+                if not line.strip() or line.startswith("#"):
+                    continue
+                careful = self._carefully(cells, layout)
+                if careful is None:
+                    continue
+                row = careful
+            rows.append(row)
+            numbers.append(self._line)
+        if not rows:
+            return np.empty((0, len(layout.names)))
+        raw = np.array(rows)
+        finite = np.isfinite(raw)
+        raw[:, layout.may_lack] = np.where(
+            finite[:, layout.may_lack], raw[:, layout.may_lack], np.nan
+        )
+        good = (finite | layout.may_lack).all(axis=1)
+        time = raw[:, 0] * layout.gain[0, 0]
+        before = np.maximum.accumulate(
+            np.concatenate([[self._last], np.where(good, time, -np.inf)])
+        )
+        late = good & ~(time > before[:-1])
+        for place in np.flatnonzero(~good | late):
+            if late[place]:
+                self._skip(numbers[place], layout.columns[0], "the time does not increase")
+            else:
+                column = int(np.argmin(finite[place] | layout.may_lack))
+                self._skip(numbers[place], layout.columns[column], "no number")
+        keep = good & ~late
+        self._last = float(before[-1])
+        return _in_si(raw[keep], layout)
+
+    def _carefully(self, cells: list[str], layout: Layout) -> list[float] | None:
+        """Read a line that is not plain numbers; None where it is bad."""
+        if len(cells) != self._width:
+            self._skip(self._line, "", f"{len(cells)} cells where the header has {self._width}")
+            return None
+        row = []
+        for place, column, may_lack in zip(
+            self._places, layout.columns, layout.may_lack, strict=True
+        ):
+            text = cells[place].strip().strip("\"'")
+            try:
+                row.append(np.nan if may_lack and not text else float(text))
+            except ValueError:
+                self._skip(self._line, column, f"{text[:40]!r} is no number")
+                return None
+        return row
+
+    def _skip(self, number: int, column: str, what: str) -> None:
+        where = f"{self.name}: line {number}" + (f", column {column}" if column else "")
+        if self.strict:
+            raise InputError(what, where=where)
+        self.bad_lines += 1
+        if self.bad_lines <= MOST_COMPLAINTS:
+            more = "; further ones are only counted" if self.bad_lines == MOST_COMPLAINTS else ""
+            self.complain(f"{where}: {what}: skipped{more}")
+
+
+def _in_si(raw: Array, layout: Layout) -> Array:
+    """Apply gains; a missing position stays missing and spoils nothing else."""
+    lost = np.isnan(raw)
+    values = np.where(lost, 0.0, raw) @ layout.gain + layout.offset
+    values[:, 1:][lost[:, 1:]] = np.nan
+    return values

@@ -1,0 +1,111 @@
+"""Is a filter still consistent with its model? A test on windows of normalised innovations.
+
+Over a window the normalised innovation squared (NIS) of a consistent filter averages the number
+of readings, and with white Gaussian noise its sum follows the chi-squared law (Bar-Shalom, Li and
+Kirubarajan 2001, section 5.4). Encoder steps are not Gaussian and model errors not white, so where
+there are windows known to be good, the law is a gamma distribution with their mean and variance,
+of which chi-squared is the special case.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gammaincinv
+
+Array = NDArray[np.float64]
+
+FEWEST_WINDOWS = 10
+"""Good windows from which on their scatter is believed."""
+
+
+@dataclass(frozen=True)
+class Reference:
+    """Law of the mean NIS of a reading over a window: a gamma distribution.
+
+    Attributes:
+        shape, scale: its mean is their product, 1 for a filter that is told the right noise.
+    """
+
+    shape: float
+    scale: float
+
+    @staticmethod
+    def of_theory(readings: int) -> Reference:
+        """Chi-squared with ``readings`` degrees of freedom, over ``readings``."""
+        return Reference(readings / 2.0, 2.0 / readings)
+
+    @staticmethod
+    def of_windows(means: Array, readings: int) -> Reference:
+        """The law of good windows; with fewer than `FEWEST_WINDOWS` of them, theory's.
+
+        Args:
+            means: (n,) mean NIS of a reading over each window.
+            readings: in a window. The variance is at least that of theory at this mean.
+        """
+        theory = Reference.of_theory(readings)
+        if means.size < FEWEST_WINDOWS:
+            return theory
+        mean = float(np.mean(means))
+        variance = max(float(np.var(means, ddof=1)), 2.0 * mean**2 / readings)
+        return Reference(mean**2 / variance, variance / mean)
+
+    def threshold(self, probability: float) -> float:
+        """What a consistent window exceeds with ``probability``."""
+        return float(self.scale * gammaincinv(self.shape, 1.0 - probability))
+
+
+def window_means(nis: Array, n_readings: int, samples: int) -> Array:
+    """Mean NIS of a reading over whole windows of ``samples``, (windows,).
+
+    Args:
+        nis: (T,) NaN where no reading was taken; n_readings: of one sample.
+        samples: length of a window; windows less than half full are left out.
+    """
+    count = nis.size // samples
+    whole = nis[: count * samples].reshape(count, samples)
+    full = np.isfinite(whole).sum(axis=1)
+    sums = np.nansum(whole, axis=1)
+    kept = full >= 0.5 * samples
+    return np.asarray(sums[kept] / (full[kept] * n_readings))
+
+
+class WindowTest:
+    """Sums innovations up to windows, one after the other.
+
+    Attributes:
+        ratio: mean NIS of a reading over the last whole window, NaN before the first.
+        by_reading: (ny,) mean square of each innovation in its own standard deviation, there.
+        windows: how many were judged.
+    """
+
+    def __init__(self, n_readings: int, samples: int) -> None:
+        """Start the first window of ``samples`` samples, ``n_readings`` each."""
+        self._samples = samples
+        self.ratio = np.nan
+        self.by_reading = np.full(n_readings, np.nan)
+        self.windows = 0
+        self._nis = np.zeros(0)
+        self._squares = np.zeros((0, n_readings))
+
+    def take(self, nis: Array, squares: Array) -> list[float]:
+        """Add samples; return the mean NIS of a reading of each window that is now whole.
+
+        Args:
+            nis: (T,); squares: (T, ny) squared innovations in their own variance; NaN at gaps.
+        """
+        self._nis = np.concatenate([self._nis, nis])
+        self._squares = np.concatenate([self._squares, squares])
+        found = []
+        while self._nis.size >= self._samples:
+            first, self._nis = self._nis[: self._samples], self._nis[self._samples :]
+            parts, self._squares = self._squares[: self._samples], self._squares[self._samples :]
+            means = window_means(first, parts.shape[1], self._samples)
+            if means.size:
+                self.ratio = float(means[0])
+                self.by_reading = np.nanmean(parts, axis=0)
+                self.windows += 1
+                found.append(self.ratio)
+        return found

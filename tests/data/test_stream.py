@@ -1,0 +1,122 @@
+"""Lines that come in pieces, and lines that are wrong."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bampipe.data.session import read_session
+from bampipe.data.stream import Layout, SampleStream
+from bampipe.errors import InputError
+
+SAMPLES = Path(__file__).parents[2] / "sample_runs"
+SI = Layout.in_si(["q_yaw", "force_x"])
+
+
+class Pipe:
+    """A pipe with a stream at its end."""
+
+    def __init__(self, layouts=(SI,), strict=False):
+        self.source, sink = os.pipe()
+        os.set_blocking(self.source, False)
+        self._sink = os.fdopen(sink, "wb", buffering=0)
+        self.said = []
+        self.stream = SampleStream(self.source, "log", layouts, strict, self.said.append)
+
+    def write(self, text):
+        """Send text; return what the stream makes of it."""
+        self._sink.write(text.encode() if isinstance(text, str) else text)
+        return self.stream.read()
+
+    def close(self):
+        """Send no more; return what the stream makes of the rest."""
+        self._sink.close()
+        return self.stream.read(last=True)
+
+
+def test_lines_come_in_pieces():
+    pipe = Pipe()
+    assert pipe.write("\ufeff# logger 3\nforce_x, t,").shape == (0, 0)
+    assert pipe.write(" note, q_yaw\n1.5,0.0").shape == (0, 3)
+    assert pipe.stream.names == ("t", "q_yaw", "force_x")
+    np.testing.assert_array_equal(pipe.write(",a,0.25\n2.5,"), [[0.0, 0.25, 1.5]])
+    np.testing.assert_array_equal(pipe.write("0.1,b,0.5\r\n\n3.5"), [[0.1, 0.5, 2.5]])
+    pipe.write(",0.2,c,")
+    np.testing.assert_array_equal(pipe.close(), [[0.2, np.nan, 3.5]])
+    assert pipe.stream.ended
+    assert pipe.stream.bad_lines == 0
+
+
+@pytest.mark.parametrize("delimiter", [";", "\t"])
+def test_other_delimiters(delimiter):
+    pipe = Pipe()
+    rows = pipe.write("t,q_yaw,force_x\n1,2,3\n".replace(",", delimiter))
+    np.testing.assert_array_equal(rows, [[1.0, 2.0, 3.0]])
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("0.1,abc,1", "line 3, column q_yaw: 'abc' is no number"),
+        ("0.1,1", "line 3: 2 cells where the header has 3"),
+        ("0.1,1,", "line 3, column force_x: '' is no number"),
+        ("0.1,1,inf", "line 3, column force_x: no number"),
+        ("0.0,1,1", "line 3, column t: the time does not increase"),
+        ("nan,1,1", "line 3, column t: no number"),
+    ],
+)
+def test_a_bad_line_is_skipped_and_said(line, said):
+    pipe = Pipe()
+    rows = pipe.write(f"t,q_yaw,force_x\n0.0,1,1\n{line}\n0.2,3,1\n")
+    np.testing.assert_array_equal(rows[:, 1], [1.0, 3.0])
+    assert pipe.stream.bad_lines == 1
+    assert pipe.said == [f"log: {said}: skipped"]
+    strict = Pipe(strict=True)
+    with pytest.raises(InputError, match=said.split(":")[0]):
+        strict.write(f"t,q_yaw,force_x\n0.0,1,1\n{line}\n0.2,3,1\n")
+
+
+def test_a_position_may_be_missing():
+    rows = Pipe().write("t,q_yaw,force_x\n0.0,,1\n0.1,nan,1\n0.2,inf,1\n")
+    assert np.isnan(rows[:, 1]).all()
+    np.testing.assert_array_equal(rows[:, [0, 2]], [[0.0, 1.0], [0.1, 1.0], [0.2, 1.0]])
+
+
+def test_only_the_first_complaints_are_said():
+    pipe = Pipe()
+    pipe.write("t,q_yaw,force_x\n" + "x,1,1\n" * 50)
+    assert pipe.stream.bad_lines == 50
+    assert len(pipe.said) == 3
+    assert "only counted" in pipe.said[-1]
+
+
+def test_a_header_that_lacks_a_column():
+    with pytest.raises(InputError, match=r"log: line 2.*no column 'force_x'"):
+        Pipe().write("# head\nt,q_yaw,force\n")
+
+
+def test_what_is_no_text_is_refused():
+    pipe = Pipe()
+    pipe.write("t,q_yaw,force_x\n")
+    with pytest.raises(InputError, match="line without end"):
+        for _ in range(40):
+            pipe.write(b"\x00" * 50_000)
+
+
+def test_raw_columns_of_a_session_become_si():
+    layout = Layout.of_session(read_session(SAMPLES / "first"))
+    pipe = Pipe((SI, layout))
+    rows = pipe.write(
+        "time_us,enc_yaw,enc_pitch,enc_extension,brake_yaw,brake_pitch,brake_extension,"
+        "force_x_v,force_y_v,force_z_v\n2000000,33333.3333,-4000,3000,1,2,3,1.021,-0.034,0.012\n"
+    )
+    found = dict(zip(pipe.stream.names, rows[0], strict=True))
+    assert found["t"] == pytest.approx(2.0)
+    assert found["q_yaw"] == pytest.approx(1.0)
+    assert found["q_pitch"] == found["q_extension"] == 0.0
+    assert [found[f"brake_{axis}"] for axis in ("yaw", "pitch", "extension")] == [1.0, 2.0, 3.0]
+    forces = [found[f"force_{component}"] for component in "xyz"]
+    np.testing.assert_allclose(forces, [12.0, 0.1, -0.05], atol=1e-12)

@@ -1,0 +1,65 @@
+"""The online filter and its test of consistency."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from slider import TRUTH, model, position_only, record, settings
+
+from bampipe.estimate.consistency import Reference, WindowTest, window_means
+from bampipe.estimate.online import OnlineFilter
+from bampipe.estimate.unscented import filter_trials
+
+
+@pytest.mark.parametrize("square_root", [False, True])
+def test_portions_do_not_matter(square_root: bool) -> None:
+    trial = position_only(record(6, 2.0))
+    y = trial.y.copy()
+    y[300:310] = np.nan
+    trial = replace(trial, y=y)
+    chosen = settings(square_root=square_root, walk_sd=0.01 * TRUTH)
+    slider = model()
+    mean, spread = slider.to_estimated(1.2 * TRUTH, TRUTH)
+    batch = filter_trials(slider, [trial], mean, np.diag(spread**2), chosen)
+    whole = batch.trials[0]
+    rng = np.random.default_rng(1)
+    online = OnlineFilter(slider, chosen, trial.x, trial.x_sd, mean, np.diag(spread**2))
+    at, nis = 0, []
+    while at < trial.t.size:
+        part = slice(at, at + int(rng.integers(1, 40)))
+        nis.append(online.advance(trial.t[part], trial.u[part], trial.y[part]).nis)
+        at = part.stop
+    np.testing.assert_allclose(online.mean, whole.mean[-1], rtol=1e-12, atol=1e-14)
+    scale = np.sqrt(np.diag(whole.covariance[-1]))
+    error = (online.covariance - whole.covariance[-1]) / np.outer(scale, scale)
+    assert np.max(np.abs(error)) < 1e-12
+    np.testing.assert_allclose(np.concatenate(nis), whole.nis, rtol=1e-9)
+
+
+def test_threshold_is_exceeded_as_often_as_stated() -> None:
+    rng = np.random.default_rng(2)
+    samples, readings = 50, 3
+    nis = np.sum(rng.normal(size=(200_000, readings)) ** 2, axis=1)
+    means = window_means(nis, readings, samples)
+    for law in (
+        Reference.of_theory(samples * readings),
+        Reference.of_windows(means[:200], samples * readings),
+    ):
+        assert np.mean(means[200:] > law.threshold(0.01)) == pytest.approx(0.01, abs=0.006)
+
+
+def test_few_good_windows_leave_theory() -> None:
+    assert Reference.of_windows(np.full(3, 0.2), 60) == Reference.of_theory(60)
+
+
+def test_windows_half_empty_are_not_judged() -> None:
+    nis = np.concatenate([np.full(10, 2.0), np.full(6, np.nan), np.full(4, 2.0), np.full(5, 9.0)])
+    np.testing.assert_allclose(window_means(nis, 2, 10), [1.0])
+    test = WindowTest(2, 10)
+    squares = np.stack([nis / 2.0, nis / 2.0], axis=1)
+    judged = [mean for k in range(25) for mean in test.take(nis[k : k + 1], squares[k : k + 1])]
+    assert judged == pytest.approx([1.0])
+    assert test.windows == 1
+    np.testing.assert_allclose(test.by_reading, 1.0)

@@ -1,0 +1,220 @@
+"""The monitor: the batch filter's numbers, an alarm when the plant changes, a growing file."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from identified_run import TRUTH, simulated_run
+
+from bampipe.data.store import read_json, read_parquet, write_json
+from bampipe.estimate.unscented import Trial, filter_trials
+from bampipe.physics import Model, compile_model, registry
+from bampipe.stages.base import RunFolder
+from bampipe.stages.monitor_start import Options, first_state, start_from_run
+from bampipe.stages.monitoring import Monitor
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    """A simulated run, identified perfectly: the truth with small uncertainties."""
+    found = simulated_run(tmp_path_factory.mktemp("monitored"), seconds=12.0)
+    names = list(TRUTH)
+    sd = np.array([0.002 * value for value in TRUTH.values()])
+    axes = read_json(found.path("ingest/session.json"))["axes"]
+    content = {
+        "parameters": {n: {"estimate": TRUTH[n], "sd": s} for n, s in zip(names, sd, strict=True)},
+        "covariance": {"names": names, "matrix": np.diag(sd**2).tolist()},
+        "input_timing": {"estimate": 0.0},
+        "noise": {
+            "reading_sd": {a: axes[a]["resolution"] / np.sqrt(12.0) for a in axes},
+            "process_sd": dict.fromkeys(
+                ("force_x", "force_y", "force_z", "gravity_compensator"), 0.05
+            ),
+        },
+    }
+    write_json(found.root / "models/base/identify.json", content)
+    return found
+
+
+@pytest.fixture(scope="module")
+def begun(run: RunFolder):
+    return start_from_run(run, "base", Options())
+
+
+def samples(run: RunFolder, trial: str):
+    frame = read_parquet(run.path("ingest/samples.parquet"), trial=trial).drop(columns="trial_id")
+    return frame
+
+
+def as_csv(frame) -> str:
+    return frame.to_csv(index=False)
+
+
+def test_same_estimates_as_the_batch_filter(run: RunFolder, begun: tuple) -> None:
+    system, start = begun
+    frame = samples(run, "t01")
+    names, values = tuple(frame.columns), frame.to_numpy(dtype=float)
+    monitor = Monitor(system, start, Options(), pytest.fail)
+    for first in range(0, len(values), 77):
+        monitor.push(names, values[first : first + 77])
+    n = len(system.coordinates)
+    y, u = values[:, 1 : 1 + n].copy(), values[:, 1 + n :].copy()
+    batch = filter_trials(
+        start.model,
+        [Trial(values[:, 0].copy(), u, y, first_state(system, y, u), start.x_sd)],
+        start.theta, start.covariance, replace(start.settings, stride=1),
+    )  # fmt: skip
+    report = monitor.report()
+    theta, _ = start.model.to_physical(batch.theta)
+    found = [item["estimate"] for item in report["parameters"].values()]
+    np.testing.assert_allclose(found, theta, rtol=1e-12)
+    mean = batch.trials[0].mean[-1]
+    for i, state in enumerate(report["state"].values()):
+        assert state["position"] == pytest.approx(mean[i], rel=1e-12, abs=1e-14)
+        assert state["velocity"] == pytest.approx(mean[n + i], rel=1e-12, abs=1e-14)
+
+
+def test_no_alarm_while_nothing_changes(run: RunFolder, begun: tuple) -> None:
+    system, start = begun
+    monitor = Monitor(system, start, Options(), pytest.fail)
+    frame = samples(run, "t00")
+    monitor.push(tuple(frame.columns), frame.to_numpy(dtype=float))
+    report = monitor.report()
+    assert report["nis"]["windows"] >= 10
+    assert report["alarms"] == 0
+    for name, value in TRUTH.items():
+        entry = report["parameters"][name]
+        assert entry["lower"] - 0.01 * value < value < entry["upper"] + 0.01 * value
+
+
+def test_alarm_when_a_sensor_changes(run: RunFolder, begun: tuple) -> None:
+    system, start = begun
+    monitor = Monitor(system, start, Options(), lambda _: None)
+    frame = samples(run, "t00")
+    frame.loc[frame["t"] > 6.0, "force_x"] *= 1.2
+    values = frame.to_numpy(dtype=float)
+    calm = int(np.searchsorted(values[:, 0], 6.0))
+    monitor.push(tuple(frame.columns), values[:calm])
+    assert monitor.alarms == 0
+    monitor.push(tuple(frame.columns), values[calm:])
+    assert monitor.alarms > 0
+
+
+def test_a_gap_starts_the_motion_and_not_the_parameters(run: RunFolder, begun: tuple) -> None:
+    system, start = begun
+    said: list[str] = []
+    monitor = Monitor(system, start, Options(), said.append)
+    frame = samples(run, "t00")
+    values = frame.to_numpy(dtype=float)
+    kept = (values[:, 0] < 4.0) | (values[:, 0] > 6.0)
+    monitor.push(tuple(frame.columns), values[values[:, 0] < 4.0])
+    before = monitor.report()["parameters"]["mass"]
+    monitor.push(tuple(frame.columns), values[kept & (values[:, 0] > 5.0)])
+    after = monitor.report()["parameters"]["mass"]
+    assert monitor.restarts == 1
+    assert "gap" in said[0]
+    assert after["upper"] - after["lower"] < 1.2 * (before["upper"] - before["lower"])
+    assert monitor.alarms == 0
+
+
+def test_a_lost_motion_starts_anew(run: RunFolder, begun: tuple) -> None:
+    """A force of 1e200 N: the filter fails, the monitor goes on."""
+    system, start = begun
+    said: list[str] = []
+    monitor = Monitor(system, start, Options(), said.append)
+    frame = samples(run, "t00")
+    values = frame.to_numpy(dtype=float, copy=True)
+    values[1000, frame.columns.get_loc("force_x")] = 1e200
+    monitor.push(tuple(frame.columns), values)
+    assert monitor.restarts >= 1
+    assert "grew without bound" in said[0]
+    state = monitor.report()["state"]
+    assert all(np.isfinite(list(item.values())).all() for item in state.values())
+
+
+def test_memory_and_speed_hold(run: RunFolder, begun: tuple) -> None:
+    """5 kHz sustained, parsing included, on one core; nothing grows."""
+    from bampipe.data.stream import SampleStream
+    from bampipe.stages.monitor_start import layouts
+
+    system, start = begun
+    frame = samples(run, "t00")
+    source, sink = os.pipe()
+    stream = SampleStream(source, "pipe", layouts(system, None), True, pytest.fail)
+    monitor = Monitor(system, start, Options(), pytest.fail)
+    text = as_csv(frame).encode()
+    step, taken, begin = 1 << 14, 0, time.process_time()
+    for first in range(0, len(text), step):
+        os.write(sink, text[first : first + step])
+        values = stream.read()
+        if len(values):
+            monitor.push(stream.names, values)
+            taken += len(values)
+    rate = taken / (time.process_time() - begin)
+    os.close(sink)
+    os.close(source)
+    assert taken >= len(frame) - 1
+    assert rate > 5000.0, rate
+
+
+def test_follows_a_growing_file_until_told_to_stop(run: RunFolder, tmp_path: Path) -> None:
+    frame = samples(run, "t00")
+    lines = as_csv(frame).splitlines(keepends=True)
+    log = tmp_path / "log.csv"
+    log.write_text("".join(lines[:1500]) + lines[1500][:20])
+    process = subprocess.Popen(
+        [sys.executable, "-m", "bampipe", "monitor", str(log), "--device", "bam", "--every", "0.5"],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert process.stdout is not None
+    first = json.loads(process.stdout.readline())
+    with log.open("a") as file:
+        file.write(lines[1500][20:] + "not a line\n" + "".join(lines[1501:3001]))
+    later = first
+    while later["samples"] < 2500:
+        later = json.loads(process.stdout.readline())
+    process.send_signal(signal.SIGINT)
+    out, errors = process.communicate(timeout=30)
+    assert process.returncode == 0, errors
+    assert 0 < first["samples"] <= 1499  # a line half written waits for its end
+    assert json.loads(out.splitlines()[-1])["bad_lines"] == 1
+    assert "line 1502" in errors
+    assert "Traceback" not in errors
+    assert later["parameters"]["mass"]["lower"] < 3.5 < later["parameters"]["mass"]["upper"]
+
+
+@pytest.mark.parametrize(
+    ("text", "options", "said"),
+    [
+        ("t,q_yaw\n", [], "no column 'q_pitch' in the header"),
+        ("", ["--every", "0"], "--every: must be positive"),
+        ("", ["--window", "-1"], "must be positive"),
+        ("", ["--run", "nothing"], "exclude each other"),
+    ],
+)
+def test_mistakes_are_one_line(tmp_path: Path, text: str, options: list[str], said: str) -> None:
+    log = tmp_path / "log.csv"
+    log.write_text(text)
+    command = [sys.executable, "-m", "bampipe", "monitor", str(log), "--device", "bam", "--once"]
+    done = subprocess.run([*command, *options], capture_output=True, text=True)
+    assert done.returncode == 2
+    assert said in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+
+
+def test_a_model_with_a_force_rate_is_refused() -> None:
+    from bampipe.errors import InputError
+    from bampipe.stages.monitor_start import layouts
+
+    system = compile_model(Model(registry.device("bam"), ("force_delay",)))
+    with pytest.raises(InputError, match="known only afterwards"):
+        layouts(system, None)
