@@ -16,7 +16,7 @@ from bampipe.cli import places, show
 from bampipe.errors import InputError
 
 if TYPE_CHECKING:
-    from bampipe.data.stream import SampleStream
+    from bampipe.stages.monitor_start import Stream
     from bampipe.stages.monitoring import Monitor
 
 POLL_S = 0.02
@@ -104,7 +104,7 @@ def _prepare(
     strict: bool,
     remark: Any,
     runs: Path,
-) -> tuple[Monitor, SampleStream]:
+) -> tuple[Monitor, Stream]:
     """Compile the model before the first sample is due, then open the stream."""
     from bampipe.physics import Model, compile_model, registry
     from bampipe.stages import monitor_start, monitoring
@@ -121,7 +121,7 @@ def _prepare(
     return monitoring.Monitor(system, start, options, remark), stream
 
 
-def follow(stream: SampleStream, watch: Monitor, output: _Output, wait: bool) -> None:
+def follow(stream: Stream, watch: Monitor, output: _Output, wait: bool) -> None:
     """Filter what comes until the end, or where ``wait``, until the user stops it."""
     try:
         while True:
@@ -158,7 +158,7 @@ class _Output:
         if self._screen:
             self._screen.stop()
 
-    def show(self, watch: Monitor, stream: SampleStream, final: bool = False) -> None:
+    def show(self, watch: Monitor, stream: Stream, final: bool = False) -> None:
         """Show where things stand if it is time to."""
         if self._screen:
             if final or time.monotonic() - self._drawn > SCREEN_S:

@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +31,9 @@ from bampipe.stages.motions import free_trials, input_columns
 from bampipe.stages.sensor_noise import white_part
 
 Array = NDArray[np.float64]
+
+Stream: TypeAlias = SampleStream
+"""What `open_stream` returns."""
 
 FIRST_LOOK = 500
 """Samples from which the noise is found where no run states it."""
@@ -124,7 +128,7 @@ def open_stream(
     session: Path | None,
     strict: bool,
     complain: Callable[[str], None],
-) -> SampleStream:
+) -> Stream:
     """Open a growing file, or standard input where ``samples`` is ``-``.
 
     Args:
