@@ -236,7 +236,8 @@ def build(
                 f"{ast.unparse(node)[:60]!r} is not a real number below {MAX_NUMBER:g}",
                 where=where,
             )
-        return value
+        # sympy's 0.0 is not equal to 0, and everything here and later asks whether terms are 0.
+        return sp.Integer(0) if value.is_number and value.is_zero else value
 
     def combine(node: ast.AST) -> Any:
         match node:
@@ -268,7 +269,8 @@ def build(
                 if a.is_number and a != 0 and b * math.log(abs(a)) > math.log(MAX_NUMBER):
                     return sp.oo
                 # Halves stay exact: sympy then sees a square root.
-                return a ** (sp.Rational(int(2 * b), 2) if 2 * b == int(2 * b) else b)
+                halves = 2.0 * float(b)
+                return a ** (sp.Rational(int(halves), 2) if halves.is_integer() else b)
             case ast.Call(func=ast.Name(id=name), args=args):
                 values = [walk(argument) for argument in args]
                 if name == "exp" and values[0].is_number and values[0] > 69:

@@ -86,6 +86,12 @@ HOSTILE = [
     "0/0",
     "1/(yaw - yaw)",
     "0**-1",
+    "1/0.0",
+    "yaw/0.0",
+    "0.0**-1",
+    "(0.0*yaw)**-2",
+    "5./+.0",
+    "--\x0b+\x0b++5.----5----5./+5.----5---------5./+.0",
     "log(0)",
     "log(-1)",
     "sqrt(-1)",
@@ -176,6 +182,12 @@ def test_hostile_text_is_refused_at_once_in_one_line(text):
 def test_what_is_not_text_is_refused(value):
     with pytest.raises(InputError, match="as text"):
         expression.parse(value, "here")
+
+
+def test_decimals_mean_what_whole_numbers_mean():
+    yaw = SYMBOLS["yaw"]
+    assert read("yaw**0.5") == sp.sqrt(yaw) and read("yaw**2.0") == yaw**2
+    assert read("0.0*yaw") == 0 and read("0.0") == 0 and read("sgn(0.0)") == 0
 
 
 def test_a_wrong_name_suggests_the_right_one():
