@@ -42,25 +42,25 @@ jobs = 1
 """
 EFFECT = "stribeck:carriage"
 CHILD = "base+stribeck.carriage"
-CORE = ("ingest", "filter", "stiffness", "identify", "validate", "compare")
 # Diagnosis and report take longest: they have run folders of their own.
+SLOW = ("diagnose", "report")
 KINDS = {
-    "core": CORE,
-    "diagnose": (*CORE[:-1], "diagnose", "compare"),
-    "report": (*CORE, "report"),
+    kind: tuple(stage for stage in base.STAGES if stage not in SLOW or stage == kind)
+    for kind in ("core", *SLOW)
 }
-STEPS = {
-    "ingest": "core",
-    "filter": "core",
-    "stiffness": "core",
-    "identify:base": "core",
-    f"identify:{CHILD}": "core",
-    "validate:base": "core",
-    f"validate:{CHILD}": "core",
-    "diagnose:base": "diagnose",
-    "compare": "core",
-    "report": "report",
-}
+
+
+def steps() -> dict[str, str]:
+    """Every step that is killed, and the kind of run folder it is killed in."""
+    found = {}
+    for stage in base.STAGES:
+        kind = stage if stage in SLOW else "core"
+        models = ("base",) if stage in SLOW else ("base", CHILD)
+        names = [f"{stage}:{model}" for model in models] if stage in base.PER_MODEL else [stage]
+        found |= dict.fromkeys(names, kind)
+    return found
+
+
 EXTEND = "extend"
 LONGEST = 600.0
 
@@ -247,13 +247,14 @@ def main() -> None:
     # Imported once, here: the kills then meet the work, not Python's start.
     for stage in base.STAGES:
         base.load(stage)
-    targets = (*STEPS, EXTEND)
+    kinds = steps()
+    targets = (*kinds, EXTEND)
     with working_folder(options.keep) as work:
         make_versions(work)
         folders = {kind: Folder(work, kind) for kind in KINDS}
         while killed.total() < options.kills:
             step = targets[(killed.total() + missed) % len(targets)]
-            folder = folders[STEPS.get(step, "core")]
+            folder = folders[kinds.get(step, "core")]
             folder.take(1 - folder.version)
             alive = folder.kill(step, draw)
             killed[step] += alive
