@@ -5,10 +5,10 @@ from __future__ import annotations
 import datetime
 import importlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from bampipe.report import page, style, typeset
-from bampipe.report.document import Document, Figure, Section
+from bampipe.report.document import Block, Callout, Document, Figure, Section
 from bampipe.report.results import Results
 from bampipe.report.sections import SECTIONS
 
@@ -48,6 +48,7 @@ def build(results: Results, progress: Callable[[float, str], None]) -> Report:
             section: Section | None = module.section(results)
         if section is not None:
             sections.append(section)
+    sections[0] = replace(sections[0], blocks=(*_warnings(results), *sections[0].blocks))
     document = Document(
         f"Session {results.session['session_id']}", _subtitle(results), tuple(sections)
     )
@@ -62,6 +63,15 @@ def build(results: Results, progress: Callable[[float, str], None]) -> Report:
     }
     titles = tuple(section.title for section in sections)
     return Report(printed, page.page(document), figures, titles)
+
+
+def _warnings(results: Results) -> tuple[Block, ...]:
+    """Return what must be known before anything else is read."""
+    if not results.outdated:
+        return ()
+    steps = ", ".join(f"`{step}`" for step in results.outdated)
+    text = f"Run these again before relying on what they say: {steps}."
+    return (Callout("attention", "Some results are older than what they were made from", text),)
 
 
 def _subtitle(results: Results) -> str:

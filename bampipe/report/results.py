@@ -76,6 +76,25 @@ class Results:
         return () if frame is None else tuple(str(name) for name in frame.columns)
 
     @cached_property
+    def outdated(self) -> tuple[str, ...]:
+        """Steps whose inputs were made anew after they ran, as ``run.json`` tells, sorted."""
+        stages: dict[str, Any] = (self.json("run.json") or {}).get("stages", {})
+        makers = {name: step for step, made in stages.items() for name in made.get("outputs", {})}
+        found: set[str] = set()
+        while True:
+            more = {
+                step
+                for step, made in stages.items()
+                if step not in found
+                for name, digest in (made.get("inputs") or {}).items()
+                if name in makers
+                and (makers[name] in found or stages[makers[name]]["outputs"][name] != digest)
+            } - {"report"}
+            if not more:
+                return tuple(sorted(found))
+            found |= more
+
+    @cached_property
     def session(self) -> dict[str, Any]:
         """What ingest says of the session.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import json
 import re
 import shutil
 import subprocess
@@ -159,6 +160,21 @@ def test_provenance_lists_inputs_versions_and_keys_in_order(full: Report) -> Non
     assert row_of(table, "filter")[1:] == ["1", "1bcdef012345"]
     places = [table.index(f"<code>{name}<") for name in ("ingest", "filter", "stiffness")]
     assert places == sorted(places)
+
+
+def test_results_older_than_their_inputs_are_named_first(
+    full: Report, full_run: Path, tmp_path: Path
+) -> None:
+    assert "older than what they were made from" not in full.html
+    root = tmp_path / "run"
+    shutil.copytree(full_run, root)
+    record = json.loads((root / "run.json").read_text())
+    record["stages"]["ingest"]["outputs"]["ingest/x"] = "new"
+    (root / "run.json").write_text(json.dumps(record))
+    assert Results(root).outdated == ("filter", "identify:base", "stiffness")
+    report = build(Results(root), quiet)
+    place = report.html.index("older than what they were made from")
+    assert place < report.html.index("<table") and "identify:base" in report.html[place:][:400]
 
 
 def test_all_figures_of_the_paper(full: Report) -> None:
