@@ -61,7 +61,9 @@ class Settings:
             noise floor: no replay is perfect, and changes of direction blurred by sampling invite
             spurious effects, up to a tenth of the error on a linear axis.
         at_floor: see ``worth_at_floor``.
-        above_floor: error over floor beyond which an axis still lacks something.
+        above_floor: error over floor beyond which an axis still lacks something, if some of it
+            could be predicted from the motion.
+        surely: error over floor beyond which it lacks something, predictable or not.
         explained: least share of the excess error that the effects found must remove, else the
             axis is reported as unknown.
         jobs: worker processes.
@@ -77,7 +79,8 @@ class Settings:
     worth_at_floor: float = 0.16
     at_floor: float = 1.12
     above_floor: float = 1.3
-    explained: float = 0.5
+    surely: float = 2.0
+    explained: float = 0.6
     jobs: int = 2
     seed: int = 0
 
@@ -111,6 +114,8 @@ class AxisFinding:
         explainable_chance: share that it predicts on replays of the final model, the largest.
         effects: effects found that act on this axis.
         remains: whether the effects found leave something that no effect explains.
+        nearest: on an axis called unknown, the effects that come nearest without explaining it.
+        explained: share of the excess mean square that the effects found or nearest remove.
     """
 
     verdict: str
@@ -123,6 +128,8 @@ class AxisFinding:
     explainable_chance: float
     effects: tuple[str, ...] = ()
     remains: bool = False
+    nearest: tuple[str, ...] = ()
+    explained: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -408,11 +415,13 @@ class _Search:
             here = tuple(n for n in selected if main[n] == axis or axis in reach[n])
             excess = before[axis] ** 2 - min(floor, bare_floor[axis]) ** 2
             left = max(after[axis] ** 2 - floor**2, 0.0)
-            lacking = bool(after[axis] > s.above_floor * floor + 3.0 * scatter and share > 0.05)
+            above = after[axis] / (floor + 3.0 * scatter / s.above_floor)
+            lacking = bool(above > s.surely or (above > s.above_floor and share > 0.05))
             verdict = "missing" if here else "nothing_missing"
-            if lacking and (not here or left > (1.0 - s.explained) * max(excess, 1e-30)):
+            explained = max(0.0, 1.0 - left / max(excess, 1e-30)) if here else 0.0
+            if lacking and explained < s.explained:
                 verdict = "unknown_effect"
-                unknown |= set(here)
+                unknown |= {n for n in here if main[n] == axis}
             findings.append(
                 AxisFinding(
                     verdict,
@@ -425,6 +434,8 @@ class _Search:
                     luck,
                     here if verdict == "missing" else (),
                     lacking and verdict == "missing",
+                    here if verdict == "unknown_effect" else (),
+                    explained,
                 )
             )
         kept = [n for n in selected if n not in unknown]

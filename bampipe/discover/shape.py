@@ -13,7 +13,7 @@ from bampipe.discover.recording import Motion
 
 Array = NDArray[np.float64]
 
-_BINS = 16
+BINS = 16
 _LEAST = 12
 
 
@@ -111,7 +111,7 @@ def _since_reversal(motion: Motion, axis: int) -> tuple[Array, Array]:
     return motion.t - motion.t[last], np.abs(motion.q[:, axis] - motion.q[last, axis])
 
 
-def residual_map(evidence: Evidence, axis: int, variable: Variable, bins: int = _BINS) -> Map:
+def residual_map(evidence: Evidence, axis: int, variable: Variable, bins: int = BINS) -> Map:
     """Bin the residual of ``axis`` by ``variable`` into ``bins`` parts of equal count."""
     use = np.concatenate([u[:, axis] for u in evidence.used]) > 0
     r = np.concatenate([x[:, axis] for x in evidence.residual])[use]
@@ -154,7 +154,7 @@ def explainable_share(evidence: Evidence, axis: int, seed: int = 0) -> float:
     for k in range(len(x)):
         others = [i for i in range(len(x)) if i != k]
         trees = ExtraTreesRegressor(
-            n_estimators=20, min_samples_leaf=8, max_features=0.6, random_state=seed, n_jobs=1
+            n_estimators=16, min_samples_leaf=5, max_features=1.0, random_state=seed, n_jobs=1
         )
         trees.fit(np.concatenate([x[i] for i in others]), np.concatenate([y[i] for i in others]))
         left += float(np.sum((y[k] - trees.predict(x[k])) ** 2))
@@ -191,54 +191,3 @@ def _doing(motion: Motion, rows: Sequence[int] | Array, axis: int, unit: str) ->
         "moving up" if qd.mean() > 0 else "moving down"
     )  # fmt: skip
     return f"{moved} near {q.mean():.2f} {unit} at up to {np.abs(qd).max():.2f} {unit}/s"
-
-
-def describe(evidence: Evidence, axis: int) -> str:
-    """The residual's shape in one sentence: what it varies with most, where, which way."""
-    known = [v for v in variables(evidence, axis) if v.name not in ("trial", "direction")]
-    maps = [residual_map(evidence, axis, v, 3 * _BINS) for v in known]
-    best = max(maps, key=lambda m: m.share)
-    unit = f"{evidence.system.torque_units[axis]} near {best.variable}"
-    strong = np.abs(best.mean) > 0.5 * np.max(np.abs(best.mean))
-    places = []
-    for side in (strong & (best.mean < 0.0), strong & (best.mean > 0.0)):
-        if side.any():
-            weight = np.abs(best.mean[side])
-            middle = float(np.average(best.center[side], weights=weight))
-            peak = best.mean[side][int(np.argmax(weight))]
-            places.append((middle, f"{peak:+.2g} {unit} {middle:.3g} {best.unit}".strip()))
-    places.sort()
-    narrow = strong.sum() <= len(strong) / 3
-    form = "a bump of" if narrow else "a broad change,"
-    if len(places) == 2:
-        form = "opposite bumps of" if narrow else "a change of sign,"
-    inside = best.center[strong]
-    variable = known[maps.index(best)]
-    return (
-        f"{form} {' and '.join(words for _, words in places)} (between {inside.min():.3g} and "
-        f"{inside.max():.3g} {best.unit}), {_by_direction(evidence, axis, variable)}; "
-        f"{best.variable} carries {100 * best.share:.0f} % of the residual's variance"
-    )
-
-
-def _by_direction(evidence: Evidence, axis: int, variable: Variable) -> str:
-    """Whether the residual keeps its sign when the motion turns round, as friction does not."""
-    r = np.concatenate([x[:, axis] for x in evidence.residual])
-    v = np.concatenate(variable.values)
-    kept = [evidence.band.kept(len(m.t)) for m in evidence.motions]
-    rate = np.concatenate([m.qd[k, axis] for m, k in zip(evidence.motions, kept, strict=True)])
-    edges = np.unique(np.quantile(v, np.linspace(0.0, 1.0, 3 * _BINS + 1)))
-    which = np.clip(np.searchsorted(edges, v, side="right") - 1, 0, len(edges) - 2)
-    means = []
-    for b in range(len(edges) - 1):
-        up, down = r[(which == b) & (rate > 0.0)], r[(which == b) & (rate < 0.0)]
-        if len(up) >= 4 and len(down) >= 4:
-            means.append((up.mean(), down.mean()))
-    if len(means) < 4:
-        return "seen in one direction of motion only"
-    likeness = float(np.corrcoef(np.array(means).T)[0, 1])
-    if likeness > 0.6:
-        return "the same in both directions of motion, as of a spring"
-    if likeness < -0.6:
-        return "opposite in the two directions of motion, as of friction"
-    return "different in the two directions of motion"

@@ -13,8 +13,9 @@ import numpy as np
 from bampipe.data.store import write_json
 from bampipe.discover.advice import advise
 from bampipe.discover.chance import Recipe, Session
+from bampipe.discover.description import describe
 from bampipe.discover.diagnosis import Diagnosis, Settings, diagnose
-from bampipe.discover.shape import describe, residual_map, variables, worst_windows
+from bampipe.discover.shape import residual_map, variables, worst_windows
 from bampipe.errors import InputError
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import compile_model
@@ -123,7 +124,7 @@ def _result(found: Diagnosis, session: Session, recipe: Recipe, model: str) -> d
     names = found.evidence.system.coordinates
     units = found.evidence.system.torque_units
     shapes = {
-        axis: describe(found.evidence, i)
+        axis: describe(found.initial if found.axes[i].nearest else found.evidence, i)
         for i, axis in enumerate(names)
         if found.axes[i].verdict == "unknown_effect" or found.axes[i].remains
     }
@@ -142,6 +143,8 @@ def _result(found: Diagnosis, session: Session, recipe: Recipe, model: str) -> d
             "unit": units[i],
             "effects": list(a.effects),
             "remains": a.remains,
+            "nearest": list(a.nearest),
+            "explained_by_effects": a.explained,
             "sentence": _sentence(axis, i, found, shapes.get(axis, "")),
         }
     ranking = [
@@ -186,7 +189,9 @@ def _result(found: Diagnosis, session: Session, recipe: Recipe, model: str) -> d
 
 def _sentence(axis: str, i: int, found: Diagnosis, shape: str) -> str:
     a, unit = found.axes[i], found.evidence.system.torque_units[i]
-    ratio = a.rmse_after / max(a.noise_floor, 1e-30)
+    floor = max(a.noise_floor, 1e-30)
+    ratio = a.rmse_after / floor
+    error = a.rmse_before if a.nearest else a.rmse_after
     if a.verdict == "missing":
         words = " and ".join(a.effects)
         alike = [g for n in a.effects for g in found.groups.get(n, ())]
@@ -203,8 +208,13 @@ def _sentence(axis: str, i: int, found: Diagnosis, shape: str) -> str:
     if a.verdict == "unknown_effect":
         return (
             f"{axis.capitalize()}: something is missing that no effect in the library explains "
-            f"(held-out error {a.rmse_after:.3g} {unit}, {ratio:.1f} times the noise floor); its "
+            f"(held-out error {error:.3g} {unit}, {error / floor:.1f} times the noise floor); its "
             f"shape: {shape}."
+        ) + (
+            f" The nearest that the library has, {' and '.join(a.nearest)}, would remove "
+            f"{100 * a.explained:.0f} % of the excess mean square."
+            if a.nearest
+            else ""
         )
     return (
         f"{axis.capitalize()}: nothing is missing that these trials could show (held-out error "

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from bampipe.discover.chance import Session, system_of
+from bampipe.discover.chance import Session, fit_session, system_of
+from bampipe.discover.description import describe
 from bampipe.discover.diagnosis import Settings, diagnose
-from bampipe.discover.shape import describe
 from tests.discover.sessions import bam, made
 
 QUICK = Settings(replicates=5, final_replicates=4, jobs=2)
@@ -100,3 +100,38 @@ def test_the_same_session_gives_the_same_numbers_with_one_process_or_two():
     )
     assert [r.p_value for r in one.ranking] == [r.p_value for r in two.ranking]
     assert [a.noise_floor for a in one.axes] == [a.noise_floor for a in two.axes]
+
+
+RIPPLE = {
+    "name": "ripple",
+    "summary": "A torque that ripples with position",
+    "scope": "axis",
+    "kind": "torque",
+    "torque": "height*sin(wavenumber*q)",
+    "looks_like": "periodic in position",
+    "source": "made up for a test",
+    "parameters": {
+        "height": {"unit": "N.m", "prior": 0.5, "sd": 1.0},
+        "wavenumber": {"unit": "1/rad", "prior": 25.0, "sd": 1.0},
+    },
+}
+HUM = RIPPLE | {
+    "name": "hum",
+    "summary": "A vibration from outside",
+    "torque": "height*sin(frequency*t)",
+    "parameters": {
+        "height": {"unit": "N.m", "prior": 0.5, "sd": 1.0},
+        "frequency": {"unit": "rad/s", "prior": 17.0, "sd": 1.0},
+    },
+}
+
+
+@pytest.mark.parametrize(
+    ("effect", "words"),
+    [(RIPPLE, ("ripple of 0.", "repeats every 0.25")), (HUM, ("vibration of 0.", "at 2.7"))],
+)
+def test_the_period_of_an_unknown_effect_is_said(effect, words):
+    session = made(bam([f"{effect['name']}:yaw"], [effect]), {})
+    evidence = fit_session(session, bam(), system_of(bam()).prior)
+    said = describe(evidence, 0)
+    assert all(word in said for word in words), said

@@ -1,0 +1,139 @@
+"""The shape of a residual in one sentence: what it varies with, where, which way round."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.discover.evidence import Evidence
+from bampipe.discover.shape import BINS, Map, Variable, residual_map, variables
+
+Array = NDArray[np.float64]
+
+_CARRIES = 0.2
+"""Least share of the residual's variance that a variable carries to be named its cause."""
+
+_RIPPLE = 0.5
+"""Least share of what a variable carries that a sine must carry to be called a ripple."""
+
+
+@dataclass(frozen=True)
+class _Sine:
+    """Best sine through scattered values: share of their variance, amplitude, cycles a unit."""
+
+    share: float
+    amplitude: float
+    frequency: float
+
+
+def describe(evidence: Evidence, axis: int) -> str:
+    """The residual's shape in one sentence: what it varies with most, where, which way."""
+    known = [v for v in variables(evidence, axis) if v.name not in ("trial", "direction")]
+    maps = [residual_map(evidence, axis, v, 3 * BINS) for v in known]
+    best = int(np.argmax([m.share for m in maps]))
+    most, variable = maps[best], known[best]
+    if most.share < _CARRIES:
+        return _without_cause(evidence, axis, most)
+    carries = f"{most.variable} carries {100 * most.share:.0f} % of the residual's variance"
+    turning = _by_direction(evidence, axis, variable)
+    unit = evidence.system.torque_units[axis]
+    ripple = _ripple(evidence, axis, variable)
+    if ripple is not None and ripple.share > _RIPPLE * most.share:
+        period = 1.0 / ripple.frequency
+        return (
+            f"a ripple of {ripple.amplitude:.2g} {unit} along {most.variable} that repeats every "
+            f"{period:.3g} {most.unit}, {turning}; {carries}"
+        )
+    return f"{_bumps(most, unit)}, {turning}; {carries}"
+
+
+def _bumps(most: Map, torque_unit: str) -> str:
+    unit = f"{torque_unit} near {most.variable}"
+    strong = np.abs(most.mean) > 0.5 * np.max(np.abs(most.mean))
+    places = []
+    for side in (strong & (most.mean < 0.0), strong & (most.mean > 0.0)):
+        if side.any():
+            weight = np.abs(most.mean[side])
+            middle = float(np.average(most.center[side], weights=weight))
+            peak = most.mean[side][int(np.argmax(weight))]
+            places.append((middle, f"{peak:+.2g} {unit} {middle:.3g} {most.unit}".strip()))
+    places.sort()
+    narrow = strong.sum() <= len(strong) / 3
+    form = "a bump of" if narrow else "a broad change,"
+    if len(places) == 2:
+        form = "opposite bumps of" if narrow else "a change of sign,"
+    inside = most.center[strong]
+    return (
+        f"{form} {' and '.join(words for _, words in places)} (between {inside.min():.3g} and "
+        f"{inside.max():.3g} {most.unit})"
+    )
+
+
+def _ripple(evidence: Evidence, axis: int, variable: Variable) -> _Sine | None:
+    """A sine along ``variable`` with at least two periods within its range."""
+    use = np.concatenate([u[:, axis] for u in evidence.used]) > 0
+    r = np.concatenate([x[:, axis] for x in evidence.residual])[use]
+    v = np.concatenate(variable.values)[use]
+    low, high = np.quantile(v, [0.01, 0.99])
+    if high <= low:
+        return None
+    return _best_sine(v, r, np.arange(2.0, BINS, 0.1) / (high - low))
+
+
+def _without_cause(evidence: Evidence, axis: int, most: Map) -> str:
+    """What can be said of a residual that follows nothing the arm does: its frequency."""
+    band, unit = evidence.band, evidence.system.torque_units[axis]
+    idle = f"follows nothing that the arm does ({most.variable} carries {100 * most.share:.0f} %)"
+    longest = max(len(r) for r in evidence.residual) * band.step / band.rate_hz
+    grid = np.arange(2.0 / longest, band.cutoff_hz, 0.25 / longest)
+    found = []
+    for k, motion in enumerate(evidence.motions):
+        use = evidence.used[k][:, axis] > 0
+        if use.sum() > 2 * BINS:
+            t = motion.t[band.kept(len(motion.t))][use]
+            found.append(_best_sine(t, evidence.residual[k][use, axis], grid))
+    frequency = float(np.median([s.frequency for s in found])) if found else 0.0
+    same = [s for s in found if abs(s.frequency - frequency) < 2.0 / longest]
+    if len(same) > len(found) / 2 and np.mean([s.share for s in same]) > _CARRIES:
+        size = float(np.mean([s.amplitude for s in same]))
+        return f"a vibration of {size:.2g} {unit} at {frequency:.3g} Hz in time; it {idle}"
+    return f"scattered over all motions; it {idle}"
+
+
+def _best_sine(v: Array, r: Array, frequencies: Array) -> _Sine:
+    """Least-squares sine of any phase, at the best of ``frequencies`` (Lomb 1976)."""
+    best = _Sine(0.0, 0.0, float(frequencies[0]))
+    total = max(float(np.sum((r - r.mean()) ** 2)), 1e-30)
+    for frequency in frequencies:
+        phase = 2.0 * np.pi * frequency * v
+        columns = np.column_stack([np.sin(phase), np.cos(phase)])
+        weights = np.linalg.solve(columns.T @ columns + 1e-9 * np.eye(2), columns.T @ r)
+        share = 1.0 - float(np.sum((r - columns @ weights) ** 2)) / total
+        if share > best.share:
+            best = _Sine(share, float(np.hypot(*weights)), float(frequency))
+    return best
+
+
+def _by_direction(evidence: Evidence, axis: int, variable: Variable) -> str:
+    """Whether the residual keeps its sign when the motion turns round, as friction does not."""
+    r = np.concatenate([x[:, axis] for x in evidence.residual])
+    v = np.concatenate(variable.values)
+    kept = [evidence.band.kept(len(m.t)) for m in evidence.motions]
+    rate = np.concatenate([m.qd[k, axis] for m, k in zip(evidence.motions, kept, strict=True)])
+    edges = np.unique(np.quantile(v, np.linspace(0.0, 1.0, 3 * BINS + 1)))
+    which = np.clip(np.searchsorted(edges, v, side="right") - 1, 0, len(edges) - 2)
+    means = []
+    for b in range(len(edges) - 1):
+        up, down = r[(which == b) & (rate > 0.0)], r[(which == b) & (rate < 0.0)]
+        if len(up) >= 4 and len(down) >= 4:
+            means.append((up.mean(), down.mean()))
+    if len(means) < 4:
+        return "seen in one direction of motion only"
+    likeness = float(np.corrcoef(np.array(means).T)[0, 1])
+    if likeness > 0.6:
+        return "the same in both directions of motion, as of a spring"
+    if likeness < -0.6:
+        return "opposite in the two directions of motion, as of friction"
+    return "different in the two directions of motion"

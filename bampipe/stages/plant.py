@@ -1,0 +1,179 @@
+"""One specimen of a device with effects hidden in it: what a simulated session is recorded from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.data import store
+from bampipe.errors import InputError
+from bampipe.physics import Model, registry
+from bampipe.physics.device import Device
+from bampipe.physics.effect import BoundEffect, Effect
+from bampipe.physics.system import System, compile_model
+
+Array = NDArray[np.float64]
+
+STIFFNESS = {"rotary": 2200.0, "linear": 109e3}
+"""Typical transmission stiffness (Table I), N.m/rad and N/m."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """What to simulate.
+
+    Attributes:
+        effects: effects to hide, such as ``stribeck:yaw``; a strength of its own may follow,
+            ``stribeck:yaw=0.5``.
+        strength: size of the effects that state none. 1 is each effect's typical size: every
+            strength parameter is this times its ``typical`` (its ``sd`` where it has none), its
+            sign drawn where both make sense.
+        seed: of every random draw.
+        device: name of a built-in device.
+        effect_files: paths of effect files beside the built-in ones.
+        trials: number of free trials.
+        viscous_trials: number of trials in a viscous field rendered by the brakes.
+        locked_trials: whether each axis with a brake is also locked and loaded.
+        duration: of a free or viscous trial, s.
+        sample_rate: Hz.
+        viscous_damping: Cartesian damping of the viscous field, N.s/m.
+        amplitude: scale of the motion, 1 for all of what a person uses.
+        force_noise: standard deviation of the force sensor, N.
+        parameters: values that replace drawn ones, by full name.
+        file_format: of the trial files, ``csv`` or ``parquet``.
+    """
+
+    effects: tuple[str, ...] = ()
+    strength: float = 1.0
+    seed: int = 0
+    device: str = "bam"
+    effect_files: tuple[str, ...] = ()
+    trials: int = 5
+    viscous_trials: int = 0
+    locked_trials: bool = False
+    duration: float = 16.0
+    sample_rate: float = 500.0
+    viscous_damping: float = 40.0
+    amplitude: float = 1.0
+    force_noise: float = 0.05
+    parameters: Mapping[str, float] = field(default_factory=dict)
+    file_format: str = "csv"
+
+
+@dataclass(frozen=True)
+class Plant:
+    """The mechanism and its sensors as they truly are.
+
+    Attributes:
+        device: what is simulated.
+        motion: model with the effects that act on the motion.
+        force: model with the effects on the force reading, a pure delay left out; None without.
+        position: model with the effects on the position reading; None without.
+        values: true value of every parameter, by full name.
+        delay: by which the force reading is late, s.
+        stiffness: of each axis' transmission, N.m/rad or N/m.
+    """
+
+    device: Device
+    motion: System
+    force: System | None
+    position: System | None
+    values: Mapping[str, float]
+    delay: float
+    stiffness: Mapping[str, float]
+
+    def p(self, system: System) -> Array:
+        """True parameters of ``system``, (n_p,)."""
+        return np.array([self.values[p.name] for p in system.parameters])
+
+
+def draw_plant(config: Config) -> tuple[Plant, dict[str, float]]:
+    """Draw the plant; also the strength of each effect by canonical name."""
+    device = registry.device(config.device)
+    extra = [_own_effect(Path(path)) for path in config.effect_files]
+    strengths = dict(_strength(text, config.strength) for text in config.effects)
+    if len(strengths) < len(config.effects):
+        raise InputError("an effect is named twice")
+    whole = Model(device, strengths, extra)
+    rng = np.random.default_rng([config.seed, 0])
+    values = _base_values(device, rng)
+    for item in whole.effects:
+        values |= _effect_values(item, strengths[item.name], rng)
+    for name, value in config.parameters.items():
+        if name not in values:
+            known = ", ".join(values)
+            raise InputError(f"no parameter {name!r} to set", remedy=f"there are {known}")
+        values[name] = float(value)
+
+    def part(*kinds: str) -> System | None:
+        chosen = [e.name for e in whole.effects if e.effect.kind in kinds and not _is_delay(e)]
+        return compile_model(Model(device, chosen, extra)) if chosen else None
+
+    delay = sum(values[f"{e.prefix}.delay"] for e in whole.effects if _is_delay(e))
+    stiffness = {c.name: STIFFNESS[c.kind] * float(rng.uniform(0.95, 1.05)) for c in
+                 device.coordinates}  # fmt: skip
+    motion = part("torque", "energy") or compile_model(Model(device))
+    return (
+        Plant(device, motion, part("input"), part("measurement"), values, delay, stiffness),
+        strengths,
+    )
+
+
+def _is_delay(item: BoundEffect) -> bool:
+    """The one effect whose expression is a series for what the sensor does exactly."""
+    return item.effect.name == "force_delay"
+
+
+def _own_effect(path: Path) -> Effect:
+    return registry.effect_from(store.read_toml(path), str(path))
+
+
+def _strength(text: str, default: float) -> tuple[str, float]:
+    name, sign, number = text.partition("=")
+    if not sign:
+        return name, default
+    try:
+        value = float(number)
+    except ValueError as error:
+        raise InputError(f"strength {number!r} of effect {name!r} is not a number") from error
+    if not 0 <= value < float("inf"):
+        raise InputError(f"strength of effect {name!r} must not be negative, found {number}")
+    return name, value
+
+
+def _base_values(device: Device, rng: np.random.Generator) -> dict[str, float]:
+    """Parameters of one specimen of ``device``, around their typical values or priors."""
+    spread = {"viscous": 0.15, "coulomb": 0.1}
+    values = {}
+    for p in device.parameters:
+        nominal = p.prior if p.typical is None else p.typical
+        factor = 1.0 + spread.get(p.name.partition(".")[0], 0.003) * float(rng.uniform(-1.0, 1.0))
+        values[p.name] = p.prior if p.fixed else _between(nominal * factor, p.lower, p.upper)
+    return values
+
+
+def _effect_values(
+    item: BoundEffect, strength: float, rng: np.random.Generator
+) -> dict[str, float]:
+    """Parameters of an effect: strengths scaled and signed, shapes within 20 % of typical."""
+    values = {}
+    for p in item.parameters:
+        draw = float(rng.uniform(-1.0, 1.0))
+        if p.fixed:
+            values[p.name] = p.prior
+        elif p.strength:
+            size = p.sd if p.typical is None else p.typical
+            sign = -1.0 if p.lower < 0 and draw < 0 else 1.0
+            values[p.name] = _between(sign * strength * size, p.lower, p.upper)
+        else:
+            shape = p.prior if p.typical is None else p.typical
+            values[p.name] = _between(shape * (1.0 + 0.2 * draw), p.lower, p.upper)
+    return values
+
+
+def _between(value: float, lower: float, upper: float) -> float:
+    return min(max(value, lower), upper)
