@@ -34,11 +34,21 @@ def describe(evidence: Evidence, axis: int) -> str:
     maps = [residual_map(evidence, axis, v, 3 * BINS) for v in known]
     best = int(np.argmax([m.share for m in maps]))
     most, variable = maps[best], known[best]
+    unit = evidence.system.torque_units[axis]
+    if most.share < _CARRIES or most.variable == "time":
+        vibration = _vibration(evidence, axis)
+        if vibration is not None and vibration.share > max(most.share, _CARRIES):
+            return (
+                f"a vibration of {vibration.amplitude:.2g} {unit} at {vibration.frequency:.3g} Hz "
+                "in time, whatever the arm does"
+            )
     if most.share < _CARRIES:
-        return _without_cause(evidence, axis, most)
+        return (
+            "scattered over all motions; it follows nothing that the arm does "
+            f"({most.variable} carries {100 * most.share:.0f} %)"
+        )
     carries = f"{most.variable} carries {100 * most.share:.0f} % of the residual's variance"
     turning = _by_direction(evidence, axis, variable)
-    unit = evidence.system.torque_units[axis]
     ripple = _ripple(evidence, axis, variable)
     if ripple is not None and ripple.share > _RIPPLE * most.share:
         period = 1.0 / ripple.frequency
@@ -82,10 +92,9 @@ def _ripple(evidence: Evidence, axis: int, variable: Variable) -> _Sine | None:
     return _best_sine(v, r, np.arange(2.0, BINS, 0.1) / (high - low))
 
 
-def _without_cause(evidence: Evidence, axis: int, most: Map) -> str:
-    """What can be said of a residual that follows nothing the arm does: its frequency."""
-    band, unit = evidence.band, evidence.system.torque_units[axis]
-    idle = f"follows nothing that the arm does ({most.variable} carries {100 * most.share:.0f} %)"
+def _vibration(evidence: Evidence, axis: int) -> _Sine | None:
+    """A sine in time, of any phase in each trial, whose frequency most trials agree on."""
+    band = evidence.band
     longest = max(len(r) for r in evidence.residual) * band.step / band.rate_hz
     grid = np.arange(2.0 / longest, band.cutoff_hz, 0.25 / longest)
     found = []
@@ -94,12 +103,14 @@ def _without_cause(evidence: Evidence, axis: int, most: Map) -> str:
         if use.sum() > 2 * BINS:
             t = motion.t[band.kept(len(motion.t))][use]
             found.append(_best_sine(t, evidence.residual[k][use, axis], grid))
-    frequency = float(np.median([s.frequency for s in found])) if found else 0.0
+    if not found:
+        return None
+    frequency = float(np.median([s.frequency for s in found]))
     same = [s for s in found if abs(s.frequency - frequency) < 2.0 / longest]
-    if len(same) > len(found) / 2 and np.mean([s.share for s in same]) > _CARRIES:
-        size = float(np.mean([s.amplitude for s in same]))
-        return f"a vibration of {size:.2g} {unit} at {frequency:.3g} Hz in time; it {idle}"
-    return f"scattered over all motions; it {idle}"
+    if len(same) <= len(found) / 2:
+        return None
+    share = float(np.mean([s.share for s in same])) * len(same) / len(found)
+    return _Sine(share, float(np.mean([s.amplitude for s in same])), frequency)
 
 
 def _best_sine(v: Array, r: Array, frequencies: Array) -> _Sine:

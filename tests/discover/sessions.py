@@ -39,7 +39,7 @@ def made(
 ) -> Session:
     """Replay designed motions with the model of ``recipe`` at TRUTH and ``values``."""
     system = system_of(recipe)
-    known = TRUTH | dict(values)
+    known = TRUTH | {q.name: q.prior for q in system.parameters[len(TRUTH) :]} | dict(values)
     p = np.array([known[q.name] for q in system.parameters])
     rng = np.random.default_rng(7)
     t = np.arange(int(seconds * RATE)) / RATE
