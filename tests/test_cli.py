@@ -380,7 +380,7 @@ def test_a_refused_extension_leaves_nothing(
 
 
 def test_extend_needs_an_effect(command: Command) -> None:
-    assert "which effect?" in one_line_error(*command("extend"))
+    assert "no effect named" in one_line_error(*command("extend"))
 
 
 def test_an_effect_is_not_added_twice(ingested: Path, command: Command) -> None:

@@ -674,8 +674,9 @@ def extend(
     batch.limit_threads(1)
     if auto and second is not None:
         raise InputError("--auto chooses the effects itself", remedy=f"leave out {second!r}")
-    if not auto and first is None:
-        raise InputError("which effect?", remedy="list them with `bampipe effects`, or use --auto")
+    alone = first is None or (second is None and places.is_run(first, runs))
+    if not auto and alone:
+        raise InputError("no effect named", remedy="`bampipe effects` lists them; or use --auto")
     if not auto and second is None:
         first, second = None, first
     root = places.find_run(first, runs)

@@ -18,6 +18,11 @@ def known_runs(runs: Path) -> list[Path]:
     return sorted(found, key=lambda root: (root / record.FILE).stat().st_mtime_ns, reverse=True)
 
 
+def is_run(argument: str, runs: Path) -> bool:
+    """Return whether ``argument`` is a run folder, or the name of one in ``runs``."""
+    return any((path / record.FILE).is_file() for path in (Path(argument), runs / argument))
+
+
 def find_run(argument: str | None, runs: Path) -> Path:
     """Return the run folder that ``argument`` means.
 

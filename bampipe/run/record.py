@@ -27,6 +27,7 @@ STORAGE_FAULTS = {
     errno.EFBIG: "a file would be larger than this system allows",
     errno.ENOTDIR: "a file is in the way of a folder",
     errno.EEXIST: "a file is in the way of a folder",
+    errno.ENAMETOOLONG: "a name is too long",
 }
 """What the disk may refuse, in words."""
 
@@ -145,7 +146,7 @@ def lock(root: Path, wait: bool, waiting: Callable[[], None]) -> Iterator[None]:
             or the like.
     """
     try:
-        (root / PRIVATE).mkdir(parents=True, exist_ok=True)
+        _make(root / PRIVATE)
         with (root / PRIVATE / "lock").open("a") as handle:
             _hold(handle, root, wait, waiting)
             yield
@@ -157,6 +158,13 @@ def lock(root: Path, wait: bool, waiting: Callable[[], None]) -> Iterator[None]:
             where=os.fspath(error.filename or root),
             remedy="earlier results are untouched",
         ) from error
+
+
+def _make(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except FileNotFoundError as error:
+        raise InputError("no folder can be made here", where=str(folder.parent)) from error
 
 
 def _hold(handle: IO[str], root: Path, wait: bool, waiting: Callable[[], None]) -> None:
