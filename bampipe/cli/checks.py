@@ -1,0 +1,52 @@
+"""``bampipe status`` and ``bampipe verify``: what is current, and what was touched."""
+
+from __future__ import annotations
+
+import typer
+
+from bampipe.cli import places, show
+from bampipe.cli.options import (
+    RUNS,
+    Json,
+    Run,
+    Runs,
+)
+from bampipe.run import pipeline as pipelines
+from bampipe.run import record
+from bampipe.run.status import status
+from bampipe.run.verify import verify
+
+
+def status_(run: Run = None, runs: Runs = RUNS, json: Json = False) -> None:
+    """Which stages of a run are current, stale or failed.
+
+    Example: bampipe status 2026-10-03_s01
+    """
+    root = places.find_run(run, runs)
+    found = status(root, pipelines.recorded(record.read(root)))
+    if json:
+        show.as_json({"run": str(root), "steps": [vars(step) for step in found]})
+        return
+    show.say(str(root))
+    show.table(
+        ["step", "state", "last run", "seconds", ""],
+        [[s.step, s.state, s.started_at, s.seconds, s.reason] for s in found],
+    )
+
+
+def verify_(run: Run = None, runs: Runs = RUNS, json: Json = False) -> None:
+    """Recompute every recorded hash; say what was touched since. Exit 1 if anything was.
+
+    Example: bampipe verify 2026-10-03_s01
+    """
+    root = places.find_run(run, runs)
+    found = verify(root)
+    if json:
+        show.as_json({"run": str(root), "touched": dict(found)})
+    elif found:
+        show.say(f"{root}: {len(found)} files are not as they were recorded")
+        show.table(["file", "state"], found)
+    else:
+        show.say(f"{root}: every file is as it was recorded")
+    if found:
+        raise typer.Exit(1)

@@ -1,0 +1,148 @@
+"""``bampipe diagnose``, ``bampipe extend`` and ``bampipe demo``: the loop as commands."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from bampipe.cli import places, show
+from bampipe.cli.one_stage import (
+    advise,
+    assignments,
+    one_stage,
+    print_settings,
+    whole_pipeline,
+)
+from bampipe.cli.options import (
+    RUNS,
+    Force,
+    Json,
+    ListSettings,
+    NoWait,
+    PipelineName,
+    Quiet,
+    Run,
+    Runs,
+    Settings,
+)
+from bampipe.errors import InputError
+from bampipe.run import batch
+from bampipe.stages import base
+
+
+def diagnose(
+    run: Run = None,
+    model: Annotated[
+        str, typer.Option(help="Model to diagnose; the one extended last if omitted.")
+    ] = "",
+    settings: Settings = None,
+    list_settings: ListSettings = False,
+    pipeline: PipelineName = "",
+    force: Force = False,
+    runs: Runs = RUNS,
+    no_wait: NoWait = False,
+    json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Which effect is missing from a model, and why the tool believes so.
+
+    Example: bampipe diagnose 2026-10-03_s01
+    """
+    if list_settings:
+        print_settings("diagnose")
+        return
+    from bampipe.api.loop import current_model, next_effect
+
+    root = places.find_run(run, runs)
+    chosen = model or current_model(root)
+    one_stage(
+        "diagnose",
+        root,
+        assignments(settings),
+        pipeline=pipeline,
+        model=chosen,
+        force=force,
+        no_wait=no_wait,
+        json=json,
+        quiet=quiet,
+    )
+    name = places.next_to(root, runs)
+    effect = next_effect(root, chosen)
+    command = f"bampipe extend {name} {effect}" if effect else f"bampipe report {name}"
+    advise(quiet, json, command)
+
+
+def extend(
+    first: Annotated[
+        str | None,
+        typer.Argument(metavar="[RUN]", help="Run folder; the most recent run if omitted."),
+    ] = None,
+    second: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="EFFECT", help="Effect to add, name[:target], or an effect file[:target]."
+        ),
+    ] = None,
+    auto: Annotated[
+        bool, typer.Option("--auto", help="Follow the diagnosis until it says stop.")
+    ] = False,
+    model: Annotated[
+        str, typer.Option(help="Model to extend; the one extended last if omitted.")
+    ] = "",
+    force: Force = False,
+    runs: Runs = RUNS,
+    no_wait: NoWait = False,
+    json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Add an effect to a model, identify and validate it again, print the ladder.
+
+    Example: bampipe extend 2026-10-03_s01 stribeck:yaw
+
+    Example: bampipe extend 2026-10-03_s01 effects/snag.toml:yaw
+
+    Example: bampipe extend 2026-10-03_s01 --auto
+    """
+    from bampipe.api import loop
+
+    batch.limit_threads(1)
+    if auto and second is not None:
+        raise InputError("--auto chooses the effects itself", remedy=f"leave out {second!r}")
+    alone = first is None or (second is None and places.is_run(first, runs))
+    if not auto and alone:
+        raise InputError("no effect named", remedy="`bampipe effects` lists them; or use --auto")
+    if not auto and second is None:
+        first, second = None, first
+    root = places.find_run(first, runs)
+    pipeline = whole_pipeline(root, "")
+    parent = model or loop.current_model(root)
+    with show.Watcher(quiet or json) as watcher:
+        options = loop.Options(root, pipeline, force, not no_wait, watcher)
+        if auto:
+            last = loop.follow(options, parent, lambda line: None if json else show.say(line))
+        else:
+            last = loop.extend(options, parent, second or "")
+    ladder = base.RunFolder(root).read_json("compare.json")
+    if json:
+        show.as_json(ladder)
+        return
+    show.say(f"{root}: {last}")
+    show.summary(ladder)
+    advise(quiet, json, f"bampipe diagnose {places.next_to(root, runs)}")
+
+
+def demo(
+    runs: Runs = RUNS,
+    force: Force = False,
+    quiet: Quiet = False,
+) -> None:
+    """A shipped session with a hidden effect: the whole loop, in minutes.
+
+    Example: bampipe demo
+    """
+    from bampipe.cli.demo import demonstrate
+
+    batch.limit_threads(1)
+    with show.Watcher(quiet) as watcher:
+        demonstrate(runs, force, watcher, show.say)

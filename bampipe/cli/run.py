@@ -1,0 +1,220 @@
+"""``bampipe run``: sessions from raw log to report."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from bampipe.cli import places, show
+from bampipe.cli.lab import refresh
+from bampipe.cli.one_stage import (
+    advise,
+    assignments,
+)
+from bampipe.cli.options import (
+    RUNS,
+    Force,
+    Json,
+    NoWait,
+    PipelineName,
+    Quiet,
+    Runs,
+)
+from bampipe.errors import InputError
+from bampipe.run import batch, models
+from bampipe.run import junit as junit_xml
+from bampipe.run import pipeline as pipelines
+from bampipe.run.request import Outcome, Request
+from bampipe.run.session_name import session_id
+from bampipe.stages import base
+
+
+def run(
+    sessions: Annotated[
+        list[str], typer.Argument(metavar="SESSION...", help="Session folders, or patterns.")
+    ],
+    pipeline: PipelineName = "default",
+    jobs: Annotated[int, typer.Option("--jobs", "-j", min=1, help="Sessions at once.")] = 1,
+    engine: Annotated[
+        str, typer.Option(help="local, or dask: the workers of a Dask cluster.")
+    ] = "local",
+    scheduler: Annotated[
+        str, typer.Option(help="Address of the Dask scheduler, tcp://host:port.")
+    ] = "",
+    first: Annotated[
+        str, typer.Option("--from", metavar="STAGE", help="Take earlier stages as they stand.")
+    ] = "",
+    last: Annotated[
+        str, typer.Option("--until", metavar="STAGE", help="Stop after this stage.")
+    ] = "",
+    force: Force = False,
+    model: Annotated[str, typer.Option(help="Run and judge this model only.")] = "",
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="STAGE.NAME=VALUE", help="A setting; may be repeated."),
+    ] = None,
+    junit: Annotated[
+        Path | None, typer.Option(help="Write the gates' verdicts as JUnit XML to this file.")
+    ] = None,
+    markdown: Annotated[
+        Path | None,
+        typer.Option(help="Add a summary in Markdown to this file ($GITHUB_STEP_SUMMARY)."),
+    ] = None,
+    accepted: Annotated[
+        Path | None,
+        typer.Option(help="Folder of accepted values; accepted/ beside the runs if omitted."),
+    ] = None,
+    publish: Annotated[
+        str,
+        typer.Option(
+            metavar="URL", help="Also publish finished runs there: s3://bucket/runs, file://..."
+        ),
+    ] = "",
+    runs: Runs = RUNS,
+    no_wait: NoWait = False,
+    json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """From raw log to report: all stages of a pipeline, those that changed.
+
+    Example: bampipe run sessions/2026-10-03_s01
+
+    Example: bampipe run 'sessions/*' --jobs 2 --junit gates.xml
+    """
+    if engine not in ("local", "dask"):
+        raise InputError(f"no engine {engine!r}", remedy="choose local or dask")
+    if scheduler and engine != "dask":
+        raise InputError("--scheduler needs --engine dask")
+    folders = places.find_sessions(sessions)
+    batch.limit_threads(min(jobs, len(folders)))
+    chosen = pipelines.load(pipeline)
+    stage_settings = _stage_settings(settings)
+    requests: list[Request] = []
+    outcomes: list[Outcome] = []
+    taken: dict[Path, Path] = {}
+    for folder in folders:
+        try:
+            root = runs / session_id(folder)
+            if root in taken:
+                raise InputError(
+                    f"session_id {root.name!r} is that of {taken[root]} too",
+                    where=str(folder),
+                    remedy="give each session an id of its own",
+                )
+        except InputError as error:
+            if len(folders) == 1:
+                raise
+            outcomes.append(Outcome(folder, "refused", error=str(error)))
+            continue
+        taken[root] = folder
+        requests.append(
+            Request(
+                root=root,
+                pipeline=chosen,
+                session=folder,
+                settings=stage_settings,
+                first=first,
+                last=last,
+                force=force,
+                model=model,
+                judged=model or models.BASE,
+                accepted=accepted,
+                publish=publish,
+                processes=batch.share(min(jobs, len(folders))),
+                wait=not no_wait,
+            )
+        )
+    several = len(folders) > 1
+    with show.Watcher(quiet, several) as watcher:
+        if engine == "dask":
+            from bampipe.run.cluster import run_on_cluster
+
+            outcomes += run_on_cluster(requests, scheduler, watcher)
+        elif several:
+            outcomes += batch.run_sessions(requests, jobs, watcher)
+        else:
+            outcomes.append(batch.run_and_publish(requests[0], watcher))
+    if junit is not None:
+        _write_junit(junit, outcomes)
+    if markdown is not None:
+        _add_markdown(markdown, outcomes, model or models.BASE)
+    _report_runs(outcomes, several, json)
+    refresh(runs, several, quiet or json)
+    if not several:
+        name = places.next_to(requests[0].root, runs)
+        advise(quiet, json, _after_run(outcomes[0], name))
+    code = max(outcome.exit_code for outcome in outcomes)
+    if code:
+        raise typer.Exit(code)
+
+
+def _stage_settings(given: Sequence[str] | None) -> dict[str, dict[str, object]]:
+    found: dict[str, dict[str, object]] = {}
+    for name, value in assignments(given).items():
+        stage, dot, setting = name.partition(".")
+        if not dot:
+            raise InputError(
+                f"{name!r} does not say which stage", remedy=f"write --set STAGE.{name}=..."
+            )
+        base.check_name(stage)
+        found.setdefault(stage, {})[setting] = value
+    return found
+
+
+def _write_junit(path: Path, outcomes: Sequence[Outcome]) -> None:
+    suites = [junit_xml.Suite(item.root.name, item.verdicts, item.error) for item in outcomes]
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(junit_xml.junit(suites))
+    except OSError as error:
+        raise InputError(f"cannot be written: {error.strerror}", where=str(path)) from error
+
+
+def _add_markdown(path: Path, outcomes: Sequence[Outcome], model: str) -> None:
+    from bampipe.run.markdown import summary
+
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("a", encoding="utf-8") as stream:
+            stream.write(summary(outcomes, model))
+    except OSError as error:
+        raise InputError(f"cannot be written: {error.strerror}", where=str(path)) from error
+
+
+def _report_runs(outcomes: Sequence[Outcome], several: bool, json: bool) -> None:
+    for outcome in outcomes:
+        if outcome.traceback:
+            show.note(outcome.traceback)
+    if json:
+        show.as_json({"sessions": [outcome.content() for outcome in outcomes]})
+    elif several:
+        words = {0: "done", 1: "gate failed", 2: "bad input", 3: "crashed"}
+        rows = [
+            [
+                outcome.root.name,
+                words[outcome.exit_code],
+                sum(step.seconds for step in outcome.steps),
+                outcome.error
+                or "; ".join(
+                    f"{verdict.gate} {verdict.key}: {verdict.message}".replace(" :", ":")
+                    for verdict in outcome.verdicts
+                    if verdict.state in ("failed", "warned")
+                ),
+            ]
+            for outcome in outcomes
+        ]
+        show.table(["session", "state", "seconds", ""], rows)
+    else:
+        show.outcome(outcomes[0])
+
+
+def _after_run(outcome: Outcome, name: str) -> str:
+    if (outcome.root / "report" / "report.pdf").is_file():
+        missing = any(verdict.state in ("failed", "warned") for verdict in outcome.verdicts)
+        if missing:
+            return f"bampipe diagnose {name}"
+        return f"open {outcome.root / 'report' / 'report.pdf'}"
+    return f"bampipe status {name}"

@@ -1,0 +1,91 @@
+"""``bampipe simulate``: a session with known effects hidden in it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from bampipe.cli import show
+from bampipe.cli.one_stage import (
+    advise,
+    assignments,
+)
+from bampipe.cli.options import (
+    Json,
+    Quiet,
+)
+from bampipe.errors import InputError
+from bampipe.run import batch
+
+
+def simulate(
+    out: Annotated[Path, typer.Argument(help="Folder of the session to make.")],
+    effect: Annotated[
+        list[str] | None,
+        typer.Option("--effect", help="Effect to hide, name[:target][=strength]; may be repeated."),
+    ] = None,
+    strength: Annotated[float, typer.Option(help="Strength of effects that state none.")] = 1.0,
+    seed: Annotated[int, typer.Option(help="Seed of every random draw.")] = 0,
+    device: Annotated[str, typer.Option(help="A built-in device.")] = "bam",
+    effect_file: Annotated[
+        list[str] | None, typer.Option("--effect-file", help="An effect file; may be repeated.")
+    ] = None,
+    trials: Annotated[int, typer.Option(help="Number of free trials.")] = 5,
+    viscous_trials: Annotated[int, typer.Option(help="Number of viscous-field trials.")] = 0,
+    locked_trials: Annotated[
+        bool, typer.Option("--locked-trials", help="Also lock and load each axis.")
+    ] = False,
+    duration: Annotated[float, typer.Option(help="Of a trial, s.")] = 16.0,
+    sample_rate: Annotated[float, typer.Option(help="Hz.")] = 500.0,
+    file_format: Annotated[str, typer.Option(help="csv or parquet.")] = "csv",
+    settings: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set", metavar="NAME=VALUE", help="A parameter of the plant; may be repeated."
+        ),
+    ] = None,
+    json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Make a session from the model, with known effects hidden in it.
+
+    The truth goes into a file beside the session folder.
+
+    Example: bampipe simulate sessions/trial --effect stribeck:yaw --seed 1
+    """
+    batch.limit_threads(1)
+    from bampipe.run.events import Event
+    from bampipe.stages.simulate import Config, simulate_session
+
+    parameters: dict[str, float] = {}
+    for key, value in assignments(settings).items():
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise InputError(f"--set {key} needs a number, not {value!r}")
+        parameters[key] = float(value)
+    config = Config(
+        effects=tuple(effect or ()),
+        strength=strength,
+        seed=seed,
+        device=device,
+        effect_files=tuple(effect_file or ()),
+        trials=trials,
+        viscous_trials=viscous_trials,
+        locked_trials=locked_trials,
+        duration=duration,
+        sample_rate=sample_rate,
+        parameters=parameters,
+        file_format=file_format,
+    )
+    with show.Watcher(quiet or json) as watcher:
+
+        def progress(fraction: float, message: str) -> None:
+            watcher(Event(out.name, "simulate", "progress", fraction, message))
+
+        content = simulate_session(out, config, progress)
+    if json:
+        show.as_json(content)
+        return
+    show.summary(content)
+    advise(quiet, json, f"bampipe run {out}")
