@@ -1,6 +1,7 @@
 """The unscented filter in its covariance form: the oracle of the square-root form."""
 
 import numpy as np
+from numba import float64, void
 
 from bampipe.compiled import njit
 from bampipe.estimate.filter_signature import (
@@ -12,6 +13,15 @@ from bampipe.estimate.filter_signature import (
 )
 from bampipe.estimate.propagation import measure_points, propagate_points, scratch
 from bampipe.estimate.triangular import cholesky, forward_substitute, product
+
+
+@njit(void(float64[::1], float64[:, ::1], float64[::1], float64[:, ::1]), cache=True)
+def store(mean, covariance, mean_out, covariance_out):  # type: ignore[no-untyped-def]
+    """Copy ``mean`` (n,) and ``covariance`` (n, n)."""
+    for i in range(mean.shape[0]):
+        mean_out[i] = mean[i]
+        for j in range(mean.shape[0]):
+            covariance_out[i, j] = covariance[i, j]
 
 
 @njit(KERNEL, cache=True)
@@ -61,8 +71,7 @@ def filter_covariance(  # type: ignore[no-untyped-def]
     whitened = np.empty(ny)
     timing = p.shape[0] - 1
     work = scratch(nx, u.shape[1], p, nw)
-    means[0] = mean
-    covariances[0] = covariance
+    store(mean, covariance, means[0], covariances[0])
     for k in range(1, t.shape[0]):
         dt = t[k] - t[k - 1]
         substeps = max(1, int(np.ceil(dt / longest_step - 1e-6)))
@@ -165,8 +174,7 @@ def filter_covariance(  # type: ignore[no-untyped-def]
             for j in range(n - nx):
                 mean[nx + j] = min(max(mean[nx + j], lower[j]), upper[j])
         if k % stride == 0:
-            means[k // stride] = mean
-            covariances[k // stride] = covariance
+            store(mean, covariance, means[k // stride], covariances[k // stride])
     for i in range(n):
         if not np.isfinite(mean[i]):
             reason[0] = NOT_FINITE

@@ -83,7 +83,8 @@ def scratch(nx, nu, p, nw):  # type: ignore[no-untyped-def]
     """Scratch of `propagate_points` and `measure_points`, the parameters ``p`` in every row."""
     work = np.zeros((8, ROWS * max(2 * nx, nu, p.shape[0], nw)))
     for i in range(p.shape[0]):
-        work[6, i * ROWS : (i + 1) * ROWS] = p[i]
+        for r in range(i * ROWS, (i + 1) * ROWS):
+            work[6, r] = p[i]
     return work
 
 
@@ -210,7 +211,9 @@ def propagate_points(  # type: ignore[no-untyped-def]
     nu = u0.shape[0]
     pairs = n + nw
     rows = 1 + 2 * pairs
-    slope = u1 - u0
+    slope = np.empty(nu)
+    for i in range(nu):
+        slope[i] = u1[i] - u0[i]
     x, start, q, w = work[0], work[5], work[6], work[7]
     for first in range(0, rows, ROWS):
         count = min(ROWS, rows - first)

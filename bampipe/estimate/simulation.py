@@ -21,6 +21,7 @@ from bampipe.compiled import njit
 from bampipe.errors import InputError
 from bampipe.estimate.propagation import runge_kutta
 from bampipe.estimate.signatures import DERIVATIVE
+from bampipe.estimate.triangular import cholesky, forward_substitute
 
 Array = NDArray[np.float64]
 
@@ -91,7 +92,8 @@ def stable_steps(derivative, x, u, p, w, n, width, dt, max_step, work):  # type:
 def _run(derivative, x, u, p, w, n, width, dt, max_step, hold, work):  # type: ignore[no-untyped-def]
     """Fill the rows of ``x`` after the first."""
     for k in range(x.shape[0] - 1):
-        x[k + 1] = x[k]
+        for i in range(x.shape[1]):
+            x[k + 1, i] = x[k, i]
         end = u[k] if hold else u[k + 1]
         steps = stable_steps(derivative, x[k], u[k], p, w, n, width, dt, max_step, work)
         runge_kutta(derivative, x[k + 1], u[k], end, p, w, dt, steps, work)
@@ -118,22 +120,33 @@ def _demand(  # type: ignore[no-untyped-def]
         u[force[j]] -= 1.0
         for i in range(n):
             response[i, j] = moved[n + i] - still[n + i]
-    if not np.isfinite(response).all():  # the motion has run away: the caller says so
-        out[:] = np.nan
-        return
-    normal = response.T @ response
-    side = np.zeros(nf)
+    normal = np.empty((nf, nf))
+    factor = np.zeros((nf, nf))
+    trace = 0.0
+    for j in range(nf):
+        out[j] = 0.0
+        for k in range(nf):
+            total = 0.0
+            for i in range(n):
+                total += response[i, j] * response[i, k]
+            normal[j, k] = total
+        trace += normal[j, j]
     for i in range(n):
         error = frequency * frequency * (q_ref[i] - x[i])
         error += 2.0 * damping * frequency * (qd_ref[i] - x[n + i])
         for j in range(nf):
-            side[j] += response[i, j] * error
-    trace = 0.0
-    for j in range(nf):
-        trace += normal[j, j]
+            out[j] += response[i, j] * error
     for j in range(nf):  # keeps the solution finite where a force moves nothing
         normal[j, j] += 1e-12 * trace + 1e-300
-    out[:] = np.linalg.solve(normal, side)
+    if not (np.isfinite(trace) and cholesky(normal, factor)):
+        for j in range(nf):  # the motion has run away: the caller says so
+            out[j] = np.nan
+        return
+    forward_substitute(factor, nf, out)
+    for j in range(nf - 1, -1, -1):
+        for k in range(j + 1, nf):
+            out[j] -= factor[k, j] * out[k]
+        out[j] /= factor[j, j]
 
 
 @njit(
@@ -177,7 +190,8 @@ def _track(  # type: ignore[no-untyped-def]
         for i in range(brake.shape[0]):
             speed[i] += follow * (x[k, n + i] - speed[i])
             u[k + 1, brake[i]] += brake_gain[k, i] * abs(speed[i])
-        x[k + 1] = x[k]
+        for i in range(x.shape[1]):
+            x[k + 1, i] = x[k, i]
         steps = stable_steps(derivative, x[k], u[k], p, w, n, width, dt, max_step, work)
         runge_kutta(derivative, x[k + 1], u[k], u[k + 1], p, w, dt, steps, work)
 

@@ -60,22 +60,37 @@ def _predict(  # type: ignore[no-untyped-def]
         derivative, mean, factor, reach, noise_sd, nx, p.shape[0] - 1, free, logarithmic,
         lower, upper, u0, u1, dt, substeps, states, work,
     )  # fmt: skip
-    points = np.zeros((1 + 2 * pairs, n))  # as deviations from the mean
-    predicted[:] = mean
+    for i in range(n):
+        middle = states[i, 2 * pairs] if i < nx else mean[i]
+        total = 0.0
+        if i < nx:
+            for row in range(2 * pairs):
+                total += states[i, row] - middle
+        predicted[i] = middle + other * total
     for i in range(nx):
-        middle = states[i, 2 * pairs]
-        predicted[i] = middle + other * (states[i] - middle).sum()
-        points[:, i] = states[i] - predicted[i]
-    for pair in range(n):
-        points[pair, nx:] = reach * factor[nx:, pair]
-        points[pairs + pair, nx:] = -reach * factor[nx:, pair]
-    covariance[:] = centre * np.outer(points[2 * pairs], points[2 * pairs])
-    for row in range(2 * pairs):
-        covariance += other * np.outer(points[row], points[row])
-    cross[:] = 0.0
-    for pair in range(n):
-        start = np.ascontiguousarray(factor[:, pair]) * (other * reach)
-        cross += np.outer(start, points[pair] - points[pairs + pair])
+        for row in range(1 + 2 * pairs):
+            states[i, row] -= predicted[i]
+    # The parameters of opposite points differ by twice the root's row, and stay.
+    for i in range(n):
+        for j in range(nx):
+            total = 0.0
+            for pair in range(n):
+                ahead = states[j, pair] - states[j, pairs + pair]
+                total += other * reach * factor[i, pair] * ahead
+            cross[i, j] = total
+            if i < nx:
+                total = centre * states[i, 2 * pairs] * states[j, 2 * pairs]
+                for row in range(2 * pairs):
+                    total += other * states[i, row] * states[j, row]
+            covariance[i, j] = total
+            covariance[j, i] = total
+        for j in range(nx, n):
+            total = 0.0
+            for pair in range(n):
+                total += factor[i, pair] * factor[j, pair]
+            cross[i, j] = total
+            if i >= nx:
+                covariance[i, j] = total
 
 
 def smooth_trial(

@@ -90,7 +90,8 @@ def filter_square_root(  # type: ignore[no-untyped-def]
     for i in range(n):
         for j in range(n):
             root[i, j] = factor[j, i] if i <= j else 0.0
-    means[0] = mean
+    for i in range(n):
+        means[0, i] = mean[i]
     covariance_of(root, covariances[0])
     for k in range(1, t.shape[0]):
         dt = t[k] - t[k - 1]
@@ -197,7 +198,8 @@ def filter_square_root(  # type: ignore[no-untyped-def]
                 mean[nx + j] = min(max(mean[nx + j], lower[j]), upper[j])
         transpose(root, factor)
         if k % stride == 0:
-            means[k // stride] = mean
+            for i in range(n):
+                means[k // stride, i] = mean[i]
             covariance_of(root, covariances[k // stride])
     for i in range(n):
         if not np.isfinite(mean[i]):
