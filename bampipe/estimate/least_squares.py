@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bampipe.errors import InputError
 from bampipe.estimate.low_pass import Band
 
 Array = NDArray[np.float64]
@@ -160,11 +161,14 @@ def fit(
 
     Raises:
         ValueError: there are fewer samples than parameters.
+        InputError: the residual or its slope at ``start`` is not a finite number.
     """
     chosen = list(range(problem.n_trials)) if trials is None else list(trials)
     p = np.array(start, dtype=float)
     p[problem.free] = np.clip(p[problem.free], problem.lower, problem.upper)
     stacked = [stacked_residual(problem, trial, p) for trial in chosen]
+    for trial, s in zip(chosen, stacked, strict=True):
+        _require_finite(problem, trial, s, p)
     if sum(len(s.residual) for s in stacked) <= problem.free.size:
         raise ValueError("fewer samples than parameters")
     iterations, converged = 0, False
@@ -199,6 +203,22 @@ def fit(
         iterations=iterations,
         converged=converged,
         at_bound=np.asarray((value <= problem.lower) | (value >= problem.upper)),
+    )
+
+
+def _require_finite(problem: Problem, trial: int, stacked: Stacked, p: Array) -> None:
+    """Say which parameter makes the residual of a trial no number where the fit starts."""
+    if not np.isfinite(stacked.residual).all():
+        culprit = "with the parameters that the fit starts from"
+    elif not np.isfinite(stacked.slope).all():
+        place = problem.free[int(np.argmin(np.isfinite(stacked.slope).all(axis=(0, 1))))]
+        culprit = f"as soon as parameter number {place + 1}, {p[place]:.4g}, changes"
+    else:
+        return
+    raise InputError(
+        f"the model gives no finite force on trial number {trial + 1} {culprit}",
+        where="least squares",
+        remedy="narrow the bounds of the newest effect's parameters, or change their priors",
     )
 
 

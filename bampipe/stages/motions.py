@@ -19,6 +19,7 @@ from bampipe.estimate.least_squares import Problem, resting
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import System
 from bampipe.physics.device import derivative
+from bampipe.physics.soundness import require_sound
 from bampipe.stages.base import RunFolder
 from bampipe.stages.shelf import Shelf
 
@@ -191,6 +192,9 @@ def problem_of(
         system: the model; motions: the trials; band: the low-pass of the residual.
         held: parameters that are not estimated, beside those that the model fixes.
         timing: whether that time is estimated; else it is zero.
+
+    Raises:
+        InputError: the mass matrix is singular at a pose of a trial, or a force no number there.
     """
     n = len(system.parameters)
 
@@ -217,8 +221,17 @@ def problem_of(
         step=np.array([*step, 0.5 / band.rate_hz]),
         linear=all(system.linear[i] for i in free),
         band=band,
-        resting=[resting(m.qd, m.qd_sd, band.rate_hz) for m in motions],
+        resting=[_resting(m, system, band) for m in motions],
     )
+
+
+def _resting(motion: Motion, system: System, band: Band) -> Array:
+    """Which samples stand still, of a trial on which the equations of motion can be solved."""
+    require_sound(
+        system, motion.q, motion.qd, motion.qdd, motion.u, system.prior, motion.t,
+        f"trial {motion.trial_id}",
+    )  # fmt: skip
+    return resting(motion.qd, motion.qd_sd, band.rate_hz)
 
 
 def _columns(frame: pd.DataFrame, names: Sequence[str], where: str) -> Array:

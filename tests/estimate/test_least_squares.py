@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from slider import RATE, TRUTH, record
 
+from bampipe.errors import InputError
 from bampipe.estimate.butterworth import zero_phase
 from bampipe.estimate.least_squares import Problem, fit, refit, resting, stacked_residual
 from bampipe.estimate.low_pass import Band
@@ -164,3 +165,15 @@ def test_the_low_pass_ends_at_a_fifth_of_a_low_sampling_rate():
     slow = Band(20.0)
     assert slow.cutoff_hz == 4.0 and slow.step == 1
     assert np.isfinite(slow.thin(np.ones((100, 1)))).all()
+
+
+def test_a_start_without_numbers_is_refused() -> None:
+    inner = problem(1)
+
+    def lost(trial: int, p: np.ndarray) -> np.ndarray:
+        return inner.residual(trial, p) + np.sqrt(5.0 - p[0])
+
+    with np.errstate(invalid="ignore"), pytest.raises(InputError, match="no finite force"):
+        fit(problem(1, residual=lost, linear=False), np.array([6.0, 1.0, 2.0]))
+    with np.errstate(invalid="ignore"), pytest.raises(InputError, match="parameter number 1, 5"):
+        fit(problem(1, residual=lost, linear=False), np.array([5.0, 1.0, 2.0]))

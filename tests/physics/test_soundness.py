@@ -1,0 +1,87 @@
+"""Where the equations of motion cannot be solved, it is said in physical words."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bampipe.errors import InputError
+from bampipe.physics import Model, compile_model, registry
+from bampipe.physics.soundness import require_sound
+
+
+def arm(rotor: float):
+    """A slider on a turning arm: no inertia about the pivot where the slider is at it."""
+    return registry.device_from(
+        {
+            "name": "arm",
+            "coordinates": {"angle": {"kind": "rotary"}, "reach": {"kind": "linear"}},
+            "constants": {"I": {"value": rotor, "unit": "kg.m2", "source": "assumed"}},
+            "energy": {
+                "kinetic": "(mass*(reach**2*ddt(angle)**2 + ddt(reach)**2) + I*ddt(angle)**2)/2"
+            },
+            "inputs": {"force": ["force_x", "force_z"]},
+            "applied": {"angle": "reach*force_x", "reach": "force_z"},
+            "parameters": {"mass": {"unit": "kg", "prior": 2.0, "sd": 1.0}},
+        }
+    )
+
+
+def check(system, reach):
+    count = len(reach)
+    q = np.stack([np.full(count, 0.3), reach], axis=1)
+    flat = np.zeros((count, 2))
+    u = np.zeros((count, len(system.inputs)))
+    require_sound(system, q, flat, flat, u, system.prior, np.arange(count) * 0.01, "trial t01")
+
+
+def test_no_inertia_at_the_pivot():
+    system = compile_model(Model(arm(0.0)))
+    check(system, np.linspace(0.2, 0.8, 7))
+    with pytest.raises(InputError) as caught:
+        check(system, np.linspace(0.4, -0.4, 5))
+    said = str(caught.value)
+    assert "no inverse" in said
+    assert "angle = 0.3 rad, reach = 0 m, 0.020 s: angle has no inertia there" in said
+    assert "trial t01" in said
+
+
+def test_a_rotor_is_inertia_enough():
+    check(compile_model(Model(arm(0.01))), np.linspace(0.4, -0.4, 5))
+
+
+@pytest.mark.parametrize(
+    "pose", [(0.0, 0.0, 0.461), (0.5, np.pi / 2, 1.0), (0.5, -np.pi / 2, 0.461)]
+)
+def test_the_manipulator_has_inertia_everywhere(pose):
+    """Its drives turn with it, so rho = 0 and a vertical rod are poses like any other."""
+    system = compile_model(Model(registry.device("bam")))
+    flat = np.zeros((1, 3))
+    require_sound(
+        system, np.array([pose]), flat, flat, np.zeros((1, len(system.inputs))), system.prior,
+        np.zeros(1), "",
+    )  # fmt: skip
+    rate = np.empty(6)
+    x = np.array([*pose, 0.1, -0.1, 0.1])
+    system.derivative(x, np.ones(len(system.inputs)), system.prior, np.zeros(4), rate)
+    assert np.isfinite(rate).all()
+
+
+def test_the_effect_that_gives_no_number_is_named():
+    effect = registry.effect_from(
+        {
+            "name": "hollow",
+            "summary": "a root of a negative number beyond 0.5 m",
+            "scope": "axis",
+            "kind": "torque",
+            "looks_like": "nothing until it is gone",
+            "source": "made up",
+            "torque": "-size*sqrt(0.5 - reach)",
+            "parameters": {"size": {"unit": "N", "prior": 1.0, "sd": 1.0}},
+        }
+    )
+    model = Model(arm(0.01), ("return_spring:angle", "hollow:reach"), (effect,))
+    system = compile_model(model)
+    check(system, np.linspace(0.1, 0.4, 4))
+    with pytest.raises(InputError, match=r"effect 'hollow:reach' gives no number .*reach = 0.6 m"):
+        check(system, np.array([0.2, 0.6, 0.8]))
