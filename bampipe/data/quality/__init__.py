@@ -1,0 +1,84 @@
+"""Quality rules on one trial: repair what is safe and say so, refuse what is not.
+
+:func:`clean` takes the raw columns of a trial and returns them in SI units. A trial that cannot
+be trusted raises :class:`bampipe.errors.InputError`, whose line is the reason for which the
+trial is set aside. Whatever was changed or left out is a sentence in ``repairs``; what was only
+noticed is a sentence in ``notes``. Nothing is altered without one.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bampipe.data.quality.channels import (
+    fill_missing,
+    refuse_frozen,
+    refuse_other_units,
+    refuse_saturated,
+    to_si,
+    to_signed,
+)
+from bampipe.data.quality.clock import (
+    cut_stretch,
+    drop_backward_stamps,
+    keep_longest_stretch,
+    note_clock,
+    refuse_short,
+    time_to_seconds,
+)
+from bampipe.data.quality.encoders import (
+    hold_against_velocity,
+    mend_jumps,
+    refuse_fractions,
+    unwrap,
+)
+from bampipe.data.quality.motion import refuse_wrong_brakes, refuse_wrong_motion
+from bampipe.data.quality.table import CleanTrial, Limits, Table
+from bampipe.data.readers import RawTrial
+from bampipe.data.session import Session, TrialEntry
+
+__all__ = ["CleanTrial", "Limits", "clean"]
+
+
+def clean(raw: RawTrial, session: Session, entry: TrialEntry, limits: Limits) -> CleanTrial:
+    """Check and repair one trial and bring it to SI units.
+
+    The arrays of ``raw`` are used up.
+
+    Args:
+        raw: from :func:`bampipe.data.readers.read_trial`.
+        session: what its columns mean.
+        entry: what kind of trial it is.
+        limits: what counts as sound.
+
+    Raises:
+        InputError: the trial must be set aside; says why, and where in the file.
+    """
+    table = Table(raw, session, entry, limits)
+    refuse_other_units(table, raw.units)
+    time_to_seconds(table)
+    drop_backward_stamps(table)
+    cut_stretch(table)
+    keep_longest_stretch(table)
+    for encoder in session.encoders:
+        refuse_fractions(table, encoder)
+        unwrap(table, encoder)
+    for channel in session.channels:
+        to_signed(table, channel)
+    fill_missing(table)
+    for encoder in session.encoders:
+        mend_jumps(table, encoder)
+    table.t -= table.t[0]
+    refuse_short(table)
+    note_clock(table)
+    for encoder in session.encoders:
+        hold_against_velocity(table, encoder)
+    if session.force is not None and session.force.volts:
+        for column in session.force.columns:
+            refuse_frozen(table, column)
+            refuse_saturated(table, column)
+    columns = to_si(table)
+    refuse_wrong_motion(table, columns)
+    refuse_wrong_brakes(table, columns)
+    rate = float(1.0 / np.median(np.diff(table.t)))
+    return CleanTrial(table.t, columns, rate, table.repairs, table.notes)

@@ -1,0 +1,191 @@
+"""Force, brake and other channels: units, signs, missing, frozen or saturated samples."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from bampipe.data.quality.table import Table, counted, in_rows, longest_run
+from bampipe.data.session import SECONDS, Channel
+from bampipe.data.units import unit
+
+LARGEST_VALUE = 1e6
+"""No angle, force, torque or other input is as large as this in SI units."""
+
+
+def refuse_other_units(table: Table, stated: Mapping[str, str]) -> None:
+    """Refuse a column whose unit in the file is not that of the session file."""
+    clock = table.session.clock
+    declared = {**table.session.raw_units}
+    if not clock.datetime:
+        declared[clock.column] = {v: k for k, v in SECONDS.items()}.get(clock.seconds, "")
+    for column, text in stated.items():
+        found, expected = unit(text), unit(declared.get(column, ""))
+        if found is None or expected is None or "" in (found.si, expected.si):
+            continue
+        if (found.si, found.scale) != (expected.si, expected.scale):
+            raise table.fault(
+                f"the file gives the unit {text}, session.toml {declared[column]}",
+                column=column,
+                remedy="correct session.toml",
+            )
+
+
+def fill_missing(table: Table) -> None:
+    """Interpolate short runs of missing samples; drop them at the ends; refuse long ones."""
+    channels = [name for name in table.columns if name != table.clock]
+    some = np.zeros(len(table), dtype=bool)
+    for name in channels:
+        missing = ~np.isfinite(table.columns[name])
+        _refuse_missing(table, name, missing)
+        some |= missing
+    if not some.any():
+        return
+    sound = np.flatnonzero(~some)
+    if len(sound) == 0:
+        raise table.fault("no row is complete")
+    start, stop = int(sound[0]), int(sound[-1]) + 1
+    if start > 0 or stop < len(table):
+        dropped = len(table) - (stop - start)
+        table.keep(slice(start, stop))
+        table.repairs.append(f"{in_rows(dropped)} with missing samples at the ends dropped")
+    for name in channels:
+        values = table.columns[name]
+        missing = ~np.isfinite(values)
+        if missing.any():
+            known = ~missing
+            values[missing] = np.interp(table.t[missing], table.t[known], values[known])
+            table.repairs.append(
+                f"column '{name}': {counted(int(missing.sum()), 'missing sample')} interpolated"
+            )
+
+
+def _refuse_missing(table: Table, name: str, missing: np.ndarray) -> None:
+    count = int(missing.sum())
+    if count == 0:
+        return
+    if count == len(missing):
+        raise table.fault("holds no number at all", column=name)
+    start, length = longest_run(missing)
+    if length > table.limits.nan_run:
+        raise table.fault(
+            f"{length} samples in a row are missing, more than {table.limits.nan_run}",
+            column=name,
+            at=start,
+        )
+    if count > max(table.limits.nan_share * len(missing), table.limits.nan_run):
+        raise table.fault(
+            f"{count} of {len(missing)} samples are missing,"
+            f" more than {table.limits.nan_share:.0%}",
+            column=name,
+            at=int(np.argmax(missing)),
+        )
+
+
+def refuse_frozen(table: Table, column: str) -> None:
+    """A force channel that stands still for long is a cable that came off."""
+    values = table.columns[column]
+    start, length = longest_run(np.diff(values) == 0)
+    share = (length + 1) / len(values)
+    seconds = float(table.t[min(start + length, len(table) - 1)] - table.t[start])
+    if share > table.limits.frozen_share and seconds > table.limits.shortest_s / 2:
+        raise table.fault(
+            f"reads {values[start]:g} without a change for {seconds:.3g} s ({share:.0%} of the"
+            " trial): frozen",
+            column=column,
+            at=start,
+            remedy="check the sensor's cable",
+        )
+
+
+def refuse_saturated(table: Table, column: str) -> None:
+    """Refuse a channel that piles up at its extreme: in runs, and far above the next level."""
+    values = table.columns[column]
+    levels, counts = np.unique(values, return_counts=True)
+    if len(levels) < 3:
+        return
+    for rail, pile, beside in (
+        (levels[-1], counts[-1], counts[-2]),
+        (levels[0], counts[0], counts[1]),
+    ):
+        share = pile / len(values)
+        if share <= table.limits.saturated_share or pile <= 5 * beside:
+            continue
+        start, length = longest_run(values == rail)
+        if length >= 5:
+            raise table.fault(
+                f"{share:.1%} of the samples are at the rail {rail:g}: saturated, more than"
+                f" {table.limits.saturated_share:.0%}",
+                column=column,
+                at=start,
+                remedy="lower the gain or the load",
+            )
+
+
+def to_si(table: Table) -> dict[str, np.ndarray]:
+    """Columns (T,) in SI units by name: q_<axis>, force_<component>, brake_<axis>, channels."""
+    session, raw = table.session, table.columns
+    si: dict[str, np.ndarray] = {}
+    source: dict[str, str] = {}
+    for encoder in session.encoders:
+        values = raw.pop(encoder.column)
+        values -= encoder.zero
+        values *= encoder.scale
+        si[f"q_{encoder.axis}"] = values
+        source[f"q_{encoder.axis}"] = encoder.column
+    if session.force is not None:
+        force = session.force
+        for column, zero in zip(force.columns, force.zero, strict=True):
+            _refuse_wild(table, raw[column], f"reads {column}", column)
+            raw[column] -= zero
+        for name, column, gains in zip(force.names, force.columns, force.calibration, strict=True):
+            total = np.zeros(len(table))
+            for other, gain in zip(force.columns, gains, strict=True):
+                if gain != 0.0:
+                    total += gain * raw[other]
+            si[name] = total
+            source[name] = column
+        for column in force.columns:
+            del raw[column]
+    for brake in session.brakes:
+        si[f"brake_{brake.axis}"] = raw.pop(brake.column)
+        source[f"brake_{brake.axis}"] = brake.column
+    for channel in session.channels:
+        values = raw.pop(channel.column)
+        values *= channel.scale
+        values += channel.offset
+        si[channel.name] = values
+        source[channel.name] = channel.column
+    for name, values in si.items():
+        _refuse_wild(table, values, f"gives {name}", source[name])
+    return si
+
+
+def to_signed(table: Table, channel: Channel) -> None:
+    """Read the unsigned register of a signed number as what it stands for."""
+    if not channel.wrap_bits:
+        return
+    values = table.columns[channel.column]
+    beyond = (values < 0.0) | (values >= 2.0**channel.wrap_bits)
+    if beyond.any():
+        at = int(np.argmax(beyond))
+        raise table.fault(
+            f"found {values[at]:g}, expected 0 to {2**channel.wrap_bits - 1}",
+            column=channel.column,
+            at=at,
+            remedy="a column that is signed already needs no wrap_bits",
+        )
+    values[values >= 2.0 ** (channel.wrap_bits - 1)] -= 2.0**channel.wrap_bits
+
+
+def _refuse_wild(table: Table, values: np.ndarray, words: str, column: str) -> None:
+    wild = ~(np.abs(values) < LARGEST_VALUE)
+    if wild.any():
+        at = int(np.argmax(wild))
+        raise table.fault(
+            f"{words} = {values[at]:.3g}, which no such machine does",
+            column=column,
+            at=at,
+            remedy="check the column and its calibration",
+        )

@@ -1,0 +1,180 @@
+"""Time stamps: seconds from whatever was logged, without steps back, gaps or a wrapped counter."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bampipe.data.quality.table import Table, counted, in_rows, in_times
+from bampipe.data.session import SECONDS
+
+
+def time_to_seconds(table: Table) -> None:
+    """Time stamps in s, whatever unit they are really in; rows without one are dropped."""
+    missing = ~np.isfinite(table.t)
+    count = int(missing.sum())
+    if count:
+        if count > _few(table, len(table)):
+            at = int(np.argmax(missing))
+            raise table.fault(f"{count} time stamps are missing", column=table.clock, at=at)
+        table.keep(~missing)
+        table.repairs.append(f"{in_rows(count)} without a time stamp dropped")
+    _unwrap_clock(table)
+    steps = np.diff(table.t)
+    steps = steps[steps > 0]
+    if len(steps) == 0:
+        falls = len(table) > 1 and table.t[-1] < table.t[0]
+        raise table.fault(
+            "time runs backwards throughout" if falls else "time stands still",
+            column=table.clock,
+            remedy="is this the time column?",
+        )
+    # The first stamp goes first: stamps since 1970 in s have no room for fractions of 1 us.
+    table.t = (table.t - table.t[0]) * table.session.clock.seconds
+    nominal = table.session.sample_rate
+    ratio = float(np.median(steps)) * table.session.clock.seconds * nominal
+    power = 3 * round(np.log10(ratio) / 3)
+    if power in (-9, -6, -3, 3, 6, 9) and 0.5 < ratio / 10.0**power < 2.0:
+        table.t = table.t * 10.0**-power
+        unit = {seconds: name for name, seconds in SECONDS.items()}
+        declared = unit[table.session.clock.seconds]
+        real = unit.get(float(f"{table.session.clock.seconds * 10.0**-power:.0e}"))
+        words = f"in {real}, not {declared}" if real else f"wrong by a factor of 1e{power}"
+        table.repairs.append(f"time stamps are {words}, by the nominal rate: converted")
+    elif not 0.1 < ratio < 10.0:
+        raise table.fault(
+            f"the median step of {ratio / nominal:.3g} s does not fit sample_rate_hz = {nominal:g}",
+            column=table.clock,
+            remedy="check the unit of the time column and sample_rate_hz",
+        )
+
+
+def _unwrap_clock(table: Table) -> None:
+    """Undo the roll-over of a clock that counts ticks in 32 bits."""
+    drops = np.flatnonzero(np.diff(table.t) < -(2.0**32) * 0.9)
+    if len(drops) and table.t.min() >= 0 and table.t.max() < 2.0**32:
+        turns = np.zeros(len(table))
+        turns[drops + 1] = 2.0**32
+        table.t = table.t + np.cumsum(turns)
+        table.repairs.append(f"clock rolls over at 32 bits {in_times(len(drops))}: unrolled")
+
+
+def drop_backward_stamps(table: Table) -> None:
+    """Leave strictly increasing stamps where few rows are in the way; else refuse the trial."""
+    t = table.t
+    if np.all(np.diff(t) > 0):
+        return
+    total = len(table)
+    # A single stamp that leaps ahead would put all that follow behind it: it goes first.
+    ahead = np.zeros(total, dtype=bool)
+    ahead[1:-1] = (t[1:-1] > t[2:]) & (t[:-2] < t[2:])
+    if 0 < ahead.sum() <= _few(table, total):
+        table.keep(~ahead)
+        t = table.t
+    else:
+        ahead[:] = False
+    before = np.maximum.accumulate(t)[:-1]
+    repeated = np.concatenate([[False], t[1:] == before])
+    behind = np.concatenate([[False], t[1:] < before])
+    counts = int(repeated.sum()), int(behind.sum()) + int(ahead.sum())
+    if sum(counts) > _few(table, total):
+        at = int(np.argmax(repeated | behind))
+        if counts[1] > counts[0]:
+            raise table.fault(
+                f"time runs backwards: {counts[1]} of {total} stamps are not after those before",
+                column=table.clock,
+                at=at,
+                remedy="two recordings in one file?",
+            )
+        raise table.fault(
+            f"{counts[0]} of {total} time stamps are repeated", column=table.clock, at=at
+        )
+    table.keep(~(repeated | behind))
+    if counts[0]:
+        table.repairs.append(f"{in_rows(counts[0])} with a repeated time stamp dropped")
+    if counts[1]:
+        table.repairs.append(f"{in_rows(counts[1])} with a time stamp out of order dropped")
+
+
+def cut_stretch(table: Table) -> None:
+    """Keep the stretch of the record that the session file gives to this trial."""
+    start, end = table.entry.start_s, table.entry.end_s
+    if start == 0.0 and np.isinf(end):
+        return
+    t = table.t - table.t[0]
+    inside = (t >= start) & (t < end)
+    if not inside.any():
+        raise table.fault(
+            f"start_s = {start:g} is after the last sample, at {t[-1]:.3f} s of the record",
+            column=table.clock,
+        )
+    table.keep(inside)
+    until = f"{end:g}" if end <= t[-1] else f"{t[-1]:.3f}"
+    table.notes.append(f"from {start:g} to {until} s of the record")
+
+
+def keep_longest_stretch(table: Table) -> None:
+    """Cut at gaps in the time stamps and keep the longest stretch, if it is most of the trial."""
+    steps = np.diff(table.t)
+    if len(steps) == 0:
+        return
+    limit = max(table.limits.gap_s, 5 * float(np.median(steps)))
+    gaps = np.flatnonzero(steps > limit)
+    if len(gaps) == 0:
+        return
+    bounds = np.concatenate([[0], gaps + 1, [len(table)]])
+    longest = int(np.argmax(np.diff(bounds)))
+    start, stop = int(bounds[longest]), int(bounds[longest + 1])
+    share = (stop - start) / len(table)
+    widest = float(steps[gaps].max())
+    words = f"{counted(len(gaps), 'gap')} of up to {widest:.3g} s in the time stamps"
+    if share < table.limits.sound_share:
+        raise table.fault(
+            f"{words}, and the longest stretch between them holds {share:.0%} of the samples,"
+            f" less than {table.limits.sound_share:.0%}",
+            column=table.clock,
+            at=int(gaps[0]),
+        )
+    first, last = table.rows[start], table.rows[stop - 1]
+    dropped = len(table) - (stop - start)
+    table.keep(slice(start, stop))
+    table.repairs.append(f"{words}: rows {first} to {last} kept, {in_rows(dropped)} dropped")
+
+
+def refuse_short(table: Table) -> None:
+    """A trial of a second or less tells nothing."""
+    # Each sample stands for one step: 500 samples at 500 Hz are 1 s.
+    step = float(np.median(np.diff(table.t))) if len(table) > 1 else 0.0
+    duration = float(table.t[-1]) + step
+    if len(table) < 4 or duration < table.limits.shortest_s * (1 - 1e-6):
+        raise table.fault(
+            f"{counted(len(table), 'sample')} over {duration:.3g} s,"
+            f" less than {table.limits.shortest_s:g} s"
+        )
+
+
+def note_clock(table: Table) -> None:
+    """Say what resampling has to deal with: small gaps, jitter, another rate than announced."""
+    steps = np.diff(table.t)
+    median = float(np.median(steps))
+    gaps = steps > 1.6 * median
+    if gaps.any():
+        lost = int(np.sum(np.rint(steps[gaps] / median) - 1))
+        table.notes.append(
+            f"{counted(int(gaps.sum()), 'small gap')} in the time stamps,"
+            f" about {counted(lost, 'sample')} missing, longest {steps.max():.3g} s"
+        )
+    jitter = float(np.std(steps[~gaps]))
+    if jitter > 0.05 * median:
+        table.notes.append(
+            f"time stamps jitter by {jitter * 1e3:.3g} ms (standard deviation), from"
+            f" {steps.min() * 1e3:.3g} to {steps[~gaps].max() * 1e3:.3g} ms between samples:"
+            " put on a uniform grid by monotone cubic interpolation when filtered"
+        )
+    nominal = table.session.sample_rate
+    if abs(1 / median - nominal) > 0.02 * nominal:
+        table.notes.append(f"sampled at {1 / median:.4g} Hz, announced {nominal:g} Hz")
+
+
+def _few(table: Table, total: int) -> int:
+    """How many rows may be dropped for their time stamps."""
+    return max(3, int(table.limits.dropped_share * total))

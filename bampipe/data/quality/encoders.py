@@ -1,0 +1,142 @@
+"""Encoder readings: whole counts, no wraps, no jumps, in step with a recorded velocity."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bampipe.data import velocity
+from bampipe.data.quality.channels import fill_missing
+from bampipe.data.quality.table import Table, counted, in_times
+from bampipe.data.session import Encoder
+
+FASTEST = {"rad": 20.0, "m": 4.0}
+"""Speed below which a step is never taken for a wild reading, rad/s and m/s."""
+
+
+VELOCITY_RATIO = 1.5
+"""A recorded velocity further than this factor from the change of position is in another unit."""
+
+
+def refuse_fractions(table: Table, encoder: Encoder) -> None:
+    """Counts are whole numbers."""
+    if not encoder.counts:
+        return
+    values = table.columns[encoder.column]
+    fractions = np.isfinite(values) & (values != np.rint(values))
+    if fractions.any():
+        at = int(np.argmax(fractions))
+        raise table.fault(
+            f"found {values[at]:g}, expected whole counts",
+            column=encoder.column,
+            at=at,
+            remedy="columns swapped? or already in units (then leave counts_per_unit out)",
+        )
+
+
+def unwrap(table: Table, encoder: Encoder) -> None:
+    """Undo the wrap-around of a counter of 16, 24 or 32 bits, or of an angle at a full turn."""
+    if encoder.counts:
+        periods = [(2.0**bits, f"at {bits} bits") for bits in (16, 24, 32)]
+    elif encoder.unit == "rad":
+        periods = [(2 * np.pi / encoder.scale, "at a full turn")]
+    else:
+        return
+    values = table.columns[encoder.column]
+    known = np.flatnonzero(np.isfinite(values))
+    steps = np.diff(values[known])
+    for period, words in periods:
+        wraps = np.abs(steps) > period / 2
+        near = np.abs(np.abs(steps) - period) < period / 16
+        if not wraps.any() or not near[wraps].all() or np.ptp(values[known]) > period:
+            continue
+        turns = np.zeros(len(known))
+        turns[1:][wraps] = -np.sign(steps[wraps]) * period
+        values[known] += np.cumsum(turns)
+        first = table.rows[known[int(np.argmax(wraps)) + 1]]
+        table.repairs.append(
+            f"column '{encoder.column}' wraps {words} {in_times(int(wraps.sum()))},"
+            f" first at row {first}: unwrapped"
+        )
+        return
+
+
+def mend_jumps(table: Table, encoder: Encoder) -> None:
+    """Interpolate isolated wild readings; refuse a lasting jump (lost counts, a reset).
+
+    A step is wild when it is 20 times what all but one step in twenty stay below, and faster
+    than any of these axes can go.
+    """
+    values = table.columns[encoder.column]
+    if len(table) < 4:
+        return
+    steps = np.abs(np.diff(values))
+    fastest = FASTEST[encoder.unit] * float(np.median(np.diff(table.t))) / encoder.scale
+    limit = max(20 * float(np.quantile(steps, 0.95)), abs(fastest))
+    jumps = np.flatnonzero(steps > limit)
+    if len(jumps) == 0:
+        return
+    run, total = table.limits.nan_run, len(table)
+    wild = np.zeros(total, dtype=bool)
+    lasting = []
+    number = 0
+    while number < len(jumps):
+        here = int(jumps[number])
+        after = int(jumps[number + 1]) if number + 1 < len(jumps) else total
+        if (
+            after - here <= run
+            and after + 1 < total
+            and (abs(values[after + 1] - values[here]) <= limit)
+        ):
+            wild[here + 1 : after + 1] = True
+            number += 2
+            continue
+        if here < run:
+            wild[: here + 1] = True
+        elif total - 1 - here <= run:
+            wild[here + 1 :] = True
+        else:
+            lasting.append(here)
+        number += 1
+    if lasting or wild.sum() > table.limits.nan_share * total:
+        at = lasting[0] if lasting else int(jumps[0])
+        size = abs(values[at + 1] - values[at]) * abs(encoder.scale)
+        raise table.fault(
+            f"jumps by {size:.3g} {encoder.unit} from one sample to the next "
+            f"({in_times(len(jumps))})",
+            column=encoder.column,
+            at=at + 1,
+            remedy="counts lost, or the counter was reset",
+        )
+    values[wild] = np.nan
+    table.repairs.append(
+        f"column '{encoder.column}': {counted(int(wild.sum()), 'wild reading')} taken out"
+    )
+    fill_missing(table)
+
+
+def hold_against_velocity(table: Table, encoder: Encoder) -> None:
+    """Refuse an axis whose recorded velocity is in another unit, or of another sign."""
+    if encoder.velocity is None:
+        return
+    speed = table.columns.pop(encoder.velocity.column) * encoder.velocity.scale
+    position = (table.columns[encoder.column] - encoder.zero) * encoder.scale
+    found = velocity.compare(table.t, position, speed)
+    if found is None:
+        return
+    place = encoder.velocity.column
+    if abs(found.correlation) < 0.9:
+        table.notes.append(
+            f"column '{place}' is not the velocity of {encoder.axis} by its position"
+            f" (correlation {found.correlation:.2f}); it is not used"
+        )
+        return
+    if not 1 / VELOCITY_RATIO < found.ratio < VELOCITY_RATIO:
+        raise table.fault(
+            f"is {found.ratio:.3g} times the change of '{encoder.column}'",
+            column=place,
+            remedy="check the units and signs of both in session.toml",
+        )
+    if not 0.95 < found.ratio < 1.05:
+        table.notes.append(
+            f"column '{place}' is {found.ratio:.3g} times the change of '{encoder.column}'"
+        )

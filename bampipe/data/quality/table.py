@@ -1,0 +1,131 @@
+"""A trial while it is being cleaned, and what still counts as sound."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from bampipe.data.readers import RawTrial
+from bampipe.data.session import Session, TrialEntry
+from bampipe.errors import InputError
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What still counts as a sound trial.
+
+    Attributes:
+        shortest_s: least duration, s.
+        gap_s: longest gap in the time stamps that is left to resampling, s.
+        sound_share: least share of the trial that the longest stretch between gaps must hold.
+        dropped_share: largest share of rows that may be dropped for their time stamps.
+        nan_run: longest run of missing samples that is interpolated.
+        nan_share: largest share of missing samples in a channel.
+        saturated_share: largest share of samples at the rail of a force channel.
+        frozen_share: largest share of the trial over which a force channel may stand still.
+        still_rad, still_m: a free trial moves more than this on some axis.
+        locked_rad, locked_m: a locked axis moves less than this.
+        locked_steps: a locked axis deflects by at least this many encoder steps.
+        brake_on: brake command above which a trial is not free, N.m or N.
+    """
+
+    shortest_s: float = 1.0
+    gap_s: float = 0.25
+    sound_share: float = 0.6
+    dropped_share: float = 0.01
+    nan_run: int = 5
+    nan_share: float = 0.01
+    saturated_share: float = 0.01
+    frozen_share: float = 0.2
+    still_rad: float = 0.005
+    still_m: float = 0.0005
+    locked_rad: float = 0.2
+    locked_m: float = 0.02
+    locked_steps: int = 5
+    brake_on: float = 0.5
+
+
+@dataclass
+class CleanTrial:
+    """A sound trial.
+
+    Attributes:
+        t: (T,) s, strictly increasing from 0.
+        columns: (T,) a column in SI units: q_<axis>, force_<component>, brake_<axis>, channels.
+        sample_rate: 1 / median step, Hz.
+        repairs: what was changed or left out.
+        notes: what was noticed and left as it is.
+    """
+
+    t: np.ndarray
+    columns: dict[str, np.ndarray]
+    sample_rate: float
+    repairs: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+
+class Table:
+    """The columns of a trial while they are being cleaned, each row with its number in the file."""
+
+    def __init__(self, raw: RawTrial, session: Session, entry: TrialEntry, limits: Limits) -> None:
+        self.columns = raw.columns
+        self.session = session
+        self.entry = entry
+        self.limits = limits
+        self.clock = session.clock.column
+        length = len(raw.columns[self.clock])
+        self.rows = np.arange(raw.first_row, raw.first_row + length, dtype=np.int64)
+        self.repairs = list(raw.notes)
+        self.notes = list(raw.remarks)
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    @property
+    def t(self) -> np.ndarray:
+        """Time stamps (T,), s once :func:`time_to_seconds` has run."""
+        return self.columns[self.clock]
+
+    @t.setter
+    def t(self, seconds: np.ndarray) -> None:
+        self.columns[self.clock] = seconds
+
+    def keep(self, which: np.ndarray | slice) -> None:
+        """Keep only some rows; one column at a time, to hold little twice."""
+        self.rows = self.rows[which].copy()
+        for name in self.columns:
+            self.columns[name] = self.columns[name][which].copy()
+
+    def fault(
+        self, what: str, *, column: str = "", at: int | None = None, remedy: str = ""
+    ) -> InputError:
+        """The error to raise, with file, row and column."""
+        row = "" if at is None else f", row {self.rows[at]}"
+        where = f"{self.entry.file}{row}" + (f", column '{column}'" if column else "")
+        return InputError(what, where=where, remedy=remedy)
+
+
+def longest_run(which: np.ndarray) -> tuple[int, int]:
+    """Start and length of the longest run of True in a (T,) mask, (0, 0) where there is none."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], which, [False]]).astype(np.int8)))
+    starts, stops = edges[0::2], edges[1::2]
+    if len(starts) == 0:
+        return 0, 0
+    longest = int(np.argmax(stops - starts))
+    return int(starts[longest]), int(stops[longest] - starts[longest])
+
+
+def counted(count: int, noun: str) -> str:
+    """``3 rows``, ``1 row``."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
+def in_rows(count: int) -> str:
+    """``3 rows``, ``1 row``."""
+    return counted(count, "row")
+
+
+def in_times(count: int) -> str:
+    """``3 times``, ``once``."""
+    return "once" if count == 1 else f"{count} times"
