@@ -167,11 +167,11 @@ def test_the_corpus_is_large():
 
 @pytest.mark.parametrize("text", HOSTILE, ids=lambda t: ascii(t)[:40])
 def test_hostile_text_is_refused_at_once_in_one_line(text):
-    start = time.perf_counter()
+    start = time.process_time()
     with pytest.raises(InputError) as caught:
         value = read(text)
         assert value is None, f"accepted as {value}"
-    assert time.perf_counter() - start < 1.0
+    assert time.process_time() - start < 1.0
     message = str(caught.value)
     assert message.startswith("here: ")
     assert "\n" not in message
@@ -212,10 +212,10 @@ def test_definitions_that_multiply_each_other_are_refused_quickly():
             "parameters": {"inertia": {"unit": "kg.m2", "prior": 1.0, "sd": 0.1}},
         }
     )
-    start = time.perf_counter()
+    start = time.process_time()
     with pytest.raises(InputError, match="definitions are put in"):
         compile_model(Model(device))
-    assert time.perf_counter() - start < 10.0
+    assert time.process_time() - start < 10.0
 
 
 @settings(max_examples=400, deadline=None)

@@ -19,18 +19,25 @@ from bampipe.physics.signatures import ROWS
 BAM = registry.device("bam")
 
 
-def canonical(name):
-    """The effect at its last target: the extension, which has side loads, or a force."""
-    target = registry.effect(name).targets(BAM)[-1]
-    return f"{name}:{target}" if target else name
+def placed(name):
+    """A device that can have the effect, and the effect at its last target there.
+
+    On the BAM, where it can have it, that is the extension, which has side loads, or a force.
+    """
+    for device in (BAM, *map(registry.device, registry.device_names())):
+        targets = registry.effect(name).targets(device)
+        if targets:
+            return device, f"{name}:{targets[-1]}" if targets[-1] else name
+    raise AssertionError(f"no built-in device can have {name}")
 
 
 @pytest.mark.parametrize("name", registry.effect_names())
 def test_columns_and_compiled_functions_agree(name):
     """The same residual, acceleration and reading from both, to 1e-12 of their size."""
-    system = compile_model(Model(BAM, (canonical(name),)))
+    device, effect = placed(name)
+    system = compile_model(Model(device, (effect,)))
     count, n = 40, len(system.coordinates)
-    q, qd, qdd = random_motion(BAM, count, 21, speed=0.5)
+    q, qd, qdd = random_motion(device, count, 21, speed=0.5)
     qd[::4] *= 1e-3
     u, z = random_inputs(system, count, 22), memory_within_reason(system, count, 23)
     p = typical_parameters(system)
@@ -40,8 +47,8 @@ def test_columns_and_compiled_functions_agree(name):
     scale = np.abs(columns).max()
     np.testing.assert_allclose(system.residual(*true, z, u, p), columns, atol=1e-12 * scale)
 
-    bare = compile_model(Model(BAM))
-    base = bare.index("mass") + 1
+    bare = compile_model(Model(device))
+    base = len(bare.parameters)
     used = [system.inputs.index(c) for c in bare.inputs]
     z0 = np.zeros((count, 0))
     without = bare.residual(*true, z0, np.ascontiguousarray(u[:, used]), p[:base])
@@ -61,9 +68,10 @@ def test_columns_and_compiled_functions_agree(name):
 @pytest.mark.parametrize("name", registry.effect_names())
 def test_rows_and_single_states_agree(name):
     """The functions for many states at once are those for one, but for rounding."""
-    system = compile_model(Model(BAM, (canonical(name),)))
+    device, effect = placed(name)
+    system = compile_model(Model(device, (effect,)))
     count = 30
-    q, qd, _ = random_motion(BAM, count, 41, speed=0.5)
+    q, qd, _ = random_motion(device, count, 41, speed=0.5)
     qd[::4] *= 1e-3
     u, z = random_inputs(system, count, 42), memory_within_reason(system, count, 43)
     x = np.hstack([q, qd, z])
@@ -94,8 +102,9 @@ def test_rows_and_single_states_agree(name):
 
 @pytest.mark.parametrize("name", registry.effect_names())
 def test_reading_of_the_encoders_inverts_the_true_motion(name):
-    system = compile_model(Model(BAM, (canonical(name),)))
-    q, qd, qdd = random_motion(BAM, 20, 31, speed=0.5)
+    device, effect = placed(name)
+    system = compile_model(Model(device, (effect,)))
+    q, qd, qdd = random_motion(device, 20, 31, speed=0.5)
     u, p = random_inputs(system, 20, 32), typical_parameters(system)
     true = system.true_motion(q, qd, qdd, u, p)
     for i in range(20):
