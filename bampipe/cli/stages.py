@@ -130,7 +130,8 @@ def identify(
     model: ModelName = "",
     method: Annotated[str, typer.Option(help="ukf or least-squares.")] = "",
     engine: Annotated[
-        str, typer.Option(help="compiled, or filterpy: slow, the same numbers.")
+        str,
+        typer.Option(help="compiled; filterpy or augmented: slow, to compare with."),
     ] = "",
     settings: Settings = None,
     list_settings: ListSettings = False,

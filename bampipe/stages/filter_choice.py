@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from bampipe.errors import InputError
 
-ENGINES = ("compiled", "filterpy")
+ENGINES = ("compiled", "filterpy", "augmented")
 FORMS = ("square_root", "covariance")
 MEASURES = ("position", "position_velocity")
 
@@ -16,7 +16,8 @@ class FilterChoice:
     """Settings of the filter.
 
     Attributes:
-        engine: ``compiled``, or ``filterpy``, slow, which gives the same numbers.
+        engine: ``compiled``; ``filterpy``, slow, which gives the same numbers; or ``augmented``,
+            slow, with measurement noise in the state, which gives nearly the same.
         form: ``square_root`` or ``covariance`` form of the filter.
         measure: ``position``, or ``position_velocity`` as in the paper; filtered velocities are
             not white, so intervals from them are too narrow.

@@ -46,7 +46,8 @@ class Config(FilterChoice):
         model: which model version.
         method: ``ukf``, the augmented unscented Kalman filter, or ``least-squares`` on the
             inverse dynamics.
-        engine: ``compiled``, or ``filterpy``, slow, which gives the same numbers.
+        engine: ``compiled``; ``filterpy``, slow, which gives the same numbers; or ``augmented``,
+            slow, with measurement noise in the state, which gives nearly the same.
         form: ``square_root`` or ``covariance`` form of the filter.
         measure: ``position``, or ``position_velocity`` as in the paper; filtered velocities are
             not white, so intervals from them are too narrow.
