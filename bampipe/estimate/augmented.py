@@ -118,9 +118,9 @@ def _filter(
         joint = deviation.T @ (in_covariance[:, None] * deviation)
         if np.isfinite(trial.y[k]).all():
             expected = images[0] + in_mean @ (images - images[0])
-            error = images - expected
-            s = error.T @ (in_covariance[:, None] * error)
-            gain = np.linalg.solve(s, error.T @ (in_covariance[:, None] * deviation)).T
+            unlike = images - expected
+            s = unlike.T @ (in_covariance[:, None] * unlike)
+            gain = np.linalg.solve(s, unlike.T @ (in_covariance[:, None] * deviation)).T
             innovation[k] = trial.y[k] - expected
             innovation_sd[k] = np.sqrt(np.diag(s))
             nis[k] = innovation[k] @ np.linalg.solve(s, innovation[k])

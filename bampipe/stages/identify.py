@@ -19,9 +19,11 @@ from bampipe.stages.base import Progress, RunFolder
 from bampipe.stages.estimates import content
 from bampipe.stages.filter_choice import FilterChoice, check_among, check_choice
 from bampipe.stages.filter_estimate import estimate_by_filter
+from bampipe.stages.filter_run import trial_of
 from bampipe.stages.identifiability import identifiability
 from bampipe.stages.modelfile import load_model, model_inputs
 from bampipe.stages.motions import problem_of, read_motions
+from bampipe.stages.output_estimate import estimate_by_output
 from bampipe.stages.recordings import read_session, recipe_of
 from bampipe.stages.sensor_noise import sensor_noise
 from bampipe.stages.squares_estimate import (
@@ -34,7 +36,7 @@ from bampipe.stages.squares_estimate import (
 NAME = "identify"
 SUMMARY = "Parameters of the model with uncertainties, from the free trials"
 
-METHODS = ("ukf", "least-squares")
+METHODS = ("ukf", "least-squares", "output-error")
 Array = NDArray[np.float64]
 
 
@@ -44,8 +46,8 @@ class Config(FilterChoice):
 
     Attributes:
         model: which model version.
-        method: ``ukf``, the augmented unscented Kalman filter, or ``least-squares`` on the
-            inverse dynamics.
+        method: ``ukf``, the augmented unscented Kalman filter; ``least-squares`` on the inverse
+            dynamics; or ``output-error``, the motion simulated in pieces against the positions.
         engine: ``compiled``; ``filterpy``, slow, which gives the same numbers; or ``augmented``,
             slow, with measurement noise in the state, which gives nearly the same.
         form: ``square_root`` or ``covariance`` form of the filter.
@@ -122,6 +124,10 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         estimate = estimate_by_filter(
             run, system, motions, start, squares, noise, config, config.model, progress
         )
+    elif config.method == "output-error":
+        progress(0.3, "output error")
+        trials = [trial_of(run, motion, system, noise, 1, config) for motion in motions]
+        estimate = estimate_by_output(system, motions, trials, squares, progress)
     else:
         estimate = estimate_by_squares(system, motions, squares)
     progress(0.97, "what the trials can say")

@@ -76,6 +76,18 @@ def test_least_squares(simulated: RunFolder) -> None:
     assert len(trace) == 2
 
 
+def test_output_error(simulated: RunFolder) -> None:
+    content = identified(simulated, replace(FAST, method="output-error"))
+    assert_recovered(content, TRUTH)
+    z = [
+        (content["parameters"][name]["estimate"] - value) / content["parameters"][name]["sd"]
+        for name, value in TRUTH.items()
+    ]
+    assert np.sqrt(np.mean(np.square(z))) < 2.0
+    assert content["convergence"]["converged"]
+    assert all(0.0 < error < 1e-3 for error in content["position_error"].values())
+
+
 def test_velocity_may_be_measured_too(simulated: RunFolder) -> None:
     """Filtered velocities are neither white nor unbiased: why positions alone are the default."""
     content = identified(simulated, replace(FAST, measure="position_velocity"))
