@@ -11,6 +11,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import numba
 import numpy as np
 import pytest
 
@@ -51,8 +52,10 @@ def load(path: Path) -> ModuleType:
 
 
 @pytest.fixture
-def function(tmp_path: Path) -> Any:
+def function(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     """Compile a function that calls another; returns how to load both again, and their files."""
+    # Beside the sources, wherever the environment keeps the code of other modules.
+    monkeypatch.setattr(numba.config, "CACHE_DIR", "")
     folder = tmp_path / "code"
     folder.mkdir()
 

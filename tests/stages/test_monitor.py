@@ -174,6 +174,8 @@ def test_follows_a_growing_file_until_told_to_stop(run: RunFolder, tmp_path: Pat
     process = subprocess.Popen(
         [sys.executable, "-m", "bampipe", "monitor", str(log), "--device", "bam", "--every", "0.5"],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        # Tests run in the background by a shell inherit that Ctrl-C is ignored.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )  # fmt: skip
     assert process.stdout is not None
     first = json.loads(process.stdout.readline())
@@ -183,7 +185,7 @@ def test_follows_a_growing_file_until_told_to_stop(run: RunFolder, tmp_path: Pat
     while later["samples"] < 2500:
         later = json.loads(process.stdout.readline())
     process.send_signal(signal.SIGINT)
-    out, errors = process.communicate(timeout=30)
+    out, errors = process.communicate(timeout=60)
     assert process.returncode == 0, errors
     assert 0 < first["samples"] <= 1499  # a line half written waits for its end
     assert json.loads(out.splitlines()[-1])["bad_lines"] == 1
