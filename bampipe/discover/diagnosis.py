@@ -64,8 +64,11 @@ class Settings:
         above_floor: error over floor beyond which an axis still lacks something, if some of it
             could be predicted from the motion.
         surely: error over floor beyond which it lacks something, predictable or not.
-        explained: least share of the excess error that the effects found must remove, else the
-            axis is reported as unknown.
+        explained: least share of the excess mean square that the effects found must remove, else
+            the axis is reported as unknown.
+        far: error over floor with the effects found beyond which they must remove more.
+        explained_far: that share: an effect that only resembles the missing one, such as a spring
+            in place of a stop, removes much and leaves many times the floor.
         jobs: worker processes.
         seed: of all noise.
     """
@@ -81,6 +84,8 @@ class Settings:
     above_floor: float = 1.3
     surely: float = 2.0
     explained: float = 0.6
+    far: float = 5.0
+    explained_far: float = 0.9
     jobs: int = 2
     seed: int = 0
 
@@ -419,7 +424,7 @@ class _Search:
             lacking = bool(above > s.surely or (above > s.above_floor and share > 0.05))
             verdict = "missing" if here else "nothing_missing"
             explained = max(0.0, 1.0 - left / max(excess, 1e-30)) if here else 0.0
-            if lacking and explained < s.explained:
+            if lacking and explained < (s.explained_far if above > s.far else s.explained):
                 verdict = "unknown_effect"
                 unknown |= {n for n in here if main[n] == axis}
             findings.append(
