@@ -194,10 +194,11 @@ def _sentence(axis: str, i: int, found: Diagnosis, shape: str) -> str:
     error = a.rmse_before if a.nearest else a.rmse_after
     if a.verdict == "missing":
         words = " and ".join(a.effects)
+        verb, it = ("is", "it") if len(a.effects) == 1 else ("are", "them")
         alike = [g for n in a.effects for g in found.groups.get(n, ())]
-        also = f" (these trials cannot tell it from {', '.join(alike)})" if alike else ""
+        also = f" (these trials cannot tell {it} from {', '.join(alike)})" if alike else ""
         return (
-            f"{axis.capitalize()}: {words} is missing{also}; adding it takes the held-out error "
+            f"{axis.capitalize()}: {words} {verb} missing{also}; adding {it} takes the held-out error "
             f"from {a.rmse_before:.3g} to {a.rmse_after:.3g} {unit}, {ratio:.2f} times the noise "
             f"floor."
         ) + (
