@@ -198,9 +198,9 @@ def _sentence(axis: str, i: int, found: Diagnosis, shape: str) -> str:
         alike = [g for n in a.effects for g in found.groups.get(n, ())]
         also = f" (these trials cannot tell {it} from {', '.join(alike)})" if alike else ""
         return (
-            f"{axis.capitalize()}: {words} {verb} missing{also}; adding {it} takes the held-out error "
-            f"from {a.rmse_before:.3g} to {a.rmse_after:.3g} {unit}, {ratio:.2f} times the noise "
-            f"floor."
+            f"{axis.capitalize()}: {words} {verb} missing{also}; adding {it} takes the held-out "
+            f"error from {a.rmse_before:.3g} to {a.rmse_after:.3g} {unit}, {ratio:.2f} times the "
+            f"noise floor."
         ) + (
             f" What is left no effect in the library explains; its shape: {shape}."
             if a.remains
