@@ -13,6 +13,7 @@ from bampipe.data import store
 from bampipe.errors import InputError
 from bampipe.stages import validate
 from bampipe.stages.base import RunFolder
+from bampipe.stages.filter_run import stride_of
 from bampipe.stages.motions import Motion, put_aside
 from bampipe.stages.shelf import Shelf, in_order
 
@@ -80,3 +81,14 @@ def test_the_trials_of_a_table_with_and_without_a_row_group_each(tmp_path: Path)
     store.write_parquet(tmp_path / "none.parquet", {"t": np.arange(3.0)})
     with pytest.raises(InputError, match="no column 'trial_id'"):
         store.trial_ids(tmp_path / "none.parquet")
+
+
+def test_what_the_filter_stores_is_bounded_in_a_trial_and_in_all() -> None:
+    def stride(*sizes: int) -> int:
+        return stride_of([SimpleNamespace(t=np.empty(size)) for size in sizes])  # type: ignore[misc]
+
+    assert stride(8000, 8000, 8000) == 1
+    assert stride(20_001) == 2
+    assert stride(*[8000] * 25) == 1
+    assert stride(*[8000] * 26) == 2
+    assert stride(*[4000] * 2500) == 50

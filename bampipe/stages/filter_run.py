@@ -28,7 +28,7 @@ from bampipe.stages.shelf import in_order
 
 Array = NDArray[np.float64]
 
-_STORED = 20_000
+_STORED, _STORED_IN_ALL = 20_000, 200_000
 """Most distributions stored of one trial: memory must not grow with the log."""
 _COARSE = 300.0
 """Factor on the process noise of the search for the region of the answer."""
@@ -74,7 +74,8 @@ class FilterRun:
 
 def stride_of(motions: Sequence[Motion]) -> int:
     """Return every how many samples the filter stores its distribution."""
-    return -(-max(motion.t.size for motion in motions) // _STORED)
+    sizes = [motion.t.size for motion in motions]
+    return max(-(-max(sizes) // _STORED), -(-sum(sizes) // _STORED_IN_ALL))
 
 
 def trial_of(
