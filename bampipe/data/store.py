@@ -13,6 +13,8 @@ import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
 from types import TracebackType
@@ -165,7 +167,10 @@ def read_parquet(
     if not path.is_file():
         raise InputError("no such file", where=str(path))
     try:
-        with pq.ParquetFile(path, memory_map=False) as file:
+        footer = _footer(path) if trial is not None else None
+        with pq.ParquetFile(
+            path, metadata=None if footer is None else footer.metadata, memory_map=False
+        ) as file:
             names = file.schema_arrow.names
             wanted = list(columns) if columns is not None else names
             for name in [*wanted, *(["trial_id"] if trial is not None else [])]:
@@ -173,9 +178,9 @@ def read_parquet(
                     raise InputError(
                         f"no column '{name}'", where=str(path), remedy=f"it has {', '.join(names)}"
                     )
-            if trial is None:
+            if trial is None or footer is None:
                 return file.read(columns=wanted).select(wanted).to_pandas()
-            table = _read_trial(file, wanted, trial)
+            table = _read_trial(file, wanted, trial, footer.groups.get(trial, ()))
     except (pa.ArrowException, OSError) as error:
         raise InputError(
             "not a sound Parquet file", where=str(path), remedy="make it again (--force)"
@@ -186,7 +191,7 @@ def read_parquet(
 
 
 def trial_ids(path: Path) -> frozenset[str]:
-    """The trials that a Parquet file has rows of; data are read only where its footer is silent.
+    """The trials that a Parquet file has rows of.
 
     Raises:
         InputError: no such file, or not a sound Parquet file with ``trial_id``.
@@ -194,24 +199,15 @@ def trial_ids(path: Path) -> frozenset[str]:
     path = Path(path)
     if not path.is_file():
         raise InputError("no such file", where=str(path))
-    found: set[str] = set()
     try:
-        with pq.ParquetFile(path, memory_map=False) as file:
-            if "trial_id" not in file.schema_arrow.names:
-                raise InputError("no column 'trial_id'", where=str(path))
-            column = file.schema_arrow.names.index("trial_id")
-            for group in range(file.num_row_groups):
-                limits = file.metadata.row_group(group).column(column).statistics
-                if limits is not None and limits.has_min_max and limits.min == limits.max:
-                    found.add(str(limits.min))
-                else:
-                    table = file.read_row_group(group, columns=["trial_id"])
-                    found.update(map(str, table.column("trial_id").unique().to_pylist()))
+        footer = _footer(path)
     except (pa.ArrowException, OSError) as error:
         raise InputError(
             "not a sound Parquet file", where=str(path), remedy="make it again (--force)"
         ) from error
-    return frozenset(found)
+    if "trial_id" not in footer.metadata.schema.names:
+        raise InputError("no column 'trial_id'", where=str(path))
+    return frozenset(footer.groups)
 
 
 def sha256_file(path: Path) -> str:
@@ -320,13 +316,45 @@ def _trial_bounds(table: pa.Table) -> list[int]:
     return [0, *(np.flatnonzero(ids[1:] != ids[:-1]) + 1).tolist(), table.num_rows]
 
 
-def _read_trial(file: pq.ParquetFile, wanted: list[str], trial: str) -> pa.Table:
-    column = file.schema_arrow.names.index("trial_id")
-    groups = []
-    for group in range(file.num_row_groups):
-        limits = file.metadata.row_group(group).column(column).statistics
-        if limits is None or not limits.has_min_max or limits.min <= trial <= limits.max:
-            groups.append(group)
+@dataclass(frozen=True)
+class _Footer:
+    """What is known of a Parquet file before its data: row groups by the trial they hold."""
+
+    metadata: pq.FileMetaData
+    groups: Mapping[str, tuple[int, ...]]
+
+
+def _footer(path: Path) -> _Footer:
+    """The footer of a file, read once as long as it is the same file.
+
+    Reading it takes time in proportion to the number of trials: once a trial would be too often.
+    """
+    status = path.stat()
+    return _read_footer(path, status.st_ino, status.st_size, status.st_mtime_ns)
+
+
+@lru_cache(maxsize=8)
+def _read_footer(path: Path, inode: int, size: int, changed_ns: int) -> _Footer:
+    groups: dict[str, list[int]] = {}
+    with pq.ParquetFile(path, memory_map=False) as file:
+        metadata = file.metadata
+        if "trial_id" in metadata.schema.names:
+            column = metadata.schema.names.index("trial_id")
+            for group in range(metadata.num_row_groups):
+                limits = metadata.row_group(group).column(column).statistics
+                if limits is not None and limits.has_min_max and limits.min == limits.max:
+                    held = [str(limits.min)]
+                else:
+                    table = file.read_row_group(group, columns=["trial_id"])
+                    held = [str(name) for name in table.column("trial_id").unique().to_pylist()]
+                for name in held:
+                    groups.setdefault(name, []).append(group)
+    return _Footer(metadata, {name: tuple(found) for name, found in groups.items()})
+
+
+def _read_trial(
+    file: pq.ParquetFile, wanted: list[str], trial: str, groups: Sequence[int]
+) -> pa.Table:
     if not groups:
         return file.schema_arrow.empty_table().select(wanted)
     table = file.read_row_groups(groups, columns=list(dict.fromkeys([*wanted, "trial_id"])))
