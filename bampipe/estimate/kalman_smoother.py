@@ -117,8 +117,10 @@ def _filter(
             _predict(x, p, step, noise, work)
         if seen[t]:
             innovations[t], spreads[t] = _update(x, p, y[t], gains[t])
-        states[t] = x
-        covariances[t] = p
+        for i in range(x.shape[0]):
+            states[t, i] = x[i]
+            for j in range(x.shape[0]):
+                covariances[t, i, j] = p[i, j]
 
 
 @njit(cache=True)
