@@ -55,6 +55,8 @@ def load(path: Path) -> ModuleType:
 def function(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     """Compile a function that calls another; returns how to load both again, and their files."""
     # Beside the sources, wherever the environment keeps the code of other modules.
+    # The variable too: numba reads it again when it first compiles.
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
     monkeypatch.setattr(numba.config, "CACHE_DIR", "")
     folder = tmp_path / "code"
     folder.mkdir()
