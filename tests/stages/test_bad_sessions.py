@@ -341,6 +341,8 @@ REFUSED: dict[str, tuple[Damage, str]] = {
 # name: (damage of the first trial, what its reason must say)
 ASIDE: dict[str, tuple[Damage, str]] = {
     "empty file": (file(""), r"^trials/t01.csv: the file is empty$"),
+    "a byte order mark and nothing else": (file(b"\xfe\xff"), "the file holds no text"),
+    "blank lines only": (file("\n  \n\n"), "the file holds no text"),
     "header only": (text(lambda s: s.split("\n")[0] + "\n"), "a header but no samples"),
     "header without line end": (text(lambda s: s.split("\n")[0]), "a header but no samples"),
     "binary garbage": (file(np.random.default_rng(0).bytes(5000)), "binary data, not text"),

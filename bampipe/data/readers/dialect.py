@@ -83,6 +83,8 @@ def find_layout(head: bytes, columns: Sequence[str], dialect: Dialect, name: str
         InputError: no header, a column missing, or a layout that can be read in two ways.
     """
     lines = _lines(head, name)
+    if not any(line.text.strip() for line in lines):
+        raise InputError("the file holds no text", where=name)
     delimiters = [dialect.delimiter] if dialect.delimiter else list(DELIMITERS)
     place, delimiter, header = _header(lines, columns, dialect, delimiters, name)
     body = lines[place + 1 :]
