@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -16,6 +17,7 @@ sys.path.insert(0, str(TOYS))
 import install_toys  # noqa: E402
 
 import bampipe.stages  # noqa: E402
+from bampipe.data import schema  # noqa: E402
 from bampipe.run import pipeline as pipelines  # noqa: E402
 from bampipe.run.events import Event  # noqa: E402
 from bampipe.run.request import Outcome, Request  # noqa: E402
@@ -64,6 +66,18 @@ def contents(root: Path) -> dict[str, bytes]:
         and path.name != "run.json"
         and path.relative_to(root).parts[0] != ".bampipe"
     }
+
+
+def misfits(root: Path) -> list[str]:
+    """What the JSON files of a run, a lab or a simulation have that their schemas do not allow."""
+    found = []
+    for path in sorted(root.rglob("*.json")):
+        if ".bampipe" in path.parts:
+            continue
+        name = "ingest" if path.parent.name == "ingest" else path.stem.rpartition(".")[2]
+        content = json.loads(path.read_text(encoding="utf-8"))
+        found += [str(fault) for fault in schema.faults(content, name, str(path))]
+    return found
 
 
 @pytest.fixture

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -12,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from conftest import contents
+from conftest import contents, misfits
 
 ROOT = Path(__file__).parent.parent
 SESSION = ROOT / "sample_runs" / "first"
@@ -21,9 +22,9 @@ AXES = ("yaw", "pitch", "extension")
 pytestmark = pytest.mark.slow
 
 
-def bampipe(folder: Path, *arguments: object) -> subprocess.CompletedProcess[str]:
+def bampipe(folder: Path, *arguments: object, **variables: str) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "bampipe", *map(str, arguments)]
-    environment = {**os.environ, "SOURCE_DATE_EPOCH": "0"}
+    environment = {**os.environ, "SOURCE_DATE_EPOCH": "0", **variables}
     return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
 
 
@@ -99,6 +100,11 @@ def test_the_fields_other_programs_read(run: Path) -> None:
         assert finite(json.loads(path.read_text())), path
 
 
+def test_every_json_file_is_as_its_schema_says(run: Path) -> None:
+    assert len(list(run.rglob("*.json"))) > 9
+    assert misfits(run) == []
+
+
 def test_nothing_changed_nothing_runs_and_soon(run: Path) -> None:
     start = time.perf_counter()
     done = bampipe(run.parent.parent, "run", SESSION, "--json")
@@ -110,7 +116,13 @@ def test_nothing_changed_nothing_runs_and_soon(run: Path) -> None:
 
 
 def test_twice_the_same_bytes(run: Path, tmp_path: Path) -> None:
-    done = bampipe(tmp_path, "run", SESSION)
+    """Elsewhere, in another process for each trial, with other hashes and threads: the same."""
+    shutil.copytree(SESSION, tmp_path / "moved" / "first")
+    variables = {
+        "PYTHONHASHSEED": "7", "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1",
+        "NUMBA_NUM_THREADS": "1", "LC_ALL": "C", "TZ": "Asia/Tokyo", "COLUMNS": "40",
+    }  # fmt: skip
+    done = bampipe(tmp_path, "run", "moved/first", "--jobs", "2", **variables)
     assert done.returncode == 0, done.stderr
     first, second = contents(run), contents(tmp_path / "runs" / "first")
     assert set(first) == set(second)

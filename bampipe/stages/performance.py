@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.data.store import read_parquet, write_json
+from bampipe.errors import InputError
 from bampipe.physics import System, compile_model
 from bampipe.stages.base import Progress, RunFolder
 from bampipe.stages.modelfile import load_model, model_inputs
@@ -53,7 +54,13 @@ def outputs(config: Config) -> tuple[str, ...]:
 
 
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
-    """Map joint stiffness, friction and inertia to the handle over the poses of the session."""
+    """Map joint stiffness, friction and inertia to the handle over the poses of the session.
+
+    Raises:
+        InputError: a setting out of range, or a handle that no pose lets move every way.
+    """
+    if config.points < 2:
+        raise InputError("must be 2 or more", where="performance.points")
     run.require(f"models/{config.model}/identify.json", "identify")
     identified = run.read_json(f"models/{config.model}/identify.json")["parameters"]
     system = compile_model(load_model(run, config.model))
@@ -137,14 +144,21 @@ def _handle(
     no_input = np.zeros((len(grid), len(system.inputs)))
     gain = system.input_map(grid, no_input, p)
     regular = np.abs(np.linalg.det(gain)) > 1e-9
+    if not regular.any():
+        raise InputError(
+            "no pose of the session lets the handle move in every direction",
+            where=f"device {device.name!r}",
+            remedy="look at its forces and velocities with `bampipe device show`",
+        )
     back = np.linalg.inv(gain[regular])
+    swept = "m" if len(axes) == 1 else f"m{len(axes)}"
     entry: dict[str, object] = {
         "directions": list(device.components),
-        "workspace": {"value": _volume(system, reach, p, points), "unit": "m3"},
+        "workspace": {"value": _volume(system, reach, p, points), "unit": swept},
     }
     if all(limit is not None for limit in limits):
         whole = np.array(limits, dtype=float)
-        entry["workspace_limits"] = {"value": _volume(system, whole, p, points), "unit": "m3"}
+        entry["workspace_limits"] = {"value": _volume(system, whole, p, points), "unit": swept}
     coulomb = np.array(
         [identified.get(f"coulomb.{axis}", {}).get("estimate", 0.0) for axis in axes]
     )
@@ -167,7 +181,7 @@ def _grid(reach: Array, points: int) -> Array:
 
 
 def _volume(system: System, reach: Array, p: Array, points: int) -> float:
-    """Return the volume that the handle sweeps, m3, by the midpoint rule."""
+    """Return the volume that the handle sweeps (area, length), by the midpoint rule."""
     width = (reach[:, 1] - reach[:, 0]) / points
     inner = np.stack([reach[:, 0] + width / 2.0, reach[:, 1] - width / 2.0], axis=1)
     grid = _grid(inner, points)
@@ -180,7 +194,8 @@ def _range(values: Array, unit: str) -> dict[str, object]:
 
 
 def _headline(handle: Mapping[str, Any]) -> str:
-    parts = [f"workspace moved through {handle['workspace']['value']:.2g} m3"]
+    swept = handle["workspace"]
+    parts = [f"workspace moved through {swept['value']:.2g} {swept['unit']}"]
     for name, unit in (("stiffness", "N/m"), ("friction", "N"), ("inertia", "kg")):
         if name in handle:
             entry = handle[name]

@@ -4,11 +4,11 @@ import re
 
 import numpy as np
 import pytest
+from sessions import bam, made
 
 from bampipe.discover.chance import Session, fit_session, system_of
 from bampipe.discover.description import describe
 from bampipe.discover.diagnosis import Settings, diagnose
-from tests.discover.sessions import bam, made
 
 QUICK = Settings(replicates=5, final_replicates=4, jobs=2)
 

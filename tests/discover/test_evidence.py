@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 from scipy.signal import butter, sosfiltfilt
+from sessions import RATE, SENSORS, TRUTH, bam, made
 
 from bampipe.discover.chance import system_of
 from bampipe.discover.evidence import fit, moving, velocity_sd
 from bampipe.discover.recording import Motion
 from bampipe.estimate.low_pass import Band
-from tests.discover.sessions import RATE, SENSORS, TRUTH, bam, made
 
 
 def test_thinning_equals_the_library_filter_away_from_the_ends():

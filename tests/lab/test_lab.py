@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from conftest import misfits
 from made_runs import Made
 
 from bampipe.data import lab_tables
@@ -100,6 +101,17 @@ def test_what_was_not_diagnosed_is_said(tmp_path: Path) -> None:
     found = verdicts(make_lab(tmp_path, {3: unasked, 4: above}))
     assert found["s03"]["verdict"] == found["s04"]["verdict"] == "not diagnosed"
     assert found["s04"]["remedy"] == "bampipe diagnose s04 --model base"
+
+
+@pytest.mark.parametrize("sessions", [2, 9])
+def test_its_json_files_are_as_their_schemas_say(tmp_path: Path, sessions: int) -> None:
+    drifted = changed(2, estimates(2, coulomb__yaw=4.9), verdicts=MISSING)
+    collect(make_lab(tmp_path, {2: drifted}, sessions), tmp_path / "lab", report=False)
+    assert sorted(path.name for path in (tmp_path / "lab").glob("*.json")) == [
+        "lab.json",
+        "trends.json",
+    ]
+    assert misfits(tmp_path / "lab") == []
 
 
 def test_every_table_in_one_line(tmp_path: Path) -> None:

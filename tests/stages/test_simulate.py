@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from conftest import misfits
 from scipy.optimize import least_squares
 from scipy.signal import butter, sosfiltfilt
 
@@ -76,6 +77,7 @@ def test_same_seed_same_bytes_other_seed_other_motion(tmp_path):
 def test_truth_is_beside_and_never_inside(tmp_path):
     out, truth, _ = make(tmp_path, effects=("stribeck:yaw=0.5",), duration=1.0, trials=1)
     assert truth["effects"] == {"stribeck:yaw": 0.5}
+    assert misfits(tmp_path) == []
     assert truth["parameters"]["stribeck.yaw.force"] == pytest.approx(0.6)
     for path in out.rglob("*"):
         if path.is_file():

@@ -105,6 +105,11 @@ def test_a_session_without_a_field_says_so(run: RunFolder) -> None:
         found(run, replace(viscous.Config(), block_s=0.0))
 
 
+def test_a_setting_of_performance_that_makes_no_sense_is_refused(run: RunFolder) -> None:
+    with pytest.raises(InputError, match=r"performance\.points: must be 2 or more"):
+        performance.execute(run, run.root, performance.Config(points=1), silent)
+
+
 def test_performance_at_the_handle(run: RunFolder) -> None:
     performance.execute(run, run.root, performance.Config(), silent)
     content = read_json(run.path("models/base/performance.json"))
