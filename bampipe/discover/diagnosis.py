@@ -2,9 +2,10 @@
 
 1. Every candidate is refitted with the model and scored on trials left out.
 2. The same is done with replays of the fitted model, which lack nothing: the chance level.
-3. The best candidate that beats chance is added, and so on until none does. Candidates that come
-   close to the best are told apart by replaying each of them: the pattern of all their scores must
-   look like the measured one. Those that pass alike are reported as one group.
+3. The best candidate that beats chance is added, and so on until none does; later ones must also
+   beat replays of the model with those before them. Candidates that come close to the best are
+   told apart by replaying each of them: the pattern of all their scores must look like the
+   measured one. Those that pass alike are reported as one group.
 4. What is left is compared with the noise floor of the final model, found by replaying it.
 """
 
@@ -159,7 +160,7 @@ class Diagnosis:
 
 
 class _Chance:
-    """Mean and scatter of candidates' scores on replays of the bare model, found as needed.
+    """Mean and scatter of candidates' scores on replays of one model, found as needed.
 
     A candidate that gains nothing on the measured trials needs no chance level; most gain nothing.
     """
@@ -268,21 +269,22 @@ class _Search:
         self.progress(0.05, "scoring every candidate on the measured trials")
         first = self._scores(self.recipe, self.initial.p, self.names)
         self.progress(0.15, "replaying the model for chance levels")
-        scorer = Scorer(self.initial)
-        chance = _Chance(
-            lambda names: self._replicas(self.recipe, self.initial.p, s.replicates, names, (0,)),
-            self._gaining(first, scorer),
-            len(self.names),
-            float(scorer.independent.mean()),
-        )
+        asked = self._gaining(first, Scorer(self.initial))
+        chance = self._chance(self.recipe, self.initial, asked, (0,))
         recipe, evidence, scores = self.recipe, self.initial, first
         selected: list[str] = []
         replayed = chance.replicates
         while len(selected) < s.most_effects:
-            able = self._able(scores, chance, evidence, replayed)
+            known = chance
+            able = self._able(scores, known, evidence, replayed)
+            if able and selected:
+                # What a model with the first effects leaves by chance may look like another one.
+                close = {name: scores[name] for _, name in able}
+                known = self._chance(recipe, evidence, list(close), (4, len(selected)))
+                able = self._able(close, known, evidence, replayed)
             if not able:
                 break
-            best = self._choose(able, chance, recipe, evidence, scores)
+            best = self._choose(able, known, recipe, evidence, scores)
             selected.append(best)
             self.progress(0.45 + 0.1 * len(selected), f"added {best}, looking for more")
             recipe = replace(self.recipe, effects=(*self.recipe.effects, *selected))
@@ -295,6 +297,17 @@ class _Search:
         self.progress(0.85, "replaying the final model for its noise floor")
         final = self._replicas(recipe, evidence.p, s.final_replicates, (), (1,), share=True)
         return self._conclude(chance, first, selected, evidence, final)
+
+    def _chance(
+        self, recipe: Recipe, evidence: Evidence, asked: Sequence[str], seed: tuple[int, ...]
+    ) -> _Chance:
+        count = self.settings.replicates
+        return _Chance(
+            lambda names: self._replicas(recipe, evidence.p, count, names, seed),
+            asked,
+            len(self.names),
+            float(Scorer(evidence).independent.mean()),
+        )
 
     def _replicas(
         self,

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from bampipe.estimate.butterworth import zero_phase
+from bampipe.estimate.butterworth import rates, zero_phase
 from bampipe.physics import System
-from bampipe.physics.device import derivative
+from bampipe.physics.device import INPUT_ORDERS, derivative
 
 Array = NDArray[np.float64]
 
@@ -95,15 +95,9 @@ def observe(recording: Recording, sensors: Sensors, system: System) -> Motion:
     t = np.arange(len(recording.q)) / rate
     channels: dict[str, Array] = {"t": t, **recording.other}
     for name, column in zip(device.forces, recording.force.T, strict=True):
-        _, first, second = zero_phase(column, rate, cutoff)
-        _, third, fourth = zero_phase(second, rate, cutoff)
-        channels |= {
-            name: column,
-            derivative(name, 1): first,
-            derivative(name, 2): second,
-            derivative(name, 3): third,
-            derivative(name, 4): fourth,
-        }
+        channels[name] = column
+        found = rates(column, rate, cutoff, len(INPUT_ORDERS) - 1)
+        channels |= {derivative(name, k): values for k, values in enumerate(found, start=1)}
     for i, axis in enumerate(system.coordinates):
         if axis in device.brakes:
             channels[device.brakes[axis]] = recording.brake[:, i]

@@ -56,6 +56,18 @@ def zero_phase(
     return x[inner], velocity, acceleration
 
 
+def rates(values: Array, rate_hz: float, cutoff_hz: float, count: int) -> list[Array]:
+    """Return the first ``count`` time derivatives of ``values`` (T,), each (T,), band-limited.
+
+    Two orders come from each pass of :func:`zero_phase`, so that higher ones are smoothed more.
+    """
+    found: list[Array] = []
+    while len(found) < count:
+        _, first, second = zero_phase(found[-1] if found else values, rate_hz, cutoff_hz)
+        found += [first, second]
+    return found[:count]
+
+
 def smooth(
     position: Array, rate_hz: float, cutoff_hz: float, noise_sd: float, order: int = 2
 ) -> Derivatives:

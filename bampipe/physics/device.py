@@ -128,7 +128,7 @@ class Device:
         return tuple(name.removeprefix("force_") for name in self.forces)
 
 
-INPUT_ORDERS = ("", "rate", "curvature", "third", "fourth")
+INPUT_ORDERS = ("", "rate", "curvature", "third", "fourth", "fifth", "sixth")
 """Time derivatives of a measured input that effects may use, by order."""
 
 

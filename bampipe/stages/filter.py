@@ -19,7 +19,7 @@ from bampipe.estimate.differentiation import (
     UniformGrid,
     uniform_grid,
 )
-from bampipe.physics.device import derivative
+from bampipe.physics.device import INPUT_ORDERS, derivative
 from bampipe.stages.base import Progress, RunFolder
 
 NAME = "filter"
@@ -285,15 +285,14 @@ def _forces(
     names = [str(name) for name in frame.columns if name not in taken]
     forces = {name: grid.resample(frame[name].to_numpy(dtype=np.float64)) for name in names}
     cutoff = min(cutoff_hz, 0.2 * rate)
-    slopes = {name: butterworth.zero_phase(force, rate, cutoff) for name, force in forces.items()}
+    highest = len(INPUT_ORDERS) - 1
+    slopes = {n: butterworth.rates(force, rate, cutoff, highest) for n, force in forces.items()}
     yield from forces.items()
-    for name, (_, slope, _) in slopes.items():
-        yield derivative(name, 1), slope
-    for name, (_, _, curvature) in slopes.items():
-        yield derivative(name, 2), curvature
-        _, third, fourth = butterworth.zero_phase(curvature, rate, cutoff)
-        yield derivative(name, 3), third
-        yield derivative(name, 4), fourth
+    for name, found in slopes.items():
+        yield derivative(name, 1), found[0]
+    for name, found in slopes.items():
+        for order, values in enumerate(found[1:], start=2):
+            yield derivative(name, order), values
 
 
 def _report(

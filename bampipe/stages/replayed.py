@@ -16,7 +16,7 @@ from bampipe.estimate import butterworth, kalman_smoother, savitzky_golay
 from bampipe.estimate.differentiation import Derivatives
 from bampipe.estimate.hysteresis import noise_of
 from bampipe.physics import System
-from bampipe.physics.device import derivative
+from bampipe.physics.device import INPUT_ORDERS, derivative
 from bampipe.stages.motions import Motion, put_aside
 
 Array = NDArray[np.float64]
@@ -105,10 +105,9 @@ def _filtered(
     cutoff = settings["force"]["derivative_cutoff_hz"]
     at = {name: place for place, name in enumerate(system.inputs)}
     for column, name in enumerate(system.model.device.forces):
-        _, first, second = butterworth.zero_phase(recording.force[:, column], rate, cutoff)
-        u[:, at[name]], u_rate[:, at[name]] = recording.force[:, column], first
-        _, third, fourth = butterworth.zero_phase(second, rate, cutoff)
-        for order, values in enumerate((first, second, third, fourth), start=1):
+        found = butterworth.rates(recording.force[:, column], rate, cutoff, len(INPUT_ORDERS) - 1)
+        u[:, at[name]], u_rate[:, at[name]] = recording.force[:, column], found[0]
+        for order, values in enumerate(found, start=1):
             if derivative(name, order) in at:
                 u[:, at[derivative(name, order)]] = values
     return replace(

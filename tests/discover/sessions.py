@@ -67,7 +67,7 @@ def made(
             channels[name] = need[:, k] / lever[:, k]
             head, _, component = name.rpartition("_")
             channels[f"{head}_rate_{component}"] = np.gradient(channels[name], t)
-            for order in ("curvature", "third", "fourth"):
+            for order in ("curvature", "third", "fourth", "fifth", "sixth"):
                 channels[f"{head}_{order}_{component}"] = np.zeros(len(t))
         wanted = Motion(f"t{trial + 1:02d}", t, q, qd, qdd, channels)
         recording = replay(system, p, wanted, SENSORS, np.random.default_rng([11, trial]))

@@ -82,7 +82,9 @@ def inputs_of(system, force, force_rate, force_curvature, brake, t):
         columns[f"force_curvature_{c}"] = force_curvature[:, j]
         # 250 Hz, the rate of `smooth_motion`.
         columns[f"force_third_{c}"] = 250.0 * np.gradient(force_curvature[:, j])
-        columns[f"force_fourth_{c}"] = 250.0 * np.gradient(columns[f"force_third_{c}"])
+        lower = columns[f"force_third_{c}"]
+        for order in ("fourth", "fifth", "sixth"):
+            lower = columns[f"force_{order}_{c}"] = 250.0 * np.gradient(lower)
     columns |= {f"brake_{a}": brake[:, i] for i, a in enumerate(AXES)}
     return np.column_stack([columns[name] for name in system.inputs])
 
@@ -208,7 +210,7 @@ def symbols_of(case):
     known = {c.name: dimension(c.unit) for c in BAM.coordinates}
     known |= {name: dimension(c.unit) for name, c in BAM.constants.items()}
     known |= {"rho": dimension("m"), "mass": dimension("kg"), "t": dimension("s")}
-    for k, order in enumerate(("", "rate_", "curvature_", "third_", "fourth_")):
+    for k, order in enumerate(("", "rate_", "curvature_", "third_", "fourth_", "fifth_", "sixth_")):
         slope = tuple(np.subtract(newton, (0, 0, k)))
         known |= {f"force_{order}{c}": slope for c in "xyz"}
         if bound.effect.scope in ("force_component", "force_pair"):

@@ -29,14 +29,14 @@ def smooth(system, seed=5):
         w = 2 * np.pi * rng.uniform(0.3, 1.5, 6)
         phase, scale = rng.uniform(0, 6.28, 6), size * rng.normal(size=6)
         angle = w[:, None] * t + phase[:, None]
-        return [scale @ (w[:, None] ** k * np.sin(angle + k * np.pi / 2)) for k in range(5)]
+        return [scale @ (w[:, None] ** k * np.sin(angle + k * np.pi / 2)) for k in range(7)]
 
     rotary = system.model.device.coordinates[0].kind == "rotary"
-    q, qd, qdd, _, _ = waves(0.3 if rotary else 0.02)
+    q, qd, qdd, *_ = waves(0.3 if rotary else 0.02)
     columns = {"t": t}
     for force in system.model.device.forces:
         for k, column in enumerate(waves(0.3 if rotary else 60.0)):
-            kind = ("", "rate", "curvature", "third", "fourth")[k]
+            kind = ("", "rate", "curvature", "third", "fourth", "fifth", "sixth")[k]
             stem = force.removeprefix("force_")
             name = f"force_{kind}_{stem}" if force != stem else f"{force}_{kind}"
             columns[name if kind else force] = column

@@ -76,7 +76,9 @@ def test_columns_and_bands(run: RunFolder) -> None:
     _, kinematics = run_stage(run)
     expected = {f"{kind}_{axis}" for kind in KINEMATIC for axis in AXES}
     expected |= {"trial_id", "t", "bridged", "brake_yaw"}
-    expected |= {"force_x", "force_rate_x", "force_curvature_x", "force_third_x", "force_fourth_x"}
+    expected |= {"force_x"}
+    orders = ("rate", "curvature", "third", "fourth", "fifth", "sixth")
+    expected |= {f"force_{order}_x" for order in orders}
     assert set(kinematics.columns) == expected
     assert kinematics.notna().all(axis=None)
     rows, truth = kinematics[kinematics["trial_id"] == "a"], free_trial(0)[1]

@@ -152,7 +152,7 @@ def fit(out, effects, start):
         for j, c in enumerate("xyz"):
             columns[f"force_{c}"], columns[f"force_rate_{c}"] = force[:, j], rate[:, j]
             slope = rate[:, j]
-            for order in ("curvature", "third", "fourth"):
+            for order in ("curvature", "third", "fourth", "fifth", "sixth"):
                 slope = np.gradient(slope, t)
                 columns[f"force_{order}_{c}"] = slope
         u = np.column_stack([columns[name] for name in system.inputs])
