@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -116,7 +117,17 @@ def check(
     if not quiet:
         show.say(f"{where}: names, units and equations fit together")
         show.say("")
-        show.say(f'next: device = "{file}" in session.toml, then bampipe run SESSION')
+        show.say(f"next: {_after(file)}")
+
+
+def _after(file: str) -> str:
+    """What to do once a device file is right: run the session it lies in, or name it in one."""
+    path = Path(file)
+    if path.suffix != ".toml":
+        return f'device = "{file}" in session.toml, then bampipe run SESSION'
+    if (path.parent / "session.toml").is_file():
+        return f"bampipe run {path.parent}"
+    return f'put it into the folder of the logs, device = "{path.name}" in session.toml'
 
 
 def report_faults(faults: Sequence[str]) -> None:

@@ -12,6 +12,9 @@ from bampipe.data.session import SECONDS
 RATES_HZ = (4.0, 30_000.0)
 """Sample rates at which motion is logged."""
 
+_SMOOTHED_S = 0.06
+"""Length of the window over which motion and input are smoothed before they are compared, s."""
+
 _NICE = (1, 1.2, 1.25, 1.5, 2, 2.5, 3, 4, 5, 6, 7.5, 8)
 
 
@@ -40,6 +43,16 @@ def likely_unit(si: str, values: np.ndarray) -> str:
     return other if other and span > limit else ""
 
 
+def interval_of(name: str, value: float) -> float:
+    """Sampling interval, s, that a number beside the samples gives (``Ts``, ``fs``), else 0."""
+    plain = name.lower().replace("_", "")
+    if value > 0.0 and plain in ("ts", "dt", "tsample", "sampletime", "samplingtime"):
+        return value
+    if value > 0.0 and plain in ("fs", "samplerate", "samplingrate", "fsample"):
+        return 1.0 / value
+    return 0.0
+
+
 def sample_rate(t: np.ndarray) -> float:
     """Rate of time stamps ``t`` (T,), s, in Hz: a round number where one is within 1 %."""
     steps = np.diff(t[np.isfinite(t)])
@@ -65,34 +78,56 @@ class Driven:
         share: part of its variance that acceleration, velocity, its sign and position explain,
             0 to 1; a force, a current or a voltage that moves a mass with friction has much.
         inertia, viscous, coulomb: what multiplies acceleration, velocity and its sign.
+        gravity: what multiplies the sine and the cosine of the position, where these explain
+            clearly more than the position itself; zeros where they do not.
     """
 
     share: float
     inertia: float = 0.0
     viscous: float = 0.0
     coulomb: float = 0.0
+    gravity: tuple[float, float] = (0.0, 0.0)
 
 
-def driven(t: np.ndarray, q: np.ndarray, column: np.ndarray) -> Driven:
+def driven(t: np.ndarray, q: np.ndarray, column: np.ndarray, angle: bool = False) -> Driven:
     """Hold a column against the motion.
 
     Args:
         t: (T,) s; q: (T,) position; column: (T,).
+        angle: whether the position is an angle in rad, on which gravity may depend.
     """
     step = float(np.median(np.diff(t)))
-    width = max(3, round(0.02 / step) | 1)
-    smooth = np.convolve(q, np.hanning(width + 2)[1:-1] / np.hanning(width + 2).sum(), "same")
+    width = max(5, round(_SMOOTHED_S / step) | 1)
+    window = np.hanning(width + 2)[1:-1] / np.hanning(width + 2).sum()
+
+    def smoothed(values: np.ndarray) -> np.ndarray:
+        return np.convolve(values, window, "same")
+
+    smooth = smoothed(q)
     qd = np.gradient(smooth, step)
     qdd = np.gradient(qd, step)
     inner = slice(2 * width, -2 * width or None)
-    design = np.column_stack([qdd, qd, np.sign(qd), smooth, np.ones_like(q)])[inner]
-    target = column[inner]
+    # Both sides alike: what one filter takes off the motion, it takes off the column too.
+    sides = [smoothed(qdd), smoothed(qd), smoothed(np.sign(qd)), smoothed(smooth), np.ones_like(q)]
+    design = np.column_stack(sides)[inner]
+    target = smoothed(smoothed(column))[inner]
     spread = float(np.sum((target - target.mean()) ** 2)) if len(target) else 0.0
     if spread == 0.0 or len(target) < 20:
         return Driven(0.0)
     found = np.linalg.lstsq(design, target, rcond=None)[0]
     left = float(np.sum((target - design @ found) ** 2))
-    return Driven(max(0.0, 1.0 - left / spread), *(float(value) for value in found[:3]))
+    share, gravity = max(0.0, 1.0 - left / spread), (0.0, 0.0)
+    if angle:
+        turned = np.column_stack([*sides[:3], np.sin(sides[3]), np.cos(sides[3])])[inner]
+        flat = design[:, [0, 1, 2, 4]]
+        light = flat @ np.linalg.lstsq(flat, target, rcond=None)[0]
+        none = float(np.sum((target - light) ** 2))
+        heavy = np.linalg.lstsq(turned, target, rcond=None)[0]
+        lifted = float(np.sum((target - turned @ heavy) ** 2))
+        # Friction apart, this is what a link that hangs on the axis shows most.
+        if lifted < 0.8 * none and lifted < 1.05 * left:
+            found, gravity = heavy, (float(heavy[3]), float(heavy[4]))
+    return Driven(share, *(float(value) for value in found[:3]), gravity)
 
 
 def signed_register(values: np.ndarray) -> int:
@@ -117,7 +152,7 @@ def stretches(t: np.ndarray, q: np.ndarray) -> list[float]:
     parts = min(5, int(t[-1] // 4.0))
     if parts < 2:
         return []
-    speed = np.abs(np.gradient(q, t))
+    speed = np.abs(np.gradient(q))  # a sample: stamps may stand twice
     cuts = []
     for k in range(1, parts):
         near = np.abs(t - t[-1] * k / parts) < 0.15 * t[-1] / parts

@@ -55,11 +55,19 @@ class Layout:
             InputError: time as dates, counted samples, or registers that wrap.
         """
         where = str(session.root / "session.toml")
-        if session.clock.datetime or not session.clock.column:
+        clock = session.clock
+        if clock.datetime or clock.nanoseconds or not clock.column:
             raise InputError(
-                "a stream needs a time column that holds numbers",
+                "a stream needs one time column, which holds numbers",
                 where=f"{where}: time",
                 remedy="write seconds, or microseconds as time_us",
+            )
+        rates = [encoder.axis for encoder in session.encoders if encoder.integrate]
+        if rates:
+            raise InputError(
+                f"axis {rates[0]} has a velocity and no position, which a stream cannot do without",
+                where=where,
+                remedy="log the position",
             )
         wrapped = [channel.name for channel in session.channels if channel.wrap_bits]
         if wrapped:

@@ -15,15 +15,16 @@ from bampipe.errors import InputError
 
 MOST_FILES = 500
 _WORDS = {
-    "time": "t time timestamp stamp zeit clock seconds sec secs",
-    "reference": "goal ref reference setpoint target desired des cmd command soll demand wanted",
+    "time": "t time timestamp stamp zeit clock seconds sec secs nanosec nsec nsecs nanoseconds",
+    "reference": "goal ref reference setpoint target desired des cmd command soll sollwert demand"
+    " wanted",
     "brake": "brake bremse",
-    "velocity": "vel velocity speed qd dq qdot omega geschwindigkeit rate",
+    "velocity": "vel velocity speed qd dq qdot omega geschwindigkeit drehzahl rpm rate",
     "force": "force f fx fy fz torque tau trq kraft moment loadcell wrench effort",
-    "current": "current curr i iq amp amps ampere strom coil",
-    "voltage": "volt volts voltage pwm duty supply vin",
+    "current": "current curr i iq amp amps ampere strom spulenstrom coil",
+    "voltage": "volt volts voltage pwm duty supply vin vbat vbus battery bus spannung",
     "position": "pos position angle theta phi psi q enc encoder disp displacement x stroke winkel"
-    " weg joint deflection yaw pitch extension carriage counts",
+    " weg lage hub joint deflection yaw pitch extension carriage counts",
 }
 _BY_UNIT = {
     "s": "time", "datetime": "time", "rad": "position", "m": "position", "rad/s": "velocity",
@@ -32,10 +33,10 @@ _BY_UNIT = {
 _UNIT_WORDS = {
     "time": ("us", "ms", "ns", "s"),
     "position": ("rad", "deg", "mm", "cm", "m"),
-    "velocity": ("rad/s", "deg/s", "mm/s", "m/s"),
+    "velocity": ("rad/s", "deg/s", "mm/s", "m/s", "rpm"),
     "force": ("Nm", "kN", "N", "V"),
     "current": ("mA", "A"),
-    "voltage": ("mV", "V"),
+    "voltage": ("mV", "V", "percent", "pct", "%"),
 }
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 
@@ -69,9 +70,17 @@ _SPELLINGS = {
     "nm": "nm", "n": "N", "volt": "V", "volts": "V", "v": "V", "amp": "A", "amps": "A",
     "ampere": "A", "a": "A", "newton": "N", "meter": "m", "meters": "m", "metre": "m",
     "lb": "lbf", "lbs": "lbf", "°c": "degC", "c": "degC", "degc": "degC", "percent": "%",
-    "-": "", "1": "", "none": "", "inch": "in", "kgf": "kgf",
+    "pct": "%", "-": "", "1": "", "none": "", "inch": "in", "kgf": "kgf",
 }  # fmt: skip
 _SQUEEZED = {"Nm": "N.m", "Ncm": "N.cm", "Nmm": "N.mm", "mNm": "mN.m", "kNm": "kN.m"}
+
+
+def spelled(text: str, among: Sequence[str]) -> str:
+    """The one of ``among`` that means the same unit as ``text``, "" where there is none."""
+    known = unit(text)
+    if text in among or known is None:
+        return text if text in among else ""
+    return next((other for other in among if unit(other) == known), "")
 
 
 def unit(text: str) -> Unit | None:

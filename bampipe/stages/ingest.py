@@ -16,7 +16,7 @@ import pyarrow as pa
 
 from bampipe.data.quality import CleanTrial, Limits, clean
 from bampipe.data.readers import read_trial
-from bampipe.data.session import Session, TrialEntry, inside, read_session
+from bampipe.data.session import SECONDS, Session, TrialEntry, inside, read_session
 from bampipe.data.store import ParquetAppender, read_toml, sha256_file, write_json, write_parquet
 from bampipe.errors import InputError
 from bampipe.physics import registry
@@ -243,6 +243,12 @@ def _trial(session: Session, entry: TrialEntry, config: Config, reason: str) -> 
         datetimes={clock.column: clock.form} if clock.datetime else {},
         dialect=session.dialect,
     )
+    if clock.nanoseconds:
+        columns = dict(raw.columns)
+        whole, more = columns[clock.column], columns.pop(clock.nanoseconds)
+        # Seconds since 1970 leave no room for nanoseconds in a double: the first goes first.
+        columns[clock.column] = whole - np.fmin.reduce(whole) + SECONDS["ns"] * more
+        raw = replace(raw, columns=columns)
     if not clock.column:
         count = len(raw.columns[session.columns[0]])
         said = f"no time stamps: samples counted at {session.sample_rate:g} Hz"

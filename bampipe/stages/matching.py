@@ -56,6 +56,9 @@ class Matcher:
         found = found or [
             c for c in self.found.of("") if not c.constant and re.match(r"q\w?\Z", c.name.lower())
         ]
+        # A test stand may log the velocity only, which is integrated then.
+        found = found or [c for c in self.found.of("velocity") if not c.constant]
+        found = found or [c for c in self.found.columns if not c.constant and c.name in ("v", "V")]
         if len(found) < 2:
             return (found[0] if found else None), []
         best = found[0]
@@ -96,10 +99,33 @@ class Matcher:
         return None, ""
 
     def driver(self, position: Column) -> tuple[Column | None, str]:
-        """What drives an axis: by its motion, else by name; and what kind of input that is."""
+        """What drives an axis: by its motion, else by name; and what kind of input that is.
+
+        The kind is that of the column, ``duty`` for a voltage given as a share of the supply.
+        """
         named = [c for role in DRIVERS for c in self.found.of(role) if not c.constant]
         best = self.driving(position) or next(iter(named), None)
-        return best, best.role if best is not None and best.role in DRIVERS else "force"
+        if best is None or best.role not in DRIVERS:
+            return best, "force"
+        duty = best.role == "voltage" and {"pwm", "duty"} & set(words(best.name))
+        return best, "duty" if duty else best.role
+
+    def supply(self, driver: Column | None) -> Column | None:
+        """The supply voltage beside a duty cycle: in volts or of no unit, and never negative."""
+        for column in self.found.of("voltage"):
+            known = unit(column.unit) if column.unit else None
+            volts = known is None or known.si == "V"
+            if column is not driver and volts and np.nanmin(column.values) > 0.0:
+                return column
+        return None
+
+    def moved(self, position: Column) -> np.ndarray:
+        """Position (T,) as the column has it; the integral of one that is a velocity."""
+        values = np.nan_to_num(position.values)
+        if not is_velocity(position):
+            return values
+        steps = 0.5 * (values[1:] + values[:-1]) * np.diff(self.t)
+        return np.concatenate([[0.0], np.cumsum(steps)])
 
     def driving(self, position: Column) -> Column | None:
         """The column that acceleration, velocity and friction of the motion explain best."""
@@ -114,11 +140,16 @@ class Matcher:
             bits = guesses.signed_register(values)
             if bits:
                 values = np.where(values >= 2.0 ** (bits - 1), values - 2.0**bits, values)
-            share[column.name] = guesses.driven(self.t, position.values, values).share
+            share[column.name] = guesses.driven(self.t, self.moved(position), values).share
         best = max(share, key=lambda name: share[name], default="")
         if not best or share[best] < _DRIVEN:
             return None
         return next(c for c in self.found.columns if c.name == best)
+
+
+def is_velocity(column: Column) -> bool:
+    """Whether a column that stands for the position is a velocity, to be integrated."""
+    return column.role == "velocity" or column.name in ("v", "V")
 
 
 def _compatible(column: Column, si: str) -> bool:

@@ -95,8 +95,10 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         },
         "largest_force": _largest_force(run, system),
     }
-    # Only a handle that can be pushed as many ways as there are axes has a stiffness of its own.
-    at_handle = device.force_unit == "N" and len(device.forces) == len(system.coordinates)
+    # Only a handle that can be pushed as many ways as there are axes has a stiffness of its own;
+    # where a motor drives the device, there is none.
+    ways = len(device.forces) == len(system.coordinates)
+    at_handle = device.force_unit == "N" and ways and not device.drive
     if at_handle:
         content["handle"] = _handle(run, system, p, identified, reach, config.points)
     told = content.get("handle")

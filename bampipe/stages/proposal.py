@@ -18,15 +18,20 @@ from bampipe.data import guesses
 from bampipe.data.session import SECONDS
 from bampipe.data.store import read_toml, write_text
 from bampipe.data.survey import Column, Survey, survey, words
-from bampipe.data.units import unit
+from bampipe.data.units import spelled, unit
 from bampipe.errors import InputError
 from bampipe.physics import registry
 from bampipe.physics.device import Device
-from bampipe.stages.matching import Matcher
+from bampipe.stages.matching import Matcher, is_velocity
 from bampipe.stages.starter import starter_device
 
 SESSION, DEVICE = "session.toml", "device.toml"
 UNKNOWN = "?"
+_POSITION_UNITS = ("rad", "deg", "mrad", "rev", "m", "mm", "cm", "um", "in")
+_SPEED_UNITS = ("rad/s", "deg/s", "rev/s", "rev/min", "m/s", "cm/s", "mm/s", "in/s")
+_FORCE_UNITS = ("N", "N.m", "mN", "kN", "mN.m", "N.cm", "N.mm", "kN.m", "kgf", "lbf", "V")
+_FULL = 1.05
+_SLIDING = frozenset(["stroke", "displacement", "disp", "weg", "hub", "carriage", "piston"])
 
 
 @dataclass
@@ -77,6 +82,7 @@ class _Writer:
         self.out = Proposal(passed=[f"{name}: {reason}" for name, reason in found.passed])
         self.lines: list[str] = []
         self.match = Matcher(found)
+        self.seen: dict[str, Column | None] = {}  # inputs that a new device was made from
         self.name, self.device = self._device(device)
 
     def write(self) -> Proposal:
@@ -149,16 +155,22 @@ class _Writer:
                 remedy="name the device: bampipe init FOLDER --device NAME; columns are "
                 + ", ".join(c.name for c in self.found.columns[:12]),
             )
-        linear = (unit(position.unit) or unit("rad")).si == "m"  # type: ignore[union-attr]
+        linear = _slides(position, self.found)
         driver, role = self.match.driver(position)
         found = guesses.Driven(0.0)
         if driver is not None:
-            si = {"current": "A", "voltage": "V"}.get(role, "N" if linear else "N.m")
+            si = {"current": "A", "voltage": "V", "duty": ""}.get(role, "N" if linear else "N.m")
             drive = np.nan_to_num(_in_si(driver, si))
-            found = guesses.driven(self.match.t, _in_si(position, "m" if linear else "rad"), drive)
-        text, name = starter_device(
-            position.name, linear, role, driver.name if driver else "", self._coil(role), found
-        )
+            place = _placed(self.match, position, "m" if linear else "rad")
+            angle = not linear and not _counts(position)
+            found = guesses.driven(self.match.t, place, drive, angle)
+        supply = self.match.supply(driver) if role == "duty" else None
+        channel = {"current": "motor_current", "voltage": "motor_voltage"}.get(role, role)
+        self.seen = {"supply": supply, "force_drive" if role == "force" else channel: driver}
+        text, name, own = starter_device(
+            position.name, linear, role, driver.name if driver else "", self._coil(role), found,
+            supply is not None,
+        )  # fmt: skip
         self.out.device = text
         self.name = DEVICE
         self.device = registry.device_from(tomllib.loads(text), DEVICE)
@@ -166,6 +178,12 @@ class _Writer:
         self.out.check.append(
             f"{DEVICE}: one {kind} axis '{name}' driven by a {role}; put in what you know of it"
         )
+        for constant in own:
+            self.out.check.append(
+                f"{DEVICE}: {constant} is not yours yet: all forces and inertias scale with it"
+            )
+        if any(found.gravity):
+            self.out.check.append(f"{DEVICE}: gravity on '{name}', since the motion shows it")
 
     def _coil(self, role: str) -> bool:
         """Whether a current is recorded beside a force: that of a coil or a brake."""
@@ -193,7 +211,19 @@ class _Writer:
     def _time(self) -> None:
         times = self.found.of("time")
         self.lines.append("[time]")
+        if self._stamps(times):
+            return
         first = next((c for c in times if _increases(c.values)), None)
+        given = [(c.name, float(c.values[0])) for c in self.found.columns if c.constant]
+        steps = [(guesses.interval_of(name, value), name) for name, value in given]
+        step, name = max(steps, default=(0.0, ""))
+        if first is None and step > 0.0:
+            self.match.t = step * np.arange(len(self.found.columns[0].values))
+            self.match.used.add(name)
+            self.lines.append('unit = "samples"' + self.guess(f"counted; {name} sets the rate"))
+            self.lines[4] = f"sample_rate_hz = {1.0 / step:g}"
+            self.lines.append("")
+            return
         if first is None:
             self.match.t = np.arange(len(self.found.columns[0].values)) / 100.0
             self.lines.append('unit = "samples"' + self.guess("no column increases like a time"))
@@ -205,7 +235,7 @@ class _Writer:
         seconds = SECONDS.get(kind, 1.0)
         self.match.t = (first.values - first.values[0]) * seconds
         rate = guesses.sample_rate(self.match.t) if kind else 100.0
-        said = first.unit == kind or kind == "datetime"
+        said = kind == "datetime" or spelled(first.unit, tuple(SECONDS)) == kind
         note = "" if said else self.guess(f"time in {kind or 's'}, by the rate that it gives")
         self.lines += [f"column = {_quoted(first.name)}", f'unit = "{kind or "s"}"{note}', ""]
         if not kind:
@@ -213,6 +243,25 @@ class _Writer:
         self.lines[4] = f"sample_rate_hz = {rate:g}" + self.guess(
             f"{rate:g} Hz, from the time stamps"
         )
+
+    def _stamps(self, times: list[Column]) -> bool:
+        """Propose whole seconds and nanoseconds in two columns, as ROS has them, if there are."""
+        parts = {part: c for c in times for part in ("sec", "nanosec") if _part_of(c, part)}
+        if set(parts) != {"sec", "nanosec"}:
+            return False
+        whole, more = parts["sec"], parts["nanosec"]
+        self.match.used |= {whole.name, more.name}
+        self.match.t = whole.values - whole.values[0] + 1e-9 * more.values
+        rate = guesses.sample_rate(self.match.t)
+        note = self.guess(f"seconds in {whole.name}, nanoseconds on top in {more.name}")
+        self.lines += [
+            f"column = {_quoted(whole.name)}", 'unit = "s"',
+            f"nanoseconds = {_quoted(more.name)}{note}", "",
+        ]  # fmt: skip
+        self.lines[4] = f"sample_rate_hz = {rate:g}" + self.guess(
+            f"{rate:g} Hz, from the time stamps"
+        )
+        return True
 
     def _encoders(self, device: Device) -> dict[str, Column]:
         self.lines[3] = f'device = "{self.name}"'
@@ -235,7 +284,14 @@ class _Writer:
     def _encoder(self, axis: str, column: Column, si: str) -> str:
         name = _quoted(column.name)
         known = unit(column.unit)
-        if column.whole and np.ptp(column.values) > 100 and (known is None or known.si != si):
+        if is_velocity(column):
+            fits = known is not None and known.si == f"{si}/s"
+            said = spelled(column.unit, _SPEED_UNITS) if fits else ""
+            text = f'{axis} = {{ column = {name}, unit = "{said or f"{si}/s"}" }}'
+            return text + self.guess(
+                f"no position was recorded: that of {axis} is the integral of {column.name}"
+            )
+        if _counts(column):
             middle = float(np.median(column.values))
             counts = f"counts_per_unit = 0.0, zero_counts = {middle:.0f}"
             return f'{axis} = {{ column = {name}, {counts}, unit = "{si}" }}' + self.open(
@@ -244,7 +300,8 @@ class _Writer:
         speed = self._velocity_of(column)
         more = f", velocity = {speed}" if speed else ""
         if known is not None and known.si == si:
-            text = f'{axis} = {{ column = {name}, unit = "{column.unit.strip("[]()")}"{more} }}'
+            said = spelled(column.unit, _POSITION_UNITS) or si
+            text = f'{axis} = {{ column = {name}, unit = "{said}"{more} }}'
             return text + ("" if column.stated else self.guess(f"{column.name} in {column.unit}"))
         likely = guesses.likely_unit(si, column.values) or si
         text = f'{axis} = {{ column = {name}, unit = "{likely}"{more} }}'
@@ -263,6 +320,7 @@ class _Writer:
     def _inputs(self, device: Device, axes: dict[str, Column]) -> None:
         wanted = {**dict.fromkeys(device.forces, device.force_unit), **device.channels}
         given = self.match.inputs(wanted, tuple(axes.values()))
+        given |= {n: (c, "") for n, c in self.seen.items() if n in wanted and c is not None}
         columns = [given[name][0] for name in device.forces]
         sensed = all(name.startswith("force_") for name in device.forces)
         if sensed and columns and all(column is not None for column in columns):
@@ -289,10 +347,25 @@ class _Writer:
             more = f", wrap_bits = {bits}, signed = true" if bits else ""
             text = f'{name} = {{ column = {_quoted(column.name)}, unit = "'
             likely = guesses.likely_unit(si, column.values) or si
+            most = float(np.nanmax(np.abs(column.values)))
+            if name == "duty" and not column.unit and most > _FULL:
+                likely = "%" if most <= 100.0 else ""
+                more += "" if likely or bits else ", scale = 0.0"
             text += f'{column.unit.strip("[]()") if fits else likely}"{more} }}'
             if not (fits and column.stated) or why or bits:
                 where = f" in {likely}" if si and not fits else ""
-                scale = f", a signed register of {bits} bits: give its scale" if bits else ""
+                counts = column.whole and not column.unit and bool(si)
+                scale = "; if in counts, give their scale too" if counts else ""
+                if more.endswith("scale = 0.0"):
+                    self.lines.append(text + self.open(f"the scale of {name}, 1 over full duty"))
+                    continue
+                scale = (
+                    scale
+                    if not bits
+                    else f", a signed register of {bits} bits: give its scale"
+                    if bits
+                    else ""
+                )
                 text += self.guess(f"{column.name} is {name}{where}{why}{scale}")
             self.lines.append(text)
         self.lines.append("")
@@ -302,7 +375,7 @@ class _Writer:
         self.match.used |= {c.name for c in columns}
         components = ", ".join(f'"{name}"' for name in device.components)
         self.lines += ["[force]", f"columns = [{names}]", f"components = [{components}]"]
-        stated = {c.unit.strip("[]()") for c in columns}
+        stated = {spelled(c.unit.strip("[]()"), _FORCE_UNITS) for c in columns}
         known = unit(next(iter(stated))) if len(stated) == 1 else None
         if known is not None and known.si == device.force_unit:
             note = "" if all(c.stated for c in columns) else self.guess(f"force in {known.si}")
@@ -372,12 +445,52 @@ class _Writer:
             self.lines.append('kind = "free"')
 
 
+def _counts(column: Column) -> bool:
+    """Whether a position is in whole counts of no known unit."""
+    return column.whole and bool(np.ptp(column.values) > 100) and unit(column.unit or "?") is None
+
+
+def _part_of(column: Column, part: str) -> bool:
+    """Whether a column holds the whole seconds, or the nanoseconds on top, of time stamps."""
+    said = set(words(column.name))
+    if not column.whole:
+        return False
+    if part == "nanosec":
+        named = bool(said & {"nanosec", "nsec", "nsecs", "nanosecs", "nanoseconds"})
+        return named and bool(np.all((column.values >= 0) & (column.values < 1e9)))
+    return bool(said & {"sec", "secs", "seconds"}) and bool(np.all(np.diff(column.values) >= 0))
+
+
+def _placed(match: Matcher, column: Column, si: str) -> np.ndarray:
+    """Position in SI, unwrapped where it is an angle that wraps at a full turn."""
+    known = unit(column.unit) if column.unit else None
+    if is_velocity(column):
+        return match.moved(column) * (known.scale if known is not None else 1.0)
+    values = match.moved(column) * _scale(column, si)
+    return np.unwrap(values) if si == "rad" and not _counts(column) else values
+
+
 def _in_si(column: Column, si: str) -> np.ndarray:
     """Values of a column in ``si``, by its unit or by the likely one."""
+    return column.values * _scale(column, si)
+
+
+def _scale(column: Column, si: str) -> float:
     known = unit(column.unit) if column.unit else None
     if known is None or known.si != si:
         known = unit(guesses.likely_unit(si, column.values) or si)
-    return column.values * (known.scale if known is not None else 1.0)
+    return known.scale if known is not None else 1.0
+
+
+def _slides(column: Column, found: Survey) -> bool:
+    """Whether an axis slides rather than turns: by its unit, its name, or a force in newtons."""
+    known = unit(column.unit) if column.unit else None
+    if known is not None and known.si:
+        return known.si in ("m", "m/s")
+    if set(words(column.name)) & _SLIDING:
+        return True
+    forces = [unit(c.unit) for c in found.of("force") if c.unit]
+    return any(force is not None and force.si == "N" for force in forces)
 
 
 def _increases(values: np.ndarray) -> bool:

@@ -139,9 +139,13 @@ def test_the_session_decides_what_the_file_leaves_open(tmp_path):
     trial = read(tmp_path, "0 1,5 2\n1 2,5 3\n", dialect=Dialect(names=("t", "x", "n")))
     np.testing.assert_array_equal(trial.columns["x"], [1.5, 2.5])
     assert trial.first_row == 1
-    text = "gr\xf6\xdfe,t,x,n\n1,2,3,4\n"
+    trial = read(tmp_path, "Weg,\xb5\nm,\xb0\n1,2\n3,4\n", ("Weg",), encoding="latin-1")
+    np.testing.assert_array_equal(trial.columns["Weg"], [1.0, 3.0])
+    assert trial.units == {"Weg": "m"} and "not UTF-8" in trial.remarks[0]
+    text = "gr\x81\xdfe,t,x,n\n1,2,3,4\n"  # a byte that Windows-1252 does not have
     with pytest.raises(InputError, match='say encoding = "latin-1" under'):
         read(tmp_path, text, encoding="latin-1")
+    text = "gr\xf6\xdfe,t,x,n\n1,2,3,4\n"
     trial = read(tmp_path, text, encoding="latin-1", dialect=Dialect(encoding="latin-1"))
     np.testing.assert_array_equal(trial.columns["n"], [4.0])
 

@@ -351,8 +351,8 @@ ASIDE: dict[str, tuple[Damage, str]] = {
         "row ",
     ),
     "UTF-16, cut in a character": (text(lambda s: s.encode("utf-16")[:-1]), "not sound UTF-16"),
-    "header in Latin-1": (
-        text(lambda s: b"gr\xf6\xdfe," + s.encode()),
+    "header in no known encoding": (
+        text(lambda s: b"gr\x81\xdfe," + s.encode()),
         "row 1: the header is not UTF-8",
     ),
     "semicolons, and a decimal comma among points": (

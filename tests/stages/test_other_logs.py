@@ -132,6 +132,34 @@ def test_clocks(tmp_path, stamps, time):
     assert trial["status"] == "ok"
 
 
+def test_seconds_and_nanoseconds_in_two_columns(tmp_path):
+    stamps = 1_790_000_000_250_000_000 + np.rint(T * 1e9).astype(int)
+    form = {"sec": [str(s // 10**9) for s in stamps], "nano": [str(s % 10**9) for s in stamps]}
+    text = log({**form, "q": Q, "i": I})
+    time = 'column = "sec"\nunit = "s"\nnanoseconds = "nano"'
+    samples, trial, _ = ingested(tmp_path, text, time=time, **PLAIN)
+    check(samples)
+    assert trial["status"] == "ok"
+    with pytest.raises(InputError, match=r'time\.nanoseconds: only for unit = "s"'):
+        ingested(tmp_path, text, time=time.replace('"s"', '"ms"'), **PLAIN)
+
+
+def test_a_velocity_for_want_of_a_position_is_integrated(tmp_path):
+    text = log({"t": T, "w": QD * 60 / (2 * np.pi), "i": I}, form="{:.9f}")
+    encoder = 'column = "w", unit = "rev/min"'
+    samples, trial, about = ingested(
+        tmp_path, text, time='column = "t"\nunit = "s"', **{**PLAIN, "encoder": encoder}
+    )
+    np.testing.assert_allclose(samples["q_joint"], Q - Q[0], atol=3e-4)
+    assert "position is the integral of the velocity 'w'" in trial["repairs"]
+    assert about["axes"]["joint"] == {"unit": "rad", "resolution": None}
+    with pytest.raises(InputError, match="makes the column a velocity; leave it out"):
+        ingested(
+            tmp_path, text, time='column = "t"\nunit = "s"',
+            **{**PLAIN, "encoder": f"{encoder}, counts_per_unit = 3"},
+        )  # fmt: skip
+
+
 def test_samples_that_are_counted(tmp_path):
     samples, trial, _ = ingested(tmp_path, log({"q": Q, "i": I}), time='unit = "samples"', **PLAIN)
     np.testing.assert_allclose(samples["t"], np.arange(1000) / RATE, atol=1e-12)

@@ -12,6 +12,7 @@ import pytest
 from other_labs import (
     COULOMB,
     INERTIA,
+    MOMENT,
     PER_AMPERE,
     VISCOUS,
     damper_log,
@@ -80,6 +81,70 @@ def test_a_damper_with_a_coil(tmp_path):
     truth = damper_log(2)
     np.testing.assert_allclose(found["q_carriage"], 1e-3 * truth["Displacement"], atol=1e-8)
     np.testing.assert_allclose(found["force_drive"], truth["Force"], atol=1e-5)
+
+
+def arm_log(turned: float = 0.0) -> dict[str, np.ndarray]:
+    """The joint's log in rad and N.m, and its time in whole seconds and nanoseconds."""
+    columns = joint_log(1)
+    angle = np.deg2rad(columns["joint_angle"]) + turned
+    return {
+        "stamp": columns["stamp"],
+        "angle": (angle + np.pi) % (2 * np.pi) - np.pi,
+        "torque": 1e-3 * PER_AMPERE * columns["motor_current"],
+    }
+
+
+def test_joint_states_of_a_robot_that_wrap_at_half_a_turn(tmp_path):
+    (tmp_path / "arm").mkdir()
+    columns = arm_log(turned=3.0)
+    rows = ["header.stamp.sec,header.stamp.nanosec,name[0],position[0],effort[0]"]
+    for t, q, torque in zip(*columns.values(), strict=True):
+        nano = round((t - int(t)) * 1e9)
+        rows.append(f"{int(t)},{nano},elbow,{q:.7f},{torque:.6f}")
+    (tmp_path / "arm/a.csv").write_text("\n".join(rows) + "\n")
+    session, _ = proposed(tmp_path / "arm")
+    assert session["time"]["column"] == "header.stamp.sec" and session["sample_rate_hz"] == 100
+    assert session["time"]["nanoseconds"] == "header.stamp.nanosec"
+    device = registry.device_from(tomllib.loads((tmp_path / "arm/device.toml").read_text()))
+    assert device.drive and check_device(device) == []
+    prior = {p.name: p for p in device.parameters}
+    # The zero of the encoder is turned by 3 rad from hanging down, and gravity with it.
+    truth = {"moment": MOMENT * np.cos(3.0), "moment_across": -MOMENT * np.sin(3.0)}
+    for name, value in truth.items():
+        assert abs(prior[name].prior - value) < 0.5 * prior[name].sd
+    found = samples(tmp_path / "arm", tmp_path / "out", "a")
+    assert np.abs(np.diff(found["q_joint"])).max() < 0.1
+
+
+def test_duty_cycle_and_supply_make_a_motor(tmp_path):
+    (tmp_path / "arm").mkdir()
+    columns = arm_log()
+    rows = ["t,present_angle_deg,pwm_percent,vbat"]
+    for k, (t, q, torque) in enumerate(zip(*columns.values(), strict=True)):
+        stamp = t - columns["stamp"][0]
+        rows.append(f"{stamp:.4f},{np.rad2deg(q):.2f},{8 * torque:.2f},{12 + 0.01 * (k % 3):.2f}")
+    (tmp_path / "arm/a.csv").write_text("\n".join(rows) + "\n")
+    session, proposal = proposed(tmp_path / "arm")
+    assert session["encoders"]["joint"] == {"column": "present_angle_deg", "unit": "deg"}
+    duty, supply = session["channels"]["duty"], session["channels"]["supply"]
+    assert duty == {"column": "pwm_percent", "unit": "percent"}
+    assert supply == {"column": "vbat", "unit": "V"}
+    assert any("torque_constant is not yours yet" in line for line in proposal.check)
+    device = registry.device_from(tomllib.loads((tmp_path / "arm/device.toml").read_text()))
+    assert check_device(device) == [] and device.force_unit == ""
+
+
+def test_a_damper_whose_velocity_alone_was_kept(tmp_path):
+    (tmp_path / "damper").mkdir()
+    columns = damper_log(1)
+    pairs = zip(columns["Velocity"] / 10, columns["Force"], strict=True)
+    rows = ["V,F,Ts"] + [f"{v:.6f},{f:.3f},0.001" for v, f in pairs]
+    (tmp_path / "damper/a.csv").write_text("\n".join(rows) + "\n")
+    session, proposal = proposed(tmp_path / "damper")
+    assert session["time"] == {"unit": "samples"} and session["sample_rate_hz"] == 1000
+    (axis,) = session["encoders"].values()
+    assert axis["column"] == "V" and any("integral of V" in line for line in proposal.check)
+    assert session["force"]["columns"] == ["F"]
 
 
 def test_the_measured_axis_is_understood_from_its_motion(tmp_path):

@@ -28,6 +28,7 @@ from bampipe.data.quality.clock import (
 )
 from bampipe.data.quality.encoders import (
     hold_against_velocity,
+    integrate,
     mend_jumps,
     refuse_fractions,
     unwrap,
@@ -67,6 +68,7 @@ def clean(raw: RawTrial, session: Session, entry: TrialEntry, limits: Limits) ->
         to_signed(table, channel)
     fill_missing(table)
     for encoder in session.encoders:
+        integrate(table, encoder)
         mend_jumps(table, encoder)
     table.t -= table.t[0]
     refuse_short(table)

@@ -33,8 +33,24 @@ def refuse_fractions(table: Table, encoder: Encoder) -> None:
         )
 
 
+def integrate(table: Table, encoder: Encoder) -> None:
+    """Take the integral of a velocity, by trapezia from 0, for the position that was not recorded.
+
+    What a constant error of the velocity adds grows with time, which only terms in the position
+    itself, such as a spring, can feel.
+    """
+    if not encoder.integrate:
+        return
+    speed = table.columns[encoder.column]
+    moved = np.cumsum(0.5 * (speed[1:] + speed[:-1]) * np.diff(table.t))
+    table.columns[encoder.column] = np.concatenate([[0.0], moved])
+    table.notes.append(f"position is the integral of the velocity '{encoder.column}', from 0")
+
+
 def unwrap(table: Table, encoder: Encoder) -> None:
     """Undo the wrap-around of a counter of 16, 24 or 32 bits, or of an angle at a full turn."""
+    if encoder.integrate:
+        return
     if encoder.counts:
         periods = [(2.0**bits, f"at {bits} bits") for bits in (16, 24, 32)]
     elif encoder.unit == "rad":

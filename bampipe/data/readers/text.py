@@ -31,6 +31,8 @@ from bampipe.errors import InputError
 
 BLOCK = 1 << 20
 _UTF16 = (b"\xff\xfe", b"\xfe\xff")
+_WESTERN = "cp1252"
+_TAKEN_AS = "not UTF-8: names and units are taken as Windows-1252"
 
 
 class _Stretch:
@@ -83,14 +85,14 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
     Raises:
         InputError: binary data, a wrong layout, or a cell that is not a number; names the row.
     """
-    with opened(path, wanted.dialect, name) as stream:
+    with opened(path, wanted.dialect, name) as (stream, said):
         layout = _layout(stream, wanted, name)
         end, notes = _sound_end(stream, layout)
         values, rows = _read_samples(stream, layout, end, wanted, name)
     if rows == 0:
         raise InputError("a header but no samples", where=name)
     units = {column: layout.units[column] for column in wanted.columns if column in layout.units}
-    return RawTrial(values, layout.first_line, notes, layout.remarks, units)
+    return RawTrial(values, layout.first_line, notes, (*said, *layout.remarks), units)
 
 
 def columns(path: Path, dialect: Dialect, name: str) -> tuple[dict[str, str], Layout, bytes]:
@@ -99,7 +101,7 @@ def columns(path: Path, dialect: Dialect, name: str) -> tuple[dict[str, str], La
     Raises:
         InputError: as :func:`read`.
     """
-    with opened(path, dialect, name) as stream:
+    with opened(path, dialect, name) as (stream, _):
         head = _head(stream, name)
         layout = dialects.find_layout(head, (), dialect, name)
     names = dialects.numeric_columns(head, layout)
@@ -107,8 +109,8 @@ def columns(path: Path, dialect: Dialect, name: str) -> tuple[dict[str, str], La
 
 
 @contextmanager
-def opened(path: Path, dialect: Dialect, name: str) -> Iterator[BinaryIO]:
-    """The file as UTF-8: itself, or a copy of it in a file without a name.
+def opened(path: Path, dialect: Dialect, name: str) -> Iterator[tuple[BinaryIO, tuple[str, ...]]]:
+    """The file as UTF-8, itself or a copy of it in a file without a name; and what to say of it.
 
     Raises:
         InputError: it is not in the encoding that it claims.
@@ -118,21 +120,31 @@ def opened(path: Path, dialect: Dialect, name: str) -> Iterator[BinaryIO]:
         stream.seek(0)
         encoding = dialect.encoding or _encoding(head)
         if encoding == "utf-8":
-            yield stream
+            yield stream, ()
             return
         with tempfile.TemporaryFile() as copy:
             _transcode(stream, copy, encoding, name)
             copy.seek(0)
-            yield copy
+            yield copy, (_TAKEN_AS,) if encoding == _WESTERN and not dialect.encoding else ()
 
 
 def _encoding(head: bytes) -> str:
-    """UTF-16 by its byte order mark, or by the zeros in every other byte; else UTF-8."""
+    """UTF-16 by its byte order mark, or by the zeros in every other byte; else UTF-8.
+
+    What is not UTF-8 is taken as the Western European text that older loggers write, if it can
+    be: names and units such as a degree sign depend on that, numbers do not.
+    """
     if head.startswith(_UTF16):
         return "utf-16"
     even, odd = head[0::2].count(0), head[1::2].count(0)
     if min(even, odd) == 0 and max(even, odd) > 0.4 * len(head):
         return "utf-16-be" if even else "utf-16-le"
+    for encoding in ("utf-8", _WESTERN):
+        try:
+            codecs.getincrementaldecoder(encoding)().decode(head)
+        except UnicodeDecodeError:
+            continue
+        return encoding
     return "utf-8"
 
 

@@ -50,24 +50,39 @@ def clock_from(entry: Mapping[str, Any] | None, rate: float, where: str) -> Cloc
         )
     if "format" in entry and kind != "datetime":
         raise InputError('only for unit = "datetime"', where=f"{where}.format")
+    if "nanoseconds" in entry and kind != "s":
+        raise InputError('only for unit = "s"', where=f"{where}.nanoseconds")
     moments = kind == "datetime"
     return Clock(
         entry["column"],
         1.0 if moments else SECONDS[kind],
         moments,
         str(entry.get("format", "")),
+        str(entry.get("nanoseconds", "")),
     )
 
 
 def encoder_from(axis: str, entry: Mapping[str, Any], where: str) -> Encoder:
-    """One entry of ``[encoders]``.
+    """One entry of ``[encoders]``; a column in a unit of velocity is to be integrated.
 
     Raises:
         InputError: a count that makes no sense, or a velocity of another kind.
     """
     raw = units.unit(entry["unit"])
-    assert raw is not None and raw.si in ("rad", "m")  # by the schema
+    assert raw is not None  # by the schema
     factor = raw.scale
+    if raw.si in ("rad/s", "m/s"):
+        for key in ("counts_per_unit", "zero_counts", "resolution", "velocity"):
+            if key in entry:
+                raise InputError(
+                    f'given although unit = "{entry["unit"]}" makes the column a velocity',
+                    where=f"{where}.{key}",
+                    remedy="leave it out, or give the column of the position",
+                )
+        return Encoder(
+            axis=axis, column=entry["column"], unit=raw.si.removesuffix("/s"), zero=0.0,
+            scale=factor, counts=False, resolution=None, raw_unit=entry["unit"], integrate=True,
+        )  # fmt: skip
     velocity = _velocity(entry.get("velocity"), raw.si, f"{where}.velocity")
     if "counts_per_unit" not in entry:
         resolution = entry.get("resolution")

@@ -21,12 +21,14 @@ class Clock:
         seconds: length of one tick, s.
         datetime: whether it holds dates and times, which are read as s since the first.
         form: how they are written, as of ``strptime``; "" for ISO 8601.
+        nanoseconds: column of what comes on top of whole seconds, ns; "" where there is none.
     """
 
     column: str
     seconds: float
     datetime: bool = False
     form: str = ""
+    nanoseconds: str = ""
 
 
 @dataclass(frozen=True)
@@ -58,6 +60,7 @@ class Encoder:
         resolution: smallest step, rad or m; None where only the data can tell.
         raw_unit: unit of the column; "counts" where it counts.
         velocity: the velocity recorded beside it, None where there is none.
+        integrate: whether the column is a velocity, whose integral from 0 is the position.
     """
 
     axis: str
@@ -69,6 +72,7 @@ class Encoder:
     resolution: float | None
     raw_unit: str = ""
     velocity: Velocity | None = None
+    integrate: bool = False
 
 
 @dataclass(frozen=True)
@@ -187,7 +191,7 @@ class Session:
         force = self.force.columns if self.force else ()
         parts = (self.encoders, self.brakes, self.channels)
         speeds = (e.velocity.column for e in self.encoders if e.velocity)
-        clock = (self.clock.column,) if self.clock.column else ()
+        clock = tuple(c for c in (self.clock.column, self.clock.nanoseconds) if c)
         return (*clock, *(c.column for part in parts for c in part), *speeds, *force)
 
     @property
