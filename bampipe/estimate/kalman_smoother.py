@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from math import factorial
 
 import numpy as np
+from numba import boolean, float64, void
 from scipy.optimize import minimize_scalar
 
 from bampipe.compiled import njit
@@ -25,6 +26,10 @@ from bampipe.estimate.differentiation import Array, Derivatives, Flags
 
 ORDERS = (3, 4)
 _SETTLED = 1e-10
+
+_V = float64[::1]
+_M = float64[:, ::1]
+_SEEN = boolean[::1]
 
 
 def transition(order: int) -> tuple[Array, Array]:
@@ -54,7 +59,7 @@ def ratio_for(bandwidth_hz: float, order: int, rate_hz: float) -> float:
     return float((2.0 * np.pi * bandwidth_hz / rate_hz) ** (2 * order))
 
 
-@njit(cache=True)
+@njit(void(_V, _M, _M, _M, _M), cache=True)
 def _predict(x: Array, p: Array, step: Array, noise: Array, work: Array) -> None:
     """Advance state ``x`` (n,) and covariance ``p`` (n, n) by one sample, in place."""
     n = x.shape[0]
@@ -78,7 +83,7 @@ def _predict(x: Array, p: Array, step: Array, noise: Array, work: Array) -> None
             p[j, i] = total
 
 
-@njit(cache=True)
+@njit("UniTuple(float64, 2)(float64[::1], float64[:, ::1], float64, float64[::1])", cache=True)
 def _update(x: Array, p: Array, y: float, gain: Array) -> tuple[float, float]:
     """Take in one sample ``y`` of noise 1, in place; return innovation and its variance."""
     n = x.shape[0]
@@ -96,7 +101,7 @@ def _update(x: Array, p: Array, y: float, gain: Array) -> tuple[float, float]:
     return innovation, spread
 
 
-@njit(cache=True)
+@njit(void(_V, _SEEN, _M, _M, _V, _M, _M, float64[:, :, ::1], _M, _V, _V), cache=True)
 def _filter(
     y: Array,
     seen: Flags,
@@ -123,7 +128,7 @@ def _filter(
                 covariances[t, i, j] = p[i, j]
 
 
-@njit(cache=True)
+@njit(void(_SEEN, _M, _M, float64[:, :, ::1], _M, _V, _V, _M), cache=True)
 def _smooth(
     seen: Flags,
     step: Array,
@@ -191,7 +196,11 @@ def _smooth(
                 weight[j, i] = total
 
 
-@njit(cache=True)
+@njit(
+    "Tuple((float64, float64, int64))(float64[::1], boolean[::1], float64[:, ::1], "
+    "float64[:, ::1], float64[::1], float64[:, ::1], int64)",
+    cache=True,
+)
 def _evidence(
     y: Array, seen: Flags, step: Array, noise: Array, x: Array, p: Array, skip: int
 ) -> tuple[float, float, int]:
@@ -296,7 +305,7 @@ def smooth(position: Array, model: MotionModel, seen: Flags | None = None) -> De
             bands widen. The first sample must be there. All are, by default.
     """
     order, count = model.order, len(position)
-    seen = np.ones(count, dtype=bool) if seen is None else seen
+    seen = np.ones(count, dtype=bool) if seen is None else np.ascontiguousarray(seen)
     step, noise = transition(order)
     y = (position - position[0]) / model.noise_sd
     start, spread = _informed_prior(y, seen, step, model.ratio * noise)
@@ -355,7 +364,9 @@ def maximum_likelihood(
     step, noise = transition(order)
     quantum = resolution / np.sqrt(12.0)
     unit = quantum if quantum > 0.0 else float(np.std(np.diff(records[0][0]))) or 1.0
-    scaled = [((position - position[0]) / unit, seen) for position, seen in records]
+    scaled = [
+        ((position - position[0]) / unit, np.ascontiguousarray(seen)) for position, seen in records
+    ]
     priors = [_prior(y, order) for y, _ in scaled]
 
     def score(log_ratio: float) -> tuple[float, float, float]:

@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -136,6 +137,44 @@ def test_a_full_disk_costs_the_cache_only(function: Any, monkeypatch: pytest.Mon
     monkeypatch.setattr(compiled.tempfile, "mkstemp", full)
     assert again(4.0) == 13.0
     assert not list(folder.glob(".*"))
+
+
+def code_files(folder: Path) -> compiled._CodeFiles:
+    """What another process would see of one function: claims of files are the file's, not ours."""
+    return compiled._CodeFiles(folder, "module.function", "stamp", {os.geteuid()})
+
+
+def test_what_another_process_compiles_is_waited_for(tmp_path: Path) -> None:
+    first, second = code_files(tmp_path), code_files(tmp_path)
+    assert first.load("key") is None
+    with ThreadPoolExecutor(1) as pool:
+        waiting = pool.submit(second.load, "key")
+        with pytest.raises(TimeoutError):
+            waiting.result(timeout=0.2)
+        first.save("key", "code")
+        assert waiting.result(timeout=10.0) == "code"
+    assert [path.suffix for path in tmp_path.iterdir()] == [".nbc"], "no claim is left"
+
+
+def test_a_process_that_dies_while_compiling_holds_up_nobody(tmp_path: Path) -> None:
+    first, second = code_files(tmp_path), code_files(tmp_path)
+    assert first.load("key") is None
+    for handle in first._claims.values():
+        os.close(handle)  # as its end would
+    assert second.load("key") is None
+    second.save("key", "code")
+    assert first.load("key") == "code"
+
+
+def test_a_process_that_hangs_while_compiling_is_not_waited_for_without_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(compiled, "_PATIENCE_S", 0.1)
+    first, second = code_files(tmp_path), code_files(tmp_path)
+    assert first.load("key") is None
+    assert second.load("key") is None
+    second.save("key", "code")
+    assert code_files(tmp_path).load("key") == "code"
 
 
 # Generated source
