@@ -86,8 +86,8 @@ class Motion:
 def observe(recording: Recording, sensors: Sensors, system: System) -> Motion:
     """Filter a recording the way every recording, measured or replayed, is filtered.
 
-    Positions come back unfiltered, velocities and accelerations through a zero-phase Butterworth
-    filter at ``sensors.cutoff_hz``; the force itself unfiltered, its derivatives like velocities.
+    Positions, velocities and accelerations go through a zero-phase Butterworth filter at
+    ``sensors.cutoff_hz``; the force itself is left as it is, its derivatives like velocities.
     """
     device = system.model.device
     rate, cutoff = sensors.rate_hz, sensors.cutoff_hz

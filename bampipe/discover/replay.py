@@ -10,11 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.discover.recording import Motion, Recording, Sensors
+from bampipe.estimate.butterworth import zero_phase
 from bampipe.estimate.simulation import simulate_tracking
 from bampipe.physics import System
 from bampipe.physics.device import derivative
 
 Array = NDArray[np.float64]
+
+FOLLOWED_HZ = 10.0
+"""Highest frequency of the motion to follow where encoder and handle move apart."""
 
 
 def replay(
@@ -34,12 +38,13 @@ def replay(
     """
     u = motion.inputs(system.inputs)
     n = len(system.coordinates)
-    start = np.concatenate([motion.q[0], motion.qd[0], system.initial_memory(motion.q[0], u[0], p)])
+    q, qd = _reference(system, p, motion, u, sensors.rate_hz)
+    start = np.concatenate([q[0], qd[0], system.initial_memory(q[0], u[0], p)])
     at = {name: i for i, name in enumerate(system.inputs)}
     forces = system.model.device.forces
     widths = np.array([c.sign_width for c in system.model.device.coordinates])
     x, total = simulate_tracking(
-        system.derivative, start, u, p, 1.0 / sensors.rate_hz, motion.q, motion.qd,
+        system.derivative, start, u, p, 1.0 / sensors.rate_hz, q, qd,
         width=widths, n_noise=len(system.noise),
         force=[at[f] for f in forces],
         rate=[at.get(derivative(f, 1), -1) for f in forces],
@@ -60,5 +65,21 @@ def replay(
         if axis in brakes:
             brake[:, i] = motion.channels[brakes[axis]]
     other = {name: motion.channels[name] for name in system.model.device.channels}
-    q = (counts + 0.5) * sensors.resolution - offset
-    return Recording(motion.trial_id, q, force, brake, other)
+    read = (counts + 0.5) * sensors.resolution - offset
+    return Recording(motion.trial_id, read, force, brake, other)
+
+
+def _reference(
+    system: System, p: Array, motion: Motion, u: Array, rate_hz: float
+) -> tuple[Array, Array]:
+    """Positions and rates of the handle to follow, each (T, n_q).
+
+    Where play or wind-up lies between encoder and handle, the handle's motion is the encoder's
+    plus what the model puts between them. That jumps where a gap is crossed, a little before or
+    after the logged jump; a handle with inertia does not follow the difference of the two.
+    """
+    if not system.moves_sensors:
+        return motion.q, motion.qd
+    q, _, _ = system.true_motion(motion.q, motion.qd, motion.qdd, u, p)
+    smooth = [zero_phase(column, rate_hz, min(FOLLOWED_HZ, 0.2 * rate_hz)) for column in q.T]
+    return np.column_stack([c[0] for c in smooth]), np.column_stack([c[1] for c in smooth])
