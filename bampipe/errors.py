@@ -1,6 +1,23 @@
-"""The one exception that a user's mistake may raise."""
+"""The one exception that a user's mistake may raise, and text that is safe to show."""
 
 from functools import partial
+
+
+def printable(text: str) -> str:
+    """Return ``text`` with what no screen or document should obey written out, such as ``\\x1b``.
+
+    Names, columns and sentences come out of files that others wrote: control characters would
+    move the cursor or colour the screen, marks of writing direction would show another order,
+    and halves of surrogate pairs (bytes of a file name that are no UTF-8) cannot be encoded.
+    Line breaks and tabulators stay.
+    """
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() or c in "\n\t" else _written_out(c) for c in text)
+
+
+def _written_out(character: str) -> str:
+    return character.encode("unicode_escape").decode("ascii")
 
 
 class InputError(Exception):
@@ -25,4 +42,4 @@ class InputError(Exception):
     def __str__(self) -> str:
         text = f"{self.where}: {self.what}" if self.where else self.what
         text = f"{text}; {self.remedy}" if self.remedy else text
-        return " ".join(text.split())
+        return printable(" ".join(text.split()))

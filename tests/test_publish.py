@@ -119,15 +119,53 @@ def test_a_file_that_changed_on_the_way_is_refused(tmp_path: Path, url: str) -> 
     assert list((tmp_path / "elsewhere").iterdir()) == []
 
 
-def test_names_cannot_lead_out_of_the_run_folder(tmp_path: Path, url: str) -> None:
+@pytest.mark.parametrize(
+    ("field", "value", "said"),
+    [
+        ("files", {"../../out.txt": "0"}, "leads out of the run folder"),
+        ("files", {"figures/../../../out.txt": "0"}, "leads out of the run folder"),
+        ("files", {"/tmp/out.txt": "0"}, "leads out of the run folder"),
+        ("files", {"out\0.txt": "0"}, "leads out of the run folder"),
+        ("files", {".bampipe/staging/x/.commit.json": "0"}, "leads out of the run folder"),
+        ("files", {"run.json": None}, "damaged"),
+        ("files", ["run.json"], "damaged"),
+        ("version", "../../s2/current", "damaged"),
+        ("version", None, "damaged"),
+        ("schema", "bampipe.published/2", "not a published run"),
+    ],
+)
+def test_what_a_hostile_store_says_stays_in_the_run_folder(
+    tmp_path: Path, url: str, field: str, value: object, said: str
+) -> None:
     publish(make_run(tmp_path / "runs/s1"), url)
     system, base = fsspec.core.url_to_fs(url)
     pointer = f"{base}/s1/{CURRENT}"
-    content = json.loads(system.cat_file(pointer))
-    content["files"] = {"../../out.txt": "0"}
+    content = json.loads(system.cat_file(pointer)) | {field: value}
     system.pipe_file(pointer, json.dumps(content).encode())
-    with pytest.raises(InputError, match="leads out of the run folder"):
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(InputError, match=said):
         fetch(url, "s1", tmp_path / "elsewhere")
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize("name", ["..", ".", "", "../s1", "a/b", ".hidden", "s1\x1b[31m", "s1\n"])
+def test_a_name_that_is_no_session_is_not_fetched(tmp_path: Path, url: str, name: str) -> None:
+    """A store may list what it likes: `..` with --force would have replaced the folder of runs."""
+    publish(make_run(tmp_path / "runs/s1"), url)
+    with pytest.raises(InputError, match="is no name of a session"):
+        fetch(url, name, tmp_path / "runs", force=True)
+    assert (tmp_path / "runs/s1/run.json").is_file()
+
+
+def test_a_listing_names_sessions_only(
+    tmp_path: Path, url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    publish(make_run(tmp_path / "runs/s1"), url)
+    system, base = fsspec.core.url_to_fs(url)
+    listed = [f"{base}/s1", f"{base}/..", f"{base}/.", f"{base}/a\x1bb"]
+    monkeypatch.setattr(type(system), "ls", lambda *_, **__: listed)
+    monkeypatch.setattr(type(system), "exists", lambda *_, **__: True)
+    assert published(url) == ["s1"]
 
 
 def test_another_run_is_replaced_only_when_told(tmp_path: Path, url: str) -> None:

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from types import TracebackType
 from typing import Any
 
+from bampipe.errors import printable
 from bampipe.run.events import Event
 from bampipe.run.request import Outcome
 
@@ -28,17 +29,17 @@ def number(value: object) -> str:
         return ", ".join(f"{key} {number(item)}" for key, item in value.items())
     if isinstance(value, list | tuple):
         return ", ".join(number(item) for item in value) or "–"
-    return str(value)
+    return printable(str(value))
 
 
 def say(text: str) -> None:
     """Print a line on standard output."""
-    print(text)
+    print(printable(text))
 
 
 def note(text: str) -> None:
     """Print a line on standard error."""
-    print(text, file=sys.stderr, flush=True)
+    print(printable(text), file=sys.stderr, flush=True)
 
 
 def as_json(content: object) -> None:
@@ -251,10 +252,11 @@ class Watcher:
             from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
             self.bars = Progress(
-                TextColumn("{task.description}"),
+                # Names of sessions and trials are text: no markup of rich's.
+                TextColumn("{task.description}", markup=False),
                 BarColumn(bar_width=30),
                 TimeElapsedColumn(),
-                TextColumn("{task.fields[message]}"),
+                TextColumn("{task.fields[message]}", markup=False),
                 console=Console(stderr=True),
                 transient=True,
             )
@@ -287,6 +289,7 @@ class Watcher:
         if event.kind in ("start", "progress"):
             if name not in self.tasks:
                 self.tasks[name] = self.bars.add_task(name, total=1.0, message="")
-            self.bars.update(self.tasks[name], completed=event.fraction, message=event.message)
+            message = printable(event.message)
+            self.bars.update(self.tasks[name], completed=event.fraction, message=message)
         elif name in self.tasks:
             self.bars.remove_task(self.tasks.pop(name))

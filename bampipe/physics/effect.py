@@ -262,7 +262,9 @@ def bind(effect: Effect, target: str, device: Device) -> BoundEffect:
         choices = ", ".join(f"{effect.name}:{t}" if t else effect.name for t in targets)
         hint = expression.did_you_mean(target, targets)
         raise InputError(
-            f"effect {effect.name!r} has no target {target!r}{hint}",
+            f"effect {effect.name!r} has no target {target!r}{hint}"
+            if target
+            else f"effect {effect.name!r} needs a target",
             remedy=f"choose from {choices}",
         )
     kind = device.coordinate(target).kind if effect.scope == "axis" else ""

@@ -6,6 +6,7 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+from bampipe.errors import printable
 from bampipe.run.gates import Verdict
 
 
@@ -24,10 +25,6 @@ class Suite:
     error: str = ""
 
 
-def _printable(text: str) -> str:
-    return "".join(c for c in text if c in "\t\n\r" or ord(c) >= 0x20)
-
-
 def junit(suites: Iterable[Suite]) -> bytes:
     """Return the verdicts as JUnit XML: a session is a test suite, a gate on an axis a test."""
     top = ElementTree.Element("testsuites", name="bampipe")
@@ -36,7 +33,7 @@ def junit(suites: Iterable[Suite]) -> bytes:
         element = ElementTree.SubElement(
             top,
             "testsuite",
-            name=suite.name,
+            name=printable(suite.name),
             tests=str(tests),
             failures=str(sum(v.state == "failed" for v in suite.verdicts)),
             errors=str(int(bool(suite.error))),
@@ -44,18 +41,20 @@ def junit(suites: Iterable[Suite]) -> bytes:
         )
         if suite.error:
             case = ElementTree.SubElement(
-                element, "testcase", classname=suite.name, name="the pipeline finishes"
+                element, "testcase", classname=printable(suite.name), name="the pipeline finishes"
             )
-            ElementTree.SubElement(case, "error", message=_printable(suite.error))
+            ElementTree.SubElement(case, "error", message=printable(suite.error))
         for verdict in suite.verdicts:
             name = f"{verdict.gate}: {verdict.key}" if verdict.key else verdict.gate
-            case = ElementTree.SubElement(element, "testcase", classname=suite.name, name=name)
+            case = ElementTree.SubElement(
+                element, "testcase", classname=printable(suite.name), name=printable(name)
+            )
             if verdict.state == "failed":
-                ElementTree.SubElement(case, "failure", message=_printable(verdict.message))
+                ElementTree.SubElement(case, "failure", message=printable(verdict.message))
             elif verdict.state == "absent":
-                ElementTree.SubElement(case, "skipped", message=_printable(verdict.message))
+                ElementTree.SubElement(case, "skipped", message=printable(verdict.message))
             elif verdict.state == "warned":
-                ElementTree.SubElement(case, "system-out").text = _printable(verdict.message)
+                ElementTree.SubElement(case, "system-out").text = printable(verdict.message)
     ElementTree.indent(top)
     text: bytes = ElementTree.tostring(top, encoding="utf-8", xml_declaration=True)
     return text + b"\n"

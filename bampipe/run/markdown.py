@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from bampipe.errors import InputError
+from bampipe.errors import InputError, printable
 from bampipe.run.gates import Verdict
 from bampipe.run.models import BASE
 from bampipe.run.request import Outcome
@@ -109,6 +109,6 @@ def _cell(text: str) -> str:
     """Return ``text`` so that it cannot break the table or become markup."""
     if text in STATES.values():
         return text
-    for mark in "\\|`*_<>[]":
+    for mark in "\\|`*_<>[]&~":
         text = text.replace(mark, f"\\{mark}")
-    return " ".join(text.split())
+    return printable(" ".join(text.split()))

@@ -52,7 +52,7 @@ def read(root: Path, name: str) -> ModelFile:
     """Read ``models/<name>/model.toml``.
 
     Raises:
-        InputError: there is none, or it is damaged.
+        InputError: there is none, it is damaged, or its parent is missing.
     """
     path = root / "models" / name / "model.toml"
     if name not in names(root):
@@ -64,7 +64,16 @@ def read(root: Path, name: str) -> ModelFile:
         raise InputError("device must be a text", where=str(path))
     if not isinstance(effects, list) or not all(isinstance(item, str) for item in effects):
         raise InputError("effects must be a list of texts", where=str(path))
-    return ModelFile(name, str(content.get("parent", "")), device, tuple(effects))
+    parent = content.get("parent", "")
+    if not isinstance(parent, str):
+        raise InputError("parent must be a text", where=str(path))
+    if parent and parent not in names(root):
+        raise InputError(
+            f"model {name!r} has parent {parent!r}, which is missing",
+            where=str(path),
+            remedy="restore the parent's folder, or remove the child's",
+        )
+    return ModelFile(name, parent, device, tuple(effects))
 
 
 def write(root: Path, model: ModelFile) -> None:

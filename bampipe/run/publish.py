@@ -22,6 +22,7 @@ from typing import Any
 
 from bampipe.errors import InputError
 from bampipe.run import hashing, record
+from bampipe.run.session_name import is_name
 
 SCHEMA = "bampipe.published/1"
 CURRENT = "current.json"
@@ -82,7 +83,9 @@ def published(url: str) -> list[str]:
             return []
         system.invalidate_cache()
         names = [str(path).rstrip("/").rpartition("/")[2] for path in system.ls(base, detail=False)]
-        return sorted(name for name in names if system.exists(f"{base}/{name}/{CURRENT}"))
+        # Other names are no sessions of ours, and ".." would lead out of the folder.
+        sessions = [name for name in names if is_name(name)]
+        return sorted(name for name in sessions if system.exists(f"{base}/{name}/{CURRENT}"))
     except _faults() as error:
         raise InputError(f"cannot be read: {_first_line(error)}", where=url) from error
 
@@ -102,6 +105,8 @@ def fetch(url: str, session: str, runs: Path, force: bool = False) -> Path:
     Raises:
         InputError: nothing published, a file does not match its hash, or there is another run.
     """
+    if not is_name(session):
+        raise InputError(f"{session!r} is no name of a session", where=url)
     system, base = _open(url)
     here, root = f"{base}/{session}", runs / session
     try:
@@ -120,7 +125,7 @@ def fetch(url: str, session: str, runs: Path, force: bool = False) -> Path:
         draft = Path(tempfile.mkdtemp(prefix=f".{session}.", dir=runs))
         try:
             for name, known in current["files"].items():
-                target = _inside(draft, name, url)
+                target = draft / name
                 target.parent.mkdir(parents=True, exist_ok=True)
                 system.get_file(f"{here}/{current['version']}/{name}", str(target))
                 if hashing.digest_file(target) != known:
@@ -168,12 +173,23 @@ def _current(system: Any, here: str) -> dict[str, Any] | None:
         content = json.loads(system.cat_file(f"{here}/{CURRENT}"))
     except FileNotFoundError:
         return None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(
             f"not readable as JSON ({error})", where=f"{here}/{CURRENT}", remedy="publish anew"
         ) from error
     if not isinstance(content, dict) or content.get("schema") != SCHEMA:
         raise InputError("not a published run", where=f"{here}/{CURRENT}")
+    version, files = content.get("version"), content.get("files")
+    if (
+        not isinstance(version, str)
+        or not is_name(version)
+        or not isinstance(files, dict)
+        or not all(isinstance(known, str) for known in files.values())
+    ):
+        raise InputError("damaged", where=f"{here}/{CURRENT}", remedy="publish anew")
+    for name in files:
+        if not record.are_inside([name]) or name.split("/")[0] == record.PRIVATE or "\0" in name:
+            raise InputError(f"the name {name!r} leads out of the run folder", where=here)
     return content
 
 
@@ -189,14 +205,6 @@ def _is_same(root: Path, files: dict[str, str]) -> bool:
         (root / name).is_file() and hashing.digest_file(root / name) == known
         for name, known in files.items()
     )
-
-
-def _inside(folder: Path, name: str, url: str) -> Path:
-    """Return ``folder / name``; a name that leads out of it is refused."""
-    path = folder / name
-    if not path.resolve().is_relative_to(folder.resolve()):
-        raise InputError(f"the name {name!r} leads out of the run folder", where=url)
-    return path
 
 
 def _umask() -> int:

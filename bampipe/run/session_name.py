@@ -9,12 +9,23 @@ from bampipe.data.text import read_toml
 from bampipe.errors import InputError
 
 
+def is_name(text: str) -> bool:
+    """Whether ``text`` can name a run folder: no path, nothing hidden, no control character."""
+    return re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9._+-]{0,127}", text) is not None
+
+
 def session_id(session: Path) -> str:
     """Return the name of the run folder for ``session``: the id in its session file.
 
     Raises:
-        InputError: there is no session, or its id is no name for a folder.
+        InputError: there is no session, its id is no name for a folder, or its path is no text.
     """
+    try:
+        str(session.resolve()).encode()
+    except UnicodeEncodeError as error:
+        raise InputError(
+            "the path is no UTF-8 text", where=str(session), remedy="rename the folder"
+        ) from error
     path = session / "session.toml"
     if not path.is_file():
         if not session.exists():
@@ -36,7 +47,7 @@ def session_id(session: Path) -> str:
             "'session_id' is missing", where=str(path), remedy="give the session a name of its own"
         )
     name = content.get("session_id")
-    if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9._+-]{0,127}", name):
+    if not isinstance(name, str) or not is_name(name):
         raise InputError(
             f"session_id must be a name of letters, digits, '.', '_', '+' or '-', not {name!r}",
             where=str(path),

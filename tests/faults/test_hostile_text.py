@@ -1,0 +1,146 @@
+"""Names and sentences out of files that others wrote: shown, never obeyed."""
+
+from __future__ import annotations
+
+import io
+import os
+import shutil
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from conftest import Toy
+
+from bampipe.cli import show
+from bampipe.errors import InputError, printable
+from bampipe.report.document import Bullets, Callout, Document, Section, Subheading, Table, Text
+from bampipe.report.page import page
+from bampipe.report.typeset import pdf
+from bampipe.run import junit
+from bampipe.run.events import Event
+from bampipe.run.gates import Verdict
+from bampipe.run.markdown import summary
+from bampipe.run.request import Outcome
+
+CLEAR_SCREEN = "\x1b[2J"
+CONTROLS = [CLEAR_SCREEN, "\x9b31m", "\x07", "\x08", "\r", "\u202e", "\x7f", "\udcff", "\ufffe"]
+MARKUP = "<script>alert(1)</script><img src=x onerror=alert(2)>"
+
+
+@pytest.mark.parametrize("control", CONTROLS)
+def test_a_message_obeys_no_control_character(control: str) -> None:
+    message = str(InputError(f"no column 'a{control}b'", where=f"t{control}.csv"))
+    assert control not in message
+    assert message.isprintable() and message.encode()
+
+
+def test_plain_text_stays_as_it_is() -> None:
+    for text in ("ρ = 0 at ±90°, ‘x’ → 3 N.m", "two\nlines\tand a tab", "名前", ""):
+        assert printable(text) == text
+
+
+@pytest.mark.parametrize("control", CONTROLS)
+def test_tables_and_lines_obey_no_control_character(
+    control: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    show.table(["name", control], [[f"a{control}b", 1.0]])
+    show.say(control)
+    show.note(control)
+    printed = capsys.readouterr()
+    for text in (printed.out, printed.err):
+        assert all(c.isprintable() or c == "\n" for c in text)
+
+
+class _Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.mark.parametrize("name", ["[/b]", "[red]t", f"t{CLEAR_SCREEN}", "[link=file:///etc]x"])
+def test_progress_takes_a_trial_for_text(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    screen = _Terminal()
+    monkeypatch.setattr("sys.stderr", screen)
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "200")
+    with show.Watcher(quiet=False) as watcher:
+        watcher(Event("run", "ingest", "progress", 0.5, name))
+        watcher.bars.refresh()
+    assert printable(name) in screen.getvalue()
+
+
+def test_a_column_of_a_log_cannot_move_the_cursor(
+    tmp_path: Path, command: Callable[..., tuple[int, str, str]]
+) -> None:
+    folder = tmp_path / "s"
+    folder.mkdir()
+    name = CLEAR_SCREEN.replace("\x1b", "\\u001b")
+    (folder / "session.toml").write_text(
+        f"""schema = "bampipe.session/1"
+session_id = "s"
+device = "slider{name}"
+sample_rate_hz = 100.0
+trials = [{{ file = "a{name}.csv", kind = "free" }}]
+[encoders]
+carriage = {{ column = "x", counts_per_unit = 1.0, unit = "m" }}
+"""
+    )
+    code, out, err = command("run", folder, "--runs", tmp_path / "runs")
+    assert code == 2 and "\\x1b[2J" in err, err
+    assert "\x1b" not in out + err
+
+
+@pytest.mark.parametrize("control", CONTROLS)
+def test_junit_is_xml_whatever_a_session_is_called(control: str) -> None:
+    verdict = Verdict(f"gate{control}", f"yaw{control}", "failed", 1.0, f"bad{control}{MARKUP}")
+    suites = [junit.Suite(f"s{control}", (verdict,)), junit.Suite(MARKUP, (), f"no{control}")]
+    top = ElementTree.fromstring(junit.junit(suites))
+    assert [suite.get("name") for suite in top] == [printable(f"s{control}"), MARKUP]
+    message = top[0][0][0].get("message")
+    assert message is not None and message.endswith(MARKUP)
+
+
+def test_markdown_takes_a_session_for_text(tmp_path: Path) -> None:
+    hostile = "x|y`*[a](javascript:b)<img src=x>&lt;b&gt;\n# head\x1b[2J"
+    outcome = Outcome(tmp_path / "s", "refused", (), (), hostile)
+    (line,) = [line for line in summary([outcome]).splitlines() if "javascript" in line]
+    assert "\x1b" not in line and "# head" not in line[:2]
+    bare = line.replace("\\\\", "")
+    for mark in "|`*[]<>&":
+        inside = bare.strip("| ").partition(" | ")[2].rpartition(" | ")[2]
+        assert mark not in inside.replace(f"\\{mark}", ""), mark
+
+
+def test_a_path_that_is_no_text_is_one_line(
+    toy: Toy, command: Callable[..., tuple[int, str, str]]
+) -> None:
+    folder = os.fsdecode(os.fsencode(toy.folder) + b"/b\xffd")
+    shutil.copytree(toy.session, folder)
+    arguments = ("--pipeline", toy.pipeline_file, "--runs", toy.runs)
+    code, _, err = command("run", folder, *arguments)
+    assert code == 2 and err.count("\n") == 1, err
+    assert "\\udcff" in err and "rename" in err
+
+
+HOSTILE = (
+    MARKUP,
+    '#import "/etc/passwd"; #read("/etc/passwd")',
+    "$\\input{/etc/passwd}$",
+    "`*_**`",
+)
+
+
+@pytest.mark.parametrize("text", HOSTILE)
+def test_the_report_takes_names_for_text(text: str) -> None:
+    blocks = (
+        Text(text),
+        Subheading(text),
+        Bullets((text,)),
+        Callout("good", text, text),
+        Table(text, (text,), ((text,),), "l"),
+    )
+    document = Document(text, text, (Section(text, blocks),))
+    body = page(document)
+    for tag in ("<script>alert", "<img src=x"):
+        assert tag not in body
+    assert pdf(document, 0).startswith(b"%PDF")
