@@ -20,7 +20,8 @@ from pathlib import Path
 import numpy as np
 
 from bampipe.discover.chance import Recipe, Session
-from bampipe.discover.diagnosis import Settings, diagnose
+from bampipe.discover.diagnosis import diagnose
+from bampipe.discover.settings import Settings
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import Model, compile_model, registry
 from bampipe.stages import ingest, simulate

@@ -208,6 +208,9 @@ def run_scores(task: ScoreTask) -> dict[str, Score]:
     return {name: score for name, score in found.items() if score is not None}
 
 
+Progress = Callable[[float, str], None]
+"""Called with a fraction of the work done and what is being done."""
+
 Pool = Callable[[Callable[[Any], Any], Sequence[Any]], Iterator[Any]]
 
 

@@ -14,7 +14,9 @@ from bampipe.data.store import write_json
 from bampipe.discover.advice import advise
 from bampipe.discover.chance import Recipe, Session
 from bampipe.discover.description import describe
-from bampipe.discover.diagnosis import Diagnosis, Settings, diagnose
+from bampipe.discover.diagnosis import diagnose
+from bampipe.discover.findings import Diagnosis
+from bampipe.discover.settings import Settings
 from bampipe.discover.shape import residual_map, variables, worst_windows
 from bampipe.errors import InputError
 from bampipe.estimate.low_pass import Band

@@ -8,7 +8,8 @@ from sessions import bam, made
 
 from bampipe.discover.chance import Session, fit_session, system_of
 from bampipe.discover.description import describe
-from bampipe.discover.diagnosis import Settings, diagnose
+from bampipe.discover.diagnosis import diagnose
+from bampipe.discover.settings import Settings
 
 QUICK = Settings(replicates=5, final_replicates=4, jobs=2)
 

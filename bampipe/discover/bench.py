@@ -1,0 +1,106 @@
+"""A session, replays of models fitted to it, and candidates scored on both."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.discover.candidates import Score, Scorer
+from bampipe.discover.chance import (
+    Pool,
+    PrepareTask,
+    Recipe,
+    Replicate,
+    ReplicateTask,
+    ScoreTask,
+    Session,
+    fit_session,
+    prepare,
+    run_replicate,
+    run_scores,
+)
+from bampipe.discover.evidence import Evidence
+from bampipe.discover.level import Level
+from bampipe.discover.settings import Settings
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Bench:
+    """What every step of a diagnosis works with.
+
+    Attributes:
+        session: the measured trials.
+        settings: how carefully to look.
+        pool: a `map` over worker processes.
+        names: every candidate.
+    """
+
+    session: Session
+    settings: Settings
+    pool: Pool
+    names: tuple[str, ...]
+
+    def prepare(self, recipe: Recipe) -> None:
+        """Derive and compile every candidate, each in one worker only."""
+        parts = 4 * self.settings.jobs
+        tasks = [PrepareTask(recipe, self.names[k::parts]) for k in range(parts)]
+        list(self.pool(prepare, tasks))
+
+    def fit(self, recipe: Recipe, start: Array) -> Evidence:
+        """Least squares of a model on the measured trials."""
+        return fit_session(self.session, recipe, start)
+
+    def replicas(
+        self,
+        recipe: Recipe,
+        p: Array,
+        count: int,
+        names: Sequence[str],
+        seed: tuple[int, ...],
+        share: bool = False,
+        analysed: tuple[Recipe, Array] | None = None,
+    ) -> list[Replicate]:
+        """Replays of a model at ``p``; ``seed`` tells this set from all others.
+
+        Each is fitted by ``analysed``, a model and where its fit starts, or else by itself, and
+        ``names`` are scored against that fit.
+        """
+        into, start = analysed or (recipe, p)
+        tasks = [
+            ReplicateTask(
+                recipe, p, into, start, (self.settings.seed, *seed, k), tuple(names), share
+            )
+            for k in range(count)
+        ]
+        return list(self.pool(run_replicate, tasks))
+
+    def scores(self, recipe: Recipe, p: Array, names: Sequence[str]) -> dict[str, Score]:
+        """Scores of candidates against a model on the measured trials."""
+        parts = 2 * self.settings.jobs
+        tasks = [ScoreTask(recipe, p, tuple(names[k::parts])) for k in range(parts)]
+        merged: dict[str, Score] = {}
+        for found in self.pool(run_scores, tasks):
+            merged |= found
+        return merged
+
+    def level(
+        self, recipe: Recipe, evidence: Evidence, asked: Sequence[str], seed: tuple[int, ...]
+    ) -> Level:
+        """Chance level of candidates against a fitted model; ``asked`` are learned at once."""
+        count = self.settings.replicates
+        return Level(
+            lambda names: self.replicas(recipe, evidence.p, count, names, seed),
+            asked,
+            len(self.names),
+            float(Scorer(evidence).independent.mean()),
+        )
+
+    def gaining(self, scores: Mapping[str, Score], scorer: Scorer) -> list[str]:
+        """Candidates whose gain could be worth having; chance lowers it at most by half of that."""
+        least = 0.5 * self.settings.worth
+        return [n for n, s in scores.items() if np.any(s.gain / scorer.independent > least)]

@@ -1,0 +1,53 @@
+"""Candidates in the order of how well they explain what a model lacks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.discover.chance import Recipe
+from bampipe.discover.findings import Ranked
+from bampipe.discover.search import Search
+from bampipe.physics.parameter import Parameter
+
+Array = NDArray[np.float64]
+
+
+def rank(search: Search, selected: Sequence[str], before: Array) -> list[Ranked]:
+    """Selected effects with their groups, then the others by their score beyond chance."""
+    order: list[str] = []
+    for name in selected:
+        order += [n for n in (name, *search.groups.get(name, ())) if n not in order]
+    others = sorted(
+        (n for n in search.first if n not in order),
+        key=lambda n: -float(search.level.excess(search.first[n]).sum()),
+    )
+    rows = []
+    for name in [*order, *others]:
+        if name not in search.first:
+            continue
+        score = search.first[name]
+        excess = search.level.excess(score)
+        axis = int(np.argmax(excess))
+        group = next(({g, *r} - {name} for g, r in search.groups.items() if name in (g, *r)), set())
+        own = [q.name for q in _own_parameters(search.recipe, name)]
+        rows.append(
+            Ranked(
+                name,
+                axis,
+                float(before[axis]),
+                float(score.error[axis]),
+                search.level.p_value(score),
+                float(excess.sum()),
+                dict(zip(own, [float(v) for v in score.values], strict=True)),
+                tuple(sorted(group)),
+            )
+        )
+    return rows
+
+
+def _own_parameters(recipe: Recipe, name: str) -> tuple[Parameter, ...]:
+    return replace(recipe, effects=(name,)).model().effects[0].parameters

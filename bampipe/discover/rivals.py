@@ -1,0 +1,88 @@
+"""Candidates that come close to each other, told apart by replaying each of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from bampipe.discover.bench import Bench
+from bampipe.discover.candidates import Score
+from bampipe.discover.chance import Progress, Recipe, Replicate
+from bampipe.discover.evidence import Evidence
+from bampipe.discover.level import Level
+from bampipe.discover.start import with_effect
+
+
+def choose(
+    bench: Bench,
+    able: Sequence[tuple[float, str]],
+    level: Level,
+    recipe: Recipe,
+    evidence: Evidence,
+    scores: Mapping[str, Score],
+    progress: Progress,
+) -> tuple[str, tuple[str, ...]]:
+    """The best of ``able``, and others that these trials cannot tell from it, two at most.
+
+    Args:
+        bench: the session.
+        able: candidates that beat chance with their excess, best first.
+        level: their chance level.
+        recipe, evidence: the model that they would be added to, fitted.
+        scores: theirs.
+        progress: called with a fraction and a message.
+    """
+    top, best = able[0]
+    axis = int(np.argmax(level.excess(scores[best])))
+    rivals = [
+        name
+        for excess, name in able[:6]
+        if excess > 0.6 * top and int(np.argmax(level.excess(scores[name]))) == axis
+    ][:4]
+    if len(rivals) == 1:
+        return best, ()
+    misfit = {}
+    for k, name in enumerate(rivals):
+        progress(0.5, f"replaying {name} to tell it from {len(rivals) - 1} rival(s)")
+        wider = replace(recipe, effects=(*recipe.effects, name))
+        fitted = bench.fit(wider, with_effect(wider, evidence, scores[name]))
+        replicas = bench.replicas(
+            wider,
+            fitted.p,
+            bench.settings.rival_replicates,
+            rivals,
+            (2, k),
+            analysed=(recipe, evidence.p),
+        )
+        misfit[name] = _misfit(rivals, scores, replicas, axis)
+    ordered = sorted(rivals, key=lambda n: misfit[n])
+    winner = ordered[0]
+    limit = max(2.0, misfit[winner] + 1.0)
+    alike = tuple(n for n in ordered[1:] if misfit[n] < limit)
+    if best in alike:
+        alike = (winner, *[n for n in alike if n != best])
+        winner = best
+    return winner, alike[:2]
+
+
+def _misfit(
+    rivals: Sequence[str],
+    scores: Mapping[str, Score],
+    replicas: Sequence[Replicate],
+    axis: int,
+) -> float:
+    """How unlike the measured pattern of scores is to the replayed one: mean squared z.
+
+    A tenth of the score is allowed for, because no replay is perfect.
+    """
+    total = 0.0
+    for name in rivals:
+        seen = scores[name].gain[axis]
+        replayed = np.array(
+            [r.scores[name].gain[axis] if name in r.scores else 0.0 for r in replicas]
+        )
+        spread = np.sqrt(replayed.var(ddof=1) + (0.1 * replayed.mean()) ** 2 + 4.0)
+        total += ((seen - replayed.mean()) / spread) ** 2
+    return float(total / len(rivals))

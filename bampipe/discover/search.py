@@ -1,0 +1,114 @@
+"""The search for what a model lacks: the best candidate that beats chance, again and again."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.discover.bench import Bench
+from bampipe.discover.candidates import Score, Scorer
+from bampipe.discover.chance import Progress, Recipe, Replicate
+from bampipe.discover.evidence import Evidence
+from bampipe.discover.level import Level
+from bampipe.discover.rivals import choose
+from bampipe.discover.start import with_effect
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Search:
+    """What a search came to.
+
+    Attributes:
+        recipe: the model as given.
+        initial: its fit.
+        level: chance level of candidates against it.
+        first: scores against it.
+        selected: effects added, in order.
+        groups: for each, the others that these trials cannot tell from it.
+        main: for each, the axis on which it helps most.
+        evidence: fit of the model with all of them.
+        final: replays of that model, with explainable shares.
+    """
+
+    recipe: Recipe
+    initial: Evidence
+    level: Level
+    first: Mapping[str, Score]
+    selected: tuple[str, ...]
+    groups: Mapping[str, tuple[str, ...]]
+    main: Mapping[str, int]
+    evidence: Evidence
+    final: tuple[Replicate, ...]
+
+
+def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Search:
+    """Add effects to a model until no candidate beats chance.
+
+    Args:
+        bench: the session and the candidates.
+        base: the model as given.
+        start: parameters to start its fit from, (n_p,).
+        progress: called with a fraction and a message.
+    """
+    s = bench.settings
+    progress(0.0, "preparing the candidates")
+    bench.prepare(base)
+    initial = bench.fit(base, start)
+    progress(0.05, "scoring every candidate on the measured trials")
+    first = bench.scores(base, initial.p, bench.names)
+    progress(0.15, "replaying the model for chance levels")
+    level = bench.level(base, initial, bench.gaining(first, Scorer(initial)), (0,))
+    recipe, evidence, scores = base, initial, first
+    groups: dict[str, tuple[str, ...]] = {}
+    main: dict[str, int] = {}
+    replayed = level.replicates
+    while len(groups) < s.most_effects:
+        known = level
+        able = _able(bench, scores, known, evidence, replayed)
+        if able and groups:
+            # What a model with the first effects leaves by chance may look like another one.
+            close = {name: scores[name] for _, name in able}
+            known = bench.level(recipe, evidence, list(close), (4, len(groups)))
+            able = _able(bench, close, known, evidence, replayed)
+        if not able:
+            break
+        best, alike = choose(bench, able, known, recipe, evidence, scores, progress)
+        groups[best] = alike
+        help_ = level.excess(first[best]) if best in first else known.excess(scores[best])
+        main[best] = int(np.argmax(help_))
+        progress(0.45 + 0.1 * len(groups), f"added {best}, looking for more")
+        recipe = replace(base, effects=(*base.effects, *groups))
+        evidence = bench.fit(recipe, with_effect(recipe, evidence, scores[best]))
+        replayed = bench.replicas(recipe, evidence.p, s.rival_replicates, (), (3,))
+        scores = bench.scores(recipe, evidence.p, [n for n in bench.names if n not in groups])
+    progress(0.85, "replaying the final model for its noise floor")
+    final = bench.replicas(recipe, evidence.p, s.final_replicates, (), (1,), share=True)
+    return Search(
+        base, initial, level, first, tuple(groups), groups, main, evidence, tuple(final)
+    )  # fmt: skip
+
+
+def _able(
+    bench: Bench,
+    scores: Mapping[str, Score],
+    level: Level,
+    evidence: Evidence,
+    replayed: Sequence[Replicate],
+) -> list[tuple[float, str]]:
+    """Candidates that beat chance and are worth having, best first."""
+    scorer, s = Scorer(evidence), bench.settings
+    level.ask(bench.gaining(scores, scorer))
+    errors = np.array([r.error for r in replayed])
+    ceiling = s.at_floor * errors.mean(axis=0) + 2.0 * errors.std(axis=0, ddof=1)
+    worth = np.where(scorer.before.error > ceiling, s.worth, s.worth_at_floor)
+    able = []
+    for name, score in scores.items():
+        excess = level.excess(score)
+        if np.any(excess / scorer.independent > worth) and level.p_value(score) < s.significance:
+            able.append((float(excess.sum()), name))
+    return sorted(able, reverse=True)

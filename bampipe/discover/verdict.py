@@ -1,0 +1,79 @@
+"""The verdict on each axis, from what a search came to and the noise floor of its final model."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bampipe.discover.candidates import Scorer
+from bampipe.discover.chance import candidates_of
+from bampipe.discover.findings import AxisFinding, Diagnosis
+from bampipe.discover.ranking import rank
+from bampipe.discover.search import Search
+from bampipe.discover.settings import Settings
+from bampipe.discover.shape import explainable_share
+
+
+def conclude(search: Search, s: Settings) -> Diagnosis:
+    """Say of each axis whether something is missing, and whether what was found explains it."""
+    before = Scorer(search.initial).before.error
+    after = Scorer(search.evidence).before.error
+    floors = np.array([r.error for r in search.final])
+    bare_floor = np.array([r.error for r in search.level.replicates]).mean(axis=0)
+    shares = np.array([r.share for r in search.final])
+    reach = {n: _reach(search, n, s.worth) for n in search.selected}
+    findings = []
+    unknown = set()
+    for axis in range(len(before)):
+        floor, scatter = floors[:, axis].mean(), floors[:, axis].std(ddof=1)
+        luck = float(shares[:, axis].max())
+        given = _beyond(explainable_share(search.initial, axis), luck)
+        share = given
+        if search.selected:
+            share = _beyond(explainable_share(search.evidence, axis), luck)
+        here = tuple(n for n in search.selected if search.main[n] == axis or axis in reach[n])
+        excess = before[axis] ** 2 - min(floor, bare_floor[axis]) ** 2
+        left = max(after[axis] ** 2 - floor**2, 0.0)
+        above = after[axis] / (floor + 3.0 * scatter / s.above_floor)
+        lacking = bool(above > s.surely or (above > s.above_floor and share > 0.05))
+        verdict = "missing" if here else "nothing_missing"
+        explained = max(0.0, 1.0 - left / max(excess, 1e-30)) if here else 0.0
+        if lacking and explained < (s.explained_far if above > s.far else s.explained):
+            verdict = "unknown_effect"
+            unknown |= {n for n in here if search.main[n] == axis}
+        findings.append(
+            AxisFinding(
+                verdict,
+                float(before[axis]),
+                float(after[axis]),
+                float(floor),
+                float(scatter),
+                given,
+                share,
+                luck,
+                here if verdict == "missing" else (),
+                lacking and verdict == "missing",
+                here if verdict == "unknown_effect" else (),
+                explained,
+            )
+        )
+    kept = [n for n in search.selected if n not in unknown]
+    ranking = rank(search, kept, before)
+    groups = {n: search.groups.get(n, ()) for n in kept}
+    return Diagnosis(
+        tuple(findings), tuple(ranking), tuple(kept), groups, search.evidence, search.initial
+    )
+
+
+def _reach(search: Search, name: str, worth: float) -> set[int]:
+    """Axes on which an effect acts and whose error it lowers."""
+    item = candidates_of(search.recipe, (name,))[0].system
+    acts = range(len(item.coordinates)) if item.moves_sensors else item.touched
+    if name not in search.first:
+        return set()
+    drop = search.level.excess(search.first[name]) / Scorer(search.initial).independent
+    return {axis for axis in acts if drop[axis] > worth}
+
+
+def _beyond(share: float, luck: float) -> float:
+    """Explained share beyond the one that replays give, of what they leave."""
+    return float(max(0.0, (share - luck) / max(1.0 - luck, 1e-9)))
