@@ -36,6 +36,8 @@ from numba.core import typeinfer
 from numba.core.caching import FunctionCache
 from numba.core.serialize import dumps
 
+from bampipe import compile_ahead
+
 _MARK = b"bampipe compiled 1\n"
 _HASH_LENGTH = hashlib.sha256().digest_size
 _PATIENCE_S = 60.0
@@ -115,13 +117,22 @@ class _CheckedCache(FunctionCache):  # type: ignore[misc]
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(function)
         source = Path(function.__code__.co_filename)
-        stamp = _generated_stamp(function) or _sources(source.parent)
+        generated = _generated_stamp(function)
+        self._generated = generated is not None
+        stamp = generated or _sources(source.parent)
         self._cache_file = _CodeFiles(
             Path(self._cache_path),
             self._impl.filename_base,
             hashlib.sha256(f"{numba.__version__} {stamp}".encode()).hexdigest()[:16],
             {os.geteuid(), source.stat().st_uid},
         )
+
+    def load_overload(self, signature: Any, target: Any) -> Any:
+        """Return compiled code; None where there is none that may be used."""
+        found = super().load_overload(signature, target)
+        if found is None and not self._generated:
+            compile_ahead.missing()
+        return found
 
     def save_overload(self, signature: Any, data: Any) -> None:
         """Keep compiled code; a full or unwritable disk leaves it uncached."""

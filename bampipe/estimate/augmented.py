@@ -15,7 +15,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from bampipe.estimate.propagation import place_parameters, runge_kutta
+from bampipe.estimate.placement import place_parameters
+from bampipe.estimate.runge_kutta import runge_kutta
 from bampipe.estimate.unscented import (
     FilteredTrial,
     FilterFailure,

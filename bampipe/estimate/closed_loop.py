@@ -10,7 +10,7 @@ from numba import float64, int64, void
 from numpy.typing import NDArray
 
 from bampipe.compiled import njit
-from bampipe.estimate.propagation import runge_kutta
+from bampipe.estimate.runge_kutta import runge_kutta
 from bampipe.estimate.signatures import COMMAND, DERIVATIVE, MEASURE
 from bampipe.estimate.simulation import require_finite, stable_steps
 

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.errors import InputError
-from bampipe.estimate.propagation import place_parameters, runge_kutta
+from bampipe.estimate.placement import place_parameters
+from bampipe.estimate.runge_kutta import runge_kutta
 from bampipe.estimate.unscented import (
     FilteredTrial,
     FilterFailure,

@@ -4,78 +4,7 @@ import numpy as np
 from numba import boolean, float64, int64, void
 
 from bampipe.compiled import njit
-from bampipe.estimate.signatures import DERIVATIVE, DERIVATIVE_ROWS, MEASURE_ROWS, ROWS
-
-
-@njit(
-    void(
-        DERIVATIVE,
-        float64[::1],
-        float64[::1],
-        float64[::1],
-        float64[::1],
-        float64[::1],
-        float64,
-        int64,
-        float64[:, ::1],
-    ),
-    cache=True,
-)
-def runge_kutta(derivative, x, u0, u1, p, w, dt, substeps, work):  # type: ignore[no-untyped-def]
-    """Advance ``x`` in place by ``dt``: classical fourth order, eq 22 with k4 at x + delta k3.
-
-    The input runs linearly from ``u0`` to ``u1`` over the interval; held constant instead, it
-    would lag the motion by half a sample, which at human forces exceeds the sensor noise.
-
-    Args:
-        derivative: f(x, u, p, w, dx).
-        x: (nx,) state.
-        u0, u1: (nu,) input at both ends.
-        p: (np,) parameters.
-        w: (nw,) process noise, constant over the interval.
-        dt: length of the interval, s.
-        substeps: number n of steps of size delta = dt / n.
-        work: (6, >= max(nx, nu)) scratch.
-    """
-    nx = x.shape[0]
-    nu = u0.shape[0]
-    k1 = work[0, :nx]
-    k2 = work[1, :nx]
-    k3 = work[2, :nx]
-    k4 = work[3, :nx]
-    probe = work[4, :nx]
-    u = work[5, :nu]
-    delta = dt / substeps
-    for step in range(substeps):
-        for i in range(nu):
-            u[i] = u0[i] + (u1[i] - u0[i]) * (step / substeps)
-        derivative(x, u, p, w, k1)
-        for i in range(nu):
-            u[i] = u0[i] + (u1[i] - u0[i]) * ((step + 0.5) / substeps)
-        for i in range(nx):
-            probe[i] = x[i] + 0.5 * delta * k1[i]
-        derivative(probe, u, p, w, k2)
-        for i in range(nx):
-            probe[i] = x[i] + 0.5 * delta * k2[i]
-        derivative(probe, u, p, w, k3)
-        for i in range(nu):
-            u[i] = u0[i] + (u1[i] - u0[i]) * ((step + 1.0) / substeps)
-        for i in range(nx):
-            probe[i] = x[i] + delta * k3[i]
-        derivative(probe, u, p, w, k4)
-        for i in range(nx):
-            x[i] += delta / 6.0 * (k1[i] + 2.0 * k2[i] + 2.0 * k3[i] + k4[i])
-
-
-@njit(
-    void(float64[::1], int64, int64[::1], boolean[::1], float64[::1], float64[::1], float64[::1]),
-    cache=True,
-)
-def place_parameters(point, nx, free, logarithmic, lower, upper, p):  # type: ignore[no-untyped-def]
-    """Write the parameters of a sigma point into ``p``, clamped to their physical range."""
-    for j in range(free.shape[0]):
-        value = min(max(point[nx + j], lower[j]), upper[j])
-        p[free[j]] = np.exp(value) if logarithmic[j] else value
+from bampipe.estimate.signatures import DERIVATIVE_ROWS, MEASURE_ROWS, ROWS
 
 
 @njit(float64[:, ::1](int64, int64, float64[::1], int64), cache=True)
@@ -138,7 +67,7 @@ def _place_rows(  # type: ignore[no-untyped-def]
     fastmath={"contract"},
 )  # fmt: skip
 def _runge_kutta_rows(derivative, count, nx, nu, dt, substeps, slope, work):  # type: ignore[no-untyped-def]
-    """Advance many states by ``dt``; see `runge_kutta`.
+    """Advance many states by ``dt``, as `bampipe.estimate.runge_kutta` advances one.
 
     Args:
         derivative: f(count, x, u, p, w, dx).

@@ -8,6 +8,7 @@ import time
 from datetime import UTC, datetime
 from typing import Any
 
+from bampipe import compile_ahead
 from bampipe.errors import InputError
 from bampipe.run import accepted, hashing, models, record, staging
 from bampipe.run.events import Event, Listener, unheard
@@ -138,7 +139,8 @@ def run_session(request: Request, listen: Listener = unheard) -> Outcome:
         runner = _Runner(request, listen)
         staging.recover(runner.state)
         try:
-            return runner.run()
+            with compile_ahead.beside(request.processes):
+                return runner.run()
         except InputError:
             if fresh and not runner.state.records:
                 shutil.rmtree(request.root)

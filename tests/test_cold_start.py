@@ -1,0 +1,76 @@
+"""On a cold start, processes beside the run compile what later stages need; once warm, none do."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from bampipe import compile_ahead
+
+
+class Started:
+    """Takes the place of `subprocess.Popen`; notes what was started and ended."""
+
+    def __init__(self) -> None:
+        self.codes: list[str] = []
+        self.ended = 0
+
+    def __call__(self, command: list[str], **_: Any) -> Started:
+        self.codes.append(command[-1])
+        return self
+
+    def terminate(self) -> None:
+        self.ended += 1
+
+    def wait(self) -> None:
+        assert self.ended, "waited for before it was ended"
+
+
+@pytest.fixture
+def started(monkeypatch: pytest.MonkeyPatch) -> Started:
+    found = Started()
+    monkeypatch.setattr(compile_ahead.subprocess, "Popen", found)
+    return found
+
+
+def test_the_first_missing_function_starts_them_and_the_end_of_the_run_ends_them(
+    started: Started,
+) -> None:
+    with compile_ahead.beside(2):
+        assert not started.codes, "nothing is missing yet"
+        compile_ahead.missing()
+        compile_ahead.missing()
+        assert len(started.codes) == len(compile_ahead._PARTS)
+        assert not started.ended
+    assert started.ended == len(started.codes)
+    compile_ahead.missing()
+    assert started.ended == len(started.codes), "none is started outside a run"
+
+
+def test_one_core_is_left_to_the_run(started: Started) -> None:
+    with compile_ahead.beside(1):
+        compile_ahead.missing()
+    assert not started.codes
+
+
+def test_what_they_import_is_kept_and_nothing_comes_from_the_working_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "numba.py").write_text("raise SystemExit('imported from the working folder')")
+    monkeypatch.setattr(sys, "path", [place for place in sys.path if place])
+    names = ", ".join(name for part in compile_ahead._PARTS for name in part)
+    noted = (
+        "from bampipe import compiled; "
+        "compiled._CheckedCache.save_overload = lambda self, *_: print(self._impl.filename_base)"
+    )
+    for before in ("pass", noted):
+        code = f"import sys; sys.path[:] = {sys.path!r}; {before}; import {names}"
+        done = subprocess.run(
+            [sys.executable, "-P", "-c", code], cwd=tmp_path, capture_output=True, text=True
+        )
+        assert done.returncode == 0, done.stderr
+    assert done.stdout == "", "compiled again"
