@@ -67,6 +67,7 @@ LAWS = {
         "distributed",
         "fsspec",
         "bampipe",
+        "bampipe.compile_ahead",
         "bampipe.errors",
         "bampipe.data",
         "bampipe.stages.base",

@@ -28,6 +28,8 @@ SUMMARY = "Velocity and acceleration from the encoders, with error bands"
 METHODS = ("auto", "kalman", "butterworth", "savitzky_golay")
 _MOVING = ("free", "viscous")
 _SHORTEST = 32
+_TUNING_PART = 2000
+"""Least length, samples, of the parts that the bandwidth is chosen from, where trials are many."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +49,8 @@ class Config:
         force_cutoff_hz: half-amplitude frequency, Hz, of the derivatives of the force; the force
             itself is not filtered.
         tuning_samples: at most so many samples of each axis are used to choose the bandwidth,
-            in equal parts from all trials.
+            in equal parts from all trials, or from some that are spread over the session where
+            there are very many.
     """
 
     method: str = "auto"
@@ -162,16 +165,22 @@ def _load(samples: Path, trial_id: str, rate: float) -> _Trial | str:
 def _tuning_records(
     samples: Path, ids: Sequence[str], axes: tuple[str, ...], rate: float, budget: int
 ) -> dict[str, list[tuple[Array, Flags]]]:
-    """Return, per axis, the first part of every trial as positions and flags of samples seen."""
+    """Return, per axis, the first parts of trials as positions and flags of samples seen."""
     records: dict[str, list[tuple[Array, Flags]]] = {axis: [] for axis in axes}
-    share = max(budget // max(len(ids), 1), _SHORTEST)
-    for trial_id in ids:
-        trial = _load(samples, trial_id, rate)
+    most = max(budget // _TUNING_PART, 1)
+    spread = np.unique(np.linspace(0, len(ids) - 1, min(len(ids), most)).round().astype(int))
+    rest = np.setdiff1d(np.arange(len(ids)), spread)
+    share = max(budget // max(len(spread), 1), _SHORTEST)
+    for number, place in enumerate((*spread, *rest)):
+        if number >= len(spread) and any(records.values()):
+            break
+        trial = _load(samples, ids[place], rate)
         if isinstance(trial, str):
             continue
         for axis in axes:
             position = trial.grid.resample(trial.frame[f"q_{axis}"].to_numpy(dtype=np.float64))
-            records[axis].append((position[:share], trial.seen[:share]))
+            # Copies: a view would keep the whole trial.
+            records[axis].append((position[:share].copy(), trial.seen[:share].copy()))
     return records
 
 

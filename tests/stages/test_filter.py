@@ -173,3 +173,27 @@ def test_shared_session(tmp_path: Path) -> None:
         assert entry["measurement_noise_sd"] < 1.3 * entry["quantisation_sd"]
         slope = np.gradient(kinematics[f"q_{axis}"], 0.002)
         assert np.corrcoef(slope[10:7990], kinematics[f"qd_{axis}"][10:7990])[0, 1] > 0.999
+
+
+def test_of_very_many_trials_some_choose_the_bandwidth(tmp_path: Path) -> None:
+    """Those are spread over the session; where none of them will do, another one does."""
+    names = "abcde"
+    frames = {name: free_trial(seed)[0] for seed, name in enumerate(names)}
+    run = write_ingested(tmp_path / "long", frames, {n: ("free", None) for n in names}, AXES)
+    path = run.path("ingest/samples.parquet")
+
+    def chosen(path: Path, budget: int) -> list[list[float]]:
+        records = stage._tuning_records(path, names, tuple(AXES), 500.0, budget)["yaw"]
+        assert all(x.base is None and seen.base is None for x, seen in records), "whole trials kept"
+        assert all(len(x) == budget // len(records) for x, _ in records)
+        return [[float(x[0]), float(x[1])] for x, _ in records]
+
+    first = {name: frame["q_yaw"].to_list()[:2] for name, frame in frames.items()}
+    assert chosen(path, 4000) == [first["a"], first["e"]]
+    assert chosen(path, 10_000) == list(first.values())
+    frames |= {name: frames[name][:20] for name in "ae"}
+    short = write_ingested(tmp_path / "short", frames, {n: ("free", None) for n in names}, AXES)
+    records = stage._tuning_records(
+        short.path("ingest/samples.parquet"), names, tuple(AXES), 500.0, 4000
+    )["yaw"]
+    assert [x[:2].tolist() for x, _ in records] == [first["b"]]
