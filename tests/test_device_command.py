@@ -75,6 +75,8 @@ def test_a_sound_device_shows_its_equations(rail, command: Command) -> None:
         ),
         ([("mass*ddt(position)**2 + 2*pulley_inertia*ddt(turn)**2", "mass*g*position")],
          ["the kinetic energy must be quadratic"]),
+        ([('name = "rail"', 'name = "rail"\ndefault_effects = ["stribek:position"]')],
+         ["default_effects: unknown effect 'stribek', did you mean 'stribeck'"]),
         ([("[limits]\nposition", "[limits]\npositon")], ["limits: unknown axis 'positon'"]),
     ],
 )  # fmt: skip

@@ -52,11 +52,31 @@ class Options:
                 first=first,
                 last=last,
                 model=model,
+                settings=settings_of(self.root, model),
                 force=self.force,
                 wait=self.wait,
             ),
             self.listen,
         )
+
+
+def settings_of(root: Path, model: str) -> dict[str, dict[str, object]]:
+    """Settings that each stage was last given for ``model``, else for the model it came from.
+
+    A ladder compares like with like: a child is identified and judged as its parent was, whether
+    a pipeline said how, or a command for one stage.
+    """
+    line = [model]
+    while line[-1] in models.names(root) and models.read(root, line[-1]).parent:
+        line.append(models.read(root, line[-1]).parent)
+    made = record.read(root)["stages"]
+    used: dict[str, dict[str, object]] = {}
+    for name in line[::-1]:
+        for stage in base.PER_MODEL:
+            given = made.get(f"{stage}:{name}", {}).get("settings")
+            if given is not None:
+                used[stage] = {key: value for key, value in given.items() if key != "model"}
+    return used
 
 
 def current_model(root: Path) -> str:

@@ -128,7 +128,7 @@ def stiffness(
 def identify(
     run: Run = None,
     model: ModelName = "",
-    method: Annotated[str, typer.Option(help="ukf, least-squares or output-error.")] = "",
+    method: Annotated[str, typer.Option(help="auto, ukf, least-squares or output-error.")] = "",
     engine: Annotated[
         str,
         typer.Option(help="compiled; filterpy or augmented: slow, to compare with."),

@@ -40,6 +40,12 @@ _REASONS = {
 }
 
 
+_NOT_A_SPREAD = (
+    "the spread of the parameters is not positive definite any more: priors far too wide, or"
+    " parameters that cannot be told apart"
+)
+
+
 class FilterFailure(ArithmeticError):
     """The filter lost the trial.
 
@@ -234,14 +240,16 @@ def filter_trials(
         joint = np.zeros((n, n))
         joint[:nx, :nx] = np.diag(np.square(trial.x_sd))
         joint[nx:, nx:] = covariance
-        if settings.square_root:
-            joint = lower_root(joint)
         try:
+            if settings.square_root:
+                joint = lower_root(joint)
             found.append(
                 run_kernel(model, settings, trial.t, trial.u, trial.y, mean, joint, settings.stride)
             )
         except FilterFailure as failure:
             raise FilterFailure(index, failure.sample, failure.reason) from None
+        except ValueError as error:
+            raise FilterFailure(index, 0, _NOT_A_SPREAD) from error
         if settings.square_root:
             joint = joint @ joint.T
         theta, covariance = mean[nx:].copy(), joint[nx:, nx:].copy()
@@ -369,14 +377,20 @@ def _array(values: Any, kind: type = np.float64) -> NDArray[Any]:
 def lower_root(covariance: Array) -> Array:
     """Return the lower L with L L^T = covariance (n, n); zero variances give zero columns.
 
+    Rounding may leave a covariance of nearly dependent variables a little short of definite: then
+    a part in 10^12 is added to each variance.
+
     Raises:
         ValueError: the matrix is not positive semidefinite.
     """
     known = np.diag(covariance) == 0.0
     root = np.zeros_like(covariance)
     keep = np.flatnonzero(~known)
-    try:
-        root[np.ix_(keep, keep)] = np.linalg.cholesky(covariance[np.ix_(keep, keep)])
-    except np.linalg.LinAlgError as error:
-        raise ValueError("the starting covariance is not positive definite") from error
-    return root
+    part = covariance[np.ix_(keep, keep)]
+    for added in (0.0, 1e-12):
+        try:
+            root[np.ix_(keep, keep)] = np.linalg.cholesky(part + added * np.diag(np.diag(part)))
+        except np.linalg.LinAlgError:
+            continue
+        return root
+    raise ValueError("the starting covariance is not positive definite")

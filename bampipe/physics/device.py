@@ -99,6 +99,7 @@ class Device:
     frictional: tuple[str, ...]
     limits: Mapping[str, tuple[float, float]]
     controller: Controller | None
+    default_effects: tuple[str, ...]
     declaration: Mapping[str, Any] = field(repr=False, compare=False)
 
     def coordinate(self, name: str) -> Coordinate:
@@ -237,6 +238,11 @@ def device_from(declaration: Mapping[str, Any], where: str = "device file") -> D
         limits[axis] = (float(pair[0]), float(pair[1]))
         if not limits[axis][0] < limits[axis][1]:
             raise InputError("lower must be below upper", where=at)
+    effects = declaration.get("default_effects", [])
+    if not isinstance(effects, list | tuple) or not all(isinstance(e, str) and e for e in effects):
+        raise InputError(
+            'expected a list such as ["stribeck:joint"]', where=f"{where}: default_effects"
+        )
     forces = inputs.get("force", [])
     if not isinstance(forces, list | tuple) or not all(
         isinstance(f, str) and f not in ("", "force_") for f in forces
@@ -279,6 +285,7 @@ def device_from(declaration: Mapping[str, Any], where: str = "device file") -> D
         controller=controller_from(
             declaration.get("controller"), tuple(forces), f"{where}: controller"
         ),
+        default_effects=tuple(effects),
         declaration=declaration,
     )
     for label, table in (

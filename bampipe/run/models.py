@@ -95,7 +95,8 @@ def ensure_base(root: Path, device: str, effects: tuple[str, ...]) -> None:
     Args:
         root: the run folder; ``ingest/session.json`` must be there where ``device`` is "".
         device: the pipeline's device, or "".
-        effects: the pipeline's effects of the base model.
+        effects: the pipeline's effects of the base model; without any, those that the device file
+            gives it.
     """
     if not device:
         session = root / "ingest" / "session.json"
@@ -105,7 +106,9 @@ def ensure_base(root: Path, device: str, effects: tuple[str, ...]) -> None:
                 where=str(root),
                 remedy="run `bampipe ingest SESSION` first",
             )
-        device = str(json.loads(session.read_text(encoding="utf-8"))["device"])
+        about = json.loads(session.read_text(encoding="utf-8"))
+        device = str(about["device"])
+        effects = effects or tuple(map(str, about.get("default_effects", [])))
     write(root, ModelFile(BASE, "", device, effects))
 
 

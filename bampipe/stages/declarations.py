@@ -14,7 +14,7 @@ from typing import Any
 from bampipe.data import schema
 from bampipe.data.store import read_toml
 from bampipe.errors import InputError
-from bampipe.physics import expression, registry
+from bampipe.physics import Model, expression, registry
 from bampipe.physics.device import Device
 from bampipe.physics.effect import Effect
 from bampipe.physics.readable import describe_equations
@@ -70,6 +70,10 @@ def device_faults(declaration: Mapping[str, Any], where: str) -> tuple[str, list
     faults = [f"{where}: {line}" for line in check_device(device)]
     if any("unknown symbol" in line for line in faults):
         return "", faults
+    try:
+        Model(device, device.default_effects)
+    except InputError as error:
+        faults.append(str(InputError(error.what, where=f"{where}: default_effects")))
     try:
         return describe_equations(device), faults
     except InputError as error:

@@ -83,6 +83,5 @@ def content(
         "covariance": {"names": names, "matrix": estimate.covariance.tolist()},
         "trials": [motion.trial_id for motion in motions],
         "identifiability": can_say.report,
-        "notes": list(can_say.sentences),
         **estimate.report,
     }

@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bampipe.errors import InputError
 from bampipe.estimate.filter_uncertainty import sandwich_covariance
 from bampipe.estimate.unscented import constrain
 from bampipe.physics import System
@@ -17,6 +16,7 @@ from bampipe.stages.estimates import Estimate, timing_entry
 from bampipe.stages.filter_choice import FilterChoice
 from bampipe.stages.filter_run import (
     Attempt,
+    MotionLost,
     calm,
     filter_model,
     run_filter,
@@ -57,7 +57,7 @@ def estimate_by_filter(
         progress: told how far it is.
 
     Raises:
-        InputError: the filter does not follow the motion.
+        MotionLost: the filter does not follow the motion.
     """
     stride = stride_of(motions)
     trials = Shelf(
@@ -92,10 +92,10 @@ def estimate_by_filter(
     def told(done: int, place: int) -> None:
         progress(0.35 + 0.6 * done / (len(trials) + 1), motions[place].trial_id)
 
-    def lost(what: str, place: int) -> InputError:
+    def lost(what: str, place: int) -> MotionLost:
         remedy = "try --method least-squares, or set the trial aside if its sensors jumped there"
         said = what.format(motions[place].trial_id)
-        return InputError(said, where=f"model {model_name}", remedy=remedy)
+        return MotionLost(said, where=f"model {model_name}", remedy=remedy)
 
     found = run_filter(model, trials, attempts, settings, choice, told, lost, system.coordinates)
     covariance, blocks = sandwich_covariance(

@@ -40,6 +40,11 @@ _CALM = 5.0
 _MARGIN_S = 0.02
 """Time around that, s, which counts too."""
 
+
+class MotionLost(InputError):
+    """The filter does not follow the measured motion, from wherever it starts."""
+
+
 Attempt = tuple[Array, Array, float]
 """Parameters to start from (nt,), their sd (nt,), both physical, and a factor on process noise."""
 
@@ -170,7 +175,7 @@ def run_filter(
     settings: FilterSettings,
     choice: FilterChoice,
     told: Callable[[int, int], None],
-    lost: Callable[[str, int], InputError],
+    lost: Callable[[str, int], MotionLost],
     axes: Sequence[str],
 ) -> FilterRun:
     """Converge on the first trial, then filter all trials; the first attempt that holds counts.
@@ -188,7 +193,7 @@ def run_filter(
         axes: names of the readings, for messages.
 
     Raises:
-        InputError: no attempt followed the motion.
+        MotionLost: no attempt followed the motion.
     """
     engine = _engine(choice)
     order = (*range(1, len(trials)), 0)
@@ -236,8 +241,8 @@ def _engine(choice: FilterChoice) -> Callable[..., FilterResult]:
 
 
 def _not_followed(
-    found: FilterRun, lost: Callable[[str, int], InputError], axes: Sequence[str]
-) -> InputError:
+    found: FilterRun, lost: Callable[[str, int], MotionLost], axes: Sequence[str]
+) -> MotionLost:
     """Say in physical words which trial and axis the filter does not follow."""
     nis = [float(np.nanmean(trial.nis)) for trial in found.main.trials]
     worst = int(np.argmax(nis))

@@ -19,7 +19,7 @@ from bampipe.stages.base import Progress, RunFolder
 from bampipe.stages.estimates import content
 from bampipe.stages.filter_choice import FilterChoice, check_among, check_choice
 from bampipe.stages.filter_estimate import estimate_by_filter
-from bampipe.stages.filter_run import trial_of
+from bampipe.stages.filter_run import MotionLost, trial_of
 from bampipe.stages.identifiability import identifiability
 from bampipe.stages.modelfile import load_model, model_inputs
 from bampipe.stages.motions import problem_of, read_motions
@@ -36,7 +36,7 @@ from bampipe.stages.squares_estimate import (
 NAME = "identify"
 SUMMARY = "Parameters of the model with uncertainties, from the free trials"
 
-METHODS = ("ukf", "least-squares", "output-error")
+METHODS = ("auto", "ukf", "least-squares", "output-error")
 Array = NDArray[np.float64]
 
 
@@ -47,7 +47,8 @@ class Config(FilterChoice):
     Attributes:
         model: which model version.
         method: ``ukf``, the augmented unscented Kalman filter; ``least-squares`` on the inverse
-            dynamics; or ``output-error``, the motion simulated in pieces against the positions.
+            dynamics; ``output-error``, the motion simulated in pieces against the positions; or
+            ``auto``: the filter, and least squares where it cannot follow the motion.
         engine: ``compiled``; ``filterpy``, slow, which gives the same numbers; or ``augmented``,
             slow, with measurement noise in the state, which gives nearly the same.
         form: ``square_root`` or ``covariance`` form of the filter.
@@ -68,7 +69,7 @@ class Config(FilterChoice):
     """
 
     model: str = "base"
-    method: str = "ukf"
+    method: str = "auto"
     start_factor: float = 1.0
     cutoff_hz: float = 8.0
     input_timing: bool = True
@@ -120,11 +121,19 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     if config.remove_bias:
         squares = unbiased(session, settings, system, motions, problem, raw)
     noise = sensor_noise(session, system, motions, config)
-    if config.method == "ukf":
-        estimate = estimate_by_filter(
-            run, system, motions, start, squares, noise, config, config.model, progress
-        )
-    elif config.method == "output-error":
+    method, notes = config.method, []
+    if method in ("auto", "ukf"):
+        try:
+            estimate = estimate_by_filter(
+                run, system, motions, start, squares, noise, config, config.model, progress
+            )
+            method = "ukf"
+        except MotionLost as error:
+            if method == "ukf":
+                raise
+            estimate, method = estimate_by_squares(system, motions, squares), "least-squares"
+            notes.append(f"Estimated by least squares, since {error.what}.")
+    elif method == "output-error":
         progress(0.3, "output error")
         trials = [trial_of(run, motion, system, noise, 1, config) for motion in motions]
         estimate = estimate_by_output(system, motions, trials, squares, progress)
@@ -134,8 +143,9 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     can_say = identifiability(
         system, motions, estimate.problem, estimate.p, noise, estimate.at_bound
     )
-    engine = config.engine if config.method == "ukf" else "compiled"
-    found = content(system, estimate, can_say, motions, config.model, config.method, engine)
+    engine = config.engine if method == "ukf" else "compiled"
+    found = content(system, estimate, can_say, motions, config.model, method, engine)
+    found["notes"] = [*notes, *can_say.sentences]
     write_json(out / f"models/{config.model}/identify.json", found)
     write_parquet(out / f"models/{config.model}/states.parquet", estimate.states)
     write_parquet(out / f"models/{config.model}/trace.parquet", estimate.trace)

@@ -321,6 +321,7 @@ def _description(session: Session, device: Device, rate: float) -> dict[str, obj
         },
         "brakes": {f"brake_{brake.axis}": {"unit": brake.unit} for brake in session.brakes},
         "channels": {channel.name: {"unit": channel.unit} for channel in session.channels},
+        **({"default_effects": list(device.default_effects)} if device.default_effects else {}),
     }
 
 

@@ -71,17 +71,13 @@ def read_session(
         noise = np.median(np.array(rows), axis=0) if rows else np.zeros(len(device.forces))
     else:
         noise = np.broadcast_to(np.asarray(stated, dtype=float), (len(device.forces),))
+    # Where no resolution is stated, that whose rounding has the noise found by the filter stage.
     resolution = np.array(
-        [
-            float(about["axes"][axis].get("resolution") or _step(recordings, i))
-            for i, axis in enumerate(system.coordinates)
-        ]
+        [float(about["axes"][a].get("resolution") or 0) for a in system.coordinates]
     )
+    if not resolution.all():
+        seen = run.read_json("filter/filter.json")["axes"]
+        noise_sd = np.array([float(seen[a]["measurement_noise_sd"]) for a in system.coordinates])
+        resolution = np.where(resolution > 0.0, resolution, np.sqrt(12.0) * noise_sd)
     sensors = Sensors(rate, resolution, np.array(noise), min(cutoff_hz, 0.2 * rate))
     return sensors, [observe(r, sensors, system) for r in recordings]
-
-
-def _step(recordings: list[Recording], axis: int) -> float:
-    """Smallest step between two readings: the resolution of an encoder that does not state it."""
-    steps = np.concatenate([np.abs(np.diff(r.q[:, axis])) for r in recordings])
-    return float(np.min(steps[steps > 0.0], initial=np.inf)) if np.any(steps > 0.0) else 1e-9

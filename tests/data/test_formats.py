@@ -89,8 +89,50 @@ def test_columns_of_matrices_in_matlab_files(tmp_path):
     scipy.io.savemat(path, {"X": np.column_stack([T, Q, F]), "s": {"q": Q}})
     trial = read_trial(path, ("X[0]", "X[2]"))
     np.testing.assert_array_equal(trial.columns["X[2]"], F)
-    assert list(columns_of(path)) == ["X[0]", "X[1]", "X[2]"]
-    assert "save(file, '-struct', 'S')" in refused(path, ("X[0]", "s"))
+    assert list(columns_of(path)) == ["X[0]", "X[1]", "X[2]", "s.q"]
+    assert "a struct, expected a vector of numbers; name what is in it: s.q" in refused(
+        path, ("X[0]", "s")
+    )
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+def test_fields_of_matlab_structs(tmp_path, compressed):
+    path = tmp_path / "a.mat"
+    pair = np.empty(2, dtype=object)
+    pair[:] = [T, Q]
+    content = {
+        "log": {
+            "time": T, "name": "run 3", "axis": {"q": Q[:, None], "X": np.column_stack([Q, F])},
+            "none": np.empty((0, 0)), "count": np.arange(len(T), dtype=np.int16), "more": {"f": F},
+        },
+        "runs": np.rec.fromarrays([pair], names="q"),
+        "cells": pair,
+    }  # fmt: skip
+    scipy.io.savemat(path, content, do_compression=compressed)
+    wanted = ("log.time", "log.axis.q", "log.axis.X[1]", "log.count", "log.more.f", "runs[1].q")
+    trial = read_trial(path, wanted)
+    expected = (T, Q, F, np.arange(len(T)), F, Q)
+    for name, values in zip(wanted, expected, strict=True):
+        np.testing.assert_array_equal(trial.columns[name], values)
+    assert {"log.time", "log.axis.X[0]", "log.more.f", "runs[0].q"} <= set(columns_of(path))
+    assert "not numbers" in refused(path, ("log.time", "log.name"))
+    assert "did you mean 'log.axis.q'" in refused(path, ("log.time", "log.axis.qq"))
+    with h5py.File(tmp_path / "b.mat", "w", userblock_size=512) as file:
+        file["log/axis/q"] = Q  # a struct as version 7.3 keeps it
+    np.testing.assert_array_equal(
+        read_trial(tmp_path / "b.mat", ("log.axis.q",)).columns["log.axis.q"], Q
+    )
+    sound = path.read_bytes()
+    rng = np.random.default_rng(4)
+    for _ in range(200):  # a damaged file is refused or read, in one line, whatever it says
+        damaged = bytearray(sound)
+        for place in rng.integers(128, len(sound), 3):
+            damaged[place] = rng.integers(256)
+        path.write_bytes(bytes(damaged))
+        try:
+            read_trial(path, ("log.axis.q",))
+        except InputError as error:
+            assert "\n" not in str(error)
 
 
 # JSON

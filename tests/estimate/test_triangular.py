@@ -5,6 +5,7 @@ import pytest
 
 from bampipe.estimate.signatures import ROWS
 from bampipe.estimate.triangular import append_rows, condition, covariance_of, rank_one_update
+from bampipe.estimate.unscented import lower_root
 from bampipe.physics import signatures as of_physics
 
 RNG = np.random.default_rng(2)
@@ -55,3 +56,13 @@ def test_a_downdate_that_leaves_nothing_is_refused():
 
 def test_both_layers_lay_rows_out_alike():
     assert ROWS == of_physics.ROWS
+
+
+def test_the_root_of_a_covariance_that_rounding_left_indefinite() -> None:
+    spread = np.array([1e6, 1e-6, 3.0])
+    whole = np.outer(spread, spread)  # all three are one and the same
+    whole[0, 1] = whole[1, 0] = whole[0, 1] * (1 + 1e-14)
+    root = lower_root(whole)
+    np.testing.assert_allclose(root @ root.T, whole, rtol=1e-9)
+    with pytest.raises(ValueError, match="not positive definite"):
+        lower_root(np.array([[1.0, 2.0], [2.0, 1.0]]))

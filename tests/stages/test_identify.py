@@ -16,6 +16,7 @@ from bampipe.errors import InputError
 from bampipe.stages import identify
 from bampipe.stages.base import RunFolder, silent
 from bampipe.stages.filter_choice import ENGINES
+from bampipe.stages.filter_run import MotionLost
 
 TOLERANCE = {"viscous": 0.03, "coulomb": 0.05, "mass": 0.01}
 FAST = identify.Config(longest_step_s=2e-3)
@@ -76,6 +77,23 @@ def test_least_squares(simulated: RunFolder) -> None:
     assert len(trace) == 2
 
 
+def test_least_squares_stand_in_where_the_filter_loses_the_motion(
+    simulated: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def lost(*_: object) -> None:
+        raise MotionLost("the predicted motion grew without bound", remedy="try least squares")
+
+    monkeypatch.setattr(identify, "estimate_by_filter", lost)
+    content = identified(simulated)
+    assert content["method"] == "least-squares"
+    assert content["notes"][0] == (
+        "Estimated by least squares, since the predicted motion grew without bound."
+    )
+    assert_recovered(content, TRUTH)
+    with pytest.raises(InputError, match="grew without bound; try least squares"):
+        identified(simulated, replace(FAST, method="ukf"))
+
+
 def test_output_error(simulated: RunFolder) -> None:
     content = identified(simulated, replace(FAST, method="output-error"))
     assert_recovered(content, TRUTH)
@@ -122,7 +140,7 @@ def test_filterpy_gives_the_same_numbers(tmp_path: Path) -> None:
 
 
 def test_mistakes_are_told(simulated: RunFolder, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="choose from ukf, least-squares"):
+    with pytest.raises(InputError, match="choose from auto, ukf, least-squares"):
         identified(simulated, replace(FAST, method="magic"))
     with pytest.raises(InputError, match="must be positive"):
         identified(simulated, replace(FAST, block_s=0.0))

@@ -126,6 +126,8 @@ def _found(
 
     path, index = split_index(column, file)
     field = None
+    if path not in file and path.replace(".", "/") in file:  # as a field of a struct is written
+        path = path.replace(".", "/")
     if path not in file and "." in path and path.rpartition(".")[0] in file:
         path, _, field = path.rpartition(".")
     if path not in file:

@@ -1,8 +1,8 @@
 """Real vectors in MATLAB files of version 5 to 7.2, read with every length checked.
 
 scipy.io reads the same files, but writes and reads past its buffers where a damaged file lies
-about a length, which ends the process without a word. Only what a log needs is read here:
-variables that are real numeric arrays. Source: MathWorks, MAT-File Format, level 5.
+about a length, which ends the process without a word. Only what a log needs is read here: real
+numeric arrays, also those in the fields of structs. Source: MathWorks, MAT-File Format, level 5.
 """
 
 from __future__ import annotations
@@ -10,7 +10,8 @@ from __future__ import annotations
 import math
 import struct
 import zlib
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import BinaryIO
 
@@ -19,23 +20,28 @@ import numpy as np
 _MATRIX, _COMPRESSED = 14, 15
 _NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8"}
 _NUMBERS |= {12: "i8", 13: "u8"}
+_STRUCT_CLASS = 2
 _NUMERIC_CLASSES = range(6, 16)
 _COMPLEX = 0x0800
 _HEADER = 128
 _LARGEST_HEAD = 4096
 _CHUNK = 1 << 16
+_DEEPEST = 8
+_MOST_FIELDS = 4096
 
 
 @dataclass(frozen=True)
 class Variable:
-    """One variable of a file.
+    """One variable of a file, or one field of a struct.
 
     Attributes:
-        name: of the variable.
+        name: of the variable; of a field ``struct.field``, in an array of structs
+            ``struct[0].field``.
         shape: of the array.
         real: whether it is an array of real numbers.
-        start, size: place of its element in the file, bytes.
+        start, size: place in the file of the element of the whole variable, bytes.
         compressed: whether that element is compressed.
+        within: bytes of that element, inflated, before the array itself.
     """
 
     name: str
@@ -44,6 +50,7 @@ class Variable:
     start: int
     size: int
     compressed: bool
+    within: int = 0
 
     @property
     def length(self) -> int:
@@ -57,7 +64,7 @@ def is_level5(head: bytes) -> bool:
 
 
 def variables(path: Path) -> list[Variable]:
-    """The variables of the file, in its order.
+    """The variables of the file, in its order, each struct followed by what is in it.
 
     Raises:
         ValueError: the file is damaged.
@@ -74,11 +81,42 @@ def variables(path: Path) -> list[Variable]:
             if size > end - place or kind not in (_MATRIX, _COMPRESSED):
                 raise ValueError("an element is not what it says")
             source = _Source(stream, place, size, kind == _COMPRESSED, order)
-            name, shape, real = source.matrix_head()
-            if name:
-                found.append(Variable(name, shape, real, place, size, kind == _COMPRESSED))
+            whole = Variable("", (), False, place, size, kind == _COMPRESSED)
+            found += [item for item in _arrays(source, whole, "", 0) if item.name]
             place += size
     return found
+
+
+def _arrays(source: _Source, whole: Variable, label: str, depth: int) -> Iterator[Variable]:
+    """The array that comes next, and where it is a struct, those in its fields.
+
+    Args:
+        source: at the beginning of an array.
+        whole: the variable that holds it, for its place in the file.
+        label: what the array is called; "" for a variable, which has a name of its own.
+        depth: how many structs it is inside of.
+
+    Raises:
+        ValueError: the file is damaged.
+    """
+    within = source.place
+    name, shape, real, kind = source.matrix_head()
+    label = label or name
+    yield replace(whole, name=label, shape=shape, real=real, within=within)
+    if kind != _STRUCT_CLASS or depth >= _DEEPEST:
+        return
+    fields = source.field_names()
+    count = math.prod(shape)
+    if count * len(fields) > _MOST_FIELDS:
+        return
+    for number in range(count):
+        own = label if count == 1 else f"{label}[{number}]"
+        for field in fields:
+            size = source.array_size()
+            end = source.place + size
+            if size:
+                yield from _arrays(source, whole, f"{own}.{field}", depth + 1)
+            source.skip(end - source.place)
 
 
 def values(path: Path, variable: Variable) -> np.ndarray:
@@ -89,6 +127,7 @@ def values(path: Path, variable: Variable) -> np.ndarray:
     """
     with path.open("rb") as stream:
         source = _Source(stream, variable.start, variable.size, variable.compressed, _order(stream))
+        source.skip(variable.within)
         source.matrix_head()
         kind, data = source.element(8 * variable.length)
         if kind not in _NUMBERS:
@@ -115,12 +154,14 @@ class _Source:
         self._next, self._left = start, size
         self._inflate = zlib.decompressobj() if compressed else None
         self._ahead = b""
+        self.place = 0
         self.order = order
         if compressed and struct.unpack(order + "II", self._take(8))[0] != _MATRIX:
             raise ValueError("a compressed element holds no array")
+        self.place = 0
 
-    def matrix_head(self) -> tuple[str, tuple[int, ...], bool]:
-        """Name and shape of the array, and whether it holds real numbers."""
+    def matrix_head(self) -> tuple[str, tuple[int, ...], bool, int]:
+        """Name and shape of the array, whether it holds real numbers, and its class."""
         _, flags = self.element(_LARGEST_HEAD)
         _, shape = self.element(_LARGEST_HEAD)
         _, name = self.element(_LARGEST_HEAD)
@@ -131,7 +172,31 @@ class _Source:
         if min(extents) < 0:
             raise ValueError("an array has a negative size")
         real = word & 0xFF in _NUMERIC_CLASSES and not word & _COMPLEX
-        return name.decode("utf-8", "replace"), extents, real
+        return name.decode("utf-8", "replace"), extents, real, word & 0xFF
+
+    def field_names(self) -> list[str]:
+        """Names of the fields of the struct whose head was read last."""
+        _, width = self.element(_LARGEST_HEAD)
+        _, names = self.element(_CHUNK)
+        length = struct.unpack(self.order + "i", width)[0] if len(width) == 4 else 0
+        if length < 1 or len(names) % length:
+            raise ValueError("a struct is not what it says")
+        parts = [names[k : k + length] for k in range(0, len(names), length)]
+        return [part.partition(b"\0")[0].decode("utf-8", "replace") for part in parts]
+
+    def array_size(self) -> int:
+        """Bytes of the array in a field, whose tag comes next; 0 where the field is empty."""
+        kind, size = struct.unpack(self.order + "II", self._take(8))
+        if kind != _MATRIX:
+            raise ValueError("a field holds no array")
+        return int(size)
+
+    def skip(self, size: int) -> None:
+        """Pass over bytes."""
+        if size < 0:
+            raise ValueError("an array is longer than it says")
+        while size:
+            size -= len(self._take(min(size, _CHUNK)))
 
     def element(self, limit: int) -> tuple[int, bytes]:
         """Type and data of the next element, of ``limit`` bytes at most."""
@@ -153,6 +218,7 @@ class _Source:
         data = self._raw(size) if self._inflate is None else self._inflated(size)
         if whole and len(data) != size:
             raise ValueError("an element ends early")
+        self.place += len(data)
         return data
 
     def _raw(self, size: int) -> bytes:

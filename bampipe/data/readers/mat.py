@@ -20,7 +20,7 @@ def is_hdf5(head: bytes) -> bool:
 
 
 def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
-    """The wanted variables; ``X[0]`` is the first column of the matrix ``X``.
+    """The wanted variables; ``X[0]`` is the first column of ``X``, ``S.q`` a field of ``S``.
 
     Raises:
         InputError: of another version, damaged, a variable missing, or not a vector of numbers.
@@ -74,11 +74,19 @@ def _read_level_5(path: Path, wanted: Wanted, name: str) -> RawTrial:
             check_columns(list(known), [variable_name], name)
             variable = known[variable_name]
             place = f"{name}, variable '{column}'"
+            inside = [other for other in known if other.startswith(f"{variable_name}.")]
+            inside += [other for other in known if other.startswith(f"{variable_name}[0].")]
+            if inside:
+                raise InputError(
+                    "a struct, expected a vector of numbers",
+                    where=place,
+                    remedy=f"name what is in it: {', '.join(inside[:8])}",
+                )
             if not variable.real:
                 raise InputError(
                     "not numbers, expected a vector of real numbers",
                     where=place,
-                    remedy="save(file, '-struct', 'S') makes variables of a struct's fields",
+                    remedy="save it as a numeric array: cells, tables and objects are not",
                 )
             check_size(variable.length, wanted, name)
             flat = level5.values(path, variable)

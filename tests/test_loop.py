@@ -1,0 +1,41 @@
+"""How a model version is made: what its parent was given counts for the child."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from bampipe.api import loop
+from bampipe.run import models, record
+
+
+def made(settings: dict[str, object]) -> dict[str, object]:
+    """The record of a step that was given ``settings``."""
+    empty: dict[str, object] = {"config": {}, "inputs": {}, "outputs": {}, "versions": {}}
+    return {**empty, "key": "k", "settings": settings, "declared_inputs": [], "code": "c",
+            "summary": {}}  # fmt: skip
+
+
+def test_a_child_is_identified_as_its_parent_was(tmp_path: Path) -> None:
+    models.write(tmp_path, models.ModelFile("base", "", "slider", ()))
+    child = models.child_name("base", "stribeck:carriage")
+    models.write(tmp_path, models.ModelFile(child, "base", "slider", ("stribeck:carriage",)))
+    stages = {
+        "identify:base": made({"model": "base", "method": "least-squares"}),
+        "validate:base": made({"model": "base", "seed": 3}),
+        f"validate:{child}": made({"model": child, "seed": 4}),
+    }
+    record.write(tmp_path, {"schema": record.SCHEMA, "stages": stages})
+    given = loop.settings_of(tmp_path, "base")
+    assert given == {"identify": {"method": "least-squares"}, "validate": {"seed": 3}}
+    assert loop.settings_of(tmp_path, child) == {**given, "validate": {"seed": 4}}
+
+
+def test_the_device_file_gives_the_base_model_its_effects(tmp_path: Path) -> None:
+    (tmp_path / "ingest").mkdir()
+    about = {"device": "axis", "default_effects": ["stribeck:carriage"]}
+    (tmp_path / "ingest/session.json").write_text(json.dumps(about))
+    models.ensure_base(tmp_path, "", ())
+    assert models.read(tmp_path, "base").effects == ("stribeck:carriage",)
+    models.ensure_base(tmp_path, "", ("return_spring:carriage",))
+    assert models.read(tmp_path, "base").effects == ("return_spring:carriage",)
