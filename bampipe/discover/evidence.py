@@ -15,30 +15,16 @@ from numpy.typing import NDArray
 
 from bampipe.discover.recording import Motion, Sensors
 from bampipe.estimate.low_pass import Band
+from bampipe.estimate.standstill import moving, resting
 from bampipe.physics import System
 
 Array = NDArray[np.float64]
 
-REST_S = 0.03
-REST_SPEED = 5.0
 
-
-def moving(motion: Motion, sensors: Sensors, band: Band) -> Array:
-    """Which thinned samples tell about friction, (K, n_q), one or zero.
-
-    At standstill Coulomb friction is whatever balances the load, and the sign of a velocity below
-    the encoder's resolution is noise. Where an axis rests longer than `REST_S`, its residual is
-    left out, with the stretch around it that the low-pass reaches.
-    """
-    rest = np.zeros(motion.qd.shape)
-    longest = int(REST_S * sensors.rate_hz)
-    for i, sd in enumerate(velocity_sd(sensors)):
-        still = np.abs(motion.qd[:, i]) < REST_SPEED * sd
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], still.astype(int), [0]])))
-        for start, end in zip(edges[::2], edges[1::2], strict=True):
-            if end - start > longest:
-                rest[start:end, i] = 1.0
-    return (np.abs(band.thin(rest)) < 0.02).astype(float)
+def told(motion: Motion, sensors: Sensors, band: Band) -> Array:
+    """Which thinned samples tell about friction, (K, n_q), one or zero; see `standstill`."""
+    rest = resting(motion.qd, velocity_sd(sensors), sensors.rate_hz)
+    return moving(rest, band).astype(float)
 
 
 def velocity_sd(sensors: Sensors) -> Array:
@@ -65,7 +51,7 @@ class Evidence:
         plain: residual before the low-pass by trial, each (T, n_q), N.m or N.
         residual: low-passed and thinned, by trial, each (K, n_q).
         jacobian: derivative of ``residual`` by the free parameters, by trial, (K, n_q, n_free).
-        used: which samples count, by trial, (K, n_q), see `moving`; the others are zero in
+        used: which samples count, by trial, (K, n_q), see `told`; the others are zero in
             ``residual`` and ``jacobian``.
         free: indices of the parameters that are estimated.
     """
@@ -111,7 +97,7 @@ def fit(
     Args:
         system: the model.
         motions: the trials.
-        sensors: for `moving`.
+        sensors: for `told`.
         band: the low-pass.
         start: parameters to start from, (n_p,).
         iterations: the most steps taken.
@@ -121,7 +107,7 @@ def fit(
     lower = np.array([parameters[i].lower for i in free])
     upper = np.array([parameters[i].upper for i in free])
     p = start.copy()
-    used = [moving(motion, sensors, band) for motion in motions]
+    used = [told(motion, sensors, band) for motion in motions]
     evidence = _linearise(system, motions, used, band, p, free)
     cost = np.inf
     for _ in range(iterations):

@@ -18,13 +18,11 @@ from numpy.typing import NDArray
 
 from bampipe.errors import InputError
 from bampipe.estimate.low_pass import Band
+from bampipe.estimate.standstill import moving
 
 Array = NDArray[np.float64]
 Residual = Callable[[int, Array], Array]
 """residual(trial, p) -> (T, n_q): unfiltered residual of one trial for parameters p (np,)."""
-
-_REACH = 0.02
-"""Share that a rest may have in a low-passed sample before the sample is left out."""
 
 
 @dataclass(frozen=True)
@@ -93,27 +91,6 @@ class LeastSquares:
     at_bound: NDArray[np.bool_]
 
 
-def resting(qd: Array, qd_sd: Array, rate_hz: float) -> NDArray[np.bool_]:
-    """Tell where an axis stands still: there Coulomb friction balances the load, whatever it is.
-
-    An axis rests where its velocity stays within five of its standard deviations, where its sign
-    is noise, for longer than 0.03 s; a change of direction is shorter.
-
-    Args:
-        qd: (T, n_q) velocity; qd_sd: (T, n_q) its standard deviation; rate_hz: of the samples.
-
-    Returns:
-        (T, n_q).
-    """
-    still = np.abs(qd) < 5.0 * qd_sd
-    longest = int(0.03 * rate_hz)
-    for column in still.T:
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], column.astype(int), [0]])))
-        for start, end in zip(edges[::2], edges[1::2], strict=True):
-            column[start:end] = end - start > longest
-    return still
-
-
 def stacked_residual(problem: Problem, trial: int, p: Array) -> Stacked:
     """Low-pass and thin the residual of one trial and its slope by every free parameter.
 
@@ -134,8 +111,7 @@ def stacked_residual(problem: Problem, trial: int, p: Array) -> Stacked:
         difference = (problem.residual(trial, moved) - base) / (moved[place] - p[place])
         columns[:, (k + 1) * n_q : (k + 2) * n_q] = difference
     thin = problem.band.thin(columns)
-    reach = problem.band.thin(problem.resting[trial].astype(float))
-    used = np.abs(reach) < _REACH
+    used = moving(problem.resting[trial], problem.band)
     slope = thin[:, n_q:].reshape(len(thin), n_free, n_q).transpose(0, 2, 1)
     return Stacked(thin[:, :n_q] * used, np.ascontiguousarray(slope * used[:, :, None]), used)
 

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from bampipe.data.store import read_parquet, trial_ids
 from bampipe.errors import InputError
-from bampipe.estimate.least_squares import Problem, resting
+from bampipe.estimate.least_squares import Problem
 from bampipe.estimate.low_pass import Band
+from bampipe.estimate.standstill import resting
 from bampipe.physics import System
 from bampipe.physics.device import derivative
 from bampipe.physics.soundness import require_sound

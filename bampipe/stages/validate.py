@@ -15,6 +15,7 @@ from bampipe.data.store import read_parquet, write_json, write_parquet
 from bampipe.errors import InputError
 from bampipe.estimate.least_squares import Problem, fit
 from bampipe.estimate.low_pass import Band
+from bampipe.estimate.standstill import moving
 from bampipe.physics import System, compile_model
 from bampipe.stages.base import Progress, RunFolder
 from bampipe.stages.free_run import free_runs
@@ -184,14 +185,13 @@ def _compare(
         force = [system.inputs.index(name) for name in system.model.device.forces]
         kept = problem.band.kept(len(motion.t))
         thin = problem.band.thin
-        resting = np.abs(thin(problem.resting[k].astype(float)))
         residual = thin(problem.residual(k, p))
         push = np.linalg.pinv(system.input_map(motion.q[kept], u[kept], p[:n]))
         compared.append(
             _Compared(
                 trial_id=motion.trial_id,
                 t=motion.t[kept],
-                used=resting < 0.02,
+                used=moving(problem.resting[k], problem.band),
                 measured=thin(applied),
                 residual=residual,
                 residual_held_out=thin(problem.residual(k, held_out[k])),
@@ -282,7 +282,7 @@ def _noise_floor(
         for k, held in enumerate(_held_out(problem, start, groups)):
             if HELD_OUT in groups and groups[k] != HELD_OUT:
                 continue
-            used = np.abs(band.thin(problem.resting[k].astype(float))) < 0.02
+            used = moving(problem.resting[k], band)
             residual = band.thin(problem.residual(k, held)) * used
             squares += np.sum(residual**2, axis=0)
             counts += used.sum(axis=0)

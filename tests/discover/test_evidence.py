@@ -6,7 +6,7 @@ from scipy.signal import butter, sosfiltfilt
 from sessions import RATE, SENSORS, TRUTH, bam, made
 
 from bampipe.discover.chance import system_of
-from bampipe.discover.evidence import fit, moving, velocity_sd
+from bampipe.discover.evidence import fit, told, velocity_sd
 from bampipe.discover.recording import Motion
 from bampipe.estimate.low_pass import Band
 
@@ -35,7 +35,7 @@ def test_standstill_is_left_out_and_quick_reversals_stay():
     qd[:, 1] = np.where((t > 3.0) & (t < 4.0), 0.0, 1.0)
     qd[:, 2] = 1.0
     motion = Motion("t01", t, qd, qd, qd, {})
-    used = moving(motion, SENSORS, Band(RATE))
+    used = told(motion, SENSORS, Band(RATE))
     kept_t = t[Band(RATE).kept(2000)]
     assert used[:, 0].all() and used[:, 2].all()
     assert not used[(kept_t > 3.1) & (kept_t < 3.9), 1].any()

@@ -10,8 +10,9 @@ from slider import RATE, TRUTH, record
 
 from bampipe.errors import InputError
 from bampipe.estimate.butterworth import zero_phase
-from bampipe.estimate.least_squares import Problem, fit, refit, resting, stacked_residual
+from bampipe.estimate.least_squares import Problem, fit, refit, stacked_residual
 from bampipe.estimate.low_pass import Band
+from bampipe.estimate.standstill import resting
 
 BOUNDS = (np.array([0.0, 0.0, 0.01]), np.array([np.inf, np.inf, np.inf]))
 
