@@ -354,8 +354,16 @@ def derive(model: Model, named_constants: bool = False) -> Equations:
     energies = [(kinetic, potential)]
     offset = [sp.S.Zero] * n
     z, z_names, rates, initial = [], [], [], []
-    # An offset cannot follow the rates: what a motor's back EMF takes off is left out of its load.
-    still = [e.subs(dict.fromkeys(d.qd, 0)) for e in applied]
+    # An offset is differentiated twice. It cannot follow the rates, so what a motor's back EMF
+    # takes off is left out of its load; nor states, so a lagging force counts as logged; and a
+    # delayed force is delayed to two orders less in it.
+    known = {f: e for f, e in truth.items() if not e.has(*d.z.values())}
+    offset_orders = range(LAST_ORDER - 1)
+    lost = [
+        d.channel[derivative(f, k)] for f in device.forces for k in (LAST_ORDER - 1, LAST_ORDER)
+    ]
+    none = dict.fromkeys([*d.qd, *lost], 0)
+    still = [e.subs(known, simultaneous=True).subs(none) for e in raw_applied]
     for item in model.effects:
         loaded = still if item.effect.kind == "measurement" else applied
         symbols = d.effect_symbols(item, loaded, side)
@@ -381,7 +389,8 @@ def derive(model: Model, named_constants: bool = False) -> Equations:
             initial.append(d.own(item, state.initial, symbols, f"states.{state.name}.initial"))
     others = [d.channel[c] for c in device.channels]
     free, u = [*d.p.values(), *constants], [*d.channel.values()]
-    force0 = [*forces, *others, d.channel["t"]]
+    force0 = [d.channel[derivative(f, k)] for f in device.forces for k in offset_orders]
+    force0 += [*others, d.channel["t"]]
     motion, memory = [*d.q, *d.qd], [*d.z.values()]
     gains = [entry for row in input_map for entry in row]
     words = "motion, inputs, parameters and internal states"

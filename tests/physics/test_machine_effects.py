@@ -143,6 +143,26 @@ def test_a_motor_load_taken_for_play_is_that_at_standstill():
 
 
 @pytest.mark.parametrize(
+    ("machine", "effects"),
+    [
+        ("slider", ("force_delay", "backlash:carriage")),
+        ("servo_pendulum", ("force_delay", "transmission_compliance:joint")),
+        ("slider", ("actuator_lag:motor", "backlash:carriage")),
+        ("servo_pendulum", ("channel_lag:supply", "transmission_compliance:joint")),
+    ],
+)
+def test_play_and_wind_up_go_with_a_force_that_is_late(machine, effects):
+    """Their offset is differentiated twice, which neither a state nor a last derivative allows."""
+    system = compile_model(Model(registry.device(machine), effects))
+    q, qd, qdd, u, t = smooth(system)
+    p = typical(system, 1.0)
+    z = system.memory(q, qd, qdd, u, p, t)
+    true = system.true_motion(q, qd, qdd, u, p)
+    assert np.isfinite(system.residual(*true, z, u, p)).all()
+    assert np.abs(true[0] - q).max() > 0.0
+
+
+@pytest.mark.parametrize(
     ("unit", "own", "result"),
     [("input", "A", "A"), ("1/input", "A", "1/A"), ("input/s", "", "1/s"),
      ("1/input", "m/s", "s/m"),
