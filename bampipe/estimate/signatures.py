@@ -11,7 +11,8 @@ MEASURE = types.FunctionType(types.void(_vector, _vector, _vector, _vector))
 """h(x, u, p, y) -> None: measurement of the state written into y."""
 
 COMMAND = MEASURE
-"""c(y, r, none, out) -> None: commands of a controller from readings and references."""
+"""c(y, r, s, out) -> None: commands of a controller and rates of its states, from readings,
+references and these states."""
 
 ROWS = 64
 """Most rows of one call of a function over rows; quantity i of row r is at [i*ROWS + r]."""

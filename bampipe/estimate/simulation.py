@@ -313,5 +313,6 @@ def require_finite(x: Array, dt: float) -> None:
     if len(bad):
         raise InputError(
             f"the simulated motion grows without bounds after {bad[0] * dt:.3f} s",
-            remedy="check the sizes of the parameters",
+            remedy="check the sizes of the parameters: a mass near zero under friction cannot be "
+            "followed, so give it a lower bound",
         )

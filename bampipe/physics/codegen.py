@@ -337,10 +337,12 @@ def memory_source(e: Equations) -> str:
     return SCALAR_HEADER + "import numpy as np\n" + rate + MEMORY_LOOP
 
 
-def law_source(motion: Sequence[Any], given: Sequence[Any], law: Sequence[Any]) -> str:
-    """Source of a compiled control law: ``command(y, r, none, out)``."""
+def law_source(
+    motion: Sequence[Any], given: Sequence[Any], kept: Sequence[Any], law: Sequence[Any]
+) -> str:
+    """Source of a compiled control law: ``command(y, r, s, out)``."""
     used = set().union(*(sp.sympify(e).free_symbols for e in law))
     lines, values = _block(law)
-    body = _unpack("y", motion, used) + _unpack("r", given, used)
+    body = _unpack("y", motion, used) + _unpack("r", given, used) + _unpack("s", kept, used)
     body += lines + [f"out[{i}] = {v}" for i, v in enumerate(values)]
-    return SCALAR_HEADER + _compiled("command", "y, r, none, out", body)
+    return SCALAR_HEADER + _compiled("command", "y, r, s, out", body)

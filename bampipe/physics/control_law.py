@@ -22,13 +22,17 @@ class ControlLaw:
             channels, time.
         forces: force channels in the order of the commands.
         rate_hz: how often the controller acts; 0 where that is not known.
-        command: c(y, r, none, out), numba-compiled: y are measured positions then rates (2 n_q,),
-            none is not used, out (n_f,) receives the commands in the units of the channels.
+        states: names of what the controller remembers; limits: (n_s, 2) between which.
+        command: c(y, r, s, out), numba-compiled: y are measured positions then rates (2 n_q,),
+            s (n_s,) the states, out (n_f + n_s,) receives the commands in the units of the
+            channels and the rates of the states.
     """
 
     inputs: tuple[str, ...]
     forces: tuple[str, ...]
     rate_hz: float
+    states: tuple[str, ...]
+    limits: tuple[tuple[float, float], ...]
     command: Callable[..., None]
 
 
@@ -50,7 +54,9 @@ def compile_law(device: Device) -> ControlLaw | None:
         code = generated.Generated(key, folder, {}, {"law": _source(device, inputs)})
         code.write()
     command = code.module("law").command
-    return ControlLaw(inputs, device.forces, controller.rate_hz, command)
+    states = controller.states
+    limits = tuple((state.lower, state.upper) for state in states.values())
+    return ControlLaw(inputs, device.forces, controller.rate_hz, tuple(states), limits, command)
 
 
 def _source(device: Device, inputs: tuple[str, ...]) -> str:
@@ -64,6 +70,10 @@ def _source(device: Device, inputs: tuple[str, ...]) -> str:
     given = [sp.Symbol(f"r{i}", real=True) for i in range(len(inputs))]
     symbols = dict(zip([*axes, *(f"qd_{a}" for a in axes)], motion, strict=True))
     symbols |= dict(zip(inputs, given, strict=True))
+    assert device.controller is not None
+    states = device.controller.states
+    kept = [sp.Symbol(f"s{i}", real=True) for i in range(len(states))]
+    symbols |= dict(zip(states, kept, strict=True))
     symbols |= {name: sp.Float(c.value) for name, c in device.constants.items()}
 
     def no_rate(_: object) -> object:
@@ -73,14 +83,15 @@ def _source(device: Device, inputs: tuple[str, ...]) -> str:
             remedy=f"write qd_<axis> for a measured rate, such as qd_{axes[0]}",
         )
 
-    assert device.controller is not None
+    parts = [(f"command.{force}", device.controller.command[force]) for force in device.forces]
+    parts += [(f"states.{name}.rate", state.rate) for name, state in states.items()]
     law = [
         expression.build(
-            device.controller.command[force],
+            tree,
             symbols,
-            f"device {device.name!r}: controller.command.{force}",
+            f"device {device.name!r}: controller.{place}",
             {"sgn": sp.sign, "ddt": no_rate},
         )
-        for force in device.forces
+        for place, tree in parts
     ]
-    return law_source(motion, given, law)
+    return law_source(motion, given, kept, law)

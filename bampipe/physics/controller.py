@@ -6,6 +6,7 @@ A free run, a simulation of machine and controller together, needs it; nothing e
 from __future__ import annotations
 
 import ast
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -13,7 +14,23 @@ from typing import Any
 from bampipe.errors import InputError
 from bampipe.physics import expression
 
-KEYS = ("source", "channels", "rate_hz", "command")
+KEYS = ("source", "channels", "rate_hz", "states", "command")
+
+
+@dataclass(frozen=True)
+class Integral:
+    """One state of a controller, such as the integral of its error; kept within its limits.
+
+    Attributes:
+        unit: of the state.
+        rate: its rate of change, of what a command may use; ``unit`` per second.
+        lower, upper: where it stops, in ``unit``; infinite where it does not.
+    """
+
+    unit: str
+    rate: ast.expr
+    lower: float = -math.inf
+    upper: float = math.inf
 
 
 @dataclass(frozen=True)
@@ -24,12 +41,14 @@ class Controller:
         channels: recorded references and gains that the law uses, with units.
         command: the law, by force channel, of measured motion, channels and constants.
         rate_hz: how often the controller acts; 0 where that is not known.
+        states: what it remembers from one action to the next, by name.
         source: where the law comes from.
     """
 
     channels: Mapping[str, str]
     command: Mapping[str, ast.expr]
     rate_hz: float
+    states: Mapping[str, Integral]
     source: str
 
 
@@ -70,5 +89,27 @@ def controller_from(
         channels=dict(channels),
         command={f: expression.parse(law[f], f"{where}.command.{f}") for f in forces},
         rate_hz=float(rate),
+        states=_states(entry.get("states", {}), f"{where}.states"),
         source=str(entry.get("source", "")),
     )
+
+
+def _states(entries: object, where: str) -> dict[str, Integral]:
+    if not isinstance(entries, Mapping):
+        raise InputError("expected a table, name = { unit, rate }", where=where)
+    states = {}
+    for name, entry in entries.items():
+        at = f"{where}.{name}"
+        if not isinstance(entry, Mapping) or not isinstance(entry.get("unit"), str):
+            raise InputError('expected { unit = "rad.s", rate = "goal - joint" }', where=at)
+        for key in entry:
+            if key not in ("unit", "rate", "lower", "upper"):
+                raise InputError(f"unknown key {key!r}", where=at)
+        limits = [entry.get("lower", -math.inf), entry.get("upper", math.inf)]
+        if any(isinstance(v, bool) or not isinstance(v, int | float) for v in limits):
+            raise InputError("lower and upper must be numbers", where=at)
+        if not limits[0] < limits[1]:
+            raise InputError("lower must be below upper", where=at)
+        rate = expression.parse(entry.get("rate"), f"{at}.rate")
+        states[name] = Integral(entry["unit"], rate, float(limits[0]), float(limits[1]))
+    return states

@@ -327,6 +327,7 @@ def _check_names(device: Device, where: str) -> None:
         ("inputs.brakes", device.brakes.values()),
         ("inputs.channels", device.channels),
         ("controller.channels", device.controller.channels if device.controller else ()),
+        ("controller.states", device.controller.states if device.controller else ()),
         ("constants", device.constants),
         ("definitions", device.definitions),
         ("parameters", [p.name for p in device.parameters if "." not in p.name]),

@@ -303,6 +303,12 @@ def _check_controller(device: Device, symbols: Mapping[str, Found], check: _Chec
     known = {n: d for n, d in symbols.items() if n not in [p.name for p in device.parameters]}
     for name, unit in device.controller.channels.items():
         known[name] = check.unit(unit, f"controller.channels.{name}")
+    for name, state in device.controller.states.items():
+        known[name] = check.unit(state.unit, f"controller.states.{name}")
+    for name, state in device.controller.states.items():
+        kept, second = known[name], _UNITS["s"]
+        wanted = None if kept is None else kept / second
+        check.expression(state.rate, known, f"controller.states.{name}.rate", wanted)
     for force, tree in device.controller.command.items():
         check.expression(tree, known, f"controller.command.{force}", symbols[force])
 

@@ -145,6 +145,8 @@ def _device_expressions(declaration: Mapping[str, Any]) -> Iterator[tuple[str, o
             yield f"{table}.{key}", text
     for key, text in declaration.get("controller", {}).get("command", {}).items():
         yield f"controller.command.{key}", text
+    for key, entry in declaration.get("controller", {}).get("states", {}).items():
+        yield f"controller.states.{key}.rate", entry.get("rate")
     for name, entry in declaration.get("process_noise", {}).items():
         for axis, text in entry["torque"].items():
             yield f"process_noise.{name}.torque.{axis}", text

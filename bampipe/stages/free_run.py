@@ -128,6 +128,7 @@ def _closed(run: RunFolder, system: System, motion: Motion, p: Array, law: Contr
         system.derivative, system.measure, law.command, _start(system, motion, p), motion.u, r,
         p[: len(system.parameters)], _interval(motion),
         width=_width(system), n_noise=len(system.noise), force=force, rate_hz=law.rate_hz,
+        limits=law.limits,
     )  # fmt: skip
     measured = np.hstack([motion.q, motion.qd])
     return _Run(motion.trial_id, measured, seen, motion.u[:, force], total[:, force])

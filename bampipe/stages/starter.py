@@ -112,7 +112,9 @@ force = ["{channel}"]{f"             # {driver}" if driver else ""}
 force_unit = "{si}"
 {more}'''
     lines += 'channels = { coil_current = "A" }\n' if coil else ""
-    least = 0.02 * found.inertia if found.inertia > 0.0 else 1e-6
+    # A mass near zero under friction is a motion that no simulation can follow.
+    least = 0.02 * found.inertia if found.inertia > 0.0 else 0.1 if linear else 1e-5
+    least = max(least, 0.3) if coil and linear else least
     lines += f'''
 [applied]
 {axis} = "{applied}"

@@ -82,3 +82,21 @@ def test_an_unstable_loop_is_said():
             derivative, measure, command, np.array([0.01, 0.0]), np.zeros((2000, 1)), r,
             np.array([MASS, 0.0]), DT, width=WIDTH, n_noise=1, force=[0],
         )  # fmt: skip
+
+
+@njit(COMMAND.signature)
+def with_integral(y, r, s, out):
+    out[0] = r[1] * (r[0] - y[0]) - 80.0 * y[1] + 400.0 * s[0] - 6.0
+    out[1] = r[0] - y[0]
+
+
+@pytest.mark.parametrize(("limit", "left"), [(1.0, 0.0), (0.01, (6.0 - 4.0) / STIFFNESS)])
+def test_an_integral_part_takes_a_lasting_load_off_unless_it_is_full(limit, left):
+    r = np.tile([0.0, STIFFNESS], (8001, 1))
+    x, u, _ = simulate_controlled(
+        derivative, measure, with_integral, np.array([0.0, 0.0]), np.full((8001, 1), 5.0), r,
+        np.array([MASS, 0.0]), DT, width=WIDTH, n_noise=1, force=[0], limits=[(-limit, limit)],
+    )  # fmt: skip
+    # It starts where the recorded command of 5 N comes out, if it may.
+    assert u[0, 0] == pytest.approx(5.0 if limit == 1.0 else -2.0, abs=1e-6)
+    assert x[-1, 0] == pytest.approx(-left, abs=1e-5)

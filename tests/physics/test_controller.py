@@ -53,6 +53,22 @@ def test_built_in_controllers_have_consistent_units():
         assert check_device(registry.device(name)) == []
 
 
+def test_a_loop_with_an_integral_part():
+    device = declared(
+        channels={"goal": "m", "gain": "N/m", "wind": "N/m/s"},
+        states={"wound": {"unit": "m.s", "rate": "goal - carriage", "lower": -1, "upper": 0.4}},
+        command={"force_motor": "gain*(goal - carriage) + wind*wound"},
+    )
+    assert check_device(device) == []
+    law = compile_law(device)
+    assert law.states == ("wound",) and law.limits == ((-1.0, 0.4),)
+    out = np.empty(2)
+    law.command(np.array([0.1, 0.5]), np.array([0.3, 10.0, 7.0, 0.0]), np.array([0.2]), out)
+    assert out == pytest.approx([10.0 * 0.2 + 7.0 * 0.2, 0.2])
+    wrong = declared(states={"wound": {"unit": "m", "rate": "goal - carriage"}})
+    assert any("controller.states.wound.rate" in line for line in check_device(wrong))
+
+
 def test_a_law_of_the_wrong_unit_is_said():
     device = declared(command={"force_motor": "position_gain*(goal - carriage)"})
     assert any(line.startswith("controller.command.force_motor") for line in check_device(device))
@@ -66,6 +82,12 @@ def test_a_law_of_the_wrong_unit_is_said():
         ({"channels": ["goal"]}, "channels must be a table"),
         ({"channels": {"mass": "kg"}}, "'mass' is the name of"),
         ({"rate_hz": -5}, "rate_hz must be"),
+        ({"states": {"wound": {"rate": "goal - carriage"}}}, "states.wound: expected"),
+        ({"states": {"goal": {"unit": "m.s", "rate": "1"}}}, "'goal' is the name of"),
+        (
+            {"states": {"wound": {"unit": "m.s", "rate": "1", "lower": 2, "upper": 1}}},
+            "lower must be below upper",
+        ),
     ],
 )
 def test_mistakes_are_named(controller, words):
