@@ -12,7 +12,7 @@ from typing import Any
 import sympy as sp
 from sympy.printing.pycode import PythonCodePrinter
 
-from bampipe.physics.derivation import Equations
+from bampipe.physics.equations import Equations
 
 _NAMES = {
     "sin": "sin", "cos": "cos", "tan": "tan", "exp": "exp", "log": "log", "sqrt": "sqrt",

@@ -8,9 +8,10 @@ from typing import Any
 import sympy as sp
 from sympy.printing.str import StrPrinter
 
-from bampipe.physics.derivation import constant_symbol, derive
+from bampipe.physics.derivation import derive
 from bampipe.physics.device import Device
 from bampipe.physics.model import Model
+from bampipe.physics.vocabulary import constant_symbol
 
 
 class _Notation(StrPrinter):  # type: ignore[misc]

@@ -18,10 +18,12 @@ from numpy.typing import NDArray
 
 from bampipe.physics import generated
 from bampipe.physics.codegen import ARRAY_HEADER, function_source
-from bampipe.physics.derivation import Equations, constant_symbol, derive
+from bampipe.physics.derivation import derive
+from bampipe.physics.equations import Equations
 from bampipe.physics.model import Model
 from bampipe.physics.readable import notation
 from bampipe.physics.system import System
+from bampipe.physics.vocabulary import constant_symbol
 
 Array = NDArray[np.float64]
 

@@ -254,7 +254,8 @@ def compile_model(model: Model) -> System:
     if known is not None:
         return System(model, known)
     from bampipe.physics.codegen import array_source, memory_source, rows_source, scalar_source
-    from bampipe.physics.derivation import contribution, derive
+    from bampipe.physics.derivation import derive
+    from bampipe.physics.equations import contribution
     from bampipe.physics.signatures import ROWS
 
     equations = derive(model)

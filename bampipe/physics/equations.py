@@ -1,0 +1,72 @@
+"""The equations of motion of a model as symbols, and what its effects add to them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import sympy as sp
+
+
+@dataclass(frozen=True)
+class Equations:
+    """Symbolic equations of a model; lists are in the order of the names they belong to.
+
+    Attributes:
+        q, qd, qdd: coordinates and their rates.
+        z, z_names: internal states of effects.
+        u, inputs: input symbols that the model uses, and their channel names.
+        p, w, noise: parameters; additive process noise and its names.
+        mass: mass matrix, n by n.
+        bias: h(q, qd): Coriolis, centrifugal and potential terms.
+        other: Q_other, process noise included.
+        applied: Q_applied; applied_noise: the same with noise on the measured force.
+        input_map: d applied / d force of the device itself.
+        rates, initial: of the internal states.
+        offset, offset_rate, offset_acceleration: q_true - q_measured and its derivatives.
+        kinetic, potential: energies, as declared, definitions put in.
+        linear: for each parameter, whether the residual is linear in it.
+        compensation: per coordinate, the part of Q_other that balances gravity there: see
+            `_compensation`; zero where nothing does.
+        delays: parameters that shift measured forces in time: see `_delays`.
+    """
+
+    q: list[Any]
+    qd: list[Any]
+    qdd: list[Any]
+    z: list[Any]
+    z_names: list[str]
+    u: list[Any]
+    inputs: list[str]
+    p: list[Any]
+    w: list[Any]
+    noise: list[str]
+    mass: list[list[Any]]
+    bias: list[Any]
+    other: list[Any]
+    applied: list[Any]
+    applied_noise: list[Any]
+    input_map: list[list[Any]]
+    rates: list[Any]
+    initial: list[Any]
+    offset: list[Any]
+    offset_rate: list[Any]
+    offset_acceleration: list[Any]
+    kinetic: Any
+    potential: Any
+    linear: list[bool]
+    compensation: list[Any]
+    delays: list[str]
+
+
+def contribution(full: Equations, bare: Equations) -> list[Any]:
+    """What the effects in ``full`` add to the residual of ``bare``, one expression an axis."""
+    quiet = dict.fromkeys(full.w, 0)
+    added = []
+    for i in range(len(full.q)):
+        inertia = sum(
+            (m - n) * a for m, n, a in zip(full.mass[i], bare.mass[i], full.qdd, strict=True)
+        )
+        force = full.applied[i] - bare.applied[i] + full.other[i] - bare.other[i]
+        added.append(sp.sympify(force - (full.bias[i] - bare.bias[i]) - inertia).subs(quiet))
+    return added

@@ -1,0 +1,74 @@
+"""What parts of a model are for: what balances gravity, and what shifts a force in time."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import sympy as sp
+
+from bampipe.physics import expression
+from bampipe.physics.device import derivative
+from bampipe.physics.vocabulary import Vocabulary
+
+
+def compensation(d: Vocabulary, potential: Any) -> list[Any]:
+    """Generalised force of what the device has against gravity, one expression a coordinate.
+
+    That is a torque of the device's own table, on a coordinate that the potential energy depends
+    on, that itself depends on the pose; with the effects that name it, or a constant or
+    definition that nothing but that torque uses (a compensator that lags or is mistuned).
+    """
+    device = d.model.device
+    torque = d.table(device.torque, "torque")
+    balanced = [
+        t.free_symbols & set(d.q) and potential.has(q) for t, q in zip(torque, d.q, strict=True)
+    ]
+    found = [t if kept else sp.S.Zero for t, kept in zip(torque, balanced, strict=True)]
+    rest = [device.kinetic, device.potential, *device.applied.values(), *device.side_load.values()]
+    own = _reached(device.torque.values(), device.definitions) - _reached(rest, device.definitions)
+    raw_applied, side = d.table(device.applied, "applied"), d.table(device.side_load, "side_load")
+    for item in (e for e in d.model.effects if e.effect.kind == "torque"):
+        for key, tree in item.effect.expressions.items():
+            place = d.axes.index(key.partition(".")[2] or item.target)
+            if balanced[place] and expression.names(tree) & own:
+                found[place] += d.own(item, tree, d.effect_symbols(item, raw_applied, side), key)
+    return found
+
+
+def _reached(trees: Iterable[ast.expr], definitions: Mapping[str, ast.expr]) -> set[str]:
+    """Every name that expressions use, through definitions too."""
+    found: set[str] = set()
+    waiting = {name for tree in trees for name in expression.names(tree)}
+    while waiting:
+        name = waiting.pop()
+        found.add(name)
+        if name in definitions:
+            waiting |= expression.names(definitions[name]) - found
+    return found
+
+
+def delays(d: Vocabulary, applied: list[Any]) -> list[str]:
+    """Parameters that shift a measured force in time: small, they add its rate times themselves.
+
+    To first order a shift by p seconds adds +-p times the rate of each force that it shifts,
+    mapped to the joints as the force itself is.
+    """
+    own = [p for item in d.model.effects for p in item.parameters]
+    absent = {d.p[p.name]: 0 for p in own if not p.fixed}
+    found = []
+    for p in own:
+        slope = [sp.diff(e, d.p[p.name]).subs(absent) for e in applied]
+        for force in d.model.device.forces:
+            rate = d.channel[derivative(force, 1)]
+            mapped = [sp.diff(e, d.channel[force]).subs(absent) for e in applied]
+            ratio = {
+                sp.simplify(sp.diff(a, rate) / b)
+                for a, b in zip(slope, mapped, strict=True)
+                if b != 0
+            }
+            if len(ratio) == 1 and next(iter(ratio)).is_number and next(iter(ratio)) != 0:
+                found.append(p.name)
+                break
+    return found

@@ -1,0 +1,170 @@
+"""From names in declarations to symbols: what an expression of a device or an effect may say."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Mapping
+from typing import Any
+
+import sympy as sp
+
+from bampipe.errors import InputError
+from bampipe.physics import expression
+from bampipe.physics.device import INPUT_ORDERS, derivative
+from bampipe.physics.effect import BoundEffect
+from bampipe.physics.model import Model
+
+Symbols = dict[str, Any]
+
+LAST_ORDER = len(INPUT_ORDERS) - 1
+
+
+def constant_symbol(name: str) -> Any:
+    """Symbol that stands for a constant where its number is not put in."""
+    return sp.Symbol(f"constant {name}", real=True)
+
+
+class Vocabulary:
+    """The symbols of one model, and expressions of its device and effects built from them.
+
+    Attributes:
+        model: the device and its effects.
+        axes: names of the coordinates.
+        q, qd, qdd: their symbols and those of their rates.
+        channels: every input there may be; channel: their symbols.
+        p, z: symbols of the parameters, and of effects' internal states.
+        dry: by coordinate, the dry friction that turns with the motion; filled while torques are
+            put together, before any effect is.
+        base: what every expression of the device may use.
+    """
+
+    def __init__(self, model: Model, named_constants: bool = False) -> None:
+        self.model = model
+        device = model.device
+        self.axes = [c.name for c in device.coordinates]
+        # Symbols are numbered, so that no name from a file is ever printed into generated code.
+        self.q, self.qd, self.qdd = (
+            [sp.Symbol(f"{kind}{i}", real=True) for i in range(len(self.axes))]
+            for kind in ("q", "qd", "qdd")
+        )
+        self.channels = [derivative(f, k) for k in range(len(INPUT_ORDERS)) for f in device.forces]
+        self.channels += [*device.brakes.values(), *device.channels, "t"]
+        self.channel = {name: sp.Symbol(f"u{i}", real=True) for i, name in enumerate(self.channels)}
+        self.p = {p.name: sp.Symbol(f"p{i}", real=True) for i, p in enumerate(model.parameters)}
+        self.z: dict[tuple[str, str], Any] = {}
+        for item in model.effects:
+            for state in item.effect.states:
+                symbol = sp.Symbol(f"z{len(self.z)}", real=True)
+                self.z[item.prefix, state.name] = symbol
+        self.special = {"sgn": self.sgn, "ddt": self.ddt}
+        self.sizes: dict[str, int] = {}
+        self.dry: list[Any] = [sp.S.Zero] * len(self.axes)
+        self.base: Symbols = dict(zip(self.axes, self.q, strict=True))
+        self.base |= {f"qd_{a}": s for a, s in zip(self.axes, self.qd, strict=True)}
+        self.base |= {
+            name: constant_symbol(name) if named_constants else sp.Float(c.value)
+            for name, c in device.constants.items()
+        }
+        self.base |= {p.name: self.p[p.name] for p in device.parameters if "." not in p.name}
+        self.base |= self.channel
+        for name, tree in device.definitions.items():
+            self.base[name] = self.build(tree, self.base, f"definitions.{name}")
+            self.sizes[name] = expression.expanded_size(tree, self.sizes)
+
+    def build(self, tree: ast.expr, symbols: Mapping[str, Any], what: str) -> Any:
+        return self.rebuild(tree, symbols, f"device {self.model.device.name!r}: {what}")
+
+    def rebuild(self, tree: ast.expr, symbols: Mapping[str, Any], where: str) -> Any:
+        """`expression.build` of a tree that stays of bounded size with definitions put in."""
+        if expression.expanded_size(tree, self.sizes) > expression.MAX_EXPANDED:
+            raise InputError(
+                f"the expression has more than {expression.MAX_EXPANDED} parts once the "
+                "definitions are put in",
+                where=where,
+            )
+        return expression.build(tree, symbols, where, self.special)
+
+    def sgn(self, argument: Any) -> Any:
+        """Sign, smoothed over the axis' width where the argument is a coordinate's rate."""
+        for c, rate in zip(self.model.device.coordinates, self.qd, strict=True):
+            if argument == rate:
+                return sp.tanh(argument / sp.Float(c.sign_width))
+        return sp.sign(argument)
+
+    def ddt(self, expr: Any) -> Any:
+        """Total time derivative by the chain rule over motion and measured forces.
+
+        Channels that are no forces, such as a supply voltage, count as slow: their rate is zero.
+        """
+        last = [
+            *self.qdd,
+            *(self.channel[derivative(f, LAST_ORDER)] for f in self.model.device.forces),
+        ]
+        if expr.has(*last):
+            raise InputError("ddt() of an acceleration, or of a force's last derivative")
+        brakes = [self.channel[b] for b in self.model.device.brakes.values()]
+        if expr.has(*self.z.values(), *brakes):
+            raise InputError("ddt() of an internal state or of a brake command")
+        total = sp.S.Zero
+        for a, b in (
+            *zip(self.q, self.qd, strict=True),
+            *zip(self.qd, self.qdd, strict=True),
+        ):
+            total += sp.diff(expr, a) * b
+        for force in self.model.device.forces:
+            for k in range(LAST_ORDER):
+                low, high = (
+                    self.channel[derivative(force, k)],
+                    self.channel[derivative(force, k + 1)],
+                )
+                total += sp.diff(expr, low) * high
+        total += sp.diff(expr, self.channel["t"])
+        return total.replace(sp.DiracDelta, lambda *_: sp.S.Zero)
+
+    def table(self, entries: Mapping[str, ast.expr], what: str) -> list[Any]:
+        """One expression an axis, zero where the table has none."""
+        return [
+            self.build(entries[a], self.base, f"{what}.{a}") if a in entries else sp.S.Zero
+            for a in self.axes
+        ]
+
+    def effect_symbols(self, item: BoundEffect, applied: list[Any], side: list[Any]) -> Symbols:
+        """Every name that an expression of ``item`` may use."""
+        device = self.model.device
+        symbols = dict(self.base)
+        for i, a in enumerate(self.axes):
+            symbols |= {f"applied_{a}": applied[i], f"load_{a}": sp.Abs(applied[i])}
+            for term in ("viscous", "coulomb"):
+                symbols[f"{term}_{a}"] = self.p.get(f"{term}.{a}", sp.S.Zero)
+        if item.effect.scope == "axis":
+            i, a = self.axes.index(item.target), item.target
+            symbols |= {"q": self.q[i], "qd": self.qd[i], "side_load": side[i]}
+            symbols |= {n: symbols[f"{n}_{a}"] for n in ("applied", "load", "viscous", "coulomb")}
+            symbols["dry"] = self.dry[i]
+            symbols["brake"] = self.channel.get(device.brakes.get(a, ""), sp.S.Zero)
+        elif item.effect.scope in ("force_component", "force_pair"):
+            for letter, force in zip("fg", self.targeted(item), strict=False):
+                for k, suffix in enumerate(("", "_rate", "_curvature")):
+                    symbols[letter + suffix] = self.channel[derivative(force, k)]
+        elif item.effect.scope == "channel":
+            symbols["f"] = self.channel[item.target]
+        symbols |= {s.name: self.z[item.prefix, s.name] for s in item.effect.states}
+        for p in item.parameters:
+            symbols[p.name.removeprefix(f"{item.prefix}.")] = self.p[p.name]
+        return symbols
+
+    def targeted(self, item: BoundEffect) -> tuple[str, ...]:
+        """Force channels of a force effect: its own, and for a pair the one that leaks into it."""
+        forces = self.model.device.forces
+        if item.effect.scope == "force_component":
+            return (forces[self.model.device.components.index(item.target)],)
+        short = self.model.device.components
+        return next(
+            (forces[i], forces[j])
+            for i, a in enumerate(short)
+            for j, b in enumerate(short)
+            if i != j and a + b == item.target
+        )
+
+    def own(self, item: BoundEffect, tree: ast.expr, symbols: Symbols, what: str) -> Any:
+        return self.rebuild(tree, symbols, f"effect {item.name!r}: {what}")
