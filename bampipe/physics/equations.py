@@ -27,8 +27,8 @@ class Equations:
         kinetic, potential: energies, as declared, definitions put in.
         linear: for each parameter, whether the residual is linear in it.
         compensation: per coordinate, the part of Q_other that balances gravity there: see
-            `_compensation`; zero where nothing does.
-        delays: parameters that shift measured forces in time: see `_delays`.
+            `roles.compensation`; zero where nothing does.
+        delays: parameters that shift measured forces in time: see `roles.delays`.
     """
 
     q: list[Any]
