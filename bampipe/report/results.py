@@ -88,7 +88,7 @@ class Results:
                 if step not in found
                 for name, digest in (made.get("inputs") or {}).items()
                 if name in makers
-                and (makers[name] in found or stages[makers[name]]["outputs"][name] != digest)
+                and (makers[name] in found or _differs(name, stages[makers[name]], digest))
             } - {"report"}
             if not more:
                 return tuple(sorted(found))
@@ -145,6 +145,13 @@ class Results:
     def force_unit(self, axis: str) -> str:
         """Return the unit of the generalised force of ``axis``."""
         return _FORCES.get(self.unit(axis), "")
+
+    @property
+    def pusher(self) -> str:
+        """What the measured force is that of: ``hand``, ``motor``, or else ``input``."""
+        if self.session.get("driven"):
+            return "motor"
+        return "hand" if self.session.get("brakes") else "input"
 
     def is_rotary(self, axis: str) -> bool:
         """Return whether ``axis`` turns."""
@@ -230,3 +237,12 @@ def _read_json(path: Path) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise InputError("not a table", where=str(path), remedy="make it again (--force)")
     return content
+
+
+def _differs(name: str, maker: dict[str, Any], digest: str) -> bool:
+    """Whether an input is not what its maker left.
+
+    Inputs in TOML count by what they say, outputs by their bytes: those two cannot be compared, and
+    ``ingest/session.json`` has the digest of the one such file, the device's.
+    """
+    return not name.endswith(".toml") and maker["outputs"][name] != digest

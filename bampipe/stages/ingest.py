@@ -6,6 +6,8 @@ cannot be trusted is set aside with a reason (file, row, column), and the others
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections import defaultdict
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -303,6 +305,14 @@ def _rate(session: Session, trials: pd.DataFrame) -> float:
 
 def _description(session: Session, device: Device, rate: float) -> dict[str, object]:
     force = session.force
+    more: dict[str, object] = {}
+    if session.device_file is not None:
+        said = json.dumps(device.declaration, sort_keys=True, default=str)
+        more["device_digest"] = hashlib.sha256(said.encode()).hexdigest()
+    if device.drive:
+        more["driven"] = True
+    if device.default_effects:
+        more["default_effects"] = list(device.default_effects)
     return {
         "session_id": session.session_id,
         "device": device.name,
@@ -321,7 +331,7 @@ def _description(session: Session, device: Device, rate: float) -> dict[str, obj
         },
         "brakes": {f"brake_{brake.axis}": {"unit": brake.unit} for brake in session.brakes},
         "channels": {channel.name: {"unit": channel.unit} for channel in session.channels},
-        **({"default_effects": list(device.default_effects)} if device.default_effects else {}),
+        **more,
     }
 
 

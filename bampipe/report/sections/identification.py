@@ -266,7 +266,9 @@ def _motion(results: Results) -> Figure | None:
             colour = style.SERIES[place % len(style.SERIES)]
             if axis in torques:
                 user = frame[f"torque_user_{axis}"].to_numpy()
-                style.series(panels[0, column], t, user, colour, f"{axis}, hand", **look)
+                style.series(
+                    panels[0, column], t, user, colour, f"{axis}, {results.pusher}", **look
+                )
             if f"torque_gravity_{axis}" in columns:
                 gravity = frame[f"torque_gravity_{axis}"].to_numpy()
                 dashed = {**look, "ls": (0, (3, 1.5))}
@@ -283,7 +285,7 @@ def _motion(results: Results) -> Figure | None:
             panels[row, column].legend(loc="upper right", ncols=2)
             low, high = panels[row, column].get_ylim()
             panels[row, column].set_ylim(low, high + 0.22 * (high - low))
-    forces = "generalised forces of the hand"
+    forces = f"generalised forces of the {results.pusher}"
     if any(f"torque_gravity_{axis}" in columns for axis in axes):
         forces += " and of the gravity compensator"
     caption = f"Trial {trial}{results.as_in('Fig. 6')}: {forces} (top) and the motion (bottom)."

@@ -27,7 +27,7 @@ def section(results: Results) -> Section:
     trials = _by_trial(results, content)
     if trials is not None:
         blocks.append(trials)
-    handle = _at_the_handle(content)
+    handle = _at_the_handle(content, results.pusher)
     if handle:
         blocks.append(Text(handle))
     notes = tuple(str(note) for note in content.get("notes") or ())
@@ -106,15 +106,16 @@ def _by_trial(results: Results, content: dict[str, Any]) -> Table | None:
     )
 
 
-def _at_the_handle(content: dict[str, Any]) -> str:
-    """Return the error of the force at the handle in words, where it is stored."""
+def _at_the_handle(content: dict[str, Any], pusher: str) -> str:
+    """Return the error of the measured force in words, where it is stored."""
     forces = content.get("forces") or {}
     shown = (
         f"{wording.words(name)} {wording.significant(entry['rmse'])} "
         f"{wording.unit(str(entry.get('unit', 'N')))}"
         for name, entry in forces.items()
     )
-    return f"At the handle the error is {wording.listing(shown)} (RMSE)." if forces else ""
+    place = "At the handle" if pusher == "hand" else f"Of the {pusher}"
+    return f"{place} the error is {wording.listing(shown)} (RMSE)." if forces else ""
 
 
 def _shown_trial(results: Results) -> pd.DataFrame | None:
@@ -162,7 +163,8 @@ def _forces(results: Results, frame: pd.DataFrame) -> Figure:
     panels[-1, 0].set_xlabel("time (s)")
     style.legend_below(figure, panels[0, 0])
     trial = str(frame["trial_id"].iloc[0])
-    where = "the hand's force" if at_handle else "the hand's generalised force at each joint"
+    whose = f"the {results.pusher}'s"
+    where = f"{whose} force" if at_handle else f"{whose} generalised force at each joint"
     caption = (
         f"Trial {trial}{results.as_in('Fig. 9')}: {where}, measured and predicted by the inverse "
         "dynamics, with and without its friction terms."
