@@ -5,8 +5,11 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import pytest
+
 from bampipe.api import loop
-from bampipe.run import models, record
+from bampipe.run import models, pipeline, record
+from bampipe.run.events import unheard
 
 
 def made(settings: dict[str, object]) -> dict[str, object]:
@@ -29,6 +32,20 @@ def test_a_child_is_identified_as_its_parent_was(tmp_path: Path) -> None:
     given = loop.settings_of(tmp_path, "base")
     assert given == {"identify": {"method": "least-squares"}, "validate": {"seed": 3}}
     assert loop.settings_of(tmp_path, child) == {**given, "validate": {"seed": 4}}
+
+
+def test_following_judges_the_model_that_it_starts_from(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ran: list[tuple[str, ...]] = []
+    found = {"axes": {"joint": {"verdict": "unknown_effect"}}, "selected": []}
+    monkeypatch.setattr(loop.Options, "run", lambda _, *steps: ran.append(steps))
+    monkeypatch.setattr(loop, "_diagnosis", lambda *_: found)
+    options = loop.Options(tmp_path, pipeline.load(), False, True, unheard)
+    told: list[str] = []
+    assert loop.follow(options, "base", told.append) == "base"
+    assert told == ["base, joint: unknown effect"]
+    assert ran[0] == ("identify", "validate", "base") and ran[-1] == ("compare", "compare", "")
 
 
 def test_the_device_file_gives_the_base_model_its_effects(tmp_path: Path) -> None:

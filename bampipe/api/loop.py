@@ -195,6 +195,7 @@ def follow(options: Options, model: str, tell: Callable[[str], None]) -> str:
     Returns:
         The name of the last model that is better than its parent.
     """
+    options.run("identify", "validate", model)  # what a child is held against, and the ladder shows
     for _ in range(MOST_EFFECTS):
         options.run("diagnose", "diagnose", model)
         effect = next_effect(options.root, model)
