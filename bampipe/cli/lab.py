@@ -94,7 +94,9 @@ def table(found: Lab) -> None:
     """Print the sessions that stand out, else that none does; then the trends."""
     sessions = found.content["sessions"]
     odd = [one for one in sessions if one["verdict"] != "in control"]
-    show.say(f"{found.folder}: {len(sessions)} sessions, {len(odd)} stand out")
+    many = "session" if len(sessions) == 1 else "sessions"
+    stand = "stands" if len(odd) == 1 else "stand"
+    show.say(f"{found.folder}: {len(sessions)} {many}, {len(odd)} {stand} out")
     rows = [
         [
             one["session"],

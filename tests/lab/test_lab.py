@@ -215,7 +215,7 @@ def test_the_command(
     monkeypatch.chdir(tmp_path)
     code, out, _ = command("lab")
     assert code == 0
-    assert "lab: 9 sessions, 1 stand out" in out
+    assert "lab: 9 sessions, 1 stands out" in out
     assert re.search(r"s05 .*device drifted +coulomb\.yaw \+2\d %", out)
     code, out, _ = command("lab", "runs", "--out", "elsewhere", "--json")
     assert code == 0
