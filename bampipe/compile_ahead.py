@@ -21,6 +21,12 @@ _PARTS = (
 )
 """Modules whose import compiles, by process; what is waited for longest comes first."""
 
+_END_WITH_PARENT = (
+    "import os, sys, threading; "
+    "threading.Thread(target=lambda: os._exit(len(os.read(0, 1))), daemon=True).start()"
+)
+"""Standard input ends when the run does, killed or not."""
+
 _allowed: list[bool] = []
 _running: list[subprocess.Popen[bytes]] = []
 
@@ -51,11 +57,11 @@ def missing() -> None:
     _allowed.clear()
     for modules in _PARTS:
         # The same places to import from, and nothing from the working folder.
-        code = f"import sys; sys.path[:] = {sys.path!r}; import {', '.join(modules)}"
+        code = f"{_END_WITH_PARENT}; sys.path[:] = {sys.path!r}; import {', '.join(modules)}"
         _running.append(
             subprocess.Popen(
                 [sys.executable, "-P", "-c", code],
-                stdin=subprocess.DEVNULL,
+                stdin=subprocess.PIPE,
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,
                 start_new_session=True,
