@@ -17,6 +17,11 @@ NORMAL_95 = 1.959963984540054
 """Half width of a 95 % interval of a normal distribution, in standard deviations."""
 
 
+_OF_SESSION = ("ingest/session.json", "ingest/trials.parquet", "stiffness/stiffness.json")
+_OF_MODELS = ("identify.json", "validate.json", "diagnose.json")
+"""What is read of a run, and of each of its models."""
+
+
 @dataclass
 class SessionRows:
     """Rows of one session, by table.
@@ -38,9 +43,23 @@ def of_run(root: Path) -> SessionRows:
     """Return the rows of the run folder ``root``: of whatever stages have run.
 
     Raises:
-        InputError: ingest has not run, or a result is damaged.
+        InputError: ingest has not run, or a result is damaged or was changed since it was written.
     """
-    run = RunFolder(root)
+    made = models.names(root)
+    of_models = [f"models/{model}/{name}" for model in made for name in _OF_MODELS]
+    record.require_untouched(root, [*_OF_SESSION, *of_models])
+    try:
+        return _of_sound(RunFolder(root), made)
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"a result is not as bampipe writes it ({type(error).__name__}: {error})",
+            where=str(root),
+            remedy="make it again (--force)",
+        ) from error
+
+
+def _of_sound(run: RunFolder, made: tuple[str, ...]) -> SessionRows:
+    root = run.root
     session = run.read_json("ingest/session.json")
     try:
         recorded = lab_tables.moment(session.get("recorded_at"))
@@ -53,7 +72,6 @@ def of_run(root: Path) -> SessionRows:
         ) from error
     rows = SessionRows({**key, "recorded_at": recorded})
     axes = tuple(str(axis) for axis in session.get("axes", {}))
-    made = models.names(root)
     nis: Mapping[str, Any] = {}
     for model in made:
         found = _model(run, rows, model, axes)

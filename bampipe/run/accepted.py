@@ -52,7 +52,7 @@ def read(folder: Path, device: str) -> Mapping[str, Any] | None:
         return None
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(
             f"not readable as JSON ({error})", where=str(path), remedy="restore it, or accept anew"
         ) from error
@@ -74,9 +74,11 @@ def accept(root: Path, model: str, folder: Path, force: bool = False) -> Path:
         The file written.
 
     Raises:
-        InputError: the model is not identified, or a gate failed.
+        InputError: the model is not identified, a gate failed, or a result was changed by hand.
     """
     run = RunFolder(root)
+    names = [name.replace("{model}", model) for name in RESULTS]
+    record.require_untouched(root, [*names, "ingest/session.json"])
     run.require(f"models/{model}/identify.json", "identify")
     failed = [gate["gate"] for gate in record.read(root).get("gates", ()) if _failed(gate)]
     if failed and not force:

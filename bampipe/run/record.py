@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from bampipe.errors import InputError
+from bampipe.run.hashing import digest_file
 from bampipe.stages.base import write_json
 
 SCHEMA = "bampipe.run/1"
@@ -95,6 +96,31 @@ def is_sound(made: object) -> bool:
 def are_inside(names: Iterable[str]) -> bool:
     """Whether paths stay in the folder they are relative to."""
     return not any(Path(name).is_absolute() or ".." in Path(name).parts for name in names)
+
+
+def require_untouched(root: Path, names: Iterable[str]) -> None:
+    """Hold results against the hashes that ``run.json`` keeps of them.
+
+    Args:
+        root: the run folder.
+        names: paths relative to it; one that is not there, or that no step wrote, is passed over.
+
+    Raises:
+        InputError: a file was changed or damaged since it was written; says which.
+    """
+    written = {
+        name: (step, known)
+        for step, made in read(root)["stages"].items()
+        for name, known in made["outputs"].items()
+    }
+    for name in names:
+        step, known = written.get(name, ("", ""))
+        if step and (root / name).is_file() and digest_file(root / name) != known:
+            raise InputError(
+                f"{name} was changed since {step} wrote it",
+                where=str(root),
+                remedy=f"run `bampipe {step.partition(':')[0]}` again to rebuild it",
+            )
 
 
 def replace_json(path: Path, content: dict[str, Any]) -> None:

@@ -17,6 +17,8 @@ from bampipe.data import lab_tables
 from bampipe.errors import InputError
 from bampipe.lab.collect import collect
 from bampipe.lab.place import is_current
+from bampipe.run.accepted import accept
+from bampipe.run.hashing import digest_file
 
 ROOT = Path(__file__).parent.parent.parent
 CLEAN = {"yaw": ("nothing_missing", ()), "pitch": ("nothing_missing", ())}
@@ -171,6 +173,44 @@ def test_sessions_without_a_date_come_first_and_a_damaged_run_is_named(tmp_path:
     assert found.sessions == ("undated", "s01", "s03")
     assert len(found.skipped) == 1
     assert re.match(r"s02: .*identify\.json: not readable as JSON", found.skipped[0])
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("stiffness/stiffness.json", {"axes": None}),
+        ("models/base/identify.json", {"parameters": {"mass": 3}}),
+        ("models/base/validate.json", []),
+        ("models/base/diagnose.json", {"axes": {"yaw": {}}}),
+        ("ingest/session.json", {"device": "bam", "axes": 3}),
+    ],
+)
+def test_a_result_of_another_form_leaves_its_run_out(
+    tmp_path: Path, name: str, content: object
+) -> None:
+    runs = make_lab(tmp_path, sessions=2)
+    (runs / "s01" / name).write_text(json.dumps(content))
+    found = collect(runs, tmp_path / "lab", report=False)
+    assert found.sessions == ("s02",)
+    (skipped,) = found.skipped
+    assert skipped.startswith("s01: ") and "\n" not in skipped
+
+
+def test_a_result_that_was_edited_leaves_its_run_out(tmp_path: Path) -> None:
+    runs = make_lab(tmp_path, sessions=2)
+    path = runs / "s01/models/base/identify.json"
+    step = {
+        "key": "", "config": {}, "settings": {}, "declared_inputs": [], "inputs": {}, "code": "",
+        "versions": {}, "summary": {}, "outputs": {"models/base/identify.json": digest_file(path)},
+    }  # fmt: skip
+    kept = {"schema": "bampipe.run/1", "stages": {"identify:base": step}}
+    (runs / "s01/run.json").write_text(json.dumps(kept))
+    assert collect(runs, tmp_path / "lab", report=False).skipped == ()
+    path.write_text(path.read_text().replace("4.", "5.", 1))
+    (skipped,) = collect(runs, tmp_path / "lab", report=False).skipped
+    assert "models/base/identify.json was changed since identify:base wrote it" in skipped
+    with pytest.raises(InputError, match="was changed since"):
+        accept(runs / "s01", "base", tmp_path / "accepted")
 
 
 def test_nothing_to_collect_is_one_line(tmp_path: Path) -> None:
