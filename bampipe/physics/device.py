@@ -11,7 +11,7 @@ from typing import Any
 from bampipe.errors import InputError
 from bampipe.physics import expression
 from bampipe.physics.controller import Controller, controller_from
-from bampipe.physics.parameter import Parameter, parameter_from
+from bampipe.physics.parameter import LARGEST, Parameter, parameter_from
 
 _KEYS = frozenset(
     [
@@ -235,6 +235,8 @@ def device_from(declaration: Mapping[str, Any], where: str = "device file") -> D
             pair = [entry.get("lower"), entry.get("upper")]
         if not pair or any(isinstance(v, bool) or not isinstance(v, int | float) for v in pair):
             raise InputError("expected { lower = number, upper = number }", where=at)
+        if not all(abs(v) <= LARGEST for v in pair):
+            raise InputError(f"limits must be numbers of at most {LARGEST:.0e}", where=at)
         limits[axis] = (float(pair[0]), float(pair[1]))
         if not limits[axis][0] < limits[axis][1]:
             raise InputError("lower must be below upper", where=at)

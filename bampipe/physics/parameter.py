@@ -56,6 +56,10 @@ class Parameter:
         return not self.strength and not self.fixed
 
 
+LARGEST = 1e12
+"""Of a prior, its sd or a bound: beyond, squares beside those of sensor noise lose all digits."""
+
+
 def parameter_from(name: str, entry: object, where: str) -> Parameter:
     """Check one ``[parameters.*]`` entry and make a `Parameter` of it.
 
@@ -86,8 +90,15 @@ def parameter_from(name: str, entry: object, where: str) -> Parameter:
             value = entry[key]
             if isinstance(value, bool) or not isinstance(value, int | float):
                 raise InputError(f"{key} must be a number, found {value!r}", where=where)
-            if math.isnan(value) or (math.isinf(value) and key in ("prior", "sd", "typical")):
+            endless = isinstance(value, float) and math.isinf(value)
+            if value != value or (endless and key in ("prior", "sd", "typical")):
                 raise InputError(f"{key} must be finite, found {value!r}", where=where)
+            if not endless and abs(value) > LARGEST:
+                raise InputError(
+                    f"{key} is beyond what can be computed with, {LARGEST:.0e}",
+                    where=where,
+                    remedy="give what is physically possible, in SI units",
+                )
             numbers[key] = float(value)
     for key in ("strength", "fixed"):
         if not isinstance(entry.get(key, False), bool):

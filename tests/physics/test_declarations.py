@@ -125,6 +125,8 @@ DEVICES = [
     ("limits.yaw", 3, "limits.yaw"),
     ("limits.yaw.lower", REMOVE, "limits.yaw"),
     ("limits.yaw.lower", 9.0, "limits.yaw"),
+    ("limits.yaw.lower", -(10**400), "limits.yaw"),
+    ("limits.yaw.upper", math.inf, "limits.yaw"),
     ("limits.elbow", {"lower": 0.0, "upper": 1.0}, "limits"),
 ]
 
@@ -167,6 +169,9 @@ EFFECTS = [
     ("parameters.force.rotary.prior", None, "prior"),
     ("parameters.force.rotary.strength", "false", "strength"),
     ("parameters.force.rotary.typical", math.inf, "typical"),
+    ("parameters.force.rotary.sd", 1e300, "sd is beyond what can be computed with"),
+    ("parameters.force.rotary.prior", 10**400, "prior is beyond what can be computed with"),
+    ("parameters.force.rotary.lower", -(10**400), "lower is beyond what can be computed with"),
     ("parameters.a b", {"unit": "", "prior": 0, "sd": 1}, "cannot be a name"),
     ("states", [1], "states"),
     ("states.z", {}, "states.z"),
