@@ -4,11 +4,14 @@ A one-joint arm whose motor current is logged at about 100 Hz with a jittering c
 with a magnetic coil on a testing machine. Their motion is integrated here, by Euler steps of 0.1 ms
 that share no code with bampipe; each session hides one effect, or none.
 
-    python benchmarks/other_machines.py [CASE...]     cases such as arm:stribeck; all by default
+    python benchmarks/other_machines.py [--seed N] [CASE...]
+
+Cases are such as arm:stribeck; all by default.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
 import subprocess
 import sys
@@ -188,11 +191,15 @@ def diagnosed(make: Callable[[Path, int, int], None], hidden: int, seed: int) ->
 
 def main() -> None:
     """Print one row a case."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("cases", nargs="*")
+    parser.add_argument("--seed", type=int, default=3)
+    options = parser.parse_args()
     cases = {f"arm:{n}": (arm, k) for k, n in enumerate(ARM)}
     cases |= {f"damper:{n}": (damper, k) for k, n in enumerate(DAMPER)}
     print("| hidden | verdict | named | error before | after | floor |\n|---|---|---|---|---|---|")
-    for name in sys.argv[1:] or cases:
-        print(f"| {name} | {diagnosed(*cases[name], 3)} |", flush=True)
+    for name in options.cases or cases:
+        print(f"| {name} | {diagnosed(*cases[name], options.seed)} |", flush=True)
 
 
 if __name__ == "__main__":

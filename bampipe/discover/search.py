@@ -14,7 +14,7 @@ from bampipe.discover.chance import Progress, Recipe, Replicate
 from bampipe.discover.evidence import Evidence
 from bampipe.discover.level import Level
 from bampipe.discover.rivals import choose
-from bampipe.discover.start import with_effect
+from bampipe.discover.start import with_effect, without_effect
 
 Array = NDArray[np.float64]
 
@@ -66,8 +66,9 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
     recipe, evidence, scores = base, initial, first
     groups: dict[str, tuple[str, ...]] = {}
     main: dict[str, int] = {}
+    dropped: set[str] = set()
     replayed = level.replicates
-    while len(groups) < s.most_effects:
+    for _ in range(s.most_effects):
         known = level
         able = _able(bench, scores, known, evidence, replayed)
         if able and groups:
@@ -84,13 +85,33 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
         progress(0.45 + 0.1 * len(groups), f"added {best}, looking for more")
         recipe = replace(base, effects=(*base.effects, *groups))
         evidence = bench.fit(recipe, with_effect(recipe, evidence, scores[best]))
+        recipe, evidence = _needed(bench, base, recipe, evidence)
+        dropped |= set(groups) - set(recipe.effects)
+        groups = {name: alike for name, alike in groups.items() if name not in dropped}
         replayed = bench.replicas(recipe, evidence.p, s.rival_replicates, (), (3,))
-        scores = bench.scores(recipe, evidence.p, [n for n in bench.names if n not in groups])
+        rest = [n for n in bench.names if n not in groups and n not in dropped]
+        scores = bench.scores(recipe, evidence.p, rest)
     progress(0.85, "replaying the final model for its noise floor")
     final = bench.replicas(recipe, evidence.p, s.final_replicates, (), (1,), share=True)
     return Search(
         base, initial, level, first, tuple(groups), groups, main, evidence, tuple(final)
     )  # fmt: skip
+
+
+def _needed(
+    bench: Bench, base: Recipe, recipe: Recipe, evidence: Evidence
+) -> tuple[Recipe, Evidence]:
+    """The model without those earlier effects that the latest one makes superfluous, and its fit.
+
+    What resembles the missing effect may come first, because it takes a little of several others.
+    """
+    for name in recipe.effects[len(base.effects) : -1]:
+        fewer = replace(recipe, effects=tuple(e for e in recipe.effects if e != name))
+        fitted = bench.fit(fewer, without_effect(fewer, evidence))
+        now, then = Scorer(evidence).before.error, Scorer(fitted).before.error
+        if np.all(np.log(then / now) < bench.settings.worth):
+            recipe, evidence = fewer, fitted
+    return recipe, evidence
 
 
 def _able(

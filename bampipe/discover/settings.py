@@ -44,6 +44,6 @@ class Settings:
     surely: float = 2.0
     explained: float = 0.6
     far: float = 5.0
-    explained_far: float = 0.9
+    explained_far: float = 0.75
     jobs: int = 2
     seed: int = 0

@@ -38,6 +38,12 @@ def with_effect(recipe: Recipe, evidence: Evidence, score: Score) -> Array:
     return np.clip(start, lower, upper)
 
 
+def without_effect(recipe: Recipe, evidence: Evidence) -> Array:
+    """Parameters of ``recipe``, (n_p,), from the fit of a model that has more effects."""
+    known = {q.name: v for q, v in zip(evidence.system.parameters, evidence.p, strict=True)}
+    return np.array([known[q.name] for q in system_of(recipe).parameters])
+
+
 def search_start(session: Session, recipe: Recipe) -> Array:
     """Starting values of every parameter of a model, its effects taken one after the other.
 

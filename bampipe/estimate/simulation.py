@@ -55,8 +55,9 @@ class Impedance:
 def stable_steps(derivative, x, u, p, w, n, width, dt, max_step, work):  # type: ignore[no-untyped-def]
     """Number of Runge-Kutta steps that ``dt`` needs from state ``x`` on.
 
-    At most ``max_step`` long, and no longer than the time constant of any axis that may come to
-    rest within ``dt``: the derivative is probed at both sides of standstill.
+    At most ``max_step`` long, and no longer than the time constant of any axis: the derivative is
+    probed at both sides of standstill where it may come to rest within ``dt``, else at a rate
+    nearby, for heavy damping on a small mass is stiff at any speed.
 
     Args:
         derivative: f(x, u, p, w, dx).
@@ -65,9 +66,10 @@ def stable_steps(derivative, x, u, p, w, n, width, dt, max_step, work):  # type:
         n: number of coordinates.
         width: (n,) velocity over which friction changes sign, rad/s or m/s.
         dt, max_step: s.
-        work: (8, >= nx) scratch; rows 6 and 7 are used.
+        work: (8, >= nx) scratch; rows 5 to 7 are used.
     """
     nx = x.shape[0]
+    moved = work[5, :nx]
     dx = work[6, :nx]
     probe = work[7, :nx]
     fastest = 1.0 / max_step
@@ -76,15 +78,18 @@ def stable_steps(derivative, x, u, p, w, n, width, dt, max_step, work):  # type:
         probe[i] = x[i]
     for i in range(n):
         if abs(x[n + i]) > 3.0 * abs(dx[n + i]) * dt + 5.0 * width[i]:
-            continue
-        probe[n + i] = 0.1 * width[i]
-        derivative(probe, u, p, w, dx)
-        above = dx[n + i]
-        probe[n + i] = -0.1 * width[i]
-        derivative(probe, u, p, w, dx)
-        fastest = max(fastest, (dx[n + i] - above) / (0.2 * width[i]))
+            step = 1e-3 * x[n + i]
+            probe[n + i] = x[n + i] + step
+            derivative(probe, u, p, w, moved)
+            fastest = max(fastest, (dx[n + i] - moved[n + i]) / step)
+        else:
+            probe[n + i] = 0.1 * width[i]
+            derivative(probe, u, p, w, moved)
+            above = moved[n + i]
+            probe[n + i] = -0.1 * width[i]
+            derivative(probe, u, p, w, moved)
+            fastest = max(fastest, (moved[n + i] - above) / (0.2 * width[i]))
         probe[n + i] = x[n + i]
-        derivative(x, u, p, w, dx)
     return min(int(np.ceil(dt * fastest)), _MOST_STEPS)
 
 

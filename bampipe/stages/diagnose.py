@@ -58,6 +58,7 @@ def inputs(config: Config) -> tuple[str, ...]:
         "ingest/session.json",
         "ingest/trials.parquet",
         "ingest/samples.parquet",
+        "filter/filter.json",
         f"models/{config.model}/identify.json",
         *model_inputs(config.model),
     )
