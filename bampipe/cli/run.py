@@ -214,7 +214,8 @@ def _report_runs(outcomes: Sequence[Outcome], several: bool, json: bool) -> None
 def _after_run(outcome: Outcome, name: str) -> str:
     if (outcome.root / "report" / "report.pdf").is_file():
         missing = any(verdict.state in ("failed", "warned") for verdict in outcome.verdicts)
+        diagnosed = any(step.step.startswith("diagnose") for step in outcome.steps)
         if missing:
-            return f"bampipe diagnose {name}"
+            return f"bampipe extend {name} --auto" if diagnosed else f"bampipe diagnose {name}"
         return f"open {outcome.root / 'report' / 'report.pdf'}"
     return f"bampipe status {name}"
