@@ -154,7 +154,10 @@ def test_a_motion_that_no_noise_explains_is_refused(tmp_path: Path) -> None:
     """Force channels that have nothing to do with the motion, and noise that may not grow."""
     run = simulated_run(tmp_path / "wrong", scramble=True)
     with pytest.raises(InputError, match=r"does not follow trial|lost the motion"):
-        identified(run, replace(FAST, force_noise=1e-4))
+        identified(run, replace(FAST, method="ukf", force_noise=1e-4))
+    content = identified(run, replace(FAST, method="auto", force_noise=1e-4))
+    assert content["method"] == "least-squares"
+    assert content["notes"][0].startswith("Estimated by least squares, since")
 
 
 def test_torque_against_gravity_is_stored(simulated: RunFolder) -> None:
