@@ -86,7 +86,8 @@ class Bench:
         merged: dict[str, Score] = {}
         for found in self.pool(run_scores, tasks):
             merged |= found
-        return merged
+        # In the order of the names, whatever the number of jobs: ties in the ranking keep it.
+        return {name: merged[name] for name in names if name in merged}
 
     def level(
         self, recipe: Recipe, evidence: Evidence, asked: Sequence[str], seed: tuple[int, ...]
