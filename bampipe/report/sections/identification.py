@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from typing import Any
 
 import numpy as np
@@ -182,7 +183,7 @@ def _convergence(results: Results, content: dict[str, Any], trace: pd.DataFrame)
         for start in starts[1:]:
             panel.axvline(start, color=style.FAINT, lw=0.6, ls=(0, (1, 2)), zorder=0)
         _settled(panel, trace, names)
-        panel.set_title(kind)
+        panel.set_title(textwrap.fill(kind, 26))
         panel.set_ylabel(wording.unit(unit) or "1")
         if len(panel.get_legend_handles_labels()[1]) > 1:
             panel.legend(loc="best", ncols=2 if columns == 2 else 1)
