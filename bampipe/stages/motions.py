@@ -241,7 +241,8 @@ def _columns(frame: pd.DataFrame, names: Sequence[str], where: str) -> Array:
             raise InputError(
                 f"no column {name!r}, which the model needs",
                 where=where,
-                remedy="run the stages before this one again (--force)",
+                remedy="name the channel in session.toml if it was logged; if not, the effect that "
+                "uses it cannot be weighed with this session",
             )
     return frame[list(names)].to_numpy(dtype=float, copy=True)  # one column alone is read-only
 

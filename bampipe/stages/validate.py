@@ -350,6 +350,7 @@ def _content(
             "unit": system.model.device.force_unit,
         }
     best = ", ".join(f"{axis} {entry['fit_percent']:.1f} %" for axis, entry in axes.items())
+    on = "held-out trials" if any(c.judged for c in compared) else "the trials it was fitted to"
     return {
         "model": config.model,
         "axes": axes,
@@ -359,7 +360,7 @@ def _content(
         "forces": forces,
         "cutoff_hz": config.cutoff_hz,
         "notes": list(notes),
-        "headline": f"fit on held-out trials: {best}",
+        "headline": f"fit on {on}: {best}",
     }
 
 

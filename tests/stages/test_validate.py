@@ -95,6 +95,7 @@ def test_one_trial_holds_nothing_out(tmp_path: Path) -> None:
     run = identified(simulated_run(tmp_path / "one", trials=1))
     content = validated(run)
     assert "nothing is held out" in content["notes"][0]
+    assert content["headline"].startswith("fit on the trials it was fitted to")
     assert not content["trials"]["t00"]["held_out"]
     assert not read_parquet(run.path("models/base/residuals.parquet"))["held_out"].any()
 
