@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from bampipe.estimate.butterworth import rates, zero_phase
 from bampipe.physics import System
-from bampipe.physics.device import INPUT_ORDERS, derivative
+from bampipe.physics.device import LAST_ORDER, derivative
 
 Array = NDArray[np.float64]
 
@@ -96,7 +96,7 @@ def observe(recording: Recording, sensors: Sensors, system: System) -> Motion:
     channels: dict[str, Array] = {"t": t, **recording.other}
     for name, column in zip(device.forces, recording.force.T, strict=True):
         channels[name] = column
-        found = rates(column, rate, cutoff, len(INPUT_ORDERS) - 1)
+        found = rates(column, rate, cutoff, LAST_ORDER)
         channels |= {derivative(name, k): values for k, values in enumerate(found, start=1)}
     for i, axis in enumerate(system.coordinates):
         if axis in device.brakes:

@@ -28,8 +28,7 @@ class Search:
         initial: its fit.
         level: chance level of candidates against it.
         first: scores against it.
-        selected: effects added, in order.
-        groups: for each, the others that these trials cannot tell from it.
+        groups: for each effect added, in order, the others that these trials cannot tell from it.
         main: for each, the axis on which it helps most.
         evidence: fit of the model with all of them.
         final: replays of that model, with explainable shares.
@@ -39,11 +38,15 @@ class Search:
     initial: Evidence
     level: Level
     first: Mapping[str, Score]
-    selected: tuple[str, ...]
     groups: Mapping[str, tuple[str, ...]]
     main: Mapping[str, int]
     evidence: Evidence
     final: tuple[Replicate, ...]
+
+    @property
+    def selected(self) -> tuple[str, ...]:
+        """Effects added, in order."""
+        return tuple(self.groups)
 
 
 def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Search:
@@ -88,13 +91,14 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
         recipe, evidence = _needed(bench, base, recipe, evidence)
         dropped |= set(groups) - set(recipe.effects)
         groups = {name: alike for name, alike in groups.items() if name not in dropped}
+        main = {name: axis for name, axis in main.items() if name not in dropped}
         replayed = bench.replicas(recipe, evidence.p, s.rival_replicates, (), (3,))
         rest = [n for n in bench.names if n not in groups and n not in dropped]
         scores = bench.scores(recipe, evidence.p, rest)
     progress(0.85, "replaying the final model for its noise floor")
     final = bench.replicas(recipe, evidence.p, s.final_replicates, (), (1,), share=True)
     return Search(
-        base, initial, level, first, tuple(groups), groups, main, evidence, tuple(final)
+        base, initial, level, first, groups, main, evidence, tuple(final)
     )  # fmt: skip
 
 
@@ -105,12 +109,13 @@ def _needed(
 
     What resembles the missing effect may come first, because it takes a little of several others.
     """
+    now = Scorer(evidence).before.error
     for name in recipe.effects[len(base.effects) : -1]:
         fewer = replace(recipe, effects=tuple(e for e in recipe.effects if e != name))
         fitted = bench.fit(fewer, without_effect(fewer, evidence))
-        now, then = Scorer(evidence).before.error, Scorer(fitted).before.error
+        then = Scorer(fitted).before.error
         if np.all(np.log(then / now) < bench.settings.worth):
-            recipe, evidence = fewer, fitted
+            recipe, evidence, now = fewer, fitted, then
     return recipe, evidence
 
 

@@ -24,6 +24,7 @@ from bampipe.estimate.unscented import (
     FilterResult,
     FilterSettings,
     Trial,
+    in_sequence,
 )
 
 Array = NDArray[np.float64]
@@ -42,16 +43,13 @@ def filter_trials_augmented(
     Raises:
         FilterFailure: the covariance lost positive definiteness or a number is not finite.
     """
-    lower, upper = model.range
-    theta = np.clip(np.asarray(theta, dtype=float), lower, upper)
-    covariance = np.array(covariance, dtype=float)
-    found = []
-    for index, trial in enumerate(trials):
-        filtered, theta, covariance = _filter(model, index, trial, theta, covariance, settings)
-        found.append(filtered)
-        if progress is not None:
-            progress(index + 1)
-    return FilterResult(theta, covariance, tuple(found))
+
+    def one(
+        index: int, trial: Trial, theta: Array, covariance: Array
+    ) -> tuple[FilteredTrial, Array, Array]:
+        return _filter(model, index, trial, theta, covariance, settings)
+
+    return in_sequence(one, trials, np.clip(theta, *model.range), covariance, progress)
 
 
 def _filter(

@@ -22,6 +22,7 @@ from bampipe.estimate.unscented import (
     FilterResult,
     FilterSettings,
     Trial,
+    in_sequence,
 )
 
 Array = NDArray[np.float64]
@@ -46,16 +47,13 @@ def filter_trials_by_filterpy(
         FilterFailure: the covariance lost positive definiteness.
         InputError: filterpy 2 is not installed.
     """
-    theta, covariance = np.asarray(theta, dtype=float), np.array(covariance, dtype=float)
-    found = []
-    for index, trial in enumerate(trials):
-        filtered, theta, covariance = _filter(
-            model, index, trial, theta, covariance, settings, advance
-        )
-        found.append(filtered)
-        if progress is not None:
-            progress(index + 1)
-    return FilterResult(theta, covariance, tuple(found))
+
+    def one(
+        index: int, trial: Trial, theta: Array, covariance: Array
+    ) -> tuple[FilteredTrial, Array, Array]:
+        return _filter(model, index, trial, theta, covariance, settings, advance)
+
+    return in_sequence(one, trials, theta, covariance, progress)
 
 
 def _filter(

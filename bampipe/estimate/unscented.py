@@ -229,13 +229,12 @@ def filter_trials(
     Raises:
         FilterFailure: the covariance lost positive definiteness or a number is not finite.
     """
-    nx, nt = model.n_states, model.free.size
-    n = nx + nt
-    lower, upper = model.range
-    theta = np.clip(np.asarray(theta, dtype=float), lower, upper)
-    covariance = np.array(covariance, dtype=float)
-    found = []
-    for index, trial in enumerate(trials):
+    nx = model.n_states
+    n = nx + model.free.size
+
+    def one(
+        index: int, trial: Trial, theta: Array, covariance: Array
+    ) -> tuple[FilteredTrial, Array, Array]:
         mean = np.concatenate([trial.x, theta])
         joint = np.zeros((n, n))
         joint[:nx, :nx] = np.diag(np.square(trial.x_sd))
@@ -243,8 +242,8 @@ def filter_trials(
         try:
             if settings.square_root:
                 joint = lower_root(joint)
-            found.append(
-                run_kernel(model, settings, trial.t, trial.u, trial.y, mean, joint, settings.stride)
+            filtered = run_kernel(
+                model, settings, trial.t, trial.u, trial.y, mean, joint, settings.stride
             )
         except FilterFailure as failure:
             raise FilterFailure(index, failure.sample, failure.reason) from None
@@ -252,7 +251,30 @@ def filter_trials(
             raise FilterFailure(index, 0, _NOT_A_SPREAD) from error
         if settings.square_root:
             joint = joint @ joint.T
-        theta, covariance = mean[nx:].copy(), joint[nx:, nx:].copy()
+        return filtered, mean[nx:].copy(), joint[nx:, nx:].copy()
+
+    return in_sequence(one, trials, np.clip(theta, *model.range), covariance, progress)
+
+
+def in_sequence(
+    one: Callable[[int, Trial, Array, Array], tuple[FilteredTrial, Array, Array]],
+    trials: Sequence[Trial],
+    theta: Array,
+    covariance: Array,
+    progress: Callable[[int], None] | None,
+) -> FilterResult:
+    """Filter trials one after the other, the parameters carried over.
+
+    Args:
+        one: filters the trial of a number from parameters (nt,) and their covariance (nt, nt);
+            returns it and these after it.
+        trials, theta, covariance, progress: as in `filter_trials`.
+    """
+    theta, covariance = np.array(theta, dtype=float), np.array(covariance, dtype=float)
+    found = []
+    for index, trial in enumerate(trials):
+        filtered, theta, covariance = one(index, trial, theta, covariance)
+        found.append(filtered)
         if progress is not None:
             progress(index + 1)
     return FilterResult(theta, covariance, tuple(found))

@@ -12,13 +12,13 @@ from typing import Any
 import sympy as sp
 
 from bampipe.errors import InputError
-from bampipe.physics.device import INPUT_ORDERS, derivative
+from bampipe.physics.device import INPUT_ORDERS, LAST_ORDER, derivative
 from bampipe.physics.effect import EACH
 from bampipe.physics.equations import Equations
 from bampipe.physics.lagrange import allow, check_inertia, lagrange
 from bampipe.physics.model import Model
 from bampipe.physics.roles import compensation, delays
-from bampipe.physics.vocabulary import LAST_ORDER, Vocabulary, constant_symbol
+from bampipe.physics.vocabulary import Vocabulary, constant_symbol
 
 
 def derive(model: Model, named_constants: bool = False) -> Equations:

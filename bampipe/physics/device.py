@@ -132,6 +132,8 @@ class Device:
 INPUT_ORDERS = ("", "rate", "curvature", "third", "fourth", "fifth", "sixth")
 """Time derivatives of a measured input that effects may use, by order."""
 
+LAST_ORDER = len(INPUT_ORDERS) - 1
+
 
 def derivative(force: str, order: int) -> str:
     """Name of the time derivative of an input: ``force_x`` -> ``force_rate_x``, ``duty_rate``."""

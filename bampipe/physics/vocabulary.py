@@ -10,13 +10,11 @@ import sympy as sp
 
 from bampipe.errors import InputError
 from bampipe.physics import expression
-from bampipe.physics.device import INPUT_ORDERS, derivative
+from bampipe.physics.device import INPUT_ORDERS, LAST_ORDER, derivative
 from bampipe.physics.effect import BoundEffect
 from bampipe.physics.model import Model
 
 Symbols = dict[str, Any]
-
-LAST_ORDER = len(INPUT_ORDERS) - 1
 
 
 def constant_symbol(name: str) -> Any:

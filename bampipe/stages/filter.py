@@ -19,7 +19,7 @@ from bampipe.estimate.differentiation import (
     UniformGrid,
     uniform_grid,
 )
-from bampipe.physics.device import INPUT_ORDERS, derivative
+from bampipe.physics.device import LAST_ORDER, derivative
 from bampipe.stages.base import Progress, RunFolder
 
 NAME = "filter"
@@ -294,8 +294,7 @@ def _forces(
     names = [str(name) for name in frame.columns if name not in taken]
     forces = {name: grid.resample(frame[name].to_numpy(dtype=np.float64)) for name in names}
     cutoff = min(cutoff_hz, 0.2 * rate)
-    highest = len(INPUT_ORDERS) - 1
-    slopes = {n: butterworth.rates(force, rate, cutoff, highest) for n, force in forces.items()}
+    slopes = {n: butterworth.rates(force, rate, cutoff, LAST_ORDER) for n, force in forces.items()}
     yield from forces.items()
     for name, found in slopes.items():
         yield derivative(name, 1), found[0]

@@ -123,6 +123,19 @@ def with_torques(
     return frame
 
 
+def as_filtered(system: System, motion: Motion, p: Array) -> pd.DataFrame:
+    """Return the states of a trial where the estimate leaves its motion as the filter stage did.
+
+    Args:
+        system: the model; motion: the trial, T samples; p: (n_p,) parameters.
+    """
+    columns = {}
+    for i, axis in enumerate(system.coordinates):
+        columns[f"q_{axis}"], columns[f"qd_{axis}"] = motion.q[:, i], motion.qd[:, i]
+        columns[f"qd_sd_{axis}"] = motion.qd_sd[:, i]
+    return with_torques(system, motion, motion.t, columns, p)
+
+
 def trace(
     names: Sequence[str],
     model: FilterModel,

@@ -16,7 +16,7 @@ from bampipe.physics import System
 from bampipe.physics.signatures import ROWS
 from bampipe.stages.base import Progress
 from bampipe.stages.estimates import Estimate, timing_entry
-from bampipe.stages.filter_tables import with_torques
+from bampipe.stages.filter_tables import as_filtered
 from bampipe.stages.motions import Motion
 from bampipe.stages.squares_estimate import Squares
 
@@ -115,11 +115,7 @@ def estimate_by_output(
             row[name] = so_far.p[problem.free[k]]
             row[f"{name}_sd"] = float(np.sqrt(so_far.covariance[k, k]))
         rows.append(row)
-        columns = {}
-        for i, axis in enumerate(system.coordinates):
-            columns[f"q_{axis}"], columns[f"qd_{axis}"] = motion.q[:, i], motion.qd[:, i]
-            columns[f"qd_sd_{axis}"] = motion.qd_sd[:, i]
-        frames.append(with_torques(system, motion, motion.t, columns, found.p[:-1]))
+        frames.append(as_filtered(system, motion, found.p[:-1]))
     bound = 3.0 * np.median(np.concatenate([motion.qd_sd for motion in motions]), axis=0)
     timed = len(kept) < problem.free.size
     value = found.p[problem.free]

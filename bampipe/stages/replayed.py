@@ -16,7 +16,7 @@ from bampipe.estimate import butterworth, kalman_smoother, savitzky_golay
 from bampipe.estimate.differentiation import Derivatives
 from bampipe.estimate.hysteresis import noise_of
 from bampipe.physics import System
-from bampipe.physics.device import INPUT_ORDERS, derivative
+from bampipe.physics.device import LAST_ORDER, derivative
 from bampipe.stages.motions import Motion, put_aside
 
 Array = NDArray[np.float64]
@@ -105,7 +105,7 @@ def _filtered(
     cutoff = settings["force"]["derivative_cutoff_hz"]
     at = {name: place for place, name in enumerate(system.inputs)}
     for column, name in enumerate(system.model.device.forces):
-        found = butterworth.rates(recording.force[:, column], rate, cutoff, len(INPUT_ORDERS) - 1)
+        found = butterworth.rates(recording.force[:, column], rate, cutoff, LAST_ORDER)
         u[:, at[name]], u_rate[:, at[name]] = recording.force[:, column], found[0]
         for order, values in enumerate(found, start=1):
             if derivative(name, order) in at:

@@ -14,7 +14,7 @@ from bampipe.errors import InputError
 from bampipe.estimate.least_squares import LeastSquares, Problem, fit
 from bampipe.physics import System
 from bampipe.stages.estimates import Estimate, timing_entry
-from bampipe.stages.filter_tables import with_torques
+from bampipe.stages.filter_tables import as_filtered
 from bampipe.stages.motions import Motion, problem_of
 from bampipe.stages.replayed import replayed
 
@@ -102,13 +102,7 @@ def estimate_by_squares(system: System, motions: Sequence[Motion], squares: Squa
             row[name] = so_far.p[problem.free[k]] - shift[k]
             row[f"{name}_sd"] = float(np.sqrt(so_far.covariance[k, k]))
         rows.append(row)
-    frames = []
-    for motion in motions:
-        columns = {}
-        for i, axis in enumerate(system.coordinates):
-            columns[f"q_{axis}"], columns[f"qd_{axis}"] = motion.q[:, i], motion.qd[:, i]
-            columns[f"qd_sd_{axis}"] = motion.qd_sd[:, i]
-        frames.append(with_torques(system, motion, motion.t, columns, squares.p[:-1]))
+    frames = [as_filtered(system, motion, squares.p[:-1]) for motion in motions]
     sd = 3.0 * np.median(np.concatenate([motion.qd_sd for motion in motions]), axis=0)
     timed = len(kept) < problem.free.size
     report: dict[str, object] = {

@@ -13,6 +13,7 @@ from measured import REAL, bampipe, estimates, need, result
 from bampipe.data.store import read_parquet
 from bampipe.estimate.least_squares import fit
 from bampipe.estimate.low_pass import Band
+from bampipe.estimate.standstill import moving
 from bampipe.physics import Model, compile_model, registry
 from bampipe.stages.base import RunFolder
 from bampipe.stages.motions import free_trials, problem_of, read_motion
@@ -142,8 +143,7 @@ def held_out_error(runs: tuple[Path, Path], *effects: str) -> float:
     found = fit(problems[0], np.append(system.prior, 0.0))
     errors = []
     for k, resting in enumerate(problems[1].resting):
-        moving = np.abs(BAND.thin(resting.astype(float))) < 0.02
-        errors.append(BAND.thin(problems[1].residual(k, found.p))[moving])
+        errors.append(BAND.thin(problems[1].residual(k, found.p))[moving(resting, BAND)])
     return float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))
 
 

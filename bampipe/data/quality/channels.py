@@ -168,24 +168,19 @@ def to_signed(table: Table, channel: Channel) -> None:
         return
     values = table.columns[channel.column]
     beyond = (values < 0.0) | (values >= 2.0**channel.wrap_bits)
-    if beyond.any():
-        at = int(np.argmax(beyond))
-        raise table.fault(
-            f"found {values[at]:g}, expected 0 to {2**channel.wrap_bits - 1}",
-            column=channel.column,
-            at=at,
-            remedy="a column that is signed already needs no wrap_bits",
-        )
+    table.refuse(
+        beyond,
+        lambda at: f"found {values[at]:g}, expected 0 to {2**channel.wrap_bits - 1}",
+        column=channel.column,
+        remedy="a column that is signed already needs no wrap_bits",
+    )
     values[values >= 2.0 ** (channel.wrap_bits - 1)] -= 2.0**channel.wrap_bits
 
 
 def _refuse_wild(table: Table, values: np.ndarray, words: str, column: str) -> None:
-    wild = ~(np.abs(values) < LARGEST_VALUE)
-    if wild.any():
-        at = int(np.argmax(wild))
-        raise table.fault(
-            f"{words} = {values[at]:.3g}, which no such machine does",
-            column=column,
-            at=at,
-            remedy="check the column and its calibration",
-        )
+    table.refuse(
+        ~(np.abs(values) < LARGEST_VALUE),
+        lambda at: f"{words} = {values[at]:.3g}, which no such machine does",
+        column=column,
+        remedy="check the column and its calibration",
+    )

@@ -23,14 +23,12 @@ def refuse_fractions(table: Table, encoder: Encoder) -> None:
         return
     values = table.columns[encoder.column]
     fractions = np.isfinite(values) & (values != np.rint(values))
-    if fractions.any():
-        at = int(np.argmax(fractions))
-        raise table.fault(
-            f"found {values[at]:g}, expected whole counts",
-            column=encoder.column,
-            at=at,
-            remedy="columns swapped? or already in units (then leave counts_per_unit out)",
-        )
+    table.refuse(
+        fractions,
+        lambda at: f"found {values[at]:g}, expected whole counts",
+        column=encoder.column,
+        remedy="columns swapped? or already in units (then leave counts_per_unit out)",
+    )
 
 
 def integrate(table: Table, encoder: Encoder) -> None:

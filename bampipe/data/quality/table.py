@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -104,6 +105,14 @@ class Table:
         row = "" if at is None else f", row {self.rows[at]}"
         where = f"{self.entry.file}{row}" + (f", column '{column}'" if column else "")
         return InputError(what, where=where, remedy=remedy)
+
+    def refuse(
+        self, wrong: np.ndarray, words: Callable[[int], str], *, column: str, remedy: str
+    ) -> None:
+        """Raise :meth:`fault` at the first row that is ``wrong``, (T,), if there is one."""
+        if wrong.any():
+            at = int(np.argmax(wrong))
+            raise self.fault(words(at), column=column, at=at, remedy=remedy)
 
 
 def longest_run(which: np.ndarray) -> tuple[int, int]:
