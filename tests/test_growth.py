@@ -15,7 +15,7 @@ from bampipe.stages import validate
 from bampipe.stages.base import RunFolder
 from bampipe.stages.filter_run import stride_of
 from bampipe.stages.motions import Motion, put_aside
-from bampipe.stages.shelf import Shelf, in_order
+from bampipe.stages.shelf import Shelf
 
 
 def test_trials_are_held_out_one_by_one_up_to_ten_then_in_ten_groups(tmp_path: Path) -> None:
@@ -45,7 +45,6 @@ def test_a_shelf_holds_no_more_than_it_may_and_fetches_the_rest_again() -> None:
     assert shelf[-1][0] == 4 and shelf[3][0] == 3 and len(fetched) == 5
     assert shelf[0][0] == 0 and len(fetched) == 6
     assert [item[0] for item in shelf[1:3]] == [1, 2]
-    assert [item[0] for item in in_order(shelf, [4, 0, 2])] == [4, 0, 2]
     with pytest.raises(IndexError):
         shelf[5]
     one = Shelf(fetch, 1, len, most=1)

@@ -10,7 +10,7 @@ compiled motion: slow, for comparison.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +36,6 @@ def filter_trials_augmented(
     theta: Array,
     covariance: Array,
     settings: FilterSettings,
-    progress: Callable[[int], None] | None = None,
 ) -> FilterResult:
     """Filter trials in sequence, as `unscented.filter_trials` does; same arguments and result.
 
@@ -49,7 +48,7 @@ def filter_trials_augmented(
     ) -> tuple[FilteredTrial, Array, Array]:
         return _filter(model, index, trial, theta, covariance, settings)
 
-    return in_sequence(one, trials, np.clip(theta, *model.range), covariance, progress)
+    return in_sequence(one, trials, np.clip(theta, *model.range), covariance)
 
 
 def _filter(

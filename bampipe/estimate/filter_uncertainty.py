@@ -13,13 +13,13 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from bampipe.estimate.unscented import FilteredTrial
+from bampipe.estimate.unscented import Stored
 
 Array = NDArray[np.float64]
 
 
 def sandwich_covariance(
-    trials: Sequence[FilteredTrial],
+    trials: Sequence[Stored],
     n_states: int,
     theta: Array,
     covariance: Array,

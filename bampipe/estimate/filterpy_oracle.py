@@ -34,13 +34,12 @@ def filter_trials_by_filterpy(
     theta: Array,
     covariance: Array,
     settings: FilterSettings,
-    progress: Callable[[int], None] | None = None,
     advance: Callable[..., None] = runge_kutta,
 ) -> FilterResult:
     """Filter trials in sequence, as `unscented.filter_trials` does; same arguments and result.
 
     Args:
-        model, trials, theta, covariance, settings, progress: as there.
+        model, trials, theta, covariance, settings: as there.
         advance: carries one point over an interval, with the arguments of `runge_kutta`.
 
     Raises:
@@ -53,7 +52,7 @@ def filter_trials_by_filterpy(
     ) -> tuple[FilteredTrial, Array, Array]:
         return _filter(model, index, trial, theta, covariance, settings, advance)
 
-    return in_sequence(one, trials, theta, covariance, progress)
+    return in_sequence(one, trials, theta, covariance)
 
 
 def _filter(

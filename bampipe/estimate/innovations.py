@@ -33,15 +33,14 @@ class Test:
     share: float
 
 
-def averaged(values: Array, usable: NDArray[np.bool_], length: int) -> Array:
-    """Means of consecutive stretches, (T // length,), NaN where a sample is unusable or missing.
+def averaged(values: Array, length: int) -> Array:
+    """Means of consecutive stretches, (T // length, n), NaN where a value is missing.
 
     Args:
-        values: (T,), of unit variance if the filter is right; usable: (T,); length: samples.
+        values: (T, n); length: samples.
     """
     count = len(values) // length
-    stretch = np.where(usable, values, np.nan)[: count * length].reshape(count, length)
-    return np.asarray(stretch.mean(axis=1))
+    return np.asarray(values[: count * length].reshape(count, length, -1).mean(axis=1))
 
 
 def whiteness(records: Sequence[Array], lags: int = 20) -> Test | None:

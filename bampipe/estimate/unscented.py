@@ -172,21 +172,30 @@ class Trial:
 
 
 @dataclass(frozen=True)
-class FilteredTrial:
+class Stored:
+    """What the filter believed at some times of one trial.
+
+    Attributes:
+        t: (R,) times, s: every ``stride``-th sample.
+        mean: (R, n) state and parameters on the scale of estimation; covariance: (R, n, n).
+    """
+
+    t: Array
+    mean: Array
+    covariance: Array
+
+
+@dataclass(frozen=True)
+class FilteredTrial(Stored):
     """What the filter found in one trial.
 
     Attributes:
-        t: (R,) times of the stored distributions, s: every ``stride``-th sample.
-        mean: (R, n) state and parameters on the scale of estimation; covariance: (R, n, n).
         innovation: (T, ny) reading minus prediction, NaN at the first sample and at gaps.
         innovation_sd: (T, ny) what the filter expects of it.
         nis: (T,) squared innovation in its own covariance (mean ny if the filter is consistent).
         log_likelihood: (T,) of each reading given those before.
     """
 
-    t: Array
-    mean: Array
-    covariance: Array
     innovation: Array
     innovation_sd: Array
     nis: Array
@@ -214,7 +223,6 @@ def filter_trials(
     theta: Array,
     covariance: Array,
     settings: FilterSettings,
-    progress: Callable[[int], None] | None = None,
 ) -> FilterResult:
     """Filter trials in sequence: each starts with its own state, the parameters carry over.
 
@@ -224,7 +232,6 @@ def filter_trials(
         theta: (nt,) parameters before the first trial, on the scale of estimation
             (`FilterModel.to_estimated`); covariance: (nt, nt).
         settings: noise and numerical settings.
-        progress: called with the number of trials done.
 
     Raises:
         FilterFailure: the covariance lost positive definiteness or a number is not finite.
@@ -253,7 +260,7 @@ def filter_trials(
             joint = joint @ joint.T
         return filtered, mean[nx:].copy(), joint[nx:, nx:].copy()
 
-    return in_sequence(one, trials, np.clip(theta, *model.range), covariance, progress)
+    return in_sequence(one, trials, np.clip(theta, *model.range), covariance)
 
 
 def in_sequence(
@@ -261,22 +268,19 @@ def in_sequence(
     trials: Sequence[Trial],
     theta: Array,
     covariance: Array,
-    progress: Callable[[int], None] | None,
 ) -> FilterResult:
     """Filter trials one after the other, the parameters carried over.
 
     Args:
         one: filters the trial of a number from parameters (nt,) and their covariance (nt, nt);
             returns it and these after it.
-        trials, theta, covariance, progress: as in `filter_trials`.
+        trials, theta, covariance: as in `filter_trials`.
     """
     theta, covariance = np.array(theta, dtype=float), np.array(covariance, dtype=float)
     found = []
     for index, trial in enumerate(trials):
         filtered, theta, covariance = one(index, trial, theta, covariance)
         found.append(filtered)
-        if progress is not None:
-            progress(index + 1)
     return FilterResult(theta, covariance, tuple(found))
 
 

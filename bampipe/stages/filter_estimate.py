@@ -99,17 +99,17 @@ def estimate_by_filter(
 
     found = run_filter(model, trials, attempts, settings, choice, told, lost, system.coordinates)
     covariance, blocks = sandwich_covariance(
-        found.main.trials,
+        found.trials,
         model.n_states,
         found.search.theta,
         found.search.covariance,
         choice.block_s,
     )
-    value, slope = model.to_physical(constrain(model, found.main.theta, covariance))
+    value, slope = model.to_physical(constrain(model, found.theta, covariance))
     scaled = covariance * np.outer(slope, slope)
     systematic = _systematic(value[:kept], scaled, squares)
     scaled[:kept, :kept] += np.diag(systematic**2)
-    tight = slope * np.sqrt(np.diag(found.main.covariance))
+    tight = slope * np.sqrt(np.diag(found.covariance))
     near = (value - model.lower < tight) | (model.upper - value < tight)
     p = np.append(start, 0.0)
     p[problem.free] = value
@@ -130,7 +130,7 @@ def estimate_by_filter(
         "input_timing": timing_entry(p, scaled[-1, -1] if timing else 0.0),
         "blocks": blocks,
         "restarts": found.restarts,
-        "state_3sigma": state_3sigma(system, found.main.trials),
+        "state_3sigma": state_3sigma(system, found.trials),
         "convergence": convergence(names, model, found, covariance),
     }
     return Estimate(

@@ -10,12 +10,14 @@ from numpy.typing import NDArray
 
 from bampipe.data.store import read_parquet
 from bampipe.errors import InputError
+from bampipe.estimate.innovations import averaged
 from bampipe.estimate.unscented import (
     FilteredTrial,
     FilterFailure,
     FilterModel,
     FilterResult,
     FilterSettings,
+    Stored,
     Trial,
     filter_trials,
 )
@@ -24,7 +26,6 @@ from bampipe.stages.base import RunFolder
 from bampipe.stages.filter_choice import FilterChoice
 from bampipe.stages.motions import Motion, input_columns
 from bampipe.stages.sensor_noise import Noise
-from bampipe.stages.shelf import in_order
 
 Array = NDArray[np.float64]
 
@@ -35,6 +36,9 @@ _COARSE = 300.0
 _LARGEST_NIS = 10.0
 """Mean normalised innovation squared from which on the filter is taken to have lost the motion."""
 
+STRETCH_S = 0.05
+"""Innovations are averaged over this long: from sample to sample the counts of an encoder are no
+noise, and what a model lacks acts at the pace of a hand."""
 _CALM = 5.0
 """Widths of the smoothed sign of the velocity within which an axis counts as reversing."""
 _MARGIN_S = 0.02
@@ -50,26 +54,47 @@ Attempt = tuple[Array, Array, float]
 
 
 @dataclass(frozen=True)
+class Pass(Stored):
+    """A filtered trial without its samples, so that memory does not grow with the log.
+
+    Attributes:
+        nis: mean normalised innovation squared; counted: over so many samples.
+        ratio: (ny,) root mean square of each innovation in its standard deviation.
+        stretches: (K, ny) means of innovations in their standard deviations over ``STRETCH_S``,
+            NaN where one is missing.
+    """
+
+    nis: float
+    counted: int
+    ratio: Array
+    stretches: Array
+
+
+@dataclass(frozen=True)
 class FilterRun:
     """A filter that followed all trials.
 
     Attributes:
-        search: the first pass over the first trial; main: all trials in ``order``.
+        search: the first pass over the first trial.
+        trials: the main passes over all trials in ``order``.
+        theta: (nt,) parameters after them, on the scale of estimation; covariance: (nt, nt).
         settings: noise levels of the main pass.
-        order: places of the trials of ``main`` in the session.
+        order: places of ``trials`` in the session.
         restarts: attempts that failed before.
     """
 
     search: FilterResult
-    main: FilterResult
+    trials: tuple[Pass, ...]
+    theta: Array
+    covariance: Array
     settings: FilterSettings
     order: tuple[int, ...]
     restarts: int
 
     @property
-    def passes(self) -> tuple[FilteredTrial, ...]:
+    def passes(self) -> tuple[Stored, ...]:
         """All passes over trials, the search first."""
-        return (*self.search.trials, *self.main.trials)
+        return (*self.search.trials, *self.trials)
 
     @property
     def steps(self) -> tuple[int, ...]:
@@ -197,35 +222,58 @@ def run_filter(
     """
     engine = _engine(choice)
     order = (*range(1, len(trials)), 0)
-    failure: FilterFailure | None = None
+    failure: tuple[int, FilterFailure] | None = None
     found: FilterRun | None = None
     for restarts, (value, sd, factor) in enumerate(attempts):
         mean, spread = model.to_estimated(value, sd)
         level = replace(settings, noise_sd=factor * settings.noise_sd)
         told(0, 0)
+        place = 0
         try:
             search = engine(
                 model, trials[:1], mean, np.diag(spread**2),
                 replace(level, noise_sd=_COARSE * level.noise_sd),
             )  # fmt: skip
-            main = engine(
-                model, in_order(trials, order), search.theta, search.covariance, level,
-                lambda done: told(done, order[done - 1]),
-            )  # fmt: skip
+            theta, covariance, passes = search.theta, search.covariance, []
+            for done, place in enumerate(order, start=1):
+                trial = trials[place]
+                one = engine(model, [trial], theta, covariance, level)
+                theta, covariance = one.theta, one.covariance
+                passes.append(_kept(one.trials[0], trial))
+                told(done, place)
         except FilterFailure as error:
-            failure = error
+            failure = (place, error)
             continue
-        found = FilterRun(search, main, level, order, restarts)
-        if _worst_nis(main) < _LARGEST_NIS:
+        found = FilterRun(search, tuple(passes), theta, covariance, level, order, restarts)
+        if max(each.nis for each in passes) / len(passes[0].ratio) < _LARGEST_NIS:
             return found
     if found is not None:
         raise _not_followed(found, lost, axes)
     if failure is None:
         raise RuntimeError("no attempt was made")
-    number = order[failure.trial] if failure.trial < len(order) else 0
-    t = trials[number].t[min(failure.sample, trials[number].t.size - 1)]
-    what = f"the filter lost the motion of trial {{}} at {t:.2f} s: {failure.reason}"
-    raise lost(what, number)
+    place, error = failure
+    t = trials[place].t[min(error.sample, trials[place].t.size - 1)]
+    raise lost(f"the filter lost the motion of trial {{}} at {t:.2f} s: {error.reason}", place)
+
+
+def _kept(filtered: FilteredTrial, trial: Trial) -> Pass:
+    """What later steps need of a filtered trial."""
+    size = np.asarray(filtered.innovation / filtered.innovation_sd)
+    seen = ~np.isnan(filtered.nis)
+    return Pass(
+        t=filtered.t,
+        mean=filtered.mean,
+        covariance=filtered.covariance,
+        nis=float(filtered.nis[seen].mean()) if seen.any() else np.inf,
+        counted=int(seen.sum()),
+        ratio=np.sqrt(np.nanmean(size**2, axis=0)),
+        stretches=averaged(size, stretch_of(trial)),
+    )
+
+
+def stretch_of(trial: Trial) -> int:
+    """Return the number of samples in ``STRETCH_S``."""
+    return max(1, round(STRETCH_S / float(np.median(np.diff(trial.t)))))
 
 
 def _engine(choice: FilterChoice) -> Callable[..., FilterResult]:
@@ -244,20 +292,11 @@ def _not_followed(
     found: FilterRun, lost: Callable[[str, int], MotionLost], axes: Sequence[str]
 ) -> MotionLost:
     """Say in physical words which trial and axis the filter does not follow."""
-    nis = [float(np.nanmean(trial.nis)) for trial in found.main.trials]
-    worst = int(np.argmax(nis))
-    trial = found.main.trials[worst]
-    ratio = np.sqrt(np.nanmean((trial.innovation / trial.innovation_sd) ** 2, axis=0))
+    worst = int(np.argmax([trial.nis for trial in found.trials]))
+    ratio = found.trials[worst].ratio
     axis = (*axes, *axes)[int(np.argmax(ratio))]
     return lost(
         f"the filter does not follow trial {{}}: its prediction of {axis} one sample ahead errs "
         f"{ratio.max():.0f} times more than noise explains",
         found.order[worst],
     )
-
-
-def _worst_nis(found: FilterResult) -> float:
-    """Return the mean normalised innovation squared of the worst trial; 1 is consistent."""
-    size = found.trials[0].innovation.shape[1]
-    worst = max(float(np.nanmean(trial.nis)) for trial in found.trials)
-    return worst / size if np.isfinite(worst) else np.inf

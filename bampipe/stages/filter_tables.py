@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from bampipe.estimate.unscented import FilteredTrial, FilterModel
+from bampipe.estimate.unscented import FilterModel, Stored
 from bampipe.physics import System
 from bampipe.stages.filter_run import FilterRun
 from bampipe.stages.motions import Motion
@@ -20,14 +20,15 @@ def mean_nis(found: FilterRun, motions: Sequence[Motion]) -> dict[str, object]:
     """Return the normalised innovation squared: near 1 where the noise levels are right."""
     size = found.settings.observed.size
     by_trial = {
-        motions[place].trial_id: float(np.nanmean(trial.nis)) / size
-        for place, trial in zip(found.order, found.main.trials, strict=True)
+        motions[place].trial_id: trial.nis / size
+        for place, trial in zip(found.order, found.trials, strict=True)
     }
-    total = np.concatenate([trial.nis for trial in found.main.trials])
-    return {"mean": float(np.nanmean(total)) / size, "by_trial": by_trial}
+    counts = [trial.counted for trial in found.trials]
+    total = np.average([trial.nis for trial in found.trials], weights=counts)
+    return {"mean": float(total) / size, "by_trial": by_trial}
 
 
-def state_3sigma(system: System, trials: Sequence[FilteredTrial]) -> dict[str, dict[str, float]]:
+def state_3sigma(system: System, trials: Sequence[Stored]) -> dict[str, dict[str, float]]:
     """Return three standard deviations of position and velocity, median over time (Table VI)."""
     n = len(system.coordinates)
     variance = np.concatenate(
@@ -62,7 +63,7 @@ def convergence(
     }
 
 
-def _elapsed(passes: Sequence[FilteredTrial]) -> list[Array]:
+def _elapsed(passes: Sequence[Stored]) -> list[Array]:
     """Return the time of each pass, counted from the start of the first."""
     clock, times = 0.0, []
     for trial in passes:
@@ -89,7 +90,7 @@ def states(
     """
     n = len(system.coordinates)
     frames: dict[int, pd.DataFrame] = {}
-    for place, trial in zip(found.order, found.main.trials, strict=True):
+    for place, trial in zip(found.order, found.trials, strict=True):
         keep = _thinned(trial.t.size, rows)
         t, mean = trial.t[keep], trial.mean[keep]
         sd = np.sqrt(np.diagonal(trial.covariance[keep], axis1=1, axis2=2))

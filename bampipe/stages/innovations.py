@@ -10,11 +10,8 @@ from numpy.typing import NDArray
 from bampipe.estimate.innovations import Test, averaged, independence, whiteness
 from bampipe.estimate.unscented import Trial
 from bampipe.physics import System
-from bampipe.stages.filter_run import FilterRun
+from bampipe.stages.filter_run import STRETCH_S, FilterRun, stretch_of
 
-_STRETCH_S = 0.05
-"""Innovations are averaged over this long: from sample to sample the counts of an encoder are no
-noise, and what a model lacks acts at the pace of a hand."""
 _LAGS_S = (0.0, 0.25, 0.5)
 """Lags at which inputs are taken."""
 WHITE_SHARE = 0.2
@@ -38,19 +35,17 @@ def innovation_tests(
     """
     n = len(system.coordinates)
     channels = [i for i, name in enumerate(system.inputs) if name != "t"]
+    by_trial, inputs = [], []
+    for place, trial in zip(found.order, found.trials, strict=True):
+        given = trials[place]
+        length = stretch_of(given)
+        clear = averaged(moving[place].astype(float), length) == 1.0
+        by_trial.append(np.where(clear, trial.stretches[:, :n], np.nan))
+        inputs.append(averaged(given.u[:, channels], length))
     content: dict[str, object] = {}
     for axis in range(n):
-        records, inputs = [], []
-        for place, trial in zip(found.order, found.main.trials, strict=True):
-            given = trials[place]
-            length = max(1, round(_STRETCH_S / float(np.median(np.diff(given.t)))))
-            value = trial.innovation[:, axis] / trial.innovation_sd[:, axis]
-            usable = moving[place][:, axis] & np.isfinite(value)
-            records.append(averaged(value, usable, length))
-            everywhere = np.ones(len(value), dtype=bool)
-            columns = [averaged(given.u[:, c], everywhere, length) for c in channels]
-            inputs.append(np.stack(columns, axis=1))
-        lags = [round(lag / _STRETCH_S) for lag in _LAGS_S]
+        records = [stretches[:, axis] for stretches in by_trial]
+        lags = [round(lag / STRETCH_S) for lag in _LAGS_S]
         own, driven = whiteness(records), independence(records, inputs, lags)
         entry: dict[str, object] = {"sentence": _sentence(own, driven)}
         if own is not None:

@@ -62,8 +62,3 @@ class Shelf(Sequence[Item], Generic[Item]):
         self._kept[place] = item
         self._held += size
         return item
-
-
-def in_order(items: Sequence[Item], order: Sequence[int]) -> Sequence[Item]:
-    """Return ``items`` in another order, each fetched when it is wanted."""
-    return Shelf(lambda place: items[order[place]], len(order), lambda item: 0, most=-1)

@@ -199,7 +199,7 @@ def _estimated(
 
     attempts: list[Attempt] = [(value, sd, 4.0**k) for k in range(_RESTARTS)]
     found = run_filter(model, readings, attempts, settings, config, told, lost, system.coordinates)
-    estimate, slope = model.to_physical(found.main.theta)
+    estimate, slope = model.to_physical(found.theta)
     names = [item.name for item in free]
     field = [i for i, name in enumerate(names) if name.startswith(f"{FIELD}.")]
     field_sd, blocks = _block_sd(found, model.n_states, field, config.block_s)
@@ -236,12 +236,12 @@ def _block_sd(
     Identified parameters are known so much better than the field that these trials hardly move
     them: each is put on the scale of its own uncertainty, or the inverses would lose it.
     """
-    scale = np.sqrt(np.diag(found.main.covariance))
+    scale = np.sqrt(np.diag(found.covariance))
     whole = np.concatenate([np.ones(n_states), scale])
     both = np.outer(whole, whole)
     trials = [
         replace(trial, mean=trial.mean / whole, covariance=trial.covariance / both)
-        for trial in found.main.trials
+        for trial in found.trials
     ]
     covariance, blocks = sandwich_covariance(
         trials,

@@ -65,8 +65,8 @@ def test_too_little_or_constant_input_gives_no_verdict() -> None:
     assert independence([noise(1, 5)], [np.ones((5, 2))], (0, 10)) is None
 
 
-def test_averages_skip_what_is_not_usable() -> None:
-    values, usable = np.arange(11.0), np.ones(11, dtype=bool)
-    usable[4] = False
-    found = averaged(values, usable, 3)
-    np.testing.assert_array_equal(found, [1.0, np.nan, 7.0])
+def test_averages_are_missing_where_a_value_is() -> None:
+    values = np.stack([np.arange(11.0), np.arange(11.0) ** 2], axis=1)
+    values[4, 0] = np.nan
+    np.testing.assert_array_equal(averaged(values, 3)[:, 0], [1.0, np.nan, 7.0])
+    np.testing.assert_allclose(averaged(values, 3)[:, 1], [5 / 3, 50 / 3, 149 / 3])
