@@ -22,7 +22,7 @@ from bampipe.errors import InputError
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import compile_model
 from bampipe.stages.base import Progress, RunFolder
-from bampipe.stages.modelfile import load_model, model_inputs
+from bampipe.stages.modelfile import identified, load_model, model_inputs
 from bampipe.stages.recordings import read_session, recipe_of
 
 NAME = "diagnose"
@@ -90,8 +90,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         tuple(motions), sensors, Band(sensors.rate_hz, min(config.cutoff_hz, 0.1 * sensors.rate_hz))
     )
     recipe = recipe_of(run, config.model, model)
-    identified = run.read_json(f"models/{config.model}/identify.json")["parameters"]
-    start = np.array([float(identified[p.name]["estimate"]) for p in system.parameters])
+    start = identified(run, config.model, system)
     settings = Settings(
         replicates=config.replicates,
         significance=config.significance,

@@ -1,10 +1,13 @@
-"""The model that a run folder names: its device, its effects, a lab's own files among them."""
+"""The model that a run folder names: device, effects, a lab's own files among them, estimates."""
 
 from __future__ import annotations
 
+import numpy as np
+from numpy.typing import NDArray
+
 from bampipe.data.store import read_toml
 from bampipe.errors import InputError
-from bampipe.physics import Model, registry
+from bampipe.physics import Model, System, registry
 from bampipe.stages.base import RunFolder
 
 
@@ -41,3 +44,29 @@ def model_inputs(name: str) -> tuple[str, ...]:
         f"models/{name}/effects/*.toml",
         "ingest/device.toml?",
     )
+
+
+def identified(run: RunFolder, name: str, system: System) -> NDArray[np.float64]:
+    """Return the parameters of the model called ``name``, (n_p,): fixed ones at their prior.
+
+    Args:
+        run: the run folder; system: the compiled model.
+
+    Raises:
+        InputError: the model has not been identified, or was another one when it was.
+    """
+    path = f"models/{name}/identify.json"
+    run.require(path, "identify")
+    found = run.read_json(path)["parameters"]
+    p = system.prior
+    for i, item in enumerate(system.parameters):
+        if item.fixed:
+            continue
+        if item.name not in found:
+            raise InputError(
+                f"no parameter {item.name!r}",
+                where=str(run.path(path)),
+                remedy=f"bampipe identify {run.root} --model {name} --force",
+            )
+        p[i] = float(found[item.name]["estimate"])
+    return p

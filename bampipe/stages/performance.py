@@ -15,7 +15,7 @@ from bampipe.data.store import read_parquet, write_json
 from bampipe.errors import InputError
 from bampipe.physics import System, compile_model
 from bampipe.stages.base import Progress, RunFolder
-from bampipe.stages.modelfile import load_model, model_inputs
+from bampipe.stages.modelfile import identified, load_model, model_inputs
 
 NAME = "performance"
 SUMMARY = "Workspace, stiffness, friction, inertia and force at the handle"
@@ -61,16 +61,9 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     """
     if config.points < 2:
         raise InputError("must be 2 or more", where="performance.points")
-    run.require(f"models/{config.model}/identify.json", "identify")
-    identified = run.read_json(f"models/{config.model}/identify.json")["parameters"]
     system = compile_model(load_model(run, config.model))
     device = system.model.device
-    p = np.array(
-        [
-            identified[item.name]["estimate"] if item.name in identified else item.prior
-            for item in system.parameters
-        ]
-    )
+    p = identified(run, config.model, system)
     reach = _reach(run, system)
     content: dict[str, object] = {
         "model": config.model,
@@ -100,7 +93,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     ways = len(device.forces) == len(system.coordinates)
     at_handle = device.force_unit == "N" and ways and not device.drive
     if at_handle:
-        content["handle"] = _handle(run, system, p, identified, reach, config.points)
+        content["handle"] = _handle(run, system, p, reach, config.points)
     told = content.get("handle")
     content["headline"] = _headline(told) if isinstance(told, dict) else "No handle on this device."
     write_json(out / f"models/{config.model}/performance.json", content)
@@ -130,7 +123,6 @@ def _handle(
     run: RunFolder,
     system: System,
     p: Array,
-    identified: Mapping[str, Any],
     reach: Array,
     points: int,
 ) -> dict[str, object]:
@@ -161,9 +153,8 @@ def _handle(
     if all(limit is not None for limit in limits):
         whole = np.array(limits, dtype=float)
         entry["workspace_limits"] = {"value": _volume(system, whole, p, points), "unit": swept}
-    coulomb = np.array(
-        [identified.get(f"coulomb.{axis}", {}).get("estimate", 0.0) for axis in axes]
-    )
+    known = {item.name: value for item, value in zip(system.parameters, p, strict=True)}
+    coulomb = np.array([known.get(f"coulomb.{axis}", 0.0) for axis in axes])
     entry["friction"] = _range(np.abs(back) @ coulomb, "N")
     compliance = np.linalg.inv(system.mass_matrix(grid[regular], p))
     mobility = np.einsum("tij,tik,tkl->tjl", gain[regular], compliance, gain[regular])

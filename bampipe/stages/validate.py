@@ -19,7 +19,7 @@ from bampipe.estimate.standstill import moving
 from bampipe.physics import System, compile_model
 from bampipe.stages.base import Progress, RunFolder
 from bampipe.stages.free_run import free_runs
-from bampipe.stages.modelfile import load_model, model_inputs
+from bampipe.stages.modelfile import identified, load_model, model_inputs
 from bampipe.stages.motions import (
     Motion,
     held_out_trials,
@@ -112,14 +112,14 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     if config.repeats < 1:
         raise InputError("must be 1 or more", where="validate.repeats")
     session = run.read_json("ingest/session.json")
-    run.require(f"models/{config.model}/identify.json", "identify")
-    identified = run.read_json(f"models/{config.model}/identify.json")
     system = compile_model(load_model(run, config.model))
+    p = identified(run, config.model, system)
+    late = run.read_json(f"models/{config.model}/identify.json")["input_timing"]
     motions = read_motions(run, system)
     band = Band(float(session["sample_rate_hz"]), config.cutoff_hz)
-    timing = identified["input_timing"]["sd"] > 0.0  # zero where it was not estimated
+    timing = late["sd"] > 0.0  # zero where it was not estimated
     problem = problem_of(system, motions, band, timing=timing)
-    p = _identified(system, identified, run)
+    p = np.append(p, late["estimate"])
     progress(0.1, "held-out fits")
     groups = _groups(run, motions, config.hold_out_by)
     judged = _judged(groups)
@@ -145,22 +145,6 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     write_json(out / f"models/{config.model}/validate.json", content)
     write_parquet(out / f"models/{config.model}/residuals.parquet", _table(system, compared))
     return content
-
-
-def _identified(system: System, content: Mapping[str, Any], run: RunFolder) -> Array:
-    """Return the identified parameters (np + 1,), the timing of the inputs last."""
-    p = system.prior
-    for i, item in enumerate(system.parameters):
-        if item.fixed:
-            continue
-        if item.name not in content["parameters"]:
-            raise InputError(
-                f"identify.json has no parameter {item.name!r}",
-                where=str(run.root),
-                remedy="run identify again (--force)",
-            )
-        p[i] = content["parameters"][item.name]["estimate"]
-    return np.append(p, content["input_timing"]["estimate"])
 
 
 def _compare(

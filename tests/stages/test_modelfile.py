@@ -1,0 +1,35 @@
+"""What an identified model hands on to the stages after it."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from bampipe.errors import InputError
+from bampipe.physics import Model, compile_model, registry
+from bampipe.stages.base import RunFolder
+from bampipe.stages.modelfile import identified
+
+
+def test_what_is_fixed_stands_at_its_prior_and_what_is_missing_is_named(tmp_path):
+    system = compile_model(
+        Model(registry.device("servo_pendulum"), ["load_dependent_friction:joint"])
+    )
+    free = [item.name for item in system.parameters if not item.fixed]
+    assert len(free) < len(system.parameters)
+    path = tmp_path / "models/base/identify.json"
+    path.parent.mkdir(parents=True)
+    found = {name: {"estimate": 1.0 + k, "sd": 0.1} for k, name in enumerate(free)}
+    path.write_text(json.dumps({"parameters": found}))
+    p = identified(RunFolder(tmp_path), "base", system)
+    for item, value in zip(system.parameters, p, strict=True):
+        assert value == (item.prior if item.fixed else found[item.name]["estimate"])
+    assert np.isfinite(p).all()
+    del found["armature"]
+    path.write_text(json.dumps({"parameters": found}))
+    with pytest.raises(InputError, match=r"identify\.json: no parameter 'armature'; bampipe iden"):
+        identified(RunFolder(tmp_path), "base", system)
+    with pytest.raises(InputError, match="bampipe identify"):
+        identified(RunFolder(tmp_path), "other", system)
