@@ -85,6 +85,9 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     session = read_session(Path(config.session))
     device = _device(session)
     _match(session, device)
+    if device.drive:
+        # What a motor is told, unlike a sensor, may rest or stand at its limit for long.
+        config = replace(config, frozen_share=1.0, saturated_share=1.0)
     (out / "ingest").mkdir(parents=True, exist_ok=True)
     rows: list[dict[str, object]] = []
     reasons = _refused(session)

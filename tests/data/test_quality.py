@@ -63,6 +63,24 @@ def test_a_sound_trial_comes_through_untouched():
     assert trial.sample_rate == pytest.approx(500.0)
 
 
+def test_a_force_of_several_columns_is_their_weighted_sum():
+    force = {
+        "columns": ["volts", "pulse"],
+        "components": ["motor"],
+        "unit": "V",
+        "calibration_n_per_v": [[35.0, 1.0]],
+        "zero_v": [0.1, 0.0],
+    }
+    table = columns()
+    table["volts"] = table.pop("force_x")
+    table["pulse"] = np.where(np.arange(N) % 200 < 100, 40.0, 0.0)
+    raw = RawTrial({name: np.array(values, dtype=float) for name, values in table.items()}, 2)
+    session = session_from({**TABLE, "force": force}, Path())
+    trial = clean(raw, session, session.trials[0], Limits())
+    wanted = 35.0 * (table["volts"] - 0.1) + table["pulse"]
+    np.testing.assert_allclose(trial.columns["force_motor"], wanted)
+
+
 def test_a_quiet_channel_of_a_coarse_converter_is_not_saturated():
     table = columns()
     slow = 0.004 * np.sin(np.arange(N) / 60.0)

@@ -51,6 +51,28 @@ viscous_n_s_per_m = 40
 """)
 
 
+def test_a_calibration_may_join_more_columns_than_there_are_components():
+    table = copy.deepcopy(TABLE)
+    table["force"] |= {"components": ["push"], "calibration_n_per_v": [[12.0, -1.0]]}
+    force = session_from(table, Path("here")).force
+    assert force.names == ("force_push",) and force.calibration == ((12.0, -1.0),)
+    for wrong, words in (
+        ({"components": ["x", "y", "z"]}, "found 3 names, expected 2"),
+        ({"components": ["x", "y"]}, "expected 2 rows of 2"),
+        ({"calibration_n_per_v": [[12.0]]}, "expected 1 rows of 2"),
+        ({"zero_v": [0.0]}, "found 1, expected 2"),
+        ({"calibration_n_per_v": [[0.0, 0.0]]}, "singular"),
+    ):
+        damaged = copy.deepcopy(table)
+        damaged["force"] |= wrong
+        with pytest.raises(InputError, match=words):
+            session_from(damaged, Path("here"))
+    del table["force"]["calibration_n_per_v"], table["force"]["zero_v"]
+    table["force"]["unit"] = "N"
+    with pytest.raises(InputError, match="only where unit"):
+        session_from(table, Path("here"))
+
+
 def test_what_is_read():
     session = session_from(TABLE, Path("here"))
     yaw, slide = session.encoders

@@ -188,6 +188,29 @@ def test_a_force_in_another_unit_than_the_device_takes(tmp_path):
         run_ingest(session, tmp_path / "out")
 
 
+@pytest.mark.parametrize("driven", [False, True])
+def test_what_a_motor_is_told_may_rest_or_stand_at_its_limit_a_sensor_may_not(tmp_path, driven):
+    made = sled("V")
+    force = {"calibration_n_per_v": [[35.0, 1.0]], "zero_v": [0.0, 0.0]}
+    made.session["force"] |= force | {"columns": ["motor", "pulse"]}
+    table = pq.read_table(pa.BufferReader(made.files["one.parquet"])).to_pandas()
+    table["motor"] = np.clip(2.0 * table["motor"], -1.0, 1.0)
+    table["pulse"] = np.where(table.index < 700, 0.0, 40.0)
+    stream = pa.BufferOutputStream()
+    pq.write_table(pa.Table.from_pandas(table, preserve_index=False), stream)
+    made.files["one.parquet"] = stream.getvalue().to_pybytes()
+    if driven:
+        made.files["my/sled.toml"] = SLED.replace("force_unit", "drive = true\nforce_unit")
+    session = made.write(tmp_path / "session")
+    if not driven:
+        with pytest.raises(InputError, match="saturated"):
+            run_ingest(session, tmp_path / "out")
+        return
+    run_ingest(session, tmp_path / "out")
+    frame = read_parquet(tmp_path / "out/ingest/samples.parquet")
+    np.testing.assert_allclose(frame.force_motor, 35.0 * table["motor"] + table["pulse"])
+
+
 MEASURE = """
 import json, re, sys
 from bampipe.stages import ingest

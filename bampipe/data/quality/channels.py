@@ -139,13 +139,14 @@ def to_si(table: Table) -> dict[str, np.ndarray]:
         for column, zero in zip(force.columns, force.zero, strict=True):
             _refuse_wild(table, raw[column], f"reads {column}", column)
             raw[column] -= zero
-        for name, column, gains in zip(force.names, force.columns, force.calibration, strict=True):
+        for name, gains in zip(force.names, force.calibration, strict=True):
             total = np.zeros(len(table))
-            for other, gain in zip(force.columns, gains, strict=True):
+            for column, gain in zip(force.columns, gains, strict=True):
                 if gain != 0.0:
-                    total += gain * raw[other]
+                    total += gain * raw[column]
             si[name] = total
-            source[name] = column
+            # Where one column is the component's own, it is named; else the one that weighs most.
+            source[name] = force.columns[int(np.argmax(np.abs(gains)))]
         for column in force.columns:
             del raw[column]
     for brake in session.brakes:

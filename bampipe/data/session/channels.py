@@ -140,12 +140,13 @@ def force_from(entry: Mapping[str, Any], where: str) -> Force:
         InputError: names that are not clear, or a calibration that does not fit the columns.
     """
     columns = tuple(entry["columns"])
-    size = len(columns)
+    volts = entry["unit"] == "V"
     components = entry.get("components", [_component(column) for column in columns])
-    if len(components) != size:
+    if len(components) != len(columns) and not (volts and len(components) < len(columns)):
         raise InputError(
-            f"found {len(components)} names, expected {size}, one a column",
+            f"found {len(components)} names, expected {len(columns)}, one a column",
             where=f"{where}.components",
+            remedy=None if volts else 'several columns make one component only where unit = "V"',
         )
     for component, times in Counter(components).items():
         if times > 1 or not component.isidentifier():
@@ -154,7 +155,6 @@ def force_from(entry: Mapping[str, Any], where: str) -> Force:
                 where=f"{where}.columns",
                 remedy='name the components: components = ["x", ...]',
             )
-    volts = entry["unit"] == "V"
     raw = units.unit(entry["unit"])
     assert raw is not None  # by the schema
     for key in ("calibration_n_per_v", "zero_v"):
@@ -169,9 +169,9 @@ def force_from(entry: Mapping[str, Any], where: str) -> Force:
                 remedy='give unit = "V" or leave it out',
             )
     if volts:
-        calibration, zero = _calibration(entry, size, where)
+        calibration, zero = _calibration(entry, len(components), len(columns), where)
     else:
-        calibration, zero = raw.scale * np.eye(size), [0.0] * size
+        calibration, zero = raw.scale * np.eye(len(columns)), [0.0] * len(columns)
     return Force(
         columns=columns,
         names=tuple(f"force_{component}" for component in components),
@@ -184,18 +184,21 @@ def force_from(entry: Mapping[str, Any], where: str) -> Force:
     )
 
 
-def _calibration(entry: Mapping[str, Any], size: int, where: str) -> tuple[np.ndarray, list[float]]:
+def _calibration(
+    entry: Mapping[str, Any], components: int, columns: int, where: str
+) -> tuple[np.ndarray, list[float]]:
+    """Matrix, one row a component and one column a raw column, and zero readings."""
     rows, zero = entry["calibration_n_per_v"], entry["zero_v"]
     lengths = sorted({len(row) for row in rows})
-    if len(rows) != size or lengths != [size]:
+    if len(rows) != components or lengths != [columns]:
         raise InputError(
             f"found {len(rows)} rows of {' and '.join(map(str, lengths))} numbers,"
-            f" expected {size} rows of {size}, for {size} columns",
+            f" expected {components} rows of {columns}, for {columns} columns",
             where=f"{where}.calibration_n_per_v",
         )
-    if len(zero) != size:
+    if len(zero) != columns:
         raise InputError(
-            f"found {len(zero)}, expected {size} numbers, one a column", where=f"{where}.zero_v"
+            f"found {len(zero)}, expected {columns} numbers, one a column", where=f"{where}.zero_v"
         )
     calibration = np.array(rows, dtype=float)
     condition = float(np.linalg.cond(calibration))

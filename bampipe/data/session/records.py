@@ -83,7 +83,7 @@ class Force:
         columns: columns of the trial files.
         names: names of the calibrated components, ``force_<component>``.
         unit: "N" or "N.m", after calibration.
-        calibration: n by n, N (N.m) for one raw unit.
+        calibration: one row a component, one number a column: N (N.m) for one raw unit.
         zero: raw readings without force.
         noise_sd: standard deviation at rest, in ``unit``; None if not measured.
         volts: whether the raw readings are a sensor's voltages.
