@@ -34,7 +34,7 @@ def replay(
         rng: source of the force noise and of where the encoders' counts fall.
 
     Raises:
-        InputError: the simulated motion grows without bounds.
+        Runaway: the simulated motion grows without bounds.
     """
     u = motion.inputs(system.inputs)
     n = len(system.coordinates)

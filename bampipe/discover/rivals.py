@@ -13,6 +13,7 @@ from bampipe.discover.chance import Progress, Recipe, Replicate
 from bampipe.discover.evidence import Evidence
 from bampipe.discover.level import Level
 from bampipe.discover.start import with_effect
+from bampipe.estimate.simulation import Runaway
 
 
 def choose(
@@ -48,14 +49,18 @@ def choose(
         progress(0.5, f"replaying {name} to tell it from {len(rivals) - 1} rival(s)")
         wider = replace(recipe, effects=(*recipe.effects, name))
         fitted = bench.fit(wider, with_effect(wider, evidence, scores[name]))
-        replicas = bench.replicas(
-            wider,
-            fitted.p,
-            bench.settings.rival_replicates,
-            rivals,
-            (2, k),
-            analysed=(recipe, evidence.p),
-        )
+        try:
+            replicas = bench.replicas(
+                wider,
+                fitted.p,
+                bench.settings.rival_replicates,
+                rivals,
+                (2, k),
+                analysed=(recipe, evidence.p),
+            )
+        except Runaway:
+            misfit[name] = np.inf
+            continue
         misfit[name] = _misfit(rivals, scores, replicas, axis)
     ordered = sorted(rivals, key=lambda n: misfit[n])
     winner = ordered[0]

@@ -15,6 +15,7 @@ from bampipe.discover.evidence import Evidence
 from bampipe.discover.level import Level
 from bampipe.discover.rivals import choose
 from bampipe.discover.start import with_effect, without_effect
+from bampipe.estimate.simulation import Runaway
 
 Array = NDArray[np.float64]
 
@@ -71,7 +72,7 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
     main: dict[str, int] = {}
     dropped: set[str] = set()
     replayed = level.replicates
-    for _ in range(s.most_effects):
+    while len(groups) + len(dropped) < s.most_effects:
         known = level
         able = _able(bench, scores, known, evidence, replayed)
         if able and groups:
@@ -82,17 +83,24 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
         if not able:
             break
         best, alike = choose(bench, able, known, recipe, evidence, scores, progress)
+        wider = replace(base, effects=(*base.effects, *groups, best))
+        fitted = bench.fit(wider, with_effect(wider, evidence, scores[best]))
+        wider, fitted = _needed(bench, base, wider, fitted)
+        try:
+            replayed = bench.replicas(wider, fitted.p, s.rival_replicates, (), (3,))
+        except Runaway:
+            # It resembles what is missing in these trials, but no mechanism could have it.
+            dropped.add(best)
+            scores = {name: score for name, score in scores.items() if name != best}
+            continue
+        recipe, evidence = wider, fitted
         groups[best] = alike
         help_ = level.excess(first[best]) if best in first else known.excess(scores[best])
         main[best] = int(np.argmax(help_))
         progress(0.45 + 0.1 * len(groups), f"added {best}, looking for more")
-        recipe = replace(base, effects=(*base.effects, *groups))
-        evidence = bench.fit(recipe, with_effect(recipe, evidence, scores[best]))
-        recipe, evidence = _needed(bench, base, recipe, evidence)
         dropped |= set(groups) - set(recipe.effects)
         groups = {name: alike for name, alike in groups.items() if name not in dropped}
         main = {name: axis for name, axis in main.items() if name not in dropped}
-        replayed = bench.replicas(recipe, evidence.p, s.rival_replicates, (), (3,))
         rest = [n for n in bench.names if n not in groups and n not in dropped]
         scores = bench.scores(recipe, evidence.p, rest)
     progress(0.85, "replaying the final model for its noise floor")

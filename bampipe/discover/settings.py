@@ -13,7 +13,7 @@ class Settings:
         replicates: replays of the model for the chance level.
         final_replicates: replays of the final model for the noise floor.
         rival_replicates: replays of each rival when candidates come close.
-        most_effects: the most effects added.
+        most_effects: the most effects tried, those dropped again among them.
         significance: chance of a false alarm in a session that is accepted.
         worth: least drop of log error beyond chance, on one axis, that is worth an effect.
         worth_at_floor: the same on an axis whose error is already within ``at_floor`` times its

@@ -31,6 +31,10 @@ _I = int64[::1]
 _MOST_STEPS = 4000
 
 
+class Runaway(InputError):
+    """A simulated motion grows without bounds: such a model cannot be moved."""
+
+
 @dataclass(frozen=True)
 class Impedance:
     """The arm that pulls the mechanism towards a reference motion.
@@ -230,7 +234,7 @@ def simulate(
         (T, nx) states at the samples.
 
     Raises:
-        InputError: the motion grows without bounds.
+        Runaway: the motion grows without bounds.
     """
     x = np.zeros((len(u), len(x0)))
     x[0] = x0
@@ -290,7 +294,7 @@ def simulate_tracking(
         states (T, nx) and inputs (T, nu) with the total handle force and the brake commands.
 
     Raises:
-        InputError: the motion grows without bounds.
+        Runaway: the motion grows without bounds.
     """
     arm = impedance or Impedance()
     x = np.zeros((len(u), len(x0)))
@@ -313,10 +317,10 @@ def simulate_tracking(
 
 
 def require_finite(x: Array, dt: float) -> None:
-    """Raise InputError where a simulated motion (T, nx), sampled every ``dt`` s, has diverged."""
+    """Raise Runaway where a simulated motion (T, nx), sampled every ``dt`` s, has diverged."""
     bad = np.flatnonzero(~np.isfinite(x).all(axis=1))
     if len(bad):
-        raise InputError(
+        raise Runaway(
             f"the simulated motion grows without bounds after {bad[0] * dt:.3f} s",
             remedy="check the sizes of the parameters: a mass near zero under friction cannot be "
             "followed, so give it a lower bound",

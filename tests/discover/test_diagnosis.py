@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from sessions import bam, made
 
+from bampipe.discover.bench import Bench
 from bampipe.discover.chance import Session, fit_session, system_of
 from bampipe.discover.description import describe
 from bampipe.discover.diagnosis import diagnose
 from bampipe.discover.settings import Settings
+from bampipe.estimate.simulation import Runaway
 
 QUICK = Settings(replicates=5, final_replicates=4, jobs=2)
 
@@ -59,6 +61,22 @@ def test_a_stribeck_effect_is_named_and_adding_it_reaches_the_floor():
     left = max(yaw.rmse_after**2 - yaw.noise_floor**2, 0.0)
     assert left < 0.3 * excess
     assert yaw.explainable_share > yaw.explainable_after
+
+
+def test_an_effect_that_no_mechanism_could_have_is_left_out(monkeypatch):
+    recipe = bam(["stribeck:yaw"])
+    session = made(recipe, {"stribeck.yaw.force": 1.1, "stribeck.yaw.speed": 0.05})
+    replicas = Bench.replicas
+
+    def moved(bench, recipe, *arguments, **more):
+        if "stribeck:yaw" in recipe.effects:
+            raise Runaway("the simulated motion grows without bounds")
+        return replicas(bench, recipe, *arguments, **more)
+
+    monkeypatch.setattr(Bench, "replicas", moved)
+    found = run(session)
+    assert "stribeck:yaw" not in found.selected
+    assert found.axes[0].verdict != "nothing_missing"
 
 
 def test_an_effect_outside_the_library_is_unknown_until_its_file_is_given():

@@ -76,6 +76,8 @@ def test_units_are_consistent(machine, case):
     [
         ("slider", "torque_ripple:carriage"),
         ("slider", "actuator_lag:motor"),
+        ("slider", "drive_sag:carriage"),
+        ("slider", "flexible_load:carriage"),
         ("slider", "force_delay"),
         ("magnetic_damper", "channel_lag:current"),
         ("magnetic_damper", "channel_saturation:current"),
@@ -111,7 +113,7 @@ def test_is_absent_at_zero_and_recovered_from_a_wrong_guess(machine, case):
 
 
 def test_motor_effects_are_offered_to_motors_only():
-    for name in ("torque_ripple", "actuator_lag"):
+    for name in ("torque_ripple", "actuator_lag", "drive_sag", "flexible_load"):
         assert registry.effect(name).targets(registry.device("slider"))
         assert not registry.effect(name).targets(registry.device("bam"))
         assert not registry.effect(name).targets(registry.device("magnetic_damper"))
@@ -173,3 +175,24 @@ def test_units_follow_the_channel(unit, own, result):
     content["inputs"] = {**content["inputs"], "force_unit": own}
     device = registry.device_from(content)
     assert unit_of(unit, registry.effect("force_bias"), "motor", device) == result
+
+
+def test_a_flexible_load_is_rigid_below_its_frequency_and_left_behind_above_it():
+    device = registry.device("slider")
+    system = compile_model(Model(device, ["flexible_load:carriage"]))
+    p = {x.name: 0.0 for x in system.parameters} | {"mass": 70.0}
+    own = "flexible_load.carriage."
+    p |= {own + "inertia": 25.0, own + "frequency": 60.0, own + "damping": 0.05}
+    values = np.array([p[x.name] for x in system.parameters])
+    t = np.arange(0.0, 20.0, 1e-3)
+    for w in (6.0, 30.0, 150.0):
+        q, qd, qdd = (1e-3 * w**k * np.sin(w * t + k * np.pi / 2)[:, None] for k in range(3))
+        u = np.zeros((t.size, len(system.inputs)))
+        z = system.memory(q, qd, qdd, u, values, t)
+        needed = system.required(q, qd, qdd, z, u, values)[:, 0]
+        settled = t > 10.0
+        mass = needed[settled] @ qdd[settled, 0] / (qdd[settled, 0] @ qdd[settled, 0])
+        # Of a mass on a spring and dashpot shaken at its foot: x_load / x_foot.
+        spring = 60.0**2 + 2j * 0.05 * 60.0 * w
+        ratio = spring / (spring - w**2)
+        assert mass == pytest.approx(70.0 + 25.0 * ratio.real, rel=2e-3)

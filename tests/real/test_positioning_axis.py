@@ -11,6 +11,7 @@ import shutil
 from pathlib import Path
 
 import pytest
+from conftest import misfits
 from measured import ROOT, bampipe, estimates, result
 
 SESSION = ROOT / "sample_runs" / "positioning_axis"
@@ -98,6 +99,7 @@ def test_the_diagnosis_finds_friction_by_direction_unaided(stretches):
     assert best["held_out_rmse_after"] < 0.6 * best["held_out_rmse_before"]
     half = best["parameters"]["asymmetric_coulomb.carriage.viscous_difference"]
     assert half == pytest.approx((166.7061 - 240.4236) / 2.0, rel=0.05)
+    assert misfits(stretches) == []
 
 
 def test_every_stretch_is_held_out_once(stretches):

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import misfits
 from measured import REAL, bampipe, estimates, need, result
 
 from bampipe.data.store import read_parquet
@@ -89,6 +90,7 @@ def test_the_diagnosis_ranks_load_dependent_friction_first(runs):
     best = result(runs[0], "models/base/diagnose.json")["ranking"][0]
     assert best["effect"] == "load_dependent_friction:joint" and best["p_value"] < 0.01
     assert best["held_out_rmse_after"] < 0.75 * best["held_out_rmse_before"]
+    assert misfits(runs[0]) == []
 
 
 @pytest.fixture(scope="module")
