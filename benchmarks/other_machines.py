@@ -1,8 +1,9 @@
 """Machines that nobody tuned to: does the diagnosis name what was hidden in them?
 
-A one-joint arm whose motor current is logged at about 100 Hz with a jittering clock, and a damper
-with a magnetic coil on a testing machine. Their motion is integrated here, by Euler steps of 0.1 ms
-that share no code with bampipe; each session hides one effect, or none.
+A one-joint arm whose motor current is logged at about 100 Hz with a jittering clock, a damper with
+a magnetic coil on a testing machine, and a positioning axis in closed loop whose drive is kicked by
+pulses. Their motion is integrated here, by Euler steps of 0.1 ms that share no code with bampipe;
+each session hides one effect, or none.
 
     python benchmarks/other_machines.py [--seed N] [CASE...]
 
@@ -21,10 +22,12 @@ from pathlib import Path
 
 import numpy as np
 from numba import njit
+from scipy.io import savemat
 
 DT = 1e-4
 ARM = ("none", "stribeck", "asymmetric", "load", "position", "presliding", "ripple", "lag")
 DAMPER = ("none", "hysteresis", "coil lag", "saturation", "spring")
+AXIS = ("none", "flexible load", "asymmetric", "position", "presliding", "stribeck", "delay")
 PIPELINE = """schema = "bampipe.pipeline/1"
 name = "other"
 stages = ["ingest", "filter", "identify", "validate"]
@@ -108,6 +111,44 @@ def _damper(x, v, a, current, hidden):
     return out
 
 
+@njit
+def _axis(goal, pulse, hidden):
+    """Position and drive of a carriage under cascaded position and velocity loops, each 1 ms."""
+    n = len(goal)
+    q, v, z, load, w, volts, seen, late = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, np.zeros(50)
+    out = np.zeros((n, 2))
+    for k in range(n):
+        if k % 10 == 0:
+            speed = (q - seen) / 1e-3
+            seen = q
+            volts = min(max(240.0 * (160.0 * (goal[k] - q) - speed) / 35.0, -10.0), 10.0)
+        out[k, 0], out[k, 1] = q, volts
+        late[k % 50] = 35.0 * volts + pulse[k]
+        force, mass = late[k % 50], 95.0
+        drag, dry, sign = 200.0, 20.0, np.tanh(v / 2e-4)
+        if hidden == 1:
+            mass = 70.0
+            stretch = load - q
+            pull = 25.0 * 75.0**2 * stretch + 25.0 * 2 * 0.04 * 75.0 * (w - v)
+            w += DT * -pull / 25.0
+            load += DT * w
+            force += pull
+        elif hidden == 2:
+            drag += 35.0 * np.sign(v)
+        elif hidden == 3:
+            dry += 4.0 * np.sin(120.0 * q + 1.0)
+        elif hidden == 4:
+            z += DT * (v - abs(v) * z) / 3e-4
+            sign = z
+        elif hidden == 5:
+            dry += 10.0 * np.exp(-((v / 0.01) ** 2))
+        elif hidden == 6:
+            force = late[(k + 1) % 50]
+        v += DT * (force - drag * v - dry * sign - 3.0) / mass
+        q += DT * v
+    return out
+
+
 def _write(path: Path, names: str, columns: np.ndarray) -> None:
     np.savetxt(path, columns, delimiter=",", header=names, comments="", fmt="%.7g")
 
@@ -170,6 +211,37 @@ def damper(folder: Path, hidden: int, seed: int) -> None:
     (folder / "session.toml").write_text(text)
 
 
+def axis(folder: Path, hidden: int, seed: int) -> None:
+    """One record of 25 s in a MATLAB file, cut into four stretches; moves, rests and pulses."""
+    rng = np.random.default_rng(seed)
+    text = (
+        'schema = "bampipe.session/1"\nsession_id = "machine"\ndevice = "slider"\n'
+        'sample_rate_hz = 1000.0\n[time]\ncolumn = "t"\nunit = "s"\n[encoders]\n'
+        'carriage = { column = "qm", unit = "m", resolution = 5e-8 }\n'
+        '[force]\ncolumns = ["vir", "pulses"]\ncomponents = ["motor"]\nunit = "V"\n'
+        "calibration_n_per_v = [[35.0, 1.0]]\nzero_v = [0.0, 0.0]\n"
+    )
+    t = np.arange(0.0, 25.0, DT)
+    goal, at, k = np.zeros_like(t), 0.0, 2000
+    while k < len(t) - 12000:
+        to, speed = rng.uniform(-0.12, 0.12), rng.uniform(0.05, 0.2)
+        length = int(max(1.9 * abs(to - at) / speed, 0.15) / DT)
+        s = np.linspace(0.0, 1.0, length)
+        ends = min(k + length, len(t))
+        goal[k:ends] = (at + (to - at) * s**3 * (10.0 - 15.0 * s + 6.0 * s**2))[: ends - k]
+        goal[ends:] = to
+        at, k = to, ends + int(rng.uniform(0.05, 0.4) / DT)
+    pulse = np.repeat(rng.choice([-60.0, 0.0, 0.0, 60.0], len(t) // 1500 + 1), 1500)[: len(t)]
+    motion = _axis(goal, pulse, hidden)[::10]
+    seen = np.floor(motion[:, 0] / 5e-8) * 5e-8
+    columns = {"t": t[::10], "qm": seen, "vir": motion[:, 1], "pulses": pulse[::10]}
+    savemat(folder / "record.mat", {name: column[:, None] for name, column in columns.items()})
+    for start in (0.0, 6.0, 12.0, 18.0):
+        text += f'[[trials]]\nfile = "record.mat"\nkind = "free"\nstart_s = {start}\n'
+        text += f"end_s = {start + 6.0}\n" if start < 18.0 else ""
+    (folder / "session.toml").write_text(text)
+
+
 def diagnosed(make: Callable[[Path, int, int], None], hidden: int, seed: int) -> str:
     """One row of the table: verdict, effects, error before and after, floor."""
     with tempfile.TemporaryDirectory() as name:
@@ -197,6 +269,7 @@ def main() -> None:
     options = parser.parse_args()
     cases = {f"arm:{n}": (arm, k) for k, n in enumerate(ARM)}
     cases |= {f"damper:{n}": (damper, k) for k, n in enumerate(DAMPER)}
+    cases |= {f"axis:{n}": (axis, k) for k, n in enumerate(AXIS)}
     print("| hidden | verdict | named | error before | after | floor |\n|---|---|---|---|---|---|")
     for name in options.cases or cases:
         print(f"| {name} | {diagnosed(*cases[name], options.seed)} |", flush=True)
