@@ -28,7 +28,7 @@ def section(results: Results) -> Section | None:
     notes = tuple(paper.get("notes", {}).get("text", ()))
     if notes:
         blocks += [Subheading("Where this differs from the paper, and why"), Bullets(notes)]
-    return Section("Paper and this session", tuple(blocks), new_page=True)
+    return Section("Paper and this session", tuple(blocks))
 
 
 def _row(results: Results, row: dict[str, Any]) -> tuple[str, ...]:
