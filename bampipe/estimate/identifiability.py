@@ -88,16 +88,37 @@ def bound(matrix: Array) -> Array:
     Returns:
         (n, n) covariance; rows and columns of parameters in the null space are infinite.
     """
-    scale = np.sqrt(np.diag(matrix))
-    silent = scale == 0.0
-    scale = np.where(silent, 1.0, scale)
-    value, vector = np.linalg.eigh(matrix / np.outer(scale, scale))
-    null = value < 1e-12 * max(value[-1], 1e-300)
+    scale, value, vector, null = _directions(matrix)
     inverse = (vector[:, ~null] / value[~null]) @ vector[:, ~null].T / np.outer(scale, scale)
-    lost = silent | (np.abs(vector[:, null]) > 1e-6).any(axis=1)
+    lost = (np.abs(vector[:, null]) > 1e-6).any(axis=1)
     inverse[lost] = inverse[:, lost] = 0.0
     inverse[lost, lost] = np.inf
     return np.asarray(inverse)
+
+
+def unseen(matrix: Array, prior_sd: Array) -> Array:
+    """What stays open of a prior where the information says nothing, (n, n) covariance.
+
+    That is the prior, its parameters independent, given all combinations that the data fix.
+
+    Args:
+        matrix: (n, n) information, symmetric, not negative.
+        prior_sd: (n,) positive.
+    """
+    scale, _, vector, null = _directions(matrix)
+    free = vector[:, null] / scale[:, None]
+    return np.asarray(free @ np.linalg.inv(free.T @ (free / prior_sd[:, None] ** 2)) @ free.T)
+
+
+def _directions(matrix: Array) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+    """Scale by which a matrix gets a unit diagonal, eigenvalues and vectors then, which are null.
+
+    A parameter of which nothing is known at all keeps its scale and is a null vector by itself.
+    """
+    scale = np.sqrt(np.diag(matrix))
+    scale = np.where(scale == 0.0, 1.0, scale)
+    value, vector = np.linalg.eigh(matrix / np.outer(scale, scale))
+    return scale, value, vector, value < 1e-12 * max(value[-1], 1e-300)
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from bampipe.estimate.identifiability import (
     information,
     residual_spectrum,
     slopes,
+    unseen,
     weak_directions,
 )
 from bampipe.estimate.least_squares import Problem
@@ -44,11 +45,13 @@ class Identifiability:
     Attributes:
         bound_sd: (n_free,) Cramér-Rao bound on the standard deviation of each parameter, None
             where the trials say nothing of it.
+        unseen: (n_free, n_free) covariance that their priors leave where the trials say nothing.
         report: for identify.json.
         sentences: what a reader must know before believing a number.
     """
 
     bound_sd: tuple[float | None, ...]
+    unseen: Array
     report: dict[str, object]
     sentences: tuple[str, ...]
 
@@ -87,7 +90,9 @@ def identifiability(
         _number(number, total, n, n + j, names, value, kept)
         for j, number in enumerate(known.numbers)
     ]
-    prior = np.array([system.parameters[i].sd for i in problem.free[kept]])
+    half = problem.upper[-1]  # of a sample: all that is assumed of the timing
+    assumed = np.array([system.parameters[i].sd if i < n_p else half for i in problem.free])
+    prior, place = assumed[kept], np.ix_(kept, kept)
     parameters = {names[i]: _entry(own, covariance, i, names) for i in kept}
     trials = {
         motion.trial_id: {
@@ -123,7 +128,7 @@ def identifiability(
         "sentences": sentences,
     }
     bounds = tuple(_finite(sd[i]) for i in kept)
-    return Identifiability(bounds, report, tuple(sentences))
+    return Identifiability(bounds, unseen(own, assumed)[place], report, tuple(sentences))
 
 
 def _of_trial(

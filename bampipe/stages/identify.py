@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -143,6 +143,8 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     can_say = identifiability(
         system, motions, estimate.problem, estimate.p, noise, estimate.at_bound
     )
+    # What the trials say nothing of is as uncertain as it was before, whatever the fit believes.
+    estimate = replace(estimate, covariance=estimate.covariance + can_say.unseen)
     engine = config.engine if method == "ukf" else "compiled"
     found = content(system, estimate, can_say, motions, config.model, method, engine)
     found["notes"] = [*notes, *can_say.sentences]

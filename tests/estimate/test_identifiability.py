@@ -10,6 +10,7 @@ from bampipe.estimate.identifiability import (
     growth_without,
     information,
     residual_spectrum,
+    unseen,
     weak_directions,
 )
 
@@ -85,3 +86,17 @@ def test_a_trial_that_adds_nothing_shows() -> None:
     growth = growth_without([*parts, 1e-6 * parts[0]])
     assert growth[2].max() < 1e-4
     assert growth[:2].min() > 0.3
+
+
+def test_where_data_say_nothing_the_prior_stays_given_what_they_fix() -> None:
+    prior = np.array([1.0, 2.0, 3.0, 4.0])
+    matrix = np.zeros((4, 4))
+    matrix[:2, :2] = 1e6  # the sum of the first two only
+    matrix[2, 2] = 1e4
+    left = unseen(matrix, prior)
+    shared = 1.0 * 4.0 / (1.0 + 4.0)  # of a normal pair whose sum is known
+    expected = np.zeros((4, 4))
+    expected[:2, :2] = [[shared, -shared], [-shared, shared]]
+    expected[3, 3] = 16.0
+    np.testing.assert_allclose(left, expected, atol=1e-9)
+    np.testing.assert_array_equal(unseen(np.diag([1.0, 2.0]), np.ones(2)), np.zeros((2, 2)))
