@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
 from bampipe.data import guesses
 from bampipe.data.survey import Column, Survey, words
 from bampipe.data.units import unit
+from bampipe.stages.proposal.positions import travelled
 
 DRIVERS = ("force", "current", "voltage")
 """Roles of what may drive an axis."""
@@ -21,18 +23,19 @@ _INPUT_ROLE = {"N": "force", "N.m": "force", "A": "current", "V": "voltage", "":
 Match = tuple[Column | None, str]
 
 
+@dataclass
 class Matcher:
     """The columns of a survey, and which of them are taken.
 
     Attributes:
+        found: the columns.
         t: (T,) time stamps of the first log, s.
-        used: names of the columns that have a meaning already.
+        used: names of the columns that have a meaning already; grows as tables are proposed.
     """
 
-    def __init__(self, found: Survey) -> None:
-        self.found = found
-        self.t = np.empty(0)
-        self.used: set[str] = set()
+    found: Survey
+    t: np.ndarray
+    used: set[str]
 
     def named(self, name: str, *roles: str) -> Column | None:
         """The column that has the words of ``name``, of one of the roles."""
@@ -119,14 +122,6 @@ class Matcher:
                 return column
         return None
 
-    def moved(self, position: Column) -> np.ndarray:
-        """Position (T,) as the column has it; the integral of one that is a velocity."""
-        values = np.nan_to_num(position.values)
-        if not is_velocity(position):
-            return values
-        steps = 0.5 * (values[1:] + values[:-1]) * np.diff(self.t)
-        return np.concatenate([[0.0], np.cumsum(steps)])
-
     def driving(self, position: Column) -> Column | None:
         """The column that acceleration, velocity and friction of the motion explain best."""
         share = {}
@@ -140,16 +135,11 @@ class Matcher:
             bits = guesses.signed_register(values)
             if bits:
                 values = np.where(values >= 2.0 ** (bits - 1), values - 2.0**bits, values)
-            share[column.name] = guesses.driven(self.t, self.moved(position), values).share
+            share[column.name] = guesses.driven(self.t, travelled(position, self.t), values).share
         best = max(share, key=lambda name: share[name], default="")
         if not best or share[best] < _DRIVEN:
             return None
         return next(c for c in self.found.columns if c.name == best)
-
-
-def is_velocity(column: Column) -> bool:
-    """Whether a column that stands for the position is a velocity, to be integrated."""
-    return column.role == "velocity" or column.name in ("v", "V")
 
 
 def _compatible(column: Column, si: str) -> bool:

@@ -1,0 +1,48 @@
+"""The comments of a proposal, of which its reader is told again, and the values of its tables."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+UNKNOWN = "?"
+"""Stands for a column that could not be told."""
+
+
+@dataclass
+class Notes:
+    """What a person has to look at, collected while the tables are put together.
+
+    Attributes:
+        fill_in: what only a person can know, a sentence each.
+        check: guesses, a sentence each.
+    """
+
+    fill_in: list[str] = field(default_factory=list)
+    check: list[str] = field(default_factory=list)
+
+    def guess(self, text: str) -> str:
+        """The comment that marks a guess; the same guess is told once."""
+        if text not in self.check:
+            self.check.append(text)
+        return f"  # guess: {text}"
+
+    def ask(self, text: str) -> str:
+        """The comment that marks what a person must fill in."""
+        self.fill_in.append(text)
+        return f"  # fill in: {text}"
+
+
+def quoted(text: str) -> str:
+    """``text`` as a TOML string."""
+    escaped = text.replace("\\", "\\\\").replace('"', '\\"').replace("\t", "\\t")
+    return f'"{escaped}"'
+
+
+def entry(column: str, unit: str, more: str = "") -> str:
+    """An inline table that names a column and its unit; ``more`` follows, with a comma before."""
+    return f'{{ column = {quoted(column)}, unit = "{unit}"{more} }}'
+
+
+def bare(unit: str) -> str:
+    """A unit without the brackets in which some files have it."""
+    return unit.strip("[]()")
