@@ -170,7 +170,9 @@ class Scorer:
                 at[k], cost = found
                 if cost > hopeless:
                     return self._absent(item)
-        return self._at(item, np.array(at))
+        best = self._at(item, np.array(at))
+        # An error of exactly zero, on an axis that nothing drives, is no explanation.
+        return best if best is not None and np.isfinite(best.gain).all() else None
 
     def _absent(self, item: Candidate) -> Score:
         """The score of an effect that these trials do not ask for: strength zero."""

@@ -19,6 +19,9 @@ from bampipe.estimate.least_squares import Problem
 
 Array = NDArray[np.float64]
 
+_LEAST_NOISE = 1e-12
+"""Least noise at any frequency, as a share of the mean over frequencies."""
+
 
 def slopes(problem: Problem, trial: int, p: Array) -> Array:
     """Slope of the unfiltered residual of one trial by every free parameter, (T, n_q, n_free).
@@ -44,6 +47,7 @@ def residual_spectrum(
     rate_hz: float,
     inertia: Array,
     damping: Array,
+    stiffness: Array,
     reading_sd: Array,
     force_sd: Array,
 ) -> Array:
@@ -54,12 +58,16 @@ def residual_spectrum(
 
     Args:
         count: samples; rate_hz: of them.
-        inertia, damping: (n_q,) of each axis: noise of a position reading acts through them.
-        reading_sd: (n_q,) of a position reading; force_sd: (n_q,) of the generalised force.
+        inertia, damping, stiffness: (n_q,) of each axis: noise of a position reading acts through
+            them.
+        reading_sd: (n_q,) of a position reading; force_sd: (n_q,) of the generalised force, zero
+            on an axis that nothing drives.
     """
     omega = 2.0 * np.pi * np.fft.rfftfreq(count, 1.0 / rate_hz)[:, None]
-    gain = (inertia * omega**2) ** 2 + (damping * omega) ** 2
-    return np.asarray(force_sd**2 + reading_sd**2 * gain)
+    gain = (inertia * omega**2) ** 2 + (damping * omega) ** 2 + stiffness**2
+    spectrum = force_sd**2 + reading_sd**2 * gain
+    # An axis with neither force nor stiffness would seem to be free of noise at rest.
+    return np.asarray(np.maximum(spectrum, _LEAST_NOISE * spectrum.mean(axis=0)))
 
 
 def information(slope: Array, spectrum: Array) -> Array:

@@ -68,6 +68,14 @@ class System:
         """Prior values of the parameters, (n_p,)."""
         return np.array([p.prior for p in self.parameters])
 
+    @property
+    def undriven(self) -> tuple[str, ...]:
+        """Coordinates that no measured force acts on, such as a pole that hangs on a cart."""
+        n = len(self.coordinates)
+        poses = np.linspace(0.1, 1.3, 3 * n).reshape(3, n)
+        acting = np.abs(self.input_map(poses, np.ones((3, len(self.inputs))))).sum(axis=(0, 2))
+        return tuple(c for c, some in zip(self.coordinates, acting, strict=True) if some == 0.0)
+
     def index(self, name: str) -> int:
         """Position of the parameter called ``name``.
 

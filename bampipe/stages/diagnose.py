@@ -73,12 +73,20 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     """Diagnose one model and write ``models/<model>/diagnose.json``.
 
     Raises:
-        InputError: fewer than two moving trials, or a setting out of range.
+        InputError: fewer than two moving trials, a setting out of range, or an axis that no force
+            acts on.
     """
     if config.replicates < 4:
         raise InputError("must be 4 or more", where="diagnose.replicates")
     model = load_model(run, config.model)
     system = compile_model(model)
+    if system.undriven:
+        raise InputError(
+            f"no force acts on {system.undriven[0]}: with nothing measured to hold its equation"
+            " against, whatever makes all of it smaller would seem to explain it",
+            where=f"device {model.device.name!r}",
+            remedy="judge its models by validate and compare",
+        )
     sensors, motions = read_session(run, system, config.kinematics_cutoff_hz)
     if len(motions) < 2:
         raise InputError(

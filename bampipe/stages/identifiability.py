@@ -35,6 +35,8 @@ _LITTLE = 0.5
 """Share of the prior standard deviation above which the data are said to add little."""
 _MOVES = 0.5
 """Per cent by which an estimate moves for an error of one per cent, from which on it is said."""
+_SHIFT = 1e-6
+"""Of a position, rad or m, for the slope of a force."""
 TIMING = "input_timing"
 
 
@@ -156,15 +158,29 @@ def _of_trial(
             for name in (f"viscous.{axis}" for axis in system.coordinates)
         ]
     )
+    stiffness = _stiffness(system, motion, z, u, own)
     spectrum = residual_spectrum(
         len(motion.t),
         problem.band.rate_hz,
         inertia,
         damping,
+        stiffness,
         noise.reading_sd[:n],
         np.sqrt(np.mean(np.sum(push**2, axis=2), axis=0)),
     )
     return information(slope, spectrum)
+
+
+def _stiffness(system: System, motion: Motion, z: Array, u: Array, p: Array) -> Array:
+    """Return how the force that the motion needs changes with the position, RMS, (n_q,)."""
+    found = np.zeros(len(system.coordinates))
+    here = system.required(motion.q, motion.qd, motion.qdd, z, u, p)
+    for i in range(len(found)):
+        q = motion.q.copy()
+        q[:, i] += _SHIFT
+        moved = system.required(q, motion.qd, motion.qdd, z, u, p)
+        found[i] = np.sqrt(np.mean((moved[:, i] - here[:, i]) ** 2)) / _SHIFT
+    return found
 
 
 def _finite(value: float) -> float | None:

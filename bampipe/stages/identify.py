@@ -139,6 +139,11 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         estimate = estimate_by_output(system, motions, trials, squares, progress)
     else:
         estimate = estimate_by_squares(system, motions, squares)
+    if system.undriven and method == "least-squares":
+        notes.append(
+            f"No force acts on {', '.join(system.undriven)}: least squares makes what stands in"
+            " such an equation too small, more so the more the model lacks."
+        )
     progress(0.97, "what the trials can say")
     can_say = identifiability(
         system, motions, estimate.problem, estimate.p, noise, estimate.at_bound

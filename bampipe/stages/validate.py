@@ -302,14 +302,15 @@ def _entries(
     unseen_size = _rms([c.measured for c in unseen], where)
     entries: dict[str, dict[str, object]] = {}
     for i, axis in enumerate(system.coordinates):
-        share = held_out[i] / spread[i] if spread[i] > 0.0 else 1.0
+        # Of an axis that nothing drives, such as a pole on a cart, no force is there to explain.
+        fit = 100.0 * (1.0 - held_out[i] / spread[i]) if spread[i] > 0.0 else None
         entries[axis] = {
             "rmse": float(rmse[i]),
             "rmse_without_friction": float(without[i]),
             "held_out_rmse": float(held_out[i]),
             "relative_error_percent": _percent(rmse[i], size[i]),
             "held_out_relative_error_percent": _percent(held_out[i], unseen_size[i]),
-            "fit_percent": float(100.0 * (1.0 - share)),
+            "fit_percent": None if fit is None else float(fit),
             "unit": system.torque_units[i],
         }
         if floor is not None:
@@ -333,7 +334,11 @@ def _content(
             "rmse": float(np.sqrt(np.mean(error**2))) if error.size else 0.0,
             "unit": system.model.device.force_unit,
         }
-    best = ", ".join(f"{axis} {entry['fit_percent']:.1f} %" for axis, entry in axes.items())
+    best = ", ".join(
+        f"{axis} {entry['fit_percent']:.1f} %"
+        for axis, entry in axes.items()
+        if entry["fit_percent"] is not None
+    )
     on = "held-out trials" if any(c.judged for c in compared) else "the trials it was fitted to"
     return {
         "model": config.model,

@@ -23,7 +23,7 @@ def slope(rng: np.random.Generator, count: int, columns: int) -> np.ndarray:
 def test_in_white_noise_the_information_is_that_of_least_squares(count: int) -> None:
     x = slope(np.random.default_rng(1), count, 3)
     spectrum = residual_spectrum(
-        count, 500.0, np.zeros(1), np.zeros(1), np.ones(1), np.full(1, 0.3)
+        count, 500.0, np.zeros(1), np.zeros(1), np.zeros(1), np.ones(1), np.full(1, 0.3)
     )
     expected = x[:, 0].T @ x[:, 0] / 0.3**2
     np.testing.assert_allclose(information(x, spectrum), expected, rtol=1e-10)
@@ -36,7 +36,7 @@ def test_the_bound_is_met_by_weighted_least_squares_in_the_noise_of_an_encoder()
     t = np.arange(count) / rate
     x = np.stack([np.sin(2 * np.pi * t), np.sin(9 * np.pi * t) ** 3], axis=1)[:, None, :]
     reading, force, inertia = np.array([2e-5]), np.array([0.05]), np.array([2.5])
-    spectrum = residual_spectrum(count, rate, inertia, np.zeros(1), reading, force)
+    spectrum = residual_spectrum(count, rate, inertia, np.zeros(1), np.zeros(1), reading, force)
     matrix = information(x, spectrum)
     root = np.sqrt(spectrum[:, 0])
     shaped = np.fft.rfft(x[:, 0], axis=0) / root[:, None]
@@ -50,6 +50,13 @@ def test_the_bound_is_met_by_weighted_least_squares_in_the_noise_of_an_encoder()
         )
     scatter = np.std(estimates, axis=0)
     np.testing.assert_allclose(scatter, np.sqrt(np.diag(bound(matrix))), rtol=0.12)
+
+
+def test_an_axis_that_nothing_drives_is_not_free_of_noise() -> None:
+    pole = residual_spectrum(400, 200.0, *(np.array([v]) for v in (0.06, 0.0, 1.2, 1e-3, 0.0)))
+    assert pole[0, 0] == pytest.approx((1.2e-3) ** 2) and (pole > 0.0).all()
+    free = residual_spectrum(400, 200.0, *(np.array([v]) for v in (2.0, 0.0, 0.0, 1e-3, 0.0)))
+    assert 0.0 < free[0, 0] <= free[-1, 0]
 
 
 def test_parameters_that_look_alike_are_named() -> None:
