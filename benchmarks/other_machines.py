@@ -234,7 +234,8 @@ def axis(folder: Path, hidden: int, seed: int) -> None:
     pulse = np.repeat(rng.choice([-60.0, 0.0, 0.0, 60.0], len(t) // 1500 + 1), 1500)[: len(t)]
     motion = _axis(goal, pulse, hidden)[::10]
     seen = np.floor(motion[:, 0] / 5e-8) * 5e-8
-    columns = {"t": t[::10], "qm": seen, "vir": motion[:, 1], "pulses": pulse[::10]}
+    volts = motion[:, 1] + 0.02 * rng.standard_normal(len(seen))  # of the amplifier's monitor
+    columns = {"t": t[::10], "qm": seen, "vir": volts, "pulses": pulse[::10]}
     savemat(folder / "record.mat", {name: column[:, None] for name, column in columns.items()})
     for start in (0.0, 6.0, 12.0, 18.0):
         text += f'[[trials]]\nfile = "record.mat"\nkind = "free"\nstart_s = {start}\n'

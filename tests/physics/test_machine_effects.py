@@ -76,6 +76,7 @@ def test_units_are_consistent(machine, case):
     [
         ("slider", "torque_ripple:carriage"),
         ("slider", "actuator_lag:motor"),
+        ("slider", "actuator_delay"),
         ("slider", "drive_sag:carriage"),
         ("slider", "flexible_load:carriage"),
         ("slider", "force_delay"),
@@ -113,7 +114,8 @@ def test_is_absent_at_zero_and_recovered_from_a_wrong_guess(machine, case):
 
 
 def test_motor_effects_are_offered_to_motors_only():
-    for name in ("torque_ripple", "actuator_lag", "drive_sag", "flexible_load"):
+    motors = ("torque_ripple", "actuator_lag", "actuator_delay", "drive_sag", "flexible_load")
+    for name in motors:
         assert registry.effect(name).targets(registry.device("slider"))
         assert not registry.effect(name).targets(registry.device("bam"))
         assert not registry.effect(name).targets(registry.device("magnetic_damper"))
