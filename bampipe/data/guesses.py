@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.signal import oaconvolve
 
 from bampipe.data.session import SECONDS
 
@@ -98,10 +99,12 @@ def driven(t: np.ndarray, q: np.ndarray, column: np.ndarray, angle: bool = False
     """
     step = float(np.median(np.diff(t)))
     width = max(5, round(_SMOOTHED_S / step) | 1)
+    if len(t) < 4 * width + 20:
+        return Driven(0.0)
     window = np.hanning(width + 2)[1:-1] / np.hanning(width + 2).sum()
 
     def smoothed(values: np.ndarray) -> np.ndarray:
-        return np.convolve(values, window, "same")
+        return np.asarray(oaconvolve(values, window, "same"))
 
     smooth = smoothed(q)
     qd = np.gradient(smooth, step)
@@ -112,7 +115,7 @@ def driven(t: np.ndarray, q: np.ndarray, column: np.ndarray, angle: bool = False
     design = np.column_stack(sides)[inner]
     target = smoothed(smoothed(column))[inner]
     spread = float(np.sum((target - target.mean()) ** 2)) if len(target) else 0.0
-    if spread == 0.0 or len(target) < 20:
+    if spread == 0.0:
         return Driven(0.0)
     found = np.linalg.lstsq(design, target, rcond=None)[0]
     left = float(np.sum((target - design @ found) ** 2))

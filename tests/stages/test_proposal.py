@@ -21,6 +21,7 @@ from other_labs import (
     write_joint_logs,
 )
 
+from bampipe.data.session import read_session
 from bampipe.data.store import read_parquet
 from bampipe.errors import InputError
 from bampipe.physics import registry
@@ -226,3 +227,41 @@ def test_folders_that_cannot_be_proposed_for(tmp_path, command: Command, files, 
     code, out, err = command("init", folder, *(["--device", device] if device else []))
     assert (code, out) == (2, "") and said in err and len(err.splitlines()) == 1
     assert not (folder / "session.toml").exists()
+
+
+def test_a_log_too_short_to_look_into_is_proposed_all_the_same(tmp_path):
+    rows = "\n".join(f"{k / 100},{0.1 * k},{0.01 * k}" for k in range(6))
+    (tmp_path / "a.csv").write_text(f"t,angle_deg,torque_nm\n{rows}\n")
+    assert "[encoders]" in propose(tmp_path).session
+
+
+def test_a_clock_of_no_likely_unit_is_left_open_and_costs_no_time(tmp_path):
+    t = np.arange(1000) * 1e-9
+    rows = "\n".join(f"{x:.12g},{np.sin(k / 50):.6f},{np.cos(k / 50):.6f}" for k, x in enumerate(t))
+    (tmp_path / "a.csv").write_text(f"time,angle_deg,torque_nm\n{rows}\n")
+    proposal = propose(tmp_path)
+    assert 'unit = "?"' in proposal.session and "from the time stamps" not in proposal.session
+    assert any("unit of time" in line for line in proposal.fill_in)
+    (tmp_path / "session.toml").write_text(proposal.session)
+    with pytest.raises(InputError, match="unit"):
+        read_session(tmp_path)
+
+
+def test_each_axis_is_checked_by_a_velocity_of_its_own(tmp_path):
+    t = np.arange(600) / 200.0
+    columns = {
+        "t_s": t,
+        "yaw_rad": np.sin(t),
+        "pitch_rad": np.cos(t),
+        "extension_m": 1.0 + 0.1 * np.sin(2 * t),
+        "pitch_velocity [deg/s]": np.rad2deg(-np.sin(t)),
+        "force_x": np.sin(3 * t),
+        "force_y": np.cos(3 * t),
+        "force_z": np.sin(5 * t),
+    }
+    table = np.column_stack(list(columns.values()))
+    header = ",".join(columns)
+    np.savetxt(tmp_path / "a.csv", table, delimiter=",", header=header, comments="")
+    lines = propose(tmp_path, "bam").session.splitlines()
+    with_velocity = [line.split(" = ")[0] for line in lines if ", velocity = " in line]
+    assert with_velocity == ["pitch"]

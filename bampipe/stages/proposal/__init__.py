@@ -18,7 +18,7 @@ from bampipe.stages.proposal.device import DEVICE, find_device, new_device
 from bampipe.stages.proposal.encoders import encoders_table
 from bampipe.stages.proposal.inputs import input_tables
 from bampipe.stages.proposal.matching import Matcher
-from bampipe.stages.proposal.notes import Notes
+from bampipe.stages.proposal.notes import Notes, quoted
 from bampipe.stages.proposal.trials import trials_tables
 
 SESSION = "session.toml"
@@ -91,7 +91,7 @@ def _head(folder: Path, device: str, rate: str) -> list[str]:
         "# Proposed by `bampipe init`. Look at every line marked `guess` or `fill in`.",
         'schema = "bampipe.session/1"',
         f'session_id = "{sanitised or "session"}"',
-        f'device = "{device}"',
+        f"device = {quoted(device)}",
         rate,
         "",
     ]

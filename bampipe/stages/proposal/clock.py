@@ -10,7 +10,7 @@ from bampipe.data import guesses
 from bampipe.data.session import SECONDS
 from bampipe.data.survey import Column, Survey, words
 from bampipe.data.units import spelled
-from bampipe.stages.proposal.notes import Notes, quoted
+from bampipe.stages.proposal.notes import UNKNOWN, Notes, quoted
 
 _LIKELY_RATE_HZ = 100.0
 """Proposed where nothing tells the rate."""
@@ -47,18 +47,22 @@ def clock_of(found: Survey, notes: Notes) -> Clock:
 def _in_one_column(column: Column, notes: Notes) -> Clock:
     kind = guesses.time_unit(column.values, column.unit)
     t = (column.values - column.values[0]) * SECONDS.get(kind, 1.0)
-    rate_hz = guesses.sample_rate(t) if kind else _LIKELY_RATE_HZ
-    said = kind == "datetime" or spelled(column.unit, tuple(SECONDS)) == kind
-    note = "" if said else notes.guess(f"time in {kind or 's'}, by the rate that it gives")
     if not kind:
-        notes.ask("the unit of time: no unit gives a likely rate")
-    lines = (f"column = {quoted(column.name)}", f'unit = "{kind or "s"}"{note}')
+        note = notes.ask("the unit of time: no unit gives a likely rate")
+        lines = (f"column = {quoted(column.name)}", f'unit = "{UNKNOWN}"{note}')
+        rate = f"sample_rate_hz = {_LIKELY_RATE_HZ}" + notes.ask("sample_rate_hz, the true rate")
+        samples = np.arange(len(t)) / _LIKELY_RATE_HZ
+        return Clock(samples, (column.name,), _table(*lines), rate)
+    rate_hz = guesses.sample_rate(t)
+    said = kind == "datetime" or spelled(column.unit, tuple(SECONDS)) == kind
+    note = "" if said else notes.guess(f"time in {kind}, by the rate that it gives")
+    lines = (f"column = {quoted(column.name)}", f'unit = "{kind}"{note}')
     return Clock(t, (column.name,), _table(*lines), _stamped_rate(rate_hz, notes))
 
 
 def _in_two_columns(whole: Column, rest: Column, notes: Notes) -> Clock:
     """Whole seconds and the nanoseconds on top of them, as ROS has them."""
-    t = whole.values - whole.values[0] + 1e-9 * rest.values
+    t = whole.values - whole.values[0] + 1e-9 * (rest.values - rest.values[0])
     rate_hz = guesses.sample_rate(t)
     note = notes.guess(f"seconds in {whole.name}, nanoseconds on top in {rest.name}")
     lines = (

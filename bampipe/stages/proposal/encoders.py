@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from bampipe.data import guesses
-from bampipe.data.survey import Column
+from bampipe.data.survey import Column, words
 from bampipe.data.units import spelled, unit
 from bampipe.physics.device import Coordinate, Device
 from bampipe.stages.proposal.matching import Matcher
@@ -30,7 +30,8 @@ def encoders_table(
             continue
         axes[axis.name] = column
         match.used.add(column.name)
-        lines.append(f"{axis.name} = {_encoder(axis, column, match, notes)}")
+        alone = len(device.coordinates) == 1
+        lines.append(f"{axis.name} = {_encoder(axis, alone, column, match, notes)}")
     return [*lines, ""], axes
 
 
@@ -49,12 +50,12 @@ def measured_position(axis: str, axes: int, match: Matcher, notes: Notes) -> Col
     return column
 
 
-def _encoder(axis: Coordinate, column: Column, match: Matcher, notes: Notes) -> str:
+def _encoder(axis: Coordinate, alone: bool, column: Column, match: Matcher, notes: Notes) -> str:
     if is_velocity(column):
         return _integrated(axis, column, notes)
     if in_counts(column):
         return _counted(axis, column, notes)
-    velocity = _velocity_beside(match, notes)
+    velocity = _velocity_beside(axis, alone, match, notes)
     known = unit(column.unit)
     if known is not None and known.si == axis.unit:
         said = spelled(column.unit, _POSITION_UNITS) or axis.unit
@@ -86,10 +87,12 @@ def _counted(axis: Coordinate, column: Column, notes: Notes) -> str:
     )
 
 
-def _velocity_beside(match: Matcher, notes: Notes) -> str:
+def _velocity_beside(axis: Coordinate, alone: bool, match: Matcher, notes: Notes) -> str:
     """The field of a recorded velocity, against which the position is checked; "" without one."""
     for column in match.found.of("velocity"):
-        if column.unit and unit(column.unit) is not None and not column.constant:
+        known = unit(column.unit) if column.unit else None
+        fits = known is not None and known.si == f"{axis.unit}/s" and not column.constant
+        if fits and (alone or axis.name in words(column.name)):
             match.used.add(column.name)
             notes.check.append(f"{column.name} is used to check the position only")
             return f", velocity = {entry(column.name, bare(column.unit))}"
