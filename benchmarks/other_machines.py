@@ -153,12 +153,27 @@ def _write(path: Path, names: str, columns: np.ndarray) -> None:
     np.savetxt(path, columns, delimiter=",", header=names, comments="", fmt="%.7g")
 
 
+def _head(device: str, rate_hz: float) -> str:
+    """What every session file begins with, up to its encoders."""
+    return (
+        f'schema = "bampipe.session/1"\nsession_id = "machine"\ndevice = "{device}"\n'
+        f'sample_rate_hz = {rate_hz}\n[time]\ncolumn = "t"\nunit = "s"\n[encoders]\n'
+    )
+
+
+def _stretches(file: str, seconds: float) -> str:
+    """Four trials of one record, ``seconds`` each, the last one to its end."""
+    text = ""
+    for k in range(4):
+        text += f'[[trials]]\nfile = "{file}"\nkind = "free"\nstart_s = {k * seconds}\n'
+        text += f"end_s = {(k + 1) * seconds}\n" if k < 3 else ""
+    return text
+
+
 def arm(folder: Path, hidden: int, seed: int) -> None:
     """Two records of 40 s, each cut into stretches of 10 s."""
     rng = np.random.default_rng(seed)
-    text = (
-        'schema = "bampipe.session/1"\nsession_id = "machine"\ndevice = "arm.toml"\n'
-        'sample_rate_hz = 100.0\n[time]\ncolumn = "t"\nunit = "s"\n[encoders]\n'
+    text = _head("arm.toml", 100.0) + (
         'joint = { column = "q", unit = "rad", resolution = 3.834951969714103e-4 }\n'
         '[channels]\ncurrent = { column = "i", unit = "A" }\n'
     )
@@ -177,9 +192,7 @@ def arm(folder: Path, hidden: int, seed: int) -> None:
         q = np.floor(motion[at, 0] / step) * step
         noisy = motion[at, 1] + 0.02 * rng.standard_normal(len(at))
         _write(folder / f"r{record}.csv", "t,q,i", np.column_stack([at * DT, q, noisy]))
-        for start in (0.0, 10.0, 20.0, 30.0):
-            text += f'[[trials]]\nfile = "r{record}.csv"\nkind = "free"\nstart_s = {start}\n'
-            text += f"end_s = {start + 10.0}\n" if start < 30.0 else ""
+        text += _stretches(f"r{record}.csv", 10.0)
     (folder / "session.toml").write_text(text)
     (folder / "arm.toml").write_text(ARM_DEVICE)
 
@@ -187,9 +200,7 @@ def arm(folder: Path, hidden: int, seed: int) -> None:
 def damper(folder: Path, hidden: int, seed: int) -> None:
     """Five tests of 12 s, sines and chirps of several amplitudes, the current in steps."""
     rng = np.random.default_rng(seed)
-    text = (
-        'schema = "bampipe.session/1"\nsession_id = "machine"\ndevice = "magnetic_damper"\n'
-        'sample_rate_hz = 500.0\n[time]\ncolumn = "t"\nunit = "s"\n[encoders]\n'
+    text = _head("magnetic_damper", 500.0) + (
         'piston = { column = "x", unit = "mm", resolution = 0.005 }\n'
         '[force]\ncolumns = ["f"]\ncomponents = ["load_cell"]\nunit = "N"\n'
         '[channels]\ncurrent = { column = "i", unit = "A" }\n'
@@ -214,9 +225,7 @@ def damper(folder: Path, hidden: int, seed: int) -> None:
 def axis(folder: Path, hidden: int, seed: int) -> None:
     """One record of 25 s in a MATLAB file, cut into four stretches; moves, rests and pulses."""
     rng = np.random.default_rng(seed)
-    text = (
-        'schema = "bampipe.session/1"\nsession_id = "machine"\ndevice = "slider"\n'
-        'sample_rate_hz = 1000.0\n[time]\ncolumn = "t"\nunit = "s"\n[encoders]\n'
+    text = _head("slider", 1000.0) + (
         'carriage = { column = "qm", unit = "m", resolution = 5e-8 }\n'
         '[force]\ncolumns = ["vir", "pulses"]\ncomponents = ["motor"]\nunit = "V"\n'
         "calibration_n_per_v = [[35.0, 1.0]]\nzero_v = [0.0, 0.0]\n"
@@ -237,10 +246,7 @@ def axis(folder: Path, hidden: int, seed: int) -> None:
     volts = motion[:, 1] + 0.02 * rng.standard_normal(len(seen))  # of the amplifier's monitor
     columns = {"t": t[::10], "qm": seen, "vir": volts, "pulses": pulse[::10]}
     savemat(folder / "record.mat", {name: column[:, None] for name, column in columns.items()})
-    for start in (0.0, 6.0, 12.0, 18.0):
-        text += f'[[trials]]\nfile = "record.mat"\nkind = "free"\nstart_s = {start}\n'
-        text += f"end_s = {start + 6.0}\n" if start < 18.0 else ""
-    (folder / "session.toml").write_text(text)
+    (folder / "session.toml").write_text(text + _stretches("record.mat", 6.0))
 
 
 def diagnosed(make: Callable[[Path, int, int], None], hidden: int, seed: int) -> str:

@@ -153,9 +153,7 @@ def weak_directions(matrix: Array, limit: float = 0.1, smallest_part: float = 0.
         limit: on the eigenvalues of the information scaled to a unit diagonal.
         smallest_part: parameters that move less than this share of the largest are left out.
     """
-    scale = np.sqrt(np.diag(matrix))
-    scale[scale == 0.0] = 1.0
-    value, vector = np.linalg.eigh(matrix / np.outer(scale, scale))
+    _, value, vector, _ = _directions(matrix)
     found = []
     for k in np.flatnonzero(value < limit):
         parts = vector[:, k] / vector[np.argmax(np.abs(vector[:, k])), k]

@@ -145,7 +145,7 @@ def to_si(table: Table) -> dict[str, np.ndarray]:
                 if gain != 0.0:
                     total += gain * raw[column]
             si[name] = total
-            # Where one column is the component's own, it is named; else the one that weighs most.
+            # A fault of a component is laid to the column that weighs most in it.
             source[name] = force.columns[int(np.argmax(np.abs(gains)))]
         for column in force.columns:
             del raw[column]

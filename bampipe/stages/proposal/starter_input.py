@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from bampipe.physics.device import TORQUE_UNITS
+
 _GAIN = {"current": ("A", "torque_per_ampere"), "voltage": ("V", "torque_per_volt")}
 _SCALE = "[constants]                         # sets the scale of all that is estimated\n"
 _MOTOR = """[constants]                         # they set the scale of all that is estimated
@@ -48,7 +50,7 @@ class Axis:
 
     @property
     def torque(self) -> str:
-        return "N" if self.linear else "N.m"
+        return TORQUE_UNITS[self.kind]
 
     @property
     def inertia(self) -> str:
