@@ -1,28 +1,34 @@
 """On a cold start, code that later stages need is compiled by processes beside the run.
 
 Where nothing is compiled yet, the first stage that wants compiled code would wait for it, and the
-next one again. Instead, the first function that is missing starts processes that import the
-modules with most to compile, and so leave their code on disk. No function is compiled twice, for
-what one process is at, the others wait for (`bampipe.compiled`). Where everything is compiled,
-nothing is started. A process that fails leaves its part to the run, which then says what is wrong.
+next one again. Instead, processes beside the run import the modules with most to compile, and so
+leave their code on disk. No function is compiled twice, for what one process is at, the others wait
+for (`bampipe.compiled`). They start with the first stage, unless a file says that they once came
+to their end with these sources; then only if a function turns out to be missing all the same. A
+process that fails leaves its part to the run, which then says what is wrong.
 """
 
 from __future__ import annotations
 
+import hashlib
 import os
 import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.metadata import version
+from pathlib import Path
+
+from bampipe.errors import InputError
 
 _PARTS = (
     ("bampipe.estimate.propagation", "bampipe.estimate.square_root"),
-    ("bampipe.estimate.triangular", "bampipe.estimate.low_pass", "bampipe.estimate.simulation"),
+    ("bampipe.estimate.triangular", "bampipe.estimate.simulation"),
 )
 """Modules whose import compiles, by process; what is waited for longest comes first."""
 
 _END_WITH_PARENT = (
-    "import os, sys, threading; "
+    "import gc, os, sys, threading; gc.disable(); "
     "threading.Thread(target=lambda: os._exit(len(os.read(0, 1))), daemon=True).start()"
 )
 """Standard input ends when the run does, killed or not."""
@@ -33,7 +39,7 @@ _running: list[subprocess.Popen[bytes]] = []
 
 @contextmanager
 def beside(processes: int) -> Iterator[None]:
-    """Compile ahead during the block, should a function turn out not to be compiled.
+    """Compile ahead during the block, where that is wanted.
 
     Args:
         processes: how many cores may be used, 0 for all; with one, nothing is started.
@@ -44,16 +50,27 @@ def beside(processes: int) -> Iterator[None]:
         yield
     finally:
         _allowed.clear()
+        if _running and all(process.poll() == 0 for process in _running):
+            _note()
         while _running:
             process = _running.pop()
             process.terminate()
             process.wait()
 
 
+def begin() -> None:
+    """Called when a stage is about to run; the first time counts."""
+    if _allowed and not _noted():
+        _start()
+
+
 def missing() -> None:
     """Called where a function of bampipe itself is not found compiled; the first time counts."""
-    if not _allowed:
-        return
+    if _allowed:
+        _start()
+
+
+def _start() -> None:
     _allowed.clear()
     for modules in _PARTS:
         # The same places to import from, and nothing from the working folder.
@@ -67,3 +84,31 @@ def missing() -> None:
                 start_new_session=True,
             )
         )
+
+
+def _place() -> Path | None:
+    """The file that says that everything was compiled once; None where there is no place for it."""
+    from bampipe.physics.generated import folder_of_user
+
+    digest = hashlib.sha256(f"{version('numba')} {os.environ.get('NUMBA_CACHE_DIR')}".encode())
+    for path in sorted((Path(__file__).parent / "estimate").glob("*.py")):
+        digest.update(path.read_bytes())
+    try:
+        return folder_of_user() / f"compiled_{digest.hexdigest()[:24]}"
+    except InputError:  # the run itself says so, with what to do
+        return None
+
+
+def _noted() -> bool:
+    place = _place()
+    return place is not None and place.exists()
+
+
+def _note() -> None:
+    place = _place()
+    if place is None:
+        return
+    try:
+        place.touch(mode=0o600)
+    except OSError:  # a full disk: the next run asks again
+        return

@@ -18,10 +18,14 @@ class Started:
     def __init__(self) -> None:
         self.codes: list[str] = []
         self.ended = 0
+        self.status: int | None = None
 
     def __call__(self, command: list[str], **_: Any) -> Started:
         self.codes.append(command[-1])
         return self
+
+    def poll(self) -> int | None:
+        return self.status
 
     def terminate(self) -> None:
         self.ended += 1
@@ -51,8 +55,37 @@ def test_the_first_missing_function_starts_them_and_the_end_of_the_run_ends_them
     assert started.ended == len(started.codes), "none is started outside a run"
 
 
+def test_the_first_stage_starts_them_until_they_have_come_to_their_end(
+    started: Started, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("BAMPIPE_CACHE_DIR", str(tmp_path))
+    for status, wanted in ((None, True), (1, True), (0, True), (0, False)):
+        started.codes.clear()
+        started.status = status
+        with compile_ahead.beside(2):
+            compile_ahead.begin()
+            compile_ahead.begin()
+            assert len(started.codes) == (len(compile_ahead._PARTS) if wanted else 0), status
+    with compile_ahead.beside(2):
+        compile_ahead.begin()
+        compile_ahead.missing()
+    assert started.codes, "a function is missing all the same"
+
+
+def test_without_a_place_to_note_it_the_run_goes_on(
+    started: Started, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("BAMPIPE_CACHE_DIR", str(tmp_path / "file"))
+    (tmp_path / "file").touch()
+    started.status = 0
+    with compile_ahead.beside(2):
+        compile_ahead.begin()
+    assert started.codes
+
+
 def test_one_core_is_left_to_the_run(started: Started) -> None:
     with compile_ahead.beside(1):
+        compile_ahead.begin()
         compile_ahead.missing()
     assert not started.codes
 

@@ -1,18 +1,30 @@
 """The unscented filter in its covariance form: the oracle of the square-root form."""
 
 import numpy as np
-from numba import float64, void
+from numba import float64, int64, void
+from numpy.typing import NDArray
 
 from bampipe.compiled import njit
 from bampipe.estimate.filter_signature import (
     DONE,
     INNOVATION_NOT_POSITIVE,
-    KERNEL,
     NOT_FINITE,
     STATE_NOT_POSITIVE,
+    kernel,
 )
 from bampipe.estimate.propagation import measure_points, propagate_points, scratch
-from bampipe.estimate.triangular import cholesky, forward_substitute, product
+from bampipe.estimate.triangular import cholesky, forward_substitute
+
+
+@njit(
+    float64(float64[::1], float64[::1], int64), cache=True, fastmath={"reassoc", "nsz", "contract"}
+)
+def product(a, b, count):  # type: ignore[no-untyped-def]
+    """Return the inner product of the first ``count`` elements of ``a`` and ``b``."""
+    total = 0.0
+    for i in range(count):
+        total += a[i] * b[i]
+    return total
 
 
 @njit(void(float64[::1], float64[:, ::1], float64[::1], float64[:, ::1]), cache=True)
@@ -24,7 +36,28 @@ def store(mean, covariance, mean_out, covariance_out):  # type: ignore[no-untype
             covariance_out[i, j] = covariance[i, j]
 
 
-@njit(KERNEL, cache=True)
+def memory(
+    n: int, nx: int, nu: int, ny: int, nw: int, p: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], ...]:
+    """Scratch of `filter_covariance`: points, images, root, gain, innovation, vectors, points.
+
+    Args:
+        n, nx, nu, ny, nw: lengths of mean, state, input, reading and process noise.
+        p: (np + 1,) all parameters, then the timing of the inputs.
+    """
+    return (
+        np.empty((nx, 1 + 2 * (n + nw))),
+        np.empty((ny, 1 + 2 * n)),
+        np.zeros((n, n)),
+        np.empty((n, ny)),
+        np.empty((ny, ny)),
+        np.zeros((ny, ny)),
+        np.empty((2, ny)),
+        scratch(nx, nu, p, nw),
+    )
+
+
+@njit(kernel(8), cache=True)
 def filter_covariance(  # type: ignore[no-untyped-def]
     derivative,
     measure,
@@ -53,6 +86,7 @@ def filter_covariance(  # type: ignore[no-untyped-def]
     innovation_sd,
     consistency,
     reason,
+    matrices,
 ):
     """Filter one trial, propagating the covariance. Returns the sample of failure or DONE."""
     n = mean.shape[0]
@@ -61,16 +95,9 @@ def filter_covariance(  # type: ignore[no-untyped-def]
     spread, centre, other = weights[0], weights[2], weights[3]
     reach = spread**0.5
     pairs = n + nw
-    points = np.empty((nx, 1 + 2 * pairs))
-    images = np.empty((ny, 1 + 2 * n))
-    factor = np.zeros((n, n))
-    gain = np.empty((n, ny))
-    innovation_covariance = np.empty((ny, ny))
-    innovation_factor = np.zeros((ny, ny))
-    predicted = np.empty(ny)
-    whitened = np.empty(ny)
+    points, images, factor, gain, innovation_covariance, innovation_factor, vectors, work = matrices
+    predicted, whitened = vectors[0], vectors[1]
     timing = p.shape[0] - 1
-    work = scratch(nx, u.shape[1], p, nw)
     store(mean, covariance, means[0], covariances[0])
     for k in range(1, t.shape[0]):
         dt = t[k] - t[k - 1]

@@ -5,7 +5,9 @@ distribution at sample 0 and come out as that at the last sample, so that a filt
 sample computes what the batch filter computes.
 """
 
-from numba import boolean, float64, int64
+from typing import Any
+
+from numba import boolean, float64, int64, types
 
 from bampipe.estimate.signatures import DERIVATIVE_ROWS, MEASURE_ROWS
 
@@ -14,7 +16,7 @@ NOT_FINITE = 1
 STATE_NOT_POSITIVE = 2
 INNOVATION_NOT_POSITIVE = 3
 
-KERNEL = int64(
+_ARGUMENTS = (
     DERIVATIVE_ROWS,  # f(count, x, u, p, w, dx)
     MEASURE_ROWS,  # h(count, x, u, p, y)
     float64[::1],  # t (T,) s
@@ -43,3 +45,13 @@ KERNEL = int64(
     float64[:, ::1],  # consistency (T, 2), out: NIS and log likelihood
     int64[::1],  # reason (1,), out: why it stopped
 )
+
+
+def kernel(matrices: int) -> Any:
+    """Signature of a filter that is given so many matrices of scratch as a tuple.
+
+    Kernels get their memory from the caller: in each process, numba takes a second to compile
+    what allocates arrays. The result is the sample of failure, or `DONE`.
+    """
+    scratch = types.UniTuple(float64[:, ::1], matrices)  # type: ignore[no-untyped-call]
+    return int64(*_ARGUMENTS, scratch)

@@ -101,7 +101,7 @@ def _update(x: Array, p: Array, y: float, gain: Array) -> tuple[float, float]:
     return innovation, spread
 
 
-@njit(void(_V, _SEEN, _M, _M, _V, _M, _M, float64[:, :, ::1], _M, _V, _V), cache=True)
+@njit(void(_V, _SEEN, _M, _M, _V, _M, _M, float64[:, :, ::1], _M, _V, _V, _M), cache=True)
 def _filter(
     y: Array,
     seen: Flags,
@@ -114,9 +114,12 @@ def _filter(
     gains: Array,
     innovations: Array,
     spreads: Array,
+    work: Array,
 ) -> None:
-    """Run the filter from prior ``x``, ``p`` for the first sample and keep what it passes."""
-    work = np.empty_like(p)
+    """Run the filter from prior ``x``, ``p`` for the first sample and keep what it passes.
+
+    ``work`` (n, n) is scratch.
+    """
     for t in range(y.shape[0]):
         if t > 0:
             _predict(x, p, step, noise, work)
@@ -128,7 +131,7 @@ def _filter(
                 covariances[t, i, j] = p[i, j]
 
 
-@njit(void(_SEEN, _M, _M, float64[:, :, ::1], _M, _V, _V, _M), cache=True)
+@njit(void(_SEEN, _M, _M, float64[:, :, ::1], _M, _V, _V, _M, _M, _M, _M), cache=True)
 def _smooth(
     seen: Flags,
     step: Array,
@@ -138,11 +141,16 @@ def _smooth(
     innovations: Array,
     spreads: Array,
     variances: Array,
+    vectors: Array,
+    weight: Array,
+    left: Array,
 ) -> None:
-    """Turn filtered ``states`` (T, n) into smoothed ones, in place; fill ``variances`` (T, n)."""
+    """Turn filtered ``states`` (T, n) into smoothed ones, in place; fill ``variances`` (T, n).
+
+    ``vectors`` (2, n) and ``weight`` (n, n), zeros, and ``left`` (n, n) are scratch.
+    """
     n = states.shape[1]
-    adjoint, weight = np.zeros(n), np.zeros((n, n))
-    pull, left = np.empty(n), np.empty((n, n))
+    adjoint, pull = vectors[0], vectors[1]
     for t in range(states.shape[0] - 1, -1, -1):
         p = covariances[t]
         for i in range(n):
@@ -198,18 +206,26 @@ def _smooth(
 
 @njit(
     "Tuple((float64, float64, int64))(float64[::1], boolean[::1], float64[:, ::1], "
-    "float64[:, ::1], float64[::1], float64[:, ::1], int64)",
+    "float64[:, ::1], float64[::1], float64[:, ::1], int64, float64[:, ::1], float64[::1])",
     cache=True,
 )
 def _evidence(
-    y: Array, seen: Flags, step: Array, noise: Array, x: Array, p: Array, skip: int
+    y: Array,
+    seen: Flags,
+    step: Array,
+    noise: Array,
+    x: Array,
+    p: Array,
+    skip: int,
+    work: Array,
+    gain: Array,
 ) -> tuple[float, float, int]:
     """Return sums of log S and v²/S over the innovations after ``skip``, and their count.
 
-    Once the covariance has settled it is kept until a sample is missing.
+    Once the covariance has settled it is kept until a sample is missing. ``work`` (n, n) and
+    ``gain`` (n,) are scratch.
     """
     n = x.shape[0]
-    work, gain = np.empty_like(p), np.empty(n)
     logs, squares, count = 0.0, 0.0, 0
     settled, spread = False, 1.0
     for t in range(y.shape[0]):
@@ -264,6 +280,7 @@ def _informed_prior(y: Array, seen: Flags, step: Array, noise: Array) -> tuple[A
     _filter(
         reverse, np.ascontiguousarray(seen[::-1]), step, noise, start, spread, states,
         covariances, np.zeros((count, order)), np.zeros(count), np.ones(count),
+        np.empty((order, order)),
     )  # fmt: skip
     return states[-1] * signs, 100.0 * covariances[-1] * np.outer(signs, signs)
 
@@ -314,9 +331,12 @@ def smooth(position: Array, model: MotionModel, seen: Flags | None = None) -> De
     innovations, spreads = np.zeros(count), np.ones(count)
     _filter(
         y, seen, step, model.ratio * noise, start, spread,
-        states, covariances, gains, innovations, spreads,
+        states, covariances, gains, innovations, spreads, np.empty((order, order)),
     )  # fmt: skip
-    _smooth(seen, step, states, covariances, gains, innovations, spreads, variances)
+    _smooth(
+        seen, step, states, covariances, gains, innovations, spreads, variances,
+        np.zeros((2, order)), np.zeros((order, order)), np.empty((order, order)),
+    )  # fmt: skip
     scale = model.noise_sd * model.rate_hz ** np.arange(3)
     x, sd = states[:, :3] * scale, np.sqrt(variances[:, :3]) * scale
     return Derivatives(x[:, 0] + position[0], x[:, 1], x[:, 2], sd[:, 0], sd[:, 1], sd[:, 2])
@@ -375,8 +395,9 @@ def maximum_likelihood(
         count = 0
         for (y, seen), (start, spread) in zip(scaled, priors, strict=True):
             part = _evidence(
-                y, seen, step, np.exp(log_ratio) * noise, start.copy(), spread.copy(), 4 * order
-            )
+                y, seen, step, np.exp(log_ratio) * noise, start.copy(), spread.copy(), 4 * order,
+                np.empty((order, order)), np.empty(order),
+            )  # fmt: skip
             logs, squares, count = logs + part[0], squares + part[1], count + part[2]
         best = squares / max(count, 1)
         variance = max(best, 1.0) if quantum > 0.0 else max(best, 1e-30)

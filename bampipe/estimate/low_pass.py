@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from numba import float64, int64
+from numba import float64, int64, void
 from numpy.typing import NDArray
 from scipy.signal import butter, sosfilt_zi
 
@@ -18,12 +18,10 @@ _V = float64[::1]
 _M = float64[:, ::1]
 
 
-@njit(_M(_M, _V, _V, int64[::1]), cache=True)
-def _run(values, section, start, kept):  # type: ignore[no-untyped-def]
+@njit(void(_M, _V, _V, int64[::1], _V, _M), cache=True)
+def _run(values, section, start, kept, y, out):  # type: ignore[no-untyped-def]
     count, columns = values.shape
     b0, b1, b2, a1, a2 = section[0], section[1], section[2], section[4], section[5]
-    out = np.empty((len(kept), columns))
-    y = np.empty(count)
     for j in range(columns):
         s0, s1 = start[0] * values[0, j], start[1] * values[0, j]
         for i in range(count):
@@ -41,7 +39,6 @@ def _run(values, section, start, kept):  # type: ignore[no-untyped-def]
             y[i] = v
         for i in range(len(kept)):
             out[i, j] = y[kept[i]]
-    return out
 
 
 @cache
@@ -70,7 +67,10 @@ def low_pass_at(values: Array, cutoff_hz: float, rate_hz: float, kept: NDArray[n
         ValueError: the cut-off is not between 0 and half the sampling rate.
     """
     section, start = _design(cutoff_hz, rate_hz)
-    return _run(np.ascontiguousarray(values), section, start, kept)
+    values = np.ascontiguousarray(values)
+    out = np.empty((len(kept), values.shape[1]))
+    _run(values, section, start, kept, np.empty(len(values)), out)
+    return out
 
 
 @dataclass(frozen=True)

@@ -2,18 +2,24 @@
 
 import numpy as np
 from numba import boolean, float64, int64, void
+from numpy.typing import NDArray
 
 from bampipe.compiled import njit
 from bampipe.estimate.signatures import DERIVATIVE_ROWS, MEASURE_ROWS, ROWS
 
 
-@njit(float64[:, ::1](int64, int64, float64[::1], int64), cache=True)
-def scratch(nx, nu, p, nw):  # type: ignore[no-untyped-def]
-    """Scratch of `propagate_points` and `measure_points`, the parameters ``p`` in every row."""
-    work = np.zeros((8, ROWS * max(2 * nx, nu, p.shape[0], nw)))
-    for i in range(p.shape[0]):
-        for r in range(i * ROWS, (i + 1) * ROWS):
-            work[6, r] = p[i]
+def scratch(nx: int, nu: int, p: NDArray[np.float64], nw: int) -> NDArray[np.float64]:
+    """Scratch of `propagate_points` and `measure_points`, the parameters ``p`` in every row.
+
+    Args:
+        nx, nu, nw: lengths of state, input and process noise.
+        p: (np,) all parameters, the timing of the inputs last.
+
+    Returns:
+        (9, width).
+    """
+    work = np.zeros((9, ROWS * max(2 * nx, nu, len(p), nw)))
+    work[6, : ROWS * len(p)] = np.repeat(p, ROWS)
     return work
 
 
@@ -73,7 +79,7 @@ def _runge_kutta_rows(derivative, count, nx, nu, dt, substeps, slope, work):  # 
         derivative: f(count, x, u, p, w, dx).
         count: of the rows; nx, nu: lengths of state and input.
         dt: s; substeps: number of steps.
-        slope: (nu,) what the input gains over the interval.
+        slope: (>= nu,) what the input gains over the interval.
         work: x, probe, sum, rate, u, start of the input, p, w: x in and out.
     """
     x, probe, total, rate = work[0], work[1], work[2], work[3]
@@ -140,10 +146,9 @@ def propagate_points(  # type: ignore[no-untyped-def]
     nu = u0.shape[0]
     pairs = n + nw
     rows = 1 + 2 * pairs
-    slope = np.empty(nu)
+    x, start, q, w, slope = work[0], work[5], work[6], work[7], work[8]
     for i in range(nu):
         slope[i] = u1[i] - u0[i]
-    x, start, q, w = work[0], work[5], work[6], work[7]
     for first in range(0, rows, ROWS):
         count = min(ROWS, rows - first)
         padded = (count + 3) // 4 * 4

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import float64, int64, void
+from numba import boolean, float64, int64, void
 from numpy.typing import NDArray
 
 from bampipe.compiled import njit
@@ -97,27 +97,20 @@ def stable_steps(derivative, x, u, p, w, n, width, dt, max_step, work):  # type:
     return min(int(np.ceil(dt * fastest)), _MOST_STEPS)
 
 
-@njit(void(DERIVATIVE, _M, _M, _V, _V, int64, _V, float64, float64, int64, _M), cache=True)
-def _run(derivative, x, u, p, w, n, width, dt, max_step, hold, work):  # type: ignore[no-untyped-def]
-    """Fill the rows of ``x`` after the first."""
-    for k in range(x.shape[0] - 1):
-        for i in range(x.shape[1]):
-            x[k + 1, i] = x[k, i]
-        end = u[k] if hold else u[k + 1]
-        steps = stable_steps(derivative, x[k], u[k], p, w, n, width, dt, max_step, work)
-        runge_kutta(derivative, x[k + 1], u[k], end, p, w, dt, steps, work)
-
-
 @njit(
     void(
-        DERIVATIVE, _V, _V, _V, _V, int64, _V, _V, _I, float64, float64, _M, _M, _V
+        DERIVATIVE, _V, _V, _V, _V, int64, _V, _V, _I, float64, float64, _M, _M, _M, _M, _V
     ),
     cache=True,
 )  # fmt: skip
 def _demand(  # type: ignore[no-untyped-def]
-    derivative, x, u, p, w, n, q_ref, qd_ref, force, frequency, damping, work, response, out
-):
-    """Handle force that alone would give the acceleration which the arm demands."""
+    derivative, x, u, p, w, n, q_ref, qd_ref, force, frequency, damping, work, response, normal,
+    factor, out,
+):  # fmt: skip
+    """Handle force that alone would give the acceleration which the arm demands, into ``out``.
+
+    ``response`` (n, nf), ``normal`` and ``factor`` (nf, nf) are scratch.
+    """
     nx = x.shape[0]
     nf = force.shape[0]
     still = work[6, :nx]
@@ -129,8 +122,6 @@ def _demand(  # type: ignore[no-untyped-def]
         u[force[j]] -= 1.0
         for i in range(n):
             response[i, j] = moved[n + i] - still[n + i]
-    normal = np.empty((nf, nf))
-    factor = np.zeros((nf, nf))
     trace = 0.0
     for j in range(nf):
         out[j] = 0.0
@@ -160,31 +151,32 @@ def _demand(  # type: ignore[no-untyped-def]
 
 @njit(
     void(
-        DERIVATIVE, _M, _M, _V, _V, _M, _M, _V, float64, float64,
-        _I, _I, _I, _I, _M, float64, _V, _M,
+        DERIVATIVE, _M, _M, _V, _V, int64, _M, _M, _V, float64, float64, boolean,
+        _I, _I, _I, _I, _M, float64, _V, _M, _M, _M, _M, _M,
     ),
     cache=True,
 )  # fmt: skip
-def _track(  # type: ignore[no-untyped-def]
-    derivative, x, u, p, w, q_ref, qd_ref, width, dt, max_step,
-    force, rate, curvature, brake, brake_gain, brake_time, arm, work,
+def _run(  # type: ignore[no-untyped-def]
+    derivative, x, u, p, w, n, q_ref, qd_ref, width, dt, max_step, hold,
+    force, rate, curvature, brake, brake_gain, brake_time, arm,
+    work, kept, response, normal, factor,
 ):  # fmt: skip
-    """Fill the rows of ``x`` after the first and add arm force and brake commands to ``u``."""
-    n = q_ref.shape[1]
+    """Fill the rows of ``x`` after the first and add arm force and brake commands to ``u``.
+
+    Without columns of ``force`` there is no arm, and ``q_ref``, ``qd_ref`` are not read.
+    ``kept`` (4, >= n and nf), zeros, and the matrices of `_demand` are scratch.
+    """
     nf = force.shape[0]
     frequency, damping, bandwidth = arm[0], arm[1], arm[2]
-    pull = np.zeros(nf)
-    pull_rate = np.zeros(nf)
-    goal = np.zeros(nf)
-    response = np.zeros((n, nf))
-    speed = np.zeros(n)
+    pull, pull_rate, goal, speed = kept[0], kept[1], kept[2], kept[3]
     fade = np.exp(-bandwidth * dt)
     follow = 1.0 - np.exp(-dt / brake_time)
     for k in range(x.shape[0] - 1):
-        _demand(
-            derivative, x[k], u[k], p, w, n, q_ref[k], qd_ref[k], force, frequency, damping,
-            work, response, goal,
-        )  # fmt: skip
+        if nf > 0:
+            _demand(
+                derivative, x[k], u[k], p, w, n, q_ref[k], qd_ref[k], force, frequency, damping,
+                work, response, normal, factor, goal,
+            )  # fmt: skip
         for j in range(nf):  # the low-pass, exact for a goal that is constant over dt
             gap = pull[j] - goal[j]
             slope = pull_rate[j] + bandwidth * gap
@@ -202,7 +194,8 @@ def _track(  # type: ignore[no-untyped-def]
         for i in range(x.shape[1]):
             x[k + 1, i] = x[k, i]
         steps = stable_steps(derivative, x[k], u[k], p, w, n, width, dt, max_step, work)
-        runge_kutta(derivative, x[k + 1], u[k], u[k + 1], p, w, dt, steps, work)
+        end = u[k] if hold else u[k + 1]
+        runge_kutta(derivative, x[k + 1], u[k], end, p, w, dt, steps, work)
 
 
 def simulate(
@@ -236,18 +229,10 @@ def simulate(
     Raises:
         Runaway: the motion grows without bounds.
     """
-    x = np.zeros((len(u), len(x0)))
-    x[0] = x0
-    inputs = np.array(u, dtype=np.float64, order="C")
-    work = np.zeros((8, max(len(x0), inputs.shape[1])))
-    width = np.ascontiguousarray(width, dtype=np.float64)
-    p = np.ascontiguousarray(p, dtype=np.float64)
-    _run(
-        derivative, x, inputs, p, np.zeros(n_noise), len(width), width,
-        dt, max_step, int(hold), work,
-    )  # fmt: skip
-    require_finite(x, dt)
-    return x
+    nobody = np.zeros((0, 0))
+    return _integrate(
+        derivative, x0, u, p, dt, nobody, nobody, width, n_noise, max_step, hold=hold
+    )[0]
 
 
 def simulate_tracking(
@@ -296,21 +281,51 @@ def simulate_tracking(
     Raises:
         Runaway: the motion grows without bounds.
     """
-    arm = impedance or Impedance()
+    return _integrate(
+        derivative, x0, u, p, dt, q_ref, qd_ref, width, n_noise, max_step,
+        force=force, rate=rate, curvature=curvature, arm=impedance or Impedance(),
+        brake=brake if brake_gain is not None else (), brake_gain=brake_gain,
+        brake_time=brake_time,
+    )  # fmt: skip
+
+
+def _integrate(
+    derivative: Any,
+    x0: Array,
+    u: Array,
+    p: Array,
+    dt: float,
+    q_ref: Array,
+    qd_ref: Array,
+    width: Array,
+    n_noise: int,
+    max_step: float,
+    *,
+    hold: bool = False,
+    force: Sequence[int] = (),
+    rate: Sequence[int] = (),
+    curvature: Sequence[int] = (),
+    arm: Impedance = Impedance(),
+    brake: Sequence[int] = (),
+    brake_gain: Array | None = None,
+    brake_time: float = 0.01,
+) -> tuple[Array, Array]:
+    """Give `_run` its arrays and its memory; return states (T, nx) and inputs (T, nu)."""
     x = np.zeros((len(u), len(x0)))
     x[0] = x0
     total = np.array(u, dtype=np.float64, order="C")
     gain = np.zeros((0, 0)) if brake_gain is None else np.ascontiguousarray(brake_gain)
-    work = np.zeros((8, max(len(x0), total.shape[1])))
-    brakes = brake if brake_gain is not None else ()
-    _track(
-        derivative, x, total, np.ascontiguousarray(p, dtype=np.float64), np.zeros(n_noise),
+    n, nf = len(width), len(force)
+    _run(
+        derivative, x, total, np.ascontiguousarray(p, dtype=np.float64), np.zeros(n_noise), n,
         np.array(q_ref, dtype=np.float64, order="C"),  # a copy: columns of a table are read-only
         np.array(qd_ref, dtype=np.float64, order="C"),
-        np.ascontiguousarray(width, dtype=np.float64), dt, max_step,
+        np.ascontiguousarray(width, dtype=np.float64), dt, max_step, hold,
         np.array(force, dtype=np.int64), np.array(rate, dtype=np.int64),
-        np.array(curvature, dtype=np.int64), np.array(brakes, dtype=np.int64), gain, brake_time,
-        np.array([arm.natural_frequency, arm.damping_ratio, arm.bandwidth]), work,
+        np.array(curvature, dtype=np.int64), np.array(brake, dtype=np.int64), gain, brake_time,
+        np.array([arm.natural_frequency, arm.damping_ratio, arm.bandwidth]),
+        np.zeros((8, max(len(x0), total.shape[1]))), np.zeros((4, max(n, nf))),
+        np.empty((n, nf)), np.empty((nf, nf)), np.zeros((nf, nf)),
     )  # fmt: skip
     require_finite(x, dt)
     return x, total

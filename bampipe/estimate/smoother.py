@@ -42,20 +42,23 @@ Array = NDArray[np.float64]
         float64[::1],
         float64[:, ::1],
         float64[:, ::1],
+        float64[:, ::1],
+        float64[:, ::1],
     ),
     cache=True,
 )
 def _predict(  # type: ignore[no-untyped-def]
     derivative, u0, u1, mean, factor, spread, centre, other, noise_sd, nx, p, free, logarithmic,
-    lower, upper, dt, substeps, predicted, covariance, cross,
+    lower, upper, dt, substeps, predicted, covariance, cross, states, work,
 ):  # fmt: skip
-    """Repeat one prediction; also its covariance with the state that it starts from."""
+    """Repeat one prediction; also its covariance with the state that it starts from.
+
+    ``states`` (nx, 1 + 2 (n + nw)) and ``work``, of `scratch`, are scratch.
+    """
     n = mean.shape[0]
     nw = noise_sd.shape[0]
     pairs = n + nw
     reach = spread**0.5
-    states = np.empty((nx, 1 + 2 * pairs))
-    work = scratch(nx, u0.shape[0], p, nw)
     propagate_points(
         derivative, mean, factor, reach, noise_sd, nx, p.shape[0] - 1, free, logarithmic,
         lower, upper, u0, u1, dt, substeps, states, work,
@@ -118,6 +121,8 @@ def smooth_trial(
     u = np.ascontiguousarray(trial.u, dtype=float)
     mean, covariance = filtered.mean.copy(), filtered.covariance.copy()
     predicted, spread_after, cross = np.empty(n), np.empty((n, n)), np.empty((n, n))
+    nw = settings.noise_sd.size
+    states, work = np.empty((nx, 1 + 2 * (n + nw))), scratch(nx, u.shape[1], p, nw)
     for k in range(len(trial.t) - 2, -1, -1):
         dt = float(trial.t[k + 1] - trial.t[k])
         substeps = max(1, int(np.ceil(dt / settings.longest_step - 1e-6)))
@@ -125,7 +130,7 @@ def smooth_trial(
             model.derivative_rows, u[k], u[k + 1], filtered.mean[k],
             lower_root(filtered.covariance[k]),
             spread, centre, other, settings.noise_sd, nx, p, model.free, model.logarithmic,
-            lower, upper, dt, substeps, predicted, spread_after, cross,
+            lower, upper, dt, substeps, predicted, spread_after, cross, states, work,
         )  # fmt: skip
         spread_after[range(nx, n), range(nx, n)] += np.square(settings.walk_sd) * dt
         scale = np.sqrt(np.diag(spread_after))

@@ -1,14 +1,15 @@
 """The unscented filter in its square-root form (section V-C), the default."""
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bampipe.compiled import njit
 from bampipe.estimate.filter_signature import (
     DONE,
     INNOVATION_NOT_POSITIVE,
-    KERNEL,
     NOT_FINITE,
     STATE_NOT_POSITIVE,
+    kernel,
 )
 from bampipe.estimate.propagation import measure_points, propagate_points, scratch
 from bampipe.estimate.triangular import (
@@ -22,7 +23,32 @@ from bampipe.estimate.triangular import (
 )
 
 
-@njit(KERNEL, cache=True, fastmath={"contract"})
+def memory(
+    n: int, nx: int, nu: int, ny: int, nw: int, p: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], ...]:
+    """Scratch of `filter_square_root`: points, images, roots, noise, gain, vectors, points.
+
+    Args:
+        n, nx, nu, ny, nw: lengths of mean, state, input, reading and process noise.
+        p: (np + 1,) all parameters, then the timing of the inputs.
+    """
+    pairs = n + nw
+    wide = padded(n)
+    return (
+        np.empty((nx, 1 + 2 * pairs)),
+        np.empty((ny, 1 + 2 * n)),
+        np.zeros((n, wide)),
+        np.zeros((n, padded(pairs + nw))),
+        np.zeros((ny, wide)),
+        np.empty((ny, ny)),
+        np.empty((ny, n)),
+        np.empty((ny, wide)),
+        np.empty((5, n + ny + 1)),
+        scratch(nx, nu, p, nw),
+    )
+
+
+@njit(kernel(10), cache=True, fastmath={"contract"})
 def filter_square_root(  # type: ignore[no-untyped-def]
     derivative,
     measure,
@@ -51,6 +77,7 @@ def filter_square_root(  # type: ignore[no-untyped-def]
     innovation_sd,
     consistency,
     reason,
+    matrices,
 ):
     """Filter one trial, propagating the lower root of the covariance.
 
@@ -68,20 +95,12 @@ def filter_square_root(  # type: ignore[no-untyped-def]
     reach = spread**0.5
     half = (0.5 * other) ** 0.5
     pairs = n + nw
-    points = np.empty((nx, 1 + 2 * pairs))
-    images = np.empty((ny, 1 + 2 * n))
-    root = np.zeros((n, padded(n)))  # R = L^T, so that what is rotated together is contiguous
-    columns = np.zeros((n, padded(pairs + nw)))
-    noise_columns = np.zeros((ny, padded(n)))
-    noise = np.empty((ny, ny))
-    cross = np.empty((ny, n))
-    gain = np.empty((ny, padded(n)))
-    cosine, sine = np.empty(n + 1), np.empty(n + 1)
-    single = np.empty(max(n, ny))
-    predicted = np.empty(ny)
-    whitened = np.empty(ny)
+    # root is R = L^T, so that what is rotated together is contiguous
+    points, images, root, columns, noise_columns, noise, cross, gain, vectors, work = matrices
+    cosine, sine, single = vectors[0], vectors[1], vectors[2]
+    predicted, whitened = vectors[3], vectors[4]
+    wide = root.shape[1]
     timing = p.shape[0] - 1
-    work = scratch(nx, u.shape[1], p, nw)
     centre_image = centre + 2 * nw * other
     log_normal = 0.5 * ny * np.log(2.0 * np.pi)
     walking = False
@@ -118,9 +137,9 @@ def filter_square_root(  # type: ignore[no-untyped-def]
             single[i] = abs(centre) ** 0.5 * (middle - mean[i])
             for j in range(n):
                 root[i, j] = 0.0
-        append_rows(root, nx, columns, padded(pairs + nw))
+        append_rows(root, nx, columns, columns.shape[1])
         for i in range(n):
-            for pair in range(n, padded(n)):
+            for pair in range(n, wide):
                 columns[i, pair] = 0.0
             for pair in range(n):
                 columns[i, pair] = (
@@ -133,7 +152,7 @@ def filter_square_root(  # type: ignore[no-untyped-def]
             for j in range(n):
                 root[i, j] = walk_sd[i - nx] * dt**0.5 if i == j else 0.0
         # Columns of the state first; then the parameters' rows start from their random walk.
-        append_rows(root, n, columns, padded(n))
+        append_rows(root, n, columns, wide)
         if centre != 0.0 and not rank_one_update(root, n, 1.0 if centre > 0.0 else -1.0, single):
             reason[0] = STATE_NOT_POSITIVE
             return k
@@ -167,7 +186,7 @@ def filter_square_root(  # type: ignore[no-untyped-def]
                 for j in range(ny):
                     noise[i, j] = reading_sd[i] if i == j else 0.0
                 single[i] = abs(centre_image) ** 0.5 * (middle - predicted[i])
-            append_rows(noise, ny, noise_columns, padded(n))
+            append_rows(noise, ny, noise_columns, wide)
             if not rank_one_update(noise, ny, 1.0 if centre_image >= 0.0 else -1.0, single):
                 reason[0] = INNOVATION_NOT_POSITIVE
                 return k

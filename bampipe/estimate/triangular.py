@@ -14,8 +14,7 @@ _REASSOCIATE = {"reassoc", "nsz", "contract"}  # lets sums use vector registers;
 _LANES = 16
 
 
-@njit(int64(int64), cache=True)
-def padded(n):  # type: ignore[no-untyped-def]
+def padded(n: int) -> int:
     """Return the least length from ``n`` on that fills whole vector registers, unrolled.
 
     Loops over rows padded with zeros to this length are faster than shorter ones with a
@@ -221,12 +220,3 @@ def covariance_of(upper, covariance):  # type: ignore[no-untyped-def]
         for m in range(1, i + 1):
             for j in range(n):
                 covariance[i, j] += upper[m, i] * upper[m, j]
-
-
-@njit(float64(float64[::1], float64[::1], int64), cache=True, fastmath=_REASSOCIATE)
-def product(a, b, count):  # type: ignore[no-untyped-def]
-    """Return the inner product of the first ``count`` elements of ``a`` and ``b``."""
-    total = 0.0
-    for i in range(count):
-        total += a[i] * b[i]
-    return total

@@ -321,7 +321,9 @@ def run_kernel(
     )
     consistency = np.full((size, 2), np.nan)
     reason = np.zeros(1, dtype=np.int64)
-    failed = _kernel(settings.square_root)(
+    kernel, memory = _kernel(settings.square_root)
+    nw = settings.noise_sd.size
+    failed = kernel(
         model.derivative_rows,
         model.measure_rows,
         _array(t),
@@ -340,7 +342,7 @@ def run_kernel(
         _array(settings.noise_sd),
         _array(settings.walk_sd),
         _array(settings.reading_sd),
-        np.array(settings.points.weights(n + settings.noise_sd.size)),
+        np.array(settings.points.weights(n + nw)),
         float(settings.longest_step),
         int(stride),
         filtered.mean,
@@ -349,6 +351,7 @@ def run_kernel(
         filtered.innovation_sd,
         consistency,
         reason,
+        memory(n, model.n_states, u.shape[1], ny, nw, _array(model.parameters)),
     )
     if failed != DONE:
         raise FilterFailure(0, int(failed), _REASONS[int(reason[0])])
@@ -384,15 +387,15 @@ def constrain(model: FilterModel, theta: Array, covariance: Array) -> Array:
     return np.asarray(value)
 
 
-def _kernel(square_root: bool) -> Callable[..., int]:
-    """Return one form of the filter; the other is then neither compiled nor loaded."""
+def _kernel(square_root: bool) -> tuple[Callable[..., int], Callable[..., tuple[Array, ...]]]:
+    """Return one form of the filter and what gives it scratch; the other is not even loaded."""
     if square_root:
-        from bampipe.estimate.square_root import filter_square_root
+        from bampipe.estimate import square_root as form
 
-        return filter_square_root
-    from bampipe.estimate.covariance_form import filter_covariance
+        return form.filter_square_root, form.memory
+    from bampipe.estimate import covariance_form as other
 
-    return filter_covariance
+    return other.filter_covariance, other.memory
 
 
 def _array(values: Any, kind: type = np.float64) -> NDArray[Any]:

@@ -165,7 +165,9 @@ class System:
         from bampipe.physics.loops import residual_rows
 
         arrays = [np.ascontiguousarray(x, dtype=np.float64) for x in (q, qd, qdd, z, u, p)]
-        return residual_rows(self._compiled.residual, *arrays)
+        out = np.empty(arrays[0].shape)
+        residual_rows(self._compiled.residual, *arrays, out)
+        return out
 
     def contribution(self, q: Array, qd: Array, qdd: Array, z: Array, u: Array, p: Array) -> Array:
         """What the model's effects add to the residual of the bare device, (T, n_q).

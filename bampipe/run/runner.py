@@ -30,6 +30,7 @@ class _Runner:
     def execute(self, step: Step, reason: str) -> StepResult:
         name = self.root.name
         self.listen(Event(name, step.name, "start", 0.0, reason))
+        compile_ahead.begin()
         started = datetime.now(UTC)
         clock = time.perf_counter()
         state = self.state

@@ -179,13 +179,14 @@ def test_continued_in_parts_is_the_same() -> None:
     slider = model()
     mean, spread = slider.to_estimated(TRUTH, TRUTH)
     joint, x, x_cov = np.diag(spread**2), trial.x, np.diag(trial.x_sd**2)
-    from bampipe.estimate.covariance_form import filter_covariance
+    from bampipe.estimate.covariance_form import filter_covariance, memory
 
     state = np.concatenate([x, mean])
     covariance = np.zeros((5, 5))
     covariance[:2, :2], covariance[2:, 2:] = x_cov, joint
     lower, upper = slider.range
     weights = np.array(chosen.points.weights(6))
+    scratch = memory(5, 2, trial.u.shape[1], 1, 1, slider.parameters)
     for k in range(1, trial.t.size):
         part = slice(k - 1, k + 1)
         filter_covariance(
@@ -195,6 +196,7 @@ def test_continued_in_parts_is_the_same() -> None:
             slider.logarithmic, lower, upper, chosen.noise_sd, chosen.walk_sd, chosen.reading_sd,
             weights, chosen.longest_step, 1, np.empty((2, 5)), np.empty((2, 5, 5)),
             np.empty((2, 1)), np.empty((2, 1)), np.empty((2, 2)), np.zeros(1, dtype=np.int64),
+            scratch,
         )  # fmt: skip
     np.testing.assert_allclose(state, whole.trials[0].mean[-1], rtol=1e-12, atol=1e-14)
 
