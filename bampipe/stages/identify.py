@@ -120,7 +120,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     squares = Squares(raw, raw.p, None, problem)
     if config.remove_bias:
         squares = unbiased(session, settings, system, motions, problem, raw)
-    noise = sensor_noise(session, system, motions, config)
+    noise = sensor_noise(session, system, motions, raw.p[: len(start)], config)
     method, notes = config.method, []
     if method in ("auto", "ukf"):
         try:

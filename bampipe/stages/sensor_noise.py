@@ -48,16 +48,19 @@ def sensor_noise(
     session: Mapping[str, Any],
     system: System,
     motions: Sequence[Motion],
+    p: Array,
     choice: FilterChoice,
 ) -> Noise:
     """Encoder steps spread evenly, sd = step / sqrt(12); force noise as the session says.
 
     Where the session does not say, the second difference of the force gives it: the force
     of a hand is smooth over two milliseconds. Process noise that is no force starts as the
-    torque of the same noise at an arm of 1 m.
+    torque of the same noise at an arm of 1 m. Where the load moves the encoder against the
+    handle, the noise of a force adds to what the model says that the encoder reads.
 
     Args:
         session: ``ingest/session.json``; system: the model; motions: the trials.
+        p: (n_p,) parameters near the answer.
         choice: fixes levels that are not to be found.
     """
     reading = []
@@ -86,7 +89,26 @@ def sensor_noise(
             process[place] = white_part([motion.u[:, column] for motion in motions])
     smallest = process[is_force].min() if is_force.any() else 0.05
     process[process == 0.0] = smallest or np.finfo(float).eps
-    return Noise(np.array(reading), process, is_force)
+    noise = Noise(np.array(reading), process, is_force)
+    if not system.moves_sensors:
+        return noise
+    n = len(system.coordinates)
+    own = _force_in_positions(system, motions, p, noise)
+    return replace(noise, reading_sd=np.append(np.hypot(reading[:n], own), reading[n:]))
+
+
+def _force_in_positions(system: System, motions: Sequence[Motion], p: Array, noise: Noise) -> Array:
+    """Return how far the noise of the forces moves the encoders in the model, RMS, (n_q,)."""
+    square, count = np.zeros(len(system.coordinates)), 0
+    for motion in motions:
+        here = system.true_motion(motion.q, motion.qd, motion.qdd, motion.u, p)[0]
+        for place in np.flatnonzero(noise.is_force):
+            u = motion.u.copy()
+            u[:, system.inputs.index(system.noise[place])] += noise.process_sd[place]
+            moved = system.true_motion(motion.q, motion.qd, motion.qdd, u, p)[0]
+            square += np.sum((moved - here) ** 2, axis=0)
+        count += len(motion.t)
+    return np.asarray(np.sqrt(square / count))
 
 
 def white_part(records: Sequence[Array]) -> float:

@@ -157,7 +157,14 @@ def _estimated(
 ) -> tuple[dict[str, object], pd.DataFrame]:
     """Return what viscous.json says, and how the estimates converged."""
     session = run.read_json("ingest/session.json")
-    noise = sensor_noise(session, system, motions, config)
+    known = identified["parameters"]
+    start = np.array(
+        [
+            known[item.name]["estimate"] if item.name in known else item.prior
+            for item in system.parameters
+        ]
+    )
+    noise = sensor_noise(session, system, motions, start, config)
     settings = untuned(system, noise, config)
     levels = identified.get("noise")
     if levels is not None and config.force_noise == 0.0:
@@ -172,13 +179,6 @@ def _estimated(
         u[:, _brakes(system)] = 0.0
         readings.append(Trial(trial.t, u, trial.y, trial.x, trial.x_sd))
     free = [item for item in system.parameters if not item.fixed]
-    known = identified["parameters"]
-    start = np.array(
-        [
-            known[item.name]["estimate"] if item.name in known else item.prior
-            for item in system.parameters
-        ]
-    )
     timing = float(identified["input_timing"]["estimate"])
     model = filter_model(system, readings, start, timing=False)
     model = replace(model, parameters=np.append(start, timing))

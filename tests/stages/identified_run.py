@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -26,15 +27,23 @@ MODEL = 'schema = "bampipe.model/1"\nname = "base"\ndevice = "bam"\neffects = []
 
 
 def simulated_run(
-    root: Path, *, trials: int = 2, seconds: float = 10.0, scramble: bool = False, late: int = 0
+    root: Path,
+    *,
+    trials: int = 2,
+    seconds: float = 10.0,
+    scramble: bool = False,
+    late: int = 0,
+    effect: str = "",
+    hidden: Mapping[str, float] | None = None,
 ) -> RunFolder:
     """Simulate the BAM under a hand, read by its sensors, up to the filter stage.
 
     ``scramble`` turns the force channels round in time, so that no model explains the motion;
-    ``late`` reads them that many samples after the motion.
+    ``late`` reads them that many samples after the motion. ``effect`` is in the mechanism, with
+    the parameters ``hidden``.
     """
-    system = compile_model(Model(registry.device("bam")))
-    p = np.array([TRUTH[item.name] for item in system.parameters])
+    system = compile_model(Model(registry.device("bam"), [effect] if effect else []))
+    p = np.array([{**TRUTH, **(hidden or {})}[item.name] for item in system.parameters])
     resolution = np.array(list(RESOLUTION.values()))
     sensors = Sensors(RATE, resolution, np.full(3, 0.05))
     frames = {}

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from identified_run import MODEL, TRUTH, session_truth, shared_run, simulated_run
+from identified_run import MODEL, RESOLUTION, TRUTH, session_truth, shared_run, simulated_run
 
 from bampipe.data.schema import validate
 from bampipe.data.store import read_json, read_parquet, sha256_file, write_text
@@ -177,6 +177,21 @@ def test_a_model_with_a_delay_gets_no_timing_of_its_own(simulated: RunFolder) ->
     delay = content["parameters"]["force_delay.delay"]
     assert abs(delay["estimate"]) < 2e-4
     assert_recovered(content, TRUTH)
+
+
+def test_the_force_noise_moves_the_encoder_of_an_axis_that_winds_up(tmp_path: Path) -> None:
+    """Without that in the noise of the readings, the filter gave the friction as 14 for 4.2."""
+    name = "transmission_compliance.yaw.compliance"
+    run = simulated_run(tmp_path, effect="transmission_compliance:yaw", hidden={name: 2e-3})
+    wound = MODEL.replace("[]", '["transmission_compliance:yaw"]')
+    write_text(run.path("models/base/model.toml"), wound)
+    content = identified(run)
+    assert content["method"] == "ukf"
+    assert_recovered(content, TRUTH)
+    assert content["parameters"][name]["estimate"] == pytest.approx(2e-3, rel=5e-3)
+    noise = content["noise"]
+    assert noise["process_sd"]["force_x"] < 5.0 * noise["sensor_sd"]["force_x"]
+    assert noise["reading_sd"]["yaw"] > 2.0 * RESOLUTION["yaw"] / np.sqrt(12.0)
 
 
 def test_least_squares_intervals_hold_once_its_bias_is_off(simulated: RunFolder) -> None:
