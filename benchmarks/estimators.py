@@ -93,8 +93,9 @@ def by_instruments(run: RunFolder, system: System) -> Found:
     problem = problem_of(system, motions, Band(rate))
     squares = fit(problem, np.append(system.prior, 0.0))
     choice = FilterChoice()
-    noise = sensor_noise(session, system, motions, choice)
-    trials = [trial_of(run, motion, system, noise, 1, choice) for motion in motions]
+    near = squares.p[: len(system.parameters)]
+    noise = sensor_noise(session, system, motions, near, choice)
+    trials = [trial_of(run, motion, system, near, noise, 1, choice) for motion in motions]
     simulated = [
         _simulated(system, motion, trial, squares.p)
         for motion, trial in zip(motions, trials, strict=True)

@@ -18,6 +18,10 @@ from bampipe.estimate.unscented import Stored
 Array = NDArray[np.float64]
 
 
+_SILENT = 1e-20
+"""Share of the filter's variance below which a parameter has no score in any block."""
+
+
 def sandwich_covariance(
     trials: Sequence[Stored],
     n_states: int,
@@ -30,7 +34,8 @@ def sandwich_covariance(
     With information matrix ``L = P^-1`` and vector ``e = L theta`` at both ends of a block, the
     block alone contributes ``dL`` and ``de`` and its score at the final estimate is ``de - dL
     theta``. The meat of the sandwich is the sum of their squares. Where the result claims less
-    than the filter does, the filter's standard deviation is kept.
+    than the filter does, the filter's standard deviation is kept, as it is for a parameter of
+    which no block says anything.
 
     Args:
         trials: filtered trials in order, parameters not walking.
@@ -59,8 +64,13 @@ def sandwich_covariance(
     scores = np.array([gain - matrix @ final for matrix, gain in gains])
     meat = scores.T @ scores * (len(gains) / (len(gains) - final.size))
     found = model @ meat @ model
-    widen = np.sqrt(np.maximum(np.diag(model) / np.diag(found), 1.0))
-    return np.asarray(found * np.outer(widen, widen)), len(gains)
+    own, seen = np.diag(model), np.diag(found)
+    silent = seen <= _SILENT * own
+    widen = np.sqrt(np.maximum(own / np.where(silent, own, seen), 1.0))
+    found = found * np.outer(widen, widen)
+    found[silent] = found[:, silent] = 0.0
+    found[silent, silent] = own[silent]
+    return np.asarray(found), len(gains)
 
 
 def _block_ends(t: Array, block_s: float) -> list[int]:

@@ -16,6 +16,7 @@ from bampipe.stages.estimates import Estimate, timing_entry
 from bampipe.stages.filter_choice import FilterChoice
 from bampipe.stages.filter_run import (
     Attempt,
+    FilterRun,
     MotionLost,
     calm,
     filter_model,
@@ -34,6 +35,13 @@ Array = NDArray[np.float64]
 
 _RESTARTS = 5
 """Further searches, each with four times the process noise of the one before."""
+_REGIONS = (30.0, 8.0)
+"""Standard deviations of least squares around its answer in which a model that bends with its
+parameters is searched: a prior as wide as a range leads such a filter astray."""
+_LEAST_REGION = 3e-4
+"""Least width of that, in standard deviations of the prior, times the number above."""
+_AGREE = 6.0
+"""Joint standard deviations within which filter and least squares are at one place."""
 
 
 def estimate_by_filter(
@@ -60,8 +68,9 @@ def estimate_by_filter(
         MotionLost: the filter does not follow the motion.
     """
     stride = stride_of(motions)
+    near = squares.raw.p[: len(start)]
     trials = Shelf(
-        lambda place: trial_of(run, motions[place], system, noise, stride, choice),
+        lambda place: trial_of(run, motions[place], system, near, noise, stride, choice),
         len(motions),
         lambda trial: int(trial.t.size),
     )
@@ -88,6 +97,25 @@ def estimate_by_filter(
     # more and more process noise, as a model that lacks much needs.
     attempts: list[Attempt] = [(first, spread, 1.0)]
     attempts += [(settled, prior_sd, 4.0**k) for k in range(_RESTARTS)]
+    bends = not problem.linear
+    if bends:
+        around = [
+            np.minimum(size * np.hypot(known, _LEAST_REGION * prior_sd), spread)
+            for size in _REGIONS
+        ]
+        attempts = [*((settled, region, 1.0) for region in around), *attempts]
+    answer = np.append(squares.p[problem.free[:kept]], late)
+
+    def agrees(found: FilterRun) -> bool:
+        """Whether the filter is where least squares are, the timing left out.
+
+        Where the model is linear they have one answer at most, and no need to be asked.
+        """
+        if not bends:
+            return True
+        value, slope = model.to_physical(found.theta)
+        sd = np.hypot(slope * np.sqrt(np.diag(found.covariance)), known)
+        return bool(np.all(np.abs(value - answer)[:kept] < _AGREE * sd[:kept]))
 
     def told(done: int, place: int) -> None:
         progress(0.35 + 0.6 * done / (len(trials) + 1), motions[place].trial_id)
@@ -97,7 +125,10 @@ def estimate_by_filter(
         said = what.format(motions[place].trial_id)
         return MotionLost(said, where=f"model {model_name}", remedy=remedy)
 
-    found = run_filter(model, trials, attempts, settings, choice, told, lost, system.coordinates)
+    found = run_filter(
+        model, trials, attempts, settings, choice, told, lost, system.coordinates,
+        agrees, 1 + len(_REGIONS),
+    )  # fmt: skip
     covariance, blocks = sandwich_covariance(
         found.trials,
         model.n_states,
@@ -110,7 +141,7 @@ def estimate_by_filter(
     systematic = _systematic(value[:kept], scaled, squares)
     scaled[:kept, :kept] += np.diag(systematic**2)
     tight = slope * np.sqrt(np.diag(found.covariance))
-    near = (value - model.lower < tight) | (model.upper - value < tight)
+    at_bound = (value - model.lower < tight) | (model.upper - value < tight)
     p = np.append(start, 0.0)
     p[problem.free] = value
     names = [item.name for item in free]
@@ -137,7 +168,7 @@ def estimate_by_filter(
         p=p,
         problem=problem,
         covariance=scaled[:kept, :kept],
-        at_bound=near[:kept],
+        at_bound=at_bound[:kept],
         details=details,
         report=report,
         states=states(system, motions, found, p[:-1], choice.trace_rows),

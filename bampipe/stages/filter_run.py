@@ -39,6 +39,8 @@ _LARGEST_NIS = 10.0
 STRETCH_S = 0.05
 """Innovations are averaged over this long: from sample to sample the counts of an encoder are no
 noise, and what a model lacks acts at the pace of a hand."""
+_SHIFT_KNOWN = 0.1
+"""Share of the way between encoder and mechanism to which that way is known at the start."""
 _CALM = 5.0
 """Widths of the smoothed sign of the velocity within which an axis counts as reversing."""
 _MARGIN_S = 0.02
@@ -59,6 +61,7 @@ class Pass(Stored):
 
     Attributes:
         nis: mean normalised innovation squared; counted: over so many samples.
+        log_likelihood: of all readings, each given those before.
         ratio: (ny,) root mean square of each innovation in its standard deviation.
         stretches: (K, ny) means of innovations in their standard deviations over ``STRETCH_S``,
             NaN where one is missing.
@@ -66,6 +69,7 @@ class Pass(Stored):
 
     nis: float
     counted: int
+    log_likelihood: float
     ratio: Array
     stretches: Array
 
@@ -101,6 +105,11 @@ class FilterRun:
         """Places in the session of the trials of `passes`."""
         return (0, *self.order)
 
+    @property
+    def log_likelihood(self) -> float:
+        """Of all readings in the main passes."""
+        return sum(each.log_likelihood for each in self.trials)
+
 
 def stride_of(motions: Sequence[Motion]) -> int:
     """Return every how many samples the filter stores its distribution."""
@@ -109,9 +118,25 @@ def stride_of(motions: Sequence[Motion]) -> int:
 
 
 def trial_of(
-    run: RunFolder, motion: Motion, system: System, noise: Noise, stride: int, choice: FilterChoice
+    run: RunFolder,
+    motion: Motion,
+    system: System,
+    p: Array,
+    noise: Noise,
+    stride: int,
+    choice: FilterChoice,
 ) -> Trial:
-    """Return the raw samples of one trial as the filter wants them."""
+    """Return the raw samples of one trial as the filter wants them.
+
+    The state is that of the mechanism, which is not where its encoders are once a model has
+    something between the two.
+
+    Args:
+        run: the run folder; motion: the trial; system: the model.
+        p: (n_p,) parameters near the answer, for the state at the first sample.
+        noise: of the sensors; stride: the filter stores every so many samples; choice: of the
+            filter.
+    """
     path = run.require("ingest/samples.parquet", "ingest")
     frame = read_parquet(path, trial=motion.trial_id)
     n = len(system.coordinates)
@@ -132,10 +157,15 @@ def trial_of(
         velocity = [np.interp(t, motion.t, column) for column in motion.qd.T]
         y = np.hstack([y, np.stack(velocity, axis=1)])
     first = int(np.flatnonzero(np.isfinite(y).all(axis=1))[0])
-    memory = system.initial_memory(motion.q[0], motion.u[0], system.prior)
-    x = np.concatenate([y[first, :n], motion.qd[0], memory])
+    read = y[first, :n]
+    there, rate, _ = system.true_motion(
+        read[None, :], motion.qd[:1], motion.qdd[:1], u[first : first + 1], p
+    )
+    memory = system.initial_memory(there[0], u[first], p)
+    x = np.concatenate([there[0], rate[0], memory])
+    place = np.hypot(2.0 * noise.reading_sd[:n], _SHIFT_KNOWN * (there[0] - read))
     speed = np.maximum(motion.qd_sd[0], np.sqrt(np.mean(motion.qd**2, axis=0)) * 0.1)
-    x_sd = np.concatenate([2.0 * noise.reading_sd[:n], speed, np.zeros(len(memory))])
+    x_sd = np.concatenate([place, speed, np.zeros(len(memory))])
     # The last stored distribution must be that of the last sample.
     last = first + (t.size - 1 - first) // stride * stride + 1
     return Trial(t[first:last], u[first:last], y[first:last], x, x_sd)
@@ -202,12 +232,15 @@ def run_filter(
     told: Callable[[int, int], None],
     lost: Callable[[str, int], MotionLost],
     axes: Sequence[str],
+    agrees: Callable[[FilterRun], bool] = lambda found: True,
+    rivals: int = 1,
 ) -> FilterRun:
     """Converge on the first trial, then filter all trials; the first attempt that holds counts.
 
     A filter that trusts its model far from the truth does not find back. The first trial is
     filtered with much process noise, which adds next to no information, and filtered again at
-    the end in its own right.
+    the end in its own right. Where parameters bend the model, a filter can follow the motion and
+    still sit in the wrong place: then the likeliest of several attempts counts.
 
     Args:
         model, trials, settings: as `filter_trials` takes them.
@@ -216,6 +249,8 @@ def run_filter(
         told: called with the number of trials done and the place of the next.
         lost: makes the error from what happened and the place of the trial.
         axes: names of the readings, for messages.
+        agrees: whether an attempt that follows the motion is where other evidence has it.
+        rivals: with so many that follow and do not agree, the likeliest of them counts.
 
     Raises:
         MotionLost: no attempt followed the motion.
@@ -224,6 +259,7 @@ def run_filter(
     order = (*range(1, len(trials)), 0)
     failure: tuple[int, FilterFailure] | None = None
     found: FilterRun | None = None
+    following: list[FilterRun] = []
     for restarts, (value, sd, factor) in enumerate(attempts):
         mean, spread = model.to_estimated(value, sd)
         level = replace(settings, noise_sd=factor * settings.noise_sd)
@@ -246,7 +282,13 @@ def run_filter(
             continue
         found = FilterRun(search, tuple(passes), theta, covariance, level, order, restarts)
         if max(each.nis for each in passes) / len(passes[0].ratio) < _LARGEST_NIS:
-            return found
+            if agrees(found):
+                return found
+            following.append(found)
+            if len(following) == rivals:
+                break
+    if following:
+        return max(following, key=lambda each: each.log_likelihood)
     if found is not None:
         raise _not_followed(found, lost, axes)
     if failure is None:
@@ -266,6 +308,7 @@ def _kept(filtered: FilteredTrial, trial: Trial) -> Pass:
         covariance=filtered.covariance,
         nis=float(filtered.nis[seen].mean()) if seen.any() else np.inf,
         counted=int(seen.sum()),
+        log_likelihood=float(np.nansum(filtered.log_likelihood)),
         ratio=np.sqrt(np.nanmean(size**2, axis=0)),
         stretches=averaged(size, stretch_of(trial)),
     )

@@ -135,7 +135,8 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
             notes.append(f"Estimated by least squares, since {error.what}.")
     elif method == "output-error":
         progress(0.3, "output error")
-        trials = [trial_of(run, motion, system, noise, 1, config) for motion in motions]
+        near = raw.p[: len(start)]
+        trials = [trial_of(run, motion, system, near, noise, 1, config) for motion in motions]
         estimate = estimate_by_output(system, motions, trials, squares, progress)
     else:
         estimate = estimate_by_squares(system, motions, squares)

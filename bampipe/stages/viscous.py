@@ -174,7 +174,7 @@ def _estimated(
     settings = replace(settings, stride=stride)
     readings = []
     for motion in motions:
-        trial = trial_of(run, motion, system, noise, stride, config)
+        trial = trial_of(run, motion, system, start, noise, stride, config)
         u = trial.u.copy()
         u[:, _brakes(system)] = 0.0
         readings.append(Trial(trial.t, u, trial.y, trial.x, trial.x_sd))

@@ -133,6 +133,26 @@ def test_intervals_cover_and_innovations_are_consistent() -> None:
     assert 0.8 < np.mean(nis) < 1.2
 
 
+def test_a_parameter_of_which_no_block_says_anything_keeps_its_spread() -> None:
+    trials = [position_only(record(seed)) for seed in range(2)]
+    slider = replace(
+        model(),
+        parameters=np.concatenate([TRUTH, [0.7], [0.0]]),
+        free=np.arange(4),
+        lower=np.append(model().lower, -np.inf),
+        upper=np.full(4, np.inf),
+    )
+    value, sd = np.append(TRUTH, 0.7), np.append(0.3 * TRUTH, 0.05)
+    mean, spread = slider.to_estimated(value, sd)
+    found = filter_trials(
+        slider, trials, mean, np.diag(spread**2), settings(walk_sd=np.zeros(value.size))
+    )
+    covariance, blocks = sandwich_covariance(found.trials, 2, mean, np.diag(spread**2), 1.0)
+    assert blocks > value.size
+    assert np.isfinite(covariance).all()
+    assert np.sqrt(covariance[-1, -1]) == pytest.approx(0.05, rel=1e-6)
+
+
 def test_timing_of_the_inputs_is_found() -> None:
     trials = []
     for seed in range(3):

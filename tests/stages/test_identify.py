@@ -194,6 +194,35 @@ def test_the_force_noise_moves_the_encoder_of_an_axis_that_winds_up(tmp_path: Pa
     assert noise["reading_sd"]["yaw"] > 2.0 * RESOLUTION["yaw"] / np.sqrt(12.0)
 
 
+@pytest.mark.parametrize(
+    ("effect", "hidden"),
+    [
+        ("encoder_scale:yaw", {"encoder_scale.yaw.error": -0.05}),
+        (
+            "position_dependent_friction:extension",
+            {
+                "position_dependent_friction.extension.cosine": 2.0,
+                "position_dependent_friction.extension.sine": -1.5,
+                "position_dependent_friction.extension.wavenumber": 56.0,
+            },
+        ),
+    ],
+)
+def test_a_model_that_bends_with_its_parameters_is_not_led_astray(
+    tmp_path: Path, effect: str, hidden: dict[str, float]
+) -> None:
+    """From a prior as wide as the range, the filter settled at 249 rad/m for 56."""
+    run = simulated_run(tmp_path, effect=effect, hidden=hidden)
+    write_text(run.path("models/base/model.toml"), MODEL.replace("[]", f'["{effect}"]'))
+    content = identified(run)
+    assert content["method"] == "ukf"
+    assert_recovered(content, TRUTH)
+    for name, value in hidden.items():
+        entry = content["parameters"][name]
+        assert entry["sd"] < 0.05 * abs(value), name
+        assert abs(entry["estimate"] - value) < 4.0 * entry["sd"], name
+
+
 def test_least_squares_intervals_hold_once_its_bias_is_off(simulated: RunFolder) -> None:
     """Filtered motions move its mass by more than its interval; the replay says by how much."""
     content = identified(simulated, replace(FAST, method="least-squares"))
