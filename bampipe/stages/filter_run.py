@@ -157,18 +157,38 @@ def trial_of(
         velocity = [np.interp(t, motion.t, column) for column in motion.qd.T]
         y = np.hstack([y, np.stack(velocity, axis=1)])
     first = int(np.flatnonzero(np.isfinite(y).all(axis=1))[0])
-    read = y[first, :n]
-    there, rate, _ = system.true_motion(
-        read[None, :], motion.qd[:1], motion.qdd[:1], u[first : first + 1], p
-    )
-    memory = system.initial_memory(there[0], u[first], p)
-    x = np.concatenate([there[0], rate[0], memory])
-    place = np.hypot(2.0 * noise.reading_sd[:n], _SHIFT_KNOWN * (there[0] - read))
     speed = np.maximum(motion.qd_sd[0], np.sqrt(np.mean(motion.qd**2, axis=0)) * 0.1)
-    x_sd = np.concatenate([place, speed, np.zeros(len(memory))])
+    read = (y[first, :n], motion.qd[0], motion.qdd[0])
+    x, x_sd = state_at(system, p, read, u[first], noise.reading_sd[:n], speed)
     # The last stored distribution must be that of the last sample.
     last = first + (t.size - 1 - first) // stride * stride + 1
     return Trial(t[first:last], u[first:last], y[first:last], x, x_sd)
+
+
+def state_at(
+    system: System,
+    p: Array,
+    read: tuple[Array, Array, Array],
+    u: Array,
+    reading_sd: Array,
+    speed_sd: Array,
+) -> tuple[Array, Array]:
+    """Return the state (nx,) of the mechanism whose encoders read this, and its sd (nx,).
+
+    Args:
+        system: the model; p: (n_p,) parameters.
+        read: positions, rates and accelerations that the encoders read, each (n_q,).
+        u: (n_u,) inputs.
+        reading_sd: (n_q,) of a position; speed_sd: (n_q,) of a rate.
+    """
+    q, qd, qdd = read
+    there, rate, _ = system.true_motion(q[None], qd[None], qdd[None], u[None], p)
+    memory = system.initial_memory(there[0], u, p)
+    place = np.hypot(2.0 * reading_sd, _SHIFT_KNOWN * (there[0] - q))
+    return (
+        np.concatenate([there[0], rate[0], memory]),
+        np.concatenate([place, speed_sd, np.zeros(len(memory))]),
+    )
 
 
 def calm(motion: Motion, system: System, t: Array) -> NDArray[np.bool_]:

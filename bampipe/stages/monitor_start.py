@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeAlias
 
@@ -25,7 +25,7 @@ from bampipe.estimate.unscented import (
 )
 from bampipe.physics import System, compile_model
 from bampipe.stages.base import RunFolder
-from bampipe.stages.filter_run import filter_model
+from bampipe.stages.filter_run import filter_model, state_at
 from bampipe.stages.modelfile import load_model
 from bampipe.stages.motions import free_trials, input_columns
 from bampipe.stages.sensor_noise import white_part
@@ -79,7 +79,7 @@ class Start:
     Attributes:
         model, settings: of the filter.
         theta, covariance: (nt,) and (nt, nt) parameters, on the scale of estimation.
-        x_sd: (nx,) standard deviation of the state at the first sample.
+        speed_sd: (n_q,) standard deviation of the rates at the first sample.
         reference: law of the mean NIS over a window; window: its length in samples.
     """
 
@@ -87,9 +87,16 @@ class Start:
     settings: FilterSettings
     theta: Array
     covariance: Array
-    x_sd: Array
+    speed_sd: Array
     reference: Reference
     window: int
+
+    def state(self, system: System, q: Array, u: Array) -> tuple[Array, Array]:
+        """State (nx,) at rest where the encoders read q (n_q,) under inputs u, and its sd (nx,)."""
+        p = self.model.parameters.copy()
+        p[self.model.free] = self.model.to_physical(self.theta)[0]
+        none = np.zeros(q.size)
+        return state_at(system, p[:-1], (q, none, none), u, self.settings.reading_sd, self.speed_sd)
 
 
 def layouts(system: System, session: Session | None) -> tuple[Layout, ...]:
@@ -197,13 +204,14 @@ def start_from_run(run: RunFolder, name: str, options: Options) -> tuple[System,
     )
     n = len(system.coordinates)
     speed = np.sqrt(np.mean([np.mean(np.square(_speeds(trial)), axis=0) for trial in trials], 0))
-    x_sd = np.concatenate(
-        [2.0 * settings.reading_sd, np.maximum(speed, 1e-3), np.zeros(len(system.states) - 2 * n)]
-    )
     window = max(2, round(options.window_s * rate))
+    start = Start(
+        model, settings, theta, covariance, np.maximum(speed, 1e-3),
+        Reference.of_theory(window * n), window,
+    )  # fmt: skip
     means = []
     for trial in trials:
-        begun = Trial(trial.t, trial.u, trial.y, first_state(system, trial.y, trial.u), x_sd)
+        begun = Trial(trial.t, trial.u, trial.y, *start.state(system, trial.y[0], trial.u[0]))
         try:
             whole = filter_trials(model, [begun], theta, covariance, settings).trials[0]
         except FilterFailure as failure:
@@ -213,8 +221,7 @@ def start_from_run(run: RunFolder, name: str, options: Options) -> tuple[System,
                 remedy=f"bampipe diagnose {run.root}",
             ) from failure
         means.append(window_means(whole.nis[window:], n, window))
-    reference = Reference.of_windows(np.concatenate(means), window * n)
-    return system, Start(model, settings, theta, covariance, x_sd, reference, window)
+    return system, replace(start, reference=Reference.of_windows(np.concatenate(means), window * n))
 
 
 def start_from_samples(system: System, t: Array, u: Array, q: Array, options: Options) -> Start:
@@ -249,18 +256,10 @@ def start_from_samples(system: System, t: Array, u: Array, q: Array, options: Op
         noise_sd=np.array([sensed.get(name, 0.0) or least for name in system.noise]),
         walk_sd=spread / np.sqrt(options.memory_s),
     )
-    x_sd = np.concatenate(
-        [2.0 * settings.reading_sd, np.ones(n), np.zeros(len(system.states) - 2 * n)]
-    )
     return Start(
-        model, settings, theta, np.diag(spread**2), x_sd, Reference.of_theory(window * n), window
-    )
-
-
-def first_state(system: System, q: Array, u: Array) -> Array:
-    """State at the first sample: where the encoders are, at rest, memory as at a trial's start."""
-    memory = system.initial_memory(q[0], u[0], system.prior)
-    return np.concatenate([q[0], np.zeros(len(system.coordinates)), memory])
+        model, settings, theta, np.diag(spread**2), np.ones(n),
+        Reference.of_theory(window * n), window,
+    )  # fmt: skip
 
 
 def _trial(run: RunFolder, trial_id: str, system: System) -> Trial:

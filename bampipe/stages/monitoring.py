@@ -18,7 +18,6 @@ from bampipe.stages.monitor_start import (
     FIRST_LOOK,
     Options,
     Start,
-    first_state,
     start_from_samples,
 )
 
@@ -163,9 +162,9 @@ class Monitor:
             if not seen.size:
                 return
             t, u, q = t[seen[0] :], u[seen[0] :], q[seen[0] :]
-            x = first_state(self.system, q, u)
+            x, x_sd = start.state(self.system, q[0], u[0])
             self._filter = OnlineFilter(
-                start.model, start.settings, x, start.x_sd, start.theta, start.covariance
+                start.model, start.settings, x, x_sd, start.theta, start.covariance
             )
         try:
             found = self._filter.advance(t, u, q)

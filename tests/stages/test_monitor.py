@@ -13,25 +13,30 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from identified_run import TRUTH, simulated_run
+from identified_run import MODEL, RESOLUTION, TRUTH, simulated_run
 
-from bampipe.data.store import read_json, read_parquet, write_json
+from bampipe.data.store import read_json, read_parquet, write_json, write_text
 from bampipe.estimate.unscented import Trial, filter_trials
 from bampipe.physics import Model, compile_model, registry
 from bampipe.stages.base import RunFolder
-from bampipe.stages.monitor_start import Options, first_state, start_from_run
+from bampipe.stages.monitor_start import Options, start_from_run
 from bampipe.stages.monitoring import Monitor
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
-    """A simulated run, identified perfectly: the truth with small uncertainties."""
+    """A simulated run, identified perfectly."""
     found = simulated_run(tmp_path_factory.mktemp("monitored"), seconds=12.0)
-    names = list(TRUTH)
-    sd = np.array([0.002 * value for value in TRUTH.values()])
+    return known(found, TRUTH)
+
+
+def known(found: RunFolder, truth: dict[str, float]) -> RunFolder:
+    """The run with the truth as its identified parameters, with small uncertainties."""
+    names = list(truth)
+    sd = np.array([0.002 * abs(value) for value in truth.values()])
     axes = read_json(found.path("ingest/session.json"))["axes"]
     content = {
-        "parameters": {n: {"estimate": TRUTH[n], "sd": s} for n, s in zip(names, sd, strict=True)},
+        "parameters": {n: {"estimate": truth[n], "sd": s} for n, s in zip(names, sd, strict=True)},
         "covariance": {"names": names, "matrix": np.diag(sd**2).tolist()},
         "input_timing": {"estimate": 0.0},
         "noise": {
@@ -70,7 +75,7 @@ def test_same_estimates_as_the_batch_filter(run: RunFolder, begun: tuple) -> Non
     y, u = values[:, 1 : 1 + n].copy(), values[:, 1 + n :].copy()
     batch = filter_trials(
         start.model,
-        [Trial(values[:, 0].copy(), u, y, first_state(system, y, u), start.x_sd)],
+        [Trial(values[:, 0].copy(), u, y, *start.state(system, y[0], u[0]))],
         start.theta, start.covariance, replace(start.settings, stride=1),
     )  # fmt: skip
     report = monitor.report()
@@ -94,6 +99,22 @@ def test_no_alarm_while_nothing_changes(run: RunFolder, begun: tuple) -> None:
     for name, value in TRUTH.items():
         entry = report["parameters"][name]
         assert entry["lower"] - 0.01 * value < value < entry["upper"] + 0.01 * value
+
+
+def test_begins_where_the_mechanism_is_and_not_its_encoder(tmp_path: Path) -> None:
+    """An encoder that reads 5 % too much: where it points, the mechanism never was."""
+    hidden = {"encoder_scale.yaw.error": -0.05}
+    found = simulated_run(tmp_path, trials=1, effect="encoder_scale:yaw", hidden=hidden)
+    wrong = MODEL.replace("[]", '["encoder_scale:yaw"]')
+    write_text(found.path("models/base/model.toml"), wrong)
+    system, start = start_from_run(known(found, TRUTH | hidden), "base", Options())
+    values = samples(found, "t00")
+    monitor = Monitor(system, start, Options(), pytest.fail)
+    monitor.push(tuple(values.columns), values.to_numpy(dtype=float)[:5])
+    read = float(values["q_yaw"].iloc[4])
+    state = monitor.report()["state"]["yaw"]
+    assert abs(0.05 * read) > 10.0 * RESOLUTION["yaw"]
+    assert state["position"] == pytest.approx(0.95 * read, abs=2.0 * RESOLUTION["yaw"])
 
 
 def test_alarm_when_a_sensor_changes(run: RunFolder, begun: tuple) -> None:
