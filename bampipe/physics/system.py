@@ -37,6 +37,7 @@ class System:
             the same moment.
         compensated: axes on which the device has something against gravity; see `compensation`.
         delays: names of the parameters that shift measured forces in time.
+        braked: whether what the effects add depends on a brake's command.
     """
 
     def __init__(self, model: Model, code: generated.Generated) -> None:
@@ -62,6 +63,7 @@ class System:
         self.driven: bool = meta["driven"]
         self.compensated: tuple[int, ...] = tuple(meta["compensated"])
         self.delays: tuple[str, ...] = tuple(meta["delays"])
+        self.braked: bool = meta["braked"]
 
     @property
     def prior(self) -> Array:
@@ -272,6 +274,7 @@ def compile_model(model: Model) -> System:
     added = contribution(equations, derive(Model(model.device)))
     channels = dict(zip(equations.inputs, equations.u, strict=True))
     forces = [channels[name] for name in model.device.forces]
+    brakes = {channels[name] for name in model.device.brakes.values() if name in channels}
     facts = {
         "memory": equations.z_names,
         "inputs": equations.inputs,
@@ -283,6 +286,7 @@ def compile_model(model: Model) -> System:
         and not any(e.has(*forces) for e in equations.rates),
         "compensated": [i for i, e in enumerate(equations.compensation) if e != 0],
         "delays": equations.delays,
+        "braked": any(brakes & e.free_symbols for e in (*added, *equations.rates)),
     }
     sources = {
         "columns": array_source(equations, added),

@@ -112,6 +112,10 @@ def write_json(path: Path, content: Mapping[str, object]) -> None:
     path.write_text(text + "\n", encoding="utf-8")
 
 
+MOVING = ("free", "viscous")
+"""Kinds of trial in which the arm moves; only with commanded brakes do effects of brakes show."""
+
+
 class Stage(Protocol):
     """The module of a stage (see the module docstring)."""
 

@@ -20,13 +20,12 @@ from bampipe.estimate.differentiation import (
     uniform_grid,
 )
 from bampipe.physics.device import LAST_ORDER, derivative
-from bampipe.stages.base import Progress, RunFolder
+from bampipe.stages.base import MOVING, Progress, RunFolder
 
 NAME = "filter"
 SUMMARY = "Velocity and acceleration from the encoders, with error bands"
 
 METHODS = ("auto", "kalman", "butterworth", "savitzky_golay")
-_MOVING = ("free", "viscous")
 _SHORTEST = 32
 _TUNING_PART = 2000
 """Least length, samples, of the parts that the bandwidth is chosen from, where trials are many."""
@@ -100,7 +99,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     rate = float(session["sample_rate_hz"])
     samples = run.require("ingest/samples.parquet", "ingest")
     trials = read_parquet(run.require("ingest/trials.parquet", "ingest"))
-    wanted = trials[trials["kind"].isin(_MOVING) & (trials["status"] != "set_aside")]
+    wanted = trials[trials["kind"].isin(MOVING) & (trials["status"] != "set_aside")]
     ids = [str(name) for name in wanted["trial_id"]]
     skipped: dict[str, str] = {}
 

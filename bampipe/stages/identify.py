@@ -95,12 +95,12 @@ def outputs(config: Config) -> tuple[str, ...]:
 
 
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
-    """Estimate the parameters of one model from all free trials."""
+    """Estimate one model from the free trials; effects of brakes from braked ones too."""
     _check(config)
     session = run.read_json("ingest/session.json")
     system = compile_model(load_model(run, config.model))
     progress(0.0, "reading the trials")
-    motions = read_motions(run, system, fitted=True)
+    motions = read_motions(run, system, fitted=True, braked=system.braked)
     rate = float(session["sample_rate_hz"])
     # A delay in the model and the timing of the inputs are one and the same to the data.
     free = {item.name for item in system.parameters if not item.fixed}

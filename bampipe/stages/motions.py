@@ -1,4 +1,4 @@
-"""Free trials of a run folder as arrays, and a model's residual on them."""
+"""Moving trials of a run folder as arrays, and a model's residual on them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from bampipe.estimate.standstill import resting
 from bampipe.physics import System
 from bampipe.physics.device import derivative
 from bampipe.physics.soundness import require_sound
-from bampipe.stages.base import RunFolder
+from bampipe.stages.base import MOVING, RunFolder
 from bampipe.stages.shelf import Shelf
 
 Array = NDArray[np.float64]
@@ -56,24 +56,28 @@ def held_out_trials(run: RunFolder) -> frozenset[str]:
     return frozenset(trials.loc[trials["hold_out"].astype(bool), "trial_id"].astype(str))
 
 
-def free_trials(run: RunFolder, *, fitted: bool = False) -> tuple[str, ...]:
+def free_trials(run: RunFolder, *, fitted: bool = False, braked: bool = False) -> tuple[str, ...]:
     """Return the free trials that were differentiated, in the order of the session.
 
     Args:
         run: the run folder.
         fitted: without those that the session holds out.
+        braked: those in a viscous field too, after the others: a lag of the brakes, say, shows
+            in no other.
 
     Raises:
         InputError: there is none.
     """
     trials = read_parquet(run.require("ingest/trials.parquet", "ingest"))
-    usable = trials[(trials["kind"] == "free") & (trials["status"] != "set_aside")]
+    kinds = MOVING if braked else MOVING[:1]
+    usable = trials[trials["kind"].isin(kinds) & (trials["status"] != "set_aside")]
+    usable = usable.sort_values("kind", key=lambda kind: kind != MOVING[0], kind="stable")
     if fitted:
         usable = usable[~usable["trial_id"].isin(held_out_trials(run))]
     path = run.require("filter/kinematics.parquet", "filter")
     moving = trial_ids(path)
     found = tuple(str(name) for name in usable["trial_id"] if str(name) in moving)
-    if not found:
+    if not set(found) & set(trials.loc[trials["kind"] == MOVING[0], "trial_id"].astype(str)):
         raise InputError(
             "no free trial to identify from",
             where=str(run.root),
@@ -104,18 +108,20 @@ def read_motion(run: RunFolder, trial_id: str, system: System) -> Motion:
     )
 
 
-def read_motions(run: RunFolder, system: System, *, fitted: bool = False) -> Sequence[Motion]:
+def read_motions(
+    run: RunFolder, system: System, *, fitted: bool = False, braked: bool = False
+) -> Sequence[Motion]:
     """Return the free trials, each read from ``filter/kinematics.parquet`` when it is wanted.
 
     Args:
         run: the run folder.
         system: the model, whose inputs are read.
-        fitted: without those that the session holds out.
+        fitted, braked: as in :func:`free_trials`.
 
     Raises:
         InputError: there is none; on reading one, as :func:`read_motion`.
     """
-    names = free_trials(run, fitted=fitted)
+    names = free_trials(run, fitted=fitted, braked=braked)
     return Shelf(lambda place: read_motion(run, names[place], system), len(names), n_samples)
 
 
@@ -158,7 +164,8 @@ def input_columns(
     """Return the model's inputs as columns (T, n_u).
 
     Args:
-        frame: columns force_<c>, force_rate_<c>, ..., brake_<axis>.
+        frame: columns force_<c>, force_rate_<c>, ..., brake_<axis>; a brake without a column
+            was off.
         names: inputs of the model.
         brakes: input that is the brake command, by axis.
         t: (T,) time, s.
@@ -172,6 +179,9 @@ def input_columns(
     for place, name in enumerate(names):
         if name == "t":
             values[:, place] = t - t[0]
+            continue
+        if name in column and column[name] not in frame:
+            values[:, place] = 0.0
             continue
         values[:, place] = _columns(frame, [column.get(name, name)], where)[:, 0]
     return values
@@ -232,7 +242,12 @@ def _resting(motion: Motion, system: System, band: Band) -> Array:
         system, motion.q, motion.qd, motion.qdd, motion.u, system.prior, motion.t,
         f"trial {motion.trial_id}",
     )  # fmt: skip
-    return resting(motion.qd, motion.qd_sd, band.rate_hz)
+    places = [system.model.device.brakes.get(axis) for axis in system.coordinates]
+    braked = [
+        name in system.inputs and bool(motion.u[:, system.inputs.index(name)].any())
+        for name in places
+    ]
+    return resting(motion.qd, motion.qd_sd, band.rate_hz, np.array(braked))
 
 
 def _columns(frame: pd.DataFrame, names: Sequence[str], where: str) -> Array:

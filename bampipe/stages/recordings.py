@@ -11,7 +11,7 @@ from bampipe.errors import InputError
 from bampipe.estimate.differentiation import uniform_grid
 from bampipe.estimate.hysteresis import noise_of
 from bampipe.physics import Model, System
-from bampipe.stages.base import RunFolder
+from bampipe.stages.base import MOVING, RunFolder
 from bampipe.stages.motions import held_out_trials
 
 
@@ -19,10 +19,6 @@ def recipe_of(run: RunFolder, name: str, model: Model) -> Recipe:
     """``model``, called ``name`` in the run folder, as plain data for worker processes."""
     own = [read_toml(run.path(path)) for path in run.glob(f"models/{name}/effects/*.toml")]
     return Recipe(model.device.declaration, tuple(e.name for e in model.effects), tuple(own))
-
-
-MOVING = ("free", "viscous")
-"""Kinds of trial in which the arm moves; only with commanded brakes do effects of brakes show."""
 
 
 def read_session(

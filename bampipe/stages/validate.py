@@ -22,6 +22,7 @@ from bampipe.stages.free_run import free_runs
 from bampipe.stages.modelfile import identified, load_model, model_inputs
 from bampipe.stages.motions import (
     Motion,
+    free_trials,
     held_out_trials,
     problem_of,
     read_motions,
@@ -106,7 +107,7 @@ class _Compared:
 
 
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
-    """Compare one identified model with all free trials."""
+    """Compare one identified model with all free trials, and those in a viscous field."""
     if not config.cutoff_hz > 0.0:
         raise InputError("must be positive", where="validate.cutoff_hz")
     if config.repeats < 1:
@@ -115,7 +116,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     system = compile_model(load_model(run, config.model))
     p = identified(run, config.model, system)
     late = run.read_json(f"models/{config.model}/identify.json")["input_timing"]
-    motions = read_motions(run, system)
+    motions = read_motions(run, system, braked=True)
     band = Band(float(session["sample_rate_hz"]), config.cutoff_hz)
     timing = late["sd"] > 0.0  # zero where it was not estimated
     problem = problem_of(system, motions, band, timing=timing)
@@ -123,18 +124,17 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     progress(0.1, "held-out fits")
     groups = _groups(run, motions, config.hold_out_by)
     judged = _judged(groups)
-    held_out = _held_out(problem, p, groups)
+    fitted = _fitted(run, system, motions, groups)
+    held_out = _held_out(problem, p, groups, fitted)
     compared = _compare(system, motions, problem, p, held_out, judged)
     notes = []
     if len(set(groups)) == 1:
-        notes.append(
-            "One free trial, or one group: nothing is held out; the error is that of the fit."
-        )
+        notes.append("One trial, or one group: nothing is held out; the error is that of the fit.")
     floor: Array | None = None
     if config.noise_floor:
         progress(0.4, "noise floor")
         try:
-            floor = _noise_floor(run, session, system, motions, band, p, config, groups)
+            floor = _noise_floor(run, session, system, motions, band, p, config, groups, fitted)
         except InputError as error:
             notes.append(f"No noise floor: simulating the fitted model failed ({error}).")
     used = replace(config, cutoff_hz=band.cutoff_hz)
@@ -220,6 +220,18 @@ def _groups(run: RunFolder, motions: Sequence[Motion], channel: str) -> list[int
     return [HELD_OUT if m.trial_id in unseen else k for m, k in zip(motions, numbers, strict=True)]
 
 
+def _fitted(
+    run: RunFolder, system: System, motions: Sequence[Motion], groups: Sequence[int]
+) -> list[bool]:
+    """Return which trials a fit may see: those that `identify` does.
+
+    What brakes do is no part of a model without an effect of theirs: fitted to them, it would
+    be wrong where they are off as well.
+    """
+    free = set(free_trials(run, braked=system.braked))
+    return [m.trial_id in free and g != HELD_OUT for m, g in zip(motions, groups, strict=True)]
+
+
 def _judged(groups: Sequence[int]) -> list[bool]:
     """Return which trials count as held out: those of the session, else all by turns."""
     if HELD_OUT in groups:
@@ -227,14 +239,16 @@ def _judged(groups: Sequence[int]) -> list[bool]:
     return [len(set(groups)) > 1] * len(groups)
 
 
-def _held_out(problem: Problem, p: Array, groups: Sequence[int]) -> list[Array]:
-    """Return, for each trial, the parameters that the trials of other groups give."""
+def _held_out(
+    problem: Problem, p: Array, groups: Sequence[int], fitted: Sequence[bool]
+) -> list[Array]:
+    """Return, for each trial, the parameters that the fitted trials of other groups give."""
     if len(set(groups)) == 1:
         return [p] * problem.n_trials
-    start = fit(problem, p, trials=[i for i, g in enumerate(groups) if g != HELD_OUT]).p
+    start = fit(problem, p, trials=[i for i, fits in enumerate(fitted) if fits]).p
     found = {}
     for group in sorted(set(groups)):
-        others = [i for i, g in enumerate(groups) if g not in (group, HELD_OUT)]
+        others = [i for i, fits in enumerate(fitted) if fits and groups[i] != group]
         found[group] = fit(problem, start, trials=others).p if others else p
     return [found[group] for group in groups]
 
@@ -248,6 +262,7 @@ def _noise_floor(
     p: Array,
     config: Config,
     groups: Sequence[int],
+    fitted: Sequence[bool],
 ) -> Array:
     """Return the held-out error (n_q,) that the identified model leaves when it is the truth.
 
@@ -263,7 +278,7 @@ def _noise_floor(
         seen = replayed(session, settings, system, motions, parameters, band.rate_hz, seed)
         problem = problem_of(system, seen, band)
         start = np.append(parameters, 0.0)
-        for k, held in enumerate(_held_out(problem, start, groups)):
+        for k, held in enumerate(_held_out(problem, start, groups, fitted)):
             if HELD_OUT in groups and groups[k] != HELD_OUT:
                 continue
             used = moving(problem.resting[k], band)

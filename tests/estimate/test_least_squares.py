@@ -138,6 +138,15 @@ def test_rest_is_told_from_a_change_of_direction() -> None:
     assert not still[:990].any()
 
 
+def test_a_brake_may_hold_an_axis_at_every_change_of_direction() -> None:
+    t = np.arange(0.0, 2.0, 1.0 / RATE)
+    qd = np.stack(2 * [np.sin(2 * np.pi * t)], axis=1)
+    still = resting(qd, np.full_like(qd, 1e-2), RATE, np.array([False, True]))
+    assert not still[:, 0].any()
+    np.testing.assert_array_equal(still[:, 1], np.abs(qd[:, 1]) < 0.1)
+    assert 0.04 < still[:, 1].mean() < 0.09
+
+
 def test_samples_at_rest_do_not_count() -> None:
     inner = problem(1)
     mask = np.zeros((4000, 1), dtype=bool)

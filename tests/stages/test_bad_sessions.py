@@ -488,6 +488,14 @@ ASIDE: dict[str, tuple[Damage, str]] = {
         both(put("trials.0.kind", "viscous"), put("trials.0.viscous_n_s_per_m", 40)),
         "declared viscous, but no brake is ever commanded",
     ),
+    "viscous trial whose brakes were not recorded": (
+        both(
+            put("trials.0.kind", "viscous"),
+            put("trials.0.viscous_n_s_per_m", 40),
+            drop("brakes"),
+        ),
+        "declared viscous, but no brake command is recorded",
+    ),
     "locked trial that moves": (
         both(
             put("trials.0.kind", "locked"),

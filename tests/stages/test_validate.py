@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from identified_run import shared_run, simulated_run
+from identified_run import MODEL, shared_run, simulated_run
 
 from bampipe.data.schema import validate as check
-from bampipe.data.store import read_json, read_parquet, sha256_file, write_json
+from bampipe.data.store import read_json, read_parquet, sha256_file, write_json, write_text
 from bampipe.errors import InputError
-from bampipe.stages import identify, validate
+from bampipe.stages import filter as filter_stage
+from bampipe.stages import identify, ingest, validate
+from bampipe.stages import simulate as simulation
 from bampipe.stages.base import RunFolder, silent
 
 SQUARES = identify.Config(method="least-squares")
@@ -54,6 +57,38 @@ def test_shared_sessions_stand_out_where_something_is_missing(
     for axis, entry in content["axes"].items():
         ratio = entry["held_out_rmse"] / entry["noise_floor"]
         assert ratio > 3.0 if axis == missing else ratio < 1.5, (axis, ratio)
+
+
+def test_what_brakes_do_is_judged_in_the_trials_in_which_they_act(tmp_path: Path) -> None:
+    """A lag of the brakes: free trials know nothing of it, and must not suffer from it."""
+    hidden = simulation.Config(
+        effects=("brake_lag",), seed=5, trials=2, viscous_trials=2, duration=8
+    )
+    truth = simulation.simulate_session(tmp_path / "session", hidden)
+    run = RunFolder(tmp_path / "run")
+    ingest.execute(run, run.root, ingest.Config(session=str(tmp_path / "session")), silent)
+    filter_stage.execute(run, run.root, filter_stage.Config(), silent)
+    ratios = {}
+    for name, effects in (("base", "[]"), ("lag", '["brake_lag"]')):
+        text = MODEL.replace("[]", effects).replace('"base"', f'"{name}"', 1)
+        write_text(run.path(f"models/{name}/model.toml"), text)
+        identify.execute(run, run.root, replace(SQUARES, model=name), silent)
+        validate.execute(run, run.root, validate.Config(model=name), silent)
+        content = read_json(run.path(f"models/{name}/validate.json"))
+        check(content, "validate", "validate.json")
+        ratios[name] = {
+            axis: entry["held_out_rmse"] / entry["noise_floor"]
+            for axis, entry in content["axes"].items()
+        }
+        for trial, axes in content["trials"].items():
+            if "free" in trial:
+                assert axes["yaw"]["held_out_rmse"] < 0.1, (name, trial)
+    assert min(ratios["base"].values()) > 5.0, ratios
+    assert max(ratios["lag"].values()) < 1.5, ratios
+    found = read_json(run.path("models/lag/identify.json"))["parameters"]["brake_lag.time_constant"]
+    told = read_json(Path(str(truth["truth"])))["parameters"]["brake_lag.time_constant"]
+    assert found["estimate"] == pytest.approx(told, rel=0.01)
+    assert found["sd"] < 0.01 * told
 
 
 def test_wrong_parameters_show(simulated: RunFolder, tmp_path: Path) -> None:

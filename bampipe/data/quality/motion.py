@@ -47,7 +47,7 @@ def refuse_wrong_motion(table: Table, columns: dict[str, np.ndarray]) -> None:
 
 
 def refuse_wrong_brakes(table: Table, columns: dict[str, np.ndarray]) -> None:
-    """A free trial has its brakes off."""
+    """A free trial has its brakes off, a viscous one has them on, and recorded."""
     entry, brakes = table.entry, table.session.brakes
     highest = {b.axis: float(np.abs(columns[f"brake_{b.axis}"]).max()) for b in brakes}
     for brake in brakes:
@@ -60,5 +60,10 @@ def refuse_wrong_brakes(table: Table, columns: dict[str, np.ndarray]) -> None:
             )
         if brake.axis == entry.locked_axis and highest[brake.axis] == 0.0:
             table.notes.append(f"brake of the locked axis {brake.axis} is never commanded")
-    if entry.kind == "viscous" and brakes and not any(highest.values()):
+    if entry.kind == "viscous" and not brakes:
+        raise table.fault(
+            "declared viscous, but no brake command is recorded",
+            remedy="name the columns of the commands under [brakes] in session.toml",
+        )
+    if entry.kind == "viscous" and not any(highest.values()):
         raise table.fault("declared viscous, but no brake is ever commanded")
