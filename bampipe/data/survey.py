@@ -15,7 +15,8 @@ from bampipe.errors import InputError
 
 MOST_FILES = 500
 _WORDS = {
-    "time": "t time timestamp stamp zeit clock seconds sec secs nanosec nsec nsecs nanoseconds",
+    "time": "t time timestamp stamp zeit clock seconds sec secs nanosec nsec nsecs nanoseconds"
+    " millis micros milliseconds microseconds",
     "reference": "goal ref reference setpoint target desired des cmd command soll sollwert demand"
     " wanted",
     "brake": "brake bremse",
@@ -156,7 +157,7 @@ def words(name: str) -> list[str]:
 
 
 def _role(name: str, stated: str) -> str:
-    if stated == "datetime":
+    if stated == "datetime" or name.strip().lower() in _UNIT_WORDS["time"]:
         return "time"
     said = set(words(name))
     first = [role for role in ("reference", "brake") if said & set(_WORDS[role].split())]

@@ -13,7 +13,7 @@ from bampipe.data.units import spelled
 from bampipe.stages.proposal.notes import UNKNOWN, Notes, quoted
 
 _LIKELY_RATE_HZ = 100.0
-"""Proposed where nothing tells the rate."""
+"""Taken for the other guesses where nothing tells the rate."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ def _in_one_column(column: Column, notes: Notes) -> Clock:
     if not kind:
         note = notes.ask("the unit of time: no unit gives a likely rate")
         lines = (f"column = {quoted(column.name)}", f'unit = "{UNKNOWN}"{note}')
-        rate = f"sample_rate_hz = {_LIKELY_RATE_HZ}" + notes.ask("sample_rate_hz, the true rate")
+        rate = f'sample_rate_hz = "{UNKNOWN}"' + notes.ask("sample_rate_hz, the true rate")
         samples = np.arange(len(t)) / _LIKELY_RATE_HZ
         return Clock(samples, (column.name,), _table(*lines), rate)
     rate_hz = guesses.sample_rate(t)
@@ -87,7 +87,7 @@ def _counted(found: Survey, notes: Notes) -> Clock:
         rate = f"sample_rate_hz = {1.0 / step_s:g}"
         return Clock(step_s * samples, (name,), _table(f'unit = "samples"{note}'), rate)
     note = notes.guess("no column increases like a time")
-    rate = f"sample_rate_hz = {_LIKELY_RATE_HZ}" + notes.ask("sample_rate_hz, the true rate")
+    rate = f'sample_rate_hz = "{UNKNOWN}"' + notes.ask("sample_rate_hz, the true rate")
     return Clock(samples / _LIKELY_RATE_HZ, (), _table(f'unit = "samples"{note}'), rate)
 
 

@@ -130,6 +130,9 @@ class Matcher:
             if not free or column.role == "reference" or column.constant or column is position:
                 continue
             values = np.nan_to_num(column.values)
+            known = unit(column.unit) if column.unit else None
+            if known is not None and known.si in ("rad", "m"):  # of another axis
+                continue
             if abs(float(np.corrcoef(position.values, values)[0, 1])) > 0.98:
                 continue
             bits = guesses.signed_register(values)
