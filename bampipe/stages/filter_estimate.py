@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bampipe.errors import InputError
 from bampipe.estimate.filter_uncertainty import sandwich_covariance
-from bampipe.estimate.unscented import constrain
+from bampipe.estimate.unscented import (
+    FilterFailure,
+    FilterModel,
+    FilterSettings,
+    Trial,
+    constrain,
+    filter_trials,
+)
 from bampipe.physics import System
 from bampipe.stages.base import Progress, RunFolder
 from bampipe.stages.estimates import Estimate, timing_entry
@@ -40,6 +49,11 @@ _REGIONS = (30.0, 8.0)
 parameters is searched: a prior as wide as a range leads such a filter astray."""
 _LEAST_REGION = 3e-4
 """Least width of that, in standard deviations of the prior, times the number above."""
+_REPEATS, _AROUND = 4, 10.0
+"""Most passes more of such a model; how far around the last answer, in its standard deviations."""
+_PARTS, _LIKELIER = (1, 2, 4), 30.0
+"""By what the Runge-Kutta step is divided for it, and what that must add to the logarithm of a
+trial's likelihood: three times what it adds where friction is smooth on the scale of a step."""
 _AGREE = 6.0
 """Joint standard deviations within which filter and least squares are at one place."""
 
@@ -82,7 +96,9 @@ def estimate_by_filter(
     progress(0.15, "noise levels")
     late_sd = model.upper[kept:] / np.sqrt(3.0)
     late = np.zeros(late_sd.size)
-    settled = np.append(squares.raw.p[problem.free[:kept]], late)
+    bends = not problem.linear
+    answer = np.append(squares.p[problem.free[:kept]], late)
+    settled = answer if bends else np.append(squares.raw.p[problem.free[:kept]], late)
     known = np.append(np.sqrt(np.diag(squares.raw.covariance))[:kept], late_sd)
     settings = untuned(system, noise, choice)
     settings = replace(settings, walk_sd=np.append(settings.walk_sd, late))
@@ -97,14 +113,12 @@ def estimate_by_filter(
     # more and more process noise, as a model that lacks much needs.
     attempts: list[Attempt] = [(first, spread, 1.0)]
     attempts += [(settled, prior_sd, 4.0**k) for k in range(_RESTARTS)]
-    bends = not problem.linear
     if bends:
         around = [
             np.minimum(size * np.hypot(known, _LEAST_REGION * prior_sd), spread)
             for size in _REGIONS
         ]
-        attempts = [*((settled, region, 1.0) for region in around), *attempts]
-    answer = np.append(squares.p[problem.free[:kept]], late)
+        attempts = [*((answer, region, 1.0) for region in around), *attempts]
 
     def agrees(found: FilterRun) -> bool:
         """Whether the filter is where least squares are, the timing left out.
@@ -125,10 +139,16 @@ def estimate_by_filter(
         said = what.format(motions[place].trial_id)
         return MotionLost(said, where=f"model {model_name}", remedy=remedy)
 
-    found = run_filter(
-        model, trials, attempts, settings, choice, told, lost, system.coordinates,
-        agrees, 1 + len(_REGIONS),
-    )  # fmt: skip
+    def run_from(attempts: Sequence[Attempt], settings: FilterSettings) -> FilterRun:
+        return run_filter(
+            model, trials, attempts, settings, choice, told, lost, system.coordinates,
+            agrees, 1 + len(_REGIONS),
+        )  # fmt: skip
+
+    found = run_from(attempts, settings)
+    if bends:
+        finer = _fine_enough(found, model, trials[0])
+        found = _until_it_stays(found, model, finer, run_from)
     covariance, blocks = sandwich_covariance(
         found.trials,
         model.n_states,
@@ -138,12 +158,12 @@ def estimate_by_filter(
     )
     value, slope = model.to_physical(constrain(model, found.theta, covariance))
     scaled = covariance * np.outer(slope, slope)
-    systematic = _systematic(value[:kept], scaled, squares)
+    p = np.append(start, 0.0)
+    p[problem.free] = value
+    systematic = _systematic(p, scaled, squares, kept)
     scaled[:kept, :kept] += np.diag(systematic**2)
     tight = slope * np.sqrt(np.diag(found.covariance))
     at_bound = (value - model.lower < tight) | (model.upper - value < tight)
-    p = np.append(start, 0.0)
-    p[problem.free] = value
     names = [item.name for item in free]
     details = [
         {
@@ -176,13 +196,72 @@ def estimate_by_filter(
     )
 
 
-def _systematic(value: Array, covariance: Array, squares: Squares) -> Array:
-    """Return how far filter and least squares disagree beyond their standard deviations.
+def _fine_enough(found: FilterRun, model: FilterModel, trial: Trial) -> FilterSettings:
+    """Return the settings with a step that makes a trial as likely as finer ones do.
+
+    Friction that falls within millimetres a second has bent before a step is over.
+    """
+
+    def log_likelihood(step: float) -> float:
+        wide = np.diag(_AROUND**2 * np.diag(found.covariance))
+        chosen = replace(found.settings, longest_step=step)
+        filtered = filter_trials(model, [trial], found.theta, wide, chosen)
+        return float(np.nansum(filtered.trials[0].log_likelihood))
+
+    step = found.settings.longest_step
+    # Where the filter fails, so will the passes that follow, which say why.
+    with suppress(FilterFailure):
+        tried = {part: log_likelihood(step / part) for part in _PARTS}
+        enough = max(tried.values()) - _LIKELIER
+        step /= min(part for part, likely in tried.items() if likely > enough)
+    return replace(found.settings, longest_step=step)
+
+
+def _until_it_stays(
+    found: FilterRun,
+    model: FilterModel,
+    settings: FilterSettings,
+    run_from: Callable[[Sequence[Attempt], FilterSettings], FilterRun],
+) -> FilterRun:
+    """Filter again around the answer, as long as that moves it and makes the readings likelier.
+
+    One pass takes the model as straight across all that it did not know when it began; where the
+    model bends, that leaves its mark on the answer. A start this wide of an answer adds a
+    hundredth to what is known of it.
+    """
+    for _ in range(_REPEATS):
+        finer = settings.longest_step < found.settings.longest_step
+        value, slope = model.to_physical(found.theta)
+        sd = np.sqrt(np.diag(found.covariance))
+        try:
+            again = run_from([(value, _AROUND * slope * sd, 1.0)], settings)
+        except MotionLost:
+            break
+        if again.log_likelihood < found.log_likelihood and not finer:
+            break
+        stays = np.all(np.abs(again.theta - found.theta) < sd)
+        found = replace(again, restarts=found.restarts)
+        if stays:
+            break
+    return found
+
+
+def _systematic(p: Array, covariance: Array, squares: Squares, count: int) -> Array:
+    """Return how far filter and least squares disagree beyond their standard deviations, (count,).
 
     Both see the same data and err alike by noise, but not by what the model lacks: where the
     model is right, their difference stays below the sum of their variances and adds nothing.
+    Where the model bends, least squares are asked again before that is believed: they may have
+    many answers, and the filter's be as good as theirs.
+
+    Args:
+        p: (n_p + 1,) the filter's answer; covariance: (nt, nt) of it.
+        squares: the other; count: how many parameters of the model are estimated.
     """
-    count = value.size
-    difference = value - squares.p[squares.problem.free[:count]]
-    variance = np.diag(covariance)[:count] + np.diag(squares.raw.covariance)[:count]
+    variance = (np.diag(covariance) + np.diag(squares.raw.covariance))[:count]
+    difference = (p - squares.p)[squares.problem.free[:count]]
+    if not squares.problem.linear and np.any(difference**2 > 2.0 * variance):
+        # An answer of the filter's that cannot be replayed is all the more in doubt.
+        with suppress(InputError):
+            difference = squares.gap(p)[:count]
     return np.asarray(np.sqrt(np.maximum(difference**2 - variance, 0.0)))

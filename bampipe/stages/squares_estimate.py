@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -19,6 +19,13 @@ from bampipe.stages.motions import Motion, problem_of
 from bampipe.stages.replayed import replayed
 
 Array = NDArray[np.float64]
+
+_CORRECTIONS = 5
+"""Most replays of a model that bends with its parameters, until its fit is the measured one's."""
+_SAME = 1.0
+"""Standard deviations within which the two fits are the same."""
+_SLOPE = (0.3, 3.0)
+"""Range of how far the fit to a replay moves with a parameter: 1 where there is no bias."""
 
 
 def problem_with(problem: Problem, timing: bool) -> Problem:
@@ -42,12 +49,25 @@ class Squares:
         raw: the fit; p: (n_p + 1,) without its bias, within the bounds.
         bias: (n_free,) what was taken off; None where the model could not be replayed.
         problem: what was fitted.
+        bias_at: (n_p + 1,) parameters to their bias (n_free,), by a replay, which may raise
+            :class:`InputError`; None where there is no bias.
     """
 
     raw: LeastSquares
     p: Array
     bias: Array | None
     problem: Problem
+    bias_at: Callable[[Array], Array] | None = None
+
+    def gap(self, p: Array) -> Array:
+        """Return how far the fit would be from what it is if ``p`` (n_p + 1,) were true, (n_free,).
+
+        Raises:
+            InputError: the model cannot be replayed with these parameters.
+        """
+        free = self.problem.free
+        bias = np.zeros(free.size) if self.bias_at is None else self.bias_at(p)
+        return np.asarray(p[free] + bias - self.raw.p[free])
 
 
 def unbiased(
@@ -63,28 +83,74 @@ def unbiased(
     Filtering blurs changes of direction and shortens accelerations, so that the fit to a perfect
     machine is not its truth. How far off it is, is measured: the fitted model is replayed along
     the trials, read by the same encoders, sent through the same filters and fitted again
-    (parametric bootstrap, Efron and Tibshirani 1993, chapter 10; indirect inference). The force
-    sensor is without noise there: its noise adds scatter, not bias.
+    (parametric bootstrap, Efron and Tibshirani 1993, chapter 10). The force sensor is without
+    noise there: its noise adds scatter, not bias. Where the model bends with its parameters and the
+    bias is large, it is not that at the answer: those parameters are looked for whose replay is
+    fitted as the measurement is (indirect inference, Gourieroux, Monfort and Renault 1993).
 
     Args:
         session: ``ingest/session.json``; settings: ``filter/filter.json``.
         system: the model; motions: the trials; problem: as fitted; raw: the fit.
     """
-    own = raw.p[: len(system.parameters)]
-    rate = problem.band.rate_hz
+    free, rate = problem.free, problem.band.rate_hz
+    count = len(system.parameters)
+    timing = bool(free[-1] == count)
+
+    def bias_at(p: Array) -> Array:
+        seen = replayed(
+            session, settings, system, motions, p[:count], rate, (0, 0), force_noise=False
+        )
+        again = fit(problem_with(problem_of(system, seen, problem.band), timing), raw.p)
+        return np.asarray((again.p - np.append(p[:count], 0.0))[free])
+
+    def moved(bias: Array) -> Array:
+        p = raw.p.copy()
+        p[free] = np.clip(p[free] - bias, problem.lower, problem.upper)
+        return p
+
     try:
-        seen = replayed(session, settings, system, motions, own, rate, (0, 0), force_noise=False)
-    except (
-        InputError
-    ):  # a model that lacks much may not hold the motion; it has no bias to speak of
+        bias = bias_at(raw.p)
+    except InputError:
+        # A model that lacks much may not hold the motion; it has no bias to speak of.
         return Squares(raw, raw.p, None, problem)
-    timing = bool(problem.free[-1] == len(own))
-    again = fit(problem_with(problem_of(system, seen, problem.band), timing), raw.p)
-    truth = np.append(own, 0.0)
-    bias = (again.p - truth)[problem.free]
-    p = raw.p.copy()
-    p[problem.free] = np.clip(p[problem.free] - bias, problem.lower, problem.upper)
-    return Squares(raw, p, bias, problem)
+    # A large bias of a model that bends changes on the way to the answer, by some bias^2 / p.
+    sd = np.sqrt(np.diag(raw.covariance))
+    found = Squares(raw, moved(bias), bias, problem, bias_at)
+    if not problem.linear and np.any((bias**2 > sd * np.abs(raw.p[free]))[free < count]):
+        bias = _settled(found, moved)
+        found = replace(found, p=moved(bias), bias=bias)
+    return found
+
+
+def _settled(squares: Squares, moved: Callable[[Array], Array]) -> Array:
+    """Return the bias (n_free,) at the parameters that it leads to, by secants, one by one.
+
+    Args:
+        squares: with the bias at the fit itself; moved: parameters with a bias taken off.
+    """
+    raw, free, bias = squares.raw, squares.problem.free, squares.bias
+    if bias is None:
+        raise RuntimeError("no bias to settle")
+    sd = np.maximum(np.sqrt(np.diag(raw.covariance)), np.finfo(float).tiny)
+    best, least = bias, np.inf
+    before, off_before = raw.p[free], bias
+    for _ in range(_CORRECTIONS):
+        p = moved(bias)
+        try:
+            off = squares.gap(p)
+        except InputError:
+            break
+        size = float(np.max(np.abs(off) / sd))
+        if size < least:
+            best, least = bias, size
+        if size < _SAME:
+            break
+        step = p[free] - before
+        with np.errstate(divide="ignore", invalid="ignore"):
+            slope = np.nan_to_num((off - off_before) / step, nan=1.0, posinf=1.0, neginf=1.0)
+        before, off_before = p[free], off
+        bias = raw.p[free] - (p[free] - off / np.clip(slope, *_SLOPE))
+    return best
 
 
 def estimate_by_squares(system: System, motions: Sequence[Motion], squares: Squares) -> Estimate:

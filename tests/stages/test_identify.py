@@ -223,6 +223,28 @@ def test_a_model_that_bends_with_its_parameters_is_not_led_astray(
         assert abs(entry["estimate"] - value) < 4.0 * entry["sd"], name
 
 
+def test_friction_that_falls_within_a_step(tmp_path: Path) -> None:
+    """Stribeck friction gone at 17 mm/s, which an axis passes in a few samples.
+
+    Least squares, their bias taken off where the fit was and not where it led to, gave no force
+    at all; the filter 3.45 N +- 0.005 or 47 N, by where it began and by its step.
+    """
+    hidden = {"stribeck.extension.force": 3.5, "stribeck.extension.speed": 0.017}
+    run = simulated_run(tmp_path, effect="stribeck:extension", hidden=hidden)
+    write_text(run.path("models/base/model.toml"), MODEL.replace("[]", '["stribeck:extension"]'))
+    squares = identified(run, replace(FAST, method="least-squares"))["parameters"]
+    for name, value in hidden.items():
+        assert abs(squares[name]["estimate"] - value) < 2.0 * squares[name]["sd"], name
+    assert squares["stribeck.extension.force"]["estimate"] == pytest.approx(3.5, rel=0.3)
+    for step in (2e-3, 5e-4):
+        found = identified(run, replace(FAST, longest_step_s=step))["parameters"]
+        for name, value in {**TRUTH, **hidden}.items():
+            entry = found[name]
+            assert abs(entry["estimate"] - value) < 4.0 * entry["sd"], (step, name, entry)
+        force = found["stribeck.extension.force"]
+        assert force["sd"] < 0.02 * force["estimate"]
+
+
 def test_least_squares_intervals_hold_once_its_bias_is_off(simulated: RunFolder) -> None:
     """Filtered motions move its mass by more than its interval; the replay says by how much."""
     content = identified(simulated, replace(FAST, method="least-squares"))
