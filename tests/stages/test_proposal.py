@@ -265,3 +265,43 @@ def test_each_axis_is_checked_by_a_velocity_of_its_own(tmp_path):
     lines = propose(tmp_path, "bam").session.splitlines()
     with_velocity = [line.split(" = ")[0] for line in lines if ", velocity = " in line]
     assert with_velocity == ["pitch"]
+
+
+def stage_log() -> dict[str, np.ndarray]:
+    """A slide on a test stand at 500 Hz: ms, mm, N, and the angle of a joint beside it in rad."""
+    t = np.arange(4000) / 500.0
+    x = 0.02 * np.sin(2 * np.pi * 0.7 * t) + 0.01 * np.sin(2 * np.pi * 1.3 * t)
+    v = np.gradient(x, t)
+    force = 8.0 * np.gradient(v, t) + 40.0 * v + 6.0 * np.tanh(v / 1e-3)
+    force += np.random.default_rng(3).normal(0.0, 3.0, t.size)
+    # The other joint goes with the velocity of the first better than any noisy force does.
+    return {"ms": 1e3 * t, "pos_mm": 1e3 * x, "load_cell_N": force, "Joint 2 (rad)": 3.0 * v}
+
+
+def write_stage_log(folder: Path, *columns: str) -> None:
+    log = stage_log()
+    rows = np.column_stack([log[name] for name in columns])
+    folder.mkdir(parents=True)
+    np.savetxt(folder / "a.csv", rows, "%.6f", ",", header=",".join(columns), comments="")
+
+
+def test_a_clock_named_by_its_unit(tmp_path):
+    write_stage_log(tmp_path / "a", "ms", "pos_mm", "load_cell_N")
+    session, proposal = proposed(tmp_path / "a")
+    assert session["time"] == {"column": "ms", "unit": "ms"}
+    assert session["sample_rate_hz"] == 500 and proposal.fill_in == []
+
+
+def test_a_rate_that_nobody_knows_is_refused_until_it_is_given(tmp_path):
+    write_stage_log(tmp_path / "a", "pos_mm", "load_cell_N")
+    _, proposal = proposed(tmp_path / "a")
+    assert proposal.fill_in == ["sample_rate_hz, the true rate"]
+    with pytest.raises(InputError, match=r'sample_rate_hz: found "\?"'):
+        read_session(tmp_path / "a")
+
+
+def test_the_position_of_another_joint_is_no_force(tmp_path):
+    write_stage_log(tmp_path / "a", "ms", "pos_mm", "Joint 2 (rad)", "load_cell_N")
+    session, _ = proposed(tmp_path / "a")
+    assert session["encoders"]["carriage"]["column"] == "pos_mm"
+    assert session["force"]["columns"] == ["load_cell_N"]
