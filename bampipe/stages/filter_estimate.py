@@ -54,6 +54,8 @@ _REPEATS, _AROUND = 4, 10.0
 _PARTS, _LIKELIER = (1, 2, 4), 30.0
 """By what the Runge-Kutta step is divided for it, and what that must add to the logarithm of a
 trial's likelihood: three times what it adds where friction is smooth on the scale of a step."""
+_DOUBT = 3.0
+"""Standard deviations of least squares within which their scatter is no evidence against it."""
 _AGREE = 6.0
 """Joint standard deviations within which filter and least squares are at one place."""
 
@@ -251,8 +253,8 @@ def _systematic(p: Array, covariance: Array, squares: Squares, count: int) -> Ar
 
     Both see the same data and err alike by noise, but not by what the model lacks: where the
     model is right, their difference stays below the sum of their variances and adds nothing.
-    Where the model bends, least squares are asked again before that is believed: they may have
-    many answers, and the filter's be as good as theirs.
+    Where the model bends, least squares know less than the filter and scatter on their own: they
+    are asked what they would be if the filter's answer were true, and count if that is not so.
 
     Args:
         p: (n_p + 1,) the filter's answer; covariance: (nt, nt) of it.
@@ -260,8 +262,9 @@ def _systematic(p: Array, covariance: Array, squares: Squares, count: int) -> Ar
     """
     variance = (np.diag(covariance) + np.diag(squares.raw.covariance))[:count]
     difference = (p - squares.p)[squares.problem.free[:count]]
-    if not squares.problem.linear and np.any(difference**2 > 2.0 * variance):
+    if not squares.problem.linear and np.any(difference**2 > variance):
         # An answer of the filter's that cannot be replayed is all the more in doubt.
         with suppress(InputError):
             difference = squares.gap(p)[:count]
+            difference[difference**2 < _DOUBT**2 * variance] = 0.0
     return np.asarray(np.sqrt(np.maximum(difference**2 - variance, 0.0)))
