@@ -183,6 +183,7 @@ def estimate_by_filter(
         "input_timing": timing_entry(p, scaled[-1, -1] if timing else 0.0),
         "blocks": blocks,
         "restarts": found.restarts,
+        "repeats": found.repeats,
         "state_3sigma": state_3sigma(system, found.trials),
         "convergence": convergence(names, model, found, covariance),
     }
@@ -242,7 +243,7 @@ def _until_it_stays(
         if again.log_likelihood < found.log_likelihood and not finer:
             break
         stays = np.all(np.abs(again.theta - found.theta) < sd)
-        found = replace(again, restarts=found.restarts)
+        found = replace(again, restarts=found.restarts, repeats=found.repeats + 1)
         if stays:
             break
     return found

@@ -85,6 +85,7 @@ class FilterRun:
         settings: noise levels of the main pass.
         order: places of ``trials`` in the session.
         restarts: attempts that failed before.
+        repeats: how often it was begun again around its own answer.
     """
 
     search: FilterResult
@@ -94,6 +95,7 @@ class FilterRun:
     settings: FilterSettings
     order: tuple[int, ...]
     restarts: int
+    repeats: int = 0
 
     @property
     def passes(self) -> tuple[Stored, ...]:

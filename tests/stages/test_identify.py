@@ -62,6 +62,7 @@ def test_intervals_hold_on_a_simulated_session(simulated: RunFolder) -> None:
     ]
     assert np.sqrt(np.mean(np.square(z))) < 2.0
     assert np.max(np.abs(z)) < 4.0
+    assert content["repeats"] == 0  # linear in its parameters: one pass is enough
 
 
 @pytest.mark.parametrize("factor", [0.2, 5.0])
@@ -217,6 +218,7 @@ def test_a_model_that_bends_with_its_parameters_is_not_led_astray(
     content = identified(run)
     assert content["method"] == "ukf"
     assert_recovered(content, TRUTH)
+    assert content["repeats"] > 0
     for name, value in hidden.items():
         entry = content["parameters"][name]
         assert entry["sd"] < 0.05 * abs(value), name

@@ -197,6 +197,8 @@ def _convergence(results: Results, content: dict[str, Any], trace: pd.DataFrame)
         f"Convergence of the parameters{results.as_in('Fig. 7')}, with the filter's own 95 % "
         "bounds. Dotted verticals: a new trial starts."
     )
+    if content.get("repeats", 0):
+        caption += " The filter's last run, which starts around the answer of the one before."
     return Figure("convergence", caption, style.svg(figure))
 
 

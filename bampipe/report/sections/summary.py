@@ -133,7 +133,8 @@ def _row(title: str, axes: tuple[str, ...], cell: Any) -> tuple[str, ...]:
 def _estimate(entry: dict[str, Any] | None) -> str:
     if entry is None:
         return "–"
-    return f"{wording.with_sd(entry['estimate'], entry.get('sd'))} {wording.unit(entry['unit'])}"
+    value = wording.with_sd(entry["estimate"], entry.get("sd"))
+    return f"{value} {wording.unit(entry['unit'])}".rstrip()
 
 
 def _error(results: Results, axis: str, entry: dict[str, Any] | None, key: str) -> str:
