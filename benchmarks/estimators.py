@@ -10,7 +10,6 @@ bias, standard deviation, how often the stated 95 % interval holds the truth, se
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import tempfile
 import time
@@ -57,9 +56,8 @@ class Found:
     seconds: float
 
 
-def prepare(root: Path, seed: int, trials: int, duration: float) -> tuple[RunFolder, Array]:
-    """Simulate a session up to the filter stage; return it and the truth."""
-    config = simulate.Config(seed=seed, trials=trials, duration=duration)
+def prepare(root: Path, config: simulate.Config) -> tuple[RunFolder, dict[str, float]]:
+    """Simulate a session up to the filter stage; return it, with a base model, and the truth."""
     simulate.simulate_session(root / "session", config, silent)
     run = RunFolder(root / "run")
     for folder in ("ingest", "filter", "models/base"):
@@ -67,9 +65,8 @@ def prepare(root: Path, seed: int, trials: int, duration: float) -> tuple[RunFol
     ingest.execute(run, run.root, ingest.Config(session=str(root / "session")), silent)
     filter_stage.execute(run, run.root, filter_stage.Config(), silent)
     write_text(run.path("models/base/model.toml"), MODEL)
-    told = json.loads((root / "session.truth.json").read_text())["parameters"]
-    system = compile_model(Model(registry.device("bam")))
-    return run, np.array([told[item.name] for item in system.parameters])
+    truth: dict[str, float] = read_json(root / "session.truth.json")["parameters"]
+    return run, truth
 
 
 def by_stage(run: RunFolder, names: Sequence[str], settings: dict[str, object]) -> Found:
@@ -192,7 +189,9 @@ def main() -> None:
     found: dict[str, list[Found]] = defaultdict(list)
     for seed in range(chosen.seed, chosen.seed + chosen.sessions):
         with tempfile.TemporaryDirectory() as folder:
-            run, truth = prepare(Path(folder), seed, chosen.trials, chosen.duration)
+            config = simulate.Config(seed=seed, trials=chosen.trials, duration=chosen.duration)
+            run, told = prepare(Path(folder), config)
+            truth = np.array([told[name] for name in names])
             results = {label: by_stage(run, names, dict(s)) for label, s in BY_STAGE.items()}
             results["instrumental variables"] = by_instruments(run, system)
         for label, one in results.items():

@@ -21,13 +21,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from estimators import MODEL, prepare
 from hidden_effects import SINGLES
 
-from bampipe.stages import filter as filter_stage
-from bampipe.stages import identify, ingest, simulate, validate
+from bampipe.data.store import write_text
+from bampipe.stages import identify, simulate, validate
 from bampipe.stages.base import RunFolder, silent
-
-MODEL = 'schema = "bampipe.model/1"\nname = "{name}"\ndevice = "bam"\neffects = {effects}\n'
 
 
 @dataclass(frozen=True)
@@ -75,21 +74,15 @@ def outcome(effect: str, seed: int) -> Outcome:
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
         config = simulate.Config(effects=(effect,), seed=seed, viscous_trials=3 if braked else 0)
-        simulate.simulate_session(root / "session", config, silent)
-        run = RunFolder(root / "run")
-        for part in ("ingest", "filter", "models/base", "models/right"):
-            run.path(part).mkdir(parents=True)
-        ingest.execute(run, run.root, ingest.Config(session=str(root / "session")), silent)
-        filter_stage.execute(run, run.root, filter_stage.Config(), silent)
+        run, truth = prepare(root, config)
+        right = MODEL.replace("[]", json.dumps([effect])).replace('"base"', '"right"', 1)
+        write_text(run.path("models/right/model.toml"), right)
         ratios, seconds = [], 0.0
-        for name, effects in (("base", []), ("right", [effect])):
-            text = MODEL.format(name=name, effects=json.dumps(effects))
-            run.path(f"models/{name}/model.toml").write_text(text, encoding="utf-8")
+        for name in ("base", "right"):
             begun = time.process_time()
             identify.execute(run, run.root, identify.Config(model=name), silent)
             seconds = time.process_time() - begun
             ratios.append(_ratio(run, name))
-        truth = json.loads((root / "session.truth.json").read_text())["parameters"]
         found = run.read_json("models/right/identify.json")
     entries = found["parameters"]
     head = effect.split(":")[0]

@@ -120,7 +120,7 @@ def estimate_by_filter(
             np.minimum(size * np.hypot(known, _LEAST_REGION * prior_sd), spread)
             for size in _REGIONS
         ]
-        attempts = [*((answer, region, 1.0) for region in around), *attempts]
+        attempts = [*((settled, region, 1.0) for region in around), *attempts]
 
     def agrees(found: FilterRun) -> bool:
         """Whether the filter is where least squares are, the timing left out.

@@ -117,20 +117,18 @@ def unbiased(
     sd = np.sqrt(np.diag(raw.covariance))
     found = Squares(raw, moved(bias), bias, problem, bias_at)
     if not problem.linear and np.any((bias**2 > sd * np.abs(raw.p[free]))[free < count]):
-        bias = _settled(found, moved)
+        bias = _settled(found, bias, moved)
         found = replace(found, p=moved(bias), bias=bias)
     return found
 
 
-def _settled(squares: Squares, moved: Callable[[Array], Array]) -> Array:
+def _settled(squares: Squares, bias: Array, moved: Callable[[Array], Array]) -> Array:
     """Return the bias (n_free,) at the parameters that it leads to, by secants, one by one.
 
     Args:
-        squares: with the bias at the fit itself; moved: parameters with a bias taken off.
+        squares: the fit; bias: at the fit itself; moved: parameters with a bias taken off.
     """
-    raw, free, bias = squares.raw, squares.problem.free, squares.bias
-    if bias is None:
-        raise RuntimeError("no bias to settle")
+    raw, free = squares.raw, squares.problem.free
     sd = np.maximum(np.sqrt(np.diag(raw.covariance)), np.finfo(float).tiny)
     best, least = bias, np.inf
     before, off_before = raw.p[free], bias

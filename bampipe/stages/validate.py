@@ -124,7 +124,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     progress(0.1, "held-out fits")
     groups = _groups(run, motions, config.hold_out_by)
     judged = _judged(groups)
-    fitted = _fitted(run, system, motions, groups)
+    fitted = _fitted(run, system, motions)
     held_out = _held_out(problem, p, groups, fitted)
     compared = _compare(system, motions, problem, p, held_out, judged)
     notes = []
@@ -220,16 +220,14 @@ def _groups(run: RunFolder, motions: Sequence[Motion], channel: str) -> list[int
     return [HELD_OUT if m.trial_id in unseen else k for m, k in zip(motions, numbers, strict=True)]
 
 
-def _fitted(
-    run: RunFolder, system: System, motions: Sequence[Motion], groups: Sequence[int]
-) -> list[bool]:
+def _fitted(run: RunFolder, system: System, motions: Sequence[Motion]) -> list[bool]:
     """Return which trials a fit may see: those that `identify` does.
 
     What brakes do is no part of a model without an effect of theirs: fitted to them, it would
     be wrong where they are off as well.
     """
-    free = set(free_trials(run, braked=system.braked))
-    return [m.trial_id in free and g != HELD_OUT for m, g in zip(motions, groups, strict=True)]
+    seen = set(free_trials(run, fitted=True, braked=system.braked))
+    return [motion.trial_id in seen for motion in motions]
 
 
 def _judged(groups: Sequence[int]) -> list[bool]:

@@ -15,6 +15,7 @@ from bampipe.discover.recording import Motion, Sensors
 from bampipe.discover.replay import replay
 from bampipe.physics import Model, compile_model, registry
 from bampipe.stages import filter as filter_stage
+from bampipe.stages import ingest
 from bampipe.stages.base import RunFolder, silent
 
 RATE = 500.0
@@ -70,6 +71,13 @@ def simulated_run(
 def shared_run(root: Path, name: str) -> RunFolder:
     """Take the shared session ``name`` up to the filter stage; skip where it is absent."""
     return _filtered(ingested_session(root, name))
+
+
+def recorded_run(root: Path, session: Path) -> RunFolder:
+    """Take the session in a folder up to the filter stage."""
+    run = RunFolder(root)
+    ingest.execute(run, root, ingest.Config(session=str(session)), silent)
+    return _filtered(run)
 
 
 def session_truth(name: str) -> dict[str, float]:

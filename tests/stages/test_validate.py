@@ -8,13 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from identified_run import MODEL, shared_run, simulated_run
+from identified_run import MODEL, recorded_run, shared_run, simulated_run
 
 from bampipe.data.schema import validate as check
 from bampipe.data.store import read_json, read_parquet, sha256_file, write_json, write_text
 from bampipe.errors import InputError
-from bampipe.stages import filter as filter_stage
-from bampipe.stages import identify, ingest, validate
+from bampipe.stages import identify, validate
 from bampipe.stages import simulate as simulation
 from bampipe.stages.base import RunFolder, silent
 
@@ -65,9 +64,7 @@ def test_what_brakes_do_is_judged_in_the_trials_in_which_they_act(tmp_path: Path
         effects=("brake_lag",), seed=5, trials=2, viscous_trials=2, duration=8
     )
     truth = simulation.simulate_session(tmp_path / "session", hidden)
-    run = RunFolder(tmp_path / "run")
-    ingest.execute(run, run.root, ingest.Config(session=str(tmp_path / "session")), silent)
-    filter_stage.execute(run, run.root, filter_stage.Config(), silent)
+    run = recorded_run(tmp_path / "run", tmp_path / "session")
     ratios = {}
     for name, effects in (("base", "[]"), ("lag", '["brake_lag"]')):
         text = MODEL.replace("[]", effects).replace('"base"', f'"{name}"', 1)

@@ -8,15 +8,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from identified_run import MODEL
+from identified_run import recorded_run
 from run_folders import SESSIONS
 
-from bampipe.data.store import read_json, read_parquet, write_parquet, write_text
+from bampipe.data.store import read_json, read_parquet, write_parquet
 from bampipe.errors import InputError
 from bampipe.physics import Model, compile_model, registry
 from bampipe.physics.viscous_field import viscous_field
-from bampipe.stages import filter as filter_stage
-from bampipe.stages import identify, ingest, performance, viscous
+from bampipe.stages import identify, performance, viscous
 from bampipe.stages import simulate as simulation
 from bampipe.stages.base import RunFolder, silent
 
@@ -25,10 +24,7 @@ SQUARES = identify.Config(method="least-squares")
 
 def identified(root: Path, session: Path) -> RunFolder:
     """Take a session up to its identification, by least squares, which is quick."""
-    run = RunFolder(root)
-    ingest.execute(run, root, ingest.Config(session=str(session)), silent)
-    filter_stage.execute(run, root, filter_stage.Config(), silent)
-    write_text(root / "models/base/model.toml", MODEL)
+    run = recorded_run(root, session)
     identify.execute(run, root, SQUARES, silent)
     return run
 
