@@ -21,19 +21,21 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import read_json, write_text
 from bampipe.estimate.least_squares import Problem, Stacked, fit, stacked_residual
 from bampipe.estimate.low_pass import Band
 from bampipe.estimate.unscented import Trial
+from bampipe.identification.filter_choice import FilterChoice
+from bampipe.identification.filter_run import trial_of
+from bampipe.identification.output_estimate import segments_of
+from bampipe.identification.sensor_noise import sensor_noise
 from bampipe.physics import Model, System, compile_model, registry
+from bampipe.progress import silent
+from bampipe.simulator import session as simulate
 from bampipe.stages import filter as filter_stage
-from bampipe.stages import identify, ingest, simulate
-from bampipe.stages.base import RunFolder, silent
-from bampipe.stages.filter_choice import FilterChoice
-from bampipe.stages.filter_run import trial_of
-from bampipe.stages.motions import Motion, problem_of, read_motions
-from bampipe.stages.output_estimate import segments_of
-from bampipe.stages.sensor_noise import sensor_noise
+from bampipe.stages import identify, ingest
+from bampipe.trials.motions import Motion, problem_of, read_motions
 
 Array = NDArray[np.float64]
 

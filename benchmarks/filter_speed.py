@@ -28,13 +28,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import read_json, read_parquet
 from bampipe.estimate import filterpy_oracle
 from bampipe.estimate.unscented import FilterModel, FilterSettings, Trial, filter_trials
 from bampipe.physics import Model, compile_model, registry
 from bampipe.physics.system import System
-from bampipe.stages import ingest, simulate
-from bampipe.stages.base import RunFolder, silent
+from bampipe.progress import silent
+from bampipe.simulator import session as simulate
+from bampipe.stages import ingest
 
 HERE = Path(__file__).parent / "filter_speed_engines"
 LONGEST_STEP = 1e-3

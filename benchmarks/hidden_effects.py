@@ -19,14 +19,16 @@ from pathlib import Path
 
 import numpy as np
 
+from bampipe.data.run_folder import RunFolder
 from bampipe.discover.chance import Recipe, Session
 from bampipe.discover.diagnosis import diagnose
 from bampipe.discover.settings import Settings
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import Model, compile_model, registry
-from bampipe.stages import ingest, simulate
-from bampipe.stages.base import RunFolder, silent
-from bampipe.stages.recordings import read_session
+from bampipe.progress import silent
+from bampipe.simulator import session as simulate
+from bampipe.stages import ingest
+from bampipe.trials.recordings import read_session
 
 SINGLES = (
     "stribeck:yaw", "stribeck:pitch", "stribeck:extension", "presliding:yaw", "presliding:pitch",

@@ -16,9 +16,9 @@ import time
 import numpy as np
 
 from bampipe.data.stream import SampleStream
+from bampipe.monitor.monitor import Monitor
+from bampipe.monitor.start import Options, layouts
 from bampipe.physics import Model, compile_model, registry
-from bampipe.stages.monitor_start import Options, layouts
-from bampipe.stages.monitoring import Monitor
 
 RATE = 5000.0
 

@@ -24,9 +24,11 @@ import numpy as np
 from estimators import MODEL, prepare
 from hidden_effects import SINGLES
 
+from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import write_text
-from bampipe.stages import identify, simulate, validate
-from bampipe.stages.base import RunFolder, silent
+from bampipe.progress import silent
+from bampipe.simulator import session as simulate
+from bampipe.stages import identify, validate
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from bampipe.data import store
+from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError
+from bampipe.identification.filter_run import stride_of
 from bampipe.stages import validate
-from bampipe.stages.base import RunFolder
-from bampipe.stages.filter_run import stride_of
-from bampipe.stages.motions import Motion, put_aside
-from bampipe.stages.shelf import Shelf
+from bampipe.trials.motions import Motion, put_aside
+from bampipe.trials.trial_cache import Shelf
 
 
 def test_trials_are_held_out_one_by_one_up_to_ten_then_in_ten_groups(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError
 from bampipe.run import models, record
 from bampipe.run.events import Event, Listener
@@ -89,7 +90,7 @@ def current_model(root: Path) -> str:
 
 
 def _diagnosis(root: Path, model: str) -> dict[str, Any]:
-    return base.RunFolder(root).read_json(f"models/{model}/diagnose.json")
+    return RunFolder(root).read_json(f"models/{model}/diagnose.json")
 
 
 def next_effect(root: Path, model: str) -> str:
@@ -115,8 +116,8 @@ def _named(text: str) -> tuple[str, Path | None]:
     if own is None:
         return text, None
     path, target = own
+    from bampipe.declarations.files import read_effect
     from bampipe.physics import registry
-    from bampipe.stages.declarations import read_effect
 
     effect = registry.effect_from(read_effect(str(path)), str(path))
     return f"{effect.name}:{target}" if target else effect.name, path
@@ -168,7 +169,7 @@ def _write_child(root: Path, parent: str, effect: str, file: Path | None) -> Non
     Raises:
         InputError: the parent has the effect already, or the device cannot have it.
     """
-    from bampipe.stages.modelfile import load_model
+    from bampipe.declarations.model_file import load_model
 
     before = models.read(root, parent)
     if effect in before.effects:
@@ -181,7 +182,7 @@ def _write_child(root: Path, parent: str, effect: str, file: Path | None) -> Non
         text = source.read_text(encoding="utf-8")
         record.replace_text(root / "models" / child / "effects" / name, text)
     models.write(root, models.ModelFile(child, parent, before.device, (*before.effects, effect)))
-    load_model(base.RunFolder(root), child)
+    load_model(RunFolder(root), child)
 
 
 def follow(options: Options, model: str, tell: Callable[[str], None]) -> str:
@@ -217,6 +218,6 @@ def follow(options: Options, model: str, tell: Callable[[str], None]) -> str:
 
 def _better(root: Path, parent: str, child: str) -> bool:
     """Whether ``child`` has a lower held-out error than ``parent`` on some axis."""
-    run = base.RunFolder(root)
+    run = RunFolder(root)
     before, after = (run.read_json(f"models/{m}/validate.json")["axes"] for m in (parent, child))
     return any(after[axis]["held_out_rmse"] < before[axis]["held_out_rmse"] for axis in before)

@@ -9,6 +9,7 @@ from pathlib import Path
 import bampipe
 from bampipe.api.loop import Options, follow
 from bampipe.cli import places
+from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError
 from bampipe.run import models, pipeline
 from bampipe.run.events import Listener
@@ -42,7 +43,7 @@ def demonstrate(runs: Path, force: bool, listen: Listener, tell: Callable[[str],
     chosen = pipeline.load()
     tell(f"1. {session}: an arm with something wrong that its model does not know.")
     run_session(Request(root, chosen, session=session, force=force, judged=models.BASE), listen)
-    validated = base.RunFolder(root).read_json(f"models/{models.BASE}/validate.json")
+    validated = RunFolder(root).read_json(f"models/{models.BASE}/validate.json")
     for axis, entry in sorted(validated["axes"].items()):
         tell(
             f"   {axis}: error on unseen trials {entry['held_out_rmse']:.3g} {entry['unit']}, "
@@ -54,7 +55,7 @@ def demonstrate(runs: Path, force: bool, listen: Listener, tell: Callable[[str],
     )
     last = follow(options, models.BASE, lambda line: tell(f"   {line}"))
     tell("3. The error on unseen trials, model by model.")
-    ladder = base.RunFolder(root).read_json("compare.json")["ladder"]
+    ladder = RunFolder(root).read_json("compare.json")["ladder"]
     for rung in ladder:
         errors = ", ".join(
             f"{axis} {value:.3g} (floor {rung['noise_floor'][axis]:.3g})"

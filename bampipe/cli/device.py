@@ -55,8 +55,8 @@ def show_(
 
     Example: bampipe device show slider
     """
+    from bampipe.declarations.files import device_faults, read_device
     from bampipe.physics import registry
-    from bampipe.stages.declarations import device_faults, read_device
 
     declaration, where = read_device(device)
     equations, faults = device_faults(declaration, where)
@@ -101,7 +101,7 @@ def check(
 
     Example: bampipe device check rail.toml
     """
-    from bampipe.stages.declarations import device_faults, read_device
+    from bampipe.declarations.files import device_faults, read_device
 
     declaration, where = read_device(file)
     equations, faults = device_faults(declaration, where)
@@ -144,8 +144,8 @@ def check_effect_file(text: str, device_name: str, json: bool) -> None:
         InputError: there is no such file or device.
         typer.Exit: something is wrong with it.
     """
+    from bampipe.declarations.files import effect_faults, read_device, read_effect
     from bampipe.physics import registry
-    from bampipe.stages.declarations import effect_faults, read_device, read_effect
 
     file, _, target = text.partition(":")
     declaration, where = read_device(device_name)

@@ -44,8 +44,8 @@ def show_one(text: str, device_name: str, json: bool) -> None:
     Raises:
         InputError: no such effect, device or target.
     """
+    from bampipe.declarations.files import read_device, read_effect
     from bampipe.physics import registry
-    from bampipe.stages.declarations import read_device, read_effect
 
     name, _, target = text.partition(":")
     device = registry.device_from(*read_device(device_name))

@@ -28,7 +28,7 @@ def init(
 
     Example: bampipe init logs/2026-10-03 --device slider --dry
     """
-    from bampipe.stages.proposal import propose, write_proposal
+    from bampipe.proposal import propose, write_proposal
 
     proposal = propose(folder, device)
     written = [] if dry else write_proposal(folder, proposal)

@@ -26,9 +26,9 @@ from bampipe.cli.options import (
     Runs,
     Settings,
 )
+from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError
 from bampipe.run import batch
-from bampipe.stages import base
 
 
 def diagnose(
@@ -123,7 +123,7 @@ def extend(
             last = loop.follow(options, parent, lambda line: None if json else show.say(line))
         else:
             last = loop.extend(options, parent, second or "")
-    ladder = base.RunFolder(root).read_json("compare.json")
+    ladder = RunFolder(root).read_json("compare.json")
     if json:
         show.as_json(ladder)
         return

@@ -16,8 +16,8 @@ from bampipe.cli import places, show
 from bampipe.errors import InputError
 
 if TYPE_CHECKING:
-    from bampipe.stages.monitor_start import Stream
-    from bampipe.stages.monitoring import Monitor
+    from bampipe.monitor.monitor import Monitor
+    from bampipe.monitor.start import Stream
 
 POLL_S = 0.02
 SCREEN_S = 0.25
@@ -71,7 +71,7 @@ def monitor(
 
     Example: logger | bampipe monitor - --run 2026-10-03_s01 --session sessions/2026-10-03_s01
     """
-    from bampipe.stages.monitor_start import Options
+    from bampipe.monitor.start import Options
 
     options = Options(window_s, false_alarms, memory_s)
     options.check()
@@ -106,10 +106,11 @@ def _prepare(
     runs: Path,
 ) -> tuple[Monitor, Stream]:
     """Compile the model before the first sample is due, then open the stream."""
+    from bampipe.data.run_folder import RunFolder
+    from bampipe.declarations.files import read_device
+    from bampipe.monitor import monitor as monitoring
+    from bampipe.monitor import start as monitor_start
     from bampipe.physics import Model, compile_model, registry
-    from bampipe.stages import monitor_start, monitoring
-    from bampipe.stages.base import RunFolder
-    from bampipe.stages.declarations import read_device
 
     if device:
         system = compile_model(Model(registry.device_from(*read_device(device))))

@@ -57,7 +57,7 @@ def simulate(
     """
     batch.limit_threads(1)
     from bampipe.run.events import Event
-    from bampipe.stages.simulate import Config, simulate_session
+    from bampipe.simulator.session import Config, simulate_session
 
     parameters: dict[str, float] = {}
     for key, value in assignments(settings).items():

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from bampipe.discover.candidates import candidate
 from bampipe.discover.chance import Recipe, Session
 from bampipe.discover.evidence import Evidence
-from bampipe.discover.recording import Motion
 from bampipe.physics import System
 from bampipe.physics.device import INPUT_ORDERS, derivative
 from bampipe.physics.registry import device_from, effect_from
+from bampipe.trials.observation import Motion
 
 Array = NDArray[np.float64]
 

@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 
 from bampipe.discover.candidates import Candidate, Score, Scorer, candidate
 from bampipe.discover.evidence import Evidence, fit
-from bampipe.discover.recording import Motion, Sensors, observe
-from bampipe.discover.replay import replay
 from bampipe.discover.shape import explainable_share
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import Model, System, compile_model
 from bampipe.physics.registry import device_from, effect_from
+from bampipe.trials.observation import Motion, Sensors, observe
+from bampipe.trials.replay import replay
 
 Array = NDArray[np.float64]
 

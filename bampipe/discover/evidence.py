@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bampipe.discover.recording import Motion, Sensors
 from bampipe.estimate.low_pass import Band
 from bampipe.estimate.standstill import moving, resting
 from bampipe.physics import System
+from bampipe.trials.observation import Motion, Sensors
 
 Array = NDArray[np.float64]
 

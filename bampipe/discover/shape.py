@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.discover.evidence import Evidence
-from bampipe.discover.recording import Motion
+from bampipe.trials.observation import Motion
 
 Array = NDArray[np.float64]
 

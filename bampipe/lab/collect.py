@@ -14,7 +14,7 @@ from bampipe.data import lab_tables, store
 from bampipe.errors import InputError
 from bampipe.lab import rows, trends
 from bampipe.lab.place import FILE, LOCK, is_foreign, run_folders
-from bampipe.stages.base import Progress, silent
+from bampipe.progress import Progress, silent
 
 SCHEMA = "bampipe.lab/1"
 TRENDS = "trends.json"

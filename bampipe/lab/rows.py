@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from bampipe.data import lab_tables, store
+from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError
 from bampipe.run import models, record
-from bampipe.stages.base import RunFolder
 
 NORMAL_95 = 1.959963984540054
 """Half width of a 95 % interval of a normal distribution, in standard deviations."""

@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
+from bampipe.data.run_folder import RunFolder, write_json
 from bampipe.data.schema import validate
 from bampipe.errors import InputError
 from bampipe.run import record
-from bampipe.stages.base import RunFolder, write_json
 
 SCHEMA = "bampipe.accepted/1"
 ACCEPTED = "accepted"

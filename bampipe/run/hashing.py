@@ -18,7 +18,6 @@ from pathlib import Path
 import bampipe
 from bampipe.data.text import read_toml
 from bampipe.errors import InputError
-from bampipe.stages import base
 
 PACKAGES = (
     "h5py",
@@ -34,7 +33,15 @@ PACKAGES = (
 )
 """Packages whose version may change a result."""
 
-SHARED_CODE = ("physics", "estimate", "discover", "data")
+SHARED_CODE = (
+    "physics",
+    "estimate",
+    "data",
+    "declarations",
+    "trials",
+    "identification",
+    "discover",
+)
 """Sub-packages every stage may call; a change in one of them reruns every stage."""
 
 ABSENT = "absent"
@@ -196,15 +203,9 @@ def digest_code(stage: str) -> str:
     """
     package = Path(bampipe.__file__).parent
     parts = [package / name for name in SHARED_CODE]
-    parts += [package / "compiled.py", package / "errors.py"]
+    parts += [package / "compiled.py", package / "errors.py", package / "stages" / "base.py"]
     if stage == "report":
         parts.append(package / "report")
-    stages = package / "stages"
-    parts += [
-        path
-        for path in sorted(stages.glob("*.py"))
-        if path.stem not in base.STAGES and path.stem != "__init__"
-    ]
     spec = importlib.util.find_spec(f"bampipe.stages.{stage}")
     if spec is not None and spec.origin is not None:
         origin = Path(spec.origin)

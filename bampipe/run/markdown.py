@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
+from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError, printable
 from bampipe.run.gates import Verdict
 from bampipe.run.models import BASE
 from bampipe.run.request import Outcome
-from bampipe.stages.base import RunFolder
 
 STATES = {0: "passed", 1: "**gate failed**", 2: "**bad input**", 3: "**crashed**"}
 MOST = 30

@@ -12,9 +12,9 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import IO, Any
 
+from bampipe.data.run_folder import write_json
 from bampipe.errors import InputError
 from bampipe.run.hashing import digest_file
-from bampipe.stages.base import write_json
 
 SCHEMA = "bampipe.run/1"
 FILE = "run.json"

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError
 from bampipe.run import hashing, models, record
 from bampipe.run.gates import Verdict
@@ -29,7 +30,7 @@ class RunState:
     def __init__(self, request: Request) -> None:
         self.request = request
         self.root = request.root
-        self.folder = base.RunFolder(request.root)
+        self.folder = RunFolder(request.root)
         self.damaged = record.is_damaged(request.root)
         self.content = record.read(request.root)
         self.written = copy.deepcopy(self.content)

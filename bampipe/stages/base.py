@@ -27,93 +27,12 @@ from __future__ import annotations
 
 import difflib
 import importlib
-import json
-from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, cast
 
+from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError
-
-
-class Progress(Protocol):
-    """Called by a stage to say how far it is."""
-
-    def __call__(self, fraction: float, message: str) -> None:
-        """Report that ``fraction`` (0 to 1) is done; ``message`` says what is under way."""
-
-
-def silent(fraction: float, message: str) -> None:
-    """A :class:`Progress` that shows nothing."""
-
-
-@dataclass(frozen=True)
-class RunFolder:
-    """Read access to the run folder of one session.
-
-    Attributes:
-        root: the run folder.
-    """
-
-    root: Path
-
-    def path(self, relative: str) -> Path:
-        """Return the path of ``relative``, a path relative to the run folder."""
-        return self.root / relative
-
-    def exists(self, relative: str) -> bool:
-        """Return whether the file ``relative`` is there."""
-        return self.path(relative).is_file()
-
-    def require(self, relative: str, stage: str) -> Path:
-        """Return the path of ``relative``.
-
-        Raises:
-            InputError: the file is not there yet; the remedy names ``stage``.
-        """
-        if not self.exists(relative):
-            raise InputError(
-                f"{relative} is missing",
-                where=str(self.root),
-                remedy=f"run `bampipe {stage} {self.root}` first",
-            )
-        return self.path(relative)
-
-    def read_json(self, relative: str) -> dict[str, Any]:
-        """Return the contents of the JSON file ``relative``.
-
-        Raises:
-            InputError: the file is missing or is not JSON.
-        """
-        path = self.path(relative)
-        try:
-            return cast(dict[str, Any], json.loads(path.read_text(encoding="utf-8")))
-        except FileNotFoundError as error:
-            raise InputError(f"{relative} is missing", where=str(self.root)) from error
-        except (json.JSONDecodeError, UnicodeDecodeError) as error:
-            raise InputError(
-                f"not readable as JSON ({error})", where=str(path), remedy="run with --force"
-            ) from error
-
-    def glob(self, pattern: str) -> tuple[str, ...]:
-        """Return the files that match ``pattern``, relative to the run folder, sorted."""
-        found = (path for path in self.root.glob(pattern) if path.is_file())
-        return tuple(sorted(path.relative_to(self.root).as_posix() for path in found))
-
-
-def write_json(path: Path, content: Mapping[str, object]) -> None:
-    """Write ``content`` as JSON with sorted keys: the same content gives the same bytes.
-
-    Raises:
-        ValueError: a number is not finite (JSON has none; store None and say why).
-    """
-    text = json.dumps(content, sort_keys=True, indent=1, ensure_ascii=False, allow_nan=False)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text + "\n", encoding="utf-8")
-
-
-MOVING = ("free", "viscous")
-"""Kinds of trial in which the arm moves; only with commanded brakes do effects of brakes show."""
+from bampipe.progress import Progress
 
 
 class Stage(Protocol):

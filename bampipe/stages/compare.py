@@ -8,9 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import read_toml, write_json
 from bampipe.errors import InputError
-from bampipe.stages.base import Progress, RunFolder
+from bampipe.progress import Progress
 
 NAME = "compare"
 SUMMARY = "Held-out error of every model version, and which parameters moved"

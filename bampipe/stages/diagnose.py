@@ -10,7 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import write_json
+from bampipe.declarations.model_file import identified, load_model, model_inputs
 from bampipe.discover.advice import advise
 from bampipe.discover.chance import Recipe, Session
 from bampipe.discover.description import describe
@@ -21,9 +23,8 @@ from bampipe.discover.shape import residual_map, variables, worst_windows
 from bampipe.errors import InputError
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import compile_model
-from bampipe.stages.base import Progress, RunFolder
-from bampipe.stages.modelfile import identified, load_model, model_inputs
-from bampipe.stages.recordings import read_session, recipe_of
+from bampipe.progress import Progress
+from bampipe.trials.recordings import read_session, recipe_of
 
 NAME = "diagnose"
 SUMMARY = "Find which physical effect the model lacks"

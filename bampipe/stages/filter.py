@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from bampipe.data.run_folder import MOVING, RunFolder
 from bampipe.data.store import ParquetAppender, read_parquet, write_json
 from bampipe.errors import InputError
 from bampipe.estimate import butterworth, kalman_smoother, savitzky_golay
@@ -20,7 +21,7 @@ from bampipe.estimate.differentiation import (
     uniform_grid,
 )
 from bampipe.physics.device import LAST_ORDER, derivative
-from bampipe.stages.base import MOVING, Progress, RunFolder
+from bampipe.progress import Progress
 
 NAME = "filter"
 SUMMARY = "Velocity and acceleration from the encoders, with error bands"

@@ -8,30 +8,31 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import write_json, write_parquet
+from bampipe.declarations.model_file import load_model, model_inputs
 from bampipe.discover.chance import Session
 from bampipe.discover.start import search_start
 from bampipe.errors import InputError
 from bampipe.estimate.least_squares import fit
 from bampipe.estimate.low_pass import Band
-from bampipe.physics import System, compile_model
-from bampipe.stages.base import Progress, RunFolder
-from bampipe.stages.estimates import content
-from bampipe.stages.filter_choice import FilterChoice, check_among, check_choice
-from bampipe.stages.filter_estimate import estimate_by_filter
-from bampipe.stages.filter_run import MotionLost, trial_of
-from bampipe.stages.identifiability import identifiability
-from bampipe.stages.modelfile import load_model, model_inputs
-from bampipe.stages.motions import problem_of, read_motions
-from bampipe.stages.output_estimate import estimate_by_output
-from bampipe.stages.recordings import read_session, recipe_of
-from bampipe.stages.sensor_noise import sensor_noise
-from bampipe.stages.squares_estimate import (
+from bampipe.identification.estimates import content
+from bampipe.identification.filter_choice import FilterChoice, check_among, check_choice
+from bampipe.identification.filter_estimate import estimate_by_filter
+from bampipe.identification.filter_run import MotionLost, trial_of
+from bampipe.identification.identifiability import identifiability
+from bampipe.identification.output_estimate import estimate_by_output
+from bampipe.identification.sensor_noise import sensor_noise
+from bampipe.identification.squares_estimate import (
     Squares,
     estimate_by_squares,
     problem_with,
     unbiased,
 )
+from bampipe.physics import System, compile_model
+from bampipe.progress import Progress
+from bampipe.trials.motions import problem_of, read_motions
+from bampipe.trials.recordings import read_session, recipe_of
 
 NAME = "identify"
 SUMMARY = "Parameters of the model with uncertainties, from the free trials"

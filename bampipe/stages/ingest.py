@@ -18,13 +18,14 @@ import pyarrow as pa
 
 from bampipe.data.quality import CleanTrial, Limits, clean
 from bampipe.data.readers import read_trial
+from bampipe.data.run_folder import RunFolder
 from bampipe.data.session import SECONDS, Session, TrialEntry, inside, read_session
 from bampipe.data.store import ParquetAppender, read_toml, sha256_file, write_json, write_parquet
 from bampipe.errors import InputError
 from bampipe.physics import registry
 from bampipe.physics.device import Device
 from bampipe.physics.units import parse_unit
-from bampipe.stages.base import Progress, RunFolder
+from bampipe.progress import Progress
 
 NAME = "ingest"
 SUMMARY = "Read a session's raw logs, check and repair the trials, bring them to SI units"

@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import read_parquet, write_json
+from bampipe.declarations.model_file import identified, load_model, model_inputs
 from bampipe.errors import InputError
 from bampipe.physics import System, compile_model
-from bampipe.stages.base import Progress, RunFolder
-from bampipe.stages.modelfile import identified, load_model, model_inputs
+from bampipe.progress import Progress
 
 NAME = "performance"
 SUMMARY = "Workspace, stiffness, friction, inertia and force at the handle"

@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from bampipe.stages.base import Progress, RunFolder
+from bampipe.data.run_folder import RunFolder
+from bampipe.progress import Progress
 
 NAME = "report"
 SUMMARY = "PDF and web page of everything found so far"

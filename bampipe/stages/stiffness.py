@@ -11,12 +11,13 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import ParquetAppender, read_parquet, read_toml, write_json
 from bampipe.errors import InputError
 from bampipe.estimate.differentiation import uniform_grid
 from bampipe.estimate.hysteresis import Branch, Cycle, Hysteresis, hysteresis
 from bampipe.physics import Model, System, compile_model, registry
-from bampipe.stages.base import Progress, RunFolder
+from bampipe.progress import Progress
 
 NAME = "stiffness"
 SUMMARY = "Stiffness, loop width and bandwidth of the locked axes"

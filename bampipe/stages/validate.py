@@ -11,23 +11,24 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import read_parquet, write_json, write_parquet
+from bampipe.declarations.model_file import identified, load_model, model_inputs
 from bampipe.errors import InputError
 from bampipe.estimate.least_squares import Problem, fit
 from bampipe.estimate.low_pass import Band
 from bampipe.estimate.standstill import moving
+from bampipe.identification.free_run import free_runs
 from bampipe.physics import System, compile_model
-from bampipe.stages.base import Progress, RunFolder
-from bampipe.stages.free_run import free_runs
-from bampipe.stages.modelfile import identified, load_model, model_inputs
-from bampipe.stages.motions import (
+from bampipe.progress import Progress
+from bampipe.trials.motions import (
     Motion,
     free_trials,
     held_out_trials,
     problem_of,
     read_motions,
 )
-from bampipe.stages.replayed import replayed
+from bampipe.trials.replayed import replayed
 
 NAME = "validate"
 SUMMARY = "Predicted against measured torque and force, on trials that the fit has not seen"

@@ -12,16 +12,14 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy import stats
 
+from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import read_parquet, write_json, write_parquet
+from bampipe.declarations.model_file import load_model, model_inputs
 from bampipe.errors import InputError
 from bampipe.estimate.filter_uncertainty import sandwich_covariance
 from bampipe.estimate.unscented import Trial
-from bampipe.physics import Model, System, compile_model
-from bampipe.physics.viscous_field import NAME as FIELD
-from bampipe.physics.viscous_field import viscous_field
-from bampipe.stages.base import Progress, RunFolder
-from bampipe.stages.filter_choice import FilterChoice, check_choice
-from bampipe.stages.filter_run import (
+from bampipe.identification.filter_choice import FilterChoice, check_choice
+from bampipe.identification.filter_run import (
     Attempt,
     FilterRun,
     filter_model,
@@ -29,10 +27,13 @@ from bampipe.stages.filter_run import (
     stride_of,
     trial_of,
 )
-from bampipe.stages.filter_tables import trace
-from bampipe.stages.modelfile import load_model, model_inputs
-from bampipe.stages.motions import Motion, read_motion
-from bampipe.stages.sensor_noise import sensor_noise, untuned
+from bampipe.identification.filter_tables import trace
+from bampipe.identification.sensor_noise import sensor_noise, untuned
+from bampipe.physics import Model, System, compile_model
+from bampipe.physics.viscous_field import NAME as FIELD
+from bampipe.physics.viscous_field import viscous_field
+from bampipe.progress import Progress
+from bampipe.trials.motions import Motion, read_motion
 
 NAME = "viscous"
 SUMMARY = "Cartesian damping that the brakes rendered in the viscous trials, against the command"

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from bampipe.discover.chance import Recipe, Session, system_of
-from bampipe.discover.recording import Motion, Sensors, observe
-from bampipe.discover.replay import replay
 from bampipe.estimate.butterworth import zero_phase
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import registry
+from bampipe.trials.observation import Motion, Sensors, observe
+from bampipe.trials.replay import replay
 
 RATE = 250.0
 TRUTH = {

@@ -7,8 +7,8 @@ from sessions import RATE, SENSORS, TRUTH, bam, made
 
 from bampipe.discover.chance import system_of
 from bampipe.discover.evidence import fit, told, velocity_sd
-from bampipe.discover.recording import Motion
 from bampipe.estimate.low_pass import Band
+from bampipe.trials.observation import Motion
 
 
 def test_thinning_equals_the_library_filter_away_from_the_ends():

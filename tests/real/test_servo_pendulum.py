@@ -11,13 +11,13 @@ import pytest
 from conftest import misfits
 from measured import REAL, bampipe, estimates, need, result
 
+from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import read_parquet
 from bampipe.estimate.least_squares import fit
 from bampipe.estimate.low_pass import Band
 from bampipe.estimate.standstill import moving
 from bampipe.physics import Model, compile_model, registry
-from bampipe.stages.base import RunFolder
-from bampipe.stages.motions import free_trials, problem_of, read_motion
+from bampipe.trials.motions import free_trials, problem_of, read_motion
 
 HELD_OUT_GAIN = 200
 HEAD = """

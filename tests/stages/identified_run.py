@@ -10,13 +10,14 @@ import numpy as np
 import pandas as pd
 from run_folders import SESSIONS, ingested_session, write_ingested
 
+from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import write_text
-from bampipe.discover.recording import Motion, Sensors
-from bampipe.discover.replay import replay
 from bampipe.physics import Model, compile_model, registry
+from bampipe.progress import silent
 from bampipe.stages import filter as filter_stage
 from bampipe.stages import ingest
-from bampipe.stages.base import RunFolder, silent
+from bampipe.trials.observation import Motion, Sensors
+from bampipe.trials.replay import replay
 
 RATE = 500.0
 RESOLUTION = {"yaw": 4.6875e-5, "pitch": 9.8125e-5, "extension": 3.0e-5}

@@ -10,8 +10,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import write_json, write_parquet
-from bampipe.stages.base import RunFolder
 
 SESSIONS = Path(__file__).resolve().parents[3] / "shared" / "sessions"
 

@@ -20,10 +20,11 @@ import pytest
 import scipy.io
 from made_session import COLUMNS, Made, csv_text, free_trial, locked_trial
 
+from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import read_parquet
 from bampipe.errors import InputError
+from bampipe.progress import silent
 from bampipe.stages import ingest
-from bampipe.stages.base import RunFolder, silent
 
 T01 = "trials/t01.csv"
 Damage = Callable[[Made], Callable[[Path], None] | None]

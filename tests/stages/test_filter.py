@@ -9,10 +9,11 @@ import pandas as pd
 import pytest
 from run_folders import ingested_session, write_ingested
 
+from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import read_json, read_parquet, sha256_file
 from bampipe.errors import InputError
+from bampipe.progress import silent
 from bampipe.stages import filter as stage
-from bampipe.stages.base import RunFolder, silent
 
 AXES = {"yaw": {"unit": "rad", "resolution": 5e-5}, "extension": {"unit": "m", "resolution": 3e-5}}
 KINEMATIC = ("q", "qd", "qdd", "q_sd", "qd_sd", "qdd_sd")

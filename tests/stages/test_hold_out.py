@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 from identified_run import simulated_run
 
+from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import read_json, read_parquet, write_parquet
 from bampipe.physics import Model, compile_model, registry
+from bampipe.progress import silent
 from bampipe.stages import identify, validate
-from bampipe.stages.base import RunFolder, silent
-from bampipe.stages.motions import free_trials
-from bampipe.stages.recordings import read_session
+from bampipe.trials.motions import free_trials
+from bampipe.trials.recordings import read_session
 
 SPOILT, KEPT = "t02", ("t00", "t01")
 

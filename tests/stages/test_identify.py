@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 from identified_run import MODEL, RESOLUTION, TRUTH, session_truth, shared_run, simulated_run
 
+from bampipe.data.run_folder import RunFolder
 from bampipe.data.schema import validate
 from bampipe.data.store import read_json, read_parquet, sha256_file, write_text
 from bampipe.errors import InputError
+from bampipe.identification.filter_choice import ENGINES
+from bampipe.identification.filter_run import MotionLost
+from bampipe.progress import silent
 from bampipe.stages import identify
-from bampipe.stages.base import RunFolder, silent
-from bampipe.stages.filter_choice import ENGINES
-from bampipe.stages.filter_run import MotionLost
 
 TOLERANCE = {"viscous": 0.03, "coulomb": 0.05, "mass": 0.01}
 FAST = identify.Config(longest_step_s=2e-3)

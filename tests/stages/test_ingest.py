@@ -16,10 +16,11 @@ import pytest
 from made_session import COUNTS, SESSION, Made, free_trial, toml_text
 from run_folders import SESSIONS
 
+from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import read_json, read_parquet
 from bampipe.errors import InputError
+from bampipe.progress import silent
 from bampipe.stages import ingest
-from bampipe.stages.base import RunFolder, silent
 
 NAMES = [f"open-0{number}" for number in range(1, 10)]
 
@@ -214,7 +215,8 @@ def test_what_a_motor_is_told_may_rest_or_stand_at_its_limit_a_sensor_may_not(tm
 MEASURE = """
 import json, re, sys
 from bampipe.stages import ingest
-from bampipe.stages.base import RunFolder, silent
+from bampipe.data.run_folder import RunFolder
+from bampipe.progress import silent
 from pathlib import Path
 
 def peak():

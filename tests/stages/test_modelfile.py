@@ -7,10 +7,10 @@ import json
 import numpy as np
 import pytest
 
+from bampipe.data.run_folder import RunFolder
+from bampipe.declarations.model_file import identified
 from bampipe.errors import InputError
 from bampipe.physics import Model, compile_model, registry
-from bampipe.stages.base import RunFolder
-from bampipe.stages.modelfile import identified
 
 
 def test_what_is_fixed_stands_at_its_prior_and_what_is_missing_is_named(tmp_path):

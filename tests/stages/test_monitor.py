@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 from identified_run import MODEL, RESOLUTION, TRUTH, simulated_run
 
+from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import read_json, read_parquet, write_json, write_text
 from bampipe.estimate.unscented import Trial, filter_trials
+from bampipe.monitor.monitor import Monitor
+from bampipe.monitor.start import Options, start_from_run
 from bampipe.physics import Model, compile_model, registry
-from bampipe.stages.base import RunFolder
-from bampipe.stages.monitor_start import Options, start_from_run
-from bampipe.stages.monitoring import Monitor
 
 
 @pytest.fixture(scope="module")
@@ -165,7 +165,7 @@ def test_a_lost_motion_starts_anew(run: RunFolder, begun: tuple) -> None:
 def test_memory_and_speed_hold(run: RunFolder, begun: tuple) -> None:
     """5 kHz sustained, parsing included, on one core; nothing grows."""
     from bampipe.data.stream import SampleStream
-    from bampipe.stages.monitor_start import layouts
+    from bampipe.monitor.start import layouts
 
     system, start = begun
     frame = samples(run, "t00")
@@ -236,7 +236,7 @@ def test_mistakes_are_one_line(tmp_path: Path, text: str, options: list[str], sa
 
 def test_a_model_with_a_force_rate_is_refused() -> None:
     from bampipe.errors import InputError
-    from bampipe.stages.monitor_start import layouts
+    from bampipe.monitor.start import layouts
 
     system = compile_model(Model(registry.device("bam"), ("force_delay",)))
     with pytest.raises(InputError, match="known only afterwards"):

@@ -8,11 +8,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import read_json, read_parquet
 from bampipe.data.units import unit
 from bampipe.errors import InputError
+from bampipe.progress import silent
 from bampipe.stages import ingest
-from bampipe.stages.base import RunFolder, silent
 
 DEVICE = """
 schema = "bampipe.device/1"

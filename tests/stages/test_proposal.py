@@ -21,14 +21,15 @@ from other_labs import (
     write_joint_logs,
 )
 
+from bampipe.data.run_folder import RunFolder
 from bampipe.data.session import read_session
 from bampipe.data.store import read_parquet
 from bampipe.errors import InputError
 from bampipe.physics import registry
 from bampipe.physics.units import check_device
+from bampipe.progress import silent
+from bampipe.proposal import propose, write_proposal
 from bampipe.stages import ingest
-from bampipe.stages.base import RunFolder, silent
-from bampipe.stages.proposal import propose, write_proposal
 
 ROOT = Path(__file__).resolve().parents[2]
 Command = Callable[..., tuple[int, str, str]]

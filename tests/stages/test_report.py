@@ -11,8 +11,9 @@ import pandas as pd
 import pytest
 from run_folders import write_ingested
 
+from bampipe.data.run_folder import RunFolder
+from bampipe.progress import silent
 from bampipe.stages import report
-from bampipe.stages.base import RunFolder, silent
 
 AXES = {"slide": {"unit": "m", "resolution": 1e-5}}
 

@@ -17,7 +17,7 @@ from scipy.signal import butter, sosfiltfilt
 from bampipe.data.session import read_session
 from bampipe.errors import InputError
 from bampipe.physics import Model, compile_model, registry
-from bampipe.stages.simulate import Config, simulate_session
+from bampipe.simulator.session import Config, simulate_session
 
 AXES = ("yaw", "pitch", "extension")
 SAMPLES = Path(__file__).parents[2] / "sample_runs"

@@ -10,11 +10,12 @@ import pandas as pd
 import pytest
 from run_folders import SESSIONS, ingested_session, write_ingested
 
+from bampipe.data.run_folder import RunFolder
 from bampipe.data.schema import validate
 from bampipe.data.store import read_json, read_parquet, sha256_file
 from bampipe.errors import InputError
+from bampipe.progress import silent
 from bampipe.stages import stiffness
-from bampipe.stages.base import RunFolder, silent
 
 AXES = {
     "yaw": {"unit": "rad", "resolution": 4.6875e-5},

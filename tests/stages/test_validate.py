@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 from identified_run import MODEL, recorded_run, shared_run, simulated_run
 
+from bampipe.data.run_folder import RunFolder
 from bampipe.data.schema import validate as check
 from bampipe.data.store import read_json, read_parquet, sha256_file, write_json, write_text
 from bampipe.errors import InputError
+from bampipe.progress import silent
+from bampipe.simulator import session as simulation
 from bampipe.stages import identify, validate
-from bampipe.stages import simulate as simulation
-from bampipe.stages.base import RunFolder, silent
 
 SQUARES = identify.Config(method="least-squares")
 

@@ -11,13 +11,14 @@ import pytest
 from identified_run import recorded_run
 from run_folders import SESSIONS
 
+from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import read_json, read_parquet, write_parquet
 from bampipe.errors import InputError
 from bampipe.physics import Model, compile_model, registry
 from bampipe.physics.viscous_field import viscous_field
+from bampipe.progress import silent
+from bampipe.simulator import session as simulation
 from bampipe.stages import identify, performance, viscous
-from bampipe.stages import simulate as simulation
-from bampipe.stages.base import RunFolder, silent
 
 SQUARES = identify.Config(method="least-squares")
 

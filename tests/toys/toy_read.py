@@ -7,8 +7,9 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
+from bampipe.data.run_folder import RunFolder, write_json
 from bampipe.errors import InputError
-from bampipe.stages.base import Progress, RunFolder, write_json
+from bampipe.progress import Progress
 
 NAME = "toy_read"
 SUMMARY = "Read the numbers"

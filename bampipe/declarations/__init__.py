@@ -1,0 +1,1 @@
+"""Device, effect and model files read and checked."""

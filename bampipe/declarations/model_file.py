@@ -1,0 +1,72 @@
+"""The model that a run folder names: device, effects, a lab's own files among them, estimates."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.data.run_folder import RunFolder
+from bampipe.data.store import read_toml
+from bampipe.errors import InputError
+from bampipe.physics import Model, System, registry
+
+
+def load_model(run: RunFolder, name: str) -> Model:
+    """Return the model called ``name`` as ``models/<name>/model.toml`` declares it.
+
+    Effect files in ``models/<name>/effects/`` and the device file ``ingest/device.toml`` come
+    before built-in ones.
+
+    Raises:
+        InputError: a file is missing or wrong, or an effect or the device is not known.
+    """
+    relative = f"models/{name}/model.toml"
+    path = run.require(relative, "identify")
+    content = read_toml(path)
+    device, effects = content.get("device"), content.get("effects", [])
+    if not isinstance(device, str):
+        raise InputError("device must be a text", where=str(path))
+    if not isinstance(effects, list) or not all(isinstance(item, str) for item in effects):
+        raise InputError("effects must be a list of texts", where=str(path))
+    own = []
+    for file in run.glob(f"models/{name}/effects/*.toml"):
+        own.append(registry.effect_from(read_toml(run.path(file)), str(run.path(file))))
+    if run.exists("ingest/device.toml"):
+        place = run.path("ingest/device.toml")
+        return Model(registry.device_from(read_toml(place), str(place)), effects, own)
+    return Model(registry.device(device), effects, own)
+
+
+def model_inputs(name: str) -> tuple[str, ...]:
+    """Return the paths that `load_model` reads, as a stage declares them."""
+    return (
+        f"models/{name}/model.toml",
+        f"models/{name}/effects/*.toml",
+        "ingest/device.toml?",
+    )
+
+
+def identified(run: RunFolder, name: str, system: System) -> NDArray[np.float64]:
+    """Return the parameters of the model called ``name``, (n_p,): fixed ones at their prior.
+
+    Args:
+        run: the run folder; system: the compiled model.
+
+    Raises:
+        InputError: the model has not been identified, or was another one when it was.
+    """
+    path = f"models/{name}/identify.json"
+    run.require(path, "identify")
+    found = run.read_json(path)["parameters"]
+    p = system.prior
+    for i, item in enumerate(system.parameters):
+        if item.fixed:
+            continue
+        if item.name not in found:
+            raise InputError(
+                f"no parameter {item.name!r}",
+                where=str(run.path(path)),
+                remedy=f"bampipe identify {run.root} --model {name} --force",
+            )
+        p[i] = float(found[item.name]["estimate"])
+    return p

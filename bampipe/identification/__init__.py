@@ -1,0 +1,1 @@
+"""Parameters of a model from its trials: estimators, sensor noise, identifiability."""

@@ -1,0 +1,272 @@
+"""The unscented filter's estimate: noise levels, convergence, all trials, honest intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.data.run_folder import RunFolder
+from bampipe.errors import InputError
+from bampipe.estimate.filter_uncertainty import sandwich_covariance
+from bampipe.estimate.unscented import (
+    FilterFailure,
+    FilterModel,
+    FilterSettings,
+    Trial,
+    constrain,
+    filter_trials,
+)
+from bampipe.identification.estimates import Estimate, timing_entry
+from bampipe.identification.filter_choice import FilterChoice
+from bampipe.identification.filter_run import (
+    Attempt,
+    FilterRun,
+    MotionLost,
+    calm,
+    filter_model,
+    run_filter,
+    stride_of,
+    trial_of,
+)
+from bampipe.identification.filter_tables import convergence, mean_nis, state_3sigma, states, trace
+from bampipe.identification.innovations import innovation_tests
+from bampipe.identification.sensor_noise import Noise, noise_report, tuned, untuned
+from bampipe.identification.squares_estimate import Squares, bias_details
+from bampipe.physics import System
+from bampipe.progress import Progress
+from bampipe.trials.motions import Motion
+from bampipe.trials.trial_cache import Shelf
+
+Array = NDArray[np.float64]
+
+_RESTARTS = 5
+"""Further searches, each with four times the process noise of the one before."""
+_REGIONS = (30.0, 8.0)
+"""Standard deviations of least squares around its answer in which a model that bends with its
+parameters is searched: a prior as wide as a range leads such a filter astray."""
+_LEAST_REGION = 3e-4
+"""Least width of that, in standard deviations of the prior, times the number above."""
+_REPEATS, _AROUND = 4, 10.0
+"""Most passes more of such a model; how far around the last answer, in its standard deviations."""
+_PARTS, _LIKELIER = (1, 2, 4), 30.0
+"""By what the Runge-Kutta step is divided for it, and what that must add to the logarithm of a
+trial's likelihood: three times what it adds where friction is smooth on the scale of a step."""
+_DOUBT = 3.0
+"""Standard deviations of least squares within which their scatter is no evidence against it."""
+_AGREE = 6.0
+"""Joint standard deviations within which filter and least squares are at one place."""
+
+
+def estimate_by_filter(
+    run: RunFolder,
+    system: System,
+    motions: Sequence[Motion],
+    start: Array,
+    squares: Squares,
+    noise: Noise,
+    choice: FilterChoice,
+    model_name: str,
+    progress: Progress,
+) -> Estimate:
+    """Tune the noise, converge on the first trial, then filter all trials.
+
+    Args:
+        run: the run folder; system: the model; motions: the trials.
+        start: (n_p,) starting values.
+        squares: least squares, which gives the region of the answer and checks it.
+        noise: of the sensors; choice: of the filter; model_name: for messages.
+        progress: told how far it is.
+
+    Raises:
+        MotionLost: the filter does not follow the motion.
+    """
+    stride = stride_of(motions)
+    near = squares.raw.p[: len(start)]
+    trials = Shelf(
+        lambda place: trial_of(run, motions[place], system, near, noise, stride, choice),
+        len(motions),
+        lambda trial: int(trial.t.size),
+    )
+    problem = squares.problem
+    free = [item for item in system.parameters if not item.fixed]
+    kept = len(free)
+    timing = problem.free.size > kept
+    model = filter_model(system, trials, start, timing)
+    progress(0.15, "noise levels")
+    late_sd = model.upper[kept:] / np.sqrt(3.0)
+    late = np.zeros(late_sd.size)
+    bends = not problem.linear
+    answer = np.append(squares.p[problem.free[:kept]], late)
+    settled = answer if bends else np.append(squares.raw.p[problem.free[:kept]], late)
+    known = np.append(np.sqrt(np.diag(squares.raw.covariance))[:kept], late_sd)
+    settings = untuned(system, noise, choice)
+    settings = replace(settings, walk_sd=np.append(settings.walk_sd, late))
+    moving = [calm(m, system, trial.t) for m, trial in zip(motions, trials, strict=True)]
+    clear = [every.all(axis=1) for every in moving]
+    settings = tuned(settings, model, trials, clear, settled, known, noise, choice)
+    settings = replace(settings, stride=stride)
+    prior_sd = np.append([item.sd for item in free], late_sd)
+    first = np.append(start[problem.free[:kept]], late)
+    spread = np.hypot(prior_sd, first - np.append(system.prior[problem.free[:kept]], late))
+    # If the prior does not lead to the answer, the search starts from least squares, then with
+    # more and more process noise, as a model that lacks much needs.
+    attempts: list[Attempt] = [(first, spread, 1.0)]
+    attempts += [(settled, prior_sd, 4.0**k) for k in range(_RESTARTS)]
+    if bends:
+        around = [
+            np.minimum(size * np.hypot(known, _LEAST_REGION * prior_sd), spread)
+            for size in _REGIONS
+        ]
+        attempts = [*((settled, region, 1.0) for region in around), *attempts]
+
+    def agrees(found: FilterRun) -> bool:
+        """Whether the filter is where least squares are, the timing left out.
+
+        Where the model is linear they have one answer at most, and no need to be asked.
+        """
+        if not bends:
+            return True
+        value, slope = model.to_physical(found.theta)
+        sd = np.hypot(slope * np.sqrt(np.diag(found.covariance)), known)
+        return bool(np.all(np.abs(value - answer)[:kept] < _AGREE * sd[:kept]))
+
+    def told(done: int, place: int) -> None:
+        progress(0.35 + 0.6 * done / (len(trials) + 1), motions[place].trial_id)
+
+    def lost(what: str, place: int) -> MotionLost:
+        remedy = "try --method least-squares, or set the trial aside if its sensors jumped there"
+        said = what.format(motions[place].trial_id)
+        return MotionLost(said, where=f"model {model_name}", remedy=remedy)
+
+    def run_from(attempts: Sequence[Attempt], settings: FilterSettings) -> FilterRun:
+        return run_filter(
+            model, trials, attempts, settings, choice, told, lost, system.coordinates,
+            agrees, 1 + len(_REGIONS),
+        )  # fmt: skip
+
+    found = run_from(attempts, settings)
+    if bends:
+        finer = _fine_enough(found, model, trials[0])
+        found = _until_it_stays(found, model, finer, run_from)
+    covariance, blocks = sandwich_covariance(
+        found.trials,
+        model.n_states,
+        found.search.theta,
+        found.search.covariance,
+        choice.block_s,
+    )
+    value, slope = model.to_physical(constrain(model, found.theta, covariance))
+    scaled = covariance * np.outer(slope, slope)
+    p = np.append(start, 0.0)
+    p[problem.free] = value
+    systematic = _systematic(p, scaled, squares, kept)
+    scaled[:kept, :kept] += np.diag(systematic**2)
+    tight = slope * np.sqrt(np.diag(found.covariance))
+    at_bound = (value - model.lower < tight) | (model.upper - value < tight)
+    names = [item.name for item in free]
+    details = [
+        {
+            "filter_sd": float(tight[k]),
+            "systematic_sd": float(systematic[k]),
+            "least_squares": float(squares.p[problem.free[k]]),
+            **bias,
+        }
+        for k, bias in enumerate(bias_details(squares, range(kept)))
+    ]
+    report: dict[str, object] = {
+        "nis": mean_nis(found, motions),
+        "innovations": innovation_tests(system, found, trials, moving),
+        "noise": noise_report(system, found.settings, noise),
+        "input_timing": timing_entry(p, scaled[-1, -1] if timing else 0.0),
+        "blocks": blocks,
+        "restarts": found.restarts,
+        "repeats": found.repeats,
+        "state_3sigma": state_3sigma(system, found.trials),
+        "convergence": convergence(names, model, found, covariance),
+    }
+    return Estimate(
+        p=p,
+        problem=problem,
+        covariance=scaled[:kept, :kept],
+        at_bound=at_bound[:kept],
+        details=details,
+        report=report,
+        states=states(system, motions, found, p[:-1], choice.trace_rows),
+        trace=trace(names, model, motions, found, choice.trace_rows),
+    )
+
+
+def _fine_enough(found: FilterRun, model: FilterModel, trial: Trial) -> FilterSettings:
+    """Return the settings with a step that makes a trial as likely as finer ones do.
+
+    Friction that falls within millimetres a second has bent before a step is over.
+    """
+
+    def log_likelihood(step: float) -> float:
+        wide = np.diag(_AROUND**2 * np.diag(found.covariance))
+        chosen = replace(found.settings, longest_step=step)
+        filtered = filter_trials(model, [trial], found.theta, wide, chosen)
+        return float(np.nansum(filtered.trials[0].log_likelihood))
+
+    step = found.settings.longest_step
+    # Where the filter fails, so will the passes that follow, which say why.
+    with suppress(FilterFailure):
+        tried = {part: log_likelihood(step / part) for part in _PARTS}
+        enough = max(tried.values()) - _LIKELIER
+        step /= min(part for part, likely in tried.items() if likely > enough)
+    return replace(found.settings, longest_step=step)
+
+
+def _until_it_stays(
+    found: FilterRun,
+    model: FilterModel,
+    settings: FilterSettings,
+    run_from: Callable[[Sequence[Attempt], FilterSettings], FilterRun],
+) -> FilterRun:
+    """Filter again around the answer, as long as that moves it and makes the readings likelier.
+
+    One pass takes the model as straight across all that it did not know when it began; where the
+    model bends, that leaves its mark on the answer. A start this wide of an answer adds a
+    hundredth to what is known of it.
+    """
+    for _ in range(_REPEATS):
+        finer = settings.longest_step < found.settings.longest_step
+        value, slope = model.to_physical(found.theta)
+        sd = np.sqrt(np.diag(found.covariance))
+        try:
+            again = run_from([(value, _AROUND * slope * sd, 1.0)], settings)
+        except MotionLost:
+            break
+        if again.log_likelihood < found.log_likelihood and not finer:
+            break
+        stays = np.all(np.abs(again.theta - found.theta) < sd)
+        found = replace(again, restarts=found.restarts, repeats=found.repeats + 1)
+        if stays:
+            break
+    return found
+
+
+def _systematic(p: Array, covariance: Array, squares: Squares, count: int) -> Array:
+    """Return how far filter and least squares disagree beyond their standard deviations, (count,).
+
+    Both see the same data and err alike by noise, but not by what the model lacks: where the
+    model is right, their difference stays below the sum of their variances and adds nothing.
+    Where the model bends, least squares know less than the filter and scatter on their own: they
+    are asked what they would be if the filter's answer were true, and count if that is not so.
+
+    Args:
+        p: (n_p + 1,) the filter's answer; covariance: (nt, nt) of it.
+        squares: the other; count: how many parameters of the model are estimated.
+    """
+    variance = (np.diag(covariance) + np.diag(squares.raw.covariance))[:count]
+    difference = (p - squares.p)[squares.problem.free[:count]]
+    if not squares.problem.linear and np.any(difference**2 > variance):
+        # An answer of the filter's that cannot be replayed is all the more in doubt.
+        with suppress(InputError):
+            difference = squares.gap(p)[:count]
+            difference[difference**2 < _DOUBT**2 * variance] = 0.0
+    return np.asarray(np.sqrt(np.maximum(difference**2 - variance, 0.0)))

@@ -1,0 +1,367 @@
+"""Raw samples through the unscented filter: a search for the region of the answer, then all."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.data.run_folder import RunFolder
+from bampipe.data.store import read_parquet
+from bampipe.errors import InputError
+from bampipe.estimate.innovations import averaged
+from bampipe.estimate.unscented import (
+    FilteredTrial,
+    FilterFailure,
+    FilterModel,
+    FilterResult,
+    FilterSettings,
+    Stored,
+    Trial,
+    filter_trials,
+)
+from bampipe.identification.filter_choice import FilterChoice
+from bampipe.identification.sensor_noise import Noise
+from bampipe.physics import System
+from bampipe.trials.motions import Motion, input_columns
+
+Array = NDArray[np.float64]
+
+_STORED, _STORED_IN_ALL = 20_000, 200_000
+"""Most distributions stored of one trial: memory must not grow with the log."""
+_COARSE = 300.0
+"""Factor on the process noise of the search for the region of the answer."""
+_LARGEST_NIS = 10.0
+"""Mean normalised innovation squared from which on the filter is taken to have lost the motion."""
+
+STRETCH_S = 0.05
+"""Innovations are averaged over this long: from sample to sample the counts of an encoder are no
+noise, and what a model lacks acts at the pace of a hand."""
+_SHIFT_KNOWN = 0.1
+"""Share of the way between encoder and mechanism to which that way is known at the start."""
+_CALM = 5.0
+"""Widths of the smoothed sign of the velocity within which an axis counts as reversing."""
+_MARGIN_S = 0.02
+"""Time around that, s, which counts too."""
+
+
+class MotionLost(InputError):
+    """The filter does not follow the measured motion, from wherever it starts."""
+
+
+Attempt = tuple[Array, Array, float]
+"""Parameters to start from (nt,), their sd (nt,), both physical, and a factor on process noise."""
+
+
+@dataclass(frozen=True)
+class Pass(Stored):
+    """A filtered trial without its samples, so that memory does not grow with the log.
+
+    Attributes:
+        nis: mean normalised innovation squared; counted: over so many samples.
+        log_likelihood: of all readings, each given those before.
+        ratio: (ny,) root mean square of each innovation in its standard deviation.
+        stretches: (K, ny) means of innovations in their standard deviations over ``STRETCH_S``,
+            NaN where one is missing.
+    """
+
+    nis: float
+    counted: int
+    log_likelihood: float
+    ratio: Array
+    stretches: Array
+
+
+@dataclass(frozen=True)
+class FilterRun:
+    """A filter that followed all trials.
+
+    Attributes:
+        search: the first pass over the first trial.
+        trials: the main passes over all trials in ``order``.
+        theta: (nt,) parameters after them, on the scale of estimation; covariance: (nt, nt).
+        settings: noise levels of the main pass.
+        order: places of ``trials`` in the session.
+        restarts: attempts that failed before.
+        repeats: how often it was begun again around its own answer.
+    """
+
+    search: FilterResult
+    trials: tuple[Pass, ...]
+    theta: Array
+    covariance: Array
+    settings: FilterSettings
+    order: tuple[int, ...]
+    restarts: int
+    repeats: int = 0
+
+    @property
+    def passes(self) -> tuple[Stored, ...]:
+        """All passes over trials, the search first."""
+        return (*self.search.trials, *self.trials)
+
+    @property
+    def steps(self) -> tuple[int, ...]:
+        """Places in the session of the trials of `passes`."""
+        return (0, *self.order)
+
+    @property
+    def log_likelihood(self) -> float:
+        """Of all readings in the main passes."""
+        return sum(each.log_likelihood for each in self.trials)
+
+
+def stride_of(motions: Sequence[Motion]) -> int:
+    """Return every how many samples the filter stores its distribution."""
+    sizes = [motion.t.size for motion in motions]
+    return max(-(-max(sizes) // _STORED), -(-sum(sizes) // _STORED_IN_ALL))
+
+
+def trial_of(
+    run: RunFolder,
+    motion: Motion,
+    system: System,
+    p: Array,
+    noise: Noise,
+    stride: int,
+    choice: FilterChoice,
+) -> Trial:
+    """Return the raw samples of one trial as the filter wants them.
+
+    The state is that of the mechanism, which is not where its encoders are once a model has
+    something between the two.
+
+    Args:
+        run: the run folder; motion: the trial; system: the model.
+        p: (n_p,) parameters near the answer, for the state at the first sample.
+        noise: of the sensors; stride: the filter stores every so many samples; choice: of the
+            filter.
+    """
+    path = run.require("ingest/samples.parquet", "ingest")
+    frame = read_parquet(path, trial=motion.trial_id)
+    n = len(system.coordinates)
+    stamps = frame["t"].to_numpy(dtype=float)
+    t = stamps - stamps[0]
+    brakes = system.model.device.brakes.values()
+    for place, name in enumerate(system.inputs):
+        if name not in frame and name != "t" and name not in brakes:
+            frame[name] = np.interp(t, motion.t, motion.u[:, place])
+    u = input_columns(frame, system.inputs, system.model.device.brakes, t, str(path))
+    for column in u.T:
+        lost = np.isnan(column)
+        if lost.any():
+            column[lost] = np.interp(t[lost], t[~lost], column[~lost])
+    # A copy: a table's only column would come out read-only, which compiled code refuses.
+    y = frame[[f"q_{axis}" for axis in system.coordinates]].to_numpy(dtype=float, copy=True)
+    if choice.measure == "position_velocity":
+        velocity = [np.interp(t, motion.t, column) for column in motion.qd.T]
+        y = np.hstack([y, np.stack(velocity, axis=1)])
+    first = int(np.flatnonzero(np.isfinite(y).all(axis=1))[0])
+    speed = np.maximum(motion.qd_sd[0], np.sqrt(np.mean(motion.qd**2, axis=0)) * 0.1)
+    read = (y[first, :n], motion.qd[0], motion.qdd[0])
+    x, x_sd = state_at(system, p, read, u[first], noise.reading_sd[:n], speed)
+    # The last stored distribution must be that of the last sample.
+    last = first + (t.size - 1 - first) // stride * stride + 1
+    return Trial(t[first:last], u[first:last], y[first:last], x, x_sd)
+
+
+def state_at(
+    system: System,
+    p: Array,
+    read: tuple[Array, Array, Array],
+    u: Array,
+    reading_sd: Array,
+    speed_sd: Array,
+) -> tuple[Array, Array]:
+    """Return the state (nx,) of the mechanism whose encoders read this, and its sd (nx,).
+
+    Args:
+        system: the model; p: (n_p,) parameters.
+        read: positions, rates and accelerations that the encoders read, each (n_q,).
+        u: (n_u,) inputs.
+        reading_sd: (n_q,) of a position; speed_sd: (n_q,) of a rate.
+    """
+    q, qd, qdd = read
+    there, rate, _ = system.true_motion(q[None], qd[None], qdd[None], u[None], p)
+    memory = system.initial_memory(there[0], u, p)
+    place = np.hypot(2.0 * reading_sd, _SHIFT_KNOWN * (there[0] - q))
+    return (
+        np.concatenate([there[0], rate[0], memory]),
+        np.concatenate([place, speed_sd, np.zeros(len(memory))]),
+    )
+
+
+def calm(motion: Motion, system: System, t: Array) -> NDArray[np.bool_]:
+    """Tell where each axis moves well clear of standstill and reversal, (T, n_q).
+
+    Within a few widths of the smoothed sign, friction bends faster than the spread of the state,
+    and no Gaussian describes what an encoder reads of an axis that stands still: there the filter
+    makes no claim that its innovations could be tested against.
+
+    Args:
+        motion: the trial as the filter stage left it; system: the model.
+        t: (T,) times at which it is wanted, s since the start of the trial.
+    """
+    width = np.array([c.sign_width for c in system.model.device.coordinates])
+    slow = np.abs(motion.qd) < _CALM * width
+    rate = (len(motion.t) - 1) / float(motion.t[-1] - motion.t[0])
+    reach = int(np.ceil(_MARGIN_S * rate))
+    window = np.ones(2 * reach + 1)
+    near = np.stack([np.convolve(column, window, "same") for column in slow.T], axis=1)
+    place = np.clip(np.searchsorted(motion.t, t), 0, len(motion.t) - 1)
+    return np.asarray(near[place] < 0.5)
+
+
+def filter_model(
+    system: System, trials: Sequence[Trial], start: Array, timing: bool
+) -> FilterModel:
+    """Return the model as the filter wants it.
+
+    Args:
+        system: the model; trials: whose sampling interval bounds the timing.
+        start: (n_p,) values of the parameters, those that are not estimated included.
+        timing: whether the timing of the inputs is estimated, as the last parameter. A model
+            that has a delay of its own cannot tell the two apart.
+    """
+    places = [i for i, item in enumerate(system.parameters) if not item.fixed]
+    lower = [system.parameters[i].lower for i in places]
+    upper = [system.parameters[i].upper for i in places]
+    if timing:
+        half = 0.5 * float(np.median(np.diff(trials[0].t)))
+        places, lower, upper = [*places, len(system.parameters)], [*lower, -half], [*upper, half]
+    return FilterModel(
+        derivative=system.derivative,
+        measure=system.measure,
+        derivative_rows=system.derivative_rows,
+        measure_rows=system.measure_rows,
+        n_states=len(system.states),
+        parameters=np.append(start, 0.0),
+        free=np.array(places, dtype=np.int64),
+        lower=np.array(lower),
+        upper=np.array(upper),
+        reads_parameters=system.moves_sensors,
+    )
+
+
+def run_filter(
+    model: FilterModel,
+    trials: Sequence[Trial],
+    attempts: Sequence[Attempt],
+    settings: FilterSettings,
+    choice: FilterChoice,
+    told: Callable[[int, int], None],
+    lost: Callable[[str, int], MotionLost],
+    axes: Sequence[str],
+    agrees: Callable[[FilterRun], bool] = lambda found: True,
+    rivals: int = 1,
+) -> FilterRun:
+    """Converge on the first trial, then filter all trials; the first attempt that holds counts.
+
+    A filter that trusts its model far from the truth does not find back. The first trial is
+    filtered with much process noise, which adds next to no information, and filtered again at
+    the end in its own right. Where parameters bend the model, a filter can follow the motion and
+    still sit in the wrong place: then the likeliest of several attempts counts.
+
+    Args:
+        model, trials, settings: as `filter_trials` takes them.
+        attempts: where to start, one after the other.
+        choice: which engine.
+        told: called with the number of trials done and the place of the next.
+        lost: makes the error from what happened and the place of the trial.
+        axes: names of the readings, for messages.
+        agrees: whether an attempt that follows the motion is where other evidence has it.
+        rivals: with so many that follow and do not agree, the likeliest of them counts.
+
+    Raises:
+        MotionLost: no attempt followed the motion.
+    """
+    engine = _engine(choice)
+    order = (*range(1, len(trials)), 0)
+    failure: tuple[int, FilterFailure] | None = None
+    found: FilterRun | None = None
+    following: list[FilterRun] = []
+    for restarts, (value, sd, factor) in enumerate(attempts):
+        mean, spread = model.to_estimated(value, sd)
+        level = replace(settings, noise_sd=factor * settings.noise_sd)
+        told(0, 0)
+        place = 0
+        try:
+            search = engine(
+                model, trials[:1], mean, np.diag(spread**2),
+                replace(level, noise_sd=_COARSE * level.noise_sd),
+            )  # fmt: skip
+            theta, covariance, passes = search.theta, search.covariance, []
+            for done, place in enumerate(order, start=1):
+                trial = trials[place]
+                one = engine(model, [trial], theta, covariance, level)
+                theta, covariance = one.theta, one.covariance
+                passes.append(_kept(one.trials[0], trial))
+                told(done, place)
+        except FilterFailure as error:
+            failure = (place, error)
+            continue
+        found = FilterRun(search, tuple(passes), theta, covariance, level, order, restarts)
+        if max(each.nis for each in passes) / len(passes[0].ratio) < _LARGEST_NIS:
+            if agrees(found):
+                return found
+            following.append(found)
+            if len(following) == rivals:
+                break
+    if following:
+        return max(following, key=lambda each: each.log_likelihood)
+    if found is not None:
+        raise _not_followed(found, lost, axes)
+    if failure is None:
+        raise RuntimeError("no attempt was made")
+    place, error = failure
+    t = trials[place].t[min(error.sample, trials[place].t.size - 1)]
+    raise lost(f"the filter lost the motion of trial {{}} at {t:.2f} s: {error.reason}", place)
+
+
+def _kept(filtered: FilteredTrial, trial: Trial) -> Pass:
+    """What later steps need of a filtered trial."""
+    size = np.asarray(filtered.innovation / filtered.innovation_sd)
+    seen = ~np.isnan(filtered.nis)
+    return Pass(
+        t=filtered.t,
+        mean=filtered.mean,
+        covariance=filtered.covariance,
+        nis=float(filtered.nis[seen].mean()) if seen.any() else np.inf,
+        counted=int(seen.sum()),
+        log_likelihood=float(np.nansum(filtered.log_likelihood)),
+        ratio=np.sqrt(np.nanmean(size**2, axis=0)),
+        stretches=averaged(size, stretch_of(trial)),
+    )
+
+
+def stretch_of(trial: Trial) -> int:
+    """Return the number of samples in ``STRETCH_S``."""
+    return max(1, round(STRETCH_S / float(np.median(np.diff(trial.t)))))
+
+
+def _engine(choice: FilterChoice) -> Callable[..., FilterResult]:
+    if choice.engine == "filterpy":
+        from bampipe.estimate.filterpy_oracle import filter_trials_by_filterpy
+
+        return filter_trials_by_filterpy
+    if choice.engine == "augmented":
+        from bampipe.estimate.augmented import filter_trials_augmented
+
+        return filter_trials_augmented
+    return filter_trials
+
+
+def _not_followed(
+    found: FilterRun, lost: Callable[[str, int], MotionLost], axes: Sequence[str]
+) -> MotionLost:
+    """Say in physical words which trial and axis the filter does not follow."""
+    worst = int(np.argmax([trial.nis for trial in found.trials]))
+    ratio = found.trials[worst].ratio
+    axis = (*axes, *axes)[int(np.argmax(ratio))]
+    return lost(
+        f"the filter does not follow trial {{}}: its prediction of {axis} one sample ahead errs "
+        f"{ratio.max():.0f} times more than noise explains",
+        found.order[worst],
+    )

@@ -1,0 +1,165 @@
+"""What a filter found, as tables and summaries: states, convergence, consistency."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from bampipe.estimate.unscented import FilterModel, Stored
+from bampipe.identification.filter_run import FilterRun
+from bampipe.physics import System
+from bampipe.trials.motions import Motion
+
+Array = NDArray[np.float64]
+
+
+def mean_nis(found: FilterRun, motions: Sequence[Motion]) -> dict[str, object]:
+    """Return the normalised innovation squared: near 1 where the noise levels are right."""
+    size = found.settings.observed.size
+    by_trial = {
+        motions[place].trial_id: trial.nis / size
+        for place, trial in zip(found.order, found.trials, strict=True)
+    }
+    counts = [trial.counted for trial in found.trials]
+    total = np.average([trial.nis for trial in found.trials], weights=counts)
+    return {"mean": float(total) / size, "by_trial": by_trial}
+
+
+def state_3sigma(system: System, trials: Sequence[Stored]) -> dict[str, dict[str, float]]:
+    """Return three standard deviations of position and velocity, median over time (Table VI)."""
+    n = len(system.coordinates)
+    variance = np.concatenate(
+        [np.diagonal(trial.covariance, axis1=1, axis2=2)[:, : 2 * n] for trial in trials]
+    )
+    bound = 3.0 * np.sqrt(np.median(variance, axis=0))
+    return {
+        axis: {"position": float(bound[i]), "velocity": float(bound[n + i])}
+        for i, axis in enumerate(system.coordinates)
+    }
+
+
+def convergence(
+    names: Sequence[str], model: FilterModel, found: FilterRun, covariance: Array
+) -> dict[str, object]:
+    """Say from when on every estimate stays within 2 % or 3 sd of its final value."""
+    nx = model.n_states
+    value, slope = model.to_physical(np.concatenate([p.mean[:, nx:] for p in found.passes]))
+    elapsed = np.concatenate(_elapsed(found.passes))
+    final = value[-1]
+    band = np.maximum(0.02 * np.abs(final), 3.0 * slope[-1] * np.sqrt(np.diag(covariance)))
+    outside = np.abs(value - final) > band
+    settled = {}
+    for place, name in enumerate(names):
+        late = np.flatnonzero(outside[:, place])
+        settled[name] = float(elapsed[late[-1]]) if late.size else 0.0
+    total = float(elapsed[-1])
+    return {
+        "settled_s": settled,
+        "total_s": total,
+        "converged": max(settled.values(), default=0.0) < 0.9 * total,
+    }
+
+
+def _elapsed(passes: Sequence[Stored]) -> list[Array]:
+    """Return the time of each pass, counted from the start of the first."""
+    clock, times = 0.0, []
+    for trial in passes:
+        times.append(clock + trial.t - trial.t[0])
+        clock += float(trial.t[-1] - trial.t[0])
+    return times
+
+
+def _thinned(count: int, rows: int) -> NDArray[np.int64]:
+    """Return indices of at most ``rows`` of ``count`` samples, the last one included."""
+    step = -(-count // rows)
+    return np.arange(count - 1, -1, -step)[::-1]
+
+
+def states(
+    system: System, motions: Sequence[Motion], found: FilterRun, p: Array, rows: int
+) -> pd.DataFrame:
+    """Return the filtered motion of every trial, in the order of the session.
+
+    Args:
+        system: the model; motions: the trials; found: the filter's.
+        p: (n_p,) the parameters found.
+        rows: most rows a trial.
+    """
+    n = len(system.coordinates)
+    frames: dict[int, pd.DataFrame] = {}
+    for place, trial in zip(found.order, found.trials, strict=True):
+        keep = _thinned(trial.t.size, rows)
+        t, mean = trial.t[keep], trial.mean[keep]
+        sd = np.sqrt(np.diagonal(trial.covariance[keep], axis1=1, axis2=2))
+        columns = {}
+        for i, axis in enumerate(system.coordinates):
+            columns[f"q_{axis}"], columns[f"q_sd_{axis}"] = mean[:, i], sd[:, i]
+            columns[f"qd_{axis}"], columns[f"qd_sd_{axis}"] = mean[:, n + i], sd[:, n + i]
+        frames[place] = with_torques(system, motions[place], t, columns, p)
+    return pd.concat([frames[i] for i in range(len(motions))], ignore_index=True)
+
+
+def with_torques(
+    system: System, motion: Motion, t: Array, columns: Mapping[str, Array], p: Array
+) -> pd.DataFrame:
+    """Return the motion with the trial, the torque of the hand and that against gravity (Fig. 6).
+
+    Args:
+        system: the model; motion: the trial as the filter stage left it.
+        t: (K,) times of the rows; columns: each (K,).
+        p: (n_p,) parameters.
+    """
+    z = system.memory(motion.q, motion.qd, motion.qdd, motion.u, p, motion.t)
+    hand = system.applied(motion.q, motion.qd, motion.qdd, z, motion.u, p)
+    gravity = system.compensation(motion.q, motion.qd, z, motion.u, p)
+    frame = pd.DataFrame({"trial_id": motion.trial_id, "t": t, **columns})
+    for i, axis in enumerate(system.coordinates):
+        frame[f"torque_user_{axis}"] = np.interp(t, motion.t, hand[:, i])
+    for i in system.compensated:
+        axis = system.coordinates[i]
+        frame[f"torque_gravity_{axis}"] = np.interp(t, motion.t, gravity[:, i])
+    return frame
+
+
+def as_filtered(system: System, motion: Motion, p: Array) -> pd.DataFrame:
+    """Return the states of a trial where the estimate leaves its motion as the filter stage did.
+
+    Args:
+        system: the model; motion: the trial, T samples; p: (n_p,) parameters.
+    """
+    columns = {}
+    for i, axis in enumerate(system.coordinates):
+        columns[f"q_{axis}"], columns[f"qd_{axis}"] = motion.q[:, i], motion.qd[:, i]
+        columns[f"qd_sd_{axis}"] = motion.qd_sd[:, i]
+    return with_torques(system, motion, motion.t, columns, p)
+
+
+def trace(
+    names: Sequence[str],
+    model: FilterModel,
+    motions: Sequence[Motion],
+    found: FilterRun,
+    rows: int,
+) -> pd.DataFrame:
+    """Return how the parameters converged, trial by trial, the search first.
+
+    Args:
+        names: of the filter's parameters, of which the first ``len(names)`` are stored.
+        model: the filter's; motions: the trials; rows: most rows a trial.
+        found: the passes.
+    """
+    frames = []
+    for step, trial, elapsed in zip(found.steps, found.passes, _elapsed(found.passes), strict=True):
+        keep = _thinned(trial.t.size, rows)
+        value, slope = model.to_physical(trial.mean[keep, model.n_states :])
+        value = np.clip(value, model.lower, model.upper)
+        variance = np.diagonal(trial.covariance[keep], axis1=1, axis2=2)[:, model.n_states :]
+        frame = pd.DataFrame({"t_total": elapsed[keep], "trial_id": motions[step].trial_id})
+        for place, name in enumerate(names):
+            frame[name] = value[:, place]
+            frame[f"{name}_sd"] = slope[:, place] * np.sqrt(variance[:, place])
+        frames.append(frame)
+    return pd.concat(frames, ignore_index=True)

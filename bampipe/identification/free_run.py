@@ -1,0 +1,198 @@
+"""Free runs: the identified model left to itself over a trial, against the measured position.
+
+Where the device declares its controller and the session recorded what that needs, machine and
+controller run together from the reference (closed loop). Otherwise the recorded inputs drive the
+model alone (open loop), which says something only where the mechanism forgets where it started:
+without a restoring force any error of the force is integrated for ever.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.data.run_folder import RunFolder
+from bampipe.data.store import read_parquet
+from bampipe.errors import InputError
+from bampipe.estimate.closed_loop import simulate_controlled
+from bampipe.estimate.simulation import simulate
+from bampipe.physics import System
+from bampipe.physics.control_law import ControlLaw, compile_law
+from bampipe.physics.device import INPUT_ORDERS, derivative
+from bampipe.trials.motions import Motion
+
+Array = NDArray[np.float64]
+
+CLOSED, OPEN = "closed_loop", "open_loop"
+_PUSHED = 0.1
+"""How far the start is displaced to see whether it is forgotten, in spreads of the motion."""
+_FORGOTTEN = 0.5
+"""Share of that which may be left over the last fifth of a trial."""
+
+
+@dataclass(frozen=True)
+class _Run:
+    """One trial: measured and simulated readings (T, 2 n_q), commands (T, n_f)."""
+
+    trial_id: str
+    measured: Array
+    simulated: Array
+    force: Array
+    command: Array
+
+
+def free_runs(
+    run: RunFolder,
+    system: System,
+    motions: Sequence[Motion],
+    parameters: Sequence[Array],
+    judged: Sequence[bool],
+) -> dict[str, object]:
+    """Run the model freely over every trial and say how far it ends up from the measurement.
+
+    Args:
+        run: the run folder, for the channels of the controller.
+        system: the model.
+        motions: the trials.
+        parameters: for each trial, (>= n_p,) parameters that have not seen it.
+        judged: which trials count for the whole; all where none does.
+
+    Returns:
+        ``mode`` (``closed_loop`` or ``open_loop``), ``axes.<axis>`` and
+        ``trials.<trial_id>.<axis>`` with ``mean_absolute`` and ``rmse`` of the position, rad or m,
+        and relative errors of position and velocity in per cent; in closed loop
+        ``forces.<channel>`` with the relative error of the command. ``{"reason": ...}`` where no
+        free run is possible or meaningful.
+    """
+    law = compile_law(system.model.device)
+    reason = "the device file declares no [controller]"
+    if law is not None:
+        reason = _lacks(run, system, law)
+    mode = OPEN if law is None or reason else CLOSED
+    runs = []
+    try:
+        for motion, p in zip(motions, parameters, strict=True):
+            if law is not None and mode == CLOSED:
+                runs.append(_closed(run, system, motion, p, law))
+            elif runs or _forgets(system, motion, p):
+                runs.append(_open(system, motion, p))
+            else:
+                return {
+                    "reason": f"{reason}, and driven by its recorded inputs alone the mechanism "
+                    "does not forget where it started"
+                }
+    except InputError as error:
+        return {"reason": f"{mode.replace('_', ' ')}: {error}"}
+    content: dict[str, object] = {
+        "mode": mode,
+        "axes": _axes(system, [r for r, j in zip(runs, judged, strict=True) if j] or runs),
+        "trials": {r.trial_id: _axes(system, [r]) for r in runs},
+    }
+    if mode == CLOSED:
+        content["forces"] = {
+            name: {
+                "relative_error_percent": _percent(
+                    np.concatenate([r.command[:, j] - r.force[:, j] for r in runs]),
+                    np.concatenate([r.force[:, j] for r in runs]),
+                )
+            }
+            for j, name in enumerate(system.model.device.forces)
+        }
+    else:
+        content["reason"] = reason
+    return content
+
+
+def _lacks(run: RunFolder, system: System, law: ControlLaw) -> str:
+    """Why this session and model have no closed loop to run; "" where they have."""
+    recorded = run.read_json("ingest/session.json").get("channels", {})
+    missing = [n for n in law.inputs if n != "t" and n not in recorded]
+    if missing:
+        return f"the session records no channel {missing[0]!r} for the controller"
+    orders = range(1, len(INPUT_ORDERS))
+    rates = {derivative(f, k) for f in law.forces for k in orders} & set(system.inputs)
+    return "the model uses time derivatives of the force, which a command lacks" if rates else ""
+
+
+def _closed(run: RunFolder, system: System, motion: Motion, p: Array, law: ControlLaw) -> _Run:
+    path = run.require("filter/kinematics.parquet", "filter")
+    frame = read_parquet(path, trial=motion.trial_id)
+    r = np.empty((len(motion.t), len(law.inputs)))
+    for place, name in enumerate(law.inputs):
+        r[:, place] = motion.t if name == "t" else frame[name].to_numpy(dtype=float)
+    force = [system.inputs.index(name) for name in law.forces]
+    _, total, seen = simulate_controlled(
+        system.derivative, system.measure, law.command, _start(system, motion, p), motion.u, r,
+        p[: len(system.parameters)], _interval(motion),
+        width=_width(system), n_noise=len(system.noise), force=force, rate_hz=law.rate_hz,
+        limits=law.limits,
+    )  # fmt: skip
+    measured = np.hstack([motion.q, motion.qd])
+    return _Run(motion.trial_id, measured, seen, motion.u[:, force], total[:, force])
+
+
+def _open(system: System, motion: Motion, p: Array, push: Array | None = None) -> _Run:
+    start = _start(system, motion, p)
+    n = motion.q.shape[1]
+    if push is not None:
+        start[:n] += push
+    x = simulate(
+        system.derivative, start, motion.u, p[: len(system.parameters)], _interval(motion),
+        width=_width(system), n_noise=len(system.noise),
+    )  # fmt: skip
+    seen = np.empty((len(x), 2 * n))
+    for i in range(len(x)):
+        system.measure(x[i], motion.u[i], p, seen[i])
+    none = np.zeros((len(x), 0))
+    return _Run(motion.trial_id, np.hstack([motion.q, motion.qd]), seen, none, none)
+
+
+def _forgets(system: System, motion: Motion, p: Array) -> bool:
+    """Whether the mechanism, driven by the recorded inputs, loses a displacement of its start."""
+    push = _PUSHED * motion.q.std(axis=0)
+    n = len(push)
+    near, far = _open(system, motion, p), _open(system, motion, p, push)
+    late = slice(-(len(motion.t) // 5) or None, None)
+    left = (far.simulated - near.simulated)[late, :n]
+    return bool(np.all(np.sqrt(np.mean(left**2, axis=0)) < _FORGOTTEN * push))
+
+
+def _start(system: System, motion: Motion, p: Array) -> Array:
+    q, qd, _ = system.true_motion(
+        motion.q[:1], motion.qd[:1], motion.qdd[:1], motion.u[:1], p[: len(system.parameters)]
+    )
+    memory = system.initial_memory(q[0], motion.u[0], p)
+    return np.concatenate([q[0], qd[0], memory])
+
+
+def _interval(motion: Motion) -> float:
+    return float(motion.t[1] - motion.t[0])
+
+
+def _width(system: System) -> Array:
+    return np.array([c.sign_width for c in system.model.device.coordinates])
+
+
+def _axes(system: System, runs: Sequence[_Run]) -> dict[str, Mapping[str, object]]:
+    n = len(system.coordinates)
+    error = np.concatenate([r.simulated - r.measured for r in runs])
+    measured = np.concatenate([r.measured for r in runs])
+    return {
+        axis: {
+            "mean_absolute": float(np.mean(np.abs(error[:, i]))),
+            "rmse": float(np.sqrt(np.mean(error[:, i] ** 2))),
+            "relative_error_percent": _percent(error[:, i], measured[:, i]),
+            "velocity_relative_error_percent": _percent(error[:, n + i], measured[:, n + i]),
+            "unit": system.coordinate_units[i],
+        }
+        for i, axis in enumerate(system.coordinates)
+    }
+
+
+def _percent(error: Array, size: Array) -> float:
+    """Norm of the error over the norm of the measured quantity, per cent."""
+    norm = float(np.linalg.norm(size))
+    return 100.0 * float(np.linalg.norm(error)) / norm if norm > 0.0 else 100.0

@@ -1,0 +1,318 @@
+"""What these trials can and cannot say of a model's numbers, in numbers and in words."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.estimate.identifiability import (
+    Weak,
+    bound,
+    growth_without,
+    information,
+    residual_spectrum,
+    slopes,
+    unseen,
+    weak_directions,
+)
+from bampipe.estimate.least_squares import Problem
+from bampipe.identification.sensor_noise import Noise
+from bampipe.physics import System
+from bampipe.physics.structure import Number, Structure, structure
+from bampipe.trials.motions import Motion
+
+Array = NDArray[np.float64]
+
+_NOTHING = 0.01
+"""A trial without which no bound would grow by this share adds nothing."""
+_CLOSE = 0.9
+"""Correlation from which on two numbers are said to move together."""
+_LITTLE = 0.5
+"""Share of the prior standard deviation above which the data are said to add little."""
+_MOVES = 0.5
+"""Per cent by which an estimate moves for an error of one per cent, from which on it is said."""
+_SHIFT = 1e-6
+"""Of a position, rad or m, for the slope of a force."""
+TIMING = "input_timing"
+
+
+@dataclass(frozen=True)
+class Identifiability:
+    """What the trials could say at best.
+
+    Attributes:
+        bound_sd: (n_free,) Cramér-Rao bound on the standard deviation of each parameter, None
+            where the trials say nothing of it.
+        unseen: (n_free, n_free) covariance that their priors leave where the trials say nothing.
+        report: for identify.json.
+        sentences: what a reader must know before believing a number.
+    """
+
+    bound_sd: tuple[float | None, ...]
+    unseen: Array
+    report: dict[str, object]
+    sentences: tuple[str, ...]
+
+
+def identifiability(
+    system: System,
+    motions: Sequence[Motion],
+    problem: Problem,
+    p: Array,
+    noise: Noise,
+    at_bound: NDArray[np.bool_],
+) -> Identifiability:
+    """Return what sensor noise alone leaves open about the parameters at ``p``.
+
+    Args:
+        system: the model; motions: the trials; problem: their inverse dynamics, the timing of
+            the inputs last where it is estimated.
+        p: (n_p + 1,) estimates, the timing last.
+        noise: of the sensors.
+        at_bound: (n_parameters,) which estimates lie at the limit of their range.
+    """
+    known = structure(system)
+    n_p = len(system.parameters)
+    names = [system.parameters[i].name if i < n_p else TIMING for i in problem.free]
+    joint = [_of_trial(system, known, motions, problem, k, p, noise) for k in range(len(motions))]
+    n = len(names)
+    total = np.sum(joint, axis=0)
+    own = total[:n, :n]
+    covariance = bound(own)
+    sd = np.sqrt(np.diag(covariance))
+    value = p[problem.free]
+    kept = [i for i, name in enumerate(names) if name != TIMING]
+    weak = [w for w in weak_directions(own) if set(w.members) & set(kept)]
+    growth = growth_without([part[:n, :n] for part in joint])[:, kept]
+    numbers = [
+        _number(number, total, n, n + j, names, value, kept)
+        for j, number in enumerate(known.numbers)
+    ]
+    half = problem.upper[-1]  # of a sample: all that is assumed of the timing
+    assumed = np.array([system.parameters[i].sd if i < n_p else half for i in problem.free])
+    prior, place = assumed[kept], np.ix_(kept, kept)
+    parameters = {names[i]: _entry(own, covariance, i, names) for i in kept}
+    trials = {
+        motion.trial_id: {
+            "growth": float(min(row.max(initial=0.0), 1e9)),
+            "parameter": names[kept[int(np.argmax(row))]],
+        }
+        for motion, row in zip(motions, growth, strict=True)
+    }
+    sentences = [
+        *(_together(group.members, group.combinations) for group in known.together),
+        *(_moving(w, names, value, covariance) for w in weak),
+        *_unsaid([names[i] for i in kept], sd[kept], prior),
+        *_limits([names[i] for i in kept], at_bound),
+        *_idle(trials),
+        *_leaning(numbers),
+    ]
+    report: dict[str, object] = {
+        "parameters": parameters,
+        "weak_directions": [
+            {
+                "members": [names[i] for i in w.members],
+                "parts": list(w.parts),
+                "strength": w.strength,
+            }
+            for w in weak
+        ],
+        "numbers": numbers,
+        "together": [
+            {"members": list(g.members), "combinations": list(g.combinations)}
+            for g in known.together
+        ],
+        "trials": trials,
+        "sentences": sentences,
+    }
+    bounds = tuple(_finite(sd[i]) for i in kept)
+    return Identifiability(bounds, unseen(own, assumed)[place], report, tuple(sentences))
+
+
+def _of_trial(
+    system: System,
+    known: Structure,
+    motions: Sequence[Motion],
+    problem: Problem,
+    trial: int,
+    p: Array,
+    noise: Noise,
+) -> Array:
+    """Return the information of one trial on the parameters, then on the device's numbers."""
+    motion, own = motions[trial], p[:-1]
+    n = len(system.coordinates)
+    u = motion.u - p[-1] * motion.u_rate
+    z = system.memory(motion.q, motion.qd, motion.qdd, u, own, motion.t)
+    moved = system.true_motion(motion.q, motion.qd, motion.qdd, u, own)
+    slope = np.concatenate([slopes(problem, trial, p), known.slopes(*moved, z, u, own)], axis=2)
+    slope *= ~problem.resting[trial][:, :, None]
+    push = system.input_map(motion.q, u, own) * noise.process_sd[noise.is_force]
+    inertia = np.diagonal(system.mass_matrix(motion.q, own), axis1=1, axis2=2).mean(axis=0)
+    damping = np.array(
+        [
+            next((own[i] for i, item in enumerate(system.parameters) if item.name == name), 0.0)
+            for name in (f"viscous.{axis}" for axis in system.coordinates)
+        ]
+    )
+    stiffness = _stiffness(system, motion, z, u, own)
+    spectrum = residual_spectrum(
+        len(motion.t),
+        problem.band.rate_hz,
+        inertia,
+        damping,
+        stiffness,
+        noise.reading_sd[:n],
+        np.sqrt(np.mean(np.sum(push**2, axis=2), axis=0)),
+    )
+    return information(slope, spectrum)
+
+
+def _stiffness(system: System, motion: Motion, z: Array, u: Array, p: Array) -> Array:
+    """Return how the force that the motion needs changes with the position, RMS, (n_q,)."""
+    found = np.zeros(len(system.coordinates))
+    here = system.required(motion.q, motion.qd, motion.qdd, z, u, p)
+    for i in range(len(found)):
+        q = motion.q.copy()
+        q[:, i] += _SHIFT
+        moved = system.required(q, motion.qd, motion.qdd, z, u, p)
+        found[i] = np.sqrt(np.mean((moved[:, i] - here[:, i]) ** 2)) / _SHIFT
+    return found
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def _entry(own: Array, covariance: Array, i: int, names: Sequence[str]) -> dict[str, object]:
+    """Return bound, bound were all others known, and the parameter that most looks alike."""
+    entry: dict[str, object] = {
+        "bound_sd": _finite(np.sqrt(covariance[i, i])),
+        "alone_sd": _finite(1.0 / np.sqrt(own[i, i])) if own[i, i] > 0.0 else None,
+    }
+    partner, correlation = _partner(covariance, i)
+    if partner is not None:
+        entry |= {"partner": names[partner], "correlation": correlation}
+    return entry
+
+
+def _partner(covariance: Array, i: int) -> tuple[int | None, float]:
+    """Return the other number whose error goes most with that of ``i``, and the correlation."""
+    sd = np.sqrt(np.diag(covariance))
+    usable = np.isfinite(sd) & (sd > 0.0)
+    if not usable[i] or usable.sum() < 2:
+        return None, 0.0
+    correlation = np.zeros(len(sd))
+    correlation[usable] = covariance[i, usable] / (sd[i] * sd[usable])
+    correlation[i] = 0.0
+    place = int(np.argmax(np.abs(correlation)))
+    return place, float(correlation[place])
+
+
+def _number(
+    number: Number,
+    total: Array,
+    n: int,
+    place: int,
+    names: Sequence[str],
+    value: Array,
+    kept: Sequence[int],
+) -> dict[str, Any]:
+    """Return what the trials say of one number of the device, were it estimated too."""
+    rows = [*range(n), place]
+    covariance = bound(total[np.ix_(rows, rows)])
+    partner, correlation = _partner(covariance, n)
+    shift = -np.linalg.lstsq(total[:n, :n], total[:n, place], rcond=1e-12)[0]
+    size = np.abs(value)
+    per_cent = {names[i]: float(shift[i] * number.value / value[i]) for i in kept if size[i] > 0.0}
+    return {
+        "name": number.name,
+        "value": number.value,
+        "unit": number.unit,
+        "bound_sd": _finite(np.sqrt(covariance[n, n])),
+        "partner": None if partner is None else names[partner],
+        "correlation": correlation,
+        "moves_percent": per_cent,
+    }
+
+
+def _together(members: Sequence[str], combinations: Sequence[str]) -> str:
+    return (
+        f"{_listed(members)} enter the equations only as {_listed(combinations)}: no motion "
+        "tells the parts apart."
+    )
+
+
+def _moving(weak: Weak, names: Sequence[str], value: Array, covariance: Array) -> str:
+    """Say which parameters move together, and for a pair how well sum and difference are known."""
+    told = _listed([f"`{names[i]}`" for i in weak.members])
+    pair = list(weak.members)
+    start = f"{told} move together here"
+    if (
+        len(pair) != 2
+        or np.any(value[pair] == 0.0)
+        or not np.isfinite(covariance[pair, pair]).all()
+    ):
+        return f"{start}: {100.0 * weak.strength:.2g} % of the information is left for that."
+    relative = covariance[np.ix_(pair, pair)] / np.outer(value[pair], value[pair])
+    both = [0.5 * np.sqrt(np.array([1.0, s]) @ relative @ np.array([1.0, s])) for s in (1.0, -1.0)]
+    better, worse = ("sum", "difference") if both[0] < both[1] else ("difference", "sum")
+    return (
+        f"{start}: their {better}, each in per cent of itself, is known to "
+        f"{100.0 * min(both):.2g} % at best, their {worse} to {100.0 * max(both):.2g} %."
+    )
+
+
+def _unsaid(names: Sequence[str], sd: Array, prior: Array) -> list[str]:
+    return [
+        f"These trials say next to nothing of `{name}`: what was assumed of it stands."
+        if not np.isfinite(bound_sd)
+        else f"These trials say little of `{name}`: at best ± {bound_sd:.2g}, ± {assumed:.2g} was "
+        "assumed before."
+        for name, bound_sd, assumed in zip(names, sd, prior, strict=True)
+        if not bound_sd < _LITTLE * assumed
+    ]
+
+
+def _limits(names: Sequence[str], at_bound: NDArray[np.bool_]) -> list[str]:
+    return [
+        f"`{name}` lies at the limit of its range: its interval is no guide."
+        for name, there in zip(names, at_bound, strict=True)
+        if there
+    ]
+
+
+def _idle(trials: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    if len(trials) < 2:
+        return []
+    return [
+        f"Trial {name} adds next to nothing: without it no bound would grow by more than "
+        f"{100.0 * entry['growth']:.1g} %."
+        for name, entry in trials.items()
+        if entry["growth"] < _NOTHING
+    ]
+
+
+def _leaning(numbers: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Say which numbers of the device file the estimates rest on, and which they resemble."""
+    told = []
+    for number in numbers:
+        moved = {
+            name: size for name, size in number["moves_percent"].items() if abs(size) >= _MOVES
+        }
+        if moved:
+            shown = _listed([f"`{name}` by {size:+.1f} %" for name, size in moved.items()])
+            told.append(f"An error of 1 % in {number['name']} would move {shown}.")
+        if number["partner"] is not None and abs(number["correlation"]) > _CLOSE:
+            told.append(
+                f"Were {number['name']} estimated too, it and `{number['partner']}` would move "
+                f"together (correlation {number['correlation']:+.2f})."
+            )
+    return told
+
+
+def _listed(items: Sequence[str]) -> str:
+    return items[0] if len(items) == 1 else f"{', '.join(items[:-1])} and {items[-1]}"

@@ -1,0 +1,89 @@
+"""Whether the filter's innovations are white and independent of the inputs, channel by channel."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.estimate.innovations import Test, averaged, independence, whiteness
+from bampipe.estimate.unscented import Trial
+from bampipe.identification.filter_run import STRETCH_S, FilterRun, stretch_of
+from bampipe.physics import System
+
+_LAGS_S = (0.0, 0.25, 0.5)
+"""Lags at which inputs are taken."""
+WHITE_SHARE = 0.2
+"""Share predictable from the past below which a channel counts as white: docs/identification."""
+INPUT_SHARE = 0.05
+"""Share predictable from the inputs below which a channel counts as independent of them."""
+_SIGNIFICANT = 0.01
+
+
+def innovation_tests(
+    system: System,
+    found: FilterRun,
+    trials: Sequence[Trial],
+    moving: Sequence[NDArray[np.bool_]],
+) -> dict[str, object]:
+    """Return both tests for each position channel, and a sentence on each, for identify.json.
+
+    Args:
+        system: the model; found: the filter's; trials: as it was given them.
+        moving: by trial, (T, n_q) where each axis is clear of standstill and reversal.
+    """
+    n = len(system.coordinates)
+    channels = [i for i, name in enumerate(system.inputs) if name != "t"]
+    by_trial, inputs = [], []
+    for place, trial in zip(found.order, found.trials, strict=True):
+        given = trials[place]
+        length = stretch_of(given)
+        clear = averaged(moving[place].astype(float), length) == 1.0
+        by_trial.append(np.where(clear, trial.stretches[:, :n], np.nan))
+        inputs.append(averaged(given.u[:, channels], length))
+    content: dict[str, object] = {}
+    for axis in range(n):
+        records = [stretches[:, axis] for stretches in by_trial]
+        lags = [round(lag / STRETCH_S) for lag in _LAGS_S]
+        own, driven = whiteness(records), independence(records, inputs, lags)
+        entry: dict[str, object] = {"sentence": _sentence(own, driven)}
+        if own is not None:
+            entry["whiteness"] = _entry(own) | {"white": not _fails(own, WHITE_SHARE)}
+        if driven is not None:
+            passed = not _fails(driven, INPUT_SHARE)
+            entry["inputs"] = _entry(driven) | {"independent": passed}
+        content[system.coordinates[axis]] = entry
+    return content
+
+
+def _fails(test: Test, limit: float) -> bool:
+    return test.p_value < _SIGNIFICANT and test.share > limit
+
+
+def _entry(test: Test) -> dict[str, object]:
+    return {
+        "statistic": test.statistic,
+        "degrees": test.degrees,
+        "p_value": test.p_value,
+        "share": test.share,
+    }
+
+
+def _sentence(own: Test | None, driven: Test | None) -> str:
+    """Say both outcomes in words."""
+    if own is None or driven is None:
+        return "Too little motion to test the innovations."
+    past = f"{100.0 * own.share:.0f} % of their variance follows from their past"
+    force = f"{100.0 * driven.share:.0f} % from the inputs"
+    if not _fails(own, WHITE_SHARE) and not _fails(driven, INPUT_SHARE):
+        return f"White and independent of the inputs: {past}, {force}; nothing points to a lack."
+    if _fails(driven, INPUT_SHARE):
+        return (
+            f"Not independent of the inputs: {force}, {past}. The model answers the force wrongly: "
+            "a delay, a gain, an inertia or what carries the load."
+        )
+    return (
+        f"Not white: {past}, {force}. Something acts that the model lacks and that does not follow "
+        "the force, such as friction of another shape."
+    )

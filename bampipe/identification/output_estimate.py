@@ -1,0 +1,156 @@
+"""Output error on the raw positions of the free trials: see `estimate.output_error`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from bampipe.errors import InputError
+from bampipe.estimate.output_error import OutputError, Segment, fit_output
+from bampipe.estimate.simulation import simulate
+from bampipe.estimate.unscented import Trial
+from bampipe.identification.estimates import Estimate, timing_entry
+from bampipe.identification.filter_tables import as_filtered
+from bampipe.identification.squares_estimate import Squares
+from bampipe.physics import System
+from bampipe.physics.signatures import ROWS
+from bampipe.progress import Progress
+from bampipe.trials.motions import Motion
+
+Array = NDArray[np.float64]
+
+SEGMENT_S = 0.5
+"""Length of a segment, s: noise of a force moves the motion by less than friction does."""
+_LONGEST_STEP = 1e-3
+"""Of the integration, s; friction near standstill shortens it further."""
+_POSITION_STEP, _RATE_STEP, _PARAMETER_STEP, _TIMING_STEP = 1e-5, 1e-4, 1e-4, 1e-5
+"""Differences for slopes: rad or m, per s, in prior standard deviations, s."""
+
+
+def segments_of(system: System, motion: Motion, trial: Trial, p: Array) -> list[Segment]:
+    """Cut a trial into segments; those with a missing reading are left out.
+
+    Args:
+        system: the model; motion: the filtered trial, for initial velocities; trial: its raw
+            samples, which are put on a uniform grid.
+        p: (n_p,) parameters for the internal states that segments start from. The fit's own
+            have the timing of the inputs behind them, by which these are moved.
+    """
+    n, nx = len(system.coordinates), len(system.states)
+    dt = float(np.median(np.diff(trial.t)))
+    t = trial.t[0] + dt * np.arange(int((trial.t[-1] - trial.t[0]) / dt + 1e-6) + 1)
+    # On stamps that are even already, interpolation changes nothing.
+    y, u = (np.stack([np.interp(t, trial.t, c) for c in x.T], axis=1) for x in (trial.y, trial.u))
+    rate = np.gradient(u, dt, axis=0)
+    width = np.array([c.sign_width for c in system.model.device.coordinates])
+    memory = system.memory(motion.q, motion.qd, motion.qdd, motion.u, p, motion.t)
+    state = np.hstack([motion.qd, memory])
+    count = max(4 * nx, round(SEGMENT_S / dt))
+    found = []
+    for first in range(0, t.size - count + 1, count):
+        part = slice(first, first + count)
+        if not np.isfinite(y[part]).all():
+            continue
+        start = [np.interp(t[first] - trial.t[0], motion.t, column) for column in state.T]
+        x0 = np.concatenate([y[first, :n], start])
+
+        def run(x: Array, parameters: Array, part: slice = part) -> Array:
+            moved = u[part] - parameters[-1] * rate[part]
+            try:
+                states = simulate(
+                    system.derivative, x, moved, parameters[:-1], dt,
+                    width=width, n_noise=len(system.noise), max_step=_LONGEST_STEP,
+                )  # fmt: skip
+            except InputError:  # a step too far: the fit halves it
+                return np.full((count, n), np.inf)
+            return _readings(system, states, moved, parameters[:-1])
+
+        step = np.full(nx, _RATE_STEP)
+        step[:n] = _POSITION_STEP
+        step[2 * n :] *= 1.0 + np.abs(x0[2 * n :])
+        found.append(Segment(run, y[part, :n], x0, step))
+    return found
+
+
+def estimate_by_output(
+    system: System,
+    motions: Sequence[Motion],
+    trials: Sequence[Trial],
+    squares: Squares,
+    progress: Progress,
+) -> Estimate:
+    """Return the output-error estimate, from least squares on; its trace is the fit so far.
+
+    Args:
+        system: the model; motions, trials: filtered and raw; squares: where to start.
+        progress: told how many trials are done.
+    """
+    problem = squares.problem
+    segments = [
+        segments_of(system, motion, trial, squares.p[:-1])
+        for motion, trial in zip(motions, trials, strict=True)
+    ]
+    sd = np.array([*(item.sd for item in system.parameters), 0.0])
+    step = np.where(problem.free < len(sd) - 1, _PARAMETER_STEP * sd[problem.free], _TIMING_STEP)
+
+    def fit(number: int, start: Array, most: int) -> OutputError:
+        chosen = [segment for trial in segments[:number] for segment in trial]
+        return fit_output(chosen, start, problem.free, problem.lower, problem.upper, step, most)
+
+    found = fit(len(segments), squares.p, 15)
+    kept = [k for k, i in enumerate(problem.free) if i < len(system.parameters)]
+    rows, frames, clock = [], [], 0.0
+    for number, motion in enumerate(motions, start=1):
+        progress(0.4 + 0.5 * number / len(motions), motion.trial_id)
+        clock += float(motion.t[-1])
+        if sum(len(trial) for trial in segments[:number]) <= problem.free.size:
+            continue
+        so_far = found if number == len(motions) else fit(number, found.p, 2)
+        row: dict[str, object] = {"t_total": clock, "trial_id": motion.trial_id}
+        for k in kept:
+            name = system.parameters[problem.free[k]].name
+            row[name] = so_far.p[problem.free[k]]
+            row[f"{name}_sd"] = float(np.sqrt(so_far.covariance[k, k]))
+        rows.append(row)
+        frames.append(as_filtered(system, motion, found.p[:-1]))
+    bound = 3.0 * np.median(np.concatenate([motion.qd_sd for motion in motions]), axis=0)
+    timed = len(kept) < problem.free.size
+    value = found.p[problem.free]
+    return Estimate(
+        p=found.p,
+        problem=problem,
+        covariance=found.covariance[np.ix_(kept, kept)],
+        at_bound=np.asarray((value <= problem.lower) | (value >= problem.upper))[kept],
+        details=[{"least_squares": float(squares.p[problem.free[k]])} for k in kept],
+        report={
+            "input_timing": timing_entry(found.p, found.covariance[-1, -1] if timed else 0.0),
+            "position_error": dict(zip(system.coordinates, map(float, found.rms), strict=True)),
+            "convergence": {"iterations": found.iterations, "converged": found.converged},
+            "state_3sigma": {
+                axis: {"velocity": float(bound[i])} for i, axis in enumerate(system.coordinates)
+            },
+        },
+        states=pd.concat(frames, ignore_index=True),
+        trace=pd.DataFrame(rows),
+    )
+
+
+def _readings(system: System, states: Array, u: Array, p: Array) -> Array:
+    """What the encoders read of a simulated motion, (T, n_q)."""
+    n = len(system.coordinates)
+    if not system.moves_sensors:
+        return states[:, :n]
+    found = np.empty((len(states), n))
+    parameters = np.repeat(p, ROWS)
+    for first in range(0, len(states), ROWS):
+        part = slice(first, min(first + ROWS, len(states)))
+        count = part.stop - first
+        x, inputs = (np.zeros((width.shape[1], ROWS)) for width in (states, u))
+        x[:, :count], inputs[:, :count] = states[part].T, u[part].T
+        y = np.zeros(2 * n * ROWS)
+        system.measure_rows(count, x.ravel(), inputs.ravel(), parameters, y)
+        found[part] = y.reshape(-1, ROWS)[:n, :count].T
+    return found

@@ -1,0 +1,205 @@
+"""Noise of a session's sensors, and the levels that the filter is best told (NIS, likelihood)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.estimate.filter_uncertainty import climb
+from bampipe.estimate.unscented import (
+    FilterFailure,
+    FilterModel,
+    FilterSettings,
+    Trial,
+    filter_trials,
+)
+from bampipe.identification.filter_choice import FilterChoice
+from bampipe.physics import System
+from bampipe.trials.motions import Motion
+
+Array = NDArray[np.float64]
+
+_TUNING_SAMPLES = 3000
+"""Samples of one trial on which the noise levels are tuned."""
+_TUNING_STEP_S = 2e-3
+"""Longest Runge-Kutta step while tuning, s: noise levels need no more."""
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Noise of the sensors before any tuning.
+
+    Attributes:
+        reading_sd: (ny,) of position, and velocity where measured.
+        process_sd: (nw,) of the model's process noise, one sample.
+        is_force: (nw,) which of these are a measured force.
+    """
+
+    reading_sd: Array
+    process_sd: Array
+    is_force: NDArray[np.bool_]
+
+
+def sensor_noise(
+    session: Mapping[str, Any],
+    system: System,
+    motions: Sequence[Motion],
+    p: Array,
+    choice: FilterChoice,
+) -> Noise:
+    """Encoder steps spread evenly, sd = step / sqrt(12); force noise as the session says.
+
+    Where the session does not say, the second difference of the force gives it: the force
+    of a hand is smooth over two milliseconds. Process noise that is no force starts as the
+    torque of the same noise at an arm of 1 m. Where the load moves the encoder against the
+    handle, the noise of a force adds to what the model says that the encoder reads.
+
+    Args:
+        session: ``ingest/session.json``; system: the model; motions: the trials.
+        p: (n_p,) parameters near the answer.
+        choice: fixes levels that are not to be found.
+    """
+    reading = []
+    for place, axis in enumerate(system.coordinates):
+        step = session["axes"][axis].get("resolution") or 0.0
+        if choice.reading_noise > 0.0 and step > 0.0:
+            reading.append(choice.reading_noise * step)
+        elif step > 0.0:
+            reading.append(step / np.sqrt(12.0))
+        else:
+            reading.append(white_part([motion.q[:, place] for motion in motions]))
+    if choice.measure == "position_velocity":
+        velocity = np.concatenate([motion.qd_sd for motion in motions])
+        reading.extend(np.median(velocity, axis=0))
+    given = session.get("force", {}).get("noise_sd")
+    is_force = np.array([name in system.inputs for name in system.noise])
+    process = np.zeros(len(system.noise))
+    forces = [name for name, force in zip(system.noise, is_force, strict=True) if force]
+    for place, name in enumerate(system.noise):
+        if choice.force_noise > 0.0:
+            process[place] = choice.force_noise
+        elif name in forces and isinstance(given, int | float) and given > 0.0:
+            process[place] = float(given)
+        elif name in forces:
+            column = system.inputs.index(name)
+            process[place] = white_part([motion.u[:, column] for motion in motions])
+    smallest = process[is_force].min() if is_force.any() else 0.05
+    process[process == 0.0] = smallest or np.finfo(float).eps
+    noise = Noise(np.array(reading), process, is_force)
+    if not system.moves_sensors:
+        return noise
+    n = len(system.coordinates)
+    own = _force_in_positions(system, motions, p, noise)
+    return replace(noise, reading_sd=np.append(np.hypot(reading[:n], own), reading[n:]))
+
+
+def _force_in_positions(system: System, motions: Sequence[Motion], p: Array, noise: Noise) -> Array:
+    """Return how far the noise of the forces moves the encoders in the model, RMS, (n_q,)."""
+    square, count = np.zeros(len(system.coordinates)), 0
+    for motion in motions:
+        here = system.true_motion(motion.q, motion.qd, motion.qdd, motion.u, p)[0]
+        for place in np.flatnonzero(noise.is_force):
+            u = motion.u.copy()
+            u[:, system.inputs.index(system.noise[place])] += noise.process_sd[place]
+            moved = system.true_motion(motion.q, motion.qd, motion.qdd, u, p)[0]
+            square += np.sum((moved - here) ** 2, axis=0)
+        count += len(motion.t)
+    return np.asarray(np.sqrt(square / count))
+
+
+def white_part(records: Sequence[Array]) -> float:
+    """Standard deviation of the white part of a smooth signal, from its second differences."""
+    second = np.concatenate([np.diff(record, 2) for record in records])
+    return float(np.median(np.abs(second)) / (0.6745 * np.sqrt(6.0)))
+
+
+def untuned(system: System, noise: Noise, choice: FilterChoice) -> FilterSettings:
+    """Return the settings of the filter with the noise of the sensors as it is stated."""
+    n = len(system.coordinates)
+    free = [item for item in system.parameters if not item.fixed]
+    return FilterSettings(
+        observed=np.arange(2 * n if choice.measure == "position_velocity" else n),
+        reading_sd=noise.reading_sd,
+        noise_sd=noise.process_sd,
+        walk_sd=choice.random_walk * np.array([item.sd for item in free]),
+        longest_step=choice.longest_step_s,
+        square_root=choice.form == "square_root",
+    )
+
+
+def tuned(
+    settings: FilterSettings,
+    model: FilterModel,
+    trials: Sequence[Trial],
+    clear: Sequence[NDArray[np.bool_]],
+    value: Array,
+    sd: Array,
+    noise: Noise,
+    choice: FilterChoice,
+) -> FilterSettings:
+    """Set the noise levels at the maximum of the filter's likelihood on part of one trial.
+
+    The noise of a measured force is at least that of its sensor: what is more is model error.
+    Reversals are left out: there the filter's Gaussian fits whatever the noise, and noise of
+    twice its size would pay for them everywhere else.
+
+    Args:
+        settings: with the levels to start from.
+        model: the filter's; trials: of which the longest is used.
+        clear: by trial, (T,) samples at which no axis reverses; all count where none is clear.
+        value: (nt,) parameters near the answer, physical; sd: (nt,) how well they are known.
+        noise: of the sensors.
+        choice: fixes levels that are not to be found.
+    """
+    quick = replace(settings, longest_step=max(settings.longest_step, _TUNING_STEP_S))
+    longest = max(range(len(trials)), key=lambda i: trials[i].t.size)
+    whole = trials[longest]
+    part = replace(
+        whole, t=whole.t[:_TUNING_SAMPLES], u=whole.u[:_TUNING_SAMPLES], y=whole.y[:_TUNING_SAMPLES]
+    )
+    counts = clear[longest][:_TUNING_SAMPLES]
+    counts = counts if counts.any() else np.ones(part.t.size, dtype=bool)
+    spread = np.maximum(sd, 1e-6 * np.abs(value))
+    mean, sd = model.to_estimated(value, np.maximum(spread, np.finfo(float).tiny))
+
+    def with_levels(levels: Array) -> FilterSettings:
+        factor = np.exp(levels)
+        return replace(
+            quick,
+            reading_sd=quick.reading_sd * factor[0],
+            noise_sd=quick.noise_sd * factor[1:],
+        )
+
+    def log_likelihood(levels: Array) -> float:
+        try:
+            found = filter_trials(model, [part], mean, np.diag(sd**2), with_levels(levels))
+        except FilterFailure:
+            return -np.inf
+        return float(np.nansum(found.trials[0].log_likelihood[counts]))
+
+    count = noise.process_sd.size
+    step = np.log(np.array([2.0**0.125, *np.full(count, 2.0)]))
+    lower = np.array([-np.inf, *np.where(noise.is_force, 0.0, np.log(1e-3))])
+    if choice.reading_noise > 0.0:
+        step[0] = 0.0
+    if choice.force_noise > 0.0:
+        step[1:][noise.is_force] = 0.0
+    best, _ = climb(log_likelihood, np.zeros(count + 1), step, lower)
+    return replace(with_levels(best), longest_step=settings.longest_step)
+
+
+def noise_report(
+    system: System, settings: FilterSettings, noise: Noise
+) -> dict[str, dict[str, float]]:
+    """Return the levels used and those of the sensors, by name, as identify.json has them."""
+    names = [*system.coordinates, *(f"{axis}_rate" for axis in system.coordinates)]
+    reading = zip(names, settings.reading_sd, strict=False)
+    return {
+        "reading_sd": {name: float(sd) for name, sd in reading},
+        "process_sd": dict(zip(system.noise, (float(sd) for sd in settings.noise_sd), strict=True)),
+        "sensor_sd": dict(zip(system.noise, (float(sd) for sd in noise.process_sd), strict=True)),
+    }

@@ -1,0 +1,196 @@
+"""Least squares on the inverse dynamics, freed of the bias that filtered motions give it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from bampipe.errors import InputError
+from bampipe.estimate.least_squares import LeastSquares, Problem, fit
+from bampipe.identification.estimates import Estimate, timing_entry
+from bampipe.identification.filter_tables import as_filtered
+from bampipe.physics import System
+from bampipe.trials.motions import Motion, problem_of
+from bampipe.trials.replayed import replayed
+
+Array = NDArray[np.float64]
+
+_CORRECTIONS = 5
+"""Most replays of a model that bends with its parameters, until its fit is the measured one's."""
+_SAME = 1.0
+"""Standard deviations within which the two fits are the same."""
+_SLOPE = (0.3, 3.0)
+"""Range of how far the fit to a replay moves with a parameter: 1 where there is no bias."""
+
+
+def problem_with(problem: Problem, timing: bool) -> Problem:
+    """Return the problem with the timing of the inputs estimated or held as it is given."""
+    if timing:
+        return problem
+    return replace(
+        problem,
+        free=problem.free[:-1],
+        lower=problem.lower[:-1],
+        upper=problem.upper[:-1],
+        step=problem.step[:-1],
+    )
+
+
+@dataclass(frozen=True)
+class Squares:
+    """Least squares with its bias taken off.
+
+    Attributes:
+        raw: the fit; p: (n_p + 1,) without its bias, within the bounds.
+        bias: (n_free,) what was taken off; None where the model could not be replayed.
+        problem: what was fitted.
+        bias_at: (n_p + 1,) parameters to their bias (n_free,), by a replay, which may raise
+            :class:`InputError`; None where there is no bias.
+    """
+
+    raw: LeastSquares
+    p: Array
+    bias: Array | None
+    problem: Problem
+    bias_at: Callable[[Array], Array] | None = None
+
+    def gap(self, p: Array) -> Array:
+        """Return how far the fit would be from what it is if ``p`` (n_p + 1,) were true, (n_free,).
+
+        Raises:
+            InputError: the model cannot be replayed with these parameters.
+        """
+        free = self.problem.free
+        bias = np.zeros(free.size) if self.bias_at is None else self.bias_at(p)
+        return np.asarray(p[free] + bias - self.raw.p[free])
+
+
+def unbiased(
+    session: Mapping[str, Any],
+    settings: Mapping[str, Any],
+    system: System,
+    motions: Sequence[Motion],
+    problem: Problem,
+    raw: LeastSquares,
+) -> Squares:
+    """Take off what the filters alone do to the fit.
+
+    Filtering blurs changes of direction and shortens accelerations, so that the fit to a perfect
+    machine is not its truth. How far off it is, is measured: the fitted model is replayed along
+    the trials, read by the same encoders, sent through the same filters and fitted again
+    (parametric bootstrap, Efron and Tibshirani 1993, chapter 10). The force sensor is without
+    noise there: its noise adds scatter, not bias. Where the model bends with its parameters and the
+    bias is large, it is not that at the answer: those parameters are looked for whose replay is
+    fitted as the measurement is (indirect inference, Gourieroux, Monfort and Renault 1993).
+
+    Args:
+        session: ``ingest/session.json``; settings: ``filter/filter.json``.
+        system: the model; motions: the trials; problem: as fitted; raw: the fit.
+    """
+    free, rate = problem.free, problem.band.rate_hz
+    count = len(system.parameters)
+    timing = bool(free[-1] == count)
+
+    def bias_at(p: Array) -> Array:
+        seen = replayed(
+            session, settings, system, motions, p[:count], rate, (0, 0), force_noise=False
+        )
+        again = fit(problem_with(problem_of(system, seen, problem.band), timing), raw.p)
+        return np.asarray((again.p - np.append(p[:count], 0.0))[free])
+
+    def moved(bias: Array) -> Array:
+        p = raw.p.copy()
+        p[free] = np.clip(p[free] - bias, problem.lower, problem.upper)
+        return p
+
+    try:
+        bias = bias_at(raw.p)
+    except InputError:
+        # A model that lacks much may not hold the motion; it has no bias to speak of.
+        return Squares(raw, raw.p, None, problem)
+    # A large bias of a model that bends changes on the way to the answer, by some bias^2 / p.
+    sd = np.sqrt(np.diag(raw.covariance))
+    found = Squares(raw, moved(bias), bias, problem, bias_at)
+    if not problem.linear and np.any((bias**2 > sd * np.abs(raw.p[free]))[free < count]):
+        bias = _settled(found, bias, moved)
+        found = replace(found, p=moved(bias), bias=bias)
+    return found
+
+
+def _settled(squares: Squares, bias: Array, moved: Callable[[Array], Array]) -> Array:
+    """Return the bias (n_free,) at the parameters that it leads to, by secants, one by one.
+
+    Args:
+        squares: the fit; bias: at the fit itself; moved: parameters with a bias taken off.
+    """
+    raw, free = squares.raw, squares.problem.free
+    sd = np.maximum(np.sqrt(np.diag(raw.covariance)), np.finfo(float).tiny)
+    best, least = bias, np.inf
+    before, off_before = raw.p[free], bias
+    for _ in range(_CORRECTIONS):
+        p = moved(bias)
+        try:
+            off = squares.gap(p)
+        except InputError:
+            break
+        size = float(np.max(np.abs(off) / sd))
+        if size < least:
+            best, least = bias, size
+        if size < _SAME:
+            break
+        step = p[free] - before
+        with np.errstate(divide="ignore", invalid="ignore"):
+            slope = np.nan_to_num((off - off_before) / step, nan=1.0, posinf=1.0, neginf=1.0)
+        before, off_before = p[free], off
+        bias = raw.p[free] - (p[free] - off / np.clip(slope, *_SLOPE))
+    return best
+
+
+def estimate_by_squares(system: System, motions: Sequence[Motion], squares: Squares) -> Estimate:
+    """Return the least-squares estimate; its trace is the fit to the trials so far."""
+    problem, raw = squares.problem, squares.raw
+    kept = [k for k, i in enumerate(problem.free) if i < len(system.parameters)]
+    names = [system.parameters[problem.free[k]].name for k in kept]
+    shift = np.zeros(problem.free.size) if squares.bias is None else squares.bias
+    rows, clock = [], 0.0
+    for number, motion in enumerate(motions):
+        clock += float(motion.t[-1])
+        so_far = fit(problem, raw.p, trials=range(number + 1))
+        row: dict[str, object] = {"t_total": clock, "trial_id": motion.trial_id}
+        for k, name in zip(kept, names, strict=True):
+            row[name] = so_far.p[problem.free[k]] - shift[k]
+            row[f"{name}_sd"] = float(np.sqrt(so_far.covariance[k, k]))
+        rows.append(row)
+    frames = [as_filtered(system, motion, squares.p[:-1]) for motion in motions]
+    sd = 3.0 * np.median(np.concatenate([motion.qd_sd for motion in motions]), axis=0)
+    timed = len(kept) < problem.free.size
+    report: dict[str, object] = {
+        "input_timing": timing_entry(squares.p, raw.covariance[-1, -1] if timed else 0.0),
+        "residual_sd": dict(zip(system.coordinates, map(float, raw.residual_sd), strict=True)),
+        "convergence": {"iterations": raw.iterations, "converged": raw.converged},
+        "state_3sigma": {
+            axis: {"velocity": float(sd[i])} for i, axis in enumerate(system.coordinates)
+        },
+    }
+    return Estimate(
+        p=squares.p,
+        problem=problem,
+        covariance=raw.covariance[np.ix_(kept, kept)],
+        at_bound=raw.at_bound[kept],
+        details=bias_details(squares, kept),
+        report=report,
+        states=pd.concat(frames, ignore_index=True),
+        trace=pd.DataFrame(rows),
+    )
+
+
+def bias_details(squares: Squares, kept: Sequence[int]) -> list[dict[str, float]]:
+    """Return, for each of the parameters ``kept``, the bias that was taken off."""
+    if squares.bias is None:
+        return [{} for _ in kept]
+    return [{"least_squares_bias": float(squares.bias[k])} for k in kept]

@@ -1,0 +1,1 @@
+"""An identified model that watches its device while it runs."""

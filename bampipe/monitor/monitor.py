@@ -1,0 +1,200 @@
+"""The filter on samples as they come: state, parameters, and an alarm when they stop agreeing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.data.stream import MOST_COMPLAINTS
+from bampipe.estimate.consistency import WindowTest
+from bampipe.estimate.online import OnlineFilter
+from bampipe.estimate.unscented import FilterFailure
+from bampipe.monitor.start import (
+    FIRST_LOOK,
+    Options,
+    Start,
+    start_from_samples,
+)
+from bampipe.physics import System
+
+Array = NDArray[np.float64]
+
+NORMAL_95 = 1.959963984540054
+PORTION = 512
+"""Samples filtered at once, so that memory stays the same."""
+
+
+class Monitor:
+    """Takes samples, keeps the distribution of state and parameters, judges the innovations.
+
+    Attributes:
+        alarm: whether the last whole window was inconsistent; alarms: how many were, by runs of
+            consecutive ones.
+        restarts: how often the motion was started anew after a gap or a lost motion.
+        samples: how many were taken.
+    """
+
+    def __init__(
+        self,
+        system: System,
+        start: Start | None,
+        options: Options,
+        complain: Callable[[str], None],
+    ) -> None:
+        """Wait for the first sample.
+
+        Args:
+            system: the model; start: None to begin from the first `FIRST_LOOK` samples.
+            options: of the alarm; complain: told of the first few new starts of the motion.
+        """
+        self.system, self.options, self._complain = system, options, complain
+        self.alarm, self.alarms, self.restarts, self.samples = False, 0, 0, 0
+        self.start: Start | None = None
+        self._filter: OnlineFilter | None = None
+        self._test: WindowTest | None = None
+        self._waiting: list[tuple[Array, Array, Array]] = []
+        self._threshold, self._t, self._axis = np.nan, np.nan, ""
+        self._first_t = np.nan
+        if start is not None:
+            self._begin(start)
+
+    def push(self, names: Sequence[str], values: Array) -> None:
+        """Take samples (T, m), columns ``names`` as a `Layout` has them."""
+        for first in range(0, len(values), PORTION):
+            part = values[first : first + PORTION]
+            if not np.isfinite(self._first_t):
+                self._first_t = float(part[0, 0])
+            t = part[:, 0].copy()
+            u = self._inputs(names, part)
+            q = part[:, [names.index(f"q_{axis}") for axis in self.system.coordinates]]
+            self.samples += len(part)
+            if self.start is None:
+                self._waiting.append((t, u, q))
+                if sum(len(item[0]) for item in self._waiting) < FIRST_LOOK:
+                    continue
+                t, u, q = (np.concatenate(parts) for parts in zip(*self._waiting, strict=True))
+                self._waiting.clear()
+                self._begin(start_from_samples(self.system, t, u, q, self.options))
+            self._take(t, u, q)
+
+    def report(self) -> dict[str, object]:
+        """Return where things stand, as JSON can hold it; no state before the filter has begun."""
+        content: dict[str, object] = {
+            "t": None if np.isnan(self._t) else self._t,
+            "samples": self.samples,
+            "restarts": self.restarts,
+            "alarm": self.alarm,
+            "alarms": self.alarms,
+        }
+        if self._filter is None or self.start is None or self._test is None:
+            return content
+        model, n = self.start.model, len(self.system.coordinates)
+        mean, sd = self._filter.mean, np.sqrt(np.diag(self._filter.covariance))
+        content["state"] = {
+            axis: {
+                "position": float(mean[i]),
+                "position_sd": float(sd[i]),
+                "velocity": float(mean[n + i]),
+                "velocity_sd": float(sd[n + i]),
+            }
+            for i, axis in enumerate(self.system.coordinates)
+        }
+        theta, spread = mean[model.n_states :], sd[model.n_states :]
+        low, value, high = (
+            np.clip(
+                model.to_physical(theta + side * NORMAL_95 * spread)[0], model.lower, model.upper
+            )
+            for side in (-1.0, 0.0, 1.0)
+        )
+        content["parameters"] = {
+            self.system.parameters[place].name: {
+                "estimate": float(value[i]),
+                "lower": float(low[i]),
+                "upper": float(high[i]),
+                "unit": self.system.parameters[place].unit,
+            }
+            for i, place in enumerate(model.free)
+        }
+        judged = self._test.windows > 0
+        content["nis"] = {
+            "window": self._test.ratio if judged else None,
+            "threshold": self._threshold,
+            "windows": self._test.windows,
+            "worst": self._axis,
+        }
+        return content
+
+    def _begin(self, start: Start) -> None:
+        self.start = start
+        self._test = WindowTest(len(self.system.coordinates), start.window)
+        self._threshold = start.reference.threshold(self.options.probability)
+
+    def _inputs(self, names: Sequence[str], values: Array) -> Array:
+        brakes = {name: f"brake_{axis}" for axis, name in self.system.model.device.brakes.items()}
+        u = np.zeros((len(values), len(self.system.inputs)))
+        for place, name in enumerate(self.system.inputs):
+            column = brakes.get(name, name)
+            if name == "t":
+                u[:, place] = values[:, 0] - self._first_t
+            elif column in names:
+                u[:, place] = values[:, names.index(column)]
+        return u
+
+    def _take(self, t: Array, u: Array, q: Array) -> None:
+        """Filter samples, cut where a gap starts the motion anew."""
+        ahead = np.diff(t, prepend=t[0] if np.isnan(self._t) else self._t)
+        for first, last in _stretches(ahead, self.options.gap_s):
+            if ahead[first] > self.options.gap_s and self._filter is not None:
+                self._again(f"a gap of {ahead[first]:.3g} s before {t[first]:.3f} s")
+            self._filter_stretch(t[first:last], u[first:last], q[first:last])
+        self._t = float(t[-1])
+
+    def _filter_stretch(self, t: Array, u: Array, q: Array) -> None:
+        start, test = self.start, self._test
+        if start is None or test is None:
+            raise RuntimeError("samples before the start")
+        if self._filter is None:
+            seen = np.flatnonzero(np.isfinite(q).all(axis=1))
+            if not seen.size:
+                return
+            t, u, q = t[seen[0] :], u[seen[0] :], q[seen[0] :]
+            x, x_sd = start.state(self.system, q[0], u[0])
+            self._filter = OnlineFilter(
+                start.model, start.settings, x, x_sd, start.theta, start.covariance
+            )
+        try:
+            found = self._filter.advance(t, u, q)
+        except FilterFailure as failure:
+            self._filter = None
+            self._again(f"near {t[min(failure.sample, t.size - 1)]:.3f} s {failure.reason}")
+            return
+        squares = np.square(found.innovation / found.innovation_sd)
+        for mean in test.take(found.nis, squares):
+            inconsistent = mean > self._threshold
+            self.alarms += inconsistent and not self.alarm
+            self.alarm = bool(inconsistent)
+            self._axis = self.system.coordinates[int(np.argmax(test.by_reading))]
+
+    def _again(self, why: str) -> None:
+        """Start the motion anew; the parameters go on from where they are, if they are known."""
+        self.restarts += 1
+        if self.restarts <= MOST_COMPLAINTS:
+            self._complain(f"{why}: the motion starts anew")
+        if self._filter is not None and self.start is not None:
+            nx = self.start.model.n_states
+            self.start = replace(
+                self.start,
+                theta=self._filter.mean[nx:].copy(),
+                covariance=self._filter.covariance[nx:, nx:],
+            )
+        self._filter = None
+
+
+def _stretches(ahead: Array, gap: float) -> list[tuple[int, int]]:
+    """Bounds of the stretches of samples without a gap in them."""
+    cuts = [0, *(int(i) for i in np.flatnonzero(ahead > gap) if i > 0), len(ahead)]
+    return list(pairwise(cuts))

@@ -1,0 +1,283 @@
+"""Where a monitor starts from: a run that was identified, or the priors of a device."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.data.run_folder import RunFolder
+from bampipe.data.session import Session, read_session
+from bampipe.data.store import read_parquet
+from bampipe.data.stream import Layout, SampleStream
+from bampipe.declarations.model_file import load_model
+from bampipe.errors import InputError
+from bampipe.estimate.consistency import Reference, window_means
+from bampipe.estimate.unscented import (
+    FilterFailure,
+    FilterModel,
+    FilterSettings,
+    Trial,
+    filter_trials,
+)
+from bampipe.identification.filter_run import filter_model, state_at
+from bampipe.identification.sensor_noise import white_part
+from bampipe.physics import System, compile_model
+from bampipe.trials.motions import free_trials, input_columns
+
+Array = NDArray[np.float64]
+
+Stream: TypeAlias = SampleStream
+"""What `open_stream` returns."""
+
+FIRST_LOOK = 500
+"""Samples from which the noise is found where no run states it."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """What a monitor can be told.
+
+    Attributes:
+        window_s: length of the windows that the alarm judges, s.
+        false_alarms_per_hour: how often a consistent filter may raise it.
+        memory_s: time over which a parameter may wander by its starting uncertainty, s;
+            infinite for parameters that stay.
+        gap_s: a longer gap between samples starts the motion, not the parameters, anew.
+    """
+
+    window_s: float = 1.0
+    false_alarms_per_hour: float = 1.0
+    memory_s: float = 60.0
+    gap_s: float = 0.5
+
+    def check(self) -> None:
+        """Raise :class:`InputError` where an option makes no sense."""
+        for name in ("window_s", "false_alarms_per_hour", "memory_s", "gap_s"):
+            if not getattr(self, name) > 0.0:
+                raise InputError("must be positive", where=f"--{name.replace('_', '-')}")
+        if self.probability >= 0.5:
+            raise InputError(
+                "more false alarms than windows", where="--false-alarms", remedy="ask for fewer"
+            )
+
+    @property
+    def probability(self) -> float:
+        """Of a false alarm in one window."""
+        return self.false_alarms_per_hour * self.window_s / 3600.0
+
+
+@dataclass(frozen=True)
+class Start:
+    """What the filter starts from.
+
+    Attributes:
+        model, settings: of the filter.
+        theta, covariance: (nt,) and (nt, nt) parameters, on the scale of estimation.
+        speed_sd: (n_q,) standard deviation of the rates at the first sample.
+        reference: law of the mean NIS over a window; window: its length in samples.
+    """
+
+    model: FilterModel
+    settings: FilterSettings
+    theta: Array
+    covariance: Array
+    speed_sd: Array
+    reference: Reference
+    window: int
+
+    def state(self, system: System, q: Array, u: Array) -> tuple[Array, Array]:
+        """State (nx,) at rest where the encoders read q (n_q,) under inputs u, and its sd (nx,)."""
+        p = self.model.parameters.copy()
+        p[self.model.free] = self.model.to_physical(self.theta)[0]
+        none = np.zeros(q.size)
+        return state_at(system, p[:-1], (q, none, none), u, self.settings.reading_sd, self.speed_sd)
+
+
+def layouts(system: System, session: Session | None) -> tuple[Layout, ...]:
+    """What the header of a stream for this model may look like.
+
+    SI columns named as in ``ingest/samples.parquet``, brake commands being zero where their
+    columns are absent; with a session file, also the columns of its raw logs.
+
+    Raises:
+        InputError: the model needs an input that no sensor gives at once, such as a rate.
+    """
+    device = system.model.device
+    given = {*device.forces, *device.channels, *device.brakes.values(), "t"}
+    derived = [name for name in system.inputs if name not in given]
+    if derived:
+        raise InputError(
+            f"the model needs {derived[0]}, which is known only afterwards",
+            where="bampipe monitor",
+            remedy="monitor a model without this effect",
+        )
+    brakes = {name: f"brake_{axis}" for axis, name in device.brakes.items()}
+    positions = [f"q_{axis}" for axis in system.coordinates]
+    others = [name for name in system.inputs if name not in brakes and name != "t"]
+    commands = [brakes[name] for name in system.inputs if name in brakes]
+    found = [Layout.in_si([*positions, *others, *commands])]
+    if commands:
+        found.append(Layout.in_si([*positions, *others]))
+    if session is not None:
+        found.append(Layout.of_session(session))
+    return tuple(found)
+
+
+def open_stream(
+    samples: str,
+    system: System,
+    session: Path | None,
+    strict: bool,
+    complain: Callable[[str], None],
+) -> Stream:
+    """Open a growing file, or standard input where ``samples`` is ``-``.
+
+    Args:
+        samples: path, or ``-``; system: the model; session: folder whose raw columns may come.
+        strict: raise at a bad line; complain: told of the first ones that are skipped.
+
+    Raises:
+        InputError: there is no such file, or the session file is wrong.
+    """
+    known = layouts(system, read_session(session) if session is not None else None)
+    if samples == "-":
+        return SampleStream(0, "standard input", known, strict, complain)
+    try:
+        descriptor = os.open(samples, os.O_RDONLY)
+    except OSError as error:
+        raise InputError(
+            f"cannot be read: {error.strerror}", where=samples, remedy="which file grows?"
+        ) from error
+    return SampleStream(descriptor, samples, known, strict, complain)
+
+
+def start_from_run(run: RunFolder, name: str, options: Options) -> tuple[System, Start]:
+    """Take model, parameters and noise from an identified run.
+
+    The alarm's threshold comes from the run's own free trials, filtered as the monitor will:
+    what counts is whether the innovations change.
+
+    Raises:
+        InputError: the model has not been identified by the filter.
+    """
+    system = compile_model(load_model(run, name))
+    path = f"models/{name}/identify.json"
+    run.require(path, "identify")
+    found = run.read_json(path)
+    if "noise" not in found:
+        raise InputError(
+            "identified without the filter: its noise levels are not known",
+            where=str(run.path(path)),
+            remedy=f"bampipe identify {run.root} --set method=ukf",
+        )
+    values = system.prior
+    names = found["covariance"]["names"]
+    for parameter in names:
+        values[system.index(parameter)] = found["parameters"][parameter]["estimate"]
+    session = run.read_json("ingest/session.json")
+    rate = float(session["sample_rate_hz"])
+    trials = [_trial(run, trial, system) for trial in free_trials(run, fitted=True)]
+    model = filter_model(system, trials, values, timing=False)
+    model.parameters[-1] = found["input_timing"]["estimate"]
+    sd = np.array([found["parameters"][parameter]["sd"] for parameter in names])
+    value = values[model.free]
+    theta, spread = model.to_estimated(value, np.maximum(sd, 1e-6 * np.abs(value)))
+    matrix = np.array(found["covariance"]["matrix"])
+    scale = np.sqrt(np.diag(matrix))
+    scale[scale == 0.0] = 1.0
+    correlation = matrix / np.outer(scale, scale)
+    np.fill_diagonal(correlation, 1.0)
+    covariance = correlation * np.outer(spread, spread)
+    reading = [found["noise"]["reading_sd"][axis] for axis in system.coordinates]
+    settings = FilterSettings(
+        observed=np.arange(len(reading)),
+        reading_sd=np.array(reading),
+        noise_sd=np.array([found["noise"]["process_sd"][item] for item in system.noise]),
+        walk_sd=spread / np.sqrt(options.memory_s),
+        stride=max(trial.t.size for trial in trials),
+    )
+    n = len(system.coordinates)
+    speed = np.sqrt(np.mean([np.mean(np.square(_speeds(trial)), axis=0) for trial in trials], 0))
+    window = max(2, round(options.window_s * rate))
+    start = Start(
+        model, settings, theta, covariance, np.maximum(speed, 1e-3),
+        Reference.of_theory(window * n), window,
+    )  # fmt: skip
+    means = []
+    for trial in trials:
+        begun = Trial(trial.t, trial.u, trial.y, *start.state(system, trial.y[0], trial.u[0]))
+        try:
+            whole = filter_trials(model, [begun], theta, covariance, settings).trials[0]
+        except FilterFailure as failure:
+            raise InputError(
+                f"the identified model does not follow its own trials: {failure.reason}",
+                where=str(run.path(path)),
+                remedy=f"bampipe diagnose {run.root}",
+            ) from failure
+        means.append(window_means(whole.nis[window:], n, window))
+    return system, replace(start, reference=Reference.of_windows(np.concatenate(means), window * n))
+
+
+def start_from_samples(system: System, t: Array, u: Array, q: Array, options: Options) -> Start:
+    """Take parameters from the device's priors and the noise from the first samples.
+
+    The noise of a position is its smallest step, spread evenly; that of an input is what of it
+    is not smooth. The alarm's threshold is that of white Gaussian noise.
+
+    Args:
+        system: the model; t: (T,); u: (T, nu); q: (T, n_q): the first `FIRST_LOOK` samples.
+    """
+    trial = Trial(t, u, q, np.zeros(0), np.zeros(0))
+    model = filter_model(system, [trial], system.prior, timing=False)
+    free = [item for item in system.parameters if not item.fixed]
+    theta, spread = model.to_estimated(
+        np.array([item.prior for item in free]), np.array([item.sd for item in free])
+    )
+    reading = []
+    for column in q.T:
+        steps = np.abs(np.diff(column[np.isfinite(column)]))
+        moved = steps[steps > 1e-12]
+        reading.append((float(moved.min()) if moved.size else 1e-5) / np.sqrt(12.0))
+    sensed = {name: white_part([u[:, system.inputs.index(name)]]) for name in system.noise
+              if name in system.inputs}  # fmt: skip
+    least = min((sd for sd in sensed.values() if sd > 0.0), default=0.05)
+    n = len(system.coordinates)
+    rate = 1.0 / float(np.median(np.diff(t)))
+    window = max(2, round(options.window_s * rate))
+    settings = FilterSettings(
+        observed=np.arange(n),
+        reading_sd=np.array(reading),
+        noise_sd=np.array([sensed.get(name, 0.0) or least for name in system.noise]),
+        walk_sd=spread / np.sqrt(options.memory_s),
+    )
+    return Start(
+        model, settings, theta, np.diag(spread**2), np.ones(n),
+        Reference.of_theory(window * n), window,
+    )  # fmt: skip
+
+
+def _trial(run: RunFolder, trial_id: str, system: System) -> Trial:
+    """The raw samples of a trial from the first whole reading on; its state is left open."""
+    path = run.require("ingest/samples.parquet", "ingest")
+    frame = read_parquet(path, trial=trial_id)
+    t = frame["t"].to_numpy(dtype=float, copy=True)
+    u = input_columns(frame, system.inputs, system.model.device.brakes, t, str(path))
+    y = frame[[f"q_{axis}" for axis in system.coordinates]].to_numpy(dtype=float, copy=True)
+    first = int(np.flatnonzero(np.isfinite(y).all(axis=1) & np.isfinite(u).all(axis=1))[0])
+    for column in u.T:
+        lost = np.isnan(column)
+        column[lost] = np.interp(t[lost], t[~lost], column[~lost])
+    return Trial(t[first:], u[first:], y[first:], np.zeros(0), np.zeros(0))
+
+
+def _speeds(trial: Trial) -> Array:
+    """Coarse velocities over a twentieth of a second, (rows, n_q), for their size only."""
+    step = max(1, round(0.05 / float(np.median(np.diff(trial.t)))))
+    speed = np.diff(trial.y[::step], axis=0) / np.diff(trial.t[::step])[:, None]
+    return np.nan_to_num(speed)

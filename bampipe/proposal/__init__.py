@@ -1,0 +1,121 @@
+"""A session file proposed for a folder of logs: what can be seen is guessed, the rest left open.
+
+Every guess is marked in the text. What no look at the data can tell, such as how many counts make
+a radian, is left at a value that the session reader refuses with a line saying what to fill in.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from bampipe.data.store import write_text
+from bampipe.data.survey import survey
+from bampipe.errors import InputError
+from bampipe.proposal.clock import clock_of
+from bampipe.proposal.device import DEVICE, find_device, new_device
+from bampipe.proposal.encoders import encoders_table
+from bampipe.proposal.inputs import input_tables
+from bampipe.proposal.matching import Matcher
+from bampipe.proposal.notes import Notes, quoted
+from bampipe.proposal.trials import trials_tables
+
+SESSION = "session.toml"
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """What to write, and what a person has to look at.
+
+    Attributes:
+        session: text of ``session.toml``.
+        device: text of a device file to write beside it, "" where there is one already.
+        fill_in: what only a person can know, a sentence each; the session is refused without.
+        check: guesses, a sentence each.
+        passed: files left out, with the reason.
+    """
+
+    session: str
+    device: str
+    fill_in: list[str]
+    check: list[str]
+    passed: list[str]
+
+
+def propose(folder: Path, device: str = "") -> Proposal:
+    """Propose a session file for the logs in ``folder``; writes nothing.
+
+    Args:
+        folder: with logs, in it or in folders below.
+        device: a built-in device or a device file in the folder; guessed where empty.
+
+    Raises:
+        InputError: no logs, a session file is there already, or no such device.
+    """
+    if (folder / SESSION).exists():
+        raise InputError(
+            f"there is a {SESSION} already",
+            where=str(folder),
+            remedy=f"it is left alone; to run it: bampipe run {folder}",
+        )
+    found = survey(folder)
+    notes = Notes()
+    chosen = find_device(folder, found, device)
+    clock = clock_of(found, notes)
+    match = Matcher(found, clock.t, set(clock.columns))
+    if chosen is None:
+        chosen = new_device(folder, match, notes)
+    encoders, axes = encoders_table(chosen.device, match, notes)
+    inputs = input_tables(chosen, axes, match, notes)
+    lines = [
+        *_head(folder, chosen.name, clock.rate),
+        *clock.lines,
+        *encoders,
+        *inputs,
+        *_not_used(match),
+        *trials_tables(chosen.device, axes, match, notes),
+    ]
+    return Proposal(
+        session="\n".join(lines) + "\n",
+        device=chosen.text,
+        fill_in=notes.fill_in,
+        check=notes.check,
+        passed=[f"{name}: {reason}" for name, reason in found.passed],
+    )
+
+
+def _head(folder: Path, device: str, rate: str) -> list[str]:
+    sanitised = re.sub(r"[^A-Za-z0-9._-]", "_", folder.resolve().name).lstrip("._-")
+    return [
+        "# Proposed by `bampipe init`. Look at every line marked `guess` or `fill in`.",
+        'schema = "bampipe.session/1"',
+        f'session_id = "{sanitised or "session"}"',
+        f"device = {quoted(device)}",
+        rate,
+        "",
+    ]
+
+
+def _not_used(match: Matcher) -> list[str]:
+    left = [column.name for column in match.found.columns if column.name not in match.used]
+    return [f"# not used: {', '.join(left)}", ""] if left else []
+
+
+def write_proposal(folder: Path, proposal: Proposal) -> list[Path]:
+    """Write what was proposed; returns the files written.
+
+    Raises:
+        InputError: one of them is there already, or the folder cannot be written.
+    """
+    texts = {folder / SESSION: proposal.session}
+    if proposal.device:
+        texts[folder / DEVICE] = proposal.device
+    for path in texts:
+        if path.exists():
+            raise InputError(
+                "is there already and is left alone", where=str(path), remedy="move it away"
+            )
+    for path, text in texts.items():
+        write_text(path, text)
+    return list(texts)

@@ -1,0 +1,117 @@
+"""The table ``[time]`` and the sample rate, from the columns that increase as a clock does."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bampipe.data import guesses
+from bampipe.data.session import SECONDS
+from bampipe.data.survey import Column, Survey, words
+from bampipe.data.units import spelled
+from bampipe.proposal.notes import UNKNOWN, Notes, quoted
+
+_LIKELY_RATE_HZ = 100.0
+"""Taken for the other guesses where nothing tells the rate."""
+
+
+@dataclass(frozen=True)
+class Clock:
+    """The time of the first log, and how the session file says it.
+
+    Attributes:
+        t: (T,) time stamps, s.
+        columns: names of the columns that the time takes up.
+        lines: the table ``[time]``.
+        rate: the line on the sample rate, which stands above all tables.
+    """
+
+    t: np.ndarray
+    columns: tuple[str, ...]
+    lines: tuple[str, ...]
+    rate: str
+
+
+def clock_of(found: Survey, notes: Notes) -> Clock:
+    """Propose how time is told: by stamps in one column or two, else by counting samples."""
+    times = found.of("time")
+    whole = [c for c in times if _whole_seconds(c)]
+    rest = [c for c in times if _nanoseconds_on_top(c)]
+    if whole and rest:
+        return _in_two_columns(whole[-1], rest[-1], notes)
+    column = next((c for c in times if _increases(c.values)), None)
+    return _counted(found, notes) if column is None else _in_one_column(column, notes)
+
+
+def _in_one_column(column: Column, notes: Notes) -> Clock:
+    kind = guesses.time_unit(column.values, column.unit)
+    t = (column.values - column.values[0]) * SECONDS.get(kind, 1.0)
+    if not kind:
+        note = notes.ask("the unit of time: no unit gives a likely rate")
+        lines = (f"column = {quoted(column.name)}", f'unit = "{UNKNOWN}"{note}')
+        rate = f'sample_rate_hz = "{UNKNOWN}"' + notes.ask("sample_rate_hz, the true rate")
+        samples = np.arange(len(t)) / _LIKELY_RATE_HZ
+        return Clock(samples, (column.name,), _table(*lines), rate)
+    rate_hz = guesses.sample_rate(t)
+    said = kind == "datetime" or spelled(column.unit, tuple(SECONDS)) == kind
+    note = "" if said else notes.guess(f"time in {kind}, by the rate that it gives")
+    lines = (f"column = {quoted(column.name)}", f'unit = "{kind}"{note}')
+    return Clock(t, (column.name,), _table(*lines), _stamped_rate(rate_hz, notes))
+
+
+def _in_two_columns(whole: Column, rest: Column, notes: Notes) -> Clock:
+    """Whole seconds and the nanoseconds on top of them, as ROS has them."""
+    t = whole.values - whole.values[0] + 1e-9 * (rest.values - rest.values[0])
+    rate_hz = guesses.sample_rate(t)
+    note = notes.guess(f"seconds in {whole.name}, nanoseconds on top in {rest.name}")
+    lines = (
+        f"column = {quoted(whole.name)}",
+        'unit = "s"',
+        f"nanoseconds = {quoted(rest.name)}{note}",
+    )
+    return Clock(t, (whole.name, rest.name), _table(*lines), _stamped_rate(rate_hz, notes))
+
+
+def _counted(found: Survey, notes: Notes) -> Clock:
+    """No column is a clock; a number beside the samples may give the rate."""
+    samples = np.arange(len(found.columns[0].values))
+    steps = [
+        (guesses.interval_of(column.name, float(column.values[0])), column.name)
+        for column in found.columns
+        if column.constant
+    ]
+    step_s, name = max(steps, default=(0.0, ""))
+    if step_s > 0.0:
+        note = notes.guess(f"counted; {name} sets the rate")
+        rate = f"sample_rate_hz = {1.0 / step_s:g}"
+        return Clock(step_s * samples, (name,), _table(f'unit = "samples"{note}'), rate)
+    note = notes.guess("no column increases like a time")
+    rate = f'sample_rate_hz = "{UNKNOWN}"' + notes.ask("sample_rate_hz, the true rate")
+    return Clock(samples / _LIKELY_RATE_HZ, (), _table(f'unit = "samples"{note}'), rate)
+
+
+def _table(*lines: str) -> tuple[str, ...]:
+    return ("[time]", *lines, "")
+
+
+def _stamped_rate(rate_hz: float, notes: Notes) -> str:
+    note = notes.guess(f"{rate_hz:g} Hz, from the time stamps")
+    return f"sample_rate_hz = {rate_hz:g}{note}"
+
+
+def _whole_seconds(column: Column) -> bool:
+    named = not {"sec", "secs", "seconds"}.isdisjoint(words(column.name))
+    return named and column.whole and bool(np.all(np.diff(column.values) >= 0))
+
+
+def _nanoseconds_on_top(column: Column) -> bool:
+    said = {"nanosec", "nsec", "nsecs", "nanosecs", "nanoseconds"}
+    named = not said.isdisjoint(words(column.name))
+    within = (column.values >= 0) & (column.values < 1e9)
+    return named and column.whole and bool(np.all(within))
+
+
+def _increases(values: np.ndarray) -> bool:
+    known = values[np.isfinite(values)]
+    return len(known) > 3 and float(np.mean(np.diff(known) > 0)) > 0.9

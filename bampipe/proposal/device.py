@@ -1,0 +1,143 @@
+"""The device of a session: one named or in the folder, a built-in one that fits, or a new one."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from bampipe.data import guesses
+from bampipe.data.survey import Column, Survey, words
+from bampipe.data.text import read_toml
+from bampipe.errors import InputError
+from bampipe.physics import registry
+from bampipe.physics.device import Device
+from bampipe.proposal.encoders import measured_position
+from bampipe.proposal.matching import Matcher
+from bampipe.proposal.notes import Notes
+from bampipe.proposal.positions import in_counts, position_in_si, scale_to, slides
+from bampipe.proposal.starter import starter_device
+from bampipe.proposal.starter_input import Drive
+
+DEVICE = "device.toml"
+
+
+@dataclass(frozen=True)
+class ChosenDevice:
+    """The device, and how the session file calls it.
+
+    Attributes:
+        name: of a built-in device, or the path of a device file relative to the folder of logs.
+        device: the device.
+        text: of a new device file, "" where there is one already.
+        columns: what the inputs of a new device were made from, by the name of the input.
+    """
+
+    name: str
+    device: Device
+    text: str = ""
+    columns: Mapping[str, Column] = field(default_factory=dict)
+
+
+def find_device(folder: Path, found: Survey, wanted: str) -> ChosenDevice | None:
+    """The device ``wanted``; where that is empty, the one in the folder or that the logs are of.
+
+    Raises:
+        InputError: no such device, a device file outside the folder, or one that is wrong.
+    """
+    if wanted.endswith(".toml"):
+        return _device_file(folder, wanted)
+    if wanted:
+        return ChosenDevice(wanted, registry.device(wanted))
+    for path in sorted(folder.glob("*.toml")):
+        content = read_toml(path)
+        if content.get("schema") == "bampipe.device/1":
+            return ChosenDevice(path.name, registry.device_from(content, str(path)))
+    return _built_in(found)
+
+
+def _device_file(folder: Path, wanted: str) -> ChosenDevice:
+    path = next((path for path in (folder / wanted, Path(wanted)) if path.is_file()), None)
+    if path is None:
+        raise InputError("no such file", where=wanted)
+    full, root = path.resolve(), folder.resolve()
+    if not full.is_relative_to(root):
+        raise InputError(
+            "the device file is not in the folder of the logs",
+            where=wanted,
+            remedy=f"copy it to {folder}",
+        )
+    device = registry.device_from(read_toml(path), str(path))
+    return ChosenDevice(full.relative_to(root).as_posix(), device)
+
+
+def _built_in(found: Survey) -> ChosenDevice | None:
+    """The first built-in device of which the columns have all names."""
+    positions = {word for column in found.of("position") for word in words(column.name)}
+    columns = [set(words(column.name)) for column in found.columns]
+    for name in registry.device_names():
+        device = registry.device(name)
+        inputs = [
+            set(words(name.removeprefix("force_"))) for name in (*device.forces, *device.channels)
+        ]
+        named = all(any(said <= column for column in columns) for said in inputs)
+        if named and {c.name for c in device.coordinates} <= positions:
+            return ChosenDevice(name, device)
+    return None
+
+
+def new_device(folder: Path, match: Matcher, notes: Notes) -> ChosenDevice:
+    """Propose a device file for one axis, with priors by a rough fit to the first log.
+
+    Raises:
+        InputError: no column looks like a position.
+    """
+    found = match.found
+    position = measured_position("", 1, match, notes)
+    if position is None:
+        raise InputError(
+            "no column looks like a position",
+            where=f"{folder}: {found.files[0]}",
+            remedy="name the device: bampipe init FOLDER --device NAME; columns are "
+            + ", ".join(c.name for c in found.columns[:12]),
+        )
+    linear = slides(position, found)
+    driver, role = match.driver(position)
+    supply = match.supply(driver) if role == "duty" else None
+    # A current recorded beside a force is that of a coil or a brake.
+    coil = role == "force" and any(not c.constant for c in found.of("current"))
+    fit = _rough_fit(position, driver, role, linear, match.t)
+    drive = Drive(role, driver.name if driver is not None else "", supply is not None, coil)
+    starter = starter_device(position.name, linear, drive, fit)
+    kind = "linear" if linear else "rotary"
+    notes.check.append(
+        f"{DEVICE}: one {kind} axis '{starter.axis}' driven by a {role}; put in what you know of it"
+    )
+    for constant in starter.own:
+        notes.check.append(
+            f"{DEVICE}: {constant} is not yours yet: all forces and inertias scale with it"
+        )
+    if any(fit.gravity):
+        notes.check.append(f"{DEVICE}: gravity on '{starter.axis}', since the motion shows it")
+    columns = {"supply": supply, starter.input: driver}
+    return ChosenDevice(
+        DEVICE,
+        registry.device_from(tomllib.loads(starter.text), DEVICE),
+        starter.text,
+        {name: column for name, column in columns.items() if column is not None},
+    )
+
+
+def _rough_fit(
+    position: Column, driver: Column | None, role: str, linear: bool, t: np.ndarray
+) -> guesses.Driven:
+    """How the driver goes with the motion, both in SI; nothing found where nothing drives."""
+    if driver is None:
+        return guesses.Driven(0.0)
+    si = {"current": "A", "voltage": "V", "duty": ""}.get(role, "N" if linear else "N.m")
+    drive = np.nan_to_num(driver.values * scale_to(si, driver))
+    place = position_in_si(position, t, "m" if linear else "rad")
+    return guesses.driven(t, place, drive, angle=not linear and not in_counts(position))

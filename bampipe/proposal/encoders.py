@@ -1,0 +1,99 @@
+"""The table ``[encoders]``: the column of every axis, its unit or counts, and its velocity."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bampipe.data import guesses
+from bampipe.data.survey import Column, words
+from bampipe.data.units import spelled, unit
+from bampipe.physics.device import Coordinate, Device
+from bampipe.proposal.matching import Matcher
+from bampipe.proposal.notes import UNKNOWN, Notes, bare, entry, quoted
+from bampipe.proposal.positions import in_counts, is_velocity
+
+_POSITION_UNITS = ("rad", "deg", "mrad", "rev", "m", "mm", "cm", "um", "in")
+_SPEED_UNITS = ("rad/s", "deg/s", "rev/s", "rev/min", "m/s", "cm/s", "mm/s", "in/s")
+
+
+def encoders_table(
+    device: Device, match: Matcher, notes: Notes
+) -> tuple[list[str], dict[str, Column]]:
+    """Propose the column of every axis; its lines, and the columns found, by axis."""
+    lines = ["[encoders]"]
+    axes: dict[str, Column] = {}
+    for axis in device.coordinates:
+        column = measured_position(axis.name, len(device.coordinates), match, notes)
+        if column is None:
+            note = notes.ask(f"the column of the position of {axis.name}")
+            lines.append(f"{axis.name} = {entry(UNKNOWN, axis.unit)}{note}")
+            continue
+        axes[axis.name] = column
+        match.used.add(column.name)
+        alone = len(device.coordinates) == 1
+        lines.append(f"{axis.name} = {_encoder(axis, alone, column, match, notes)}")
+    return [*lines, ""], axes
+
+
+def measured_position(axis: str, axes: int, match: Matcher, notes: Notes) -> Column | None:
+    """The column of the position of an axis; a guess is noted where it was one of several.
+
+    Args:
+        axis: name of the axis, "" for any.
+        axes: how many axes there are.
+        match: the columns.
+        notes: where a guess is noted.
+    """
+    column, candidates = match.position(axis, axes)
+    if column is not None and candidates:
+        notes.guess(f"of {', '.join(candidates)}, {column.name} is the measured position")
+    return column
+
+
+def _encoder(axis: Coordinate, alone: bool, column: Column, match: Matcher, notes: Notes) -> str:
+    if is_velocity(column):
+        return _integrated(axis, column, notes)
+    if in_counts(column):
+        return _counted(axis, column, notes)
+    velocity = _velocity_beside(axis, alone, match, notes)
+    known = unit(column.unit)
+    if known is not None and known.si == axis.unit:
+        said = spelled(column.unit, _POSITION_UNITS) or axis.unit
+        note = "" if column.stated else notes.guess(f"{column.name} in {column.unit}")
+        return entry(column.name, said, velocity) + note
+    by_size = guesses.likely_unit(axis.unit, column.values)
+    likely, why = (by_size, ", by its size") if by_size else (axis.unit, "")
+    return entry(column.name, likely, velocity) + notes.guess(
+        f"{column.name} is the position of {axis.name}, in {likely}{why}"
+    )
+
+
+def _integrated(axis: Coordinate, column: Column, notes: Notes) -> str:
+    known = unit(column.unit)
+    si = f"{axis.unit}/s"
+    said = spelled(column.unit, _SPEED_UNITS) if known is not None and known.si == si else ""
+    return entry(column.name, said or si) + notes.guess(
+        f"no position was recorded: that of {axis.name} is the integral of {column.name}"
+    )
+
+
+def _counted(axis: Coordinate, column: Column, notes: Notes) -> str:
+    middle = float(np.median(column.values))
+    return (
+        f"{{ column = {quoted(column.name)}, counts_per_unit = 0.0, zero_counts = {middle:.0f},"
+        f' unit = "{axis.unit}" }}'
+    ) + notes.ask(
+        f"counts_per_unit of {axis.name}, the counts in one {axis.unit}; zero_counts is a guess"
+    )
+
+
+def _velocity_beside(axis: Coordinate, alone: bool, match: Matcher, notes: Notes) -> str:
+    """The field of a recorded velocity, against which the position is checked; "" without one."""
+    for column in match.found.of("velocity"):
+        known = unit(column.unit) if column.unit else None
+        fits = known is not None and known.si == f"{axis.unit}/s" and not column.constant
+        if fits and (alone or axis.name in words(column.name)):
+            match.used.add(column.name)
+            notes.check.append(f"{column.name} is used to check the position only")
+            return f", velocity = {entry(column.name, bare(column.unit))}"
+    return ""

@@ -1,0 +1,136 @@
+"""The tables ``[force]``, ``[brakes]`` and ``[channels]``: the columns of what a device is fed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from bampipe.data import guesses
+from bampipe.data.survey import Column
+from bampipe.data.units import spelled, unit
+from bampipe.physics.device import Device
+from bampipe.proposal.device import ChosenDevice
+from bampipe.proposal.matching import Match, Matcher
+from bampipe.proposal.notes import UNKNOWN, Notes, bare, entry, quoted
+
+_FORCE_UNITS = ("N", "N.m", "mN", "kN", "mN.m", "N.cm", "N.mm", "kN.m", "kgf", "lbf", "V")
+_FULL_DUTY = 1.05
+"""A duty cycle as a share goes to 1, and a little over by rounding."""
+
+
+def input_tables(
+    chosen: ChosenDevice, axes: Mapping[str, Column], match: Matcher, notes: Notes
+) -> list[str]:
+    """Propose the column of every input; the lines of those tables that have something to say."""
+    device = chosen.device
+    wanted = {**dict.fromkeys(device.forces, device.force_unit), **device.channels}
+    given = match.inputs(wanted, tuple(axes.values()))
+    given |= {name: (c, "") for name, c in chosen.columns.items() if name in wanted}
+    lines = []
+    sensed = all(name.startswith("force_") for name in device.forces)
+    forces = [column for name in device.forces if (column := given[name][0]) is not None]
+    if sensed and forces and len(forces) == len(device.forces):
+        match.used |= {column.name for column in forces}
+        lines += _force_table(device, forces, given[device.forces[0]][1], notes)
+        wanted = dict(device.channels)
+    lines += _brakes_table(device, match, notes)
+    return lines + _channels_table(wanted, given, match, notes)
+
+
+def _force_table(device: Device, columns: list[Column], why: str, notes: Notes) -> list[str]:
+    names = ", ".join(quoted(column.name) for column in columns)
+    components = ", ".join(f'"{name}"' for name in device.components)
+    return [
+        "[force]",
+        f"columns = [{names}]",
+        f"components = [{components}]",
+        *_force_unit(device, columns, why, notes),
+        "",
+    ]
+
+
+def _force_unit(device: Device, columns: list[Column], why: str, notes: Notes) -> list[str]:
+    """The unit that all force columns share, and what makes forces of volts."""
+    units = {spelled(bare(column.unit), _FORCE_UNITS) for column in columns}
+    common = units.pop() if len(units) == 1 else None
+    known = unit(common) if common is not None else None
+    if known is not None and known.si == device.force_unit:
+        stated = all(column.stated for column in columns)
+        return [f'unit = "{common}"' + ("" if stated else notes.guess(f"force in {known.si}"))]
+    if common == "V":
+        row = f"[{', '.join(['0.0'] * len(columns))}]"
+        rows = f"[{', '.join([row] * len(columns))}]"
+        return [
+            'unit = "V"' + notes.guess("the force channels are volts, by their names"),
+            f"calibration_n_per_v = {rows}" + notes.ask("calibration_n_per_v, N for one volt"),
+            f"zero_v = {row}" + notes.ask("zero_v, the volts without force"),
+        ]
+    names = ", ".join(quoted(column.name) for column in columns)
+    note = notes.guess(f"{names} is a force in {device.force_unit}{why}; volts need a gain")
+    return [f'unit = "{device.force_unit}"{note}']
+
+
+def _brakes_table(device: Device, match: Matcher, notes: Notes) -> list[str]:
+    named = {axis: match.named(name, "brake") for axis, name in device.brakes.items()}
+    brakes = {axis: column for axis, column in named.items() if column is not None}
+    if not brakes:
+        return []
+    match.used |= {column.name for column in brakes.values()}
+    units = ", ".join(device.coordinate(axis).torque_unit for axis in brakes)
+    return [
+        "[brakes]",
+        f"columns = [{', '.join(quoted(column.name) for column in brakes.values())}]",
+        f'unit = "{units}"' + notes.guess("brake commands are in SI units"),
+        "",
+    ]
+
+
+def _channels_table(
+    wanted: Mapping[str, str], given: Mapping[str, Match], match: Matcher, notes: Notes
+) -> list[str]:
+    """Lines for the inputs ``wanted``, by name, with their SI units; none if nothing is."""
+    if not wanted:
+        return []
+    lines = ["[channels]"]
+    for name, si in wanted.items():
+        column, why = given[name]
+        if column is None:
+            note = notes.ask(f"the column of {name}" + (f" in {si}" if si else ""))
+            lines.append(f"{name} = {entry(UNKNOWN, si)}{note}")
+            continue
+        match.used.add(column.name)
+        lines.append(f"{name} = {_channel(name, si, column, why, notes)}")
+    return [*lines, ""]
+
+
+def _channel(name: str, si: str, column: Column, why: str, notes: Notes) -> str:
+    """Column and unit of one input; its register or its scale, where the unit does not do."""
+    bits = guesses.signed_register(column.values)
+    register = f", wrap_bits = {bits}, signed = true" if bits else ""
+    known = unit(column.unit)
+    if column.unit and known is not None and known.si == si:
+        table = entry(column.name, bare(column.unit), register)
+        if column.stated and not why and not bits:
+            return table
+        return table + notes.guess(f"{column.name} is {name}{why}{_unscaled(si, column, bits)}")
+    likely = guesses.likely_unit(si, column.values) or si
+    if name == "duty" and not column.unit:
+        most = float(np.nanmax(np.abs(column.values)))
+        if most > 100.0 and not bits:
+            table = entry(column.name, "", ", scale = 0.0")
+            return table + notes.ask(f"the scale of {name}, 1 over full duty")
+        if most > _FULL_DUTY:
+            likely = "%" if most <= 100.0 else ""
+    where = f" in {likely}" if si else ""
+    return entry(column.name, likely, register) + notes.guess(
+        f"{column.name} is {name}{where}{why}{_unscaled(si, column, bits)}"
+    )
+
+
+def _unscaled(si: str, column: Column, bits: int) -> str:
+    """What to add of a column that may be in counts, with ``bits`` where it is a register."""
+    if bits:
+        return f", a signed register of {bits} bits: give its scale"
+    counts = column.whole and not column.unit and si
+    return "; if in counts, give their scale too" if counts else ""

@@ -1,0 +1,151 @@
+"""Which column of a log is which: by name and unit first, then by what the data show."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from bampipe.data import guesses
+from bampipe.data.survey import Column, Survey, words
+from bampipe.data.units import unit
+from bampipe.proposal.positions import travelled
+
+DRIVERS = ("force", "current", "voltage")
+"""Roles of what may drive an axis."""
+
+_DRIVEN = 0.5
+"""Share of a column that the motion must explain for it to pass as what drives it."""
+
+_INPUT_ROLE = {"N": "force", "N.m": "force", "A": "current", "V": "voltage", "": "voltage"}
+Match = tuple[Column | None, str]
+
+
+@dataclass
+class Matcher:
+    """The columns of a survey, and which of them are taken.
+
+    Attributes:
+        found: the columns.
+        t: (T,) time stamps of the first log, s.
+        used: names of the columns that have a meaning already; grows as tables are proposed.
+    """
+
+    found: Survey
+    t: np.ndarray
+    used: set[str]
+
+    def named(self, name: str, *roles: str) -> Column | None:
+        """The column that has the words of ``name``, of one of the roles."""
+        wanted = set(words(name))
+        for column in self.found.of(*roles):
+            if column.name == name or wanted <= set(words(column.name)):
+                return column
+        return None
+
+    def position(self, axis: str, axes: int) -> tuple[Column | None, list[str]]:
+        """The measured position of an axis; and all that it was chosen from, if several.
+
+        Args:
+            axis: name of the axis, "" for any.
+            axes: how many axes there are: of several, only the name tells which is which.
+        """
+        named = self.named(axis, "position") if axis else None
+        if named is not None or axes > 1:
+            return named, []
+        found = [c for c in self.found.of("position") if not c.constant]
+        found = found or [
+            c for c in self.found.of("") if not c.constant and re.match(r"q\w?\Z", c.name.lower())
+        ]
+        # A test stand may log the velocity only, which is integrated then.
+        found = found or [c for c in self.found.of("velocity") if not c.constant]
+        found = found or [c for c in self.found.columns if not c.constant and c.name in ("v", "V")]
+        if len(found) < 2:
+            return (found[0] if found else None), []
+        best = found[0]
+        for other in found[1:]:
+            alike = abs(float(np.corrcoef(best.values, other.values)[0, 1])) > 0.9
+            best = other if alike and guesses.follows(best.values, other.values) else best
+        return best, [c.name for c in found]
+
+    def inputs(self, wanted: Mapping[str, str], axes: tuple[Column, ...]) -> dict[str, Match]:
+        """The column of every input, and why it is thought so where that is not by its name.
+
+        Args:
+            wanted: inputs with their SI units.
+            axes: columns of the positions.
+        """
+        given: dict[str, Match] = {}
+        # Those with a unit first: what has none could be anything.
+        for name, si in sorted(wanted.items(), key=lambda item: not item[1]):
+            given[name] = self._input(name, si, axes)
+            column = given[name][0]
+            self.used |= {column.name} if column is not None else set()
+        return given
+
+    def _input(self, name: str, si: str, axes: tuple[Column, ...]) -> Match:
+        role = _INPUT_ROLE.get(si, "")
+        free = [c for c in self.found.columns if c.name not in self.used]
+        exact = next((c for c in free if c.name == name), None)
+        named = exact or self.named(name, role) or self.named(name.removeprefix("force_"), role)
+        if named is not None and named in free:
+            return named, ""
+        fitting = [c for c in free if c.role == role and not c.constant and (si or not c.unit)]
+        if len(fitting) == 1 and _compatible(fitting[0], si):
+            return fitting[0], ""
+        for position in axes:
+            best = self.driving(position)
+            if best is not None and best.role in ("", role) and _compatible(best, si):
+                return best, ", since the motion follows it"
+        return None, ""
+
+    def driver(self, position: Column) -> tuple[Column | None, str]:
+        """What drives an axis: by its motion, else by name; and what kind of input that is.
+
+        The kind is that of the column, ``duty`` for a voltage given as a share of the supply.
+        """
+        named = [c for role in DRIVERS for c in self.found.of(role) if not c.constant]
+        best = self.driving(position) or next(iter(named), None)
+        if best is None or best.role not in DRIVERS:
+            return best, "force"
+        duty = best.role == "voltage" and {"pwm", "duty"} & set(words(best.name))
+        return best, "duty" if duty else best.role
+
+    def supply(self, driver: Column | None) -> Column | None:
+        """The supply voltage beside a duty cycle: in volts or of no unit, and never negative."""
+        for column in self.found.of("voltage"):
+            known = unit(column.unit) if column.unit else None
+            volts = known is None or known.si == "V"
+            if column is not driver and volts and np.nanmin(column.values) > 0.0:
+                return column
+        return None
+
+    def driving(self, position: Column) -> Column | None:
+        """The column that acceleration, velocity and friction of the motion explain best."""
+        share = {}
+        for column in self.found.columns:
+            free = column.name not in self.used and column.role not in ("time", "velocity")
+            if not free or column.role == "reference" or column.constant or column is position:
+                continue
+            values = np.nan_to_num(column.values)
+            known = unit(column.unit) if column.unit else None
+            if known is not None and known.si in ("rad", "m"):  # of another axis
+                continue
+            if abs(float(np.corrcoef(position.values, values)[0, 1])) > 0.98:
+                continue
+            bits = guesses.signed_register(values)
+            if bits:
+                values = np.where(values >= 2.0 ** (bits - 1), values - 2.0**bits, values)
+            share[column.name] = guesses.driven(self.t, travelled(position, self.t), values).share
+        best = max(share, key=lambda name: share[name], default="")
+        if not best or share[best] < _DRIVEN:
+            return None
+        return next(c for c in self.found.columns if c.name == best)
+
+
+def _compatible(column: Column, si: str) -> bool:
+    """Whether nothing that the column says of its unit contradicts ``si``."""
+    known = unit(column.unit) if column.unit else None
+    return known is None or known.si == si

@@ -1,0 +1,174 @@
+"""A device file to start from: one axis with friction, driven by what was recorded."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from bampipe.data.guesses import Driven
+from bampipe.data.survey import words
+from bampipe.proposal.starter_input import Axis, Drive, Input, input_of
+
+_TAKEN = frozenset(
+    [
+        *("enc", "encoder", "pos", "position", "angle", "counts", "ticks", "displacement", "disp"),
+        *("stroke", "present", "actual", "act", "measured", "meas", "current", "state", "value"),
+        *("deg", "degree", "degrees", "rad", "radian", "radians", "vel", "velocity", "speed"),
+        *("header", "feedback", "percent"),
+    ]
+)
+_FROM_A_MOTOR = frozenset(["effort", "torque", "tau"])
+_DRIVE = "drive = true                        # from a motor; false: from a force sensor\n"
+_YIELDS = 2e-3
+
+
+@dataclass(frozen=True)
+class Starter:
+    """A device file to start from.
+
+    Attributes:
+        text: of the file.
+        axis: name of its axis.
+        input: name of the input that drives the axis.
+        own: names of the constants that only its user knows.
+    """
+
+    text: str
+    axis: str
+    input: str
+    own: tuple[str, ...]
+
+
+def starter_device(position: str, linear: bool, drive: Drive, found: Driven) -> Starter:
+    """Write a device file of one axis.
+
+    Args:
+        position: column of the position; its name may name the axis.
+        linear: whether the axis slides rather than turns.
+        drive: what drives it.
+        found: sizes by a rough fit, SI, from which the priors are taken.
+    """
+    names = [word for word in words(position) if word not in _TAKEN and len(word) > 2]
+    axis = Axis(names[0] if names else ("carriage" if linear else "joint"), linear)
+    source = input_of(axis, drive)
+    sections = [
+        _coordinate(axis, drive),
+        source.constants,
+        _energy(axis, found),
+        _torque(axis, drive.coil),
+        _inputs(source, drive),
+        f'[applied]\n{axis.name} = "{source.applied}"\n',
+        _friction(axis, found),
+        _inertia(axis, drive.coil, found),
+        _offset(axis, found),
+        *_moments(found),
+        *(_coil_parameters(axis, found) if drive.coil else []),
+    ]
+    text = "\n".join(section for section in sections if section)
+    return Starter(text, axis.name, source.name, source.own)
+
+
+def _coordinate(axis: Axis, drive: Drive) -> str:
+    width = f"sign_width = {_YIELDS:g}                  # a fluid yields over some mm/s\n"
+    return f"""# Proposed by `bampipe init`: one axis with inertia and friction
+schema = "bampipe.device/1"
+name = "{axis.name}"
+summary = "One {axis.kind} axis driven by a {drive.role}"
+source = "fill in"
+
+[coordinates.{axis.name}]
+kind = "{axis.kind}"
+symbol = "{axis.name[0]}"
+{width if drive.coil else ""}"""
+
+
+def _energy(axis: Axis, found: Driven) -> str:
+    name = axis.name
+    potential = f'"-moment*cos({name}) + moment_across*sin({name})"'
+    if not any(found.gravity):
+        hint = f'gravity of a link: "-moment*cos({name})", moment in N.m'
+        potential = f'"0"                     # {hint}'
+    return f'[energy]\nkinetic = "inertia*ddt({name})**2/2"\npotential = {potential}\n'
+
+
+def _torque(axis: Axis, coil: bool) -> str:
+    qd = f"qd_{axis.name}"
+    rubbed = f"friction_per_ampere*sgn({qd}) + viscous_per_ampere*{qd}"
+    coiled = f" - abs(coil_current)*({rubbed})" if coil else ""
+    return (
+        "[torque]                            # what is left at standstill\n"
+        f'{axis.name} = "-offset{coiled}"\n'
+    )
+
+
+def _inputs(source: Input, drive: Drive) -> str:
+    comment = f"             # {drive.column}" if drive.column else ""
+    motor = drive.role != "force" or not _FROM_A_MOTOR.isdisjoint(words(drive.column))
+    channels = f"channels = {{ {source.beside} }}\n" if source.beside else ""
+    return f"""[inputs]
+force = ["{source.name}"]{comment}
+force_unit = "{source.si}"
+{_DRIVE if motor else ""}{channels}"""
+
+
+def _friction(axis: Axis, found: Driven) -> str:
+    viscous, coulomb = (", ".join(_prior(size)) for size in (found.viscous, found.coulomb))
+    return f"""[friction.{axis.name}]
+viscous = {{ unit = "{axis.viscous}", {viscous}, lower = 0.0 }}  # guess
+coulomb = {{ unit = "{axis.torque}", {coulomb}, lower = 0.0 }}  # guess
+"""
+
+
+def _inertia(axis: Axis, coil: bool, found: Driven) -> str:
+    # A mass near zero under friction is a motion that no simulation can follow.
+    least = 0.02 * found.inertia if found.inertia > 0.0 else 0.1 if axis.linear else 1e-5
+    least = max(least, 0.3) if coil and axis.linear else least
+    prior, sd = _prior(found.inertia)
+    values = (f"{prior}  # guess", sd, f"lower = {_rounded(least):g}")
+    return _parameter("inertia", axis.inertia, values, "all that moves, reduced to this axis")
+
+
+def _offset(axis: Axis, found: Driven) -> str:
+    values = ("prior = 0.0", f"sd = {_rounded(3.0 * abs(found.coulomb) or 20.0):g}")
+    meaning = "needed to hold the axis where nothing else acts"
+    return _parameter("offset", axis.torque, values, meaning)
+
+
+def _moments(found: Driven) -> list[str]:
+    """The parameters of gravity; none where the motion shows none."""
+    if not any(found.gravity):
+        return []
+    sd = f"sd = {_rounded(max(map(abs, found.gravity))):g}"
+    meaning = "mass times gravity times distance of the centre of gravity"
+    return [
+        _parameter(name, "N.m", (f"prior = {_rounded(size):g}  # guess", sd), meaning)
+        for name, size in zip(("moment", "moment_across"), found.gravity, strict=True)
+    ]
+
+
+def _coil_parameters(axis: Axis, found: Driven) -> list[str]:
+    texts = []
+    for name, unit, size in (
+        ("friction_per_ampere", axis.torque, found.coulomb),
+        ("viscous_per_ampere", axis.viscous, found.viscous),
+    ):
+        prior, sd = _prior(size)
+        values = (f"{prior}  # guess", sd, "lower = 0.0")
+        meaning = "what the coil adds, in proportion to its current"
+        texts.append(_parameter(name, f"{unit}/A", values, meaning))
+    return texts
+
+
+def _parameter(name: str, unit: str, values: tuple[str, ...], meaning: str) -> str:
+    lines = (f"[parameters.{name}]", f'unit = "{unit}"', *values, f'description = "{meaning}"')
+    return "\n".join(lines) + "\n"
+
+
+def _prior(size: float) -> tuple[str, str]:
+    """A prior of the size found and its spread, five times that; wide where nothing was found."""
+    if size <= 0.0:
+        return "prior = 1.0", "sd = 100.0"
+    return f"prior = {_rounded(size):g}", f"sd = {_rounded(5.0 * size):g}"
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.2g}")

@@ -1,0 +1,55 @@
+"""The tables ``[[trials]]``: one for every log, or for every part of the only one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import pairwise
+from pathlib import Path
+
+from bampipe.data import guesses
+from bampipe.data.survey import Column, words
+from bampipe.physics.device import Device
+from bampipe.proposal.matching import Matcher
+from bampipe.proposal.notes import Notes, quoted
+
+
+def trials_tables(
+    device: Device, axes: Mapping[str, Column], match: Matcher, notes: Notes
+) -> list[str]:
+    """Propose the trials and their kinds; a single long record is cut at rests of its first axis.
+
+    Args:
+        device: whose axes a locked trial may name.
+        axes: columns of the positions.
+        match: the logs and their time.
+        notes: where guesses and what is left open are noted.
+    """
+    files = match.found.files
+    cuts: list[float] = []
+    if len(files) == 1 and axes:
+        cuts = guesses.stretches(match.t, next(iter(axes.values())).values)
+    lines = []
+    if cuts:
+        note = notes.guess("one record, cut at rests, so that each part can be held out")
+        lines.append(note.strip())
+    for file in files:
+        for start_s, end_s in pairwise([None, *cuts, None]):
+            lines += ["[[trials]]", f"file = {quoted(file)}", *_kind(file, device, notes)]
+            lines += [f"start_s = {start_s}"] if start_s is not None else []
+            lines += [f"end_s = {end_s}"] if end_s is not None else []
+            lines.append("")
+    return lines
+
+
+def _kind(file: str, device: Device, notes: Notes) -> list[str]:
+    said = set(words(Path(file).stem))
+    axis = next((c.name for c in device.coordinates if c.name in said), "")
+    if "locked" in said and axis:
+        note = notes.guess(f"{file} is a locked trial, by its name")
+        return [f'kind = "locked"{note}', f'locked_axis = "{axis}"']
+    if "viscous" in said:
+        return [
+            'kind = "viscous"' + notes.guess(f"{file} is a viscous trial, by its name"),
+            "viscous_n_s_per_m = 0.0" + notes.ask("viscous_n_s_per_m, the commanded damping"),
+        ]
+    return ['kind = "free"']

@@ -1,0 +1,1 @@
+"""Sessions of a simulated device, with a hidden effect where one is wanted."""

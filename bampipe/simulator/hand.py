@@ -1,0 +1,149 @@
+"""What a person does to a simulated plant: free and locked trials, trials in a viscous field."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.estimate.simulation import Impedance, simulate_tracking
+from bampipe.physics.device import Coordinate, Device, derivative
+from bampipe.physics.system import System
+from bampipe.simulator.plant import Config, Plant
+
+Array = NDArray[np.float64]
+
+REACH = {"rotary": 0.65, "linear": 0.8}
+"""Largest wanted motion as a share of half the range: people use more of a rod than of a turn."""
+
+HASTE = {"rotary": 15.0, "linear": 6.0}
+"""Largest wanted acceleration, rad/s2 and m/s2: about 40 N at the handle of the BAM."""
+
+LOCKED_LOAD = {"rotary": 50.0, "linear": 120.0}
+"""Peak load of a locked trial, N.m and N."""
+
+LOCKED_BRAKE = 200.0
+LOCKED_PERIOD, LOCKED_CYCLES = 4.0, 6
+BAND = (0.1, 2.0)
+"""Frequencies of the motion that the hand wants, Hz (Section II-E)."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """True course of one trial: t (T,) s; q, qd (T, n_q); force (T, n_f); brake (T, n_b)."""
+
+    t: Array
+    q: Array
+    qd: Array
+    force: Array
+    brake: Array
+
+
+def _wanted(
+    device: Device, config: Config, rng: np.random.Generator, t: Array, share: float
+) -> tuple[Array, Array]:
+    """Position and rate that the hand wants: band-limited noise in each axis, from rest."""
+    q = np.empty((len(t), len(device.coordinates)))
+    qd = np.empty_like(q)
+    rise = np.clip(t / 1.0, 0.0, 1.0)
+    fade, fade_rate = rise**2 * (3 - 2 * rise), 6 * rise * (1 - rise)
+    for i, c in enumerate(device.coordinates):
+        middle, half = _range(device, c)
+        frequency = 2 * np.pi * rng.uniform(*BAND, size=40)
+        # A hand reaches far slowly and only a little fast.
+        size = rng.normal(size=40) / (1.0 + (frequency / (2 * np.pi * 0.6)) ** 2) ** 2
+        phase = np.outer(t, frequency) + rng.uniform(0.0, 2 * np.pi, size=40)
+        wave, rate = np.sin(phase) @ size, np.cos(phase) @ (size * frequency)
+        reach = half * REACH[c.kind] * config.amplitude * share * rng.uniform(0.7, 1.0)
+        bend = np.sin(phase) @ (size * frequency**2)
+        scale = min(reach / np.abs(wave).max(), HASTE[c.kind] / np.abs(bend).max())
+        q[:, i] = middle + scale * (wave[0] + fade * (wave - wave[0]))
+        qd[:, i] = scale * (fade * rate + fade_rate * (wave - wave[0]))
+    return q, qd
+
+
+def moving_trial(
+    plant: Plant, config: Config, rng: np.random.Generator, viscous: bool
+) -> Recording:
+    """A free trial, or one in a viscous field."""
+    system, device = plant.motion, plant.device
+    dt = 1.0 / config.sample_rate
+    t = np.arange(round(config.duration * config.sample_rate), dtype=np.float64) * np.float64(dt)
+    q_ref, qd_ref = _wanted(device, config, rng, t, 0.6 if viscous else 1.0)
+    arm = Impedance(natural_frequency=rng.uniform(7.0, 10.0), damping_ratio=1.0, bandwidth=50.0)
+    u = np.zeros((len(t), len(system.inputs)))
+    if "t" in system.inputs:
+        u[:, system.inputs.index("t")] = t
+    force = [system.inputs.index(f) for f in device.forces]
+    slopes = [[_column(system, derivative(f, k)) for f in device.forces] for k in (1, 2)]
+    n = len(device.coordinates)
+    brakes = [system.inputs.index(device.brakes[c.name]) for c in device.coordinates] if (
+        viscous or set(device.brakes) == {c.name for c in device.coordinates}
+    ) else []  # fmt: skip
+    p = plant.p(system)
+    x0 = np.concatenate([q_ref[0], np.zeros(n), system.initial_memory(q_ref[0], u[0], p)])
+    pose = q_ref
+    # The field J^T K J needs the pose; its own motion settles after a few rounds.
+    for _ in range(4 if viscous else 1):
+        gain = config.viscous_damping * (system.input_map(pose) ** 2).sum(axis=2)
+        x, total = simulate_tracking(
+            system.derivative, x0, u, p, dt, q_ref, qd_ref,
+            width=np.array([c.sign_width for c in device.coordinates]),
+            n_noise=len(system.noise), force=force, rate=slopes[0], curvature=slopes[1],
+            impedance=arm, brake=brakes, brake_gain=gain if viscous else None,
+        )  # fmt: skip
+        pose = x[:, :n]
+    brake = [system.inputs.index(b) for b in device.brakes.values()]
+    return Recording(t, x[:, :n], x[:, n : 2 * n], total[:, force], total[:, brake])
+
+
+def _column(system: System, name: str) -> int:
+    return system.inputs.index(name) if name in system.inputs else -1
+
+
+def locked_trial(plant: Plant, config: Config, rng: np.random.Generator, axis: str) -> Recording:
+    """An axis held by its brake while the handle is loaded: the transmission winds up.
+
+    The load is stiffness times deflection plus friction that builds up over a tenth of the
+    deflection (Dahl), which gives the loop of Fig. 3.
+    """
+    device = plant.device
+    names = [c.name for c in device.coordinates]
+    i = names.index(axis)
+    kind = device.coordinates[i].kind
+    stiffness = plant.stiffness[axis]
+    t = np.arange(round(LOCKED_PERIOD * LOCKED_CYCLES * config.sample_rate)) / config.sample_rate
+    peak = LOCKED_LOAD[kind] / stiffness
+    deflection = peak * (1 - 0.03 * rng.uniform()) * np.sin(2 * np.pi * t / LOCKED_PERIOD)
+    friction = 1.5 * plant.values.get(f"coulomb.{axis}", 0.02 * LOCKED_LOAD[kind])
+    share = np.empty(len(t))
+    share[0] = 0.0
+    for k, step in enumerate(np.diff(deflection)):
+        aim = np.sign(step)
+        share[k + 1] = aim + (share[k] - aim) * np.exp(-abs(step) / (0.1 * peak))
+    middle = [_range(device, c) for c in device.coordinates]
+    pose = np.array([m + 0.05 * half for m, half in middle])
+    q = np.tile(pose, (len(t), 1))
+    q[:, i] += deflection
+    load = np.zeros((len(t), len(names)))
+    load[:, i] = stiffness * deflection + friction * share
+    force = _forces(plant.motion.input_map(q), load)
+    wander = rng.uniform(0.0, 2 * np.pi, size=force.shape[1])
+    others = np.abs(force).max(axis=0) < 0.05 * np.abs(force).max()
+    force += np.where(others, 1.2 * np.sin(2 * np.pi * 0.17 * t[:, None] + wander), 0.0)
+    brake = np.zeros((len(t), len(device.brakes)))
+    brake[:, list(device.brakes).index(axis)] = LOCKED_BRAKE
+    return Recording(t, q, np.zeros_like(q), force, brake)
+
+
+def _forces(input_map: Array, load: Array) -> Array:
+    """Handle forces (T, n_f) that give the generalised forces ``load`` (T, n_q)."""
+    inverse = np.linalg.pinv(input_map)
+    return np.asarray(np.einsum("tfq,tq->tf", inverse, load), dtype=np.float64)
+
+
+def _range(device: Device, c: Coordinate) -> tuple[float, float]:
+    """Middle and half width of an axis' range."""
+    lower, upper = device.limits.get(c.name, (-1.0, 1.0) if c.kind == "rotary" else (-0.2, 0.2))
+    return (lower + upper) / 2, (upper - lower) / 2

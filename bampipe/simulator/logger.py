@@ -1,0 +1,185 @@
+"""What the sensors and the logger of a simulated plant write: counts, volts, brake commands."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from bampipe.errors import InputError
+from bampipe.physics.device import INPUT_ORDERS, Coordinate, Device, derivative
+from bampipe.physics.system import System
+from bampipe.simulator.hand import Recording
+from bampipe.simulator.plant import Config, Plant
+
+Array = NDArray[np.float64]
+
+ENCODERS = {
+    "yaw": ("enc_yaw", 21333.3333, 12000),
+    "pitch": ("enc_pitch", 10191.0828, -4000),
+    "extension": ("enc_extension", 33333.3333, 3000),
+}
+"""Column, counts per unit and counts at zero; other axes get 20000 per rad, 33333 per m."""
+
+CALIBRATION = np.array([[12.0, 0.15, -0.1], [0.1, 11.5, 0.2], [-0.05, 0.1, 24.0]])
+ZERO_V = np.array([0.021, -0.034, 0.012])
+_TOO_HIGH = range(3, len(INPUT_ORDERS))
+
+
+def read_out(
+    plant: Plant, config: Config, rng: np.random.Generator, true: Recording, locked: bool
+) -> pd.DataFrame:
+    """What the logger writes: whole counts, volts, brake commands."""
+    device = plant.device
+    force = _sensed_force(plant, true) + config.force_noise * rng.normal(size=true.force.shape)
+    # A locked trial winds up the transmission itself: the encoder sees the deflection as given.
+    q = _sensed_position(plant, true, np.zeros_like(true.force) if locked else true.force)
+    columns: dict[str, Any] = {"time_us": np.round(true.t * 1e6).astype(np.int64)}
+    for i, c in enumerate(device.coordinates):
+        name, per_unit, zero = _encoder(c)
+        columns[name] = np.round(q[:, i] * per_unit + zero).astype(np.int64)
+    if device.force_unit == "N":
+        calibration, zero_v = _calibration(len(device.forces))
+        volts = np.linalg.solve(calibration, force.T).T + zero_v
+        columns |= {f"{f}_v": np.round(volts[:, j], 6) for j, f in enumerate(device.forces)}
+    else:
+        columns |= {f: np.round(force[:, j], 6) for j, f in enumerate(device.forces)}
+    columns |= {b: np.round(true.brake[:, j], 4) for j, b in enumerate(device.brakes.values())}
+    return pd.DataFrame(columns)
+
+
+def _inputs(system: System, true: Recording, force: Array) -> Array:
+    """Columns of u for the sensor models."""
+    u = np.zeros((len(true.t), len(system.inputs)))
+    for j, f in enumerate(system.model.device.forces):
+        u[:, system.inputs.index(f)] = force[:, j]
+    for j, b in enumerate(system.model.device.brakes.values()):
+        if b in system.inputs:
+            u[:, system.inputs.index(b)] = true.brake[:, j]
+    if "t" in system.inputs:
+        u[:, system.inputs.index("t")] = true.t
+    return u
+
+
+def _sensed_position(plant: Plant, true: Recording, force: Array) -> Array:
+    """The reading q_m that solves q_true = q_m + offset(q_m), by iteration; ``force`` loads it."""
+    if plant.position is None:
+        return true.q
+    system = plant.position
+    u, p = _inputs(system, true, force), plant.p(system)
+    q = true.q
+    for _ in range(100):
+        step = true.q - system.true_motion(q, true.qd, np.zeros_like(q), u, p)[0]
+        q = q + step
+        if np.abs(step).max() < 1e-12:
+            return q
+    raise InputError("a position effect is too strong to be simulated", remedy="weaken it")
+
+
+def _sensed_force(plant: Plant, true: Recording) -> Array:
+    """The reading of the force sensor, without noise.
+
+    The effects say true = T(reading). T is affine in the reading and its two derivatives, so its
+    coefficients at each sample follow from probing it; the reading then solves the equation,
+    sample by sample where derivatives take part (implicit differences, stable for any lag).
+    """
+    late = np.column_stack(
+        [np.interp(true.t - plant.delay, true.t, column) for column in true.force.T]
+    )
+    if plant.force is None:
+        return late
+    system, nf = plant.force, late.shape[1]
+    if system.memory_names:
+        raise InputError("an input effect with internal states cannot be simulated")
+    p, no_states = plant.p(system), np.zeros((len(late), 0))
+    still, names = np.zeros_like(true.q), plant.device.forces
+    inverse = np.linalg.pinv(system.input_map(true.q))
+
+    def corrected(u: Array) -> Array:
+        applied = system.applied(true.q, true.qd, still, no_states, u, p)
+        return np.asarray(np.einsum("tfq,tq->tf", inverse, applied), dtype=np.float64)
+
+    zero = _inputs(system, true, np.zeros_like(late))
+    constant = corrected(zero)
+    if any(_input_column(system, derivative(f, k)) >= 0 for f in names for k in _TOO_HIGH):
+        raise InputError("an input effect with a third derivative cannot be simulated")
+    response = np.zeros((3, len(late), nf, nf))
+    for order in range(3):
+        for j, f in enumerate(names):
+            column = _input_column(system, derivative(f, order))
+            if column >= 0:
+                u = zero.copy()
+                u[:, column] = 1.0
+                response[order, :, :, j] = corrected(u) - constant
+    side = late - constant
+    if not response[1:].any():
+        reading = np.linalg.solve(response[0], side[:, :, None])[:, :, 0]
+        if not np.allclose(corrected(_inputs(system, true, reading)), late, atol=1e-6):
+            raise InputError("an input effect is not linear in the force: cannot be simulated")
+        return np.asarray(reading)
+    h = true.t[1] - true.t[0]
+    reading = np.empty_like(late)
+    now, before = late[0], late[0]
+    for k in range(len(late)):
+        a, b, c = response[0, k], response[1, k] / h, response[2, k] / h**2
+        known = side[k] + b @ now + c @ (2 * now - before)
+        reading[k] = np.linalg.solve(a + b + c, known)
+        before, now = now, reading[k]
+    return reading
+
+
+def _input_column(system: System, name: str) -> int:
+    return system.inputs.index(name) if name in system.inputs else -1
+
+
+def _encoder(c: Coordinate) -> tuple[str, float, int]:
+    return ENCODERS.get(c.name, (f"enc_{c.name}", 20000.0 if c.kind == "rotary" else 33333.0, 0))
+
+
+def _calibration(nf: int) -> tuple[Array, Array]:
+    if nf > len(ZERO_V):
+        return 12.0 * np.eye(nf), np.zeros(nf)
+    return CALIBRATION[:nf, :nf], ZERO_V[:nf]
+
+
+def session_toml(
+    session_id: str, device: Device, config: Config, trials: list[dict[str, str]]
+) -> str:
+    """The session file over the trials that `read_out` made."""
+    lines = [
+        'schema = "bampipe.session/1"',
+        f"session_id = {json.dumps(session_id)}",
+        f"device = {json.dumps(config.device)}",
+        f"sample_rate_hz = {config.sample_rate!r}",
+        "",
+        "[encoders]",
+    ]
+    for c in device.coordinates:
+        name, per_unit, zero = _encoder(c)
+        entry = f'column = "{name}", counts_per_unit = {per_unit!r}, zero_counts = {zero}'
+        lines.append(f'{c.name} = {{ {entry}, unit = "{c.unit}" }}')
+    lines += ["", "[force]"]
+    if device.force_unit == "N":
+        calibration, zero_v = _calibration(len(device.forces))
+        lines += [
+            f"columns = {json.dumps([f'{f}_v' for f in device.forces])}",
+            'unit = "V"',
+            'frame = "handle"',
+            f"calibration_n_per_v = {json.dumps(calibration.tolist())}",
+            f"zero_v = {json.dumps(zero_v.tolist())}",
+        ]
+    else:
+        lines += [f"columns = {json.dumps(list(device.forces))}", f'unit = "{device.force_unit}"']
+    lines.append(f"noise_sd_n = {config.force_noise!r}")
+    if device.brakes:
+        units = ", ".join(device.coordinate(axis).torque_unit for axis in device.brakes)
+        names = json.dumps(list(device.brakes.values()))
+        lines += ["", "[brakes]", f"columns = {names}", f'unit = "{units}"']
+    for trial in trials:
+        lines += ["", "[[trials]]", *(f'{key} = "{value}"' for key, value in trial.items())]
+        if trial["kind"] == "viscous":
+            lines.append(f"viscous_n_s_per_m = {config.viscous_damping!r}")
+    return "\n".join(lines) + "\n"

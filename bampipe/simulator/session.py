@@ -1,0 +1,122 @@
+"""A session in the raw-log format, recorded from the model itself, with effects hidden in it.
+
+The plant is the compiled model with the effects of kind torque and energy; the effects of kind
+input and measurement act on what its sensors read. The truth goes into a file beside the session
+folder, never inside.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+
+from bampipe.data import store
+from bampipe.errors import InputError
+from bampipe.physics.device import Device
+from bampipe.progress import Progress, silent
+from bampipe.simulator.hand import locked_trial, moving_trial
+from bampipe.simulator.logger import read_out, session_toml
+from bampipe.simulator.plant import Config, draw_plant
+
+__all__ = ["Config", "simulate_session"]
+
+NAME = "simulate"
+SUMMARY = "Make a session from the model, with known effects hidden in it"
+
+
+def simulate_session(out: Path, config: Config, progress: Progress = silent) -> dict[str, object]:
+    """Write a session folder ``out`` and the truth about it to ``out`` + ``.truth.json``.
+
+    Args:
+        out: folder to make; must not exist, or be empty.
+        config: what to simulate; equal configurations give equal bytes.
+        progress: told after each trial.
+
+    Returns:
+        ``session``, ``truth`` (paths), ``effects``, ``trials`` (file names).
+
+    Raises:
+        InputError: an effect, parameter or option makes no sense, or ``out`` is not empty.
+    """
+    _check(config)
+    out = Path(out).resolve()
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}", out.name):
+        raise InputError(
+            f"{out.name!r} cannot name a session", remedy="use letters, digits, '.', '_' and '-'"
+        )
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError("exists and is not an empty folder", where=str(out))
+    plant, strengths = draw_plant(config)
+    trials = _plan(plant.device, config)
+    try:
+        (out / "trials").mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot make the folder: {error.strerror}", where=str(out)) from error
+    for number, trial in enumerate(trials):
+        rng = np.random.default_rng([config.seed, 1 + number])
+        if trial["kind"] == "locked":
+            recording = locked_trial(plant, config, rng, trial["locked_axis"])
+        else:
+            recording = moving_trial(plant, config, rng, trial["kind"] == "viscous")
+        frame = read_out(plant, config, rng, recording, trial["kind"] == "locked")
+        path = out / trial["file"]
+        if config.file_format == "csv":
+            store.write_text(path, frame.to_csv(index=False, lineterminator="\n"))
+        else:
+            store.write_parquet(path, frame)
+        progress((number + 1) / len(trials), trial["file"])
+    store.write_text(out / "session.toml", session_toml(out.name, plant.device, config, trials))
+    truth = out.with_name(out.name + ".truth.json")
+    store.write_json(
+        truth,
+        {
+            "schema": "bampipe.truth/1",
+            "device": plant.device.name,
+            "effects": strengths,
+            "configuration": asdict(config),
+            "parameters": dict(plant.values),
+            "stiffness": dict(plant.stiffness) if config.locked_trials else {},
+        },
+    )
+    return {
+        "session": str(out),
+        "truth": str(truth),
+        "effects": list(strengths),
+        "trials": [trial["file"] for trial in trials],
+    }
+
+
+def _check(config: Config) -> None:
+    positive = ("duration", "sample_rate", "amplitude", "viscous_damping")
+    for name in positive:
+        if not 0 < getattr(config, name) < float("inf"):
+            raise InputError(f"{name} must be positive, found {getattr(config, name)!r}")
+    for name in ("strength", "force_noise", "trials", "viscous_trials", "seed"):
+        if not 0 <= getattr(config, name) < float("inf"):
+            raise InputError(f"{name} must not be negative, found {getattr(config, name)!r}")
+    if config.amplitude > 1:
+        raise InputError(f"amplitude must be at most 1, found {config.amplitude}")
+    if config.trials + config.viscous_trials == 0 and not config.locked_trials:
+        raise InputError("nothing to simulate", remedy="ask for at least one trial")
+    if config.duration * config.sample_rate < 10:
+        raise InputError("a trial would have fewer than 10 samples", remedy="make it longer")
+    if config.file_format not in ("csv", "parquet"):
+        raise InputError(f"file format {config.file_format!r} is neither csv nor parquet")
+
+
+def _plan(device: Device, config: Config) -> list[dict[str, str]]:
+    """The ``[[trials]]`` entries."""
+    kinds = [("free", "")] * config.trials + [("viscous", "")] * config.viscous_trials
+    if config.locked_trials:
+        kinds += [("locked", c.name) for c in device.coordinates if c.name in device.brakes]
+    if not device.brakes and (config.viscous_trials or config.locked_trials):
+        raise InputError(f"device {device.name!r} has no brakes for locked or viscous trials")
+    trials = []
+    for number, (kind, axis) in enumerate(kinds, start=1):
+        label = f"{kind}_{axis}" if axis else kind
+        entry = {"file": f"trials/t{number:02d}_{label}.{config.file_format}", "kind": kind}
+        trials.append(entry | ({"locked_axis": axis} if axis else {}))
+    return trials

@@ -1,0 +1,1 @@
+"""Trials on their way from samples to residual, for every stage alike."""
