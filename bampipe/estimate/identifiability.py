@@ -15,31 +15,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bampipe.estimate.least_squares import Problem
+from bampipe.estimate.bounded import scaled_eigenbasis
 
 Array = NDArray[np.float64]
 
 _LEAST_NOISE = 1e-12
 """Least noise at any frequency, as a share of the mean over frequencies."""
-
-
-def slopes(problem: Problem, trial: int, p: Array) -> Array:
-    """Slope of the unfiltered residual of one trial by every free parameter, (T, n_q, n_free).
-
-    Args:
-        problem: the model as residuals.
-        trial: index of the trial.
-        p: (np,) parameters at which to take it, by forward differences.
-    """
-    base = problem.residual(trial, p)
-    found = np.empty((*base.shape, problem.free.size))
-    for k, place in enumerate(problem.free):
-        moved = p.copy()
-        moved[place] += problem.step[k]
-        if moved[place] > problem.upper[k]:
-            moved[place] = p[place] - problem.step[k]
-        found[:, :, k] = (problem.residual(trial, moved) - base) / (moved[place] - p[place])
-    return found
 
 
 def residual_spectrum(
@@ -96,7 +77,7 @@ def bound(matrix: Array) -> Array:
     Returns:
         (n, n) covariance; rows and columns of parameters in the null space are infinite.
     """
-    scale, value, vector, null = _directions(matrix)
+    scale, value, vector, null = scaled_eigenbasis(matrix)
     inverse = (vector[:, ~null] / value[~null]) @ vector[:, ~null].T / np.outer(scale, scale)
     lost = (np.abs(vector[:, null]) > 1e-6).any(axis=1)
     inverse[lost] = inverse[:, lost] = 0.0
@@ -113,20 +94,9 @@ def unseen(matrix: Array, prior_sd: Array) -> Array:
         matrix: (n, n) information, symmetric, not negative.
         prior_sd: (n,) positive.
     """
-    scale, _, vector, null = _directions(matrix)
+    scale, _, vector, null = scaled_eigenbasis(matrix)
     free = vector[:, null] / scale[:, None]
     return np.asarray(free @ np.linalg.inv(free.T @ (free / prior_sd[:, None] ** 2)) @ free.T)
-
-
-def _directions(matrix: Array) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
-    """Scale by which a matrix gets a unit diagonal, eigenvalues and vectors then, which are null.
-
-    A parameter of which nothing is known at all keeps its scale and is a null vector by itself.
-    """
-    scale = np.sqrt(np.diag(matrix))
-    scale = np.where(scale == 0.0, 1.0, scale)
-    value, vector = np.linalg.eigh(matrix / np.outer(scale, scale))
-    return scale, value, vector, value < 1e-12 * max(value[-1], 1e-300)
 
 
 @dataclass(frozen=True)
@@ -153,7 +123,7 @@ def weak_directions(matrix: Array, limit: float = 0.1, smallest_part: float = 0.
         limit: on the eigenvalues of the information scaled to a unit diagonal.
         smallest_part: parameters that move less than this share of the largest are left out.
     """
-    _, value, vector, _ = _directions(matrix)
+    _, value, vector, _ = scaled_eigenbasis(matrix)
     found = []
     for k in np.flatnonzero(value < limit):
         parts = vector[:, k] / vector[np.argmax(np.abs(vector[:, k])), k]

@@ -11,12 +11,13 @@ Everything here sees arrays and callables only.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.errors import InputError
+from bampipe.estimate.bounded import descend
 from bampipe.estimate.low_pass import Band
 from bampipe.estimate.standstill import moving
 
@@ -91,29 +92,40 @@ class LeastSquares:
     at_bound: NDArray[np.bool_]
 
 
+def residual_and_slopes(problem: Problem, trial: int, p: Array) -> tuple[Array, Array]:
+    """Unfiltered residual of one trial (T, n_q) and its slopes (T, n_q, n_free), by differences.
+
+    Args:
+        problem: the model as residuals.
+        trial: index of the trial.
+        p: (np,) parameters at which to take them; differences are forward, backward at a bound.
+    """
+    base = problem.residual(trial, p)
+    slopes = np.empty((*base.shape, problem.free.size))
+    for k, index in enumerate(problem.free):
+        moved = p.copy()
+        moved[index] += problem.step[k]
+        if moved[index] > problem.upper[k]:
+            moved[index] = p[index] - problem.step[k]
+        slopes[:, :, k] = (problem.residual(trial, moved) - base) / (moved[index] - p[index])
+    return base, slopes
+
+
 def stacked_residual(problem: Problem, trial: int, p: Array) -> Stacked:
     """Low-pass and thin the residual of one trial and its slope by every free parameter.
 
     Args:
         problem: the model as residuals.
         trial: index of the trial.
-        p: (np,) parameters at which to linearise, by forward differences.
+        p: (np,) parameters at which to linearise.
     """
-    base = problem.residual(trial, p)
-    n_q, n_free = base.shape[1], problem.free.size
-    columns = np.empty((len(base), n_q * (n_free + 1)))
-    columns[:, :n_q] = base
-    for k, place in enumerate(problem.free):
-        moved = p.copy()
-        moved[place] += problem.step[k]
-        if moved[place] > problem.upper[k]:
-            moved[place] = p[place] - problem.step[k]
-        difference = (problem.residual(trial, moved) - base) / (moved[place] - p[place])
-        columns[:, (k + 1) * n_q : (k + 2) * n_q] = difference
-    thin = problem.band.thin(columns)
+    base, slopes = residual_and_slopes(problem, trial, p)
+    count, n_q, n_free = slopes.shape
+    columns = np.concatenate([base[:, :, None], slopes], axis=2).reshape(count, -1)
+    thin = problem.band.thin(columns).reshape(-1, n_q, 1 + n_free)
     used = moving(problem.resting[trial], problem.band)
-    slope = thin[:, n_q:].reshape(len(thin), n_free, n_q).transpose(0, 2, 1)
-    return Stacked(thin[:, :n_q] * used, np.ascontiguousarray(slope * used[:, :, None]), used)
+    thin *= used[:, :, None]
+    return Stacked(np.ascontiguousarray(thin[:, :, 0]), np.ascontiguousarray(thin[:, :, 1:]), used)
 
 
 def fit(
@@ -147,39 +159,57 @@ def fit(
         _require_finite(problem, trial, s, p)
     if sum(len(s.residual) for s in stacked) <= problem.free.size:
         raise ValueError("fewer samples than parameters")
-    iterations, converged = 0, False
-    while iterations < most_iterations:
-        iterations += 1
-        before, cost = p, _cost(stacked)
-        target = refit(stacked, p[problem.free], problem.lower, problem.upper)
-        share = 1.0
-        while True:
-            moved = before.copy()
-            moved[problem.free] += share * (target - before[problem.free])
-            if problem.linear:
-                tried = [_moved(s, (moved - before)[problem.free]) for s in stacked]
-            else:
-                tried = [stacked_residual(problem, trial, moved) for trial in chosen]
-            gained = cost - _cost(tried)
-            if gained >= 0.0 or share < 1e-3:
-                break
-            share /= 2.0
-        converged = abs(gained) < 1e-10
-        if gained >= 0.0:
-            p, stacked = moved, tried
-        if gained < 1e-10:
-            break
-    value = p[problem.free]
-    covariance = _sandwich(problem, stacked, block_s)
+    start_at = _Linearised(problem, chosen, p, stacked)
+    found = descend(start_at, problem.lower, problem.upper, most_iterations)
+    last = found.last
     return LeastSquares(
-        p=p,
-        covariance=covariance,
-        residual_sd=_scatter(stacked),
-        stacked=tuple(stacked),
-        iterations=iterations,
-        converged=converged,
-        at_bound=np.asarray((value <= problem.lower) | (value >= problem.upper)),
+        p=last.p,
+        covariance=_sandwich(problem, last.stacked, block_s),
+        residual_sd=_scatter(last.stacked),
+        stacked=tuple(last.stacked),
+        iterations=found.iterations,
+        converged=found.converged,
+        at_bound=found.at_bound,
     )
+
+
+@dataclass(frozen=True)
+class _Linearised:
+    """The chosen trials, linearised at parameters ``p``: what `descend` follows."""
+
+    problem: Problem
+    trials: Sequence[int]
+    p: Array
+    stacked: Sequence[Stacked]
+
+    @property
+    def value(self) -> Array:
+        return np.asarray(self.p[self.problem.free])
+
+    @property
+    def cost(self) -> float:
+        """Negative log likelihood a sample where each axis has its own unknown scatter."""
+        return float(np.sum(np.log(np.maximum(_scatter(self.stacked), 1e-300))))
+
+    def normal_equations(self) -> tuple[Array, Array]:
+        weight = 1.0 / np.maximum(_scatter(self.stacked), 1e-300)
+        n_free = self.problem.free.size
+        normal, moment = np.zeros((n_free, n_free)), np.zeros(n_free)
+        for s in self.stacked:
+            slope = (s.slope * weight[None, :, None]).reshape(-1, n_free)
+            normal += slope.T @ slope
+            moment -= slope.T @ (s.residual * weight).reshape(-1)
+        return normal, moment
+
+    def moved(self, value: Array, share: float) -> _Linearised:
+        p = self.p.copy()
+        p[self.problem.free] = value
+        if self.problem.linear:
+            step = value - self.value
+            stacked = [Stacked(s.residual + s.slope @ step, s.slope, s.used) for s in self.stacked]
+        else:
+            stacked = [stacked_residual(self.problem, trial, p) for trial in self.trials]
+        return replace(self, p=p, stacked=stacked)
 
 
 def _require_finite(problem: Problem, trial: int, stacked: Stacked, p: Array) -> None:
@@ -187,8 +217,8 @@ def _require_finite(problem: Problem, trial: int, stacked: Stacked, p: Array) ->
     if not np.isfinite(stacked.residual).all():
         culprit = "with the parameters that the fit starts from"
     elif not np.isfinite(stacked.slope).all():
-        place = problem.free[int(np.argmin(np.isfinite(stacked.slope).all(axis=(0, 1))))]
-        culprit = f"as soon as parameter number {place + 1}, {p[place]:.4g}, changes"
+        index = problem.free[int(np.argmin(np.isfinite(stacked.slope).all(axis=(0, 1))))]
+        culprit = f"as soon as parameter number {index + 1}, {p[index]:.4g}, changes"
     else:
         return
     raise InputError(
@@ -198,61 +228,10 @@ def _require_finite(problem: Problem, trial: int, stacked: Stacked, p: Array) ->
     )
 
 
-def refit(
-    stacked: Sequence[Stacked],
-    value: Array,
-    lower: Array,
-    upper: Array,
-) -> Array:
-    """Solve the linearised problem within bounds; exact where the model is linear.
-
-    Bounds are kept by the active-set rule of Lawson and Hanson: a parameter that would leave its
-    range is held at the bound and the others are solved again.
-
-    Args:
-        stacked: trials to use, linearised at ``value``; leave one out to hold it out.
-        value: (n_free,) where they are linearised; lower, upper: (n_free,).
-
-    Returns:
-        (n_free,) estimates.
-    """
-    weight = 1.0 / np.maximum(_scatter(stacked), 1e-300)
-    n_free = value.size
-    normal, side = np.zeros((n_free, n_free)), np.zeros(n_free)
-    for s in stacked:
-        slope = (s.slope * weight[None, :, None]).reshape(-1, n_free)
-        normal += slope.T @ slope
-        side -= slope.T @ (s.residual * weight).reshape(-1)
-    scale = np.sqrt(np.diag(normal))
-    scale[scale == 0.0] = 1.0
-    step = np.zeros(n_free)
-    free = np.ones(n_free, dtype=bool)
-    for _ in range(n_free + 1):
-        rest = side - normal[:, ~free] @ step[~free]
-        part = normal[np.ix_(free, free)] / np.outer(scale[free], scale[free])
-        solved = np.linalg.lstsq(part, rest[free] / scale[free], rcond=1e-12)[0] / scale[free]
-        step[free] = solved
-        outside = free & ((value + step < lower) | (value + step > upper))
-        if not outside.any():
-            break
-        step[outside] = np.clip(value + step, lower, upper)[outside] - value[outside]
-        free &= ~outside
-    return np.asarray(value + step)
-
-
-def _moved(stacked: Stacked, step: Array) -> Stacked:
-    return Stacked(stacked.residual + stacked.slope @ step, stacked.slope, stacked.used)
-
-
 def _scatter(stacked: Sequence[Stacked]) -> Array:
     square = np.sum([np.sum(s.residual**2, axis=0) for s in stacked], axis=0)
     count = np.sum([np.sum(s.used, axis=0) for s in stacked], axis=0)
     return np.asarray(np.sqrt(square / np.maximum(count, 1)))
-
-
-def _cost(stacked: Sequence[Stacked]) -> float:
-    """Negative log likelihood a sample where each axis has its own unknown scatter."""
-    return float(np.sum(np.log(np.maximum(_scatter(stacked), 1e-300))))
 
 
 def _sandwich(problem: Problem, stacked: Sequence[Stacked], block_s: float) -> Array:

@@ -10,16 +10,19 @@ inverse dynamics it needs no acceleration, and unlike the filter no noise levels
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.errors import InputError
+from bampipe.estimate.bounded import descend
 
 Array = NDArray[np.float64]
 
-_SMALLEST_SHARE = 1e-3
+_TOLERANCE = 1e-8
+"""Change of the logarithm of the position error below which the fit has converged."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +49,7 @@ class OutputError:
         p: (np,) all parameters; covariance: (n_free, n_free) of the free ones.
         rms: (n_q,) position error that is left, rad or m.
         iterations: Gauss-Newton steps; converged: whether the last one gained nothing.
+        at_bound: (n_free,) which parameters ended on a bound.
     """
 
     p: Array
@@ -53,6 +57,7 @@ class OutputError:
     rms: Array
     iterations: int
     converged: bool
+    at_bound: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -115,56 +120,73 @@ def fit_output(
             where="output error",
             remedy="start from the parameters of `--method least-squares`",
         )
-    weight = _weight(errors)
-    converged, iterations = False, 0
-    while iterations < most_iterations and not converged:
-        iterations += 1
-        linear = [
-            _linearise(segment, x0, p, free, upper, step, weight)
-            for segment, x0 in zip(segments, states, strict=True)
-        ]
-        parts = [item.projected for item in linear]
-        move = _bounded(parts, p[free], lower, upper)
-        cost, share = _cost(errors, weight), 1.0
-        while True:
-            moved = p.copy()
-            moved[free] = np.clip(p[free] + share * move, lower, upper)
-            tried = [
-                x0 + share * _of_state(item, move) for x0, item in zip(states, linear, strict=True)
-            ]
-            new = _errors(segments, tried, moved)
-            gained = cost - _cost(new, weight)
-            if gained > 0.0 or share < _SMALLEST_SHARE:
-                break
-            share /= 2.0
-        converged = not gained > 1e-8 * cost
-        if gained > 0.0:
-            p, states, errors = moved, tried, new
-            weight = _weight(errors)
-    linear = [
-        _linearise(segment, x0, p, free, upper, step, weight)
-        for segment, x0 in zip(segments, states, strict=True)
-    ]
+    first = _Shot(segments, free, upper, step, p, states, errors)
+    found = descend(first, lower, upper, most_iterations, _TOLERANCE)
     return OutputError(
-        p=p,
-        covariance=_sandwich([item.projected for item in linear]),
-        rms=1.0 / weight,
-        iterations=iterations,
-        converged=converged,
+        p=found.last.p,
+        covariance=_sandwich(found.last.projected),
+        rms=found.last.rms,
+        iterations=found.iterations,
+        converged=found.converged,
+        at_bound=found.at_bound,
     )
+
+
+@dataclass(frozen=True)
+class _Shot:
+    """All segments, simulated from ``states`` with parameters ``p``: what `descend` follows."""
+
+    segments: Sequence[Segment]
+    free: NDArray[np.int64]
+    upper: Array
+    step: Array
+    p: Array
+    states: Sequence[Array]
+    errors: Sequence[Array]
+
+    @property
+    def value(self) -> Array:
+        return np.asarray(self.p[self.free])
+
+    @cached_property
+    def rms(self) -> Array:
+        return np.asarray(np.sqrt(np.mean(np.square(np.concatenate(self.errors)), axis=0)))
+
+    @property
+    def cost(self) -> float:
+        """Negative log likelihood a sample where each axis has its own unknown scatter."""
+        return float(np.sum(np.log(np.maximum(self.rms, 1e-300))))
+
+    @cached_property
+    def linear(self) -> list[_Linear]:
+        return [
+            _linearise(segment, x0, self.p, self.free, self.upper, self.step, 1.0 / self.rms)
+            for segment, x0 in zip(self.segments, self.states, strict=True)
+        ]
+
+    @cached_property
+    def projected(self) -> list[tuple[Array, Array]]:
+        return [item.projected for item in self.linear]
+
+    def normal_equations(self) -> tuple[Array, Array]:
+        return (
+            np.sum([slope.T @ slope for _, slope in self.projected], axis=0),
+            np.sum([slope.T @ error for error, slope in self.projected], axis=0),
+        )
+
+    def moved(self, value: Array, share: float) -> _Shot:
+        p = self.p.copy()
+        p[self.free] = value
+        whole = (value - self.value) / share
+        states = [
+            x0 + share * _of_state(item, whole)
+            for x0, item in zip(self.states, self.linear, strict=True)
+        ]
+        return replace(self, p=p, states=states, errors=_errors(self.segments, states, p))
 
 
 def _errors(segments: Sequence[Segment], states: Sequence[Array], p: Array) -> list[Array]:
     return [s.q - s.simulate(x0, p) for s, x0 in zip(segments, states, strict=True)]
-
-
-def _weight(errors: Sequence[Array]) -> Array:
-    return np.asarray(1.0 / np.sqrt(np.mean(np.square(np.concatenate(errors)), axis=0)))
-
-
-def _cost(errors: Sequence[Array], weight: Array) -> float:
-    total = float(sum(np.sum(np.square(error * weight)) for error in errors))
-    return total if np.isfinite(total) else np.inf
 
 
 def _linearise(
@@ -193,24 +215,6 @@ def _of_state(linear: _Linear, move: Array) -> Array:
     """Change of the initial state that goes with a change of the parameters."""
     rest = linear.error - linear.by_parameter @ move
     return np.asarray(np.linalg.lstsq(linear.by_state, rest, rcond=1e-12)[0])
-
-
-def _bounded(
-    parts: Sequence[tuple[Array, Array]], value: Array, lower: Array, upper: Array
-) -> Array:
-    """Step of the parameters; those that would leave their range stop at the bound."""
-    normal = np.sum([slope.T @ slope for _, slope in parts], axis=0)
-    side = np.sum([slope.T @ error for error, slope in parts], axis=0)
-    move, free = np.zeros(value.size), np.ones(value.size, dtype=bool)
-    for _ in range(value.size):
-        rest = side - normal[:, ~free] @ move[~free]
-        move[free] = np.linalg.lstsq(normal[np.ix_(free, free)], rest[free], rcond=1e-14)[0]
-        outside = free & ((value + move < lower) | (value + move > upper))
-        if not outside.any():
-            break
-        move[outside] = np.clip(value + move, lower, upper)[outside] - value[outside]
-        free &= ~outside
-    return move
 
 
 def _sandwich(parts: Sequence[tuple[Array, Array]]) -> Array:

@@ -15,11 +15,10 @@ from bampipe.estimate.identifiability import (
     growth_without,
     information,
     residual_spectrum,
-    slopes,
     unseen,
     weak_directions,
 )
-from bampipe.estimate.least_squares import Problem
+from bampipe.estimate.least_squares import Problem, residual_and_slopes
 from bampipe.identification.sensor_noise import Noise
 from bampipe.physics import System
 from bampipe.physics.structure import Number, Structure, structure
@@ -148,7 +147,9 @@ def _of_trial(
     u = motion.u - p[-1] * motion.u_rate
     z = system.memory(motion.q, motion.qd, motion.qdd, u, own, motion.t)
     moved = system.true_motion(motion.q, motion.qd, motion.qdd, u, own)
-    slope = np.concatenate([slopes(problem, trial, p), known.slopes(*moved, z, u, own)], axis=2)
+    slope = np.concatenate(
+        [residual_and_slopes(problem, trial, p)[1], known.slopes(*moved, z, u, own)], axis=2
+    )
     slope *= ~problem.resting[trial][:, :, None]
     push = system.input_map(motion.q, u, own) * noise.process_sd[noise.is_force]
     inertia = np.diagonal(system.mass_matrix(motion.q, own), axis1=1, axis2=2).mean(axis=0)

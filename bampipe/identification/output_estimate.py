@@ -118,12 +118,11 @@ def estimate_by_output(
         frames.append(as_filtered(system, motion, found.p[:-1]))
     bound = 3.0 * np.median(np.concatenate([motion.qd_sd for motion in motions]), axis=0)
     timed = len(kept) < problem.free.size
-    value = found.p[problem.free]
     return Estimate(
         p=found.p,
         problem=problem,
         covariance=found.covariance[np.ix_(kept, kept)],
-        at_bound=np.asarray((value <= problem.lower) | (value >= problem.upper))[kept],
+        at_bound=found.at_bound[kept],
         details=[{"least_squares": float(squares.p[problem.free[k]])} for k in kept],
         report={
             "input_timing": timing_entry(found.p, found.covariance[-1, -1] if timed else 0.0),

@@ -1,0 +1,152 @@
+"""Least squares within bounds: one linear solver, and one Gauss-Newton descent on top of it.
+
+A linear fit hands its normal equations to `solve_bounded`. Sums over trials, over axes and over all
+trials but one are sums of normal equations, so a held-out fit needs no second pass over the data:
+
+    normal, moment = slope.T @ slope, slope.T @ measured
+    solve_bounded(normal, moment, lower, upper).x
+
+Coefficients with equal bounds are held at that value. A nonlinear fit wraps the point it has
+reached in an `Iterate` and calls `descend`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Generic, Protocol, Self, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import lsq_linear
+
+Array = NDArray[np.float64]
+
+_RANK_TOLERANCE = 1e-12
+"""Of the largest eigenvalue, at unit diagonal: what lies below is rounding."""
+_SMALLEST_SHARE = 1e-3
+"""Of a Gauss-Newton step, after which halving it ends."""
+
+
+def scaled_eigenbasis(matrix: Array) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+    """Eigenvectors of normal equations in coefficients that make their diagonal one.
+
+    A coefficient that nothing is known of keeps its scale and is a null vector by itself.
+
+    Args:
+        matrix: (n, n) symmetric, not negative.
+
+    Returns:
+        scale (n,), eigenvalues (n,) rising, eigenvectors (n, n) and which of them are null (n,).
+    """
+    scale = np.sqrt(np.diag(matrix))
+    scale = np.where(scale == 0.0, 1.0, scale)
+    values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
+    return scale, values, vectors, values < _RANK_TOLERANCE * max(values[-1], 1e-300)
+
+
+@dataclass(frozen=True)
+class BoundedSolution:
+    """Solution of a bounded linear least-squares problem.
+
+    Attributes:
+        x: (n,) coefficients within their bounds.
+        at_bound: (n,) which of them are at a bound.
+    """
+
+    x: Array
+    at_bound: NDArray[np.bool_]
+
+
+def solve_bounded(normal: Array, moment: Array, lower: Array, upper: Array) -> BoundedSolution:
+    """Minimise ``x^T normal x / 2 - moment^T x`` over ``lower <= x <= upper``.
+
+    Directions that the data do not determine are left at zero, the least-norm solution in
+    coefficients scaled to unit diagonal. Bounds are met by the active-set method of Stark and
+    Parker (1995), which also releases a coefficient from a bound.
+
+    Args:
+        normal: (n, n) slope^T slope; moment: (n,) slope^T measured, whatever the weights.
+        lower, upper: (n,), infinite where there is no bound; equal where a coefficient is given.
+    """
+    x = np.array(lower, dtype=float)
+    open_ = np.flatnonzero(lower < upper)
+    held = np.flatnonzero(~(lower < upper))
+    if open_.size:
+        rest = moment[open_] - normal[np.ix_(open_, held)] @ x[held]
+        scale, values, vectors, null = scaled_eigenbasis(normal[np.ix_(open_, open_)])
+        singular, vectors = np.sqrt(values[~null]), vectors[:, ~null]
+        target = vectors.T @ (rest / scale) / singular
+        low, high = lower[open_], upper[open_]
+        free = vectors @ (target / singular) / scale
+        if np.any((free < low) | (free > high)):
+            root, range_ = singular[:, None] * vectors.T, (low * scale, high * scale)
+            found = lsq_linear(root, target, range_, method="bvls", max_iter=10 * low.size)
+            free = np.clip(found.x / scale, low, high)
+            free = np.where(found.active_mask < 0, low, np.where(found.active_mask > 0, high, free))
+        x[open_] = free
+    return BoundedSolution(x, np.asarray((x <= lower) | (x >= upper)))
+
+
+class Iterate(Protocol):
+    """A point that a nonlinear fit has reached; never changed, only followed by others."""
+
+    @property
+    def value(self) -> Array:
+        """(n,) parameters."""
+
+    @property
+    def cost(self) -> float:
+        """What is minimised; not finite where the model fails."""
+
+    def normal_equations(self) -> tuple[Array, Array]:
+        """Return slope^T slope (n, n) and minus slope^T residual (n,), linearised here."""
+
+    def moved(self, value: Array, share: float) -> Self:
+        """Return the point at ``value``, which is that ``share`` of a full step away."""
+
+
+Point = TypeVar("Point", bound=Iterate)
+
+
+@dataclass(frozen=True)
+class Descent(Generic[Point]):
+    """Where a descent ended.
+
+    Attributes:
+        last: the point it reached.
+        iterations: Gauss-Newton steps taken.
+        converged: whether the last one no longer changed the cost.
+        at_bound: (n,) which parameters are at a bound.
+    """
+
+    last: Point
+    iterations: int
+    converged: bool
+    at_bound: NDArray[np.bool_]
+
+
+def descend(
+    start: Point, lower: Array, upper: Array, most_iterations: int, tolerance: float = 1e-10
+) -> Descent[Point]:
+    """Take Gauss-Newton steps within bounds, each halved until the cost does not rise.
+
+    Args:
+        start: where to start, within the bounds.
+        lower, upper: (n,) bounds of the parameters.
+        most_iterations: the most steps.
+        tolerance: change of the cost below which the descent has converged.
+    """
+    at, iterations, gained = start, 0, np.inf
+    while iterations < most_iterations and gained >= tolerance:
+        iterations += 1
+        step = solve_bounded(*at.normal_equations(), lower - at.value, upper - at.value).x
+        share = 1.0
+        while True:
+            tried = at.moved(np.clip(at.value + share * step, lower, upper), share)
+            gained = at.cost - tried.cost
+            if gained >= 0.0 or share < _SMALLEST_SHARE:
+                break
+            share /= 2.0
+        at = tried if gained >= 0.0 else at
+    at_bound = np.asarray((at.value <= lower) | (at.value >= upper))
+    return Descent(at, iterations, abs(gained) < tolerance, at_bound)

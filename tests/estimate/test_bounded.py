@@ -1,0 +1,115 @@
+"""The bounded least-squares solver against scipy's on the rows, and the descent against scipy's."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares, lsq_linear
+
+from bampipe.estimate.bounded import descend, solve_bounded
+
+
+def problem(seed: int, rows: int = 60, n: int = 7) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of strongly correlated columns whose sizes differ by nine decades, and their target."""
+    rng = np.random.default_rng(seed)
+    mixed = rng.normal(size=(rows, n)) @ (np.eye(n) + 0.9 * rng.normal(size=(n, n)))
+    return mixed * 10.0 ** rng.uniform(-4.5, 4.5, n), rng.normal(size=rows)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_scipy_finds_the_same_within_bounds(seed: int) -> None:
+    a, b = problem(seed)
+    size = np.abs(np.linalg.lstsq(a, b, rcond=None)[0])
+    rng = np.random.default_rng(seed + 100)
+    lower = np.where(rng.random(7) < 0.3, -np.inf, -rng.random(7) * size)
+    upper = np.where(rng.random(7) < 0.3, np.inf, rng.random(7) * size)
+    found = solve_bounded(a.T @ a, a.T @ b, lower, upper)
+    scale = np.linalg.norm(a, axis=0)
+    theirs = lsq_linear(a / scale, b, (lower * scale, upper * scale), method="bvls", max_iter=100)
+    np.testing.assert_allclose(found.x * scale, theirs.x, rtol=1e-7, atol=1e-9)
+    np.testing.assert_array_equal(found.at_bound, theirs.active_mask != 0)
+    assert np.all((found.x >= lower) & (found.x <= upper))
+    assert np.all((found.x == lower) | (found.x == upper) | ~found.at_bound)
+
+
+def test_a_coefficient_is_released_from_a_bound() -> None:
+    """Clipped at first, the second is inside its range once the first one is at its own bound."""
+    a, b = np.array([[1.0, 0.0], [2.0, 1.0]]), np.array([2.0, 3.0])
+    assert np.linalg.solve(a, b).tolist() == [2.0, -1.0]
+    found = solve_bounded(a.T @ a, a.T @ b, np.zeros(2), np.array([1.0, 9.0]))
+    np.testing.assert_allclose(found.x, [1.0, 1.0])
+    assert found.at_bound.tolist() == [True, False]
+
+
+def test_without_bounds_it_is_least_squares() -> None:
+    a, b = problem(3)
+    free = np.full(7, np.inf)
+    found = solve_bounded(a.T @ a, a.T @ b, -free, free)
+    np.testing.assert_allclose(found.x, np.linalg.lstsq(a, b, rcond=None)[0], rtol=1e-7)
+    assert not found.at_bound.any()
+
+
+def test_a_coefficient_with_equal_bounds_is_held() -> None:
+    a, b = problem(4)
+    lower, upper = np.full(7, -np.inf), np.full(7, np.inf)
+    lower[2] = upper[2] = 0.3
+    found = solve_bounded(a.T @ a, a.T @ b, lower, upper)
+    others = np.delete(np.arange(7), 2)
+    rest = np.linalg.lstsq(a[:, others], b - 0.3 * a[:, 2], rcond=None)[0]
+    assert found.x[2] == 0.3 and found.at_bound[2]
+    np.testing.assert_allclose(found.x[others], rest, rtol=1e-7)
+    all_held = solve_bounded(a.T @ a, a.T @ b, np.ones(7), np.ones(7))
+    assert all_held.x.tolist() == [1.0] * 7
+
+
+def test_what_the_data_do_not_determine_stays_at_zero() -> None:
+    a, b = problem(5)
+    twice = np.column_stack([a, a[:, 0], np.zeros(len(a))])
+    free = np.full(9, np.inf)
+    found = solve_bounded(twice.T @ twice, twice.T @ b, -free, free).x
+    assert found[8] == 0.0
+    assert found[7] == pytest.approx(found[0])
+    best = a @ np.linalg.lstsq(a, b, rcond=None)[0]
+    np.testing.assert_allclose(twice @ found, best, rtol=1e-6, atol=1e-7)
+
+
+@dataclass(frozen=True)
+class Decay:
+    """``exp`` fitted to points: the residual is nonlinear in the second parameter."""
+
+    value: np.ndarray
+    t = np.linspace(0.0, 3.0, 50)
+    measured = 2.0 * np.exp(-1.3 * t) + 0.01 * np.sin(40.0 * t)
+
+    def residual(self, value: np.ndarray) -> np.ndarray:
+        return value[0] * np.exp(-value[1] * self.t) - self.measured
+
+    @property
+    def cost(self) -> float:
+        return float(np.sum(self.residual(self.value) ** 2))
+
+    def normal_equations(self) -> tuple[np.ndarray, np.ndarray]:
+        fall = np.exp(-self.value[1] * self.t)
+        slope = np.column_stack([fall, -self.value[0] * self.t * fall])
+        return slope.T @ slope, -slope.T @ self.residual(self.value)
+
+    def moved(self, value: np.ndarray, share: float) -> Decay:
+        return Decay(value)
+
+
+@pytest.mark.parametrize("highest", [9.0, 1.1])
+def test_a_descent_ends_where_scipy_s_does(highest: float) -> None:
+    lower, upper = np.zeros(2), np.array([9.0, highest])
+    start = Decay(np.array([0.2, 0.1]))
+    found = descend(start, lower, upper, 50, tolerance=1e-14)
+    theirs = least_squares(start.residual, start.value, bounds=(lower, upper), xtol=1e-12)
+    np.testing.assert_allclose(found.last.value, theirs.x, rtol=1e-5)
+    assert found.converged and found.iterations < 50
+    assert found.at_bound.tolist() == [False, highest == 1.1]
+
+
+def test_a_descent_that_ran_out_of_steps_has_not_converged() -> None:
+    found = descend(Decay(np.array([0.2, 0.1])), np.zeros(2), np.full(2, 9.0), 1)
+    assert found.iterations == 1 and not found.converged
