@@ -22,10 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.data.run_folder import RunFolder
-from bampipe.data.store import read_json, write_text
 from bampipe.estimate.least_squares import Problem, Stacked, fit, stacked_residual
 from bampipe.estimate.low_pass import Band
 from bampipe.estimate.unscented import Trial
+from bampipe.files import read_json, write_text
 from bampipe.identification.filter_choice import FilterChoice
 from bampipe.identification.filter_run import trial_of
 from bampipe.identification.output_estimate import segments_of

@@ -29,9 +29,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.data.run_folder import RunFolder
-from bampipe.data.store import read_json, read_parquet
+from bampipe.data.store import read_parquet
 from bampipe.estimate import filterpy_oracle
 from bampipe.estimate.unscented import FilterModel, FilterSettings, Trial, filter_trials
+from bampipe.files import read_json
 from bampipe.physics import Model, compile_model, registry
 from bampipe.physics.system import System
 from bampipe.progress import silent

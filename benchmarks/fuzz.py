@@ -22,7 +22,6 @@ from pathlib import Path
 import atheris
 
 with atheris.instrument_imports(include=["bampipe.data", "bampipe.physics", "tomllib"]):
-    from bampipe.data import text
     from bampipe.data.readers import read_trial
     from bampipe.data.session.file import session_from
     from bampipe.physics import expression, registry
@@ -35,6 +34,7 @@ import scipy.io
 import sympy as sp
 
 from bampipe.errors import InputError
+from bampipe.files import read_toml
 
 ROOT = Path(__file__).parent.parent
 COLUMNS = ("time_us", "enc", "force_v")
@@ -66,7 +66,7 @@ def from_toml(folder: Path, use: Callable[[dict[str, object]], object]) -> Check
 
     def check(data: bytes) -> None:
         path.write_bytes(data)
-        use(text.read_toml(path))
+        use(read_toml(path))
 
     return check
 

@@ -25,7 +25,7 @@ from estimators import MODEL, prepare
 from hidden_effects import SINGLES
 
 from bampipe.data.run_folder import RunFolder
-from bampipe.data.store import write_text
+from bampipe.files import write_text
 from bampipe.progress import silent
 from bampipe.simulator import session as simulate
 from bampipe.stages import identify, validate

@@ -1,9 +1,8 @@
-"""Read access to the run folder of one session, and how its JSON is written."""
+"""Read access to the run folder of one session."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -66,14 +65,3 @@ class RunFolder:
         """Return the files that match ``pattern``, relative to the run folder, sorted."""
         found = (path for path in self.root.glob(pattern) if path.is_file())
         return tuple(sorted(path.relative_to(self.root).as_posix() for path in found))
-
-
-def write_json(path: Path, content: Mapping[str, object]) -> None:
-    """Write ``content`` as JSON with sorted keys: the same content gives the same bytes.
-
-    Raises:
-        ValueError: a number is not finite (JSON has none; store None and say why).
-    """
-    text = json.dumps(content, sort_keys=True, indent=1, ensure_ascii=False, allow_nan=False)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text + "\n", encoding="utf-8")

@@ -1,18 +1,12 @@
-"""Files of a run folder: written whole or not at all, and the same bytes for the same content.
+"""Parquet files: written whole or not at all, and the same bytes for the same content.
 
-JSON has sorted keys and no NaN; Parquet has fixed options and no metadata that varies. A file
-that cannot be read or written raises :class:`bampipe.errors.InputError` naming it.
+They have fixed options and no metadata that varies. A file that cannot be read or written raises
+:class:`bampipe.errors.InputError` naming it.
 """
 
 from __future__ import annotations
 
-import datetime
-import hashlib
-import json
-import math
-import os
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
@@ -26,56 +20,10 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from bampipe.data.text import cannot, read_json, read_toml
 from bampipe.errors import InputError
+from bampipe.files import atomic_writer
 
 Frame = pd.DataFrame | Mapping[str, np.ndarray | pa.Array]
-
-
-@contextmanager
-def atomic_writer(path: Path) -> Iterator[BinaryIO]:
-    """A binary file that takes the place of ``path`` only when the block ends without error.
-
-    Raises:
-        InputError: the folder is read-only, the disk is full, or the like.
-    """
-    path = Path(path)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with partial.open("wb") as stream:
-            yield stream
-            stream.flush()
-            os.fsync(stream.fileno())
-        partial.replace(path)
-    except OSError as error:
-        _discard(partial)
-        raise cannot("write", path, error) from error
-    except BaseException:
-        _discard(partial)
-        raise
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write ``text`` as UTF-8 with ``\\n`` line ends, whole or not at all."""
-    with atomic_writer(path) as stream:
-        stream.write(text.encode())
-
-
-def write_json(path: Path, value: object) -> None:
-    """Write ``value`` as JSON: sorted keys, indent 1, shortest exact floats, numpy accepted.
-
-    Raises:
-        ValueError: a number is NaN or infinite (its place is named): write None instead.
-        InputError: the file cannot be written.
-    """
-    place = _non_finite(value, "")
-    if place is not None:
-        raise ValueError(f"{path}: {place} is not a finite number")
-    text = json.dumps(
-        value, sort_keys=True, indent=1, allow_nan=False, ensure_ascii=False, default=_plain
-    )
-    write_text(path, text + "\n")
 
 
 class ParquetAppender:
@@ -208,71 +156,6 @@ def trial_ids(path: Path) -> frozenset[str]:
     if "trial_id" not in footer.metadata.schema.names:
         raise InputError("no column 'trial_id'", where=str(path))
     return frozenset(footer.groups)
-
-
-def sha256_file(path: Path) -> str:
-    """SHA-256 of a file's bytes, hexadecimal.
-
-    Raises:
-        InputError: the file cannot be read.
-    """
-    try:
-        with Path(path).open("rb") as stream:
-            return hashlib.file_digest(stream, "sha256").hexdigest()
-    except OSError as error:
-        raise cannot("read", Path(path), error) from error
-
-
-def content_hash(value: object) -> str:
-    """SHA-256 of what a value or a file means, hexadecimal.
-
-    A path to a ``.toml`` or ``.json`` file is parsed first, so white space, comments and the
-    order of keys do not matter; any other file is hashed by its bytes. Other values are hashed
-    by their canonical JSON (dates apart from text, 1 apart from 1.0).
-    """
-    if isinstance(value, Path):
-        if value.suffix == ".toml":
-            value = read_toml(value)
-        elif value.suffix == ".json":
-            value = read_json(value)
-        else:
-            return sha256_file(value)
-    text = json.dumps(value, sort_keys=True, separators=(",", ":"), default=_tagged)
-    return hashlib.sha256(text.encode()).hexdigest()
-
-
-def _discard(partial: Path) -> None:
-    if partial.exists():
-        partial.unlink()
-
-
-def _plain(value: object) -> object:
-    if isinstance(value, np.generic | np.ndarray):
-        return value.tolist()
-    if isinstance(value, datetime.date | datetime.datetime | datetime.time):
-        return value.isoformat()
-    if isinstance(value, Path):
-        return value.as_posix()
-    raise TypeError(f"{type(value).__name__} has no JSON form")
-
-
-def _tagged(value: object) -> object:
-    return {f"${type(value).__name__}": _plain(value)}
-
-
-def _non_finite(value: object, place: str) -> str | None:
-    """Dotted place of the first NaN or infinity in nested containers, None if there is none."""
-    if isinstance(value, Mapping):
-        items = [(f"{place}.{key}" if place else str(key), item) for key, item in value.items()]
-    elif isinstance(value, list | tuple):
-        items = [(f"{place}[{number}]", item) for number, item in enumerate(value)]
-    elif isinstance(value, np.ndarray):
-        return _non_finite(value.tolist(), place)
-    elif isinstance(value, float | np.floating):
-        return None if math.isfinite(value) else place or "the value"
-    else:
-        return None
-    return next((hit for key, item in items if (hit := _non_finite(item, key)) is not None), None)
 
 
 def _table(frame: Frame) -> pa.Table:

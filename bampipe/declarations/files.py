@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from bampipe.data import schema
-from bampipe.data.store import read_toml
 from bampipe.errors import InputError
+from bampipe.files import read_toml
 from bampipe.physics import Model, expression, registry
 from bampipe.physics.device import Device
 from bampipe.physics.effect import Effect

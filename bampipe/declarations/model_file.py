@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.data.run_folder import RunFolder
-from bampipe.data.store import read_toml
 from bampipe.errors import InputError
+from bampipe.files import read_toml
 from bampipe.physics import Model, System, registry
 
 

@@ -10,8 +10,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from bampipe.data import lab_tables, store
+from bampipe.data import lab_tables
 from bampipe.errors import InputError
+from bampipe.files import atomic_writer, write_json, write_text
 from bampipe.lab import rows, trends
 from bampipe.lab.place import FILE, LOCK, is_foreign, run_folders
 from bampipe.progress import Progress, silent
@@ -81,7 +82,7 @@ def collect(runs: Path, folder: Path, *, report: bool = True, progress: Progress
         )
     with _alone(folder):
         counts = lab_tables.write(folder, tables)
-        store.write_json(folder / TRENDS, content)
+        write_json(folder / TRENDS, content)
         if report:
             progress(0.7, "report")
             _report(folder)
@@ -92,7 +93,7 @@ def collect(runs: Path, folder: Path, *, report: bool = True, progress: Progress
             "skipped": skipped,
             "tables": counts,
         }
-        store.write_json(folder / FILE, about)
+        write_json(folder / FILE, about)
     return Lab(folder, content, sessions, tuple(skipped), counts)
 
 
@@ -101,11 +102,11 @@ def _report(folder: Path) -> None:
     from bampipe.report.lab import build
 
     made = build(folder)
-    with store.atomic_writer(folder / "report.pdf") as stream:
+    with atomic_writer(folder / "report.pdf") as stream:
         stream.write(made.pdf)
-    store.write_text(folder / "report.html", made.html)
+    write_text(folder / "report.html", made.html)
     for name, svg in made.figures.items():
-        store.write_text(folder / "figures" / f"{name}.svg", svg)
+        write_text(folder / "figures" / f"{name}.svg", svg)
     for old in (folder / "figures").glob("*.svg"):
         if old.stem not in made.figures:
             old.unlink()

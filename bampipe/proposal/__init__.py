@@ -10,9 +10,9 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from bampipe.data.store import write_text
 from bampipe.data.survey import survey
 from bampipe.errors import InputError
+from bampipe.files import write_text
 from bampipe.proposal.clock import clock_of
 from bampipe.proposal.device import DEVICE, find_device, new_device
 from bampipe.proposal.encoders import encoders_table

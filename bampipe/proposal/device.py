@@ -11,8 +11,8 @@ import numpy as np
 
 from bampipe.data import guesses
 from bampipe.data.survey import Column, Survey, words
-from bampipe.data.text import read_toml
 from bampipe.errors import InputError
+from bampipe.files import read_toml
 from bampipe.physics import registry
 from bampipe.physics.device import Device
 from bampipe.proposal.encoders import measured_position

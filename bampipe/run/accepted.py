@@ -12,9 +12,10 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from bampipe.data.run_folder import RunFolder, write_json
+from bampipe.data.run_folder import RunFolder
 from bampipe.data.schema import validate
 from bampipe.errors import InputError
+from bampipe.files import write_json
 from bampipe.run import record
 
 SCHEMA = "bampipe.accepted/1"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import importlib.metadata
 import importlib.util
 import json
@@ -10,14 +9,12 @@ import os
 import platform
 import time
 from collections.abc import Iterable, Mapping
-from datetime import date, datetime
-from datetime import time as clock_time
 from functools import cache
 from pathlib import Path
 
 import bampipe
-from bampipe.data.text import read_toml
 from bampipe.errors import InputError
+from bampipe.files import digest_content, digest_file, digest_input, read_toml
 
 PACKAGES = (
     "h5py",
@@ -48,43 +45,6 @@ ABSENT = "absent"
 
 # A file changed within this time of being hashed could change again without its time stamp showing.
 RACY_NS = 2_000_000_000
-
-
-def digest_bytes(content: bytes) -> str:
-    """Return the SHA-256 of ``content`` in hexadecimal."""
-    return hashlib.sha256(content).hexdigest()
-
-
-def digest_file(path: Path) -> str:
-    """Return the SHA-256 of the bytes of ``path`` in hexadecimal, read in pieces."""
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
-
-
-def _plain(value: object) -> object:
-    if isinstance(value, datetime | date | clock_time):
-        return value.isoformat()
-    raise TypeError(f"cannot hash a {type(value).__name__}")
-
-
-def digest_content(content: object) -> str:
-    """Return the SHA-256 of ``content`` (what JSON or TOML can hold), whatever its key order."""
-    text = json.dumps(content, sort_keys=True, separators=(",", ":"), default=_plain)
-    return digest_bytes(text.encode())
-
-
-def digest_input(path: Path) -> str:
-    """Return the hash of an input: a TOML file counts by what it says, others by their bytes.
-
-    White space and comments in a TOML file therefore change nothing. A file that is not valid
-    TOML counts by its bytes: the stage that reads it says what is wrong with it.
-    """
-    if path.suffix == ".toml":
-        try:
-            return digest_content(read_toml(path))
-        except InputError:
-            return digest_file(path)
-    return digest_file(path)
 
 
 class HashMemory:
@@ -203,7 +163,7 @@ def digest_code(stage: str) -> str:
     """
     package = Path(bampipe.__file__).parent
     parts = [package / name for name in SHARED_CODE]
-    parts += [package / "compiled.py", package / "errors.py", package / "stages" / "base.py"]
+    parts += [package / f"{name}.py" for name in ("compiled", "errors", "files", "stages/base")]
     if stage == "report":
         parts.append(package / "report")
     spec = importlib.util.find_spec(f"bampipe.stages.{stage}")

@@ -7,8 +7,8 @@ import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 
-from bampipe.data.text import read_toml
 from bampipe.errors import InputError
+from bampipe.files import read_toml
 from bampipe.run import record
 from bampipe.run.settings import did_you_mean
 

@@ -9,8 +9,8 @@ from typing import Any
 
 import bampipe
 from bampipe.data.schema import validate
-from bampipe.data.text import read_toml
 from bampipe.errors import InputError
+from bampipe.files import read_toml
 from bampipe.run.settings import did_you_mean
 from bampipe.stages import base
 

@@ -21,7 +21,8 @@ from pathlib import Path
 from typing import Any
 
 from bampipe.errors import InputError
-from bampipe.run import hashing, record
+from bampipe.files import digest_content, digest_file, json_text
+from bampipe.run import record
 from bampipe.run.session_name import is_name
 
 SCHEMA = "bampipe.published/1"
@@ -48,8 +49,8 @@ def publish(root: Path, url: str) -> str:
         for path in sorted(root.rglob("*"))
         if path.is_file() and path.relative_to(root).parts[0] != record.PRIVATE
     }
-    hashes = {name: hashing.digest_file(path) for name, path in files.items()}
-    version = hashing.digest_content(hashes)[:16]
+    hashes = {name: digest_file(path) for name, path in files.items()}
+    version = digest_content(hashes)[:16]
     system, base = _open(url)
     here = f"{base}/{root.name}"
     try:
@@ -62,10 +63,9 @@ def publish(root: Path, url: str) -> str:
                 system.makedirs(target.rpartition("/")[0], exist_ok=True)
                 system.put_file(str(path), target)
         content = {"schema": SCHEMA, "session": root.name, "version": version, "files": hashes}
-        text = json.dumps(content, sort_keys=True, indent=1, ensure_ascii=False) + "\n"
         # The transaction renames or completes the upload: no half-written file is ever seen.
         with system.transaction, system.open(f"{here}/{CURRENT}", "wb") as stream:
-            stream.write(text.encode())
+            stream.write(json_text(content).encode())
     except _faults() as error:
         raise InputError(f"cannot be published: {_first_line(error)}", where=url) from error
     return version
@@ -128,7 +128,7 @@ def fetch(url: str, session: str, runs: Path, force: bool = False) -> Path:
                 target = draft / name
                 target.parent.mkdir(parents=True, exist_ok=True)
                 system.get_file(f"{here}/{current['version']}/{name}", str(target))
-                if hashing.digest_file(target) != known:
+                if digest_file(target) != known:
                     raise InputError(f"{name} is not as it was published", where=f"{url}/{session}")
             draft.chmod(0o777 & ~_umask())
             if root.exists():
@@ -202,7 +202,7 @@ def _size(system: Any, path: str) -> int | None:
 
 def _is_same(root: Path, files: dict[str, str]) -> bool:
     return all(
-        (root / name).is_file() and hashing.digest_file(root / name) == known
+        (root / name).is_file() and digest_file(root / name) == known
         for name, known in files.items()
     )
 

@@ -12,25 +12,12 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import IO, Any
 
-from bampipe.data.run_folder import write_json
 from bampipe.errors import InputError
-from bampipe.run.hashing import digest_file
+from bampipe.files import STORAGE_FAULTS, digest_file, json_text
 
 SCHEMA = "bampipe.run/1"
 FILE = "run.json"
 PRIVATE = ".bampipe"
-STORAGE_FAULTS = {
-    errno.ENOSPC: "the disk is full",
-    errno.EDQUOT: "the disk quota is used up",
-    errno.EROFS: "the file system is read-only",
-    errno.EACCES: "no permission to write",
-    errno.EPERM: "no permission to write",
-    errno.EFBIG: "a file would be larger than this system allows",
-    errno.ENOTDIR: "a file is in the way of a folder",
-    errno.EEXIST: "a file is in the way of a folder",
-    errno.ENAMETOOLONG: "a name is too long",
-}
-"""What the disk may refuse, in words."""
 
 _TABLES = ("stages", "timings", "failures", "place")
 _FIELDS = {
@@ -125,8 +112,7 @@ def require_untouched(root: Path, names: Iterable[str]) -> None:
 
 def replace_json(path: Path, content: dict[str, Any]) -> None:
     """Write ``content`` to ``path``, whole or not at all."""
-    with _drafted(path) as draft:
-        write_json(draft, content)
+    replace_text(path, json_text(content))
 
 
 def replace_text(path: Path, text: str) -> None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from bampipe.data.text import read_toml
 from bampipe.errors import InputError
+from bampipe.files import read_toml
 
 
 def is_name(text: str) -> bool:

@@ -11,7 +11,8 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-from bampipe.run import hashing, record
+from bampipe.files import digest_file
+from bampipe.run import record
 from bampipe.run.request import Step
 from bampipe.run.state import RunState
 
@@ -58,7 +59,7 @@ def written(staging: Path, declared: tuple[str, ...], step: Step) -> dict[str, s
     undeclared = sorted(files.keys() - allowed)
     if undeclared:
         raise RuntimeError(f"stage {step.name} wrote {undeclared[0]}, which it does not declare")
-    return {name: hashing.digest_file(path) for name, path in files.items()}
+    return {name: digest_file(path) for name, path in files.items()}
 
 
 def seal(
@@ -114,7 +115,7 @@ def _is_whole(staging: Path) -> bool:
         if not record.is_sound(entry["record"]) or not record.are_inside(entry["remove"]):
             return False
         return all(
-            hashing.digest_file(staging / name) == digest
+            digest_file(staging / name) == digest
             for name, digest in entry["record"]["outputs"].items()
             if (staging / name).is_file()
         )

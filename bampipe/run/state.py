@@ -10,6 +10,7 @@ from typing import Any
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError
+from bampipe.files import digest_content, digest_file, digest_input
 from bampipe.run import hashing, models, record
 from bampipe.run.gates import Verdict
 from bampipe.run.request import Request, Step
@@ -50,7 +51,7 @@ class RunState:
         status = path.stat()
         key = (relative, status.st_ino, status.st_size, status.st_mtime_ns)
         if key not in self.digests:
-            self.digests[key] = hashing.digest_file(path)
+            self.digests[key] = digest_file(path)
         return self.digests[key]
 
     def settings(self, step: Step) -> dict[str, object]:
@@ -63,7 +64,7 @@ class RunState:
 
     def digest_record(self, step: Step) -> str:
         """Hash of what ``run.json`` says of the other steps, times and places left out."""
-        return hashing.digest_content(
+        return digest_content(
             {name: made["key"] for name, made in self.records.items() if name != step.name}
         )
 
@@ -110,7 +111,7 @@ class RunState:
                 self.check_untouched(name)
                 path = self.root / name
                 is_text = path.suffix == ".toml"
-                found[name] = hashing.digest_input(path) if is_text else self.digest(name)
+                found[name] = digest_input(path) if is_text else self.digest(name)
         if step.stage in base.READS_SESSION:
             found.update(hashing.digest_session(self.session_folder(), self.memory))
         return dict(sorted(found.items()))
@@ -133,7 +134,7 @@ class RunState:
                 )
 
     def key(self, step: Step, config: Mapping[str, object], inputs: Mapping[str, str]) -> str:
-        return hashing.digest_content(
+        return digest_content(
             {
                 "stage": step.stage,
                 "config": config,

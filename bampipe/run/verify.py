@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from bampipe.files import digest_file, digest_input
 from bampipe.run import hashing, record
 from bampipe.stages import base
 
@@ -27,7 +28,7 @@ def verify(root: Path) -> list[tuple[str, str]]:
             path = root / name
             if not path.is_file():
                 found[name] = "gone"
-            elif hashing.digest_file(path) != written:
+            elif digest_file(path) != written:
                 found[name] = "changed"
         for name, written in made.get("inputs", {}).items():
             if name.startswith("session:"):
@@ -38,7 +39,7 @@ def verify(root: Path) -> list[tuple[str, str]]:
                 continue
             if not path.is_file():
                 found[name] = "gone"
-            elif hashing.digest_input(path) != written and path.suffix == ".toml":
+            elif digest_input(path) != written and path.suffix == ".toml":
                 found[name] = "changed"
     place = content.get("place", {}).get("session")
     for stage in base.READS_SESSION:

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bampipe.data import store
 from bampipe.errors import InputError
+from bampipe.files import read_toml
 from bampipe.physics import Model, registry
 from bampipe.physics.device import Device
 from bampipe.physics.effect import BoundEffect, Effect
@@ -129,7 +129,7 @@ def _is_delay(item: BoundEffect) -> bool:
 
 
 def _own_effect(path: Path) -> Effect:
-    return registry.effect_from(store.read_toml(path), str(path))
+    return registry.effect_from(read_toml(path), str(path))
 
 
 def _strength(text: str, default: float) -> tuple[str, float]:

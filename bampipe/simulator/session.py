@@ -15,6 +15,7 @@ import numpy as np
 
 from bampipe.data import store
 from bampipe.errors import InputError
+from bampipe.files import write_json, write_text
 from bampipe.physics.device import Device
 from bampipe.progress import Progress, silent
 from bampipe.simulator.hand import locked_trial, moving_trial
@@ -64,13 +65,13 @@ def simulate_session(out: Path, config: Config, progress: Progress = silent) -> 
         frame = read_out(plant, config, rng, recording, trial["kind"] == "locked")
         path = out / trial["file"]
         if config.file_format == "csv":
-            store.write_text(path, frame.to_csv(index=False, lineterminator="\n"))
+            write_text(path, frame.to_csv(index=False, lineterminator="\n"))
         else:
             store.write_parquet(path, frame)
         progress((number + 1) / len(trials), trial["file"])
-    store.write_text(out / "session.toml", session_toml(out.name, plant.device, config, trials))
+    write_text(out / "session.toml", session_toml(out.name, plant.device, config, trials))
     truth = out.with_name(out.name + ".truth.json")
-    store.write_json(
+    write_json(
         truth,
         {
             "schema": "bampipe.truth/1",

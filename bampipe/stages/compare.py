@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from bampipe.data.run_folder import RunFolder
-from bampipe.data.store import read_toml, write_json
 from bampipe.errors import InputError
+from bampipe.files import read_toml, write_json
 from bampipe.progress import Progress
 
 NAME = "compare"

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from bampipe.data.run_folder import RunFolder
-from bampipe.data.store import write_json
 from bampipe.declarations.model_file import identified, load_model, model_inputs
 from bampipe.discover.advice import advise
 from bampipe.discover.chance import Recipe, Session
@@ -22,6 +21,7 @@ from bampipe.discover.settings import Settings
 from bampipe.discover.shape import residual_map, variables, worst_windows
 from bampipe.errors import InputError
 from bampipe.estimate.low_pass import Band
+from bampipe.files import write_json
 from bampipe.physics import compile_model
 from bampipe.progress import Progress
 from bampipe.trials.recordings import read_session, recipe_of

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from bampipe.data.run_folder import MOVING, RunFolder
-from bampipe.data.store import ParquetAppender, read_parquet, write_json
+from bampipe.data.store import ParquetAppender, read_parquet
 from bampipe.errors import InputError
 from bampipe.estimate import butterworth, kalman_smoother, savitzky_golay
 from bampipe.estimate.differentiation import (
@@ -20,6 +20,7 @@ from bampipe.estimate.differentiation import (
     UniformGrid,
     uniform_grid,
 )
+from bampipe.files import write_json
 from bampipe.physics.device import LAST_ORDER, derivative
 from bampipe.progress import Progress
 

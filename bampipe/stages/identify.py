@@ -9,13 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.data.run_folder import RunFolder
-from bampipe.data.store import write_json, write_parquet
+from bampipe.data.store import write_parquet
 from bampipe.declarations.model_file import load_model, model_inputs
 from bampipe.discover.chance import Session
 from bampipe.discover.start import search_start
 from bampipe.errors import InputError
 from bampipe.estimate.least_squares import fit
 from bampipe.estimate.low_pass import Band
+from bampipe.files import write_json
 from bampipe.identification.estimates import content
 from bampipe.identification.filter_choice import FilterChoice, check_among, check_choice
 from bampipe.identification.filter_estimate import estimate_by_filter

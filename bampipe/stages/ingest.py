@@ -6,8 +6,6 @@ cannot be trusted is set aside with a reason (file, row, column), and the others
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections import defaultdict
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,8 +18,9 @@ from bampipe.data.quality import CleanTrial, Limits, clean
 from bampipe.data.readers import read_trial
 from bampipe.data.run_folder import RunFolder
 from bampipe.data.session import SECONDS, Session, TrialEntry, inside, read_session
-from bampipe.data.store import ParquetAppender, read_toml, sha256_file, write_json, write_parquet
+from bampipe.data.store import ParquetAppender, write_parquet
 from bampipe.errors import InputError
+from bampipe.files import digest_content, digest_file, read_toml, write_json
 from bampipe.physics import registry
 from bampipe.physics.device import Device
 from bampipe.physics.units import parse_unit
@@ -211,7 +210,7 @@ def _refused(session: Session) -> list[str]:
         except InputError:
             continue  # said when the trial's turn comes
         if path.stat().st_size > 0:
-            same[sha256_file(path)].append(number)
+            same[digest_file(path)].append(number)
     reasons = [""] * len(session.trials)
     for alike_files in same.values():
         numbers = [
@@ -311,8 +310,7 @@ def _description(session: Session, device: Device, rate: float) -> dict[str, obj
     force = session.force
     more: dict[str, object] = {}
     if session.device_file is not None:
-        said = json.dumps(device.declaration, sort_keys=True, default=str)
-        more["device_digest"] = hashlib.sha256(said.encode()).hexdigest()
+        more["device_digest"] = digest_content(device.declaration)
     if device.drive:
         more["driven"] = True
     if device.default_effects:

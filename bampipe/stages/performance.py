@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.data.run_folder import RunFolder
-from bampipe.data.store import read_parquet, write_json
+from bampipe.data.store import read_parquet
 from bampipe.declarations.model_file import identified, load_model, model_inputs
 from bampipe.errors import InputError
+from bampipe.files import write_json
 from bampipe.physics import System, compile_model
 from bampipe.progress import Progress
 

@@ -12,10 +12,11 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from bampipe.data.run_folder import RunFolder
-from bampipe.data.store import ParquetAppender, read_parquet, read_toml, write_json
+from bampipe.data.store import ParquetAppender, read_parquet
 from bampipe.errors import InputError
 from bampipe.estimate.differentiation import uniform_grid
 from bampipe.estimate.hysteresis import Branch, Cycle, Hysteresis, hysteresis
+from bampipe.files import read_toml, write_json
 from bampipe.physics import Model, System, compile_model, registry
 from bampipe.progress import Progress
 

@@ -12,12 +12,13 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from bampipe.data.run_folder import RunFolder
-from bampipe.data.store import read_parquet, write_json, write_parquet
+from bampipe.data.store import read_parquet, write_parquet
 from bampipe.declarations.model_file import identified, load_model, model_inputs
 from bampipe.errors import InputError
 from bampipe.estimate.least_squares import Problem, fit
 from bampipe.estimate.low_pass import Band
 from bampipe.estimate.standstill import moving
+from bampipe.files import write_json
 from bampipe.identification.free_run import free_runs
 from bampipe.physics import System, compile_model
 from bampipe.progress import Progress

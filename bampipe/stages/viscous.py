@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from bampipe.data.run_folder import RunFolder
-from bampipe.data.store import read_parquet, write_json, write_parquet
+from bampipe.data.store import read_parquet, write_parquet
 from bampipe.declarations.model_file import load_model, model_inputs
 from bampipe.errors import InputError
 from bampipe.estimate.filter_uncertainty import sandwich_covariance
 from bampipe.estimate.unscented import Trial
+from bampipe.files import write_json
 from bampipe.identification.filter_choice import FilterChoice, check_choice
 from bampipe.identification.filter_run import (
     Attempt,

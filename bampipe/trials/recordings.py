@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from bampipe.data.run_folder import MOVING, RunFolder
-from bampipe.data.store import read_parquet, read_toml
+from bampipe.data.store import read_parquet
 from bampipe.discover.chance import Recipe
 from bampipe.errors import InputError
 from bampipe.estimate.differentiation import uniform_grid
 from bampipe.estimate.hysteresis import noise_of
+from bampipe.files import read_toml
 from bampipe.physics import Model, System
 from bampipe.trials.motions import held_out_trials
 from bampipe.trials.observation import Motion, Recording, Sensors, observe

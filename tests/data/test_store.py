@@ -1,4 +1,3 @@
-import datetime
 import os
 import stat
 
@@ -8,8 +7,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from bampipe.data import store, text
+from bampipe import files
+from bampipe.data import store
 from bampipe.errors import InputError
+from bampipe.files import atomic_writer, digest_file, digest_input, read_json, read_toml, write_json
 
 
 def frame(trial="t01", rows=5):
@@ -18,18 +19,17 @@ def frame(trial="t01", rows=5):
 
 def test_json_is_sorted_exact_and_reads_back(tmp_path):
     path = tmp_path / "a" / "x.json"
-    value = {"b": np.float64(0.1), "a": [np.int64(3), None, np.array([1.5, 2.0])], "c": True}
-    store.write_json(path, value)
+    value = {"b": 0.1, "a": [3, None, [1.5, 2.0]], "c": True}
+    write_json(path, value)
     assert path.read_text() == '{\n "a": [\n  3,\n  null,\n  [\n   1.5,\n   2.0\n  ]\n ],' + (
         '\n "b": 0.1,\n "c": true\n}\n'
     )
-    assert store.read_json(path) == {"a": [3, None, [1.5, 2.0]], "b": 0.1, "c": True}
+    assert read_json(path) == {"a": [3, None, [1.5, 2.0]], "b": 0.1, "c": True}
 
 
-@pytest.mark.parametrize("bad", [float("nan"), np.float64("inf"), np.array([1.0, np.nan])])
-def test_json_names_the_place_of_a_number_that_is_not_finite(tmp_path, bad):
-    with pytest.raises(ValueError, match=r"axes\.yaw\[1\]"):
-        store.write_json(tmp_path / "x.json", {"axes": {"yaw": [1.0, bad]}})
+def test_json_has_no_number_that_is_not_finite(tmp_path):
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        write_json(tmp_path / "x.json", {"axes": {"yaw": [1.0, float("nan")]}})
     assert list(tmp_path.iterdir()) == []
 
 
@@ -37,14 +37,14 @@ def test_json_names_the_place_of_a_number_that_is_not_finite(tmp_path, bad):
 def test_json_that_is_no_json_is_named(tmp_path, content):
     (tmp_path / "x.json").write_bytes(content)
     with pytest.raises(InputError, match=r"x\.json.*: not JSON"):
-        store.read_json(tmp_path / "x.json")
+        read_json(tmp_path / "x.json")
 
 
 def test_json_that_is_broken_is_named_with_its_line(tmp_path):
     path = tmp_path / "x.json"
     path.write_text('{"a": 1,\n oops}')
     with pytest.raises(InputError, match=r"x\.json, line 2"):
-        store.read_json(path)
+        read_json(path)
 
 
 @pytest.mark.parametrize(
@@ -57,51 +57,51 @@ def test_json_that_is_broken_is_named_with_its_line(tmp_path):
         ("a = 1\n".encode("utf-16"), "UTF-16"),
         (b"a = " + b"[" * 50_000, "nested too deeply"),
         (b".".join([b"a"] * 5_000) + b" = 1", "nested too deeply"),
-        (b"#" * (text.LARGEST_TOML_BYTES + 1), "larger than 4 MB"),
+        (b"#" * (files.LARGEST_TOML_BYTES + 1), "larger than 4 MB"),
     ],
 )
 def test_toml_that_is_broken_is_named_with_its_line(tmp_path, content, message):
     path = tmp_path / "x.toml"
     path.write_bytes(content)
     with pytest.raises(InputError, match=message):
-        store.read_toml(path)
+        read_toml(path)
 
 
 def test_missing_files_are_named(tmp_path):
-    for read in (store.read_json, store.read_toml, store.read_parquet):
+    for read in (read_json, read_toml, store.read_parquet):
         with pytest.raises(InputError, match=r"nowhere.*: no such file"):
             read(tmp_path / "nowhere")
 
 
 def test_an_error_while_writing_leaves_the_old_file_and_no_other(tmp_path):
     path = tmp_path / "x.json"
-    store.write_json(path, {"old": 1})
-    with pytest.raises(RuntimeError), store.atomic_writer(path) as stream:
+    write_json(path, {"old": 1})
+    with pytest.raises(RuntimeError), atomic_writer(path) as stream:
         stream.write(b"half")
         raise RuntimeError
-    assert store.read_json(path) == {"old": 1}
+    assert read_json(path) == {"old": 1}
     assert list(tmp_path.iterdir()) == [path]
 
 
 def test_a_file_where_a_folder_should_be_is_a_plain_error(tmp_path):
     (tmp_path / "run").write_text("")
     with pytest.raises(InputError, match="cannot write"):
-        store.write_json(tmp_path / "run" / "x.json", {})
+        write_json(tmp_path / "run" / "x.json", {})
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root writes everywhere")
 def test_a_read_only_folder_is_a_plain_error(tmp_path):
     tmp_path.chmod(stat.S_IREAD | stat.S_IEXEC)
     with pytest.raises(InputError, match="permission denied"):
-        store.write_json(tmp_path / "x.json", {})
+        write_json(tmp_path / "x.json", {})
 
 
 def test_a_full_disk_is_a_plain_error(tmp_path):
     if not os.path.exists("/dev/full"):
         pytest.skip("no /dev/full here")
     with (
-        pytest.raises(InputError, match="no space left"),
-        store.atomic_writer(tmp_path / "x"),
+        pytest.raises(InputError, match="the disk is full"),
+        atomic_writer(tmp_path / "x"),
         open("/dev/full", "wb", buffering=0) as full,
     ):
         full.write(b"x")
@@ -164,16 +164,14 @@ def test_a_damaged_parquet_file_is_named(tmp_path, damage):
         store.read_parquet(path)
 
 
-def test_content_hash_sees_meaning_only(tmp_path):
+def test_a_toml_file_counts_by_what_it_says_and_others_by_their_bytes(tmp_path):
     first, second, third = (tmp_path / f"{name}.toml" for name in "abc")
     first.write_text("a = 1\n[t]\nb = 2026-01-01\n")
     second.write_text("# note\na  =  1\n t = { b = 2026-01-01 }\n")
-    third.write_text('a = 1\n[t]\nb = "2026-01-01"\n')
-    assert store.content_hash(first) == store.content_hash(second)
-    assert store.content_hash(first) != store.content_hash(third)
-    assert store.content_hash({"a": 1}) != store.content_hash({"a": 1.0})
-    assert store.content_hash({"a": datetime.date(2026, 1, 1)}) != store.content_hash({"a": 1})
+    third.write_text("a = 1.0\n[t]\nb = 2026-01-01\n")
+    assert digest_input(first) == digest_input(second)
+    assert digest_input(first) != digest_input(third)
     raw = tmp_path / "x.csv"
     raw.write_bytes(b"abc")
-    assert store.content_hash(raw) == store.sha256_file(raw)
-    assert store.sha256_file(raw).startswith("ba7816bf")
+    assert digest_input(raw) == digest_file(raw)
+    assert digest_file(raw).startswith("ba7816bf")

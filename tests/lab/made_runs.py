@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from bampipe.data import store
+from bampipe.files import write_json, write_text
 
 AXES = ("yaw", "pitch")
 
@@ -46,7 +47,7 @@ class Made:
             "sample_rate_hz": 500.0,
             "axes": {axis: {"unit": "rad", "resolution": 1e-4} for axis in AXES},
         }
-        store.write_json(root / "ingest/session.json", session)
+        write_json(root / "ingest/session.json", session)
         trials = {
             "trial_id": ["t1", "t2"],
             "kind": ["free", "free"],
@@ -59,7 +60,7 @@ class Made:
         }
         store.write_parquet(root / "ingest/trials.parquet", trials)  # type: ignore[arg-type]
         axes = {} if self.stiffness is None else {"yaw": _stiffness(self.stiffness)}
-        store.write_json(root / "stiffness/stiffness.json", {"axes": axes})
+        write_json(root / "stiffness/stiffness.json", {"axes": axes})
         self._model(root, "base", [], self.parameters, self.error)
         if self.verdicts is not None:
             told = {
@@ -72,13 +73,13 @@ class Made:
                 }
                 for axis, (verdict, effects) in self.verdicts.items()
             }
-            store.write_json(root / "models/base/diagnose.json", {"axes": told})
+            write_json(root / "models/base/diagnose.json", {"axes": told})
         if self.child is not None:
             effect, parameters = self.child
             name = f"base+{effect.replace(':', '.')}"
             self._model(root, name, [effect], parameters, {axis: 1.0 for axis in AXES})
         record = {"schema": "bampipe.run/1", "stages": {}, "gates": [], "failures": {}}
-        store.write_json(root / "run.json", record)
+        write_json(root / "run.json", record)
         return root
 
     def _model(
@@ -93,14 +94,14 @@ class Made:
         text = (
             f'schema = "bampipe.model/1"\nname = "{name}"\ndevice = "bam"\neffects = [{listed}]\n'
         )
-        store.write_text(root / f"models/{name}/model.toml", text)
+        write_text(root / f"models/{name}/model.toml", text)
         entries = {
             key: {"estimate": value, "sd": self.sd, "unit": "N.m", "at_bound": False}
             for key, value in parameters.items()
         }
         content = {"method": "ukf", "parameters": entries, "nis": {"by_trial": {"t1": 1.1}}}
-        store.write_json(root / f"models/{name}/identify.json", content)
-        store.write_json(
+        write_json(root / f"models/{name}/identify.json", content)
+        write_json(
             root / f"models/{name}/validate.json",
             {
                 "axes": {

@@ -15,10 +15,10 @@ from made_runs import Made
 
 from bampipe.data import lab_tables
 from bampipe.errors import InputError
+from bampipe.files import digest_file
 from bampipe.lab.collect import collect
 from bampipe.lab.place import is_current
 from bampipe.run.accepted import accept
-from bampipe.run.hashing import digest_file
 
 ROOT = Path(__file__).parent.parent.parent
 CLEAN = {"yaw": ("nothing_missing", ()), "pitch": ("nothing_missing", ())}

@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from bampipe.data.store import write_json, write_parquet, write_text
+from bampipe.data.store import write_parquet
+from bampipe.files import write_json, write_text
 
 AXES = ("yaw", "pitch", "extension")
 TORQUE_UNIT = {"yaw": "N.m", "pitch": "N.m", "extension": "N"}

@@ -11,7 +11,7 @@ import pandas as pd
 from run_folders import SESSIONS, ingested_session, write_ingested
 
 from bampipe.data.run_folder import RunFolder
-from bampipe.data.store import write_text
+from bampipe.files import write_text
 from bampipe.physics import Model, compile_model, registry
 from bampipe.progress import silent
 from bampipe.stages import filter as filter_stage

@@ -11,7 +11,8 @@ import pandas as pd
 import pytest
 
 from bampipe.data.run_folder import RunFolder
-from bampipe.data.store import write_json, write_parquet
+from bampipe.data.store import write_parquet
+from bampipe.files import write_json
 
 SESSIONS = Path(__file__).resolve().parents[3] / "shared" / "sessions"
 

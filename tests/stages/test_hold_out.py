@@ -9,7 +9,8 @@ import pytest
 from identified_run import simulated_run
 
 from bampipe.data.run_folder import RunFolder
-from bampipe.data.store import read_json, read_parquet, write_parquet
+from bampipe.data.store import read_parquet, write_parquet
+from bampipe.files import read_json
 from bampipe.physics import Model, compile_model, registry
 from bampipe.progress import silent
 from bampipe.stages import identify, validate

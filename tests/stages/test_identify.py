@@ -12,8 +12,9 @@ from identified_run import MODEL, RESOLUTION, TRUTH, session_truth, shared_run, 
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.data.schema import validate
-from bampipe.data.store import read_json, read_parquet, sha256_file, write_text
+from bampipe.data.store import read_parquet
 from bampipe.errors import InputError
+from bampipe.files import digest_file, read_json, write_text
 from bampipe.identification.filter_choice import ENGINES
 from bampipe.identification.filter_run import MotionLost
 from bampipe.progress import silent
@@ -121,7 +122,7 @@ def test_tables_and_determinism(simulated: RunFolder, tmp_path: Path) -> None:
     hashes = []
     for folder in ("one", "two"):
         identify.execute(simulated, tmp_path / folder, config, silent)
-        hashes.append([sha256_file(tmp_path / folder / name) for name in files])
+        hashes.append([digest_file(tmp_path / folder / name) for name in files])
     assert hashes[0] == hashes[1]
     states = read_parquet(tmp_path / "one/models/base/states.parquet")
     assert states["trial_id"].unique().tolist() == ["t00", "t01"]

@@ -17,8 +17,9 @@ from made_session import COUNTS, SESSION, Made, free_trial, toml_text
 from run_folders import SESSIONS
 
 from bampipe.data.run_folder import RunFolder
-from bampipe.data.store import read_json, read_parquet
+from bampipe.data.store import read_parquet
 from bampipe.errors import InputError
+from bampipe.files import read_json
 from bampipe.progress import silent
 from bampipe.stages import ingest
 

@@ -16,8 +16,9 @@ import pytest
 from identified_run import MODEL, RESOLUTION, TRUTH, simulated_run
 
 from bampipe.data.run_folder import RunFolder
-from bampipe.data.store import read_json, read_parquet, write_json, write_text
+from bampipe.data.store import read_parquet
 from bampipe.estimate.unscented import Trial, filter_trials
+from bampipe.files import read_json, write_json, write_text
 from bampipe.monitor.monitor import Monitor
 from bampipe.monitor.start import Options, start_from_run
 from bampipe.physics import Model, compile_model, registry

@@ -9,9 +9,10 @@ import pandas as pd
 import pytest
 
 from bampipe.data.run_folder import RunFolder
-from bampipe.data.store import read_json, read_parquet
+from bampipe.data.store import read_parquet
 from bampipe.data.units import unit
 from bampipe.errors import InputError
+from bampipe.files import read_json
 from bampipe.progress import silent
 from bampipe.stages import ingest
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bampipe.data.store import read_json
+from bampipe.files import read_json
 from bampipe.physics import Model, compile_model, registry
 
 DEVICE = """

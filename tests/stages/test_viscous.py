@@ -12,8 +12,9 @@ from identified_run import recorded_run
 from run_folders import SESSIONS
 
 from bampipe.data.run_folder import RunFolder
-from bampipe.data.store import read_json, read_parquet, write_parquet
+from bampipe.data.store import read_parquet, write_parquet
 from bampipe.errors import InputError
+from bampipe.files import read_json
 from bampipe.physics import Model, compile_model, registry
 from bampipe.physics.viscous_field import viscous_field
 from bampipe.progress import silent

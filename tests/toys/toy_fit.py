@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from bampipe.data.run_folder import RunFolder, write_json
+from bampipe.data.run_folder import RunFolder
+from bampipe.files import write_json
 from bampipe.progress import Progress
 from bampipe.stages.toy_read import log
 

@@ -7,8 +7,9 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
-from bampipe.data.run_folder import RunFolder, write_json
+from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError
+from bampipe.files import write_json
 from bampipe.progress import Progress
 
 NAME = "toy_read"

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from bampipe.data import schema, store
+from bampipe.data import schema
 from bampipe.data.readers.trial import Dialect
 from bampipe.data.session.channels import (
     brakes_from,
@@ -22,6 +22,7 @@ from bampipe.data.session.places import is_device_path, lexically_inside
 from bampipe.data.session.records import FILE_NAME, Session
 from bampipe.data.session.trials import trials_from
 from bampipe.errors import InputError
+from bampipe.files import read_toml
 
 
 def read_session(path: Path) -> Session:
@@ -38,7 +39,7 @@ def read_session(path: Path) -> Session:
         raise InputError(
             f"no {FILE_NAME} in this folder", where=str(path), remedy="give a session folder"
         )
-    return session_from(store.read_toml(file), file.parent, str(file))
+    return session_from(read_toml(file), file.parent, str(file))
 
 
 def session_from(table: Mapping[str, Any], root: Path, where: str = FILE_NAME) -> Session:
