@@ -1,0 +1,33 @@
+"""Simulators that share no code with bampipe: sessions of four machines with a known truth.
+
+Equations of motion, integrators, friction, sensors and session files are written here from the
+physics, with numpy, numba and scipy alone, so that benchmarks and tests hold the product against
+something that cannot share its mistakes. ``record(machine, folder, seed, effects, conditions)``
+writes one session folder and, beside it, ``<folder>.truth.json``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from independent import bam
+from independent.sensors import Conditions
+
+MACHINES = {"bam": bam}
+
+
+def record(
+    machine: str,
+    folder: Path,
+    seed: int,
+    effects: Mapping[str, float] | None = None,
+    conditions: Conditions | None = None,
+) -> dict[str, Any]:
+    """Write a session of ``machine`` with ``effects`` (strength by name, 1 is typical) hidden.
+
+    Returns the truth: ``effects`` and ``outside`` (names in the library of bampipe and beyond it),
+    ``parameters`` (values that an identification of the right model must find, by full name).
+    """
+    return MACHINES[machine].record(folder, seed, effects or {}, conditions)

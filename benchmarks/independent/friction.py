@@ -1,0 +1,128 @@
+"""Friction and other forces along one axis, as the simulators integrate them.
+
+Dry friction is a set-valued law solved implicitly at every step: an axis whose push is below its
+dry friction stands still. Equations such as those of bampipe let it creep instead; ``creep`` does.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+AXIS = np.dtype(
+    [
+        (name, np.float64)
+        for name in (
+            "viscous", "coulomb",                   # resist motion always
+            "creep",                                # dry friction as tanh(v/creep) where not zero
+            "stribeck", "stribeck_speed",           # extra dry friction that dies out with speed
+            "dahl", "dahl_distance",                # dry friction that builds up over a distance
+            "dry_difference", "viscous_difference", # half the difference between the directions
+            "drag",                                 # grows with the square of the speed
+            "ripple", "ripple_phase", "wavenumber", # dry friction along the travel
+            "load_share", "side_share",             # dry friction by load along and across
+            "softening", "warming_time",            # viscous friction lost as the axis warms
+            "spring", "spring_rest",
+            "cogging", "cogging_phase", "cogging_wavenumber",
+            "detent", "detent_at", "detent_width",  # a magnet that catches near one position
+            "stop", "stop_at",                      # a soft stop beyond one position
+            "slack_spring", "slack",                # a spring that is loose in the middle
+            "cable", "cable_time",                  # a cable that winds and creeps
+            "reach_share", "reach_rest",            # dry friction by another axis' position
+        )
+    ]
+)  # fmt: skip
+"""Laws of one axis; zero switches each off, and lengths and times are never zero."""
+
+_NEVER_ZERO = (
+    "stribeck_speed", "dahl_distance", "wavenumber", "warming_time", "cogging_wavenumber",
+    "detent_width", "cable_time",
+)  # fmt: skip
+
+MEMORY = np.dtype([("dahl", np.float64), ("heat", np.float64), ("cable", np.float64)])
+"""What an axis remembers: built-up friction (share), friction power (W), cable rest (position)."""
+
+
+def blank_laws(axes: int) -> np.ndarray:
+    """Laws of ``axes`` axes with everything switched off, dtype AXIS, (axes,)."""
+    laws = np.zeros(axes, AXIS)
+    for name in _NEVER_ZERO:
+        laws[name] = 1.0
+    return laws
+
+
+@njit(cache=True)
+def push_along(law, q, memory):
+    """Forces of position alone: springs, stops, magnets, cables."""
+    force = -law.spring * (q - law.spring_rest)
+    force += law.cogging * np.sin(law.cogging_wavenumber * q + law.cogging_phase)
+    x = (q - law.detent_at) / law.detent_width
+    force -= law.detent * x * np.exp(0.5 - 0.5 * x * x)
+    if q > law.stop_at:
+        force -= law.stop * (q - law.stop_at)
+    if abs(q) > law.slack:
+        force -= law.slack_spring * (q - np.sign(q) * law.slack)
+    return force - law.cable * (q - memory.cable)
+
+
+@njit(cache=True)
+def dry_level(law, q, v, load, side, elsewhere):
+    """Dry friction that opposes motion in the direction of ``v``; Dahl's part is not in it."""
+    level = law.coulomb + law.stribeck * np.exp(-((v / law.stribeck_speed) ** 2)) - law.dahl
+    level += law.dry_difference * np.sign(v)
+    level += law.ripple * np.sin(law.wavenumber * q + law.ripple_phase)
+    level += law.load_share * abs(load) + law.side_share * side
+    level += law.reach_share * (elsewhere - law.reach_rest)
+    return max(level, 0.0)
+
+
+@njit(cache=True)
+def drag_slope(law, v, memory):
+    """Viscous friction as force over velocity."""
+    warm = max(1.0 - law.softening * memory.heat, 0.1)
+    return law.viscous * warm + law.viscous_difference * np.sign(v) + law.drag * abs(v)
+
+
+@njit(cache=True)
+def resist(law, memory, v_free, v, h, inertia, q, load, side, elsewhere):
+    """Impulse of friction over a step of ``h`` on an axis that would reach ``v_free`` without it.
+
+    Implicit in the velocity: friction stops an axis, and never turns it round.
+    """
+    impulse = -law.dahl * memory.dahl * h
+    v_free += impulse / inertia
+    dry = dry_level(law, q, v_free, load, side, elsewhere) * h / inertia
+    # Where the sign changes within the step, the slope of the new direction counts.
+    slope = drag_slope(law, v if v * v_free > 0.0 else v_free, memory) * h / inertia
+    if law.creep > 0.0:
+        v_new = _creep(v_free, dry, slope, law.creep)
+    elif abs(v_free) <= dry:
+        v_new = 0.0
+    else:
+        v_new = (v_free - np.sign(v_free) * dry) / (1.0 + slope)
+    return impulse + (v_new - v_free) * inertia
+
+
+@njit(cache=True)
+def _creep(v_free, dry, slope, width):
+    """Solve v + slope*v + dry*tanh(v/width) = v_free by bisection: the left side only grows."""
+    low, high = min(v_free, 0.0), max(v_free, 0.0)
+    for _ in range(60):
+        v = 0.5 * (low + high)
+        if v + slope * v + dry * np.tanh(v / width) < v_free:
+            low = v
+        else:
+            high = v
+        if high - low < 1e-9:
+            break
+    return 0.5 * (low + high)
+
+
+@njit(cache=True)
+def remember(law, memory, q, v, h):
+    """Advance what the axis remembers over ``h`` at velocity ``v``: exact for constant velocity."""
+    aim = np.sign(v)
+    memory.dahl = aim + (memory.dahl - aim) * np.exp(-abs(v) * h / law.dahl_distance)
+    power = law.viscous * v * v + law.coulomb * abs(v)
+    memory.heat += (power - memory.heat) * h / law.warming_time
+    memory.cable += (q - memory.cable) * h / law.cable_time

@@ -1,0 +1,117 @@
+"""Conditions of a recording, and the files of a session folder."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """How well a session is recorded; the defaults are good days.
+
+    Attributes:
+        trials: free trials; seconds: length of each; None for what is usual on the machine.
+        rate_hz: sample rate; None for what is usual on the machine.
+        noise_factor: true force noise over what the session file states.
+        hum: amplitude of 50 Hz (with a fifth of it at 150 Hz) on the force, in its stated noise.
+        coarse: counts of the encoders are so many times coarser.
+        dropped: share of the samples that are lost.
+        jitter: standard deviation of the time between samples, as a share of it; stamps are true.
+        creep: dry friction is the smoothed one of the device file instead of a true standstill.
+        viscous_trials, locked_trials: of a machine with brakes.
+    """
+
+    trials: int | None = None
+    seconds: float | None = None
+    rate_hz: float | None = None
+    noise_factor: float = 1.0
+    hum: float = 0.0
+    coarse: float = 1.0
+    dropped: float = 0.0
+    jitter: float = 0.0
+    creep: bool = False
+    viscous_trials: int = 0
+    locked_trials: bool = False
+
+
+GOOD = Conditions()
+HARD = {
+    "noise five times what is stated": Conditions(noise_factor=5.0),
+    "mains hum": Conditions(hum=10.0),
+    "encoders eight times coarser": Conditions(coarse=8.0),
+    "three short trials": Conditions(trials=3, seconds=6.0),
+    "dropped samples": Conditions(dropped=0.02),
+    "jitter": Conditions(jitter=0.1),
+}
+"""Conditions of hard days, by name."""
+
+
+def sample_steps(
+    rng: np.random.Generator, steps: int, per_sample: float, conditions: Conditions
+) -> np.ndarray:
+    """Integration steps at which the logger samples: jittering, some lost; the first is 0."""
+    at = np.arange(0.0, steps, per_sample)
+    at = at + per_sample * np.clip(conditions.jitter * rng.standard_normal(len(at)), -0.45, 0.45)
+    at[0] = 0.0
+    kept = rng.uniform(size=len(at)) >= conditions.dropped
+    kept[0] = True
+    chosen = np.minimum(np.rint(at[kept]).astype(np.int64), steps - 1)
+    return np.unique(chosen)
+
+
+def read_force(
+    rng: np.random.Generator, t: np.ndarray, force: np.ndarray, noise: float, conditions: Conditions
+) -> np.ndarray:
+    """The reading (T, n) of ``force`` with the noise and hum of ``conditions``."""
+    read = force + conditions.noise_factor * noise * rng.standard_normal(force.shape)
+    phases = rng.uniform(0.0, 2 * np.pi, (2, force.shape[1]))
+    mains = 2 * np.pi * 50.0 * t[:, None]
+    hum = np.sin(mains + phases[0]) + 0.2 * np.sin(3 * mains + phases[1])
+    return np.asarray(read + conditions.hum * noise * hum)
+
+
+def write_trial(path: Path, columns: Mapping[str, np.ndarray]) -> None:
+    """Write one CSV, a column each; whole numbers stay whole, others get seven figures."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    frame = pd.DataFrame(dict(columns))
+    frame.to_csv(path, index=False, float_format="%.7g", lineterminator="\n")
+
+
+def write_session(
+    folder: Path, head: str, trials: Sequence[Mapping[str, Any]], truth: Mapping[str, Any]
+) -> None:
+    """Write session.toml with ``head`` before the trials, and the truth beside the folder."""
+    lines = [f'schema = "bampipe.session/1"\nsession_id = {json.dumps(folder.name)}\n{head}']
+    for trial in trials:
+        entries = [f"{key} = {json.dumps(value)}" for key, value in trial.items()]
+        lines.append("\n".join(["[[trials]]", *entries]) + "\n")
+    (folder / "session.toml").write_text("\n".join(lines), encoding="utf-8")
+    beside = folder.with_name(f"{folder.name}.truth.json")
+    beside.write_text(json.dumps(truth, indent=1) + "\n", encoding="utf-8")
+
+
+def tell_truth(
+    machine: str,
+    seed: int,
+    effects: Mapping[str, float],
+    outside: Sequence[str],
+    parameters: Mapping[str, float],
+    conditions: Conditions,
+) -> dict[str, Any]:
+    """The content of the truth file."""
+    return {
+        "machine": machine,
+        "seed": seed,
+        "effects": [name for name in effects if name.split(":")[0] not in outside],
+        "outside": [name for name in effects if name.split(":")[0] in outside],
+        "strengths": dict(effects),
+        "parameters": {name: float(value) for name, value in parameters.items()},
+        "conditions": asdict(conditions),
+    }
