@@ -1,5 +1,7 @@
 """The one exception that a user's mistake may raise, and text that is safe to show."""
 
+import difflib
+from collections.abc import Iterable
 from functools import partial
 
 
@@ -43,3 +45,17 @@ class InputError(Exception):
         text = f"{self.where}: {self.what}" if self.where else self.what
         text = f"{text}; {self.remedy}" if self.remedy else text
         return printable(" ".join(text.split()))
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """``, did you mean 'x'?`` for the closest of ``known``, or nothing where none is close."""
+    lowered = {str(name).lower(): name for name in known}
+    close = difflib.get_close_matches(word.lower(), lowered, n=1)
+    return f", did you mean '{lowered[close[0]]}'?" if close else ""
+
+
+def choose_from(word: str, known: Iterable[str]) -> str:
+    """As a remedy: the closest of ``known``, or all of them where none is close."""
+    names = sorted(known)
+    nearest = did_you_mean(word, names).removeprefix(", ")
+    return nearest or (f"choose from {', '.join(names)}" if names else "")

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from bampipe.declarations.pipeline import Gate
 from bampipe.errors import InputError
 from bampipe.run import accepted, gates, pipeline
 from bampipe.run.gates import Verdict
@@ -19,10 +20,10 @@ from bampipe.run.markdown import summary
 from bampipe.run.request import Outcome
 
 ROOT = Path(__file__).parent.parent
-CHANGE = pipeline.Gate(
-    "change",
-    "models/{model}/identify.json",
-    "parameters.*.estimate",
+CHANGE = Gate(
+    name="change",
+    result="models/{model}/identify.json",
+    value="parameters.*.estimate",
     against="accepted",
     max=5.0,
     optional=True,
@@ -46,7 +47,7 @@ def made(root: Path, sd: float = 0.01, **estimates: float) -> Path:
     return root
 
 
-def states(root: Path, folder: Path, gate: pipeline.Gate = CHANGE) -> dict[str, str]:
+def states(root: Path, folder: Path, gate: Gate = CHANGE) -> dict[str, str]:
     return {v.key: v.state for v in gates.judge(gate, root, "base", folder)}
 
 

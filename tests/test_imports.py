@@ -14,7 +14,18 @@ import bampipe
 from bampipe.stages import base
 
 PACKAGE = Path(bampipe.__file__).parent
-HEAVY = ("h5py", "matplotlib", "numba", "numpy", "pandas", "pyarrow", "scipy", "sklearn", "sympy")
+HEAVY = (
+    "h5py",
+    "matplotlib",
+    "numba",
+    "numpy",
+    "pandas",
+    "pyarrow",
+    "pydantic",
+    "scipy",
+    "sklearn",
+    "sympy",
+)
 
 # What each layer may import beside the standard library and itself.
 LAWS = {
@@ -79,12 +90,11 @@ LAWS = {
     },
     "declarations": {
         "numpy",
-        "scipy",
-        "pandas",
-        "pyarrow",
-        "numba",
+        "pydantic",
         "bampipe.errors",
         "bampipe.files",
+        "bampipe.schema",
+        "bampipe.stages.base",
         "bampipe.physics",
         "bampipe.data",
     },
@@ -146,7 +156,16 @@ LAWS = {
         "bampipe.discover",
         "bampipe.report",
     },
-    "report": {"numpy", "matplotlib", "typst", "pandas", "pyarrow", "bampipe", "bampipe.errors"},
+    "report": {
+        "numpy",
+        "matplotlib",
+        "typst",
+        "pandas",
+        "pyarrow",
+        "bampipe",
+        "bampipe.declarations",
+        "bampipe.errors",
+    },
     "run": {
         "bampipe.progress",
         "dask",
@@ -156,7 +175,9 @@ LAWS = {
         "bampipe.compile_ahead",
         "bampipe.errors",
         "bampipe.files",
+        "bampipe.schema",
         "bampipe.data",
+        "bampipe.declarations",
         "bampipe.stages.base",
     },
     "lab": {

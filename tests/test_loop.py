@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from bampipe.api import loop
+from bampipe.declarations.model import ModelFile
 from bampipe.run import models, pipeline, record
 from bampipe.run.events import unheard
 
@@ -20,9 +21,12 @@ def made(settings: dict[str, object]) -> dict[str, object]:
 
 
 def test_a_child_is_identified_as_its_parent_was(tmp_path: Path) -> None:
-    models.write(tmp_path, models.ModelFile("base", "", "slider", ()))
+    models.write(tmp_path, ModelFile(name="base", device="slider"))
     child = models.child_name("base", "stribeck:carriage")
-    models.write(tmp_path, models.ModelFile(child, "base", "slider", ("stribeck:carriage",)))
+    models.write(
+        tmp_path,
+        ModelFile(name=child, parent="base", device="slider", effects=("stribeck:carriage",)),
+    )
     stages = {
         "identify:base": made({"model": "base", "method": "least-squares"}),
         "validate:base": made({"model": "base", "seed": 3}),

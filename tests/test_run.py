@@ -17,6 +17,8 @@ import install_toys
 import pytest
 from conftest import TOYS, Toy, contents
 
+from bampipe.declarations.model import ModelFile
+from bampipe.declarations.pipeline import Gate
 from bampipe.errors import InputError
 from bampipe.run import batch, gates, junit, models, record
 from bampipe.run import pipeline as pipelines
@@ -398,7 +400,10 @@ def test_children_are_refreshed_once_they_were_run(toy: Toy) -> None:
     parent = models.read(toy.root, "base")
     name = models.child_name("base", "stribeck:yaw")
     assert name == "base+stribeck.yaw"
-    models.write(toy.root, models.ModelFile(name, "base", parent.device, ("stribeck:yaw",)))
+    models.write(
+        toy.root,
+        ModelFile(name=name, parent="base", device=parent.device, effects=("stribeck:yaw",)),
+    )
     toy.run()
     assert toy.ran() == [], "nobody has asked for the child yet"
     toy.run(first="toy_fit", last="toy_fit", model=name, judged="")
@@ -492,8 +497,9 @@ def test_folder_of_sessions_is_not_a_session(toy: Toy) -> None:
 # Gates
 
 
-def gate(**changes: object) -> pipelines.Gate:
-    return replace(pipelines.Gate("limit", "models/{model}/v.json", "axes.*.a", max=2.0), **changes)
+def gate(**changes: object) -> Gate:
+    limit = Gate(name="limit", result="models/{model}/v.json", value="axes.*.a", max=2.0)
+    return limit.model_copy(update=changes)
 
 
 def judged(tmp_path: Path, content: object, **changes: object) -> list[gates.Verdict]:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
@@ -14,10 +13,12 @@ from bampipe.api.opened import Run, open_run
 from bampipe.run import batch, models, record, runner
 from bampipe.run import pipeline as pipelines
 from bampipe.run.events import unheard
-from bampipe.run.pipeline import Pipeline
 from bampipe.run.request import Request
 from bampipe.run.session_name import session_id
 from bampipe.stages import base
+
+if TYPE_CHECKING:
+    from bampipe.declarations.pipeline import Pipeline
 
 Path_ = str | Path
 RUNS = "runs"
@@ -151,7 +152,7 @@ def _opened(run: Run | Path_) -> Run:
 
 def _whole(root: Path) -> Pipeline:
     """The pipeline of a run, with every stage in it."""
-    return replace(pipelines.recorded(record.read(root)), stages=base.STAGES)
+    return pipelines.recorded(record.read(root)).with_every_stage()
 
 
 def _options(run: Run) -> loop.Options:

@@ -7,16 +7,18 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError
 from bampipe.run import models, record
 from bampipe.run.events import Event, Listener
-from bampipe.run.pipeline import Pipeline
 from bampipe.run.request import Request
 from bampipe.run.runner import run_session
 from bampipe.stages import base
+
+if TYPE_CHECKING:
+    from bampipe.declarations.pipeline import Pipeline
 
 MOST_EFFECTS = 5
 
@@ -144,7 +146,7 @@ def extend(options: Options, parent: str, effect: str) -> str:
     fresh = not (root / "models" / child).exists()
     try:
         with options.lock():
-            models.ensure_base(root, options.pipeline.device, options.pipeline.effects)
+            models.ensure_base(root, *options.pipeline.base_model)
             _write_child(root, parent, name, file)
         options.run("identify", "validate", parent)
         options.run("identify", "validate", child)
@@ -169,6 +171,7 @@ def _write_child(root: Path, parent: str, effect: str, file: Path | None) -> Non
     Raises:
         InputError: the parent has the effect already, or the device cannot have it.
     """
+    from bampipe.declarations.model import ModelFile
     from bampipe.declarations.model_file import load_model
 
     before = models.read(root, parent)
@@ -181,7 +184,9 @@ def _write_child(root: Path, parent: str, effect: str, file: Path | None) -> Non
     for name, source in sorted(own.items()):
         text = source.read_text(encoding="utf-8")
         record.replace_text(root / "models" / child / "effects" / name, text)
-    models.write(root, models.ModelFile(child, parent, before.device, (*before.effects, effect)))
+    effects = (*before.effects, effect)
+    model = ModelFile(name=child, parent=parent, device=before.device, effects=effects)
+    models.write(root, model)
     load_model(RunFolder(root), child)
 
 

@@ -13,11 +13,9 @@ from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError
 from bampipe.run import models, pipeline
 from bampipe.run.events import Listener
-from bampipe.run.pipeline import Pipeline
 from bampipe.run.request import Request
 from bampipe.run.runner import run_session
 from bampipe.run.session_name import session_id
-from bampipe.stages import base
 
 _PACKAGE = Path(bampipe.__file__).parent
 _SAMPLES = (_PACKAGE / "_sample_runs", _PACKAGE.parent / "sample_runs")
@@ -50,9 +48,7 @@ def demonstrate(runs: Path, force: bool, listen: Listener, tell: Callable[[str],
             f"sensor noise alone would leave {entry['noise_floor']:.3g} {entry['unit']}"
         )
     tell("2. Which effect is missing? The diagnosis, then the model extended, until nothing is.")
-    options = Options(
-        root, Pipeline(**{**vars(chosen), "stages": base.STAGES}), force, True, listen
-    )
+    options = Options(root, chosen.with_every_stage(), force, True, listen)
     last = follow(options, models.BASE, lambda line: tell(f"   {line}"))
     tell("3. The error on unseen trials, model by model.")
     ladder = RunFolder(root).read_json("compare.json")["ladder"]

@@ -6,8 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from bampipe.cli import show
-from bampipe.errors import InputError
-from bampipe.run.settings import did_you_mean
+from bampipe.errors import InputError, choose_from
 
 COLUMNS, ROWS = 61, 13
 
@@ -59,7 +58,7 @@ def show_one(text: str, device_name: str, json: bool) -> None:
     if target and target not in targets:
         raise InputError(
             f"effect {effect.name!r} has no target {target!r} on device {device_name!r}",
-            remedy=did_you_mean(target, targets),
+            remedy=choose_from(target, targets),
         )
     chosen = target or targets[0]
 

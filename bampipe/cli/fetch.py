@@ -8,9 +8,8 @@ from typing import Annotated
 import typer
 
 from bampipe.cli import show
-from bampipe.errors import InputError
+from bampipe.errors import InputError, choose_from
 from bampipe.run import publish
-from bampipe.run.settings import did_you_mean
 
 
 def fetch(
@@ -39,7 +38,7 @@ def fetch(
             raise InputError(
                 f"no session {session!r} is published",
                 where=url,
-                remedy=did_you_mean(session, known),
+                remedy=choose_from(session, known),
             )
         show.say(str(publish.fetch(url, session, runs, force)))
     if not quiet:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from bampipe.cli import places, show
 from bampipe.run import batch, record
@@ -14,6 +13,9 @@ from bampipe.run.request import Outcome, Request
 from bampipe.run.runner import run_session
 from bampipe.run.settings import parse_assignment
 from bampipe.stages import base
+
+if TYPE_CHECKING:
+    from bampipe.declarations.pipeline import Pipeline
 
 AFTER = {
     "ingest": "filter",
@@ -46,10 +48,10 @@ def advise(quiet: bool, json: bool, command: str) -> None:
         show.say(f"next: {command}")
 
 
-def whole_pipeline(root: Path, name: str) -> pipelines.Pipeline:
+def whole_pipeline(root: Path, name: str) -> Pipeline:
     """Return the pipeline whose settings count for single stages, with every stage in it."""
     chosen = pipelines.load(name) if name else pipelines.recorded(record.read(root))
-    return replace(chosen, stages=base.STAGES)
+    return chosen.with_every_stage()
 
 
 def one_stage(

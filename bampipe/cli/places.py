@@ -6,10 +6,9 @@ import glob
 from collections.abc import Sequence
 from pathlib import Path
 
-from bampipe.errors import InputError
+from bampipe.errors import InputError, choose_from
 from bampipe.run import record
 from bampipe.run.session_name import session_id
-from bampipe.run.settings import did_you_mean
 
 
 def known_runs(runs: Path) -> list[Path]:
@@ -50,7 +49,7 @@ def find_run(argument: str | None, runs: Path) -> Path:
             "this session has not been run", where=argument, remedy=f"`bampipe run {argument}`"
         )
     names = [root.name for root in known_runs(runs)]
-    remedy = did_you_mean(argument, names) or "start with `bampipe run SESSION`"
+    remedy = choose_from(argument, names) or "start with `bampipe run SESSION`"
     raise InputError(f"no run {argument!r}", where=str(runs), remedy=remedy)
 
 

@@ -8,14 +8,13 @@ follows it, given ``bampipe*`` in ``packages.find`` and ``"bampipe._schemas" = [
 
 from __future__ import annotations
 
-import difflib
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-from bampipe.errors import InputError
+from bampipe.errors import InputError, did_you_mean
 
 _PACKAGE = Path(__file__).resolve().parent.parent
 _FOLDERS = (_PACKAGE / "_schemas", _PACKAGE.parent / "schemas")
@@ -123,13 +122,6 @@ def dotted(path: Iterable[str | int]) -> str:
         else:
             text += f".{part}" if text else part
     return text
-
-
-def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """``", did you mean 'x'?"`` for the closest of ``known``, or nothing where none is close."""
-    lowered = {str(key).lower(): key for key in known}
-    close = difflib.get_close_matches(name.lower(), lowered, n=1, cutoff=0.6)
-    return f", did you mean '{lowered[close[0]]}'?" if close else ""
 
 
 def _order(error: Any) -> tuple[list[tuple[bool, object]], bool, str]:

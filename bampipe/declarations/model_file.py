@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.data.run_folder import RunFolder
+from bampipe.declarations.model import read_model_file
 from bampipe.errors import InputError
 from bampipe.files import read_toml
 from bampipe.physics import Model, System, registry
@@ -22,19 +23,14 @@ def load_model(run: RunFolder, name: str) -> Model:
     """
     relative = f"models/{name}/model.toml"
     path = run.require(relative, "identify")
-    content = read_toml(path)
-    device, effects = content.get("device"), content.get("effects", [])
-    if not isinstance(device, str):
-        raise InputError("device must be a text", where=str(path))
-    if not isinstance(effects, list) or not all(isinstance(item, str) for item in effects):
-        raise InputError("effects must be a list of texts", where=str(path))
+    model = read_model_file(path)
     own = []
     for file in run.glob(f"models/{name}/effects/*.toml"):
         own.append(registry.effect_from(read_toml(run.path(file)), str(run.path(file))))
     if run.exists("ingest/device.toml"):
         place = run.path("ingest/device.toml")
-        return Model(registry.device_from(read_toml(place), str(place)), effects, own)
-    return Model(registry.device(device), effects, own)
+        return Model(registry.device_from(read_toml(place), str(place)), model.effects, own)
+    return Model(registry.device(model.device), model.effects, own)
 
 
 def model_inputs(name: str) -> tuple[str, ...]:

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from bampipe.errors import InputError
+from bampipe.errors import InputError, did_you_mean
 from bampipe.physics import expression
 
 KEYS = ("source", "channels", "rate_hz", "states", "command")
@@ -71,9 +71,7 @@ def controller_from(
         raise InputError("expected a table", where=where)
     for key in entry:
         if key not in KEYS:
-            raise InputError(
-                f"unknown key {key!r}{expression.did_you_mean(key, KEYS)}", where=where
-            )
+            raise InputError(f"unknown key {key!r}{did_you_mean(key, KEYS)}", where=where)
     channels, law = entry.get("channels", {}), entry.get("command")
     if not isinstance(channels, Mapping) or not all(isinstance(u, str) for u in channels.values()):
         raise InputError("channels must be a table, name = unit", where=where)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
 
-from bampipe.errors import InputError
+from bampipe.errors import InputError, did_you_mean
 from bampipe.physics import expression
 from bampipe.physics.controller import Controller, controller_from
 from bampipe.physics.parameter import LARGEST, Parameter, parameter_from
@@ -113,7 +113,7 @@ class Device:
                 return coordinate
         known = [c.name for c in self.coordinates]
         raise InputError(
-            f"device {self.name!r} has no axis {name!r}{expression.did_you_mean(name, known)}",
+            f"device {self.name!r} has no axis {name!r}{did_you_mean(name, known)}",
             remedy=f"its axes are {', '.join(known)}",
         )
 
@@ -169,7 +169,7 @@ def device_from(declaration: Mapping[str, Any], where: str = "device file") -> D
     unknown = sorted(set(declaration) - _KEYS)
     if unknown:
         raise InputError(
-            f"unknown table {unknown[0]!r}{expression.did_you_mean(unknown[0], _KEYS)}",
+            f"unknown table {unknown[0]!r}{did_you_mean(unknown[0], _KEYS)}",
             where=where,
         )
     if declaration.get("schema", "bampipe.device/1") != "bampipe.device/1":
@@ -214,7 +214,7 @@ def device_from(declaration: Mapping[str, Any], where: str = "device file") -> D
     for axis, terms in _table(declaration, "friction", where, False).items():
         at = f"{where}: friction.{axis}"
         if axis not in axes:
-            raise InputError(f"unknown axis{expression.did_you_mean(axis, axes)}", where=at)
+            raise InputError(f"unknown axis{did_you_mean(axis, axes)}", where=at)
         if not isinstance(terms, Mapping) or set(terms) != {"viscous", "coulomb"}:
             raise InputError("give viscous and coulomb, each with unit, prior, sd", where=at)
         frictional.append(axis)
@@ -303,7 +303,7 @@ def device_from(declaration: Mapping[str, Any], where: str = "device file") -> D
         for axis in table:
             if axis not in axes:
                 raise InputError(
-                    f"unknown axis {axis!r}{expression.did_you_mean(axis, axes)}",
+                    f"unknown axis {axis!r}{did_you_mean(axis, axes)}",
                     where=f"{where}: {label}",
                     remedy=f"axes are {', '.join(axes)}",
                 )
@@ -315,9 +315,7 @@ def _known(entry: Mapping[str, Any], keys: tuple[str, ...], where: str) -> None:
     """Raise InputError for a key of ``entry`` that is not one of ``keys``."""
     for key in entry:
         if key not in keys:
-            raise InputError(
-                f"unknown key {key!r}{expression.did_you_mean(key, keys)}", where=where
-            )
+            raise InputError(f"unknown key {key!r}{did_you_mean(key, keys)}", where=where)
 
 
 def _check_names(device: Device, where: str) -> None:

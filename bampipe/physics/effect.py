@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from bampipe.errors import InputError
+from bampipe.errors import InputError, did_you_mean
 from bampipe.physics import expression
 from bampipe.physics.device import INPUT_ORDERS, Device, derivative
 from bampipe.physics.parameter import Parameter, parameter_from
@@ -157,7 +157,7 @@ def effect_from(declaration: Mapping[str, Any], where: str = "effect file") -> E
     unknown = sorted(set(declaration) - _KEYS)
     if unknown:
         raise InputError(
-            f"unknown key {unknown[0]!r}{expression.did_you_mean(unknown[0], _KEYS)}",
+            f"unknown key {unknown[0]!r}{did_you_mean(unknown[0], _KEYS)}",
             where=where,
         )
     if declaration.get("schema", "bampipe.effect/1") != "bampipe.effect/1":
@@ -260,7 +260,7 @@ def bind(effect: Effect, target: str, device: Device) -> BoundEffect:
         )
     if target not in targets:
         choices = ", ".join(f"{effect.name}:{t}" if t else effect.name for t in targets)
-        hint = expression.did_you_mean(target, targets)
+        hint = did_you_mean(target, targets)
         raise InputError(
             f"effect {effect.name!r} has no target {target!r}{hint}"
             if target

@@ -7,7 +7,6 @@ a sympy expression; nothing of it is ever evaluated.
 from __future__ import annotations
 
 import ast
-import difflib
 import keyword
 import math
 import warnings
@@ -15,7 +14,7 @@ from collections.abc import Callable, Mapping
 from functools import cache
 from typing import Any
 
-from bampipe.errors import InputError
+from bampipe.errors import InputError, did_you_mean
 
 MAX_LENGTH = 2000
 MAX_NODES = 500
@@ -173,12 +172,6 @@ def check_name(name: object, where: str) -> str:
     if name in FUNCTIONS:
         raise InputError(f"{name!r} is the name of a function", where=where)
     return name
-
-
-def did_you_mean(word: str, known: Any) -> str:
-    """``, did you mean 'x'?`` where something known is close to ``word``, else nothing."""
-    close = difflib.get_close_matches(word, [str(k) for k in known], n=1)
-    return f", did you mean {close[0]!r}?" if close else ""
 
 
 def _bounded(value: Any) -> bool:

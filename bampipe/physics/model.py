@@ -10,11 +10,10 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from bampipe.errors import InputError
+from bampipe.errors import InputError, did_you_mean
 from bampipe.physics import registry
 from bampipe.physics.device import Device
 from bampipe.physics.effect import BoundEffect, Effect, bind
-from bampipe.physics.expression import did_you_mean
 from bampipe.physics.parameter import Parameter
 
 

@@ -8,10 +8,9 @@ from functools import cache
 from importlib.resources import files
 from typing import Any
 
-from bampipe.errors import InputError
+from bampipe.errors import InputError, did_you_mean
 from bampipe.physics.device import Device, device_from
 from bampipe.physics.effect import Effect, effect_from
-from bampipe.physics.expression import did_you_mean
 
 __all__ = [
     "device",

@@ -16,8 +16,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 
-from bampipe.errors import InputError
-from bampipe.physics import expression
+from bampipe.errors import InputError, did_you_mean
 from bampipe.physics.device import INPUT_ORDERS, Device, derivative
 from bampipe.physics.effect import EACH, BoundEffect, Effect, bind, unit_of
 
@@ -142,7 +141,7 @@ def _walk(node: ast.expr, symbols: Mapping[str, Found]) -> Found:
             return _number(float(value))  # type: ignore[arg-type]
         case ast.Name(id=name):
             if name not in symbols:
-                raise _Mismatch(f"unknown symbol {name!r}{expression.did_you_mean(name, symbols)}")
+                raise _Mismatch(f"unknown symbol {name!r}{did_you_mean(name, symbols)}")
             return symbols[name]
         case ast.UnaryOp(operand=operand):
             return _walk(operand, symbols)

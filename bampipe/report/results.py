@@ -12,6 +12,7 @@ from typing import Any
 
 import pandas as pd
 
+from bampipe.declarations.model import read_model_file
 from bampipe.errors import InputError
 
 _RATES = {"rad": "rad/s", "m": "m/s"}
@@ -206,13 +207,7 @@ class Results:
     def effects(self, model: str) -> tuple[str, ...]:
         """Return the effects that ``model`` has beyond the bare device."""
         path = self.root / "models" / model / "model.toml"
-        if not path.is_file():
-            return ()
-        try:
-            content = tomllib.loads(path.read_text(encoding="utf-8"))
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            raise InputError(f"not valid TOML: {error}", where=str(path)) from error
-        return tuple(str(item) for item in content.get("effects", ()))
+        return read_model_file(path).effects if path.is_file() else ()
 
     @cached_property
     def paper(self) -> dict[str, Any] | None:

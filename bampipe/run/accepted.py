@@ -6,17 +6,18 @@ control. `bampipe accept RUN` writes it; gates with ``against = "accepted"`` rea
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 from urllib.parse import quote
 
 from bampipe.data.run_folder import RunFolder
-from bampipe.data.schema import validate
 from bampipe.errors import InputError
-from bampipe.files import write_json
+from bampipe.files import read_json, write_json
 from bampipe.run import record
+
+if TYPE_CHECKING:
+    from bampipe.declarations.accepted import Accepted
 
 SCHEMA = "bampipe.accepted/1"
 ACCEPTED = "accepted"
@@ -42,7 +43,7 @@ def device_of(root: Path) -> str:
     return str(RunFolder(root).read_json("ingest/session.json")["device"])
 
 
-def read(folder: Path, device: str) -> Mapping[str, Any] | None:
+def read(folder: Path, device: str) -> Accepted | None:
     """Return what was accepted for ``device``; None where nothing was.
 
     Raises:
@@ -51,15 +52,14 @@ def read(folder: Path, device: str) -> Mapping[str, Any] | None:
     path = file_of(folder, device)
     if not path.is_file():
         return None
+    from bampipe.declarations.accepted import Accepted
+    from bampipe.schema import read as check
+
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise InputError(
-            f"not readable as JSON ({error})", where=str(path), remedy="restore it, or accept anew"
-        ) from error
-    validate(content, "accepted", str(path))
-    found: Mapping[str, Any] = content
-    return found
+        return check(Accepted, read_json(path), str(path))
+    except InputError as error:
+        remedy = error.remedy or "restore it, or accept anew"
+        raise InputError(error.what, where=error.where, remedy=remedy) from error
 
 
 def accept(root: Path, model: str, folder: Path, force: bool = False) -> Path:

@@ -7,10 +7,12 @@ import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from bampipe.run import accepted
-from bampipe.run.pipeline import Gate
+
+if TYPE_CHECKING:
+    from bampipe.declarations.pipeline import Gate
 
 
 @dataclass(frozen=True)
@@ -121,10 +123,10 @@ def _against_accepted(
     kept = accepted.read(baseline, accepted.device_of(root))
     if kept is None:
         return [_missing(gate, "", f"nothing accepted yet in {baseline}: run `bampipe accept`")]
-    if kept["model"] != model:
-        what = f"the accepted values are those of model {kept['model']!r}, not of {model!r}"
+    if kept.model != model:
+        what = f"the accepted values are those of model {kept.model!r}, not of {model!r}"
         return [_missing(gate, "", what)]
-    old = kept["results"].get(gate.result, {})
+    old = kept.results.get(gate.result, {})
     parent, _, last = gate.value.rpartition(".")
     now, before = _pick(content, gate.value), _pick(old, gate.value)
     sds, old_sds = (_pick(of, f"{parent}.sd") for of in (content, old))

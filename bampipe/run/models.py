@@ -4,42 +4,16 @@ from __future__ import annotations
 
 import json
 import tomllib
-from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from bampipe.errors import InputError
-from bampipe.files import read_toml
+from bampipe.errors import InputError, choose_from
 from bampipe.run import record
-from bampipe.run.settings import did_you_mean
 
-SCHEMA = "bampipe.model/1"
+if TYPE_CHECKING:
+    from bampipe.declarations.model import ModelFile
+
 BASE = "base"
-
-
-@dataclass(frozen=True)
-class ModelFile:
-    """What ``models/<name>/model.toml`` says.
-
-    Attributes:
-        name: name of the model; a child's is its parent's, ``+`` and the effect added.
-        parent: name of the parent, "" for the base model.
-        device: name of the device.
-        effects: effects, ``name[:target]``.
-    """
-
-    name: str
-    parent: str
-    device: str
-    effects: tuple[str, ...]
-
-    def text(self) -> str:
-        """Return the model as TOML."""
-        lines = [f"schema = {json.dumps(SCHEMA)}", f"name = {json.dumps(self.name)}"]
-        if self.parent:
-            lines.append(f"parent = {json.dumps(self.parent)}")
-        lines.append(f"device = {json.dumps(self.device)}")
-        lines.append(f"effects = [{', '.join(json.dumps(effect) for effect in self.effects)}]")
-        return "\n".join(lines) + "\n"
 
 
 def names(root: Path) -> tuple[str, ...]:
@@ -54,26 +28,12 @@ def read(root: Path, name: str) -> ModelFile:
     Raises:
         InputError: there is none, it is damaged, or its parent is missing.
     """
-    path = root / "models" / name / "model.toml"
+    from bampipe.declarations.model import read_model_file
+
     if name not in names(root):
         known = names(root) or (BASE,)
-        raise InputError(f"no model {name!r}", where=str(root), remedy=did_you_mean(name, known))
-    content = read_toml(path)
-    device, effects = content.get("device"), content.get("effects", [])
-    if not isinstance(device, str):
-        raise InputError("device must be a text", where=str(path))
-    if not isinstance(effects, list) or not all(isinstance(item, str) for item in effects):
-        raise InputError("effects must be a list of texts", where=str(path))
-    parent = content.get("parent", "")
-    if not isinstance(parent, str):
-        raise InputError("parent must be a text", where=str(path))
-    if parent and parent not in names(root):
-        raise InputError(
-            f"model {name!r} has parent {parent!r}, which is missing",
-            where=str(path),
-            remedy="restore the parent's folder, or remove the child's",
-        )
-    return ModelFile(name, parent, device, tuple(effects))
+        raise InputError(f"no model {name!r}", where=str(root), remedy=choose_from(name, known))
+    return read_model_file(root / "models" / name / "model.toml")
 
 
 def write(root: Path, model: ModelFile) -> None:
@@ -98,6 +58,8 @@ def ensure_base(root: Path, device: str, effects: tuple[str, ...]) -> None:
         effects: the pipeline's effects of the base model; without any, those that the device file
             gives it.
     """
+    from bampipe.declarations.model import ModelFile
+
     if not device:
         session = root / "ingest" / "session.json"
         if not session.is_file():
@@ -109,7 +71,7 @@ def ensure_base(root: Path, device: str, effects: tuple[str, ...]) -> None:
         about = json.loads(session.read_text(encoding="utf-8"))
         device = str(about["device"])
         effects = effects or tuple(map(str, about.get("default_effects", [])))
-    write(root, ModelFile(BASE, "", device, effects))
+    write(root, ModelFile(name=BASE, device=device, effects=effects))
 
 
 def child_name(parent: str, effect: str) -> str:

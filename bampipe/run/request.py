@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from bampipe.errors import InputError
 from bampipe.run.gates import Verdict
-from bampipe.run.pipeline import Pipeline
 from bampipe.stages import base
+
+if TYPE_CHECKING:
+    from bampipe.declarations.pipeline import Pipeline
 
 
 @dataclass(frozen=True)

@@ -97,7 +97,7 @@ class _Runner:
         pipeline = self.request.pipeline
         for stage in selected(self.request):
             if stage in base.PER_MODEL:
-                models.ensure_base(self.root, pipeline.device, pipeline.effects)
+                models.ensure_base(self.root, *pipeline.base_model)
                 if self.request.model:
                     models.read(self.root, self.request.model)
             for step in self.state.steps(stage):

@@ -3,25 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import tomllib
 import types
 import typing
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
-from bampipe.errors import InputError
+from bampipe.errors import InputError, choose_from
 from bampipe.stages import base
-
-
-def did_you_mean(wrong: str, names: Iterable[str]) -> str:
-    """Return a remedy that names the nearest of ``names``, else all of them."""
-    choices = sorted(names)
-    lowered = {name.lower(): name for name in choices}
-    near = difflib.get_close_matches(wrong.lower(), list(lowered), n=3, cutoff=0.55)
-    if near:
-        return "did you mean " + " or ".join(repr(lowered[name]) for name in near) + "?"
-    return f"choose from {', '.join(choices)}" if choices else ""
 
 
 def _describe(kind: Any) -> str:
@@ -106,7 +95,7 @@ def configure(stage: str, settings: Mapping[str, object], where: str = "") -> An
             raise InputError(
                 f"{stage} has no setting {name!r}",
                 where=where,
-                remedy=did_you_mean(name, fields),
+                remedy=choose_from(name, fields),
             )
         try:
             values[name] = _convert(value, hints[name])

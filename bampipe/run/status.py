@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from bampipe.errors import InputError
-from bampipe.run.pipeline import Pipeline
 from bampipe.run.request import Request
 from bampipe.run.state import RunState
 from bampipe.stages import base
+
+if TYPE_CHECKING:
+    from bampipe.declarations.pipeline import Pipeline
 
 
 @dataclass(frozen=True)

@@ -25,13 +25,12 @@ files into the run folder once ``execute`` has returned. No stage calls another.
 
 from __future__ import annotations
 
-import difflib
 import importlib
 from pathlib import Path
 from typing import Any, Protocol, cast
 
 from bampipe.data.run_folder import RunFolder
-from bampipe.errors import InputError
+from bampipe.errors import InputError, choose_from
 from bampipe.progress import Progress
 
 
@@ -85,9 +84,7 @@ def check_name(name: str) -> None:
     """Raise InputError unless there is a stage ``name``."""
     if name in STAGES:
         return
-    near = difflib.get_close_matches(name, STAGES, n=1, cutoff=0.55)
-    choices = f"did you mean {near[0]!r}?" if near else f"choose from {', '.join(STAGES)}"
-    raise InputError(f"no stage {name!r}", remedy=choices)
+    raise InputError(f"no stage {name!r}", remedy=choose_from(name, STAGES))
 
 
 def load(name: str) -> Stage:

@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from bampipe.data.run_folder import RunFolder
+from bampipe.declarations.model import ModelFile, read_model_file
 from bampipe.errors import InputError
-from bampipe.files import read_toml, write_json
+from bampipe.files import write_json
 from bampipe.progress import Progress
 
 NAME = "compare"
@@ -47,28 +48,19 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     """
     if not config.sigmas > 0:
         raise InputError("must be positive", where="compare.sigmas")
-    models: dict[str, Mapping[str, Any]] = {}
+    models: dict[str, ModelFile] = {}
     for path in run.glob("models/*/model.toml"):
         name = Path(path).parent.name
         if run.exists(f"models/{name}/validate.json"):
-            models[name] = read_toml(run.path(path))
+            models[name] = read_model_file(run.path(path))
     if not models:
         raise InputError(
             "no model has been validated yet",
             where=str(run.root),
             remedy=f"run `bampipe validate {run.root}` first",
         )
-    declared = {Path(p).parent.name for p in run.glob("models/*/model.toml")}
-    for name, content in models.items():
-        parent = content.get("parent", "")
-        if parent and parent not in declared:
-            raise InputError(
-                f"model {name!r} has parent {parent!r}, which is missing",
-                where=str(run.path(f"models/{name}/model.toml")),
-                remedy="restore the parent's folder, or remove the child's",
-            )
-    order = sorted(models, key=lambda n: (len(models[n].get("effects", [])), n))
-    ladder = [_rung(run, name, models[name], models) for name in order]
+    order = sorted(models, key=lambda n: (len(models[n].effects), n))
+    ladder = [_rung(run, name, models) for name in order]
     parameters: dict[str, dict[str, object]] = {}
     for name in order:
         found = run.read_json(f"models/{name}/identify.json")["parameters"]
@@ -84,19 +76,17 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     return result
 
 
-def _rung(
-    run: RunFolder, name: str, content: Mapping[str, Any], models: Mapping[str, Mapping[str, Any]]
-) -> dict[str, object]:
+def _rung(run: RunFolder, name: str, models: Mapping[str, ModelFile]) -> dict[str, object]:
     validated = run.read_json(f"models/{name}/validate.json")
     axes = validated["axes"]
-    parent = str(content.get("parent", ""))
-    had = models.get(parent, {}).get("effects", []) if parent else []
-    added = [e for e in content.get("effects", []) if e not in had]
+    parent, effects = models[name].parent, models[name].effects
+    had = models[parent].effects if parent in models else ()
+    added = [e for e in effects if e not in had]
     rung: dict[str, object] = {
         "model": name,
         "parent": parent or None,
         "added": ", ".join(added) or None,
-        "effects": list(content.get("effects", [])),
+        "effects": list(effects),
         "held_out_rmse": {a: entry["held_out_rmse"] for a, entry in axes.items()},
         "noise_floor": {a: entry.get("noise_floor") for a, entry in axes.items()},
         "unit": {a: entry["unit"] for a, entry in axes.items()},
@@ -111,14 +101,14 @@ def _rung(
 
 def _moved(
     parameters: Mapping[str, Mapping[str, Any]],
-    models: Mapping[str, Mapping[str, Any]],
+    models: Mapping[str, ModelFile],
     order: list[str],
     sigmas: float,
 ) -> list[dict[str, object]]:
     """Parameters that changed from parent to child by more than their uncertainty."""
     moved = []
     for model in order:
-        parent = str(models[model].get("parent", ""))
+        parent = models[model].parent
         for name, by_model in parameters.items():
             if parent not in by_model or model not in by_model:
                 continue

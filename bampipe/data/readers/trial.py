@@ -7,8 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from bampipe.data.schema import did_you_mean
-from bampipe.errors import InputError
+from bampipe.errors import InputError, did_you_mean
 
 LARGEST_BYTES = 4 << 30
 """A trial larger than this in memory is refused unless the caller allows more."""

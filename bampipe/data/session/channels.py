@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 
 from bampipe.data import units
-from bampipe.data.schema import did_you_mean
 from bampipe.data.session.records import Brake, Channel, Clock, Encoder, Force, Velocity
-from bampipe.errors import InputError
+from bampipe.errors import InputError, did_you_mean
 
 LARGEST_CONDITION = 1e8
 """A calibration matrix with a larger condition number counts as singular."""

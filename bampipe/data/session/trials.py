@@ -8,10 +8,9 @@ from collections.abc import Mapping
 from pathlib import PurePosixPath
 from typing import Any
 
-from bampipe.data.schema import did_you_mean
 from bampipe.data.session.places import lexically_inside
 from bampipe.data.session.records import Encoder, TrialEntry
-from bampipe.errors import InputError
+from bampipe.errors import InputError, did_you_mean
 
 
 def trials_from(

@@ -1,0 +1,47 @@
+"""The file ``models/<name>/model.toml``: a device, its effects, and the model it came from."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Literal
+
+from pydantic import Field
+
+from bampipe.errors import InputError
+from bampipe.files import read_toml
+from bampipe.schema import Declaration, Several, Text, read
+
+
+class ModelFile(Declaration):
+    """A model of a run folder."""
+
+    schema_: Literal["bampipe.model/1"] = Field(default="bampipe.model/1", alias="schema")
+    name: Text = Field(
+        description="Name of the model; a child's is its parent's, + and the effect added"
+    )
+    parent: str = Field(default="", description="Name of the parent; empty for the base model")
+    device: Text = Field(description="Name of the device")
+    effects: Several[Text] = Field(default=(), description="Effects, name[:target]")
+
+    def text(self) -> str:
+        """Return the model as TOML."""
+        table = self.model_dump(by_alias=True, exclude={} if self.parent else {"parent"})
+        lines = (f"{key} = {json.dumps(value)}" for key, value in table.items())
+        return "\n".join(lines) + "\n"
+
+
+def read_model_file(path: Path) -> ModelFile:
+    """Read a ``model.toml`` of a run folder.
+
+    Raises:
+        InputError: there is none, it is damaged, or the folder of its parent is missing.
+    """
+    model = read(ModelFile, read_toml(path), str(path))
+    if model.parent and not (path.parent.parent / model.parent / path.name).is_file():
+        raise InputError(
+            f"model {model.name!r} has parent {model.parent!r}, which is missing",
+            where=str(path),
+            remedy="restore the parent's folder, or remove the child's",
+        )
+    return model

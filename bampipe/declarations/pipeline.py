@@ -1,0 +1,120 @@
+"""Pipeline files: which stages run, with which settings, and which results are good enough."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, Field, PrivateAttr, StringConstraints, model_validator
+
+from bampipe.errors import choose_from
+from bampipe.schema import Declaration, Distinct, Number, Several, Text, fault
+from bampipe.stages import base
+
+
+def _known_stage(name: str) -> str:
+    if name not in base.STAGES:
+        raise fault(f"no stage {name!r}", remedy=choose_from(name, base.STAGES))
+    return name
+
+
+def _in_order(stages: tuple[str, ...]) -> tuple[str, ...]:
+    order = [base.STAGES.index(stage) for stage in stages]
+    if order != sorted(set(order)):
+        raise fault(
+            "stages must stand once each and in order",
+            remedy=f"the order is {', '.join(base.STAGES)}",
+        )
+    return stages
+
+
+StageName = Annotated[str, AfterValidator(_known_stage)]
+NumberPath = Annotated[
+    str,
+    StringConstraints(pattern=r"^[^*]*(\*[^*]*)?$"),
+    Field(description="a dotted path of a number; one * stands for every key at its place"),
+]
+
+
+class Gate(Declaration):
+    """A limit on one number of a result, or on that number for each axis."""
+
+    name: Text = Field(description="What the gate guards, a few words")
+    result: Annotated[
+        str,
+        StringConstraints(pattern=r"^[^/].*\.json$"),
+        Field(description="a JSON file in the run folder; {model} is the model that is judged"),
+    ]
+    value: NumberPath
+    divide_by: NumberPath = Field(
+        default="", description="a dotted path of a number that the value is divided by"
+    )
+    against: Literal["", "accepted"] = Field(
+        default="",
+        description="Judge the change since the accepted values instead, in percent, less two"
+        " standard deviations",
+    )
+    max: Number | None = Field(default=None, description="Largest value that passes")
+    min: Number | None = Field(default=None, description="Smallest value that passes")
+    level: Literal["fail", "warn"] = Field(
+        default="fail", description="fail: exit code 1; warn: said, but the run counts as good"
+    )
+    optional: bool = Field(default=False, description="A result that is not there passes")
+    advice: str = Field(default="", description="What to do where the gate does not pass")
+
+    @model_validator(mode="after")
+    def _limited(self) -> Gate:
+        if self.max is None and self.min is None:
+            raise fault("neither 'max' nor 'min'", remedy="give the limit")
+        return self
+
+
+class BaseModelTable(Declaration):
+    """The base model, where it differs from the bare device of the session."""
+
+    device: str = Field(
+        default="", description="Device of the base model; the session's where left out"
+    )
+    effects: Distinct[Text] = Field(
+        default=(), description="Effects of the base model, name[:target]"
+    )
+
+
+class Pipeline(Declaration):
+    """What ``bampipe run`` does."""
+
+    schema_: Literal["bampipe.pipeline/1"] = Field(alias="schema")
+    name: Annotated[str, StringConstraints(pattern="^[A-Za-z0-9_-]+$")]
+    summary: str = Field(default="", description="What the pipeline is for, in one sentence")
+    stages: Annotated[Several[StageName], AfterValidator(_in_order), Field(min_length=1)] = Field(
+        description="The stages, in order"
+    )
+    model: BaseModelTable = BaseModelTable()
+    settings: dict[StageName, dict[str, Any]] = Field(
+        {}, description="By stage: fields of its configuration, in place of the defaults"
+    )
+    gates: Several[Gate] = Field(default=(), description="Limits that the results are held against")
+    _where: str = PrivateAttr("")
+
+    @property
+    def where(self) -> str:
+        """The file, for messages."""
+        return self._where or f"pipeline {self.name}"
+
+    @property
+    def base_model(self) -> tuple[str, tuple[str, ...]]:
+        """Device and effects of the base model."""
+        return self.model.device, self.model.effects
+
+    def with_every_stage(self) -> Pipeline:
+        """Return the pipeline for single stages: its settings count, each stage may run."""
+        return self.model_copy(update={"stages": base.STAGES})
+
+    def content(self) -> dict[str, Any]:
+        """Return what ``run.json`` keeps of the pipeline."""
+        return {
+            "name": self.name,
+            "stages": list(self.stages),
+            "device": self.model.device,
+            "effects": list(self.model.effects),
+            "settings": {stage: dict(values) for stage, values in self.settings.items()},
+        }

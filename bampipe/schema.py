@@ -1,0 +1,276 @@
+"""One declaration of each file: a pydantic model, its faults in plain words, its JSON Schema."""
+
+from __future__ import annotations
+
+import ast
+import json
+import re
+from collections.abc import Iterable, Mapping
+from functools import cache
+from typing import Annotated, Any, TypeVar, get_args
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    GetCoreSchemaHandler,
+    PrivateAttr,
+    Strict,
+    StringConstraints,
+    ValidationError,
+)
+from pydantic.json_schema import GenerateJsonSchema
+from pydantic_core import PydanticCustomError, core_schema
+
+from bampipe.errors import InputError, did_you_mean
+
+
+class Declaration(BaseModel):
+    """A table of a file: unknown keys are refused, and nothing is converted but lists to tuples."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        frozen=True,
+        strict=True,
+        allow_inf_nan=False,
+        arbitrary_types_allowed=True,
+    )
+
+
+class NamedDeclaration(Declaration):
+    """A table among several of a kind, each called by its key."""
+
+    _name: str = PrivateAttr("")
+
+    @property
+    def name(self) -> str:
+        """The key of the table."""
+        return self._name
+
+
+D = TypeVar("D", bound=Declaration)
+T = TypeVar("T")
+
+
+def fault(what: str, at: str = "", remedy: str = "") -> PydanticCustomError:
+    """Return what a validator raises: the words of an `InputError`, and a key below its table."""
+    return PydanticCustomError("fault", "{what}", {"what": what, "at": at, "remedy": remedy})
+
+
+def _refuse_rounded(value: Any) -> Any:
+    if isinstance(value, int) and not isinstance(value, bool) and abs(value) > 2**53:
+        raise fault("found a whole number beyond 2^53")
+    return value
+
+
+def _refuse_twice(values: tuple[T, ...]) -> tuple[T, ...]:
+    if len(set(values)) < len(values):
+        raise fault(f"found {_shown(values)}, expected no entry twice")
+    return values
+
+
+Text = Annotated[str, StringConstraints(min_length=1)]
+Number = Annotated[float, BeforeValidator(_refuse_rounded)]
+Several = Annotated[tuple[T, ...], Strict(False)]
+Distinct = Annotated[
+    tuple[T, ...],
+    Strict(False),
+    AfterValidator(_refuse_twice),
+    Field(json_schema_extra={"uniqueItems": True}),
+]
+
+
+class ByName:
+    """Of ``Annotated[tuple[NamedDeclaration, ...], ByName(key)]``: a table of tables in the file.
+
+    Args:
+        key: type of the names.
+    """
+
+    def __init__(self, key: Any) -> None:
+        self.key = key
+
+    def __get_pydantic_core_schema__(
+        self, source: Any, handler: GetCoreSchemaHandler
+    ) -> core_schema.CoreSchema:
+        entry = get_args(source)[0]
+        table = handler.generate_schema(dict.__class_getitem__((self.key, entry)))
+        return core_schema.no_info_after_validator_function(_named, table)
+
+
+def _named(table: dict[str, NamedDeclaration]) -> tuple[NamedDeclaration, ...]:
+    for name, entry in table.items():
+        entry._name = name
+    return tuple(table.values())
+
+
+def read(kind: type[D], content: object, where: str) -> D:
+    """Check what was read from a file against its declaration.
+
+    Args:
+        kind: the declaration.
+        content: the parsed file.
+        where: the file, for messages.
+
+    Raises:
+        InputError: names the file, the field (dotted), what was found, what is expected, and
+            how many other fields are wrong.
+    """
+    try:
+        return kind.model_validate(content)
+    except ValidationError as error:
+        first, *others = _faults(error, kind, where)
+        more = f" (and {len(others)} more)" if others else ""
+        raise InputError(first.what + more, where=first.where, remedy=first.remedy) from None
+
+
+def faults(kind: type[Declaration], content: object, where: str) -> list[InputError]:
+    """Everything for which `read` refuses ``content``, one error a field; none where it fits."""
+    try:
+        kind.model_validate(content)
+    except ValidationError as error:
+        return _faults(error, kind, where)
+    return []
+
+
+class _Generator(GenerateJsonSchema):
+    """JSON Schema without a title for every field, which would repeat its name."""
+
+    def field_title_should_be_set(self, schema: Any) -> bool:
+        return False
+
+
+@cache
+def json_schema(kind: type[Declaration]) -> dict[str, Any]:
+    """The JSON Schema of a file."""
+    content = kind.model_json_schema(schema_generator=_Generator)
+    name = content["properties"].get("schema", {}).get("const")
+    head = {"$schema": GenerateJsonSchema.schema_dialect} | ({"$id": name} if name else {})
+    return head | content
+
+
+def json_schema_text(kind: type[Declaration]) -> str:
+    """The JSON Schema of a file as it stands in ``schemas/``: what fits into a line is one."""
+
+    def lines(value: Any, indent: str, used: int) -> str:
+        short = json.dumps(value, ensure_ascii=False)
+        if len(indent) + used + len(short) < 100 or not isinstance(value, dict | list):
+            return short
+        inner = indent + " "
+        if isinstance(value, list):
+            parts = [lines(item, inner, 1) for item in value]
+        else:
+            labels = [f"{json.dumps(key)}: " for key in value]
+            parts = [
+                label + lines(item, inner, len(label) + 1)
+                for label, item in zip(labels, value.values(), strict=True)
+            ]
+        joined = f",\n{inner}".join(parts)
+        return f"{short[0]}\n{inner}{joined}\n{indent}{short[-1]}"
+
+    return lines(json_schema(kind), "", 0) + "\n"
+
+
+def dotted(path: Iterable[str | int]) -> str:
+    """``encoders.yaw.unit`` or ``trials[2].kind``, for the keys and indices in ``path``."""
+    text = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in path)
+    return text.removeprefix(".")
+
+
+_EXPECTED = {
+    "string_type": "text",
+    "float_type": "a number",
+    "int_type": "a whole number",
+    "bool_type": "true or false",
+    "list_type": "a list",
+    "tuple_type": "a list",
+    "dict_type": "a table",
+    "model_type": "a table",
+    "finite_number": "a finite number",
+    "greater_than": "more than {gt:g}",
+    "greater_than_equal": "{ge:g} or more",
+    "less_than": "less than {lt:g}",
+    "less_than_equal": "{le:g} or less",
+    "string_too_short": "text that is not empty",
+    "string_too_long": "at most {max_length} characters",
+}
+
+
+def _faults(error: ValidationError, kind: type[Declaration], where: str) -> list[InputError]:
+    found = error.errors(include_url=False)
+    # A key that is not known often is a missing one misspelt: it comes first.
+    found.sort(key=lambda e: (len(e["loc"]) > 1, e["type"] != "extra_forbidden"))
+    return [_fault(e, json_schema(kind), where) for e in found]
+
+
+def _fault(error: Any, schema: Mapping[str, Any], where: str) -> InputError:
+    """One error of pydantic in plain words."""
+    path = [part for part in error["loc"] if not str(part).startswith("#")]
+    kind, given, more = error["type"], error["input"], error.get("ctx", {})
+    remedy = ""
+    if path and path[-1] == "[key]":
+        path = path[:-2]
+    if kind in ("missing", "extra_forbidden"):
+        *path, key = path
+        known = _node(schema, error["loc"][:-1]).get("properties", {})
+        if kind == "missing":
+            what, remedy = f"'{key}' is missing", known.get(key, {}).get("description", "")
+        else:
+            what = f"unknown key {_shown(key)}{did_you_mean(str(key), known)}"
+            remedy = "" if "did you mean" in what else f"known keys: {', '.join(known)}"
+    elif kind == "fault":
+        what, remedy = more["what"], more["remedy"]
+        path += [more["at"]] if more["at"] else []
+    elif kind == "literal_error":
+        choices = [ast.literal_eval(text) for text in re.findall(r"'[^']*'|\d+", more["expected"])]
+        what = f"found {_shown(given)}, expected {' or '.join(map(_shown, choices))}"
+        what += did_you_mean(given, choices) if isinstance(given, str) else ""
+    else:
+        node = _node(schema, error["loc"])
+        if kind == "string_pattern_mismatch":
+            expected = node.get("description", f"a name that matches {more['pattern']}")
+        elif kind == "too_short":
+            unit = "entry" if more["field_type"] == "Dictionary" else "in the list"
+            expected = f"at least {more['min_length']} {unit}"
+        else:
+            expected = _EXPECTED.get(kind, error["msg"]).format(**more)
+        what = f"found {_shown(given)}, expected {expected}"
+    place = dotted(path)
+    return InputError(what, where=f"{where}: {place}" if place else where, remedy=remedy)
+
+
+def _node(schema: Mapping[str, Any], path: Iterable[str | int]) -> Mapping[str, Any]:
+    """What ``schema`` says of the place ``path``; a part ``#Name`` chooses that definition."""
+    node = schema
+    for part in path:
+        if str(part).startswith("#"):
+            node = schema["$defs"][str(part)[1:]]
+        elif part == "[key]":
+            continue
+        elif isinstance(part, int):
+            node = node.get("items", {})
+        else:
+            others = node.get("additionalProperties") or {}
+            others = next(iter(node.get("patternProperties", {}).values()), others)
+            node = node.get("properties", {}).get(part, others)
+        node = node["anyOf"][0] if "$ref" not in node and "anyOf" in node else node
+        if "$ref" in node:
+            node = schema["$defs"][node["$ref"].rpartition("/")[2]] | {
+                key: value for key, value in node.items() if key != "$ref"
+            }
+    return node
+
+
+def _shown(value: object) -> str:
+    if isinstance(value, Mapping):
+        return "a table" if value else "an empty table"
+    if isinstance(value, tuple):
+        value = list(value)
+    try:
+        text = json.dumps(value, ensure_ascii=False)
+    except (TypeError, ValueError):  # a date, or a number of thousands of digits
+        text = str(value)[:60] if not isinstance(value, int) else "a huge number"
+    text = {"NaN": "nan", "Infinity": "inf", "-Infinity": "-inf"}.get(text, text)
+    return text if len(text) <= 60 else text[:57] + "..."
