@@ -68,16 +68,16 @@ def device_faults(declaration: Mapping[str, Any], where: str) -> tuple[str, list
     except InputError as error:
         return "", [str(error)]
     faults = [f"{where}: {line}" for line in check_device(device)]
-    if any("unknown symbol" in line for line in faults):
-        return "", faults
     try:
         Model(device, device.default_effects)
     except InputError as error:
         faults.append(str(InputError(error.what, where=f"{where}: default_effects")))
+    if faults:
+        return "", faults
     try:
-        return describe_equations(device), faults
+        return describe_equations(device), []
     except InputError as error:
-        return "", [*faults, _named(error, where)]
+        return "", [_named(error, where)]
 
 
 def effect_faults(

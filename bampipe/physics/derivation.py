@@ -18,7 +18,12 @@ from bampipe.physics.equations import Equations
 from bampipe.physics.lagrange import allow, check_inertia, lagrange
 from bampipe.physics.model import Model
 from bampipe.physics.roles import compensation, delays
+from bampipe.physics.time_limit import OutOfTime, time_limit
 from bampipe.physics.vocabulary import Vocabulary, constant_symbol
+
+LONGEST_S = 60.0
+"""Processor time that a derivation may take: the BAM takes 1 s, a planar arm with four links 23 s.
+Sympy's simplification has no bound of its own: 17 operations can take it an hour."""
 
 
 def derive(model: Model, named_constants: bool = False) -> Equations:
@@ -29,9 +34,21 @@ def derive(model: Model, named_constants: bool = False) -> Equations:
         named_constants: leave the device's constants as symbols, for people to read.
 
     Raises:
-        InputError: an expression uses a name that does not exist there, or the mass matrix is
-            singular everywhere.
+        InputError: an expression uses a name that does not exist there, the mass matrix is
+            singular everywhere, or the derivation takes more than `LONGEST_S`.
     """
+    try:
+        with time_limit(LONGEST_S):
+            return _derive(model, named_constants)
+    except OutOfTime:
+        raise InputError(
+            f"deriving the equations of motion takes more than {LONGEST_S:g} s",
+            where=f"device {model.device.name!r}",
+            remedy="use fewer or shorter expressions",
+        ) from None
+
+
+def _derive(model: Model, named_constants: bool) -> Equations:
     d = Vocabulary(model, named_constants)
     constants = [constant_symbol(c) for c in model.device.constants if named_constants]
     device, axes = model.device, d.axes
@@ -56,7 +73,8 @@ def derive(model: Model, named_constants: bool = False) -> Equations:
     potential = d.build(device.potential, d.base, "energy.potential")
     other = _device_torque(d, truth, w)
 
-    energies = [(kinetic, potential)]
+    label = f"device {device.name!r}: energy.kinetic"
+    energies = [(label, device.kinetic, kinetic, potential)]
     offset = [sp.S.Zero] * n
     z, z_names, rates, initial = [], [], [], []
     # An offset is differentiated twice. It cannot follow the rates, so what a motor's back EMF
@@ -77,10 +95,11 @@ def derive(model: Model, named_constants: bool = False) -> Equations:
             if item.effect.kind == "input":
                 continue
             value = d.own(item, tree, symbols, key)
+            label = f"effect {item.name!r}: {key}"
             if key == "kinetic":
-                energies.append((value, sp.S.Zero))
+                energies.append((label, tree, value, sp.S.Zero))
             elif key == "potential":
-                energies.append((sp.S.Zero, value))
+                energies.append((label, tree, sp.S.Zero, value))
             elif place not in axes:
                 raise InputError(f"effect {item.name!r}: {key}: device has no axis {place!r}")
             elif item.effect.kind == "torque":
@@ -99,7 +118,7 @@ def derive(model: Model, named_constants: bool = False) -> Equations:
     motion, memory = [*d.q, *d.qd], [*d.z.values()]
     gains = [entry for row in input_map for entry in row]
     words = "motion, inputs, parameters and internal states"
-    kinetics, potentials = zip(*energies, strict=True)
+    _, _, kinetics, potentials = zip(*energies, strict=True)
     allow("the kinetic energy", [*kinetics], [*motion, *free], "positions, rates and parameters")
     allow("the potential energy", [*potentials], [*d.q, *free], "positions and parameters")
     allow(
@@ -114,13 +133,18 @@ def derive(model: Model, named_constants: bool = False) -> Equations:
     allow("an initial value", initial, [*d.q, *u, *free], "positions, inputs and parameters")
     allow("an offset", offset, [*d.q, *force0, *free], "positions, forces and parameters")
 
-    terms = [lagrange(a, b, tuple(d.q), tuple(d.qd)) for a, b in energies]
+    terms = []
+    for label, tree, a, b in energies:
+        try:
+            terms.append(lagrange(a, b, tuple(d.q), tuple(d.qd)))
+        except OutOfTime:
+            raise d.too_long(tree, label) from None
     mass = [[sum(t[0][i][j] for t in terms) for j in range(n)] for i in range(n)]
     bias = [sum(t[1][i] for t in terms) for i in range(n)]
     for row, term in zip(mass, bias, strict=True):
         allow("the equation of motion", [*row, term], [*motion, *free], "motion and parameters")
     check_inertia(model, mass, [*d.q, *constants])
-    kinetic, potential = (sum(parts) for parts in zip(*energies, strict=True))
+    kinetic, potential = sum(kinetics), sum(potentials)
 
     offset_rate = [d.ddt(e) for e in offset]
     offset_acceleration = [d.ddt(e) for e in offset_rate]

@@ -21,6 +21,9 @@ MAX_NODES = 500
 MAX_EXPONENT = 12
 MAX_NUMBER = 1e30
 MAX_EXPANDED = 20_000
+"""Most parts of an expression once definitions are put in and rates are taken: 65 times the
+kinetic energy of the BAM, 18 times that of a planar arm with six links; equations derived from as
+many take seconds."""
 FUNCTIONS = {
     "sin": 1,
     "cos": 1,

@@ -13,6 +13,7 @@ from bampipe.physics import expression
 from bampipe.physics.device import INPUT_ORDERS, LAST_ORDER, derivative
 from bampipe.physics.effect import BoundEffect
 from bampipe.physics.model import Model
+from bampipe.physics.time_limit import OutOfTime
 
 Symbols = dict[str, Any]
 
@@ -67,20 +68,48 @@ class Vocabulary:
         self.base |= self.channel
         for name, tree in device.definitions.items():
             self.base[name] = self.build(tree, self.base, f"definitions.{name}")
-            self.sizes[name] = expression.expanded_size(tree, self.sizes)
+            size = expression.expanded_size(tree, self.sizes)
+            self.sizes[name] = max(size, int(sp.count_ops(self.base[name])))
 
     def build(self, tree: ast.expr, symbols: Mapping[str, Any], what: str) -> Any:
         return self.rebuild(tree, symbols, f"device {self.model.device.name!r}: {what}")
 
     def rebuild(self, tree: ast.expr, symbols: Mapping[str, Any], where: str) -> Any:
-        """`expression.build` of a tree that stays of bounded size with definitions put in."""
-        if expression.expanded_size(tree, self.sizes) > expression.MAX_EXPANDED:
+        """`expression.build` of a tree that stays of bounded size with definitions put in.
+
+        Raises:
+            InputError: it does not, or takes longer than the limit that the caller has set.
+        """
+        size = expression.expanded_size(tree, self.sizes)
+        if size <= expression.MAX_EXPANDED:
+            try:
+                value = expression.build(tree, symbols, where, self.special)
+                size = sp.count_ops(value)
+            except OutOfTime:
+                raise self.too_long(tree, where) from None
+        if size > expression.MAX_EXPANDED:
             raise InputError(
-                f"the expression has more than {expression.MAX_EXPANDED} parts once the "
-                "definitions are put in",
+                f"more than {expression.MAX_EXPANDED} operations once definitions are put in and "
+                "rates are taken",
                 where=where,
+                remedy=self._shorten(tree),
             )
-        return expression.build(tree, symbols, where, self.special)
+        return value
+
+    def too_long(self, tree: ast.expr, where: str) -> InputError:
+        """What to say where deriving equations from the expression ``tree`` exceeds its limit."""
+        return InputError(
+            "deriving the equations of motion takes too long: "
+            f"{expression.expanded_size(tree, self.sizes)} operations with definitions put in",
+            where=where,
+            remedy=self._shorten(tree),
+        )
+
+    def _shorten(self, tree: ast.expr) -> str:
+        used = [name for name in sorted(expression.names(tree)) if name in self.sizes]
+        longest = max(used, key=self.sizes.__getitem__, default="")
+        above = f", above all definition {longest!r}" if longest else ""
+        return f"shorten it{above}: fewer nested functions, lower powers"
 
     def sgn(self, argument: Any) -> Any:
         """Sign, smoothed over the axis' width where the argument is a coordinate's rate."""
