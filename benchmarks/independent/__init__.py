@@ -12,10 +12,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from independent import bam
+from independent import axis, bam, damper, joint
 from independent.sensors import Conditions
 
-MACHINES = {"bam": bam}
+MACHINES = {"bam": bam, "joint": joint, "axis": axis, "damper": damper}
 
 
 def record(

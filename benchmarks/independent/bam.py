@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 from scipy.signal import butter, lfilter, sosfiltfilt
 
-from independent.friction import MEMORY, blank_laws, push_along, remember, resist
+from independent.friction import MEMORY, blank_laws, push_along, remember, resist, set_law
 from independent.sensors import (
     GOOD,
     Conditions,
@@ -62,24 +62,23 @@ MACHINE = np.dtype(
 )  # fmt: skip
 
 LAWS = {
-    "stribeck": ({"stribeck": (1.0, 1.3, 2.6)}, {"stribeck_speed": (0.05, 0.05, 0.02)}),
-    "presliding": ({"dahl": (0.95, 1.5, 2.5)}, {"dahl_distance": (0.025, 0.025, 0.01)}),
-    "asymmetric_coulomb": ({"dry_difference": (0.3, 0.5, 0.9),
-                            "viscous_difference": (0.25, 0.3, 1.5)}, {}),
-    "quadratic_drag": ({"drag": (1.0, 1.2, 8.0)}, {}),
-    "position_dependent_friction": ({"ripple": (0.45, 0.6, 1.3)}, {"wavenumber": (18.0, 18.0, 60.0),
-                                    "ripple_phase": (0.6, 0.6, 0.6)}),
-    "load_dependent_friction": ({"load_share": (0.07, 0.09, 0.0), "side_share": (0.0, 0.0, 0.1)},
-                                {}),
-    "thermal_damping": ({"softening": (0.05, 0.06, 0.06)}, {"warming_time": (6.0, 6.0, 6.0)}),
-    "return_spring": ({"spring": (2.0, 2.5, 12.0)}, {"spring_rest": (0.15, 0.1, 1.05)}),
-    "detent": ({"detent": (1.2, 1.5, 3.0)}, {"detent_at": (0.15, 0.1, 1.12),
-               "detent_width": (0.05, 0.05, 0.02)}),
-    "one_sided_stop": ({"stop": (14.0, 20.0, 90.0)}, {"stop_at": (0.3, 0.2, 1.25)}),
-    "dead_zone_spring": ({"slack_spring": (8.0, 10.0, 0.0)}, {"slack": (0.3, 0.2, 0.0)}),
-    "winding_cable": ({"cable": (4.0, 5.0, 25.0)}, {"cable_time": (1.5, 1.5, 1.5)}),
+    "stribeck": {"stribeck": (1.0, 1.3, 2.6), "stribeck_speed": (0.05, 0.05, 0.02)},
+    "presliding": {"dahl": (0.7, 1.3, 2.2), "dahl_distance": (0.025, 0.025, 0.01)},
+    "asymmetric_coulomb": {"dry_difference": (0.3, 0.5, 0.9),
+                           "viscous_difference": (0.25, 0.3, 1.5)},
+    "quadratic_drag": {"drag": (1.0, 1.2, 8.0)},
+    "position_dependent_friction": {"ripple": (0.45, 0.6, 1.3), "wavenumber": (18.0, 18.0, 60.0),
+                                    "ripple_phase": (0.6, 0.6, 0.6)},
+    "load_dependent_friction": {"load_share": (0.07, 0.09, 0.0), "side_share": (0.0, 0.0, 0.1)},
+    "thermal_damping": {"softening": (0.05, 0.06, 0.06), "warming_time": (6.0, 6.0, 6.0)},
+    "return_spring": {"spring": (2.0, 2.5, 12.0), "spring_rest": (0.15, 0.1, 1.05)},
+    "detent": {"detent": (1.2, 1.5, 3.0), "detent_at": (0.15, 0.1, 1.12),
+               "detent_width": (0.05, 0.05, 0.02)},
+    "one_sided_stop": {"stop": (14.0, 20.0, 90.0), "stop_at": (0.3, 0.2, 1.25)},
+    "dead_zone_spring": {"slack_spring": (8.0, 10.0, 0.0), "slack": (0.3, 0.2, 1.0)},
+    "winding_cable": {"cable": (4.0, 5.0, 25.0), "cable_time": (1.5, 1.5, 1.5)},
 }  # fmt: skip
-"""Effects of one axis: laws that scale with the strength, and laws that shape them, by axis."""
+"""Effects of one axis: their laws, typical for yaw, pitch and extension."""
 
 OUTSIDE = (
     "detent", "one_sided_stop", "dead_zone_spring", "winding_cable", "friction_by_reach", "hum",
@@ -290,8 +289,6 @@ class _Specimen:
         self.laws["creep"] = creep * SIGN_WIDTHS
         self.laws["viscous"] = rng.uniform([3.2, 2.8, 10.5], [5.2, 4.6, 16.0])
         self.laws["coulomb"] = rng.uniform([0.85, 1.6, 2.8], [1.4, 2.6, 4.2])
-        self.laws["stop_at"] = np.inf
-        self.laws["slack"] = np.inf
         machine = np.zeros(1, MACHINE)
         machine["mass"] = rng.uniform(3.3, 3.8)
         machine["compensator_gain"], machine["compensator_lag"] = 1.0, STEP
@@ -316,15 +313,8 @@ class _Specimen:
         component = COMPONENTS.index(at[0]) if at and at[0] in COMPONENTS else -1
         m, laws = self.machine, self.laws
         if name in LAWS:
-            strengths, shapes = LAWS[name]
-            side = sign if name == "asymmetric_coulomb" else 1.0
-            for key, typical in strengths.items():
-                laws[key][axis] = side * size * typical[axis]
-            for key, typical in shapes.items():
-                laws[key][axis] = typical[axis] * rng.uniform(0.85, 1.15)
-            if name == "presliding":
-                laws["dahl"][axis] = min(laws["dahl"][axis], 0.95 * laws["coulomb"][axis])
-            self._expect_law(name, at, laws[axis])
+            typical = {key: values[axis] for key, values in LAWS[name].items()}
+            self.truth |= set_law(laws[axis], full, typical, size, rng)
         elif name == "backlash":
             m["gap"], m["contact"], m["loose_axis"] = 0.03 * size, 2e4, axis
         elif name == "inertia_mismatch":
@@ -365,27 +355,6 @@ class _Specimen:
             m["hum_torque"], m["hum_frequency"] = 0.6 * size, rng.uniform(2.0, 4.0)
         else:
             raise ValueError(f"the arm has no effect {full!r}")
-
-    def _expect_law(self, name: str, at: str, law: np.ndarray) -> None:
-        """What an identification of the right model finds, where it has the same meaning there."""
-        ripple = law["ripple"] * np.array(
-            [np.cos(law["ripple_phase"]), np.sin(law["ripple_phase"])]
-        )
-        values = {
-            "stribeck": {"force": law["stribeck"], "speed": law["stribeck_speed"]},
-            "presliding": {"force": law["dahl"], "distance": law["dahl_distance"]},
-            "asymmetric_coulomb": {"difference": law["dry_difference"],
-                                   "viscous_difference": law["viscous_difference"]},
-            "quadratic_drag": {"coefficient": law["drag"]},
-            "position_dependent_friction": {"sine": ripple[0], "cosine": ripple[1],
-                                            "wavenumber": law["wavenumber"]},
-            "load_dependent_friction": {"coefficient": law["load_share"],
-                                        "side_coefficient": law["side_share"]},
-            "return_spring": {"stiffness": law["spring"],
-                              "offset": law["spring"] * law["spring_rest"]},
-        }  # fmt: skip
-        for key, value in values.get(name, {}).items():
-            self.truth[f"{name}.{at}.{key}"] = value
 
     def read(self, rng: np.random.Generator, t: Any, q: Any, force: Any, c: Conditions) -> Any:
         """Counts (T, 3) and volts (T, 3) of a trial."""

@@ -6,6 +6,8 @@ dry friction stands still. Equations such as those of bampipe let it creep inste
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from numba import njit
 
@@ -39,6 +41,21 @@ _NEVER_ZERO = (
     "detent_width", "cable_time",
 )  # fmt: skip
 
+_SHAPES = {
+    "stribeck_speed", "dahl_distance", "wavenumber", "ripple_phase", "warming_time", "spring_rest",
+    "cogging_wavenumber", "cogging_phase", "detent_at", "detent_width", "stop_at", "slack",
+    "cable_time",
+}  # fmt: skip
+_SAME = {
+    "stribeck": {"stribeck": "force", "stribeck_speed": "speed"},
+    "presliding": {"dahl": "force", "dahl_distance": "distance"},
+    "asymmetric_coulomb": {"dry_difference": "difference",
+                           "viscous_difference": "viscous_difference"},
+    "quadratic_drag": {"drag": "coefficient"},
+    "load_dependent_friction": {"load_share": "coefficient", "side_share": "side_coefficient"},
+}  # fmt: skip
+"""Laws here, by the names of the parameters in bampipe that mean the same."""
+
 MEMORY = np.dtype([("dahl", np.float64), ("heat", np.float64), ("cable", np.float64)])
 """What an axis remembers: built-up friction (share), friction power (W), cable rest (position)."""
 
@@ -48,7 +65,42 @@ def blank_laws(axes: int) -> np.ndarray:
     laws = np.zeros(axes, AXIS)
     for name in _NEVER_ZERO:
         laws[name] = 1.0
+    laws["stop_at"] = laws["slack"] = np.inf
     return laws
+
+
+def set_law(
+    law: np.ndarray,
+    effect: str,
+    typical: Mapping[str, float],
+    size: float,
+    rng: np.random.Generator,
+) -> dict[str, float]:
+    """Switch on the laws of ``effect``, such as ``stribeck:yaw``, at ``size`` times ``typical``.
+
+    Shapes are drawn within 15 %. Returns what an identification of the right model must find, by
+    full name; nothing where bampipe writes the effect in other mathematics.
+    """
+    name, _, axis = effect.partition(":")
+    sign = rng.choice([-1.0, 1.0]) if name == "asymmetric_coulomb" else 1.0
+    for key, value in typical.items():
+        law[key] = value * (rng.uniform(0.85, 1.15) if key in _SHAPES else sign * size)
+    if name == "presliding":
+        law["dahl"] = min(law["dahl"], 0.95 * law["coulomb"])
+    of_wave = {
+        "position_dependent_friction": ("ripple", "ripple_phase", "wavenumber"),
+        "torque_ripple": ("cogging", "cogging_phase", "cogging_wavenumber"),
+    }
+    if name in of_wave:
+        height, phase, wavenumber = (law[key] for key in of_wave[name])
+        found = {"sine": height * np.cos(phase), "cosine": height * np.sin(phase)}
+        found["wavenumber"] = wavenumber
+    elif name == "return_spring":
+        found = {"stiffness": law["spring"], "offset": law["spring"] * law["spring_rest"]}
+    else:
+        same = _SAME.get(name, {})
+        found = {theirs: law[own] for own, theirs in same.items() if law[own] != 0.0}
+    return {f"{name}.{axis}.{key}": float(value) for key, value in found.items()}
 
 
 @njit(cache=True)

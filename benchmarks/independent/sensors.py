@@ -54,11 +54,19 @@ HARD = {
 
 
 def sample_steps(
-    rng: np.random.Generator, steps: int, per_sample: float, conditions: Conditions
+    rng: np.random.Generator,
+    steps: int,
+    per_sample: float,
+    conditions: Conditions,
+    jitter: float = 0.0,
 ) -> np.ndarray:
-    """Integration steps at which the logger samples: jittering, some lost; the first is 0."""
+    """Integration steps at which the logger samples: jittering, some lost; the first is 0.
+
+    ``jitter`` is that of the machine's logger on good days.
+    """
     at = np.arange(0.0, steps, per_sample)
-    at = at + per_sample * np.clip(conditions.jitter * rng.standard_normal(len(at)), -0.45, 0.45)
+    share = np.hypot(jitter, conditions.jitter)
+    at = at + per_sample * np.clip(share * rng.standard_normal(len(at)), -0.45, 0.45)
     at[0] = 0.0
     kept = rng.uniform(size=len(at)) >= conditions.dropped
     kept[0] = True

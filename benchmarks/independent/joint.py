@@ -1,0 +1,150 @@
+"""One rotary joint with gravity, driven by a motor current that is logged at about 94 Hz.
+
+The clock jitters and its stamps are rounded to a millisecond, the current is read in steps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from independent.sensors import (
+    GOOD,
+    Conditions,
+    read_force,
+    sample_steps,
+    tell_truth,
+    write_session,
+    write_trial,
+)
+from independent.single_axis import STEP, Specimen, draw_moves, draw_waves, move
+
+RATE_HZ, TORQUE_PER_AMPERE = 93.7, 10.0
+COUNT, CURRENT_STEP, NOISE = 5e-5, 2e-3, 0.015
+SIGN_WIDTH = 1e-3
+LAWS = {
+    "stribeck": {"stribeck": 3.0, "stribeck_speed": 0.06},
+    "presliding": {"dahl": 5.0, "dahl_distance": 0.01},
+    "asymmetric_coulomb": {"dry_difference": 1.2, "viscous_difference": 1.0},
+    "quadratic_drag": {"drag": 3.0},
+    "position_dependent_friction": {"ripple": 1.5, "wavenumber": 15.0, "ripple_phase": 0.6},
+    "load_dependent_friction": {"load_share": 0.08},
+    "thermal_damping": {"softening": 0.02, "warming_time": 8.0},
+    "return_spring": {"spring": 4.0, "spring_rest": 0.3},
+    "torque_ripple": {"cogging": 1.2, "cogging_wavenumber": 20.0, "cogging_phase": 0.6},
+    "detent": {"detent": 4.0, "detent_at": 0.3, "detent_width": 0.08},
+    "one_sided_stop": {"stop": 40.0, "stop_at": 0.6},
+    "winding_cable": {"cable": 12.0, "cable_time": 2.0},
+}
+MOTOR = {"actuator_delay": 0.02, "actuator_lag": 0.03, "drive_sag": 0.003}
+OUTSIDE = ("detent", "one_sided_stop", "winding_cable")
+EFFECTS = (
+    *(f"{name}:joint" for name in LAWS if name not in OUTSIDE),
+    "actuator_delay", "actuator_lag:current", "drive_sag:joint",
+)  # fmt: skip
+UNKNOWN = tuple(f"{name}:joint" for name in OUTSIDE)
+DEVICE = f"""schema = "bampipe.device/1"
+name = "joint"
+summary = "One joint of an arm, driven by a motor current"
+source = "a simulator"
+
+[coordinates.joint]
+kind = "rotary"
+symbol = "q"
+sign_width = {SIGN_WIDTH}
+
+[constants]
+torque_per_ampere = {{ value = {TORQUE_PER_AMPERE}, unit = "N.m/A", source = "data sheet" }}
+
+[energy]
+kinetic = "inertia*ddt(joint)**2/2"
+potential = "-moment*cos(joint) + moment_across*sin(joint)"
+
+[torque]
+joint = "-offset"
+
+[inputs]
+force = ["current"]
+force_unit = "A"
+drive = true
+
+[applied]
+joint = "torque_per_ampere*current"
+
+[friction.joint]
+viscous = {{ unit = "N.m.s/rad", prior = 5.0, sd = 10.0, lower = 0.0 }}
+coulomb = {{ unit = "N.m", prior = 5.0, sd = 10.0, lower = 0.0 }}
+
+[parameters]
+inertia = {{ unit = "kg.m2", prior = 2.0, sd = 3.0, lower = 0.05 }}
+moment = {{ unit = "N.m", prior = 20.0, sd = 20.0 }}
+moment_across = {{ unit = "N.m", prior = 0.0, sd = 20.0 }}
+offset = {{ unit = "N.m", prior = 0.0, sd = 5.0 }}
+"""
+
+
+def _draw_specimen(rng: np.random.Generator, effects: Mapping[str, float], creep: bool) -> Specimen:
+    mechanism = {
+        "inertia": rng.uniform(1.5, 3.0), "moment": rng.uniform(15.0, 35.0),
+        "moment_across": rng.uniform(-8.0, 8.0), "offset": rng.uniform(-0.5, 0.5),
+    }  # fmt: skip
+    control = {"position_gain": 12.0, "velocity_gain": 60.0, "feed_forward": 1.0,
+               "limit": 150.0, "hold": 0.002}  # fmt: skip
+    friction = {"viscous": rng.uniform(5.0, 12.0), "coulomb": rng.uniform(4.0, 8.0),
+                "creep": creep * SIGN_WIDTH}  # fmt: skip
+    specimen = Specimen("joint", mechanism | control, friction)
+    specimen.truth |= mechanism
+    specimen.hide(effects, LAWS, MOTOR, rng)
+    return specimen
+
+
+def record(
+    folder: Path, seed: int, effects: Mapping[str, float], conditions: Conditions | None = None
+) -> dict[str, Any]:
+    """Write a session of the joint; see ``independent.record``."""
+    c = conditions or GOOD
+    specimen = _draw_specimen(np.random.default_rng([seed, 0]), effects, c.creep)
+    rate_hz = c.rate_hz or RATE_HZ
+    steps = round((c.seconds or 15.0) / STEP)
+    trials = []
+    for number in range(c.trials or 5):
+        rng = np.random.default_rng([seed, 1 + number])
+        if number % 2:
+            goal, rate = draw_moves(rng, steps, 1.2, 1.8, 0.15)
+        else:
+            goal, rate = draw_waves(rng, steps, 1.2, 0.8)
+        at = sample_steps(rng, steps, 1.0 / (rate_hz * STEP), c, jitter=0.08)
+        # The stamps have whole milliseconds and are true to that.
+        at = np.unique(np.rint(at / 10).astype(np.int64) * 10)
+        at = at[at < steps]
+        motion = move(specimen.machine, specimen.law, goal, rate, np.zeros(steps), at)
+        t = at * STEP
+        current = read_force(rng, t, motion[:, 1:] / TORQUE_PER_AMPERE, NOISE, c)[:, 0]
+        step = COUNT * c.coarse
+        columns = {
+            "t": np.round(t, 3),
+            "q": np.floor(motion[:, 0] / step) * step,
+            "i": np.round(current / CURRENT_STEP) * CURRENT_STEP,
+        }
+        trials.append({"file": f"trials/t{number + 1:02d}.csv", "kind": "free"})
+        write_trial(folder / trials[-1]["file"], columns)
+    head = f"""device = "joint.toml"
+sample_rate_hz = {rate_hz!r}
+
+[time]
+column = "t"
+unit = "s"
+
+[encoders]
+joint = {{ column = "q", unit = "rad", resolution = {COUNT * c.coarse!r} }}
+
+[channels]
+current = {{ column = "i", unit = "A" }}
+"""
+    truth = tell_truth("joint", seed, effects, OUTSIDE, specimen.truth, c)
+    write_session(folder, head, trials, truth)
+    (folder / "joint.toml").write_text(DEVICE, encoding="utf-8")
+    return truth

@@ -1,0 +1,164 @@
+"""One axis moved by a motor under position and velocity loops: a joint with gravity, or a carriage.
+
+The controller sets its command every 2 ms (joint) or 1 ms (carriage) and holds it. A part of what
+moves may hang behind an elastic coupling; the motor may be late, slow or weak.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from independent.friction import MEMORY, blank_laws, push_along, remember, resist, set_law
+
+STEP = 1e-4
+MACHINE = np.dtype(
+    [
+        (name, np.float64)
+        for name in (
+            "inertia", "moment", "moment_across", "offset",          # of the mechanism
+            "load_inertia", "load_frequency", "load_damping",        # of what hangs behind it
+            "delay", "lag", "sag",                                   # of the motor
+            "position_gain", "velocity_gain", "feed_forward", "limit", "hold",  # of the controller
+        )
+    ]
+)  # fmt: skip
+
+MOTOR = {
+    "actuator_delay": ("delay", "delay"),
+    "actuator_lag": ("lag", "time_constant"),
+    "drive_sag": ("sag", "sag"),
+}
+"""Effects of the motor: the field here and the parameter in bampipe."""
+
+
+@njit(cache=True)
+def move(m, law, goal, goal_rate, kick, log_at):
+    """Integrate one record; returns position and motor force command at the samples, (n, 2).
+
+    ``kick`` (steps,) is added to the command after the controller, and is logged with it.
+    """
+    h = STEP
+    memory = np.zeros(1, MEMORY)[0]
+    q, v = goal[0], 0.0
+    memory.cable = q
+    load_q, load_v = q, 0.0
+    command, delivered = 0.0, 0.0
+    hold, late = round(m.hold / h), round(m.delay / h)
+    queue = np.zeros(late + 1)
+    out = np.zeros((len(log_at), 2))
+    k_log = 0
+    for k in range(len(goal)):
+        if k % hold == 0:
+            command = m.velocity_gain * (
+                m.position_gain * (goal[k] - q) + m.feed_forward * goal_rate[k] - v
+            )
+            command += m.moment * np.sin(goal[k]) + m.moment_across * np.cos(goal[k])
+            command = min(max(command, -m.limit), m.limit)
+        asked = command + kick[k]
+        if k_log < len(log_at) and log_at[k_log] == k:
+            out[k_log, 0], out[k_log, 1] = q, asked
+            k_log += 1
+        queue[k % (late + 1)] = asked
+        acting = queue[(k + 1) % (late + 1)]
+        if m.lag > 0.0:
+            # The mean over the step of what a first-order lag delivers.
+            decay = np.exp(-h / m.lag)
+            new = acting + (delivered - acting) * decay
+            acting, delivered = 0.5 * (delivered + new), new
+        acting /= 1.0 + m.sag * abs(acting)
+        half = q + 0.5 * h * v
+        push = acting - m.offset + push_along(law, half, memory)
+        push -= m.moment * np.sin(half) + m.moment_across * np.cos(half)
+        own = m.inertia - m.load_inertia
+        if m.load_inertia > 0.0:
+            stretch = load_q + 0.5 * h * load_v - half
+            pull = m.load_inertia * (
+                m.load_frequency**2 * stretch
+                + 2.0 * m.load_damping * m.load_frequency * (load_v - v)
+            )
+            push += pull
+            load_q += 0.5 * h * load_v
+            load_v -= h * pull / m.load_inertia
+            load_q += 0.5 * h * load_v
+        free = v + h * push / own
+        impulse = resist(law, memory, free, v, h, own, half, acting, 0.0, 0.0)
+        v = free + impulse / own
+        remember(law, memory, half, v, h)
+        q = half + 0.5 * h * v
+    return out
+
+
+class Specimen:
+    """One axis with its hidden effects.
+
+    Attributes:
+        machine: record of dtype MACHINE; law: of dtype ``friction.AXIS``.
+        truth: what an identification of the right model must find.
+    """
+
+    def __init__(self, axis: str, values: Mapping[str, float], friction: Mapping[str, float]):
+        self.axis = axis
+        self.machine = np.zeros(1, MACHINE)[0]
+        for name, value in values.items():
+            self.machine[name] = value
+        self.law = blank_laws(1)[0]
+        for name, value in friction.items():
+            self.law[name] = value
+        self.truth = {f"{name}.{axis}": friction[name] for name in ("viscous", "coulomb")}
+
+    def hide(
+        self,
+        effects: Mapping[str, float],
+        laws: Mapping[str, Mapping[str, float]],
+        motor: Mapping[str, float],
+        rng: np.random.Generator,
+    ) -> None:
+        """Hide ``effects``; ``laws`` and ``motor`` hold the typical values of all it can have."""
+        for full, strength in effects.items():
+            name, _, at = full.partition(":")
+            size = strength * rng.uniform(0.85, 1.15)
+            if name in laws and at == self.axis:
+                self.truth |= set_law(self.law, full, laws[name], size, rng)
+            elif name in motor:
+                field, theirs = MOTOR[name]
+                self.machine[field] = size * motor[name]
+                self.truth[f"{full.replace(':', '.')}.{theirs}"] = float(self.machine[field])
+            elif name == "flexible_load":
+                # Part of the inertia that the device states hangs behind the coupling.
+                self.machine["load_inertia"] = min(0.25 * size, 0.6) * self.machine["inertia"]
+                self.machine["load_frequency"] = 75.0 * rng.uniform(0.85, 1.15)
+                self.machine["load_damping"] = 0.04
+            else:
+                raise ValueError(f"the machine has no effect {full!r}")
+
+
+def draw_moves(
+    rng: np.random.Generator, steps: int, reach: float, speed: float, pause: float
+) -> tuple[Any, Any]:
+    """Moves between random places, (steps,), and their rate: minimum jerk, rests of ``pause`` s."""
+    goal, at, k = np.zeros(steps), 0.0, round(0.2 / STEP)
+    while k < steps:
+        to = rng.uniform(-reach, reach)
+        length = max(round(1.9 * abs(to - at) / (speed * rng.uniform(0.2, 1.0)) / STEP), 800)
+        s = np.linspace(0.0, 1.0, length)[: steps - k]
+        goal[k : k + length] = at + (to - at) * s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
+        goal[k + length :] = to
+        at, k = to, k + length + round(rng.uniform(0.0, 2.0 * pause) / STEP)
+    return goal, np.gradient(goal, STEP)
+
+
+def draw_waves(
+    rng: np.random.Generator, steps: int, reach: float, highest_hz: float
+) -> tuple[Any, Any]:
+    """Five sines within ``reach``, slow ones larger, fading in over 1.5 s; and their rate."""
+    t = np.arange(steps) * STEP
+    goal = np.zeros(steps)
+    for w in 2 * np.pi * rng.uniform(0.06, highest_hz, 5):
+        goal += np.sin(w * t + rng.uniform(0.0, 6.0)) / (0.3 + w / 3.0)
+    goal *= reach * rng.uniform(0.7, 1.0) / np.abs(goal).max()
+    goal = (goal - goal[0]) * np.minimum(t / 1.5, 1.0) ** 2
+    return goal, np.gradient(goal, STEP)
