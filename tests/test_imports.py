@@ -50,6 +50,7 @@ LAWS = {
         "bampipe.physics",
         "bampipe.estimate",
         "bampipe.trials",
+        "bampipe.workers",
     },
     "data": {
         "numpy",
@@ -179,6 +180,7 @@ LAWS = {
         "bampipe.data",
         "bampipe.declarations",
         "bampipe.stages.base",
+        "bampipe.workers",
     },
     "lab": {
         "bampipe.progress",

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError
 from bampipe.run import models, record
-from bampipe.run.events import Event, Listener
+from bampipe.run.events import Listener
 from bampipe.run.request import Request
 from bampipe.run.runner import run_session
 from bampipe.stages import base
@@ -43,8 +43,7 @@ class Options:
 
     def lock(self) -> AbstractContextManager[None]:
         """Hold the run folder, as a run does; not while one of :meth:`run` is under way."""
-        event = Event(self.root.name, "", "waiting")
-        return record.lock(self.root, self.wait, lambda: self.listen(event))
+        return record.lock(self.root, self.wait, self.listen)
 
     def run(self, first: str, last: str, model: str) -> None:
         """Run the stages from ``first`` to ``last`` on ``model``."""

@@ -1,5 +1,5 @@
 """The command line: parses, calls, prints."""
 
-from bampipe.cli.app import main
+from bampipe.cli.entry import main
 
 __all__ = ["main"]

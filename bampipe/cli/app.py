@@ -1,9 +1,7 @@
-"""The program: its commands, in the order in which help lists them, and its entry point."""
+"""The program: its commands, in the order in which help lists them."""
 
 from __future__ import annotations
 
-import os
-import sys
 from collections.abc import Callable
 from typing import Annotated
 
@@ -104,16 +102,3 @@ COMMANDS: dict[str, Callable[..., None]] = {
 for _name, _command in COMMANDS.items():
     app.command(_name)(_command)
 app.add_typer(device.app, name="device")
-
-
-def main() -> None:
-    """Entry point: a user's mistake is one line on standard error and exit code 2."""
-    try:
-        app()
-    except InputError as error:
-        show.note(f"bampipe: error: {error}")
-        sys.exit(2)
-    except BrokenPipeError:
-        # Whoever read our output has closed it (`bampipe effects | head`): leave without noise.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(141)

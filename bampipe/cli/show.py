@@ -278,7 +278,10 @@ class Watcher:
             return
         name = f"{event.run}: {event.step}" if self.several else event.step
         if event.kind == "waiting":
-            note(f"bampipe: another run holds {event.run}; waiting for it")
+            holder = event.message or "another run"
+            note(f"bampipe: {holder} is at work in {event.run}; waiting for it")
+        elif event.kind == "taken over":
+            note(f"bampipe: {event.message} was killed in {event.run}; going on from there")
         elif self.bars is None:
             if event.kind == "start":
                 note(f"{name} ({event.message})" if event.message else name)

@@ -7,7 +7,6 @@ the model again and scores the same candidates. Replicates run in worker process
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
@@ -24,6 +23,7 @@ from bampipe.physics import Model, System, compile_model
 from bampipe.physics.registry import device_from, effect_from
 from bampipe.trials.observation import Motion, Sensors, observe
 from bampipe.trials.replay import replay
+from bampipe.workers import process_pool
 
 Array = NDArray[np.float64]
 
@@ -221,5 +221,5 @@ def workers(session: Session, jobs: int) -> Iterator[Pool]:
     if jobs <= 1:
         yield lambda function, tasks: map(function, tasks)
         return
-    with ProcessPoolExecutor(jobs, initializer=_enter, initargs=(session,)) as pool:
+    with process_pool(jobs, _enter, session) as pool:
         yield lambda function, tasks: pool.map(function, tasks)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import fcntl
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -16,6 +15,7 @@ from bampipe.files import atomic_writer, write_json, write_text
 from bampipe.lab import rows, trends
 from bampipe.lab.place import FILE, LOCK, is_foreign, run_folders
 from bampipe.progress import Progress, silent
+from bampipe.run.lock import hold
 
 SCHEMA = "bampipe.lab/1"
 TRENDS = "trends.json"
@@ -115,11 +115,10 @@ def _report(folder: Path) -> None:
 @contextmanager
 def _alone(folder: Path) -> Iterator[None]:
     """Hold the lab's folder: two collections at once take turns."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        handle = (folder / LOCK).open("a")
-    except OSError as error:
-        raise InputError(f"cannot be written: {error.strerror}", where=str(folder)) from error
-    with handle:
-        fcntl.flock(handle, fcntl.LOCK_EX)
+    with ExitStack() as stack:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            stack.enter_context(hold(folder / LOCK))
+        except OSError as error:
+            raise InputError(f"cannot be written: {error.strerror}", where=str(folder)) from error
         yield

@@ -15,6 +15,7 @@ from bampipe.run.events import Event, Listener
 from bampipe.run.publish import publish
 from bampipe.run.request import Outcome, Request
 from bampipe.run.runner import run_session
+from bampipe.workers import end_with_parent
 
 THREAD_VARIABLES = (
     "OMP_NUM_THREADS",
@@ -52,7 +53,7 @@ def run_and_publish(request: Request, listen: Listener) -> Outcome:
     """
     outcome = run_session(request, listen)
     if request.publish:
-        with record.lock(request.root, request.wait, lambda: None):
+        with record.lock(request.root, request.wait, listen):
             publish(request.root, request.publish)
     return outcome
 
@@ -74,6 +75,8 @@ def guarded(request: Request, listen: Listener) -> Outcome:
 
 
 def _work(pipe: multiprocessing.connection.Connection) -> None:
+    end_with_parent()
+
     def listen(event: Event) -> None:
         pipe.send(event)
 

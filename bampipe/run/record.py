@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import contextlib
-import errno
-import fcntl
 import json
 import os
-import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from bampipe.errors import InputError
 from bampipe.files import STORAGE_FAULTS, digest_file, json_text
+from bampipe.run.events import Event, Listener, unheard
+from bampipe.run.lock import hold
 
 SCHEMA = "bampipe.run/1"
 FILE = "run.json"
@@ -145,22 +144,25 @@ def write(root: Path, content: dict[str, Any]) -> None:
 
 
 @contextlib.contextmanager
-def lock(root: Path, wait: bool, waiting: Callable[[], None]) -> Iterator[None]:
+def lock(root: Path, wait: bool, listen: Listener = unheard) -> Iterator[None]:
     """Hold the run folder ``root`` alone; what the disk refuses meanwhile is a user's matter.
 
     Args:
         root: the run folder; made if it is not there.
         wait: wait while another process holds it; else refuse.
-        waiting: called once before waiting.
+        listen: told before waiting, and where the last holder was killed.
 
     Raises:
         InputError: another process holds it and ``wait`` is false; or the disk is full, read-only
             or the like.
     """
+
+    def tell(kind: str) -> Callable[[str], None]:
+        return lambda holder: listen(Event(root.name, "", kind, message=holder))
+
     try:
         _make(root / PRIVATE)
-        with (root / PRIVATE / "lock").open("a") as handle:
-            _hold(handle, root, wait, waiting)
+        with hold(root / PRIVATE / "lock", wait, tell("waiting"), tell("taken over")):
             yield
     except OSError as error:
         if error.errno not in STORAGE_FAULTS:
@@ -177,26 +179,3 @@ def _make(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except FileNotFoundError as error:
         raise InputError("no folder can be made here", where=str(folder.parent)) from error
-
-
-def _hold(handle: IO[str], root: Path, wait: bool, waiting: Callable[[], None]) -> None:
-    """Take the lock that ``handle`` stands for; closing it, or dying, gives it back."""
-    told = False
-    while True:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            if error.errno not in (errno.EWOULDBLOCK, errno.EACCES):
-                raise
-        else:
-            return
-        if not wait:
-            raise InputError(
-                "another bampipe is at work in this run folder",
-                where=str(root),
-                remedy="wait until it is done, or leave out --no-wait",
-            )
-        if not told:
-            waiting()
-            told = True
-        time.sleep(0.1)

@@ -135,8 +135,7 @@ def run_session(request: Request, listen: Listener = unheard) -> Outcome:
     """
     selected(request)
     fresh = not request.root.exists()
-    event = Event(request.root.name, "", "waiting")
-    with record.lock(request.root, request.wait, lambda: listen(event)):
+    with record.lock(request.root, request.wait, listen):
         runner = _Runner(request, listen)
         staging.recover(runner.state)
         try:

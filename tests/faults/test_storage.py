@@ -209,7 +209,7 @@ def test_extending_respects_the_lock(toy: Toy) -> None:
     options = loop.Options(toy.root, toy.request().pipeline, False, False, events.append)
     before = toy.files()
     with (
-        record.lock(toy.root, False, lambda: None),
+        record.lock(toy.root, False),
         pytest.raises(InputError, match="another bampipe is at work"),
     ):
         loop.extend(options, "base", "stribeck:yaw")

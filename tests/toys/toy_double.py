@@ -1,16 +1,18 @@
-"""Toy: doubles the numbers, slowly where the test asks for it."""
+"""Toy: doubles the numbers, slowly or in worker processes where the test asks for it."""
 
 from __future__ import annotations
 
 import os
 import time
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.files import write_json
 from bampipe.progress import Progress
 from bampipe.stages.toy_read import log
+from bampipe.workers import process_pool
 
 NAME = "toy_double"
 SUMMARY = "Double the numbers"
@@ -32,10 +34,23 @@ def outputs(config: Config) -> tuple[str, ...]:
     return ("toy/double.json", "toy/parts/*.json")
 
 
+def multiply(factor: float, number: float) -> float:
+    time.sleep(float(os.environ.get("TOY_PAUSE", "0")))
+    return factor * number
+
+
+def multiply_all(numbers: list[float], factor: float) -> list[float]:
+    jobs = int(os.environ.get("TOY_JOBS", "0"))
+    if not jobs:
+        return [factor * number for number in numbers]
+    with process_pool(jobs, os.getpid) as pool:
+        return list(pool.map(partial(multiply, factor), numbers))
+
+
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
     log(NAME)
     numbers = run.read_json("toy/numbers.json")["numbers"]
-    doubled = [config.factor * number for number in numbers]
+    doubled = multiply_all(numbers, config.factor)
     for index, value in enumerate(doubled):
         write_json(out / f"toy/parts/{index}.json", {"value": value})
         progress(index / len(doubled), f"number {index}")

@@ -1,0 +1,160 @@
+"""Commands that are killed or stopped while their worker processes run: no orphan, no lock left."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import psutil
+import pytest
+from conftest import TOYS, Toy
+
+from bampipe.errors import InputError
+from bampipe.run import record
+from bampipe.run.events import Event
+from bampipe.workers import process_pool
+
+
+def wait_for(condition: Callable[[], object], seconds: float = 20.0) -> None:
+    """Wait until ``condition`` holds."""
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "nothing happened"
+        time.sleep(0.02)
+
+
+def start(toy: Toy, *more: str, pause: float, jobs: int) -> subprocess.Popen[str]:
+    """Start a run of the toys whose doubling takes ``pause`` s a number, in ``jobs`` processes."""
+    toys = ["--pipeline", str(toy.pipeline_file), "--runs", str(toy.runs)]
+    return subprocess.Popen(
+        [sys.executable, str(TOYS / "toy_bampipe.py"), "run", *more, *toys],
+        env={**os.environ, "TOY_PAUSE": str(pause), "TOY_JOBS": str(jobs)},
+        cwd=toy.folder,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def descendants(process: subprocess.Popen[str]) -> list[psutil.Process]:
+    return psutil.Process(process.pid).children(recursive=True)
+
+
+def ended(processes: list[psutil.Process], seconds: float = 3.0) -> bool:
+    return not psutil.wait_procs(processes, timeout=seconds)[1]
+
+
+SIGNALS = [signal.SIGKILL, signal.SIGTERM, signal.SIGINT]
+
+
+@pytest.mark.parametrize("number", SIGNALS, ids=lambda number: number.name)
+def test_workers_and_lock_go_with_the_command(toy: Toy, number: signal.Signals) -> None:
+    toy.run()
+    good = toy.files()
+    process = start(toy, str(toy.session), "--force", pause=60.0, jobs=2)
+    wait_for(lambda: len(descendants(process)) == 2)
+    workers = descendants(process)
+    began = time.monotonic()
+    process.send_signal(number)
+    _, said = process.communicate(timeout=10.0)
+    assert ended(workers)
+    assert time.monotonic() - began < 5.0
+    events: list[Event] = []
+    with record.lock(toy.root, False, events.append):
+        pass
+    if number is signal.SIGKILL:
+        assert process.returncode == -number
+        assert [(event.kind, event.message) for event in events] == [
+            ("taken over", f"process {process.pid} on {os.uname().nodename}")
+        ]
+    else:
+        assert process.returncode == 128 + number, said
+        assert "stopped" in said.splitlines()[-1] and "Traceback" not in said
+        assert events == []
+    assert toy.files() == good
+    toy.run(force=True)
+    assert toy.files() == good
+
+
+@pytest.mark.parametrize("number", SIGNALS, ids=lambda number: number.name)
+def test_workers_of_workers_go_too(toy: Toy, number: signal.Signals) -> None:
+    """Several sessions at once: each in a process of its own, which has workers in its turn."""
+    import install_toys
+
+    sessions = [install_toys.make_session(toy.folder / "many" / name) for name in "ab"]
+    process = start(toy, *map(str, sessions), "--jobs", "2", pause=60.0, jobs=2)
+
+    def doubling() -> bool:
+        nested = [one for one in descendants(process) if one.parent().pid != process.pid]
+        return len(nested) == 4
+
+    wait_for(doubling)
+    workers = descendants(process)
+    process.send_signal(number)
+    process.communicate(timeout=10.0)
+    assert ended(workers)
+    for session in sessions:
+        with record.lock(toy.runs / session.name, False):
+            pass
+
+
+def test_the_next_command_says_that_it_takes_over(toy: Toy) -> None:
+    process = start(toy, str(toy.session), pause=60.0, jobs=1)
+    wait_for(lambda: len(descendants(process)) == 1)
+    process.kill()
+    process.communicate()
+    again = start(toy, str(toy.session), "--no-wait", pause=0.0, jobs=1)
+    _, said = again.communicate(timeout=30.0)
+    assert again.returncode == 0
+    assert f"bampipe: process {process.pid} on " in said and " was killed in first" in said
+
+
+def double(number: int) -> int:
+    if number < 0:
+        os.kill(os.getpid(), signal.SIGKILL)
+    if number == 13:
+        raise ValueError("an unlucky number")
+    return 2 * number
+
+
+def test_results_come_in_order_from_maps_side_by_side() -> None:
+    with process_pool(3, os.getpid) as pool:
+        first, second = pool.map(double, range(5)), pool.map(double, range(20, 25))
+        pairs = list(zip(first, second, strict=True))
+    assert pairs == [(2 * k, 40 + 2 * k) for k in range(5)]
+
+
+def test_a_worker_that_is_killed_is_one_line() -> None:
+    with (
+        pytest.raises(InputError, match=r"a worker process was ended \(exit code -9\)"),
+        process_pool(2, os.getpid) as pool,
+    ):
+        list(pool.map(double, [1, 2, -1, 3]))
+
+
+def test_an_error_in_a_worker_says_where_it_was() -> None:
+    with pytest.raises(ValueError, match="unlucky") as caught, process_pool(2, os.getpid) as pool:
+        list(pool.map(double, [1, 13]))
+    assert "in double" in caught.value.__notes__[0]
+
+
+@pytest.mark.parametrize("kind", ["folder", "fifo", "link", "device"])
+def test_a_lock_that_is_no_file_is_refused(toy: Toy, kind: str) -> None:
+    toy.run()
+    good = toy.files()
+    path = toy.root / ".bampipe" / "lock"
+    path.unlink()
+    if kind == "folder":
+        path.mkdir()
+    elif kind == "fifo":
+        os.mkfifo(path)
+    else:
+        path.symlink_to("/dev/zero" if kind == "device" else Path("..", "..", "elsewhere"))
+    with pytest.raises(InputError, match="lock"):
+        toy.run()
+    assert toy.files() == good and not (toy.runs / "elsewhere").exists()
