@@ -33,7 +33,12 @@ def start(toy: Toy, *more: str, pause: float, jobs: int) -> subprocess.Popen[str
     toys = ["--pipeline", str(toy.pipeline_file), "--runs", str(toy.runs)]
     return subprocess.Popen(
         [sys.executable, str(TOYS / "toy_bampipe.py"), "run", *more, *toys],
-        env={**os.environ, "TOY_PAUSE": str(pause), "TOY_JOBS": str(jobs)},
+        env={
+            **os.environ,
+            "TOY_PAUSE": str(pause),
+            "TOY_JOBS": str(jobs),
+            "TOY_WORKERS": str(toy.folder / "workers"),
+        },
         cwd=toy.folder,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -41,8 +46,13 @@ def start(toy: Toy, *more: str, pause: float, jobs: int) -> subprocess.Popen[str
     )
 
 
-def descendants(process: subprocess.Popen[str]) -> list[psutil.Process]:
-    return psutil.Process(process.pid).children(recursive=True)
+def workers_of(toy: Toy, process: subprocess.Popen[str], number: int) -> list[psutil.Process]:
+    """Wait for ``number`` busy workers; returns every process below ``process``."""
+    folder = toy.folder / "workers"
+    wait_for(lambda: folder.is_dir() and len(list(folder.iterdir())) == number)
+    found = psutil.Process(process.pid).children(recursive=True)
+    assert {int(path.name) for path in folder.iterdir()} <= {one.pid for one in found}
+    return found
 
 
 def ended(processes: list[psutil.Process], seconds: float = 3.0) -> bool:
@@ -57,8 +67,7 @@ def test_workers_and_lock_go_with_the_command(toy: Toy, number: signal.Signals) 
     toy.run()
     good = toy.files()
     process = start(toy, str(toy.session), "--force", pause=60.0, jobs=2)
-    wait_for(lambda: len(descendants(process)) == 2)
-    workers = descendants(process)
+    workers = workers_of(toy, process, 2)
     began = time.monotonic()
     process.send_signal(number)
     _, said = process.communicate(timeout=10.0)
@@ -88,13 +97,7 @@ def test_workers_of_workers_go_too(toy: Toy, number: signal.Signals) -> None:
 
     sessions = [install_toys.make_session(toy.folder / "many" / name) for name in "ab"]
     process = start(toy, *map(str, sessions), "--jobs", "2", pause=60.0, jobs=2)
-
-    def doubling() -> bool:
-        nested = [one for one in descendants(process) if one.parent().pid != process.pid]
-        return len(nested) == 4
-
-    wait_for(doubling)
-    workers = descendants(process)
+    workers = workers_of(toy, process, 4)
     process.send_signal(number)
     process.communicate(timeout=10.0)
     assert ended(workers)
@@ -105,7 +108,7 @@ def test_workers_of_workers_go_too(toy: Toy, number: signal.Signals) -> None:
 
 def test_the_next_command_says_that_it_takes_over(toy: Toy) -> None:
     process = start(toy, str(toy.session), pause=60.0, jobs=1)
-    wait_for(lambda: len(descendants(process)) == 1)
+    workers_of(toy, process, 1)
     process.kill()
     process.communicate()
     again = start(toy, str(toy.session), "--no-wait", pause=0.0, jobs=1)

@@ -35,6 +35,10 @@ def outputs(config: Config) -> tuple[str, ...]:
 
 
 def multiply(factor: float, number: float) -> float:
+    """Note the process in a folder, wait, and multiply."""
+    folder = Path(os.environ["TOY_WORKERS"])
+    folder.mkdir(exist_ok=True)
+    (folder / str(os.getpid())).touch()
     time.sleep(float(os.environ.get("TOY_PAUSE", "0")))
     return factor * number
 
