@@ -5,6 +5,18 @@ from pathlib import Path
 from bampipe.declarations.accepted import Accepted
 from bampipe.declarations.model import ModelFile
 from bampipe.declarations.pipeline import Pipeline
+from bampipe.results.compare import CompareResult
+from bampipe.results.diagnose import DiagnoseResult
+from bampipe.results.filter import FilterResult
+from bampipe.results.identify import IdentifyResult
+from bampipe.results.ingest import IngestResult
+from bampipe.results.lab import LabResult, TrendsResult
+from bampipe.results.performance import PerformanceResult
+from bampipe.results.run import RunResult
+from bampipe.results.stiffness import StiffnessResult
+from bampipe.results.truth import TruthResult
+from bampipe.results.validate import ValidateResult
+from bampipe.results.viscous import ViscousResult
 from bampipe.schema import Declaration, json_schema_text
 
 FOLDER = Path(__file__).parent.parent / "schemas"
@@ -12,6 +24,19 @@ FILES: dict[str, type[Declaration]] = {
     "accepted": Accepted,
     "model": ModelFile,
     "pipeline": Pipeline,
+    "compare": CompareResult,
+    "diagnose": DiagnoseResult,
+    "filter": FilterResult,
+    "identify": IdentifyResult,
+    "ingest": IngestResult,
+    "lab": LabResult,
+    "performance": PerformanceResult,
+    "run": RunResult,
+    "stiffness": StiffnessResult,
+    "trends": TrendsResult,
+    "truth": TruthResult,
+    "validate": ValidateResult,
+    "viscous": ViscousResult,
 }
 
 

@@ -121,9 +121,14 @@ def read(kind: type[D], content: object, where: str) -> D:
     try:
         return kind.model_validate(content)
     except ValidationError as error:
-        first, *others = _faults(error, kind, where)
-        more = f" (and {len(others)} more)" if others else ""
-        raise InputError(first.what + more, where=first.where, remedy=first.remedy) from None
+        raise refusal(error, kind, where) from None
+
+
+def refusal(error: ValidationError, kind: type[Declaration], where: str) -> InputError:
+    """What `read` raises for an ``error`` of pydantic."""
+    first, *others = _faults(error, kind, where)
+    more = f" (and {len(others)} more)" if others else ""
+    return InputError(first.what + more, where=first.where, remedy=first.remedy)
 
 
 def faults(kind: type[Declaration], content: object, where: str) -> list[InputError]:

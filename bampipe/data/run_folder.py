@@ -5,9 +5,14 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from bampipe.errors import InputError
+
+if TYPE_CHECKING:
+    from bampipe.results.record import Result
+
+R = TypeVar("R", bound="Result")
 
 MOVING = ("free", "viscous")
 """Kinds of trial in which the arm moves; only with commanded brakes do effects of brakes show."""
@@ -44,6 +49,14 @@ class RunFolder:
                 remedy=f"run `bampipe {stage} {self.root}` first",
             )
         return self.path(relative)
+
+    def read(self, kind: type[R], model: str = "") -> R:
+        """Return the result ``kind``, of ``model`` where it is one of a model.
+
+        Raises:
+            InputError: its stage has not run, or the file is not as bampipe writes it.
+        """
+        return kind.read(self.require(kind.file(model), kind.STAGE))
 
     def read_json(self, relative: str) -> dict[str, Any]:
         """Return the contents of the JSON file ``relative``.

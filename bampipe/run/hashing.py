@@ -33,6 +33,7 @@ PACKAGES = (
 SHARED_CODE = (
     "physics",
     "estimate",
+    "results",
     "data",
     "declarations",
     "trials",
@@ -163,7 +164,9 @@ def digest_code(stage: str) -> str:
     """
     package = Path(bampipe.__file__).parent
     parts = [package / name for name in SHARED_CODE]
-    parts += [package / f"{name}.py" for name in ("compiled", "errors", "files", "stages/base")]
+    parts += [
+        package / f"{name}.py" for name in ("compiled", "errors", "files", "schema", "stages/base")
+    ]
     if stage == "report":
         parts.append(package / "report")
     spec = importlib.util.find_spec(f"bampipe.stages.{stage}")

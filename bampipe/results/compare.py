@@ -1,0 +1,63 @@
+"""``compare.json``: the ladder of model versions on the same held-out trials."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal
+
+from pydantic import Field
+
+from bampipe.results.record import Names, Record, Result, Size
+
+
+class FreeRunPosition(Record):
+    """Position error of one axis of the model left to itself."""
+
+    mean_absolute: Size
+    rmse: Size
+    relative_error_percent: Size
+    unit: Literal["rad", "m"]
+
+
+class Rung(Record):
+    """One model version."""
+
+    model: str
+    parent: str | None
+    added: str | None = Field(description="Effects that the parent lacks")
+    effects: Names
+    held_out_rmse: dict[str, Size]
+    noise_floor: dict[str, Size | None] = Field(description="null where none was computed")
+    unit: dict[str, str]
+    free_run_mode: Literal["closed_loop", "open_loop"] | None = None
+    free_run: dict[str, FreeRunPosition] = Field(default={}, description="By axis")
+
+
+class Value(Record):
+    """A parameter as one model version has it."""
+
+    estimate: float
+    sd: Size
+    unit: str
+
+
+class Moved(Record):
+    """A parameter that an added effect changed by more than its uncertainty."""
+
+    parameter: str
+    model: str
+    parent: str
+    change: float
+    sd: Size = Field(description="Of the change")
+    unit: str
+    sentence: str
+
+
+class CompareResult(Result):
+    """The ladder of model versions on the same held-out trials."""
+
+    FILE: ClassVar[str] = "compare.json"
+    STAGE: ClassVar[str] = "compare"
+
+    ladder: tuple[Rung, ...] = Field(min_length=1, description="Parents before children")
+    parameters: dict[str, dict[str, Value]] = Field(description="By name, then by model")
+    moved: tuple[Moved, ...]

@@ -1,0 +1,51 @@
+"""``filter/filter.json``: how the motion was differentiated, and how well."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal
+
+from pydantic import Field
+
+from bampipe.results.record import Positive, Record, Result, Share, Size
+
+
+class AxisFilter(Record):
+    """How one axis was differentiated; standard deviations are medians over samples and trials."""
+
+    unit: Literal["rad", "m"]
+    bandwidth_hz: Positive
+    bandwidth_reason: str
+    order: int | None = Field(default=None, description="Of the motion model, Kalman smoother only")
+    resolution: Size = Field(description="0 where none is declared")
+    quantisation_sd: Size
+    measurement_noise_sd: Size
+    spectrum_floor_hz: Size = Field(description="Where the spectrum meets the encoder's noise")
+    likelihood_bandwidth_hz: dict[str, Size] = Field(description="By order of the motion model")
+    log_likelihood: dict[str, float] = Field(description="By order of the motion model")
+    position_sd: Size
+    velocity_sd: Size
+    acceleration_sd: Size
+
+
+class ForceFilter(Record):
+    """How the force was differentiated."""
+
+    derivative_cutoff_hz: Positive
+
+
+class FilterResult(Result):
+    """How the motion was differentiated, and how well."""
+
+    FILE: ClassVar[str] = "filter/filter.json"
+    STAGE: ClassVar[str] = "filter"
+
+    headline: str
+    method: str
+    method_reason: str
+    sample_rate_hz: Positive
+    axes: dict[str, AxisFilter] = Field(min_length=1)
+    force: ForceFilter
+    bridged_fraction: dict[str, Share] = Field(
+        description="By trial: share of its grid that had no sample"
+    )
+    skipped: dict[str, str] = Field(description="By trial: why it could not be differentiated")

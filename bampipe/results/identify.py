@@ -1,0 +1,214 @@
+"""``models/<model>/identify.json``: parameters of a model with uncertainties."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar, Literal
+
+from pydantic import Field
+
+from bampipe.results.record import Count, Names, Record, Result, Share, Size
+
+
+class Estimate(Record):
+    """One parameter."""
+
+    estimate: float
+    sd: Size = Field(
+        description="Standard deviation: block-wise sandwich, and spread between the methods"
+    )
+    unit: str
+    at_bound: bool = Field(description="Within one sd of its physical bound")
+    filter_sd: Size | None = Field(
+        default=None,
+        description="What the filter alone believes, which holds for white noise only",
+    )
+    systematic_sd: Size | None = Field(
+        default=None,
+        description="Part of sd by which filter and least squares disagree beyond noise",
+    )
+    least_squares: float | None = Field(
+        default=None, description="Least-squares estimate of it, without its bias"
+    )
+    least_squares_bias: float | None = Field(
+        default=None,
+        description="What filtering adds to least squares, found by replaying the fit",
+    )
+    bound_sd: Size | None = Field(
+        description="Cramer-Rao bound: least sd that the sensors allow; null where there is none"
+    )
+
+
+class Covariance(Record):
+    """Of the estimates, in products of their units."""
+
+    names: Names
+    matrix: tuple[tuple[float, ...], ...]
+
+
+class InputTiming(Record):
+    """Time by which forces were sampled after positions, within half a sample."""
+
+    estimate: float
+    sd: Size = Field(description="0 where it was not estimated")
+    unit: Literal["s"]
+
+
+class StateBound(Record):
+    """Three standard deviations of one axis, median over time, rad or m and per s."""
+
+    position: Size | None = None
+    velocity: Size | None = None
+
+
+class Consistency(Record):
+    """Normalised innovation squared; 1 where the noise levels are right."""
+
+    mean: Size
+    by_trial: dict[str, Size]
+
+
+class InnovationTest(Record):
+    """A test of the innovations: Ljung-Box, or F."""
+
+    statistic: float
+    degrees: int
+    p_value: Share
+    share: Share
+
+
+class Whiteness(InnovationTest):
+    """Whether the innovations follow from their past."""
+
+    white: bool
+
+
+class Independence(InnovationTest):
+    """Whether the inputs predict the innovations."""
+
+    independent: bool
+
+
+class Innovations(Record):
+    """Both tests of one axis."""
+
+    sentence: str
+    whiteness: Whiteness | None = None
+    inputs: Independence | None = None
+
+
+class NoiseLevels(Record):
+    """Standard deviations used, tuned by likelihood, and those of the sensors."""
+
+    reading_sd: dict[str, float]
+    process_sd: dict[str, float]
+    sensor_sd: dict[str, float]
+
+
+class Convergence(Record):
+    """Whether the search, or the filter along the data, came to rest."""
+
+    converged: bool
+    iterations: Count | None = Field(default=None, description="Of least squares")
+    settled_s: dict[str, Size] | None = Field(
+        default=None,
+        description="From when on each estimate stays within 2 % or 3 sd of its final value, s",
+    )
+    total_s: Size | None = None
+
+
+class ParameterBound(Record):
+    """bound_sd; alone_sd, were all others known; partner whose error goes with it."""
+
+    bound_sd: Size | None
+    alone_sd: Size | None
+    partner: str | None = None
+    correlation: float | None = Field(default=None, ge=-1.001, le=1.001)
+
+
+class WeakDirection(Record):
+    """Parameters that move together, and the share of information left for that."""
+
+    members: Names
+    parts: tuple[float, ...]
+    strength: Size
+
+
+class DeviceNumber(Record):
+    """A constant of the device file, or a sum of them, were it estimated too."""
+
+    name: str
+    value: float
+    unit: str
+    bound_sd: Size | None
+    partner: str | None
+    correlation: float
+    moves_percent: dict[str, float] = Field(
+        description="By how much each estimate moves for an error of 1 % in it, per cent"
+    )
+
+
+class Combined(Record):
+    """Numbers that enter the equations only through combinations of each other."""
+
+    members: Names
+    combinations: Names
+
+
+class TrialGrowth(Record):
+    """By how much the bound of the parameter named would grow without the trial."""
+
+    growth: float
+    parameter: str
+
+
+class IdentifiabilityReport(Record):
+    """What these trials could say of each number, at best."""
+
+    parameters: dict[str, ParameterBound]
+    weak_directions: tuple[WeakDirection, ...]
+    numbers: tuple[DeviceNumber, ...]
+    together: tuple[Combined, ...]
+    trials: dict[str, TrialGrowth]
+    sentences: Names
+
+
+class IdentifyResult(Result):
+    """Parameters of a model with uncertainties."""
+
+    FILE: ClassVar[str] = "models/{model}/identify.json"
+    STAGE: ClassVar[str] = "identify"
+
+    model: str
+    headline: str
+    method: Literal["ukf", "least-squares", "output-error"]
+    engine: Literal["compiled", "filterpy", "augmented"]
+    trials: Names = Field(description="Free trials used")
+    parameters: dict[str, Estimate] = Field(
+        description="By name: viscous.<axis>, coulomb.<axis>, mass, <effect>[.<axis>].<parameter>"
+    )
+    covariance: Covariance
+    input_timing: InputTiming
+    state_3sigma: dict[str, StateBound] = Field(description="By axis")
+    convergence: Convergence
+    identifiability: IdentifiabilityReport | None = None
+    notes: Names = Field(default=(), description="What to know before believing a number")
+    nis: Consistency | None = None
+    innovations: dict[str, Innovations] | None = Field(default=None, description="By axis")
+    noise: NoiseLevels | None = None
+    position_error: dict[str, Size] | None = Field(
+        default=None,
+        description="Output error: position error that is left, by axis, rad or m",
+    )
+    residual_sd: dict[str, Size] | None = Field(
+        default=None, description="Least squares: low-passed residual by axis, N.m or N"
+    )
+    blocks: Annotated[int, Field(ge=1)] | None = Field(
+        default=None, description="Independent blocks of time"
+    )
+    restarts: Count | None = Field(
+        default=None, description="Searches before the filter held on to the motion"
+    )
+    repeats: Count | None = Field(
+        default=None,
+        description="How often the filter ran again around its answer; the tables are of the last",
+    )

@@ -1,0 +1,61 @@
+"""``ingest/session.json``: what the session says, in SI units."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal
+
+from pydantic import Field
+
+from bampipe.results.record import Names, Positive, Record, Result, Size
+
+
+class Encoder(Record):
+    """One axis."""
+
+    unit: Literal["rad", "m"]
+    resolution: Size | None = Field(
+        description="Step of the encoder in that unit; null where none is declared"
+    )
+
+
+class Force(Record):
+    """The measured force."""
+
+    columns: Names
+    unit: str
+    noise_sd: Size | None
+
+
+class Channel(Record):
+    """A brake command, or another recorded channel."""
+
+    unit: str
+
+
+class IngestResult(Result):
+    """What the session says, in SI units."""
+
+    FILE: ClassVar[str] = "ingest/session.json"
+    STAGE: ClassVar[str] = "ingest"
+
+    session_id: str = Field(min_length=1)
+    device: str = Field(min_length=1)
+    device_file: str | None = Field(
+        description="The session's own device file; null for a built-in device"
+    )
+    device_digest: str = Field(
+        default="",
+        pattern="^([0-9a-f]{64})?$",
+        description="SHA-256 of what the session's own device file says",
+    )
+    driven: bool = Field(default=False, description="Whether a motor drives the device, not a hand")
+    default_effects: Names = Field(
+        default=(), description="Effects that the device file gives the base model"
+    )
+    recorded_at: str | None = Field(description="ISO 8601, or null")
+    sample_rate_hz: Positive = Field(description="Median over the trials, from their clocks")
+    announced_rate_hz: Positive | None = Field(description="What session.toml says, or null")
+    axes: dict[str, Encoder] = Field(min_length=1)
+    force: Force
+    brakes: dict[str, Channel]
+    channels: dict[str, Channel]

@@ -1,0 +1,91 @@
+"""``lab/lab.json`` and ``lab/trends.json``: a lab's sessions, and control charts over them."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal
+
+from pydantic import Field
+
+from bampipe.results.record import Count, Names, Record, Result, Share, Size
+
+
+class LabResult(Result):
+    """What the lab's data set was made of."""
+
+    FILE: ClassVar[str] = "lab.json"
+    STAGE: ClassVar[str] = "lab"
+
+    schema_: Literal["bampipe.lab/1"] = Field(alias="schema")
+    sessions: Names = Field(description="In the order of their recording")
+    skipped: Names = Field(description="Runs that could not be read, and why")
+    tables: dict[str, Count] = Field(description="Rows of each table")
+
+
+class ChartPoint(Record):
+    """One session on a control chart."""
+
+    session: str
+    estimate: float
+    sd: Size
+    lower: float | None = Field(description="Control limit")
+    upper: float | None
+    beyond: bool
+
+
+class ControlChart(Record):
+    """A parameter of the base model, or ``stiffness.<axis>``, over all sessions of a device."""
+
+    device: str
+    name: str
+    unit: str
+    centre: float = Field(description="Median")
+    between_sd: Size | None = Field(
+        description="Scatter between sessions, their own uncertainty taken out"
+    )
+    slope_per_session: float | None
+    slope_p: Share | None
+    drifts: bool
+    run: tuple[str, str] | None = Field(
+        description="First and last session of a run on one side of the centre, or null"
+    )
+    points: tuple[ChartPoint, ...]
+
+
+class MovedParameter(Record):
+    """A parameter beyond its control limits."""
+
+    parameter: str
+    estimate: float
+    centre: float
+    percent: float | None = Field(description="From the centre")
+    unit: str
+
+
+class SessionVerdict(Record):
+    """What is said of one session."""
+
+    session: str
+    device: str
+    recorded: str = Field(description='ISO 8601, or ""')
+    verdict: str
+    moved: tuple[MovedParameter, ...]
+    effects: Names
+    unexplained: Names = Field(description="Axes on which something unknown is missing")
+    diagnosed: bool
+    worst: tuple[float, str] | None = Field(
+        description="Largest held-out error over its floor, and its axis; or null"
+    )
+    sentence: str
+    remedy: str
+
+
+class TrendsResult(Result):
+    """Control charts of a lab's parameters, and a verdict on each session."""
+
+    FILE: ClassVar[str] = "trends.json"
+    STAGE: ClassVar[str] = "lab"
+
+    schema_: Literal["bampipe.trends/1"] = Field(alias="schema")
+    fewest_sessions: int = Field(ge=1, description="Fewer have no limits")
+    series: tuple[ControlChart, ...]
+    sessions: tuple[SessionVerdict, ...]

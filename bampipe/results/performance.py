@@ -1,0 +1,72 @@
+"""``models/<model>/performance.json``: what a hand feels, and the numbers of the device file."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from pydantic import Field
+
+from bampipe.results.record import Names, Record, Result, Size
+
+
+class Quantity(Record):
+    """A size and its unit."""
+
+    value: Size
+    unit: str
+
+
+class Resolution(Record):
+    """Step of an encoder; null where none is declared."""
+
+    value: Size | None
+    unit: str
+
+
+class Range(Record):
+    """From the lowest to the highest value."""
+
+    lower: float
+    upper: float
+    unit: str
+
+
+class DeviceConstant(Record):
+    """A constant of the device file."""
+
+    value: float
+    unit: str
+    source: str
+    description: str
+
+
+class Handle(Record):
+    """Where the handle can be pushed as many ways as there are axes."""
+
+    directions: Names
+    workspace: Quantity = Field(description="Swept in the session")
+    workspace_limits: Quantity | None = Field(
+        default=None, description="Within the limits of the device file"
+    )
+    stiffness: Range | None = None
+    friction: Range
+    inertia: Range
+
+
+class PerformanceResult(Result):
+    """What a hand feels, and the numbers of the device file."""
+
+    FILE: ClassVar[str] = "models/{model}/performance.json"
+    STAGE: ClassVar[str] = "performance"
+
+    model: str
+    headline: str
+    constants: dict[str, DeviceConstant]
+    range: dict[str, Range] = Field(
+        min_length=1, description="By axis: what the moving trials covered"
+    )
+    resolution: dict[str, Resolution] = Field(description="By axis")
+    largest_force: Quantity | None = Field(
+        description="Largest that the sensor read (99.9 % quantile); null where there is none"
+    )
+    handle: Handle | None = None

@@ -1,0 +1,100 @@
+"""What a record is: typed, immutable, read and written whole."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Self
+
+from pydantic import (
+    ConfigDict,
+    Field,
+    SerializerFunctionWrapHandler,
+    ValidationError,
+    model_serializer,
+)
+
+from bampipe.errors import InputError
+from bampipe.files import read_json, write_json
+from bampipe.schema import Declaration, refusal
+
+Size = Annotated[float, Field(ge=0)]
+Positive = Annotated[float, Field(gt=0)]
+Share = Annotated[float, Field(ge=0, le=1)]
+Count = Annotated[int, Field(ge=0)]
+Names = tuple[str, ...]
+
+
+class Record(Declaration):
+    """Part of a result.
+
+    A field of another type, one that is not declared, and a number that is not finite are
+    refused; numbers of numpy are taken. A field with a default is left out of the file where it
+    holds it.
+    """
+
+    model_config = ConfigDict(strict=False, serialize_by_alias=True)
+
+    @model_serializer(mode="wrap")
+    def _without_defaults(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        held = {
+            name
+            for name, field in type(self).model_fields.items()
+            if not field.is_required() and getattr(self, name) == field.get_default()
+        }
+        return {name: value for name, value in serialize(self).items() if name not in held}
+
+
+class Result(Record):
+    """The whole of one JSON file.
+
+    Attributes:
+        FILE: its path in the folder it belongs to; ``{model}`` stands for the model's name.
+        STAGE: the command that writes it.
+    """
+
+    FILE: ClassVar[str]
+    STAGE: ClassVar[str]
+
+    @classmethod
+    def file(cls, model: str = "") -> str:
+        """Return the path of the result of ``model``, relative to the folder."""
+        return cls.FILE.replace("{model}", model)
+
+    @classmethod
+    def read(cls, path: Path) -> Self:
+        """Read and check ``path``; fields that another version of bampipe added are passed over.
+
+        Raises:
+            InputError: no such file, or it is not as bampipe writes it: names the field.
+        """
+        content = read_json(path)
+        try:
+            return cls._checked(content)
+        except ValidationError as error:
+            for fault in error.errors():
+                if fault["type"] == "extra_forbidden":
+                    _drop(content, fault["loc"])
+        try:
+            return cls._checked(content)
+        except ValidationError as error:
+            refused = refusal(error, cls, str(path))
+            remedy = f"make it again with `bampipe {cls.STAGE} --force`"
+            raise InputError(refused.what, where=refused.where, remedy=remedy) from None
+
+    @classmethod
+    def _checked(cls, content: object) -> Self:
+        # From text, where a list may stand for a tuple but "1" does not stand for 1.
+        return cls.model_validate_json(json.dumps(content), strict=True)
+
+    def write(self, folder: Path) -> dict[str, Any]:
+        """Write the result below ``folder``, whole or not at all, and return what it says."""
+        content = self.model_dump(mode="json")
+        write_json(folder / self.file(getattr(self, "model", "")), content)
+        return content
+
+
+def _drop(content: Any, place: tuple[int | str, ...]) -> None:
+    for part in place[:-1]:
+        content = content[part]
+    del content[place[-1]]

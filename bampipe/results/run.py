@@ -1,0 +1,78 @@
+"""``run.json``: what was run on what, with what, and what came out."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import Field
+
+from bampipe.results.record import Names, Record, Result, Size
+
+Digest = Annotated[str, Field(pattern="^[0-9a-f]{64}$", description="SHA-256")]
+
+
+class Place(Record):
+    """Where it was made; no result depends on it."""
+
+    machine: str | None = None
+    session: str | None = None
+
+
+class PipelineUsed(Record):
+    """The pipeline as it was at the last run."""
+
+    name: str
+    device: str
+    effects: Names
+    stages: Names
+    settings: dict[str, dict[str, Any]]
+
+
+class StepRecord(Record):
+    """What one step was made of and what it wrote."""
+
+    key: Digest = Field(description="Hash of everything the step depends on")
+    config: dict[str, Any] = Field(description="Every setting, defaults included")
+    settings: dict[str, Any] = Field(description="Settings as given")
+    declared_inputs: Names
+    inputs: dict[str, Digest | Literal["absent"]]
+    outputs: dict[str, Digest]
+    code: Digest = Field(description="Of the sources that the stage uses")
+    versions: dict[str, str]
+    summary: dict[str, Any]
+
+
+class Timing(Record):
+    """When a step ran, and for how long."""
+
+    started_at: str
+    seconds: Size
+
+
+class GateVerdict(Record):
+    """What came of one quality gate."""
+
+    gate: str
+    key: str = Field(description='What * stood for, or ""')
+    state: Literal["passed", "failed", "warned", "absent"]
+    value: float | None
+    message: str
+
+
+class RunResult(Result):
+    """What was run on what, with what, and what came out."""
+
+    FILE: ClassVar[str] = "run.json"
+    STAGE: ClassVar[str] = "run"
+
+    schema_: Literal["bampipe.run/1"] = Field(alias="schema")
+    run: str = Field(default="", description="Name of the run folder")
+    place: Place = Field(default=Place())
+    pipeline: PipelineUsed | None = None
+    stages: dict[str, StepRecord] = Field(description="By step: <stage>, or <stage>:<model>")
+    timings: dict[str, Timing] = Field(default={})
+    failures: dict[str, str] = Field(default={}, description="By step: why its last try failed")
+    versions: dict[str, str] = Field(
+        default={}, description="Of Python, bampipe and what it rests on, at the last run"
+    )
+    gates: tuple[GateVerdict, ...] = ()

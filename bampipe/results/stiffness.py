@@ -1,0 +1,87 @@
+"""``stiffness/stiffness.json``: stiffness of the axes that were locked and loaded."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal
+
+from pydantic import Field
+
+from bampipe.results.record import Names, Positive, Record, Result, Size
+
+
+class Bandwidth(Record):
+    """sqrt(stiffness / inertia) at one pose."""
+
+    rad_s: Positive
+    hz: Positive
+    inertia: Positive = Field(description="Diagonal entry of the mass matrix, kg m2 or kg")
+
+
+class LoopCycle(Record):
+    """One hysteresis loop."""
+
+    trial_id: str
+    duration_s: Positive
+    stiffness: float
+    loop_width: float
+    loop_width_deflection: float
+    energy: float
+    amplitude: float = Field(description="Half the range of the torque")
+    centre: float = Field(description="Deflection in the middle of the loop at no torque")
+
+
+class LockedTrial(Record):
+    """One locked trial."""
+
+    stiffness: Positive
+    standard_error: Size
+    transition: float = Field(
+        description="Torque after a reversal from which the loop is post-yield"
+    )
+    bend: float = Field(
+        description="Stiffness of the first half of the post-yield part over the second, less 1"
+    )
+    drift: float = Field(
+        description="Wandering of the loops from first to last cycle, share of their range"
+    )
+
+
+class AxisStiffness(Record):
+    """Stiffness of one axis over its locked trials."""
+
+    stiffness: Positive
+    sd: Size = Field(description="Standard deviation over the cycles")
+    standard_error: Size = Field(description="Standard error of the regression over all cycles")
+    unit: str = Field(description="Of the stiffness: N.m/rad or N/m")
+    n_cycles: int = Field(ge=1)
+    bandwidth_rad_s: Positive = Field(description="sqrt(stiffness / inertia) at bandwidth_pose")
+    bandwidth_hz: Positive
+    bandwidth_pose: str = Field(description="Key of bandwidths and poses")
+    bandwidths: dict[str, Bandwidth]
+    poses: dict[str, dict[str, float]] = Field(description="Coordinates of each pose, rad or m")
+    loop_width: float = Field(description="Height of the loop, mean over the cycles")
+    loop_width_unit: str
+    loop_width_deflection: float = Field(description="The same in deflection")
+    loop_width_deflection_unit: str
+    energy_per_cycle: float = Field(description="Energy lost, mean over the cycles")
+    energy_unit: Literal["J"]
+    yielded: bool = Field(
+        description="Whether the load overcame the friction, so that the slope is the stiffness"
+    )
+    cycles: tuple[LoopCycle, ...] = Field(min_length=1)
+    trials: dict[str, LockedTrial]
+
+
+class StiffnessResult(Result):
+    """Stiffness of the axes that were locked and loaded."""
+
+    FILE: ClassVar[str] = "stiffness/stiffness.json"
+    STAGE: ClassVar[str] = "stiffness"
+
+    headline: str
+    notes: Names = Field(
+        description="What a reader must know: trials without loops, slipping brakes, small loads"
+    )
+    axes: dict[str, AxisStiffness] = Field(
+        description="One entry for each axis with a locked trial; none where there is no such trial"
+    )

@@ -1,0 +1,23 @@
+"""``<session>.truth.json``: what `bampipe simulate` put into a session."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Literal
+
+from pydantic import Field
+
+from bampipe.results.record import Result
+
+
+class TruthResult(Result):
+    """What `bampipe simulate` put into a session."""
+
+    FILE: ClassVar[str] = "{session}.truth.json"
+    STAGE: ClassVar[str] = "simulate"
+
+    schema_: Literal["bampipe.truth/1"] = Field(alias="schema")
+    device: str
+    effects: dict[str, float] = Field(description="Hidden effects and their strengths")
+    configuration: dict[str, Any] = Field(description="Every setting of the simulation")
+    parameters: dict[str, float]
+    stiffness: dict[str, float] = Field(description="By axis; empty without locked trials")

@@ -1,0 +1,101 @@
+"""``models/<model>/validate.json``: predicted against measured torque and force."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar, Literal
+
+from pydantic import ConfigDict, Field
+
+from bampipe.results.record import Names, Positive, Record, Result, Size
+
+
+class AxisError(Record):
+    """Error of the predicted generalised force of one axis."""
+
+    rmse: Size = Field(description="Parameters as identified")
+    rmse_without_friction: Size
+    held_out_rmse: Size = Field(description="Each trial by the fit to the others")
+    noise_floor: Size | None = Field(
+        default=None,
+        description="held_out_rmse of the fitted model's own simulation, same sensors and filters",
+    )
+    relative_error_percent: Size = Field(
+        description="100 rmse / root mean square of the measured torque"
+    )
+    held_out_relative_error_percent: Size = Field(
+        description="100 held_out_rmse / root mean square of the measured torque"
+    )
+    fit_percent: Annotated[float, Field(le=100)] | None = Field(
+        description="100 (1 - held_out_rmse / standard deviation of the measured torque); null on "
+        "an axis that nothing drives"
+    )
+    unit: str
+
+
+class TrialError(Record):
+    """Errors of one trial, by axis beside ``held_out``."""
+
+    model_config = ConfigDict(extra="allow")
+    __pydantic_extra__: dict[str, AxisError]
+
+    held_out: bool = Field(description="Predicted by a fit to the other trials")
+
+    @property
+    def axes(self) -> dict[str, AxisError]:
+        """The errors by axis."""
+        return self.__pydantic_extra__
+
+
+class ForceError(Record):
+    """Error of one component of the handle's force."""
+
+    rmse: Size
+    unit: str
+
+
+class FreeRunError(Record):
+    """Position error of one axis of the model left to itself."""
+
+    mean_absolute: Size
+    rmse: Size
+    relative_error_percent: Size
+    velocity_relative_error_percent: Size
+    unit: Literal["rad", "m"]
+
+
+class CommandError(Record):
+    """Error of a commanded force channel."""
+
+    relative_error_percent: Size
+
+
+class FreeRun(Record):
+    """The model left to itself over held-out trials."""
+
+    reason: str = Field(default="", description="Why there is none, or none in closed loop")
+    mode: Literal["closed_loop", "open_loop"] | None = None
+    axes: dict[str, FreeRunError] = Field(default={})
+    trials: dict[str, dict[str, FreeRunError]] = Field(default={})
+    forces: dict[str, CommandError] = Field(
+        default={}, description="Commanded force channels, closed loop"
+    )
+
+
+class ValidateResult(Result):
+    """Predicted against measured torque and force."""
+
+    FILE: ClassVar[str] = "models/{model}/validate.json"
+    STAGE: ClassVar[str] = "validate"
+
+    model: str
+    headline: str
+    cutoff_hz: Positive = Field(description="Low-pass of both sides, Hz")
+    notes: Names
+    axes: dict[str, AxisError] = Field(
+        description="Over all free trials and those in a viscous field, stretches at rest left out"
+    )
+    trials: dict[str, TrialError]
+    forces: dict[str, ForceError] = Field(
+        description="Handle force by component, identified parameters"
+    )
+    free_run: FreeRun | None = None

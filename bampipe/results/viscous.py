@@ -1,0 +1,49 @@
+"""``models/<model>/viscous.json``: damping at the handle in the viscous trials."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar, Literal
+
+from pydantic import Field
+
+from bampipe.results.record import Names, Record, Result, Share, Size
+
+
+class Damping(Record):
+    """Damping along one component of the handle's force, N.s/m."""
+
+    estimate: float = Field(description="Rendered by the brakes")
+    sd: Size
+    own_friction: float = Field(description="The device's own, as felt there")
+    felt: float = Field(description="Both together")
+    unit: Literal["N.s/m"]
+    commanded: float | None = Field(
+        default=None, description="Where it is recorded; what follows is then there too"
+    )
+    p_value: Share | None = None
+    differs: bool | None = None
+    felt_p_value: Share | None = None
+    felt_differs: bool | None = None
+    verdict: str | None = None
+
+
+class ViscousResult(Result):
+    """Damping at the handle in the viscous trials."""
+
+    FILE: ClassVar[str] = "models/{model}/viscous.json"
+    STAGE: ClassVar[str] = "viscous"
+
+    model: str
+    headline: str
+    trials: Names
+    blocks: Annotated[int, Field(ge=1)] | None = Field(
+        default=None,
+        description="Stretches of time whose scatter gave the standard deviations",
+    )
+    process_noise_factor: Annotated[float, Field(ge=1)] | None = Field(
+        default=None,
+        description="By how much the filter's process noise had to be raised; 1 mostly",
+    )
+    directions: dict[str, Damping] = Field(
+        description="By component of the handle's force; empty without viscous trials"
+    )
