@@ -5,6 +5,8 @@ from pathlib import Path
 from bampipe.declarations.accepted import Accepted
 from bampipe.declarations.model import ModelFile
 from bampipe.declarations.pipeline import Pipeline
+from bampipe.physics.device import Device
+from bampipe.physics.effect import Effect
 from bampipe.results.compare import CompareResult
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.filter import FilterResult
@@ -22,6 +24,8 @@ from bampipe.schema import Declaration, json_schema_text
 FOLDER = Path(__file__).parent.parent / "schemas"
 FILES: dict[str, type[Declaration]] = {
     "accepted": Accepted,
+    "device": Device,
+    "effect": Effect,
     "model": ModelFile,
     "pipeline": Pipeline,
     "compare": CompareResult,

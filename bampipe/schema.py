@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import ast
 import json
+import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
-from typing import Annotated, Any, TypeVar, get_args
+from typing import Annotated, Any, Self, TypeVar, get_args
 
 from pydantic import (
     AfterValidator,
@@ -20,6 +21,7 @@ from pydantic import (
     Strict,
     StringConstraints,
     ValidationError,
+    model_validator,
 )
 from pydantic.json_schema import GenerateJsonSchema
 from pydantic_core import PydanticCustomError, core_schema
@@ -28,7 +30,10 @@ from bampipe.errors import InputError, did_you_mean
 
 
 class Declaration(BaseModel):
-    """A table of a file: unknown keys are refused, and nothing is converted but lists to tuples."""
+    """A table of a file: unknown keys are refused, and nothing is converted but lists to tuples.
+
+    What is wrong between fields is found by `cross_faults`, once every field is right by itself.
+    """
 
     model_config = ConfigDict(
         extra="forbid",
@@ -37,6 +42,16 @@ class Declaration(BaseModel):
         allow_inf_nan=False,
         arbitrary_types_allowed=True,
     )
+
+    def cross_faults(self) -> Iterator[InputError]:
+        """Everything wrong between the fields; ``where`` is a key below this table, or empty."""
+        yield from ()
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if found := list(self.cross_faults()):
+            raise PydanticCustomError("faults", "faults", {"found": found})
+        return self
 
 
 class NamedDeclaration(Declaration):
@@ -54,13 +69,13 @@ D = TypeVar("D", bound=Declaration)
 T = TypeVar("T")
 
 
-def fault(what: str, at: str = "", remedy: str = "") -> PydanticCustomError:
-    """Return what a validator raises: the words of an `InputError`, and a key below its table."""
-    return PydanticCustomError("fault", "{what}", {"what": what, "at": at, "remedy": remedy})
+def fault(what: str, remedy: str = "") -> PydanticCustomError:
+    """Return what the validator of a field raises: the words of an `InputError`."""
+    return PydanticCustomError("faults", "faults", {"found": [InputError(what, remedy=remedy)]})
 
 
 def _refuse_rounded(value: Any) -> Any:
-    if isinstance(value, int) and not isinstance(value, bool) and abs(value) > 2**53:
+    if isinstance(value, int) and abs(value) > 2**53:
         raise fault("found a whole number beyond 2^53")
     return value
 
@@ -73,6 +88,8 @@ def _refuse_twice(values: tuple[T, ...]) -> tuple[T, ...]:
 
 Text = Annotated[str, StringConstraints(min_length=1)]
 Number = Annotated[float, BeforeValidator(_refuse_rounded)]
+Positive = Annotated[float, Field(gt=0), BeforeValidator(_refuse_rounded)]
+NotNegative = Annotated[float, Field(ge=0), BeforeValidator(_refuse_rounded)]
 Several = Annotated[tuple[T, ...], Strict(False)]
 Distinct = Annotated[
     tuple[T, ...],
@@ -87,16 +104,18 @@ class ByName:
 
     Args:
         key: type of the names.
+        least: number of tables.
     """
 
-    def __init__(self, key: Any) -> None:
-        self.key = key
+    def __init__(self, key: Any, least: int = 0) -> None:
+        self.key, self.least = key, least
 
     def __get_pydantic_core_schema__(
         self, source: Any, handler: GetCoreSchemaHandler
     ) -> core_schema.CoreSchema:
         entry = get_args(source)[0]
         table = handler.generate_schema(dict.__class_getitem__((self.key, entry)))
+        table = {**table, "min_length": self.least}
         return core_schema.no_info_after_validator_function(_named, table)
 
 
@@ -141,7 +160,13 @@ def faults(kind: type[Declaration], content: object, where: str) -> list[InputEr
 
 
 class _Generator(GenerateJsonSchema):
-    """JSON Schema without a title for every field, which would repeat its name."""
+    """JSON Schema without a title for every field, and without a default that JSON has not."""
+
+    def default_schema(self, schema: Any) -> dict[str, Any]:
+        content = super().default_schema(schema)
+        if content.get("default") in (math.inf, -math.inf):
+            del content["default"]
+        return content
 
     def field_title_should_be_set(self, schema: Any) -> bool:
         return False
@@ -157,11 +182,12 @@ def json_schema(kind: type[Declaration]) -> dict[str, Any]:
 
 
 def json_schema_text(kind: type[Declaration]) -> str:
-    """The JSON Schema of a file as it stands in ``schemas/``: what fits into a line is one."""
+    """The JSON Schema of a file as it stands in ``schemas/``: what is flat or short is one line."""
 
     def lines(value: Any, indent: str, used: int) -> str:
         short = json.dumps(value, ensure_ascii=False)
-        if len(indent) + used + len(short) < 100 or not isinstance(value, dict | list):
+        room = 100 if "{" in short[1:] or "[" in short else 200
+        if len(indent) + used + len(short) < room or not isinstance(value, dict | list):
             return short
         inner = indent + " "
         if isinstance(value, list):
@@ -207,16 +233,27 @@ def _faults(error: ValidationError, kind: type[Declaration], where: str) -> list
     found = error.errors(include_url=False)
     # A key that is not known often is a missing one misspelt: it comes first.
     found.sort(key=lambda e: (len(e["loc"]) > 1, e["type"] != "extra_forbidden"))
-    return [_fault(e, json_schema(kind), where) for e in found]
+    said = []
+    for e in found:
+        path = [part for part in e["loc"] if not str(part).startswith("#")]
+        path = path[:-2] if path and path[-1] == "[key]" else path
+        if e["type"] == "faults":
+            said += [_placed(f, [*path, f.where], where) for f in e["ctx"]["found"]]
+        else:
+            said.append(_in_words(e, path, json_schema(kind), where))
+    return said
 
 
-def _fault(error: Any, schema: Mapping[str, Any], where: str) -> InputError:
+def _placed(fault: InputError, path: list[Any], where: str) -> InputError:
+    place = dotted(part for part in path if part != "")
+    there = f"{where}: {place}" if place else where
+    return InputError(fault.what, where=there, remedy=fault.remedy)
+
+
+def _in_words(error: Any, path: list[Any], schema: Mapping[str, Any], where: str) -> InputError:
     """One error of pydantic in plain words."""
-    path = [part for part in error["loc"] if not str(part).startswith("#")]
     kind, given, more = error["type"], error["input"], error.get("ctx", {})
     remedy = ""
-    if path and path[-1] == "[key]":
-        path = path[:-2]
     if kind in ("missing", "extra_forbidden"):
         *path, key = path
         known = _node(schema, error["loc"][:-1]).get("properties", {})
@@ -225,9 +262,6 @@ def _fault(error: Any, schema: Mapping[str, Any], where: str) -> InputError:
         else:
             what = f"unknown key {_shown(key)}{did_you_mean(str(key), known)}"
             remedy = "" if "did you mean" in what else f"known keys: {', '.join(known)}"
-    elif kind == "fault":
-        what, remedy = more["what"], more["remedy"]
-        path += [more["at"]] if more["at"] else []
     elif kind == "literal_error":
         choices = [ast.literal_eval(text) for text in re.findall(r"'[^']*'|\d+", more["expected"])]
         what = f"found {_shown(given)}, expected {' or '.join(map(_shown, choices))}"
@@ -242,8 +276,7 @@ def _fault(error: Any, schema: Mapping[str, Any], where: str) -> InputError:
         else:
             expected = _EXPECTED.get(kind, error["msg"]).format(**more)
         what = f"found {_shown(given)}, expected {expected}"
-    place = dotted(path)
-    return InputError(what, where=f"{where}: {place}" if place else where, remedy=remedy)
+    return _placed(InputError(what, remedy=remedy), path, where)
 
 
 def _node(schema: Mapping[str, Any], path: Iterable[str | int]) -> Mapping[str, Any]:
@@ -251,7 +284,7 @@ def _node(schema: Mapping[str, Any], path: Iterable[str | int]) -> Mapping[str, 
     node = schema
     for part in path:
         if str(part).startswith("#"):
-            node = schema["$defs"][str(part)[1:]]
+            node = schema["$defs"].get(str(part)[1:], {})
         elif part == "[key]":
             continue
         elif isinstance(part, int):

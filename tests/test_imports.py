@@ -29,7 +29,16 @@ HEAVY = (
 
 # What each layer may import beside the standard library and itself.
 LAWS = {
-    "physics": {"numpy", "sympy", "numba", "llvmlite", "bampipe.compiled", "bampipe.errors"},
+    "physics": {
+        "numpy",
+        "sympy",
+        "numba",
+        "llvmlite",
+        "pydantic",
+        "bampipe.compiled",
+        "bampipe.errors",
+        "bampipe.schema",
+    },
     "estimate": {
         "numpy",
         "scipy",

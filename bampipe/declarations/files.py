@@ -1,27 +1,24 @@
 """Device and effect files held to everything that can be known before there are data.
 
-First the schema, then every expression by itself, then names and units, at last the derivation of
-the equations of motion: each step is taken only where the one before found nothing, and tells all
-that it finds.
+First every field by itself, then what fields say of each other, then units, at last the derivation
+of the equations of motion: each step is taken only where the one before found nothing, and reports
+all that it finds.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from bampipe.data import schema
+from bampipe import schema
 from bampipe.errors import InputError
 from bampipe.files import read_toml
-from bampipe.physics import Model, expression, registry
+from bampipe.physics import Model, registry
 from bampipe.physics.device import Device
 from bampipe.physics.effect import Effect
 from bampipe.physics.readable import describe_equations
 from bampipe.physics.units import check_device, check_effect
-
-_DEVICE_TABLES = ("definitions", "energy", "torque", "applied", "side_load")
-_EFFECT_KEYS = ("torque", "input", "offset", "kinetic", "potential")
 
 
 def read_device(text: str) -> tuple[Mapping[str, Any], str]:
@@ -59,14 +56,9 @@ def device_faults(declaration: Mapping[str, Any], where: str) -> tuple[str, list
     Returns:
         Text of several lines, empty where the equations cannot be derived; and one line a fault.
     """
-    faults = [str(fault) for fault in schema.faults(declaration, "device", where)]
-    faults = faults or _unreadable(_device_expressions(declaration), where)
-    if faults:
-        return "", faults
-    try:
-        device = registry.device_from(declaration, where)
-    except InputError as error:
-        return "", [str(error)]
+    if found := schema.faults(Device, declaration, where):
+        return "", [str(fault) for fault in found]
+    device = registry.device_from(declaration, where)
     faults = [f"{where}: {line}" for line in check_device(device)]
     try:
         Model(device, device.default_effects)
@@ -94,14 +86,9 @@ def effect_faults(
     Returns:
         Names ``effect[:target]`` that were tried, and one line a fault.
     """
-    faults = [str(fault) for fault in schema.faults(declaration, "effect", where)]
-    faults = faults or _unreadable(_effect_expressions(declaration), where)
-    if faults:
-        return [], faults
-    try:
-        effect = registry.effect_from(declaration, where)
-    except InputError as error:
-        return [], [str(error)]
+    if faults := schema.faults(Effect, declaration, where):
+        return [], [str(fault) for fault in faults]
+    effect = registry.effect_from(declaration, where)
     targets = (target,) if target else effect.targets(device)
     if not targets:
         return [], [f"{where}: {_unfit(effect, device)}"]
@@ -126,38 +113,3 @@ def _named(error: InputError, where: str) -> str:
     place = error.where.partition(": ")[2]
     return str(InputError(error.what, where=f"{where}: {place}" if place else where,
                           remedy=error.remedy))  # fmt: skip
-
-
-def _unreadable(expressions: Iterator[tuple[str, object]], where: str) -> list[str]:
-    """One line for each expression that does not parse."""
-    faults = []
-    for field, text in expressions:
-        try:
-            expression.parse(text, f"{where}: {field}")
-        except InputError as error:
-            faults.append(str(error))
-    return faults
-
-
-def _device_expressions(declaration: Mapping[str, Any]) -> Iterator[tuple[str, object]]:
-    for table in _DEVICE_TABLES:
-        for key, text in declaration.get(table, {}).items():
-            yield f"{table}.{key}", text
-    for key, text in declaration.get("controller", {}).get("command", {}).items():
-        yield f"controller.command.{key}", text
-    for key, entry in declaration.get("controller", {}).get("states", {}).items():
-        yield f"controller.states.{key}.rate", entry.get("rate")
-    for name, entry in declaration.get("process_noise", {}).items():
-        for axis, text in entry["torque"].items():
-            yield f"process_noise.{name}.torque.{axis}", text
-
-
-def _effect_expressions(declaration: Mapping[str, Any]) -> Iterator[tuple[str, object]]:
-    for key in _EFFECT_KEYS:
-        value = declaration.get(key, {})
-        for place, text in value.items() if isinstance(value, Mapping) else [("", value)]:
-            yield f"{key}.{place}" if place else key, text
-    for name, entry in declaration.get("states", {}).items():
-        for key in ("rate", "initial"):
-            if key in entry:
-                yield f"states.{name}.{key}", entry[key]

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, PrivateAttr, StringConstraints, model_validator
+from pydantic import AfterValidator, Field, PrivateAttr, StringConstraints
 
-from bampipe.errors import choose_from
+from bampipe.errors import InputError, choose_from
 from bampipe.schema import Declaration, Distinct, Number, Several, Text, fault
 from bampipe.stages import base
 
@@ -61,11 +62,9 @@ class Gate(Declaration):
     optional: bool = Field(default=False, description="A result that is not there passes")
     advice: str = Field(default="", description="What to do where the gate does not pass")
 
-    @model_validator(mode="after")
-    def _limited(self) -> Gate:
+    def cross_faults(self) -> Iterator[InputError]:
         if self.max is None and self.min is None:
-            raise fault("neither 'max' nor 'min'", remedy="give the limit")
-        return self
+            yield InputError("neither 'max' nor 'min'", remedy="give the limit")
 
 
 class BaseModelTable(Declaration):

@@ -210,13 +210,13 @@ def _device_torque(d: Vocabulary, truth: Mapping[Any, Any], w: list[Any]) -> lis
     other = [e.subs(truth, simultaneous=True) for e in d.table(device.torque, "torque")]
     for i, c in enumerate(device.coordinates):
         sign = d.sgn(d.qd[i])
-        if c.name in device.frictional:
+        if c.name in device.friction:
             other[i] -= d.p[f"viscous.{c.name}"] * d.qd[i] + d.p[f"coulomb.{c.name}"] * sign
         slid = sp.Dummy()
         d.dry[i] = -sp.diff(sp.sympify(other[i]).subs(sign, slid), slid)
         if c.name in device.brakes:
             other[i] -= d.channel[device.brakes[c.name]] * sign
     for k, name in enumerate(device.process_noise):
-        gains = d.table(device.process_noise[name], f"process_noise.{name}")
+        gains = d.table(device.process_noise[name].torque, f"process_noise.{name}")
         other = [e + g * w[len(device.forces) + k] for e, g in zip(other, gains, strict=True)]
     return other

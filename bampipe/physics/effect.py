@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Annotated, Any, Literal
+
+from pydantic import Discriminator, Field, PrivateAttr, StringConstraints, Tag
 
 from bampipe.errors import InputError, did_you_mean
 from bampipe.physics import expression
 from bampipe.physics.device import INPUT_ORDERS, Device, derivative
-from bampipe.physics.parameter import Parameter, parameter_from
+from bampipe.physics.expression import Expression, Name
+from bampipe.physics.parameter import Parameter
+from bampipe.schema import ByName, Declaration, Distinct, NamedDeclaration, Text, read
 
 # What an effect of each kind must give, where it may apply.
 _EXPRESSIONS = {
@@ -20,60 +25,150 @@ _EXPRESSIONS = {
     "energy": (("kinetic", "potential"), ("axis", "device")),
     "measurement": (("offset",), ("axis", "device")),
 }
-SCOPES = ("axis", "force_component", "force_pair", "channel", "device")
 EACH = "each"
 """Place of a device-wide input effect that stands for every force channel."""
-KINDS = ("torque", "input", "energy", "measurement")
-_KEYS = frozenset(
-    [
-        "schema",
-        "name",
-        "summary",
-        "scope",
-        "kind",
-        "torque",
-        "input",
-        "kinetic",
-        "potential",
-        "offset",
-        "dissipative",
-        "looks_like",
-        "source",
-        "parameters",
-        "states",
-        "devices",
-        "drive",
+
+
+class ParameterByKind(Declaration):
+    """A parameter whose unit and prior depend on the kind of axis."""
+
+    rotary: Parameter | None = None
+    linear: Parameter | None = None
+    description: str = ""
+
+
+def _shape_of_parameter(entry: object) -> str:
+    by_kind = isinstance(entry, Mapping) and not {"rotary", "linear"}.isdisjoint(entry)
+    return "#ParameterByKind" if by_kind else "#Parameter"
+
+
+def _shape_of_expressions(entry: object) -> str:
+    return "#by_place" if isinstance(entry, Mapping) else "#one"
+
+
+EffectParameter = Annotated[
+    Annotated[Parameter, Tag("#Parameter")] | Annotated[ParameterByKind, Tag("#ParameterByKind")],
+    Discriminator(_shape_of_parameter),
+]
+Expressions = Annotated[
+    Annotated[Expression, Tag("#one")]
+    | Annotated[dict[Name, Expression], Field(min_length=1), Tag("#by_place")],
+    Discriminator(_shape_of_expressions),
+]
+
+
+class Unit(Declaration):
+    """The unit of a state on one kind of axis."""
+
+    unit: str
+
+
+class State(NamedDeclaration):
+    """An internal state of an effect, where it has memory."""
+
+    rate: Expression = Field(description="Its rate of change")
+    initial: Expression = Field(
+        default="0",
+        validate_default=True,
+        description="Value at the start of a trial; 0 where left out",
+    )
+    unit: str = ""
+    rotary: Unit | None = None
+    linear: Unit | None = None
+    description: str = ""
+
+    def unit_on(self, kind: str) -> str:
+        """Unit of the state on a ``kind`` of axis; of an effect of no axis where empty."""
+        entry = {"rotary": self.rotary, "linear": self.linear}.get(kind)
+        return entry.unit if entry else self.unit
+
+
+class Effect(Declaration):
+    """An effect: one physical term that a model may have; `bind` places it on a device."""
+
+    schema_: Literal["bampipe.effect/1"] = Field(default="bampipe.effect/1", alias="schema")
+    name: Annotated[
+        str,
+        StringConstraints(pattern="^[A-Za-z_][A-Za-z0-9_]*$", max_length=60),
+        Field(description="an identifier, such as magnetic_detent"),
     ]
-)
+    summary: Text = Field(description="What it is, in one sentence")
+    scope: Literal["axis", "force_component", "force_pair", "channel", "device"] = Field(
+        description="axis: one coordinate; force_component: one reading; force_pair: a reading"
+        " that leaks into another; channel: an input that is no force; device: the whole device"
+    )
+    kind: Literal["torque", "input", "energy", "measurement"] = Field(
+        description="torque: acts on the joints; input: maps the measured force to the true one;"
+        " energy: goes through Lagrange's equation; measurement: true minus measured position"
+    )
+    torque: Expressions | None = Field(
+        default=None,
+        description="Generalised force added to the joints; per axis where the scope is device",
+    )
+    input: Expressions | None = Field(
+        default=None,
+        description="True force from the measured one (f, f_rate, f_curvature; g for the other"
+        " of a pair); per channel where the scope is device",
+    )
+    offset: Expressions | None = Field(
+        default=None, description="True position minus measured position"
+    )
+    kinetic: Expression | None = Field(default=None, description="Kinetic energy added, J")
+    potential: Expression | None = Field(default=None, description="Potential energy added, J")
+    dissipative: bool = Field(
+        default=False,
+        description="Whether the effect takes energy out of the motion for all parameters within"
+        " their bounds",
+    )
+    drive: bool = Field(
+        default=False,
+        description="Whether it is one of motors only: offered where the device says drive = true",
+    )
+    devices: Distinct[Text] = Field(
+        default=(), description="Devices that it makes sense for; all where left out"
+    )
+    looks_like: Text = Field(description="How it shows in a residual")
+    source: Text = Field(description="Literature, with year")
+    parameters: dict[Name, EffectParameter] = Field(min_length=1)
+    states: Annotated[tuple[State, ...], ByName(Name)] = ()
+    _declaration: Mapping[str, Any] = PrivateAttr({})
 
+    @property
+    def declaration(self) -> Mapping[str, Any]:
+        """The parsed file."""
+        return self._declaration
 
-@dataclass(frozen=True)
-class State:
-    """An internal state of an effect: its rate, where it starts, its unit by kind of axis."""
+    @cached_property
+    def expressions(self) -> Mapping[str, ast.expr]:
+        """Its expressions: ``torque``, or ``torque.<place>`` where there is one a place."""
+        found: dict[str, ast.expr] = {}
+        for key in _EXPRESSIONS[self.kind][0]:
+            value = getattr(self, key)
+            if isinstance(value, Mapping):
+                found |= {f"{key}.{place}": tree for place, tree in value.items()}
+            elif value is not None:
+                found[key] = value
+        return found
 
-    name: str
-    rate: ast.expr
-    initial: ast.expr
-    entry: Mapping[str, Any]
-
-
-@dataclass(frozen=True)
-class Effect:
-    """A physical term as its file declares it; `at` binds it to a target of a device."""
-
-    name: str
-    summary: str
-    scope: str
-    kind: str
-    expressions: Mapping[str, ast.expr]
-    parameters: Mapping[str, Mapping[str, Any]]
-    states: tuple[State, ...]
-    dissipative: bool
-    looks_like: str
-    source: str
-    devices: tuple[str, ...]
-    drive: bool
-    declaration: Mapping[str, Any] = field(repr=False, compare=False)
+    def cross_faults(self) -> Iterator[InputError]:
+        main, scopes = _EXPRESSIONS[self.kind]
+        if self.scope not in scopes:
+            yield InputError(
+                f"an effect of kind {self.kind!r} cannot have scope {self.scope!r}",
+                remedy=f"scope may be {' or '.join(scopes)}",
+            )
+        for key in (key for keys, _ in _EXPRESSIONS.values() for key in keys):
+            value, placed = getattr(self, key), self.scope == "device" and self.kind != "energy"
+            if value is not None and key not in main:
+                yield InputError(f"{key!r} has no meaning for kind {self.kind!r}")
+            elif value is not None and isinstance(value, Mapping) != placed:
+                form = "a table, one expression a place" if placed else "one expression"
+                yield InputError(f"{key!r} must be {form}")
+        if not self.expressions:
+            yield InputError(f"an effect of kind {self.kind!r} needs {' or '.join(main)}")
+        for state in self.states:
+            if state.name in self.parameters:
+                yield InputError("a parameter has this name already", where=f"states.{state.name}")
 
     def targets(self, device: Device) -> tuple[str, ...]:
         """Names after the colon that make sense for ``device``; ``("",)`` for a device effect."""
@@ -85,7 +180,7 @@ class Effect:
                 c.name
                 for c in device.coordinates
                 if ("brake" not in used or c.name in device.brakes)
-                and ("dry" not in used or device.rubs(c.name))
+                and ("dry" not in used or device.has_dry_friction(c.name))
             )
         if self.scope == "channel":
             return tuple(device.channels)
@@ -154,96 +249,9 @@ def effect_from(declaration: Mapping[str, Any], where: str = "effect file") -> E
     Raises:
         InputError: something is missing, unknown or of the wrong type; names the field.
     """
-    unknown = sorted(set(declaration) - _KEYS)
-    if unknown:
-        raise InputError(
-            f"unknown key {unknown[0]!r}{did_you_mean(unknown[0], _KEYS)}",
-            where=where,
-        )
-    if declaration.get("schema", "bampipe.effect/1") != "bampipe.effect/1":
-        raise InputError("schema must be 'bampipe.effect/1'", where=where)
-    for key in ("name", "summary", "scope", "kind", "looks_like", "source"):
-        if not isinstance(declaration.get(key), str) or not declaration[key]:
-            raise InputError(f"{key!r} is missing or not text", where=where)
-    scope, kind = declaration["scope"], declaration["kind"]
-    if scope not in SCOPES:
-        raise InputError(f"scope {scope!r} is none of {', '.join(SCOPES)}", where=where)
-    if kind not in KINDS:
-        raise InputError(f"kind {kind!r} is none of {', '.join(KINDS)}", where=where)
-    if not declaration["name"].isidentifier():
-        raise InputError("name must be an identifier, such as magnetic_detent", where=where)
-    main, scopes = _EXPRESSIONS[kind]
-    if scope not in scopes:
-        raise InputError(
-            f"an effect of kind {kind!r} cannot have scope {scope!r}",
-            where=where,
-            remedy=f"scope may be {' or '.join(scopes)}",
-        )
-    for other in sorted({k for keys, _ in _EXPRESSIONS.values() for k in keys} - {*main}):
-        if other in declaration:
-            raise InputError(f"{other!r} has no meaning for kind {kind!r}", where=where)
-    trees: dict[str, ast.expr] = {}
-    for key in main:
-        value = declaration.get(key)
-        placed = scope == "device" and kind != "energy"
-        if value is not None and isinstance(value, Mapping) != placed:
-            raise InputError(
-                f"{key!r} must be "
-                + ("a table, one expression a place" if placed else "one expression"),
-                where=where,
-            )
-        if isinstance(value, Mapping):
-            for place, text in value.items():
-                trees[f"{key}.{place}"] = expression.parse(text, f"{where}: {key}.{place}")
-        elif value is not None:
-            trees[key] = expression.parse(value, f"{where}: {key}")
-    if not trees:
-        raise InputError(
-            f"an effect of kind {kind!r} needs {' or '.join(main)}",
-            where=where,
-        )
-    parameters = declaration.get("parameters")
-    if not isinstance(parameters, Mapping) or not parameters:
-        raise InputError("[parameters.*] is missing", where=where)
-    for name in parameters:
-        expression.check_name(name, f"{where}: parameters")
-    states = []
-    tables = declaration.get("states", {})
-    if not isinstance(tables, Mapping):
-        raise InputError("states must be tables, [states.name]", where=where)
-    devices = declaration.get("devices", [])
-    if not isinstance(devices, list | tuple) or any(not isinstance(d, str) for d in devices):
-        raise InputError("devices must be a list of names", where=where)
-    for name, entry in tables.items():
-        at = f"{where}: states.{name}"
-        expression.check_name(name, f"{where}: states")
-        if name in parameters:
-            raise InputError("a parameter has this name already", where=at)
-        if not isinstance(entry, Mapping) or "rate" not in entry:
-            raise InputError("a state needs its rate", where=at)
-        states.append(
-            State(
-                name,
-                expression.parse(entry["rate"], f"{at}.rate"),
-                expression.parse(str(entry.get("initial", "0")), f"{at}.initial"),
-                entry,
-            )
-        )
-    return Effect(
-        name=declaration["name"],
-        summary=declaration["summary"],
-        scope=scope,
-        kind=kind,
-        expressions=trees,
-        parameters=parameters,
-        states=tuple(states),
-        dissipative=bool(declaration.get("dissipative", False)),
-        looks_like=declaration["looks_like"],
-        source=declaration["source"],
-        devices=tuple(devices),
-        drive=bool(declaration.get("drive", False)),
-        declaration=declaration,
-    )
+    effect = read(Effect, declaration, where)
+    effect._declaration = declaration
+    return effect
 
 
 def bind(effect: Effect, target: str, device: Device) -> BoundEffect:
@@ -271,17 +279,15 @@ def bind(effect: Effect, target: str, device: Device) -> BoundEffect:
     prefix = f"{effect.name}.{target}" if target else effect.name
     bound = []
     for name, entry in effect.parameters.items():
-        where = f"effect {effect.name!r}: parameters.{name}"
-        chosen = entry
-        if isinstance(entry, Mapping) and ("rotary" in entry or "linear" in entry):
-            if kind not in entry:
-                raise InputError(f"no entry for a {kind or 'device'} parameter", where=where)
-            chosen = {**entry[kind]}
-            if "description" in entry:
-                chosen.setdefault("description", entry["description"])
-        if isinstance(chosen, Mapping) and isinstance(chosen.get("unit"), str):
-            chosen = {**chosen, "unit": unit_of(chosen["unit"], effect, target, device)}
-        bound.append(parameter_from(f"{prefix}.{name}", chosen, where))
+        chosen = getattr(entry, kind, None) if isinstance(entry, ParameterByKind) else entry
+        if chosen is None:
+            raise InputError(
+                f"no entry for a {kind or 'device'} parameter",
+                where=f"effect {effect.name!r}: parameters.{name}",
+            )
+        unit = unit_of(chosen.unit, effect, target, device)
+        about = chosen.description or entry.description
+        bound.append(chosen.renamed(f"{prefix}.{name}", unit=unit, description=about))
     return BoundEffect(effect, target, tuple(bound))
 
 

@@ -12,9 +12,12 @@ import math
 import warnings
 from collections.abc import Callable, Mapping
 from functools import cache
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import BeforeValidator, PlainValidator, WithJsonSchema
 
 from bampipe.errors import InputError, did_you_mean
+from bampipe.schema import fault
 
 MAX_LENGTH = 2000
 MAX_NODES = 500
@@ -175,6 +178,32 @@ def check_name(name: object, where: str) -> str:
     if name in FUNCTIONS:
         raise InputError(f"{name!r} is the name of a function", where=where)
     return name
+
+
+def _parsed(text: object) -> ast.expr:
+    try:
+        return parse(text, "")
+    except InputError as error:
+        raise fault(error.what, error.remedy) from None
+
+
+def _named(name: object) -> str:
+    try:
+        return check_name(name, "")
+    except InputError as error:
+        raise fault(error.what, error.remedy) from None
+
+
+Expression = Annotated[
+    ast.expr,
+    PlainValidator(_parsed),
+    WithJsonSchema({"type": "string", "minLength": 1, "maxLength": MAX_LENGTH}),
+]
+Name = Annotated[
+    str,
+    BeforeValidator(_named),
+    WithJsonSchema({"type": "string", "pattern": "^[A-Za-z_][A-Za-z0-9_]*$"}),
+]
 
 
 def _bounded(value: Any) -> bool:

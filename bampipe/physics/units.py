@@ -272,25 +272,22 @@ def check_device(device: Device) -> list[str]:
     symbols = _device_symbols(device, check)
     check.expression(device.kinetic, symbols, "energy.kinetic", joule)
     check.expression(device.potential, symbols, "energy.potential", joule)
-    noise = device.declaration.get("process_noise", {})
     for axis, unit, torque in _axes(device):
         for label, table in (("torque", device.torque), ("applied", device.applied)):
             if axis in table:
                 check.expression(table[axis], symbols, f"{label}.{axis}", torque)
         if axis in device.side_load:
             check.expression(device.side_load[axis], symbols, f"side_load.{axis}", None)
-        for name, gains in device.process_noise.items():
-            if axis in gains:
+        for name, noise in device.process_noise.items():
+            if axis in noise.torque:
                 field = f"process_noise.{name}"
-                own = check.unit(str(noise[name].get("unit", "")), f"{field}.unit")
+                own = check.unit(noise.unit, f"{field}.unit")
                 wanted = None if own is None else torque / own
-                check.expression(gains[axis], symbols, f"{field}.torque.{axis}", wanted)
-        if axis in device.frictional:
+                check.expression(noise.torque[axis], symbols, f"{field}.torque.{axis}", wanted)
+        if axis in device.friction:
             wanted_units = {"viscous": torque * _UNITS["s"] / unit, "coulomb": torque}
-            for p in device.parameters:
-                term, _, place = p.name.partition(".")
-                if place == axis:
-                    check.named(p.unit, f"friction.{axis}.{term}", wanted_units[term])
+            for term, parameter in device.friction[axis]:
+                check.named(parameter.unit, f"friction.{axis}.{term}", wanted_units[term])
     _check_controller(device, symbols, check)
     return list(dict.fromkeys(check.found))
 
@@ -360,9 +357,7 @@ def check_effect(effect: Effect, device: Device, target: str = "") -> list[str]:
     symbols = _effect_symbols(item, device, check)
     kind = device.coordinate(target).kind if effect.scope == "axis" else ""
     for state in effect.states:
-        entry = state.entry.get(kind, state.entry)
-        unit = str(entry.get("unit", "")) if isinstance(entry, Mapping) else ""
-        unit = unit_of(unit, effect, target, device)
+        unit = unit_of(state.unit_on(kind), effect, target, device)
         symbols[state.name] = check.unit(unit, f"states.{state.name}.unit")
     force = symbols[device.forces[0]] if device.forces else None
     wanted: dict[str, Callable[[str], Found]] = {

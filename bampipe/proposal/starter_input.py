@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from bampipe.physics.device import TORQUE_UNITS
+from bampipe.physics.device import KINDS
 
 _GAIN = {"current": ("A", "torque_per_ampere"), "voltage": ("V", "torque_per_volt")}
 _SCALE = "[constants]                         # sets the scale of all that is estimated\n"
@@ -50,7 +50,7 @@ class Axis:
 
     @property
     def torque(self) -> str:
-        return TORQUE_UNITS[self.kind]
+        return KINDS[self.kind][1]
 
     @property
     def inertia(self) -> str:

@@ -77,12 +77,12 @@ def test_a_law_of_the_wrong_unit_is_said():
 @pytest.mark.parametrize(
     ("controller", "words"),
     [
-        ({"command": {"force_engine": "1"}}, "one expression for each of force_motor"),
-        ({"gains": {}}, "unknown key 'gains'"),
-        ({"channels": ["goal"]}, "channels must be a table"),
+        ({"command": {"force_engine": "1"}}, "one expression is needed for each of force_motor"),
+        ({"gains": {}}, 'unknown key "gains"'),
+        ({"channels": ["goal"]}, "channels: found .*, expected a table"),
         ({"channels": {"mass": "kg"}}, "'mass' is the name of"),
-        ({"rate_hz": -5}, "rate_hz must be"),
-        ({"states": {"wound": {"rate": "goal - carriage"}}}, "states.wound: expected"),
+        ({"rate_hz": -5}, "rate_hz: found -5, expected 0 or more"),
+        ({"states": {"wound": {"rate": "goal - carriage"}}}, "states.wound: 'unit' is missing"),
         ({"states": {"goal": {"unit": "m.s", "rate": "1"}}}, "'goal' is the name of"),
         (
             {"states": {"wound": {"unit": "m.s", "rate": "1", "lower": 2, "upper": 1}}},

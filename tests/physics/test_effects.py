@@ -227,8 +227,7 @@ def symbols_of(case):
     known |= {p.name.rpartition(".")[2]: dimension(p.unit) for p in bound.parameters}
     kind = BAM.coordinate(bound.target).kind if bound.effect.scope == "axis" else ""
     for state in bound.effect.states:
-        entry = state.entry.get(kind, state.entry)
-        known[state.name] = dimension(entry["unit"])
+        known[state.name] = dimension(state.unit_on(kind))
     expected = {"kinetic": dimension("J"), "potential": dimension("J"), "input": newton}
     return bound, known, expected
 
