@@ -75,6 +75,11 @@ def njit(*signatures: Any, **options: Any) -> Any:
     return decorate
 
 
+def record_type(record: type, *fields: Any) -> Any:
+    """Return numba's type of a NamedTuple with ``fields``: how kernels take records."""
+    return numba.types.BaseTuple.from_types(fields, record)
+
+
 @contextmanager
 def _collector_at_rest() -> Iterator[None]:
     """Pause the search for reference cycles: a fifth of the time that numba takes, for nothing."""

@@ -1,6 +1,6 @@
 """Estimators side by side on simulated sessions of known truth.
 
-The unscented filter in both forms, least squares, instrumental variables and output error estimate
+The unscented filter, least squares, instrumental variables and output error estimate
 friction and mass of the BAM from the same sessions, made by `bampipe simulate` with fresh seeds:
 bias, standard deviation, how often the stated 95 % interval holds the truth, seconds.
 
@@ -41,8 +41,7 @@ Array = NDArray[np.float64]
 
 MODEL = 'schema = "bampipe.model/1"\nname = "base"\ndevice = "bam"\neffects = []\n'
 BY_STAGE = {
-    "unscented filter, square root": {"form": "square_root"},
-    "unscented filter, covariance": {"form": "covariance"},
+    "unscented filter": {},
     "least squares": {"method": "least-squares"},
     "least squares, bias left in": {"method": "least-squares", "remove_bias": False},
     "output error": {"method": "output-error"},

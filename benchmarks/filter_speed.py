@@ -143,13 +143,12 @@ def timed(run: Callable[[], Array], repeats: int, steps: int) -> Measured:
     return Measured(theta, seconds, steps)
 
 
-def by_bampipe(problem: Problem, square_root: bool, repeats: int) -> Measured:
+def by_bampipe(problem: Problem, repeats: int) -> Measured:
     """The compiled filter."""
-    settings = replace(problem.settings, square_root=square_root)
 
     def run() -> Array:
         return filter_trials(
-            problem.model, [problem.trial], problem.mean, problem.covariance, settings
+            problem.model, [problem.trial], problem.mean, problem.covariance, problem.settings
         ).theta
 
     return timed(run, repeats, problem.trial.t.size - 1)
@@ -311,22 +310,21 @@ def main() -> None:
         rows["C, `cc -O3 -march=native -ffast-math`"] = by_c(
             whole, folder, limit[1], chosen.repeats
         )
-        rows["bampipe, square-root form"] = by_bampipe(whole, True, chosen.repeats)
-        rows["bampipe, covariance form"] = by_bampipe(whole, False, chosen.repeats)
+        rows["bampipe"] = by_bampipe(whole, chosen.repeats)
         jitted = by_dynamax(whole, chosen.dynamax, folder, 5)
         if jitted is None:
             print(f"dynamax is not installed for {chosen.dynamax}: pip install dynamax")
         else:
             rows["dynamax, jitted"] = jitted
-        expected = rows["bampipe, square-root form"].theta
+        expected = rows["bampipe"].theta
         for label, found in rows.items():
             require_same(label, found.theta, expected, scale)
         rows["filterpy, compiled model"] = by_filterpy(part, True, 3)
         rows["filterpy, Python model"] = by_filterpy(part, False, 3)
-        expected = by_bampipe(part, True, 0).theta
+        expected = by_bampipe(part, 0).theta
         for label in ("filterpy, compiled model", "filterpy, Python model"):
             require_same(label, rows[label].theta, expected, scale)
-    ours = rows["bampipe, square-root form"].step
+    ours = rows["bampipe"].step
     print("\n| filter | µs a step | steps per second | time over bampipe's |\n|-|-|-|-|")
     for label, found in rows.items():
         print(f"| {label} | {found.step:.1f} | {1e6 / found.step:,.0f} | {found.step / ours:.2f} |")

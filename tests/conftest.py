@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 
-TOYS = Path(__file__).parent / "toys"
-sys.path.insert(0, str(TOYS))
+TOYS, ORACLES = (Path(__file__).parent / name for name in ("toys", "oracles"))
+sys.path[:0] = [str(TOYS), str(ORACLES)]
 
 import install_toys  # noqa: E402
 

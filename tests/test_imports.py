@@ -37,6 +37,7 @@ LAWS = {
         "pydantic",
         "bampipe.compiled",
         "bampipe.errors",
+        "bampipe.model_functions",
         "bampipe.schema",
     },
     "estimate": {
@@ -47,6 +48,7 @@ LAWS = {
         "filterpy",
         "bampipe.compiled",
         "bampipe.errors",
+        "bampipe.model_functions",
     },
     "discover": {
         "numpy",

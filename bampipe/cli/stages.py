@@ -131,7 +131,7 @@ def identify(
     method: Annotated[str, typer.Option(help="auto, ukf, least-squares or output-error.")] = "",
     engine: Annotated[
         str,
-        typer.Option(help="compiled; filterpy or augmented: slow, to compare with."),
+        typer.Option(help="compiled; or filterpy: slow, to compare with."),
     ] = "",
     settings: Settings = None,
     list_settings: ListSettings = False,

@@ -1,9 +1,9 @@
-"""Butterworth filter and central differences: without phase for records, causal for online use."""
+"""Butterworth filter without phase, and central differences."""
 
 from __future__ import annotations
 
 import numpy as np
-from scipy.signal import butter, periodogram, sosfilt, sosfilt_zi, sosfiltfilt
+from scipy.signal import butter, periodogram, sosfiltfilt
 
 from bampipe.estimate.differentiation import (
     Array,
@@ -41,8 +41,8 @@ def zero_phase(
             amplitude through there.
         order: order of one pass.
     """
-    reach = int(np.ceil(4.0 * rate_hz / cutoff_hz)) + 2
     sections = _design(cutoff_hz, rate_hz, order)
+    reach = int(np.ceil(4.0 * rate_hz / cutoff_hz)) + 2
     longer = extend(values, reach, max(4, int(np.ceil(1.5 * rate_hz / cutoff_hz))))
     added = (len(longer) - len(values)) // 2
     x = np.asarray(sosfiltfilt(sections, longer, padtype=None), dtype=np.float64)
@@ -105,39 +105,3 @@ def floor_frequency(position: Array, rate_hz: float, noise_sd: float) -> float:
             return lower
         lower = upper
     return limit
-
-
-class CausalButterworth:
-    """The same filter sample by sample: low-pass, then backward differences.
-
-    The delay at low frequency is that of the low-pass, about ``delay_s``, and half a sample more
-    for each difference.
-    """
-
-    def __init__(self, rate_hz: float, cutoff_hz: float, order: int = 2) -> None:
-        self._sections = _design(cutoff_hz, rate_hz, order)
-        self._rate = rate_hz
-        self._memory: Array | None = None
-        self._recent: tuple[float, float] = (0.0, 0.0)
-        angle = 1e-3
-        shift = np.exp(-1j * angle)
-        response = np.prod(
-            [
-                (b0 + b1 * shift + b2 * shift**2) / (1.0 + a1 * shift + a2 * shift**2)
-                for b0, b1, b2, _, a1, a2 in self._sections
-            ]
-        )
-        self.delay_s = float(-np.angle(response) / angle / rate_hz)
-
-    def step(self, position: float) -> tuple[float, float, float]:
-        """Take one sample; return position, velocity and acceleration as known by now.
-
-        The first sample is taken as a handle at rest there.
-        """
-        if self._memory is None:
-            self._memory = np.asarray(sosfilt_zi(self._sections)) * position
-            self._recent = (position, position)
-        out, self._memory = sosfilt(self._sections, [position], zi=self._memory)
-        now, (last, before) = float(out[0]), self._recent
-        self._recent = (now, last)
-        return now, (now - last) * self._rate, (now - 2.0 * last + before) * self._rate**2

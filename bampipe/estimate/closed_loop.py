@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from bampipe.compiled import njit
 from bampipe.estimate.runge_kutta import runge_kutta
-from bampipe.estimate.signatures import COMMAND, DERIVATIVE, MEASURE
 from bampipe.estimate.simulation import require_finite, stable_steps
+from bampipe.model_functions import COMMAND, DERIVATIVE, MEASURE
 
 Array = NDArray[np.float64]
 

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.errors import InputError
-from bampipe.estimate.placement import place_parameters
 from bampipe.estimate.runge_kutta import runge_kutta
 from bampipe.estimate.unscented import (
     FilteredTrial,
@@ -47,12 +46,12 @@ def filter_trials_by_filterpy(
         InputError: filterpy 2 is not installed.
     """
 
-    def one(
+    def filter_one(
         index: int, trial: Trial, theta: Array, covariance: Array
     ) -> tuple[FilteredTrial, Array, Array]:
         return _filter(model, index, trial, theta, covariance, settings, advance)
 
-    return in_sequence(one, trials, theta, covariance)
+    return in_sequence(filter_one, trials, theta, covariance)
 
 
 def _filter(
@@ -81,11 +80,8 @@ def _filter(
     work = np.empty((6, max(n, 2 * nx) + u.shape[1]))
     reading = np.empty(2 * nx)
 
-    def place(point: Array) -> None:
-        place_parameters(point, nx, model.free, model.logarithmic, lower, upper, p)
-
     def move(point: Array, dt: float, k: int) -> Array:
-        place(point)
+        model.place_parameters(point[nx:n], p)
         x, w = point[:nx].copy(), point[n:].copy()
         late = p[-1] / dt * (u[k] - u[k - 1])
         start, end = u[k - 1] - late, u[k] - late
@@ -94,7 +90,7 @@ def _filter(
         return np.concatenate([x, point[nx:n], np.zeros(nw)])
 
     def read(point: Array, k: int) -> Array:
-        place(point)
+        model.place_parameters(point[nx:n], p)
         model.measure(point[:nx].copy(), u[k], p, reading)
         return reading[settings.observed].copy()
 

@@ -58,16 +58,14 @@ class OnlineFilter:
         joint[:nx, :nx] = np.diag(np.square(x_sd))
         joint[nx:, nx:] = covariance
         self._model, self._settings = model, settings
-        self._joint = lower_root(joint) if settings.square_root else joint
+        self._root = lower_root(joint)
         self._last: tuple[float, Array] | None = None
         self.mean = np.concatenate([x, np.clip(theta, lower, upper)])
 
     @property
     def covariance(self) -> Array:
         """(n, n) covariance of `mean`."""
-        if self._settings.square_root:
-            return np.asarray(self._joint @ self._joint.T)
-        return self._joint.copy()
+        return np.asarray(self._root @ self._root.T)
 
     def advance(self, t: Array, u: Array, y: Array) -> Innovations:
         """Take samples; the very first one only starts the clock.
@@ -84,7 +82,7 @@ class OnlineFilter:
             u = np.vstack([self._last[1], u])
             y = np.vstack([np.full(ny, np.nan), y])
         found = run_kernel(
-            self._model, self._settings, t, u, y, self.mean, self._joint, stride=t.size
+            self._model, self._settings, t, u, y, self.mean, self._root, stride=t.size
         )
         skipped = 0 if self._last is None else 1
         self._last = (float(t[-1]), np.array(u[-1]))

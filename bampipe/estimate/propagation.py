@@ -1,15 +1,59 @@
 """Sigma points carried over one sampling interval by the equations of motion, compiled."""
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import boolean, float64, int64, void
 from numpy.typing import NDArray
 
-from bampipe.compiled import njit
-from bampipe.estimate.signatures import DERIVATIVE_ROWS, MEASURE_ROWS, ROWS
+from bampipe.compiled import njit, record_type
+from bampipe.model_functions import DERIVATIVE_ROWS, MEASURE_ROWS, ROWS
+
+Array = NDArray[np.float64]
+
+_V = float64[::1]
+_M = float64[:, ::1]
 
 
-def scratch(nx: int, nu: int, p: NDArray[np.float64], nw: int) -> NDArray[np.float64]:
-    """Scratch of `propagate_points` and `measure_points`, the parameters ``p`` in every row.
+class Estimated(NamedTuple):
+    """What is estimated of a model and what of it is measured, as kernels take it.
+
+    Attributes:
+        n_states: length nx of the state.
+        timing: index among all parameters of the time by which the inputs were sampled after the
+            positions, s, at most a fraction of a sampling interval.
+        free: (nt,) indices of the estimated parameters among all.
+        logarithmic: (nt,) which of them are estimated as logarithms.
+        lower, upper: (nt,) their range, logarithms where so estimated.
+        observed: (ny,) which elements of the model's measurement are read.
+        reads_parameters: whether the measurement depends on estimated parameters.
+    """
+
+    n_states: int
+    timing: int
+    free: NDArray[np.int64]
+    logarithmic: NDArray[np.bool_]
+    lower: Array
+    upper: Array
+    observed: NDArray[np.int64]
+    reads_parameters: bool
+
+
+ESTIMATED = record_type(
+    Estimated, int64, int64, int64[::1], boolean[::1], _V, _V, int64[::1], boolean
+)
+
+
+X, PROBE, TOTAL, RATE, U, START, P, W, SLOPE = range(9)
+"""Rows of the workspace of sigma points: states, where the derivative is taken, the Runge-Kutta
+sum, the derivative; inputs, and those at the start of the interval; all parameters; process noise;
+and what the input gains over the interval, once for all points. In the others, quantity i of point
+r is at [i*ROWS + r]. One matrix, because of separate arrays the compiler cannot know how far apart
+they are, and checks it in every loop."""
+
+
+def allocate_points(nx: int, nu: int, p: Array, nw: int) -> Array:
+    """Return the workspace of `propagate_points` and `measure_points`, ``p`` in every row.
 
     Args:
         nx, nu, nw: lengths of state, input and process noise.
@@ -18,13 +62,13 @@ def scratch(nx: int, nu: int, p: NDArray[np.float64], nw: int) -> NDArray[np.flo
     Returns:
         (9, width).
     """
-    work = np.zeros((9, ROWS * max(2 * nx, nu, len(p), nw)))
-    work[6, : ROWS * len(p)] = np.repeat(p, ROWS)
-    return work
+    points = np.zeros((9, ROWS * max(2 * nx, nu, len(p), nw)))
+    points[P, : ROWS * len(p)] = np.repeat(p, ROWS)
+    return points
 
 
 @njit(
-    void(float64[::1], int64, float64, float64, float64[::1], int64, int64, int64, int64, int64),
+    void(_V, int64, float64, float64, _V, int64, int64, int64, int64, int64),
     cache=True,
     fastmath={"contract"},
 )
@@ -39,51 +83,45 @@ def _spread(out, offset, centre, reach, root, n, pairs, first, count, padded):  
 
 
 @njit(
-    void(
-        float64[::1], float64[:, ::1], float64, int64, int64, int64[::1], boolean[::1],
-        float64[::1], float64[::1], int64, int64, int64, float64[::1],
-    ),
+    void(ESTIMATED, _V, _M, float64, int64, int64, int64, int64, _V),
     cache=True,
     fastmath={"contract"},
-)  # fmt: skip
-def _place_rows(  # type: ignore[no-untyped-def]
-    mean, factor, reach, nx, pairs, free, logarithmic, lower, upper, first, count, padded, q
-):
-    """Write the estimated parameters of sigma points into ``q``, within their range."""
-    n = mean.shape[0]
+)
+def _spread_parameters(estimated, mean, factor, reach, pairs, first, count, padded, p):  # type: ignore[no-untyped-def]
+    """Write the estimated parameters of sigma points into ``p``, within their range."""
+    n, nx = mean.shape[0], estimated.n_states
+    free, logarithmic = estimated.free, estimated.logarithmic
+    lower, upper = estimated.lower, estimated.upper
     for j in range(free.shape[0]):
         at = free[j] * ROWS
-        _spread(q, at, mean[nx + j], reach, factor[nx + j], n, pairs, first, count, padded)
+        _spread(p, at, mean[nx + j], reach, factor[nx + j], n, pairs, first, count, padded)
         if lower[j] > -np.inf:
             for r in range(at, at + padded):
-                q[r] = max(q[r], lower[j])
+                p[r] = max(p[r], lower[j])
         if upper[j] < np.inf:
             for r in range(at, at + padded):
-                q[r] = min(q[r], upper[j])
+                p[r] = min(p[r], upper[j])
         if logarithmic[j]:
             for r in range(at, at + padded):
-                q[r] = np.exp(q[r])
+                p[r] = np.exp(p[r])
 
 
 @njit(
-    void(
-        DERIVATIVE_ROWS, int64, int64, int64, float64, int64, float64[::1], float64[:, ::1]
-    ),
+    void(DERIVATIVE_ROWS, int64, int64, int64, float64, int64, _M),
     cache=True,
     fastmath={"contract"},
-)  # fmt: skip
-def _runge_kutta_rows(derivative, count, nx, nu, dt, substeps, slope, work):  # type: ignore[no-untyped-def]
+)
+def _runge_kutta_rows(derivative, count, nx, nu, dt, substeps, points):  # type: ignore[no-untyped-def]
     """Advance many states by ``dt``, as `bampipe.estimate.runge_kutta` advances one.
 
     Args:
         derivative: f(count, x, u, p, w, dx).
         count: of the rows; nx, nu: lengths of state and input.
         dt: s; substeps: number of steps.
-        slope: (>= nu,) what the input gains over the interval.
-        work: x, probe, sum, rate, u, start of the input, p, w: x in and out.
+        points: the states ``x`` are advanced in place.
     """
-    x, probe, total, rate = work[0], work[1], work[2], work[3]
-    u, start, p, w = work[4], work[5], work[6], work[7]
+    x, probe, total, rate = points[X], points[PROBE], points[TOTAL], points[RATE]
+    u, start, p, w, slope = points[U], points[START], points[P], points[W], points[SLOPE]
     delta = dt / substeps
     for step in range(substeps):
         for stage in range(4):
@@ -111,42 +149,32 @@ def _runge_kutta_rows(derivative, count, nx, nu, dt, substeps, slope, work):  # 
 
 
 @njit(
-    void(
-        DERIVATIVE_ROWS, float64[::1], float64[:, ::1], float64, float64[::1], int64, int64,
-        int64[::1], boolean[::1], float64[::1], float64[::1], float64[::1],
-        float64[::1], float64, int64, float64[:, ::1], float64[:, ::1],
-    ),
+    void(DERIVATIVE_ROWS, ESTIMATED, _V, _M, float64, _V, _V, _V, float64, int64, _M, _M),
     cache=True,
-)  # fmt: skip
+)
 def propagate_points(  # type: ignore[no-untyped-def]
-    derivative, mean, factor, reach, noise_sd, nx, timing, free, logarithmic, lower, upper,
-    u0, u1, dt, substeps, points, work,
-):  # fmt: skip
+    derivative, estimated, mean, factor, reach, noise_sd, u0, u1, dt, substeps, images, points
+):
     """Draw the sigma points of (state, parameters, process noise) and carry each over ``dt``.
 
     Args:
         derivative: f(count, x, u, p, w, dx).
+        estimated: what of the model is estimated.
         mean: (n,) state then free parameters; factor: (n, n) lower root of their covariance.
         reach: distance of the points, in standard deviations.
         noise_sd: (nw,) of the process noise, independent of the state: its root is diagonal,
             which is why the (n + nw) root never needs to be formed.
-        nx: length of the state.
-        timing: place among the parameters of the time by which the inputs were sampled after
-            the positions, s, at most a fraction of ``dt``.
-        free: (n - nx,) places of the estimated parameters among all.
-        logarithmic: (n - nx,) which of them are estimated as logarithms.
-        lower, upper: (n - nx,) range of the estimated parameters, logarithms where so estimated.
         u0, u1: (nu,) input at both ends; dt: s; substeps: of the Runge-Kutta method.
-        points: (nx, 1 + 2 (n + nw)) result, states only, for parameters stay: the points ahead
+        images: (nx, 1 + 2 (n + nw)) result, states only, for parameters stay: the points ahead
             of the mean along each column of the joint root, those behind it, the centre.
-        work: from `scratch`, which has put the other parameters in place.
+        points: from `allocate_points`, which has put the other parameters in position.
     """
-    n = mean.shape[0]
-    nw = noise_sd.shape[0]
-    nu = u0.shape[0]
+    n, nx = mean.shape[0], estimated.n_states
+    nw, nu = noise_sd.shape[0], u0.shape[0]
     pairs = n + nw
     rows = 1 + 2 * pairs
-    x, start, q, w, slope = work[0], work[5], work[6], work[7], work[8]
+    x, start, p, w, slope = points[X], points[START], points[P], points[W], points[SLOPE]
+    timing = estimated.timing * ROWS
     for i in range(nu):
         slope[i] = u1[i] - u0[i]
     for first in range(0, rows, ROWS):
@@ -154,10 +182,7 @@ def propagate_points(  # type: ignore[no-untyped-def]
         padded = (count + 3) // 4 * 4
         for i in range(nx):
             _spread(x, i * ROWS, mean[i], reach, factor[i], n, pairs, first, count, padded)
-        _place_rows(
-            mean, factor, reach, nx, pairs, free, logarithmic, lower, upper,
-            first, count, padded, q,
-        )  # fmt: skip
+        _spread_parameters(estimated, mean, factor, reach, pairs, first, count, padded, p)
         for i in range(nw):
             for r in range(padded):
                 w[i * ROWS + r] = 0.0
@@ -167,65 +192,37 @@ def propagate_points(  # type: ignore[no-untyped-def]
                     w[i * ROWS + row - first] = distance * noise_sd[i]
         for i in range(nu):
             for r in range(padded):
-                start[i * ROWS + r] = u0[i] - q[timing * ROWS + r] * (slope[i] / dt)
-        _runge_kutta_rows(derivative, padded, nx, nu, dt, substeps, slope, work)
+                start[i * ROWS + r] = u0[i] - p[timing + r] * (slope[i] / dt)
+        _runge_kutta_rows(derivative, padded, nx, nu, dt, substeps, points)
         for i in range(nx):
             for r in range(count):
-                points[i, first + r] = x[i * ROWS + r]
+                images[i, first + r] = x[i * ROWS + r]
 
 
-@njit(
-    void(
-        MEASURE_ROWS, float64[::1], float64[:, ::1], float64, int64, int64[::1],
-        boolean[::1], float64[::1], float64[::1], float64[::1], int64[::1], boolean,
-        float64[:, ::1], float64[:, ::1],
-    ),
-    cache=True,
-)  # fmt: skip
-def measure_points(  # type: ignore[no-untyped-def]
-    measure,
-    mean,
-    factor,
-    reach,
-    nx,
-    free,
-    logarithmic,
-    lower,
-    upper,
-    u,
-    observed,
-    reads_parameters,
-    images,
-    work,
-):
+@njit(void(MEASURE_ROWS, ESTIMATED, _V, _M, float64, _V, _M, _M), cache=True)
+def measure_points(measure, estimated, mean, factor, reach, u, images, points):  # type: ignore[no-untyped-def]
     """Draw sigma points of (state, parameters) afresh and take the measurement of each.
 
     Args:
         measure: h(count, x, u, p, y).
-        mean, factor, reach, nx, free, logarithmic, lower, upper: as in `propagate_points`.
+        estimated, mean, factor, reach, points: as in `propagate_points`.
         u: (nu,) input at the time of the measurement.
-        observed: (ny,) which elements of the model's measurement are used.
-        reads_parameters: whether h depends on estimated parameters.
         images: (ny, 1 + 2 n) result, in the order of `propagate_points`.
-        work: from `scratch`.
     """
-    n = mean.shape[0]
+    n, nx, observed = mean.shape[0], estimated.n_states, estimated.observed
     rows = 1 + 2 * n
-    x, y, inputs, q = work[0], work[1], work[4], work[6]
+    x, y, inputs, p = points[X], points[PROBE], points[U], points[P]
     for first in range(0, rows, ROWS):
         count = min(ROWS, rows - first)
         padded = (count + 3) // 4 * 4
         for i in range(nx):
             _spread(x, i * ROWS, mean[i], reach, factor[i], n, n, first, count, padded)
-        if reads_parameters:
-            _place_rows(
-                mean, factor, reach, nx, n, free, logarithmic, lower, upper,
-                first, count, padded, q,
-            )  # fmt: skip
+        if estimated.reads_parameters:
+            _spread_parameters(estimated, mean, factor, reach, n, first, count, padded, p)
         for i in range(u.shape[0]):
             for r in range(padded):
                 inputs[i * ROWS + r] = u[i]
-        measure(padded, x, inputs, q, y)
+        measure(padded, x, inputs, p, y)
         for i in range(observed.shape[0]):
             for r in range(count):
                 images[i, first + r] = y[observed[i] * ROWS + r]

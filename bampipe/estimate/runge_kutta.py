@@ -3,7 +3,7 @@
 from numba import float64, int64, void
 
 from bampipe.compiled import njit
-from bampipe.estimate.signatures import DERIVATIVE
+from bampipe.model_functions import DERIVATIVE
 
 
 @njit(

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from bampipe.compiled import njit
 from bampipe.errors import InputError
 from bampipe.estimate.runge_kutta import runge_kutta
-from bampipe.estimate.signatures import DERIVATIVE
 from bampipe.estimate.triangular import cholesky, forward_substitute
+from bampipe.model_functions import DERIVATIVE
 
 Array = NDArray[np.float64]
 

@@ -1,17 +1,24 @@
-"""The unscented filter in its square-root form (section V-C), the default."""
+"""The unscented filter in its square-root form (section V-C), compiled.
+
+A filter may be stopped and continued: ``mean`` and the root of the covariance go in as the
+distribution at sample 0 and come out as that at the last sample, so that a filter fed sample by
+sample computes what the batch filter computes. Kernels get their memory from the caller: in each
+process, numba takes a second to compile what allocates arrays.
+"""
+
+from typing import NamedTuple
 
 import numpy as np
+from numba import float64, int64, types
 from numpy.typing import NDArray
 
-from bampipe.compiled import njit
-from bampipe.estimate.filter_signature import (
-    DONE,
-    INNOVATION_NOT_POSITIVE,
-    NOT_FINITE,
-    STATE_NOT_POSITIVE,
-    kernel,
+from bampipe.compiled import njit, record_type
+from bampipe.estimate.propagation import (
+    ESTIMATED,
+    allocate_points,
+    measure_points,
+    propagate_points,
 )
-from bampipe.estimate.propagation import measure_points, propagate_points, scratch
 from bampipe.estimate.triangular import (
     append_rows,
     condition,
@@ -21,63 +28,140 @@ from bampipe.estimate.triangular import (
     rank_one_update,
     transpose,
 )
+from bampipe.model_functions import DERIVATIVE_ROWS, MEASURE_ROWS
+
+Array = NDArray[np.float64]
+
+DONE = 0
+NOT_FINITE = 1
+STATE_NOT_POSITIVE = 2
+INNOVATION_NOT_POSITIVE = 3
+
+_V = float64[::1]
+_M = float64[:, ::1]
 
 
-def memory(
-    n: int, nx: int, nu: int, ny: int, nw: int, p: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], ...]:
-    """Scratch of `filter_square_root`: points, images, roots, noise, gain, vectors, points.
+class Samples(NamedTuple):
+    """Samples that follow each other: ``t`` (T,) s, inputs ``u`` (T, nu), readings ``y`` (T, ny).
+
+    A reading of NaN is missing.
+    """
+
+    t: Array
+    u: Array
+    y: Array
+
+
+class Levels(NamedTuple):
+    """Noise and numerical settings, as the kernel takes them.
+
+    Attributes:
+        process_sd: (nw,) of the process noise of each sample.
+        walk_sd: (nt,) random walk of the parameters, per square root of a second.
+        reading_sd: (ny,) of the measurement noise, additive.
+        spread: squared distance of the sigma points, in variances.
+        centre, other: weight of the central point and of each other one in a covariance.
+        longest_step: of the Runge-Kutta method, s.
+        stride: of the stored distributions, samples.
+    """
+
+    process_sd: Array
+    walk_sd: Array
+    reading_sd: Array
+    spread: float
+    centre: float
+    other: float
+    longest_step: float
+    stride: int
+
+
+class Output(NamedTuple):
+    """What the kernel fills in.
+
+    Attributes:
+        means: (ceil(T / stride), n); covariances: (ceil(T / stride), n, n).
+        innovation, innovation_sd: (T, ny); nis, log_likelihood: (T,); NaN where no reading is.
+    """
+
+    means: Array
+    covariances: Array
+    innovation: Array
+    innovation_sd: Array
+    nis: Array
+    log_likelihood: Array
+
+
+class Workspace(NamedTuple):
+    """Memory of `filter_square_root`.
+
+    Attributes:
+        images: (nx, 1 + 2 (n + nw)) states of the sigma points after the interval.
+        readings: (ny, 1 + 2 n) measurements of the sigma points.
+        root: (n, padded) upper root R of the covariance, R^T R.
+        columns: (n, padded) deviations of the states; reading_columns: (ny, padded) of readings.
+        noise: (ny, ny) lower root of what the state leaves open of the readings.
+        cross: (ny, n) readings along the columns of R^T; gain: (ny, padded) transposed gain.
+        cosine, sine, single, whitened: (n + ny + 1,).
+        points: of `propagate_points`.
+    """
+
+    images: Array
+    readings: Array
+    root: Array
+    columns: Array
+    reading_columns: Array
+    noise: Array
+    cross: Array
+    gain: Array
+    cosine: Array
+    sine: Array
+    single: Array
+    whitened: Array
+    points: Array
+
+
+def allocate(n: int, nx: int, nu: int, ny: int, nw: int, p: Array) -> Workspace:
+    """Return the memory of `filter_square_root`.
 
     Args:
         n, nx, nu, ny, nw: lengths of mean, state, input, reading and process noise.
         p: (np + 1,) all parameters, then the timing of the inputs.
     """
-    pairs = n + nw
-    wide = padded(n)
-    return (
-        np.empty((nx, 1 + 2 * pairs)),
-        np.empty((ny, 1 + 2 * n)),
-        np.zeros((n, wide)),
-        np.zeros((n, padded(pairs + nw))),
-        np.zeros((ny, wide)),
-        np.empty((ny, ny)),
-        np.empty((ny, n)),
-        np.empty((ny, wide)),
-        np.empty((5, n + ny + 1)),
-        scratch(nx, nu, p, nw),
+    pairs, wide, longest = n + nw, padded(n), n + ny + 1
+    return Workspace(
+        images=np.empty((nx, 1 + 2 * pairs)),
+        readings=np.empty((ny, 1 + 2 * n)),
+        root=np.zeros((n, wide)),
+        columns=np.zeros((n, padded(pairs + nw))),
+        reading_columns=np.zeros((ny, wide)),
+        noise=np.empty((ny, ny)),
+        cross=np.empty((ny, n)),
+        gain=np.empty((ny, wide)),
+        cosine=np.empty(longest),
+        sine=np.empty(longest),
+        single=np.empty(longest),
+        whitened=np.empty(longest),
+        points=allocate_points(nx, nu, p, nw),
     )
 
 
-@njit(kernel(10), cache=True, fastmath={"contract"})
+@njit(
+    types.UniTuple(int64, 2)(  # type: ignore[no-untyped-call]
+        DERIVATIVE_ROWS,
+        MEASURE_ROWS,
+        ESTIMATED,
+        record_type(Levels, _V, _V, _V, float64, float64, float64, float64, int64),
+        record_type(Samples, _V, _M, _M),
+        _V,
+        _M,
+        record_type(Output, _M, float64[:, :, ::1], _M, _M, _V, _V),
+        record_type(Workspace, *[_M] * 8, *[_V] * 4, _M),
+    ),
+    cache=True,
+    fastmath={"contract"},
+)
 def filter_square_root(  # type: ignore[no-untyped-def]
-    derivative,
-    measure,
-    t,
-    u,
-    y,
-    observed,
-    reads_parameters,
-    nx,
-    mean,
-    factor,
-    p,
-    free,
-    logarithmic,
-    lower,
-    upper,
-    noise_sd,
-    walk_sd,
-    reading_sd,
-    weights,
-    longest_step,
-    stride,
-    means,
-    covariances,
-    innovations,
-    innovation_sd,
-    consistency,
-    reason,
-    matrices,
+    derivative, measure, estimated, levels, samples, mean, factor, out, work
 ):
     """Filter one trial, propagating the lower root of the covariance.
 
@@ -85,27 +169,37 @@ def filter_square_root(  # type: ignore[no-untyped-def]
     by differences and sums of opposite points: parameters stay where they are, so that in the
     sums, and in the points that move the noise, only the state is not zero. The update rotates
     the joint root of measurement and state, so that it needs no downdate and cannot lose positive
-    definiteness. Returns the sample of failure or DONE.
+    definiteness.
+
+    Args:
+        derivative: f(count, x, u, p, w, dx); measure: h(count, x, u, p, y).
+        estimated, levels, samples: the model, its noise and the trial.
+        mean: (n,) state and parameters, in and out; factor: (n, n) lower root of their
+            covariance, in and out.
+        out: filled in; work: from `allocate`.
+
+    Returns:
+        Why it stopped, `DONE` or another, and the sample where it did.
     """
+    t, u, y = samples
+    nx, observed = estimated.n_states, estimated.observed
+    lower, upper = estimated.lower, estimated.upper
+    process_sd, walk_sd, reading_sd = levels.process_sd, levels.walk_sd, levels.reading_sd
+    centre, other, stride = levels.centre, levels.other, levels.stride
+    means, covariances, innovations, innovation_sd, squares, likelihoods = out
+    images, readings, root, columns, reading_columns, noise, cross, gain = work[:8]
+    cosine, sine, single, whitened, points = work[8:]
     n = mean.shape[0]
-    nw = noise_sd.shape[0]
+    nw = process_sd.shape[0]
     ny = observed.shape[0]
     nt = n - nx
-    spread, centre, other = weights[0], weights[2], weights[3]
-    reach = spread**0.5
+    reach = levels.spread**0.5
     half = (0.5 * other) ** 0.5
     pairs = n + nw
     # root is R = L^T, so that what is rotated together is contiguous
-    points, images, root, columns, noise_columns, noise, cross, gain, vectors, work = matrices
-    cosine, sine, single = vectors[0], vectors[1], vectors[2]
-    predicted, whitened = vectors[3], vectors[4]
     wide = root.shape[1]
-    timing = p.shape[0] - 1
     centre_image = centre + 2 * nw * other
     log_normal = 0.5 * ny * np.log(2.0 * np.pi)
-    walking = False
-    for j in range(nt):
-        walking = walking or walk_sd[j] != 0.0
     for i in range(n):
         for j in range(n):
             root[i, j] = factor[j, i] if i <= j else 0.0
@@ -114,26 +208,25 @@ def filter_square_root(  # type: ignore[no-untyped-def]
     covariance_of(root, covariances[0])
     for k in range(1, t.shape[0]):
         dt = t[k] - t[k - 1]
-        substeps = max(1, int(np.ceil(dt / longest_step - 1e-6)))
+        substeps = max(1, int(np.ceil(dt / levels.longest_step - 1e-6)))
         propagate_points(
-            derivative, mean, factor, reach, noise_sd, nx, timing, free, logarithmic, lower, upper,
-            u[k - 1], u[k], dt, substeps, points, work,
+            derivative, estimated, mean, factor, reach, process_sd, u[k - 1], u[k], dt, substeps,
+            images, points,
         )  # fmt: skip
         for i in range(nx):
-            middle = points[i, 2 * pairs]
+            middle = images[i, 2 * pairs]
             total = 0.0
             for row in range(2 * pairs):
-                total += points[i, row] - middle
+                total += images[i, row] - middle
             mean[i] = middle + other * total
             if not np.isfinite(mean[i]):
-                reason[0] = NOT_FINITE
-                return k
+                return NOT_FINITE, k
             for pair in range(pairs):
                 columns[i, pair] = half * (
-                    points[i, pair] + points[i, pairs + pair] - 2.0 * mean[i]
+                    images[i, pair] + images[i, pairs + pair] - 2.0 * mean[i]
                 )
             for pair in range(n, pairs):
-                columns[i, pairs + pair - n] = half * (points[i, pair] - points[i, pairs + pair])
+                columns[i, pairs + pair - n] = half * (images[i, pair] - images[i, pairs + pair])
             single[i] = abs(centre) ** 0.5 * (middle - mean[i])
             for j in range(n):
                 root[i, j] = 0.0
@@ -143,7 +236,7 @@ def filter_square_root(  # type: ignore[no-untyped-def]
                 columns[i, pair] = 0.0
             for pair in range(n):
                 columns[i, pair] = (
-                    half * (points[i, pair] - points[i, pairs + pair])
+                    half * (images[i, pair] - images[i, pairs + pair])
                     if i < nx
                     else (factor[i, pair] if pair <= i else 0.0)
                 )
@@ -154,42 +247,37 @@ def filter_square_root(  # type: ignore[no-untyped-def]
         # Columns of the state first; then the parameters' rows start from their random walk.
         append_rows(root, n, columns, wide)
         if centre != 0.0 and not rank_one_update(root, n, 1.0 if centre > 0.0 else -1.0, single):
-            reason[0] = STATE_NOT_POSITIVE
-            return k
+            return STATE_NOT_POSITIVE, k
         missing = False
         for i in range(ny):
             missing = missing or np.isnan(y[k, i])
             innovations[k, i] = np.nan
             innovation_sd[k, i] = np.nan
-        consistency[k, 0] = np.nan
-        consistency[k, 1] = np.nan
+        squares[k] = np.nan
+        likelihoods[k] = np.nan
         if not missing:
             transpose(root, factor)
-            measure_points(
-                measure, mean, factor, reach, nx, free, logarithmic, lower, upper, u[k], observed,
-                reads_parameters, images, work,
-            )  # fmt: skip
+            measure_points(measure, estimated, mean, factor, reach, u[k], readings, points)
             for i in range(ny):
-                middle = images[i, 2 * n]
+                middle = readings[i, 2 * n]
                 total = 0.0
                 for row in range(2 * n):
-                    total += images[i, row] - middle
-                predicted[i] = middle + other * total
-                innovations[k, i] = y[k, i] - predicted[i]
+                    total += readings[i, row] - middle
+                predicted = middle + other * total
+                innovations[k, i] = y[k, i] - predicted
                 # A pair of opposite points splits into its sum, which only curvature moves,
                 # and its difference, which is correlated with the state.
                 for pair in range(n):
-                    noise_columns[i, pair] = half * (
-                        images[i, pair] + images[i, n + pair] - 2.0 * predicted[i]
+                    reading_columns[i, pair] = half * (
+                        readings[i, pair] + readings[i, n + pair] - 2.0 * predicted
                     )
-                    cross[i, pair] = half * (images[i, pair] - images[i, n + pair])
+                    cross[i, pair] = half * (readings[i, pair] - readings[i, n + pair])
                 for j in range(ny):
                     noise[i, j] = reading_sd[i] if i == j else 0.0
-                single[i] = abs(centre_image) ** 0.5 * (middle - predicted[i])
-            append_rows(noise, ny, noise_columns, wide)
+                single[i] = abs(centre_image) ** 0.5 * (middle - predicted)
+            append_rows(noise, ny, reading_columns, wide)
             if not rank_one_update(noise, ny, 1.0 if centre_image >= 0.0 else -1.0, single):
-                reason[0] = INNOVATION_NOT_POSITIVE
-                return k
+                return INNOVATION_NOT_POSITIVE, k
             for i in range(ny):
                 for j in range(i):
                     noise[i, j] = noise[j, i]
@@ -203,16 +291,15 @@ def filter_square_root(  # type: ignore[no-untyped-def]
                     total += noise[i, j] * noise[i, j]
                 innovation_sd[k, i] = total**0.5
                 if not noise[i, i] > 0.0:
-                    reason[0] = INNOVATION_NOT_POSITIVE
-                    return k
+                    return INNOVATION_NOT_POSITIVE, k
             forward_substitute(noise, ny, whitened)
             for i in range(ny):
                 nis += whitened[i] ** 2
                 log_likelihood -= np.log(noise[i, i])
                 for j in range(n):
                     mean[j] += gain[i, j] * whitened[i]
-            consistency[k, 0] = nis
-            consistency[k, 1] = log_likelihood - 0.5 * nis
+            squares[k] = nis
+            likelihoods[k] = log_likelihood - 0.5 * nis
             for j in range(nt):
                 mean[nx + j] = min(max(mean[nx + j], lower[j]), upper[j])
         transpose(root, factor)
@@ -222,6 +309,5 @@ def filter_square_root(  # type: ignore[no-untyped-def]
             covariance_of(root, covariances[k // stride])
     for i in range(n):
         if not np.isfinite(mean[i]):
-            reason[0] = NOT_FINITE
-            return t.shape[0] - 1
-    return DONE
+            return NOT_FINITE, t.shape[0] - 1
+    return DONE, t.shape[0] - 1

@@ -18,18 +18,25 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bampipe.estimate.filter_signature import (
+from bampipe.estimate.propagation import Estimated
+from bampipe.estimate.sigma_points import SigmaPoints
+from bampipe.estimate.square_root import (
     DONE,
     INNOVATION_NOT_POSITIVE,
     NOT_FINITE,
     STATE_NOT_POSITIVE,
+    Levels,
+    Output,
+    Samples,
+    allocate,
+    filter_square_root,
 )
-from bampipe.estimate.sigma_points import SigmaPoints
 
 Array = NDArray[np.float64]
 
@@ -93,14 +100,14 @@ class FilterModel:
     upper: Array
     reads_parameters: bool = True
 
-    @property
+    @cached_property
     def logarithmic(self) -> NDArray[np.bool_]:
         """(nt,) which parameters are estimated as logarithms."""
         return np.asarray(self.lower > 0.0)
 
-    @property
+    @cached_property
     def range(self) -> tuple[Array, Array]:
-        """(nt,) and (nt,): the range kept all along, on the scale of estimation."""
+        """(nt,) and (nt,): the range that holds all along, on the scale of estimation."""
         log = self.logarithmic
         lower, upper = self.lower.astype(float), self.upper.astype(float)
         lower[lower == 0.0] = -np.inf
@@ -118,6 +125,12 @@ class FilterModel:
         sd[log] = np.sqrt(np.log1p(np.square(sd[log] / value[log])))
         value[log] = np.log(value[log])
         return value, sd
+
+    def place_parameters(self, theta: Array, p: Array) -> None:
+        """Write estimated parameters ``theta`` (nt,), clamped to their range, into all ``p``."""
+        value = np.minimum(np.maximum(theta, self.range[0]), self.range[1])
+        value[self.logarithmic] = np.exp(value[self.logarithmic])
+        p[self.free] = value
 
     def to_physical(self, mean: Array) -> tuple[Array, Array]:
         """Return physical parameters and their slope for ``mean`` (..., nt) as estimated."""
@@ -139,7 +152,6 @@ class FilterSettings:
         walk_sd: (nt,) random walk of the parameters, per square root of a second.
         points: spread and weights of the sigma points.
         longest_step: longest Runge-Kutta step, s.
-        square_root: propagate the root of the covariance in place of the covariance.
         stride: store the distribution of every so many samples.
     """
 
@@ -149,7 +161,6 @@ class FilterSettings:
     walk_sd: Array
     points: SigmaPoints = field(default_factory=SigmaPoints)
     longest_step: float = 1e-3
-    square_root: bool = True
     stride: int = 1
 
 
@@ -239,7 +250,7 @@ def filter_trials(
     nx = model.n_states
     n = nx + model.free.size
 
-    def one(
+    def filter_one(
         index: int, trial: Trial, theta: Array, covariance: Array
     ) -> tuple[FilteredTrial, Array, Array]:
         mean = np.concatenate([trial.x, theta])
@@ -247,24 +258,21 @@ def filter_trials(
         joint[:nx, :nx] = np.diag(np.square(trial.x_sd))
         joint[nx:, nx:] = covariance
         try:
-            if settings.square_root:
-                joint = lower_root(joint)
+            root = lower_root(joint)
             filtered = run_kernel(
-                model, settings, trial.t, trial.u, trial.y, mean, joint, settings.stride
+                model, settings, trial.t, trial.u, trial.y, mean, root, settings.stride
             )
         except FilterFailure as failure:
             raise FilterFailure(index, failure.sample, failure.reason) from None
         except ValueError as error:
             raise FilterFailure(index, 0, _NOT_A_SPREAD) from error
-        if settings.square_root:
-            joint = joint @ joint.T
-        return filtered, mean[nx:].copy(), joint[nx:, nx:].copy()
+        return filtered, mean[nx:].copy(), (root @ root.T)[nx:, nx:]
 
-    return in_sequence(one, trials, np.clip(theta, *model.range), covariance)
+    return in_sequence(filter_one, trials, np.clip(theta, *model.range), covariance)
 
 
 def in_sequence(
-    one: Callable[[int, Trial, Array, Array], tuple[FilteredTrial, Array, Array]],
+    filter_one: Callable[[int, Trial, Array, Array], tuple[FilteredTrial, Array, Array]],
     trials: Sequence[Trial],
     theta: Array,
     covariance: Array,
@@ -272,14 +280,14 @@ def in_sequence(
     """Filter trials one after the other, the parameters carried over.
 
     Args:
-        one: filters the trial of a number from parameters (nt,) and their covariance (nt, nt);
-            returns it and these after it.
+        filter_one: filters the trial of a number from parameters (nt,) and their covariance
+            (nt, nt); returns it and these after it.
         trials, theta, covariance: as in `filter_trials`.
     """
     theta, covariance = np.array(theta, dtype=float), np.array(covariance, dtype=float)
     found = []
     for index, trial in enumerate(trials):
-        filtered, theta, covariance = one(index, trial, theta, covariance)
+        filtered, theta, covariance = filter_one(index, trial, theta, covariance)
         found.append(filtered)
     return FilterResult(theta, covariance, tuple(found))
 
@@ -291,7 +299,7 @@ def run_kernel(
     u: Array,
     y: Array,
     mean: Array,
-    joint: Array,
+    root: Array,
     stride: int,
 ) -> FilteredTrial:
     """Filter samples that follow each other, from the distribution at the first one.
@@ -300,63 +308,45 @@ def run_kernel(
         model, settings: as in `filter_trials`.
         t, u, y: (T,), (T, nu), (T, ny) samples.
         mean: (n,) state and parameters at the first sample, overwritten with those at the last.
-        joint: (n, n) their covariance, or its lower root in the square-root form, likewise.
+        root: (n, n) lower root of their covariance, likewise.
         stride: store the distribution of every so many samples.
 
     Raises:
         FilterFailure: of trial 0: the covariance lost positive definiteness or a number is not
             finite.
     """
-    n, size, ny = mean.size, t.size, settings.observed.size
-    lower, upper = model.range
-    rows = -(-size // stride)
-    filtered = FilteredTrial(
-        t=np.asarray(t, dtype=float)[::stride],
-        mean=np.empty((rows, n)),
-        covariance=np.empty((rows, n, n)),
+    n, size, ny, nw = mean.size, t.size, settings.observed.size, settings.noise_sd.size
+    rows, p = -(-size // stride), _array(model.parameters)
+    out = Output(
+        means=np.empty((rows, n)),
+        covariances=np.empty((rows, n, n)),
         innovation=np.full((size, ny), np.nan),
         innovation_sd=np.full((size, ny), np.nan),
         nis=np.full(size, np.nan),
         log_likelihood=np.full(size, np.nan),
     )
-    consistency = np.full((size, 2), np.nan)
-    reason = np.zeros(1, dtype=np.int64)
-    kernel, memory = _kernel(settings.square_root)
-    nw = settings.noise_sd.size
-    failed = kernel(
-        model.derivative_rows,
-        model.measure_rows,
-        _array(t),
-        _array(u),
-        _array(y),
-        _array(settings.observed, np.int64),
-        model.reads_parameters,
+    estimated = Estimated(
         model.n_states,
-        mean,
-        joint,
-        _array(model.parameters),
+        p.size - 1,
         _array(model.free, np.int64),
         _array(model.logarithmic, np.bool_),
-        lower,
-        upper,
-        _array(settings.noise_sd),
-        _array(settings.walk_sd),
-        _array(settings.reading_sd),
-        np.array(settings.points.weights(n + nw)),
-        float(settings.longest_step),
-        int(stride),
-        filtered.mean,
-        filtered.covariance,
-        filtered.innovation,
-        filtered.innovation_sd,
-        consistency,
-        reason,
-        memory(n, model.n_states, u.shape[1], ny, nw, _array(model.parameters)),
+        *model.range,
+        _array(settings.observed, np.int64),
+        model.reads_parameters,
     )
-    if failed != DONE:
-        raise FilterFailure(0, int(failed), _REASONS[int(reason[0])])
-    filtered.nis[:], filtered.log_likelihood[:] = consistency.T
-    return filtered
+    spread, _, centre, other = settings.points.weights(n + nw)
+    levels = Levels(
+        _array(settings.noise_sd), _array(settings.walk_sd), _array(settings.reading_sd),
+        spread, centre, other, float(settings.longest_step), int(stride),
+    )  # fmt: skip
+    samples = Samples(_array(t), _array(u), _array(y))
+    ended, sample = filter_square_root(
+        model.derivative_rows, model.measure_rows, estimated, levels, samples, mean, root, out,
+        allocate(n, model.n_states, u.shape[1], ny, nw, p),
+    )  # fmt: skip
+    if ended != DONE:
+        raise FilterFailure(0, sample, _REASONS[ended])
+    return FilteredTrial(samples.t[::stride], *out)
 
 
 def constrain(model: FilterModel, theta: Array, covariance: Array) -> Array:
@@ -368,8 +358,8 @@ def constrain(model: FilterModel, theta: Array, covariance: Array) -> Array:
         model: gives the range.
         theta: (nt,) on the scale of estimation; covariance: (nt, nt).
     """
-    lower, upper = model.range
-    lower[~model.logarithmic] = model.lower[~model.logarithmic]
+    lower = np.where(model.logarithmic, model.range[0], model.lower)
+    upper = model.range[1]
     held = np.zeros(theta.size, dtype=bool)
     value = theta
     for _ in range(theta.size):
@@ -385,17 +375,6 @@ def constrain(model: FilterModel, theta: Array, covariance: Array) -> Array:
         )
         value[held] = np.clip(theta, lower, upper)[held]
     return np.asarray(value)
-
-
-def _kernel(square_root: bool) -> tuple[Callable[..., int], Callable[..., tuple[Array, ...]]]:
-    """Return one form of the filter and what gives it scratch; the other is not even loaded."""
-    if square_root:
-        from bampipe.estimate import square_root as form
-
-        return form.filter_square_root, form.memory
-    from bampipe.estimate import covariance_form as other
-
-    return other.filter_covariance, other.memory
 
 
 def _array(values: Any, kind: type = np.float64) -> NDArray[Any]:

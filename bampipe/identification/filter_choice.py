@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 from bampipe.errors import InputError
 
-ENGINES = ("compiled", "filterpy", "augmented")
-FORMS = ("square_root", "covariance")
+ENGINES = ("compiled", "filterpy")
 MEASURES = ("position", "position_velocity")
 
 
@@ -16,9 +15,7 @@ class FilterChoice:
     """Settings of the filter.
 
     Attributes:
-        engine: ``compiled``; ``filterpy``, slow, which gives the same numbers; or ``augmented``,
-            slow, with measurement noise in the state, which gives nearly the same.
-        form: ``square_root`` or ``covariance`` form of the filter.
+        engine: ``compiled``, or ``filterpy``: slow, gives the same numbers.
         measure: ``position``, or ``position_velocity`` as in the paper; filtered velocities are
             not white, so intervals from them are too narrow.
         random_walk: of the parameters, in prior standard deviations per square root of a
@@ -32,7 +29,6 @@ class FilterChoice:
     """
 
     engine: str = "compiled"
-    form: str = "square_root"
     measure: str = "position"
     random_walk: float = 0.0
     reading_noise: float = 0.0
@@ -44,7 +40,7 @@ class FilterChoice:
 
 def check_choice(choice: FilterChoice, stage: str) -> None:
     """Raise :class:`InputError` where a setting of the filter makes no sense."""
-    for name, known in (("engine", ENGINES), ("form", FORMS), ("measure", MEASURES)):
+    for name, known in (("engine", ENGINES), ("measure", MEASURES)):
         check_among(getattr(choice, name), known, f"{stage}.{name}")
     for name in ("longest_step_s", "block_s", "trace_rows"):
         if not getattr(choice, name) > 0:

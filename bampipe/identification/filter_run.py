@@ -346,10 +346,6 @@ def _engine(choice: FilterChoice) -> Callable[..., FilterResult]:
         from bampipe.estimate.filterpy_oracle import filter_trials_by_filterpy
 
         return filter_trials_by_filterpy
-    if choice.engine == "augmented":
-        from bampipe.estimate.augmented import filter_trials_augmented
-
-        return filter_trials_augmented
     return filter_trials
 
 

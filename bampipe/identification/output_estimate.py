@@ -16,7 +16,6 @@ from bampipe.identification.estimates import Estimate, timing_entry
 from bampipe.identification.filter_tables import as_filtered
 from bampipe.identification.squares_estimate import Squares
 from bampipe.physics import System
-from bampipe.physics.signatures import ROWS
 from bampipe.progress import Progress
 from bampipe.trials.motions import Motion
 
@@ -66,7 +65,7 @@ def segments_of(system: System, motion: Motion, trial: Trial, p: Array) -> list[
                 )  # fmt: skip
             except InputError:  # a step too far: the fit halves it
                 return np.full((count, n), np.inf)
-            return _readings(system, states, moved, parameters[:-1])
+            return system.encoder_readings(states, moved, parameters[:-1])[:, :n]
 
         step = np.full(nx, _RATE_STEP)
         step[:n] = _POSITION_STEP
@@ -135,21 +134,3 @@ def estimate_by_output(
         states=pd.concat(frames, ignore_index=True),
         trace=pd.DataFrame(rows),
     )
-
-
-def _readings(system: System, states: Array, u: Array, p: Array) -> Array:
-    """What the encoders read of a simulated motion, (T, n_q)."""
-    n = len(system.coordinates)
-    if not system.moves_sensors:
-        return states[:, :n]
-    found = np.empty((len(states), n))
-    parameters = np.repeat(p, ROWS)
-    for first in range(0, len(states), ROWS):
-        part = slice(first, min(first + ROWS, len(states)))
-        count = part.stop - first
-        x, inputs = (np.zeros((width.shape[1], ROWS)) for width in (states, u))
-        x[:, :count], inputs[:, :count] = states[part].T, u[part].T
-        y = np.zeros(2 * n * ROWS)
-        system.measure_rows(count, x.ravel(), inputs.ravel(), parameters, y)
-        found[part] = y.reshape(-1, ROWS)[:n, :count].T
-    return found

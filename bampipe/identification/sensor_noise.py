@@ -127,7 +127,6 @@ def untuned(system: System, noise: Noise, choice: FilterChoice) -> FilterSetting
         noise_sd=noise.process_sd,
         walk_sd=choice.random_walk * np.array([item.sd for item in free]),
         longest_step=choice.longest_step_s,
-        square_root=choice.form == "square_root",
     )
 
 

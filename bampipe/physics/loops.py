@@ -3,7 +3,7 @@
 from numba import types
 
 from bampipe.compiled import njit
-from bampipe.physics.signatures import RESIDUAL
+from bampipe.model_functions import RESIDUAL
 
 _V = types.float64[::1]
 _M = types.float64[:, ::1]

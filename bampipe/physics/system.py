@@ -115,7 +115,7 @@ class System:
     def derivative_rows(self) -> Callable[..., None]:
         """f(count, x, u, p, w, dx): `derivative` of many states at once, in vector registers.
 
-        Quantity i of row r is at ``[i*signatures.ROWS + r]``; equal to `derivative` but for
+        Quantity i of row r is at ``[i*ROWS + r]``; equal to `derivative` but for
         rounding.
         """
         return self._rows.derivative_rows
@@ -124,6 +124,29 @@ class System:
     def measure_rows(self) -> Callable[..., None]:
         """h(count, x, u, p, y): `measure` of many states at once; see `derivative_rows`."""
         return self._rows.measure_rows
+
+    def encoder_readings(self, x: Array, u: Array, p: Array) -> Array:
+        """What the encoders read of states ``x`` (T, n_x): positions, then rates, (T, 2 n_q).
+
+        Args:
+            x: states, columns as in `states`; u: inputs, (T, n_u); p: parameters, (n_p,).
+        """
+        n = len(self.coordinates)
+        if not self.moves_sensors:
+            return x[:, : 2 * n].copy()
+        from bampipe.model_functions import ROWS
+
+        found = np.empty((len(x), 2 * n))
+        parameters = np.repeat(p, ROWS)
+        for first in range(0, len(x), ROWS):
+            part = slice(first, min(first + ROWS, len(x)))
+            count = part.stop - first
+            states, inputs = (np.zeros((columns.shape[1], ROWS)) for columns in (x, u))
+            states[:, :count], inputs[:, :count] = x[part].T, u[part].T
+            y = np.zeros(2 * n * ROWS)
+            self.measure_rows(count, states.ravel(), inputs.ravel(), parameters, y)
+            found[part] = y.reshape(-1, ROWS)[:, :count].T
+        return found
 
     def true_motion(self, q: Array, qd: Array, qdd: Array, u: Array, p: Array) -> tuple[Array, ...]:
         """Motion of the mechanism from what the encoders read; each (T, n_q)."""
@@ -265,10 +288,10 @@ def compile_model(model: Model) -> System:
     known = generated.read(folder, model.key)
     if known is not None:
         return System(model, known)
+    from bampipe.model_functions import ROWS
     from bampipe.physics.codegen import array_source, memory_source, rows_source, scalar_source
     from bampipe.physics.derivation import derive
     from bampipe.physics.equations import contribution
-    from bampipe.physics.signatures import ROWS
 
     equations = derive(model)
     added = contribution(equations, derive(Model(model.device)))

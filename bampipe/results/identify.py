@@ -181,7 +181,7 @@ class IdentifyResult(Result):
     model: str
     headline: str
     method: Literal["ukf", "least-squares", "output-error"]
-    engine: Literal["compiled", "filterpy", "augmented"]
+    engine: Literal["compiled", "filterpy"]
     trials: Names = Field(description="Free trials used")
     parameters: dict[str, Estimate] = Field(
         description="By name: viscous.<axis>, coulomb.<axis>, mass, <effect>[.<axis>].<parameter>"

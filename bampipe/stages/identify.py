@@ -51,9 +51,7 @@ class Config(FilterChoice):
         method: ``ukf``, the augmented unscented Kalman filter; ``least-squares`` on the inverse
             dynamics; ``output-error``, the motion simulated in pieces against the positions; or
             ``auto``: the filter, and least squares where it cannot follow the motion.
-        engine: ``compiled``; ``filterpy``, slow, which gives the same numbers; or ``augmented``,
-            slow, with measurement noise in the state, which gives nearly the same.
-        form: ``square_root`` or ``covariance`` form of the filter.
+        engine: ``compiled``, or ``filterpy``: slow, gives the same numbers.
         measure: ``position``, or ``position_velocity`` as in the paper; filtered velocities are
             not white, so intervals from them are too narrow.
         start_factor: multiplies every starting value: estimates must not depend on it.

@@ -51,9 +51,7 @@ class Config(FilterChoice):
 
     Attributes:
         model: which model version.
-        engine: ``compiled``; ``filterpy``, slow, which gives the same numbers; or ``augmented``,
-            slow, with measurement noise in the state, which gives nearly the same.
-        form: ``square_root`` or ``covariance`` form of the filter.
+        engine: ``compiled``, or ``filterpy``: slow, gives the same numbers.
         measure: ``position``, or ``position_velocity`` as in the paper.
         random_walk: of the parameters, in prior standard deviations per square root of a second.
         reading_noise: standard deviation of a position reading in encoder steps; 0 takes it

@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numba import njit
 
-from bampipe.estimate.signatures import DERIVATIVE, DERIVATIVE_ROWS, MEASURE, MEASURE_ROWS, ROWS
 from bampipe.estimate.unscented import FilterModel, FilterSettings, Trial
+from bampipe.model_functions import DERIVATIVE, DERIVATIVE_ROWS, MEASURE, MEASURE_ROWS, ROWS
 
 TRUTH = np.array([4.0, 1.1, 2.0])
 """Viscous N.s/m, Coulomb N, mass kg."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from plain_filters import filter_augmented
 from slider import TRUTH, model, position_only, record, settings
 
-from bampipe.estimate.augmented import filter_trials_augmented
 from bampipe.estimate.unscented import Trial, filter_trials
 
 
@@ -27,16 +27,13 @@ def test_equal_where_motion_and_measurement_are_linear() -> None:
     trial = replace(short(known), y=y)
     chosen = settings(walk_sd=np.zeros(0), reading_sd=np.array([3e-5]))
     nothing = np.zeros(0), np.zeros((0, 0))
-    whole = filter_trials_augmented(linear, [trial], *nothing, chosen).trials[0]
-    for square_root in (False, True):
-        simple = filter_trials(
-            linear, [trial], *nothing, replace(chosen, square_root=square_root)
-        ).trials[0]
-        np.testing.assert_allclose(simple.mean, whole.mean, rtol=1e-9, atol=1e-12)
-        scale = np.sqrt(np.einsum("ti,tj->tij", *2 * [np.diagonal(whole.covariance, 0, 1, 2)]))
-        assert np.max(np.abs(simple.covariance - whole.covariance) / scale) < 1e-9
-        np.testing.assert_allclose(simple.nis, whole.nis, rtol=1e-6, atol=1e-9)
-        np.testing.assert_allclose(simple.log_likelihood, whole.log_likelihood, rtol=1e-9)
+    whole = filter_augmented(linear, [trial], *nothing, chosen).trials[0]
+    simple = filter_trials(linear, [trial], *nothing, chosen).trials[0]
+    np.testing.assert_allclose(simple.mean, whole.mean, rtol=1e-9, atol=1e-12)
+    scale = np.sqrt(np.einsum("ti,tj->tij", *2 * [np.diagonal(whole.covariance, 0, 1, 2)]))
+    assert np.max(np.abs(simple.covariance - whole.covariance) / scale) < 1e-9
+    np.testing.assert_allclose(simple.nis, whole.nis, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(simple.log_likelihood, whole.log_likelihood, rtol=1e-9)
 
 
 def test_close_where_they_are_not() -> None:
@@ -46,7 +43,7 @@ def test_close_where_they_are_not() -> None:
     chosen = settings(reading_sd=np.array([3e-5]), walk_sd=1e-3 * TRUTH)
     both = [
         engine(slider, [short()], mean, np.diag(spread**2), chosen)
-        for engine in (filter_trials, filter_trials_augmented)
+        for engine in (filter_trials, filter_augmented)
     ]
     sd = np.sqrt(np.diag(both[1].covariance))
     difference = np.abs(both[0].theta - both[1].theta) / sd

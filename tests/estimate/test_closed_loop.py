@@ -8,7 +8,7 @@ from numba import njit
 
 from bampipe.errors import InputError
 from bampipe.estimate.closed_loop import simulate_controlled
-from bampipe.estimate.signatures import COMMAND, DERIVATIVE, MEASURE
+from bampipe.model_functions import COMMAND, DERIVATIVE, MEASURE
 
 MASS, STIFFNESS, DAMPING = 2.0, 800.0, 8.0
 DT, WIDTH = 0.002, np.array([1e-3])

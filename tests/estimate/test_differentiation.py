@@ -147,29 +147,6 @@ def test_noise_gains_are_those_of_white_noise() -> None:
         np.testing.assert_allclose(value, band, rtol=0.15)
 
 
-def test_causal_butterworth_is_the_recursive_filter() -> None:
-    from scipy.signal import butter, lfilter
-
-    position = quantised(motion(2)[0])
-    position -= position[0]
-    causal = butterworth.CausalButterworth(RATE, 20.0)
-    out = np.array([causal.step(x) for x in position])
-    b, a = butter(2, 20.0, fs=RATE)
-    expected = lfilter(b, a, position)
-    np.testing.assert_allclose(out[:, 0], expected, atol=1e-12)
-    np.testing.assert_allclose(out[1:, 1], np.diff(expected) * RATE, atol=1e-8)
-    np.testing.assert_allclose(out[2:, 2], np.diff(expected, n=2) * RATE**2, atol=1e-5)
-
-
-def test_causal_butterworth_lags_by_its_delay() -> None:
-    t = np.arange(2000) / RATE
-    causal = butterworth.CausalButterworth(RATE, 20.0)
-    out = np.array([causal.step(x) for x in 0.7 + 0.5 * t])
-    assert out[0] == pytest.approx((0.7, 0.0, 0.0), abs=1e-6)
-    assert out[-1, 0] == pytest.approx(0.7 + 0.5 * (t[-1] - causal.delay_s), abs=1e-4)
-    assert out[-1, 1] == pytest.approx(0.5)
-
-
 def test_floor_frequency_rises_as_the_noise_falls() -> None:
     rng = np.random.default_rng(0)
     true = np.cumsum(np.cumsum(rng.standard_normal(8000))) * 1e-6
@@ -223,7 +200,7 @@ class TestUniformGrid:
 @pytest.mark.parametrize("cutoff", [0.0, 250.0])
 def test_cut_off_out_of_range(cutoff: float) -> None:
     with pytest.raises(ValueError, match="cut-off"):
-        butterworth.CausalButterworth(RATE, cutoff)
+        butterworth.zero_phase(np.zeros(100), RATE, cutoff)
 
 
 def test_window_that_does_not_fit() -> None:

@@ -120,35 +120,6 @@ def test_bandwidth_and_ratio_are_inverse(order: int) -> None:
     assert ks.bandwidth(ks.ratio_for(22.0, order, RATE), order, RATE) == pytest.approx(22.0)
 
 
-@pytest.mark.parametrize("order", ks.ORDERS)
-def test_causal_filter_ends_where_the_smoother_ends(order: int) -> None:
-    """At the last sample the smoother knows no more than the filter does."""
-    t = np.arange(1000) / RATE
-    y = np.round(0.3 * np.sin(4.0 * t) / 5e-5) * 5e-5
-    model = ks.MotionModel(order, 1.5e-5, ks.ratio_for(20.0, order, RATE), RATE)
-    seen = np.ones(1000, dtype=bool)
-    seen[300:310] = False
-    causal = ks.CausalKalman(model, velocity_sd=10.0, acceleration_sd=100.0)
-    steps = [causal.step(float(x) if there else None) for x, there in zip(y, seen, strict=True)]
-    found = ks.smooth(y, model, seen)
-    last, band = steps[-1]
-    np.testing.assert_allclose(
-        last, [found.position[-1], found.velocity[-1], found.acceleration[-1]], rtol=1e-6
-    )
-    np.testing.assert_allclose(
-        band,
-        [found.position_sd[-1], found.velocity_sd[-1], found.acceleration_sd[-1]],
-        rtol=1e-6,
-    )
-    assert steps[309][1][1] > 2.0 * steps[299][1][1]
-
-
-def test_causal_filter_starts_with_a_sample() -> None:
-    model = ks.MotionModel(3, 1e-5, 1e-4, RATE)
-    with pytest.raises(ValueError, match="starts with a sample"):
-        ks.CausalKalman(model, 1.0, 1.0).step(None)
-
-
 def test_a_trial_at_rest() -> None:
     found = ks.smooth(np.full(500, 0.25), ks.MotionModel(4, 1e-5, 1e-4, RATE))
     np.testing.assert_allclose(found.position, 0.25, atol=1e-12)

@@ -13,13 +13,12 @@ from bampipe.estimate.online import OnlineFilter
 from bampipe.estimate.unscented import filter_trials
 
 
-@pytest.mark.parametrize("square_root", [False, True])
-def test_portions_do_not_matter(square_root: bool) -> None:
+def test_portions_do_not_matter() -> None:
     trial = position_only(record(6, 2.0))
     y = trial.y.copy()
     y[300:310] = np.nan
     trial = replace(trial, y=y)
-    chosen = settings(square_root=square_root, walk_sd=0.01 * TRUTH)
+    chosen = settings(walk_sd=0.01 * TRUTH)
     slider = model()
     mean, spread = slider.to_estimated(1.2 * TRUTH, TRUTH)
     batch = filter_trials(slider, [trial], mean, np.diag(spread**2), chosen)

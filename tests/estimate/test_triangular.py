@@ -3,10 +3,8 @@
 import numpy as np
 import pytest
 
-from bampipe.estimate.signatures import ROWS
 from bampipe.estimate.triangular import append_rows, condition, covariance_of, rank_one_update
 from bampipe.estimate.unscented import lower_root
-from bampipe.physics import signatures as of_physics
 
 RNG = np.random.default_rng(2)
 
@@ -52,10 +50,6 @@ def test_a_downdate_that_leaves_nothing_is_refused():
     covariance_of(lowered, product)
     np.testing.assert_allclose(product, expected, atol=1e-13)
     assert not rank_one_update(upper, 4, -1.0, large)
-
-
-def test_both_layers_lay_rows_out_alike():
-    assert ROWS == of_physics.ROWS
 
 
 def test_the_root_of_a_covariance_that_rounding_left_indefinite() -> None:

@@ -1,17 +1,18 @@
-"""The augmented unscented filter on a slider with friction; filterpy is the oracle."""
+"""The unscented filter on a slider with friction; filterpy and a plain one are the oracles."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
+from plain_filters import filter_by_covariance
 from slider import TRUTH, model, position_only, record, settings
 
 from bampipe.estimate.filter_uncertainty import climb, sandwich_covariance
 from bampipe.estimate.filterpy_oracle import filter_trials_by_filterpy
 from bampipe.estimate.sigma_points import SigmaPoints
-from bampipe.estimate.smoother import smooth_trial
 from bampipe.estimate.unscented import FilterFailure, Trial, constrain, filter_trials
 
 
@@ -26,16 +27,14 @@ def short(seed: int, samples: int = 150) -> Trial:
     return Trial(trial.t[:samples], trial.u[:samples], trial.y[:samples], trial.x, trial.x_sd)
 
 
-@pytest.mark.parametrize("square_root", [False, True])
+@pytest.mark.parametrize("engine", [filter_trials_by_filterpy, filter_by_covariance])
 @pytest.mark.parametrize("alpha", [SigmaPoints().alpha, 0.8, 0.4])
-def test_filterpy_gives_the_same_numbers(square_root: bool, alpha: float) -> None:
-    chosen = settings(
-        walk_sd=np.array([0.1, 0.1, 0.05]), points=SigmaPoints(alpha), square_root=square_root
-    )
+def test_the_oracles_give_the_same_numbers(engine: Any, alpha: float) -> None:
+    chosen = settings(walk_sd=np.array([0.1, 0.1, 0.05]), points=SigmaPoints(alpha))
     trials = [short(1), short(2)]
     start, sd = 1.3 * TRUTH, 0.3 * TRUTH
     ours = run(trials, chosen, start=start, sd=sd)
-    theirs = run(trials, chosen, start=start, sd=sd, engine=filter_trials_by_filterpy)
+    theirs = run(trials, chosen, start=start, sd=sd, engine=engine)
     for a, b in zip(ours.trials, theirs.trials, strict=True):
         np.testing.assert_allclose(a.mean, b.mean, rtol=1e-8, atol=1e-10)
         scale = np.sqrt(np.einsum("ti,tj->tij", *2 * [np.diagonal(b.covariance, 0, 1, 2)]))
@@ -46,23 +45,17 @@ def test_filterpy_gives_the_same_numbers(square_root: bool, alpha: float) -> Non
 
 
 @pytest.mark.parametrize("observed", [[0], [0, 1]])
-def test_both_forms_agree(observed: list[int]) -> None:
-    trials = [record(1, 4.0), record(2, 4.0)]
-    if observed == [0]:
-        trials = [position_only(trial) for trial in trials]
+def test_the_covariance_itself_gives_the_same_numbers_from_far_off(observed: list[int]) -> None:
+    trial = record(1, 2.0)
+    trial = position_only(trial) if observed == [0] else trial
     sd = np.array([6e-6, 3e-3])[observed]
-    results = [
-        run(
-            trials,
-            settings(observed=np.array(observed), reading_sd=sd, square_root=form),
-            start=2.0 * TRUTH,
-            sd=TRUTH,
-        )
-        for form in (False, True)
-    ]
-    np.testing.assert_allclose(results[0].theta, results[1].theta, rtol=1e-9)
-    for a, b in zip(results[0].trials, results[1].trials, strict=True):
-        np.testing.assert_allclose(a.mean, b.mean, rtol=1e-9, atol=1e-11)
+    chosen = settings(observed=np.array(observed), reading_sd=sd)
+    ours, theirs = (
+        run([trial], chosen, start=2.0 * TRUTH, sd=TRUTH, engine=engine)
+        for engine in (filter_trials, filter_by_covariance)
+    )
+    np.testing.assert_allclose(ours.theta, theirs.theta, rtol=1e-9)
+    np.testing.assert_allclose(ours.trials[0].mean, theirs.trials[0].mean, rtol=1e-9, atol=1e-11)
 
 
 def test_square_root_runs_where_the_covariance_is_lost() -> None:
@@ -76,7 +69,7 @@ def test_square_root_runs_where_the_covariance_is_lost() -> None:
         fine = position_only(record(seed, 2.0, resolution=1e-11))
         trial = replace(fine, x_sd=np.array([100.0, 100.0]))
         try:
-            run([trial], replace(chosen, square_root=False), sd=0.1 * TRUTH)
+            run([trial], chosen, sd=0.1 * TRUTH, engine=filter_by_covariance)
         except FilterFailure as failure:
             assert "positive definiteness" in str(failure)
             lost += 1
@@ -189,56 +182,6 @@ def test_missing_readings_are_bridged() -> None:
     value, _ = model().to_physical(found.theta)
     assert np.isnan(found.trials[0].nis[1000:1050]).all()
     np.testing.assert_allclose(value, TRUTH, rtol=2e-2)
-
-
-def test_continued_in_parts_is_the_same() -> None:
-    """What an online filter needs: the state handed on gives the batch's numbers."""
-    trial = position_only(record(6, 2.0))
-    chosen = settings(square_root=False)
-    whole = run([trial], chosen)
-    slider = model()
-    mean, spread = slider.to_estimated(TRUTH, TRUTH)
-    joint, x, x_cov = np.diag(spread**2), trial.x, np.diag(trial.x_sd**2)
-    from bampipe.estimate.covariance_form import filter_covariance, memory
-
-    state = np.concatenate([x, mean])
-    covariance = np.zeros((5, 5))
-    covariance[:2, :2], covariance[2:, 2:] = x_cov, joint
-    lower, upper = slider.range
-    weights = np.array(chosen.points.weights(6))
-    scratch = memory(5, 2, trial.u.shape[1], 1, 1, slider.parameters)
-    for k in range(1, trial.t.size):
-        part = slice(k - 1, k + 1)
-        filter_covariance(
-            slider.derivative_rows, slider.measure_rows,
-            trial.t[part], trial.u[part], trial.y[part],
-            chosen.observed, True, 2, state, covariance, slider.parameters.copy(), slider.free,
-            slider.logarithmic, lower, upper, chosen.noise_sd, chosen.walk_sd, chosen.reading_sd,
-            weights, chosen.longest_step, 1, np.empty((2, 5)), np.empty((2, 5, 5)),
-            np.empty((2, 1)), np.empty((2, 1)), np.empty((2, 2)), np.zeros(1, dtype=np.int64),
-            scratch,
-        )  # fmt: skip
-    np.testing.assert_allclose(state, whole.trials[0].mean[-1], rtol=1e-12, atol=1e-14)
-
-
-def test_smoother_is_closer_than_the_filter() -> None:
-    fine = record(7, 3.0, resolution=1e-12)
-    rng = np.random.default_rng(0)
-    noisy = fine.y[:, :1] + 2e-4 * rng.standard_normal((len(fine.t), 1))
-    trial = replace(fine, y=noisy, x_sd=np.array([2e-4, 0.1]))
-    chosen = settings(reading_sd=np.array([2e-4]), noise_sd=np.array([0.3]))
-    slider = model()
-    mean, spread = slider.to_estimated(TRUTH, 1e-3 * TRUTH)
-    filtered = filter_trials(slider, [trial], mean, np.diag(spread**2), chosen).trials[0]
-    smoothed, covariance = smooth_trial(slider, trial, filtered, chosen)
-    truth = fine.y[:, 1]
-    error = [np.sqrt(np.mean((m[:, 1] - truth) ** 2)) for m in (filtered.mean, smoothed)]
-    assert error[1] < 0.8 * error[0]
-    assert (
-        np.diagonal(covariance, 0, 1, 2) <= np.diagonal(filtered.covariance, 0, 1, 2) * (1 + 1e-9)
-    ).all()
-    inside = np.abs(smoothed[:, 1] - truth) < 3.0 * np.sqrt(covariance[:, 1, 1])
-    assert inside.mean() > 0.9
 
 
 def test_sigma_points_refuse_an_impossible_spread() -> None:

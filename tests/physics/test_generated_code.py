@@ -13,8 +13,8 @@ from motions import (
     typical_parameters,
 )
 
+from bampipe.model_functions import ROWS
 from bampipe.physics import Model, compile_model, registry
-from bampipe.physics.signatures import ROWS
 
 BAM = registry.device("bam")
 

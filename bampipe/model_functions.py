@@ -1,18 +1,21 @@
-"""Numba types of the model functions that the kernels here take as arguments."""
+"""Numba types of a model's compiled functions: what is generated has them, kernels take them."""
 
 from numba import types
 
 _vector = types.float64[::1]
 
-DERIVATIVE = types.FunctionType(types.void(_vector, _vector, _vector, _vector, _vector))
+DERIVATIVE = types.FunctionType(types.void(*[_vector] * 5))
 """f(x, u, p, w, dx) -> None: state derivative written into dx."""
 
-MEASURE = types.FunctionType(types.void(_vector, _vector, _vector, _vector))
-"""h(x, u, p, y) -> None: measurement of the state written into y."""
+MEASURE = types.FunctionType(types.void(*[_vector] * 4))
+"""h(x, u, p, y) -> None: what the encoders read, positions then velocities, written into y."""
 
 COMMAND = MEASURE
 """c(y, r, s, out) -> None: commands of a controller and rates of its states, from readings,
 references and these states."""
+
+RESIDUAL = types.FunctionType(types.void(*[_vector] * 7))
+"""e(q, qd, qdd, z, u, p, out) -> None: applied minus required generalised force."""
 
 ROWS = 64
 """Most rows of one call of a function over rows; quantity i of row r is at [i*ROWS + r]."""
