@@ -43,12 +43,14 @@ EFFECTS = (
 UNKNOWN = tuple(f"{name}:carriage" for name in OUTSIDE)
 
 
-def _draw_specimen(rng: np.random.Generator, effects: Mapping[str, float], creep: bool) -> Specimen:
+def _draw_specimen(
+    rng: np.random.Generator, effects: Mapping[str, float], c: Conditions
+) -> Specimen:
     mechanism = {"mass": rng.uniform(70.0, 120.0), "offset": rng.uniform(-4.0, 4.0)}
     control = {"position_gain": 120.0, "velocity_gain": 240.0 * 35.0, "feed_forward": 0.0,
-               "limit": 350.0, "hold": 0.001}  # fmt: skip
+               "limit": 350.0, "hold": 1e-3 if c.hold else STEP}  # fmt: skip
     friction = {"viscous": rng.uniform(150.0, 260.0), "coulomb": rng.uniform(15.0, 27.0),
-                "creep": creep * SIGN_WIDTH}  # fmt: skip
+                "creep": c.creep * SIGN_WIDTH}  # fmt: skip
     machine = {"inertia": mechanism["mass"], "offset": mechanism["offset"]} | control
     specimen = Specimen("carriage", machine, friction)
     specimen.truth |= mechanism
@@ -63,13 +65,13 @@ def record(
 ) -> dict[str, Any]:
     """Write a session of the positioning axis; see ``independent.record``."""
     c = conditions or GOOD
-    specimen = _draw_specimen(np.random.default_rng([seed, 0]), effects, c.creep)
+    specimen = _draw_specimen(np.random.default_rng([seed, 0]), effects, c)
     rate_hz = c.rate_hz or RATE_HZ
     steps = round((c.seconds or 6.0) / STEP)
     trials = []
     for number in range(c.trials or 4):
         rng = np.random.default_rng([seed, 1 + number])
-        goal, rate = draw_moves(rng, steps, 0.12, 0.3, 0.1)
+        goal, rate = draw_moves(rng, steps, 0.12, 0.3 * c.pace, 0.1)
         kick = np.repeat(rng.choice([-60.0, 0.0, 0.0, 60.0], steps // 1500 + 1), 1500)[:steps]
         at = sample_steps(rng, steps, 1.0 / (rate_hz * STEP), c)
         motion = move(specimen.machine, specimen.law, goal, rate, kick, at)

@@ -261,11 +261,16 @@ def _move(m, laws, wanted, wanted_rate, log_at, braked):
     return seen, true_force, brakes
 
 
-def _draw_wanted(rng: np.random.Generator, steps: int, share: float) -> tuple[Any, Any]:
-    """Where the hand wants to be, (steps, 3), and its rate: noise of 0.1 to 1.3 Hz, from rest."""
+def _draw_wanted(
+    rng: np.random.Generator, steps: int, share: float, pace: float
+) -> tuple[Any, Any]:
+    """Where the hand wants to be, (steps, 3), and its rate: noise of 0.1 to 1.3 Hz, from rest.
+
+    Both frequencies are times ``pace``.
+    """
     coarse = 50  # drawn at 200 Hz
     n = steps // coarse + 2
-    sections = butter(2, [0.1, 1.3], "bandpass", fs=1 / (STEP * coarse), output="sos")
+    sections = butter(2, [0.1 * pace, 1.3 * pace], "bandpass", fs=1 / (STEP * coarse), output="sos")
     # Reaching far is slow: more of the slow part than a flat spectrum has.
     noise = lfilter([1.0], [1.0, -0.985], rng.standard_normal((n + 4000, 3)), axis=0)
     wave = sosfiltfilt(sections, noise, axis=0)[2000 : 2000 + n]
@@ -442,7 +447,7 @@ def record(
     for number in range(free + c.viscous_trials):
         braked = number >= free
         rng = np.random.default_rng([seed, 1 + number])
-        wanted, rate = _draw_wanted(rng, steps, 0.6 if braked else 1.0)
+        wanted, rate = _draw_wanted(rng, steps, 0.6 if braked else 1.0, c.pace)
         machine = specimen.machine
         machine["hand_frequency"], machine["hand_lag"] = rng.uniform(8.0, 11.0), 0.012
         machine["field"] = 40.0

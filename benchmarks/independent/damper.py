@@ -121,20 +121,26 @@ def _hide(
     return truth
 
 
-def _draw_stroke(rng: np.random.Generator, steps: int, test: int) -> tuple[Any, Any, Any]:
+def _draw_stroke(
+    rng: np.random.Generator, steps: int, test: int, pace: float
+) -> tuple[Any, Any, Any]:
     """Position, velocity and acceleration of a test, (steps,) each, exact derivatives."""
     t = np.arange(steps) * STEP
     if test % 2:
         # Noise: lines of equal speed from 1 to 60 Hz, random phases.
         speed, x, v, a = 0.09 * np.sqrt(2.0 / 60), np.zeros(steps), np.zeros(steps), np.zeros(steps)
-        for w in 2 * np.pi * (np.arange(60) + rng.uniform(0.5, 1.5, 60)):
+        for w in 2 * np.pi * pace * (np.arange(60) + rng.uniform(0.5, 1.5, 60)):
             turn = w * t + rng.uniform(0.0, 2 * np.pi)
             wave, slope = np.sin(turn), np.cos(turn)
             x += speed / w * wave
             v += speed * slope
             a -= speed * w * wave
         return x, v, a
-    size, low, high = rng.uniform(0.004, 0.015), rng.uniform(0.3, 0.8), rng.uniform(1.5, 3.0)
+    size, low, high = (
+        rng.uniform(0.004, 0.015),
+        pace * rng.uniform(0.3, 0.8),
+        pace * rng.uniform(1.5, 3.0),
+    )
     sweep = (high - low) / (steps * STEP)
     turn = 2 * np.pi * (low * t + 0.5 * sweep * t**2)
     w = 2 * np.pi * (low + sweep * t)
@@ -169,7 +175,7 @@ def record(
     trials = []
     for test in range(c.trials or 6):
         rng = np.random.default_rng([seed, 1 + test])
-        x, v, a = _draw_stroke(rng, steps, test)
+        x, v, a = _draw_stroke(rng, steps, test, c.pace)
         levels = rng.uniform(0.0, 2.0, 40)
         current = levels[(np.arange(steps) * STEP / (1.0 if test % 2 else 1.7)).astype(int)]
         at = sample_steps(rng, steps, 1.0 / (rate_hz * STEP), c)

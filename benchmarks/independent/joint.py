@@ -86,15 +86,17 @@ offset = {{ unit = "N.m", prior = 0.0, sd = 5.0 }}
 """
 
 
-def _draw_specimen(rng: np.random.Generator, effects: Mapping[str, float], creep: bool) -> Specimen:
+def _draw_specimen(
+    rng: np.random.Generator, effects: Mapping[str, float], c: Conditions
+) -> Specimen:
     mechanism = {
         "inertia": rng.uniform(1.5, 3.0), "moment": rng.uniform(15.0, 35.0),
         "moment_across": rng.uniform(-8.0, 8.0), "offset": rng.uniform(-0.5, 0.5),
     }  # fmt: skip
     control = {"position_gain": 12.0, "velocity_gain": 60.0, "feed_forward": 1.0,
-               "limit": 150.0, "hold": 0.002}  # fmt: skip
+               "limit": 150.0, "hold": 1e-3 if c.hold else STEP}  # fmt: skip
     friction = {"viscous": rng.uniform(5.0, 12.0), "coulomb": rng.uniform(4.0, 8.0),
-                "creep": creep * SIGN_WIDTH}  # fmt: skip
+                "creep": c.creep * SIGN_WIDTH}  # fmt: skip
     specimen = Specimen("joint", mechanism | control, friction)
     specimen.truth |= mechanism
     specimen.hide(effects, LAWS, MOTOR, rng)
@@ -106,16 +108,16 @@ def record(
 ) -> dict[str, Any]:
     """Write a session of the joint; see ``independent.record``."""
     c = conditions or GOOD
-    specimen = _draw_specimen(np.random.default_rng([seed, 0]), effects, c.creep)
+    specimen = _draw_specimen(np.random.default_rng([seed, 0]), effects, c)
     rate_hz = c.rate_hz or RATE_HZ
     steps = round((c.seconds or 15.0) / STEP)
     trials = []
     for number in range(c.trials or 5):
         rng = np.random.default_rng([seed, 1 + number])
         if number % 2:
-            goal, rate = draw_moves(rng, steps, 1.2, 1.8, 0.15)
+            goal, rate = draw_moves(rng, steps, 1.2, 1.8 * c.pace, 0.15)
         else:
-            goal, rate = draw_waves(rng, steps, 1.2, 0.8)
+            goal, rate = draw_waves(rng, steps, 1.2, 0.8 * c.pace)
         at = sample_steps(rng, steps, 1.0 / (rate_hz * STEP), c, jitter=0.08)
         # The stamps have whole milliseconds and are true to that.
         at = np.unique(np.rint(at / 10).astype(np.int64) * 10)

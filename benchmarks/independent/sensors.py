@@ -19,24 +19,28 @@ class Conditions:
     Attributes:
         trials: free trials; seconds: length of each; None for what is usual on the machine.
         rate_hz: sample rate; None for what is usual on the machine.
+        pace: how fast the motion is, 1 for usual; below 1 slow motion alone.
         noise_factor: true force noise over what the session file states.
         hum: amplitude of 50 Hz (with a fifth of it at 150 Hz) on the force, in its stated noise.
         coarse: counts of the encoders are so many times coarser.
         dropped: share of the samples that are lost.
         jitter: standard deviation of the time between samples, as a share of it; stamps are true.
         creep: dry friction is the smoothed one of the device file instead of a true standstill.
+        hold: a motor's command is held for 1 ms, so that it acts half of that late.
         viscous_trials, locked_trials: of a machine with brakes.
     """
 
     trials: int | None = None
     seconds: float | None = None
     rate_hz: float | None = None
+    pace: float = 1.0
     noise_factor: float = 1.0
     hum: float = 0.0
     coarse: float = 1.0
     dropped: float = 0.0
     jitter: float = 0.0
     creep: bool = False
+    hold: bool = False
     viscous_trials: int = 0
     locked_trials: bool = False
 
@@ -49,6 +53,7 @@ HARD = {
     "three short trials": Conditions(trials=3, seconds=6.0),
     "dropped samples": Conditions(dropped=0.02),
     "jitter": Conditions(jitter=0.1),
+    "held commands": Conditions(hold=True),
 }
 """Conditions of hard days, by name."""
 

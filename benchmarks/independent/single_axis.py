@@ -1,7 +1,7 @@
 """One axis moved by a motor under position and velocity loops: a joint with gravity, or a carriage.
 
-The controller sets its command every 2 ms (joint) or 1 ms (carriage) and holds it. A part of what
-moves may hang behind an elastic coupling; the motor may be late, slow or weak.
+A part of what moves may hang behind an elastic coupling; the motor may be late, slow or weak, and
+the controller may hold its command for a while.
 """
 
 from __future__ import annotations

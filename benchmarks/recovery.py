@@ -1,0 +1,264 @@
+"""What comes back of effects hidden by simulators that share no code with bampipe.
+
+    python benchmarks/recovery.py bam --counts 0 1 3 --seeds 4
+    python benchmarks/recovery.py joint --hidden stribeck:joint nothing --conditions "mains hum"
+
+Each session hides a drawn set of effects (``--counts``) or a named one (``--hidden``, joined by
+``+``). It is diagnosed once, or followed by ``extend --auto``, without the truth; one line a
+session, then a table. ``--list`` prints what each machine can hide.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from independent import MACHINES, record
+from independent.sensors import GOOD, HARD, Conditions
+
+import bampipe
+
+PIPELINE = """schema = "bampipe.pipeline/1"
+name = "recovery"
+stages = ["ingest", "filter", "identify", "validate"]
+"""
+DAYS = {"good": GOOD} | HARD
+
+
+@dataclass(frozen=True)
+class Case:
+    """One session to record and judge."""
+
+    machine: str
+    effects: tuple[str, ...]
+    strength: float
+    day: str
+    creep: bool
+    seed: int
+    replicates: int
+    auto: bool
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of one session.
+
+    Attributes:
+        case: the session.
+        hidden, outside: effects hidden that the library has, and that it has not.
+        named: effects found, in order; groups: what each was said to be like.
+        verdicts: of the last diagnosis, by axis.
+        over_floor: held-out error over noise floor with what was found, by axis.
+        z: error over standard deviation of each parameter that has a truth, where the set is right.
+        seconds: of the diagnosis, or of the whole loop.
+        failure: the message, if a stage refused.
+    """
+
+    case: Case
+    hidden: tuple[str, ...] = ()
+    outside: tuple[str, ...] = ()
+    named: tuple[str, ...] = ()
+    groups: tuple[tuple[str, ...], ...] = ()
+    verdicts: tuple[str, ...] = ()
+    over_floor: tuple[float, ...] = ()
+    z: tuple[float, ...] = ()
+    seconds: float = 0.0
+    failure: str = ""
+
+    def _reaches(self) -> list[set[str]]:
+        return [{n, *g} for n, g in zip(self.named, self.groups, strict=True)]
+
+    @property
+    def found(self) -> int:
+        """Hidden effects that were named, or stand in the group of one that was."""
+        return sum(any(e in reach for reach in self._reaches()) for e in self.hidden)
+
+    @property
+    def right(self) -> int:
+        """Named effects that were hidden, or stand for one that was."""
+        return sum(bool(reach & set(self.hidden)) for reach in self._reaches())
+
+    @property
+    def first(self) -> bool:
+        """The first effect named is itself one of the hidden."""
+        return bool(self.named) and self.named[0] in self.hidden
+
+    @property
+    def unknown(self) -> bool:
+        """Something was said to be missing that the library has no name for."""
+        return "unknown_effect" in self.verdicts
+
+    def line(self) -> str:
+        """One line of the log."""
+        if self.failure:
+            said = f"FAILED {self.failure}"
+        else:
+            alike = [f"{n} (or {', '.join(g)})" if g else n for n, g in
+                     zip(self.named, self.groups, strict=True)]  # fmt: skip
+            ratios = ", ".join(f"{r:.2f}" for r in self.over_floor)
+            said = f"{' + '.join(alike) or '-'} | {', '.join(self.verdicts)} | {ratios}"
+        hidden = " + ".join(self.case.effects) or "nothing"
+        return f"{self.case.machine} {self.case.day} {self.case.seed} | {hidden} -> {said}"
+
+
+def run_case(case: Case) -> Outcome:
+    """Record one session and judge it, in a temporary folder."""
+    day = Conditions(**(asdict(DAYS[case.day]) | {"creep": case.creep}))
+    if any(e.startswith("brake") for e in case.effects):
+        day = Conditions(**(asdict(day) | {"viscous_trials": 3}))
+    with tempfile.TemporaryDirectory() as folder:
+        root = Path(folder)
+        strengths = dict.fromkeys(case.effects, case.strength)
+        truth = record(case.machine, root / "session", case.seed, strengths, day)
+        (root / "recovery.toml").write_text(PIPELINE)
+        begun = time.perf_counter()
+        try:
+            run = bampipe.run_session(
+                root / "session", runs=root / "runs", pipeline=str(root / "recovery.toml")
+            )
+            begun = time.perf_counter()
+            if case.auto:
+                run = bampipe.follow(run)
+                named = tuple(run.model.split("+")[1:])
+            diagnosis = bampipe.diagnose(run, replicates=case.replicates, jobs=1, seed=case.seed)
+        except bampipe.InputError as problem:
+            return Outcome(case, failure=str(problem))
+        seconds = time.perf_counter() - begun
+        axes = diagnosis["axes"].values()
+        groups = diagnosis["groups"] if not case.auto else {}
+        named = named if case.auto else tuple(diagnosis["selected"])
+        z: tuple[float, ...] = ()
+        if set(named) == set(case.effects) and case.auto:
+            table = run.parameters(run.model)
+            z = tuple(
+                float((table.estimate[n] - value) / table.sd[n])
+                for n, value in truth["parameters"].items()
+                if n in table.index
+            )
+    return Outcome(
+        case,
+        tuple(truth["effects"]),
+        tuple(truth["outside"]),
+        named,
+        tuple(tuple(groups.get(n, ())) for n in named),
+        tuple(a["verdict"] for a in axes),
+        tuple(round(a["rmse_after"] / a["noise_floor"], 3) for a in axes),
+        z,
+        seconds,
+    )
+
+
+def draw_effects(machine: str, count: int, outside: int, seed: int) -> tuple[str, ...]:
+    """Draw ``count`` effects of the library and ``outside`` others, none of one kind twice."""
+    rng = np.random.default_rng([seed, count, outside])
+    chosen: list[str] = []
+    for pool, size in (
+        (MACHINES[machine].EFFECTS, count),
+        (MACHINES[machine].UNKNOWN, count + outside),
+    ):
+        for name in rng.permutation(pool):
+            kinds = {c.partition(":")[0] for c in chosen}
+            if len(chosen) < size and name.partition(":")[0] not in kinds:
+                chosen.append(str(name))
+    return tuple(chosen)
+
+
+def write_table(outcomes: Sequence[Outcome]) -> str:
+    """Counts and ratios by machine, day and number of hidden effects, as Markdown."""
+    lines = [
+        "| machine | day | hidden | sessions | found | named right | first right | "
+        "false alarms | unknown | error / floor | s |",
+        "|-|-|-|-|-|-|-|-|-|-|-|",
+    ]
+    done = [o for o in outcomes if not o.failure]
+
+    def kind(o: Outcome) -> tuple[str, str, int, int]:
+        return o.case.machine, o.case.day, len(o.hidden), len(o.outside)
+
+    for key in sorted({kind(o) for o in done}):
+        some = [o for o in done if kind(o) == key]
+        machine, day, hidden, outside = key
+        clean = not hidden and not outside
+        named = sum(len(o.named) for o in some)
+        axes = sum(len(o.verdicts) for o in some)
+        alarms = sum(v != "nothing_missing" for o in some for v in o.verdicts)
+        worst = [max(o.over_floor) for o in some]
+        first = sum(o.first for o in some)
+        lines.append(
+            f"| {machine} | {day} | {hidden}{f' and {outside} outside' if outside else ''} | "
+            f"{len(some)} | "
+            + (f"{sum(o.found for o in some)}/{hidden * len(some)}" if hidden else "-")
+            + f" | {f'{sum(o.right for o in some)}/{named}' if named else '-'} | "
+            + (f"{first}/{len(some)}" if hidden else "-")
+            + f" | {f'{alarms} in {axes} axes' if clean else '-'} | "
+            + (f"{sum(o.unknown for o in some)}/{len(some)}" if outside else "-")
+            + f" | {np.median(worst):.2f}, at most {max(worst):.2f} | "
+            f"{np.median([o.seconds for o in some]):.0f} |"
+        )
+    z = np.abs([value for o in done for value in o.z])
+    if len(z):
+        lines.append(
+            f"\n{np.mean(z < 1.96):.1%} of {len(z)} parameters of right models within 1.96 standard"
+            f" deviations of the truth, the farthest {z.max():.1f} off."
+        )
+    failed = len(outcomes) - len(done)
+    if failed:
+        lines.append(f"\n{failed} sessions were refused.")
+    return "\n".join(lines)
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Run the cases asked for, print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("machine", nargs="*", default=["bam"], help=", ".join(MACHINES))
+    parser.add_argument("--hidden", nargs="*", default=[], help="effects joined by +, or nothing")
+    parser.add_argument("--counts", nargs="*", type=int, default=[], help="effects to draw")
+    parser.add_argument("--outside", type=int, default=0, help="effects outside to draw beside")
+    parser.add_argument("--conditions", nargs="*", default=["good"], choices=list(DAYS))
+    parser.add_argument("--strength", type=float, default=1.0)
+    parser.add_argument("--creep", action="store_true", help="dry friction smoothed, as in bampipe")
+    parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--first-seed", type=int, default=1)
+    parser.add_argument("--replicates", type=int, default=10)
+    parser.add_argument("--auto", action="store_true", help="follow the diagnosis to its end")
+    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--out", type=Path, help="write the outcomes as JSON")
+    parser.add_argument("--list", action="store_true", help="print what each machine can hide")
+    options = parser.parse_args(arguments)
+    if options.list:
+        for name, machine in MACHINES.items():
+            print(f"{name}: {' '.join(machine.EFFECTS)}\n  outside: {' '.join(machine.UNKNOWN)}")
+        return
+    cases = []
+    for machine in options.machine:
+        for day in options.conditions:
+            for seed in range(options.first_seed, options.first_seed + options.seeds):
+                sets = [tuple(h.split("+")) if h != "nothing" else () for h in options.hidden]
+                sets += [
+                    draw_effects(machine, count, options.outside, seed) for count in options.counts
+                ]
+                cases += [
+                    Case(machine, effects, options.strength, day, options.creep, seed,
+                         options.replicates, options.auto)
+                    for effects in sets
+                ]  # fmt: skip
+    outcomes = []
+    with ProcessPoolExecutor(options.jobs) as pool:
+        for outcome in pool.map(run_case, cases):
+            outcomes.append(outcome)
+            print(outcome.line(), flush=True)
+    print(write_table(outcomes))
+    if options.out:
+        options.out.write_text(json.dumps([asdict(o) for o in outcomes], indent=1))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
