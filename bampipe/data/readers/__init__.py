@@ -4,11 +4,13 @@ Every reader returns the wanted columns as float64, with NaN where a cell is emp
 :class:`bampipe.errors.InputError` naming file, row and column where the file cannot be trusted.
 Rows of a text file are counted as an editor does (the first line is row 1); samples of the other
 files are counted from 1. Memory stays below three times what is returned; JSON and ROS bags apart,
-whose samples have to be held as objects.
+whose samples have to be held as objects. What a file would unpack to is found before the memory is
+taken (:mod:`.unpacking`).
 """
 
 from __future__ import annotations
 
+import stat
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -111,7 +113,9 @@ def _checked_ending(path: Path, name: str) -> str:
     """
     ending = path.suffix.lower()
     try:
-        size = path.stat().st_size
+        state = path.stat()
+        if not stat.S_ISREG(state.st_mode):
+            raise InputError("not a regular file", where=name)
         with path.open("rb") as stream:
             head = stream.read(_HEAD)
     except OSError as error:
@@ -124,7 +128,7 @@ def _checked_ending(path: Path, name: str) -> str:
             where=name,
             remedy=f"give {', '.join(ENDINGS)}",
         )
-    if size == 0:
+    if state.st_size == 0:
         raise InputError("the file is empty", where=name)
     matlab = head.startswith(b"MATLAB") or head[512:520] == hdf5.SIGNATURE
     kinds = [(magic, right, words) for magic, right, words in _KINDS if head.startswith(magic)]

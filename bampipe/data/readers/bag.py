@@ -11,7 +11,9 @@ topics are interpolated linearly at its times.
 from __future__ import annotations
 
 import json
+import sqlite3
 from collections.abc import Iterator, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +22,15 @@ import numpy as np
 from bampipe.data.readers import moments
 from bampipe.data.readers.extras import need
 from bampipe.data.readers.messages import RECORDED, STAMP, Field, leaves
-from bampipe.data.readers.trial import RawTrial, Wanted, check_columns, check_size
+from bampipe.data.readers.trial import (
+    LARGEST_BYTES,
+    RawTrial,
+    Wanted,
+    check_columns,
+    check_size,
+)
+from bampipe.data.readers.unpacking import check_mcap, check_ros1
 from bampipe.errors import InputError
-
-_DAMAGED = (
-    OSError, EOFError, ValueError, TypeError, KeyError, IndexError, AttributeError,
-    AssertionError, OverflowError, RuntimeError,
-)  # fmt: skip
 
 
 def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
@@ -41,7 +45,8 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
     recorded: dict[str, list[int]] = {topic: [] for topic in topics}
     stamped: dict[str, list[int | None]] = {topic: [] for topic in topics}
     cells: dict[str, list[float]] = {column: [] for column in wanted.columns}
-    for number, (topic, moment, message) in enumerate(_messages(path, topics, name), 1):
+    messages = _messages(path, topics, wanted.largest_bytes, name)
+    for number, (topic, moment, message) in enumerate(messages, 1):
         check_size(number, wanted, name)
         recorded[topic].append(moment)
         stamped[topic].append(Field(topic, STAMP).moment(message))
@@ -87,7 +92,7 @@ def columns(path: Path, name: str) -> dict[str, str]:
     """
     found: dict[str, str] = {}
     seen: set[str] = set()
-    for topic, _, message in _messages(path, (), name):
+    for topic, _, message in _messages(path, (), LARGEST_BYTES, name):
         if topic in seen:
             continue
         seen.add(topic)
@@ -137,72 +142,77 @@ def _interpolated(base: np.ndarray, times: np.ndarray, cells: list[float]) -> np
     return np.interp(at, since, values, left=np.nan, right=np.nan)
 
 
-def _messages(path: Path, topics: Sequence[str], name: str) -> Iterator[tuple[str, int, Any]]:
+def _messages(
+    path: Path, topics: Sequence[str], largest_bytes: int, name: str
+) -> Iterator[tuple[str, int, Any]]:
     """Topic, time of recording (ns) and message, in the order of recording; all if no topics.
 
     Raises:
-        InputError: not installed, damaged, or a topic is missing.
+        InputError: not installed, damaged, would unpack to too much, or a topic is missing.
     """
-    source = _json_messages if _holds_json(path, name) else _ros_messages
+    need("rosbags.highlevel", "ros", name)
+    ending = path.suffix.lower()
     try:
+        if ending == ".bag":
+            check_ros1(path, name)
+        elif ending == ".mcap":
+            check_mcap(path, largest_bytes, name)
+        else:
+            _check_tables(path)
+        source = _json_messages if ending == ".mcap" and _holds_json(path, name) else _ros_messages
         yield from source(path, topics, name)
-    except _DAMAGED as error:
+    except (InputError, MemoryError):
+        raise
+    except Exception as error:  # rosbags, apsw, mcap and codecs have no one type for damage
         raise InputError(
-            "not a sound bag", where=name, remedy="copy it again from the robot"
+            f"not a sound {'MCAP file' if ending == '.mcap' else 'bag'}",
+            where=name,
+            remedy="copy it again from the robot, or record with the message definitions in it",
         ) from error
 
 
 def _ros_messages(path: Path, topics: Sequence[str], name: str) -> Iterator[tuple[str, int, Any]]:
     highlevel = need("rosbags.highlevel", "ros", name)
-    try:
-        with highlevel.AnyReader([path]) as reader:
-            check_columns(sorted(reader.topics), topics, name)
-            chosen = [c for c in reader.connections if not topics or c.topic in topics]
-            if not chosen:
-                raise InputError("holds no messages", where=name)
-            for connection, moment, raw in reader.messages(connections=chosen):
-                yield connection.topic, moment, reader.deserialize(raw, connection.msgtype)
-    except highlevel.AnyReaderError as error:
-        raise InputError(
-            f"not a bag that can be read ({' '.join(map(str, error.args))[:120]})",
-            where=name,
-            remedy="copy it again, or record with the message definitions in it",
-        ) from error
+    with highlevel.AnyReader([path]) as reader:
+        check_columns(sorted(reader.topics), topics, name)
+        chosen = [c for c in reader.connections if not topics or c.topic in topics]
+        if not chosen:
+            raise InputError("holds no messages", where=name)
+        for connection, moment, raw in reader.messages(connections=chosen):
+            yield connection.topic, moment, reader.deserialize(raw, connection.msgtype)
+
+
+def _check_tables(path: Path) -> None:
+    """Raise ValueError unless a database holds plain tables: views, generated columns and virtual
+    tables can make rows without end of nothing.
+    """
+    place = f"{path.absolute().as_uri()}?mode=ro&immutable=1"
+    with closing(sqlite3.connect(place, uri=True)) as database:
+        for kind, label, sql in database.execute("SELECT type, name, sql FROM sqlite_master"):
+            if kind not in ("table", "index") or "VIRTUAL" in str(sql).upper().split():
+                raise ValueError(f"{label} is no plain table")
+            columns = database.execute("SELECT hidden FROM pragma_table_xinfo(?)", (label,))
+            if any(hidden for (hidden,) in columns):
+                raise ValueError(f"{label} has generated columns")
 
 
 def _holds_json(path: Path, name: str) -> bool:
     """Whether an MCAP file holds JSON messages rather than those of ROS."""
-    if path.suffix.lower() != ".mcap":
-        return False
-    reader = need("mcap.reader", "ros", name)
-    exceptions = need("mcap.exceptions", "ros", name)
-    try:
-        with path.open("rb") as stream:
-            summary = reader.make_reader(stream).get_summary()
-    except (exceptions.McapError, *_DAMAGED) as error:
-        raise InputError(
-            "not a sound MCAP file", where=name, remedy="copy it again from the robot"
-        ) from error
+    with path.open("rb") as stream:
+        summary = need("mcap.reader", "ros", name).make_reader(stream).get_summary()
     channels = summary.channels.values() if summary else ()
     return any(channel.message_encoding == "json" for channel in channels)
 
 
 def _json_messages(path: Path, topics: Sequence[str], name: str) -> Iterator[tuple[str, int, Any]]:
-    reader = need("mcap.reader", "ros", name)
-    exceptions = need("mcap.exceptions", "ros", name)
-    try:
-        with path.open("rb") as stream:
-            source = reader.make_reader(stream)
-            known = {
-                channel.topic
-                for channel in source.get_summary().channels.values()
-                if channel.message_encoding == "json"
-            }
-            check_columns(sorted(known), topics, name)
-            for _, channel, message in source.iter_messages(topics=list(topics) or None):
-                if channel.topic in known:
-                    yield channel.topic, message.log_time, json.loads(message.data)
-    except exceptions.McapError as error:
-        raise InputError(
-            "not a sound MCAP file", where=name, remedy="copy it again from the robot"
-        ) from error
+    with path.open("rb") as stream:
+        source = need("mcap.reader", "ros", name).make_reader(stream)
+        known = {
+            channel.topic
+            for channel in source.get_summary().channels.values()
+            if channel.message_encoding == "json"
+        }
+        check_columns(sorted(known), topics, name)
+        for _, channel, message in source.iter_messages(topics=list(topics) or None):
+            if channel.topic in known:
+                yield channel.topic, message.log_time, json.loads(message.data)

@@ -26,8 +26,14 @@ _COMPLEX = 0x0800
 _HEADER = 128
 _LARGEST_HEAD = 4096
 _CHUNK = 1 << 16
+_LARGEST_INFLATED = 8 << 30
+"""Bytes of compressed variables that are gone through, at most: half a minute."""
 _DEEPEST = 8
 _MOST_FIELDS = 4096
+
+
+class TooLargeError(Exception):
+    """The variables of a file unpack to more than is gone through; the text says to what."""
 
 
 @dataclass(frozen=True)
@@ -68,8 +74,10 @@ def variables(path: Path) -> list[Variable]:
 
     Raises:
         ValueError: the file is damaged.
+        TooLargeError: it would unpack to gigabytes.
     """
     found = []
+    inflated = 0
     with path.open("rb") as stream:
         order = _order(stream)
         end = stream.seek(0, 2)
@@ -82,7 +90,9 @@ def variables(path: Path) -> list[Variable]:
                 raise ValueError("an element is not what it says")
             source = _Source(stream, place, size, kind == _COMPRESSED, order)
             whole = Variable("", (), False, place, size, kind == _COMPRESSED)
+            source.most = _LARGEST_INFLATED - inflated
             found += [item for item in _arrays(source, whole, "", 0) if item.name]
+            inflated += source.place if whole.compressed else 0
             place += size
     return found
 
@@ -155,6 +165,7 @@ class _Source:
         self._inflate = zlib.decompressobj() if compressed else None
         self._ahead = b""
         self.place = 0
+        self.most = _LARGEST_INFLATED
         self.order = order
         if compressed and struct.unpack(order + "II", self._take(8))[0] != _MATRIX:
             raise ValueError("a compressed element holds no array")
@@ -229,6 +240,10 @@ class _Source:
         return data
 
     def _inflated(self, size: int) -> bytes:
+        if self.place + size > self.most:
+            raise TooLargeError(
+                f"its variables would unpack to more than {_LARGEST_INFLATED >> 20} MB"
+            )
         parts = []
         while size:
             if not self._ahead:

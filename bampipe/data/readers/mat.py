@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import struct
-import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from bampipe.data.readers import hdf5, level5
@@ -11,7 +12,7 @@ from bampipe.data.readers.arrays import labels, pick, split_index
 from bampipe.data.readers.trial import RawTrial, Wanted, aligned, check_columns, check_size
 from bampipe.errors import InputError
 
-_FAULTS = (*hdf5.FAULTS, zlib.error, struct.error)
+_FAULTS = (*hdf5.FAULTS, struct.error)
 
 
 def is_hdf5(head: bytes) -> bool:
@@ -44,10 +45,8 @@ def columns(path: Path, name: str) -> dict[str, str]:
     """
     if not _is_level_5(path, name):
         return hdf5.columns(path, name)
-    try:
+    with _faults_named(name):
         found = level5.variables(path)
-    except _FAULTS as error:
-        raise _unsound(name) from error
     return {label: "" for v in found if v.real for label in labels(v.name, v.shape)}
 
 
@@ -66,7 +65,7 @@ def _is_level_5(path: Path, name: str) -> bool:
 
 
 def _read_level_5(path: Path, wanted: Wanted, name: str) -> RawTrial:
-    try:
+    with _faults_named(name):
         known = {variable.name: variable for variable in level5.variables(path)}
         values = {}
         for column in wanted.columns:
@@ -92,10 +91,17 @@ def _read_level_5(path: Path, wanted: Wanted, name: str) -> RawTrial:
             flat = level5.values(path, variable)
             shaped = flat.reshape(variable.shape, order="F")
             values[column] = pick(shaped, index, place)
-    except _FAULTS as error:
-        raise _unsound(name) from error
     return RawTrial(aligned(values, name, "variable"), first_row=1)
 
 
-def _unsound(name: str) -> InputError:
-    return InputError("not a sound MATLAB file", where=name, remedy="save it again from MATLAB")
+@contextmanager
+def _faults_named(name: str) -> Iterator[None]:
+    """Turn what damage raises into InputError."""
+    try:
+        yield
+    except level5.TooLargeError as error:
+        raise InputError(str(error), where=name, remedy="save fewer variables") from error
+    except _FAULTS as error:
+        raise InputError(
+            "not a sound MATLAB file", where=name, remedy="save it again from MATLAB"
+        ) from error

@@ -10,6 +10,8 @@ import pandas as pd
 from bampipe.errors import InputError
 
 NANOSECONDS = 1_000_000_000
+LONGEST = 256
+"""Characters of the longest text that is taken for a date and time."""
 
 
 def nanoseconds(
@@ -28,6 +30,9 @@ def nanoseconds(
     """
     if isinstance(values, np.ndarray) and values.dtype.kind == "M":
         return values.astype("datetime64[ns]").astype(np.int64)
+    longest = max((len(value) for value in values if value is not None), default=0)
+    if longest > LONGEST:
+        raise InputError(f"a text of {longest} characters, expected a date and time", where=where)
     text = pd.Series(values, dtype="string").str.strip()
     if not form:
         text = text.str.replace(",", ".")  # ISO 8601 takes either as decimal sign

@@ -16,8 +16,8 @@ from bampipe.data.readers import moments
 from bampipe.data.readers.trial import RawTrial, Wanted, check_columns
 from bampipe.errors import InputError
 
-_COST = 12
-"""Memory that a JSON text takes once parsed, in multiples of its length, at most."""
+_COSTS = {b"{": 184, b"[": 96, b",": 40, b"\n": 16}
+"""Bytes of memory that each of these characters stands for once parsed (CPython 3.11)."""
 
 _MOST_ITEMS = 64
 _DEEPEST = 6
@@ -81,17 +81,23 @@ def _samples(
     path: Path, largest_bytes: int, name: str
 ) -> tuple[list[object], Mapping[str, object]]:
     """Samples of a file, and the numbers beside them."""
-    if path.stat().st_size * _COST > largest_bytes:
+    size = 3 * path.stat().st_size
+    if size <= largest_bytes:
+        data = path.read_bytes()
+        size = (3 if data.isascii() else 10) * len(data)
+        size += sum(cost * data.count(character) for character, cost in _COSTS.items())
+    if size > largest_bytes:
         raise InputError(
-            f"a JSON text of {path.stat().st_size >> 20} MB takes more memory than the"
-            f" {largest_bytes >> 20} MB allowed",
+            f"a JSON text that unpacks to {size >> 20} MB, where {largest_bytes >> 20} MB are"
+            " allowed",
             where=name,
             remedy="log to CSV or Parquet, or allow more (largest_trial_mb)",
         )
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError("not UTF-8 text", where=name, remedy="save it as UTF-8") from error
+    del data
     constants: Mapping[str, object] = {}
     if path.suffix.lower() in (".jsonl", ".ndjson"):
         lines = [line for line in text.splitlines() if line.strip()]

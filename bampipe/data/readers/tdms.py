@@ -36,7 +36,8 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
     values: dict[str, np.ndarray] = {}
     units = {}
     try:
-        with library.TdmsFile.open(path) as file:
+        # A stream: by its path, npTDMS would take an index file beside it for the truth.
+        with path.open("rb") as stream, library.TdmsFile.open(stream) as file:
             known = _channels(file)
             timed = [label + TIME for label, channel in known.items() if _increment(channel)]
             check_columns([*known, *timed], wanted.columns, name)
@@ -63,7 +64,8 @@ def columns(path: Path, name: str) -> dict[str, str]:
     library = need("nptdms", "tdms", name)
     found = {}
     try:
-        with library.TdmsFile.open(path) as file:
+        # A stream: by its path, npTDMS would take an index file beside it for the truth.
+        with path.open("rb") as stream, library.TdmsFile.open(stream) as file:
             for label, channel in _channels(file).items():
                 if channel.dtype.kind == "M":
                     found[label] = "datetime"

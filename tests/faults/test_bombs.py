@@ -1,0 +1,274 @@
+"""Small files that unpack to gigabytes: refused, or read, in the memory that their trial takes."""
+
+from __future__ import annotations
+
+import bz2
+import json
+import os
+import sqlite3
+import struct
+import subprocess
+import sys
+import zlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import h5py
+import lz4.frame
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from bampipe.data.readers import level5, read_trial
+from bampipe.errors import InputError
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="peak memory is read from /proc")
+
+ROWS = 20_000
+DATE = "2026-10-03T10:12:00"
+
+
+def packed_zeros(pack: Any, size: int) -> bytes:
+    """``size`` zeros through a compressor object."""
+    zeros = bytes(1 << 20)
+    return b"".join([*(pack.compress(zeros) for _ in range(size >> 20)), pack.flush()])
+
+
+def wide_text(path: Path) -> None:
+    """2 GB of text in a fixed width."""
+    with h5py.File(path, "w") as file:
+        file["x"] = np.zeros(ROWS)
+        when = file.create_dataset(
+            "when", (ROWS,), dtype="S100000", chunks=(1000,), compression="gzip"
+        )
+        chunk = packed_zeros(zlib.compressobj(), 100_000_000)
+        for start in range(0, ROWS, 1000):
+            when.id.write_direct_chunk((start,), chunk)
+
+
+def wide_chunk(path: Path) -> None:
+    """Samples with 1 GB of padding in one chunk."""
+    kind = np.dtype([("when", "S32"), ("x", "f8"), ("padding", "V50000")])
+    with h5py.File(path, "w") as file:
+        file.create_dataset(
+            "log", (ROWS,), dtype=kind, chunks=(ROWS,), compression="gzip", fillvalue=None
+        )
+        file["log"].id.write_direct_chunk((0,), packed_zeros(zlib.compressobj(), 1 << 20))
+
+
+def long_chunk(path: Path) -> None:
+    """A chunk that claims 8 kB and holds 300 MB."""
+    with h5py.File(path, "w") as file:
+        file["x"] = np.zeros(1000)
+        data = file.create_dataset("when", (1000,), "f8", chunks=(1000,), compression="gzip")
+        data.id.write_direct_chunk((0,), packed_zeros(zlib.compressobj(9), 300 << 20))
+
+
+def shared_text(path: Path) -> None:
+    """One text of 1 MB that every row refers to."""
+    with h5py.File(path, "w") as file:
+        text = h5py.string_dtype()
+        one = file.create_dataset("one", (1,), text, chunks=(1,))
+        one[0] = DATE + " " * 1_000_000
+        reference = one.id.read_direct_chunk((0,))[1]
+        when = file.create_dataset("when", (ROWS,), text, chunks=(ROWS,))
+        when.id.write_direct_chunk((0,), reference * ROWS)
+        file["x"] = np.zeros(ROWS)
+
+
+def dictionary(path: Path) -> None:
+    """One text of 1 MB that every row refers to."""
+    words = pa.array([DATE + "0" * 1_000_000])
+    when = pa.DictionaryArray.from_arrays(pa.array(np.zeros(ROWS, np.int32)), words)
+    table = pa.table({"when": when, "x": np.zeros(ROWS)}).replace_schema_metadata(None)
+    pq.write_table(table, path, compression="zstd", store_schema=False)
+
+
+def page(path: Path) -> None:
+    """One text of 300 MB in a page."""
+    table = pa.table({"when": [" " * 300_000_000], "x": [0.0]})
+    pq.write_table(table, path, compression="zstd", use_dictionary=False, write_statistics=False)
+
+
+def mcap(chunks: int, size: int) -> Callable[[Path], None]:
+    """Chunks of this size, compressed by zstd, all at the same time."""
+
+    def write(path: Path) -> None:
+        writer_module = pytest.importorskip("mcap.writer")
+        with path.open("wb") as stream:
+            writer = writer_module.Writer(stream, chunk_size=size // 2)
+            writer.start()
+            schema = writer.register_schema("state", "jsonschema", b'{"type": "object"}')
+            channel = writer.register_channel("/state", "json", schema)
+            data = b'{"x": 1.0' + b" " * size + b"}"
+            for _ in range(chunks):
+                writer.add_message(channel, 0, b'{"x": 1.0}', 0)
+                writer.add_message(channel, 10**9, data, 10**9)
+            writer.finish()
+
+    return write
+
+
+def ros1(codec: str) -> Callable[[Path], None]:
+    """A chunk of 300 MB."""
+
+    def record(fields: dict[bytes, bytes], data: bytes) -> bytes:
+        parts = [struct.pack("<I", len(k + v) + 1) + k + b"=" + v for k, v in fields.items()]
+        header = b"".join(parts)
+        return struct.pack("<I", len(header)) + header + struct.pack("<I", len(data)) + data
+
+    def write(path: Path) -> None:
+        size = 300 << 20
+        if codec == "bz2":
+            data = packed_zeros(bz2.BZ2Compressor(), size)
+        else:
+            pack = lz4.frame.LZ4FrameCompressor()
+            data = pack.begin() + packed_zeros(pack, size)
+        fields = {b"op": b"\x05", b"compression": codec.encode(), b"size": struct.pack("<I", size)}
+        start = {b"op": b"\x03", b"index_pos": struct.pack("<Q", 0)}
+        start |= {b"conn_count": struct.pack("<I", 0), b"chunk_count": struct.pack("<I", 1)}
+        path.write_bytes(b"#ROSBAG V2.0\n" + record(start, b" " * 4027) + record(fields, data))
+
+    return write
+
+
+def view(path: Path) -> None:
+    """A bag whose messages are made without end by a query."""
+    with sqlite3.connect(path) as database:
+        database.executescript(
+            "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT,"
+            " serialization_format TEXT);"
+            "CREATE VIEW messages AS WITH RECURSIVE n(id) AS (SELECT 1 UNION ALL SELECT id + 1"
+            " FROM n) SELECT id, 1 AS topic_id, id AS timestamp, zeroblob(1000) AS data FROM n;"
+        )
+
+
+def generated(path: Path) -> None:
+    """A bag whose messages hold 1 GB each that is not in the file."""
+    with sqlite3.connect(path) as database:
+        database.executescript(
+            "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT,"
+            " serialization_format TEXT);"
+            "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER,"
+            " data BLOB GENERATED ALWAYS AS (zeroblob(1000000000)) VIRTUAL);"
+            "INSERT INTO messages(topic_id, timestamp) VALUES (1, 1);"
+        )
+
+
+def brackets(path: Path) -> None:
+    """Empty objects: 150 MB of text are 4 GB of objects."""
+    with path.open("wb") as stream:
+        stream.write(b"[{}")
+        for _ in range(50):
+            stream.write(b",{}" * 1_000_000)
+        stream.write(b"]")
+
+
+def sound_hdf5(path: Path) -> None:
+    """A sound trial of 160 MB in a small file."""
+    with h5py.File(path, "w") as file:
+        for name in ("when", "x"):
+            file.create_dataset(name, data=np.zeros(10_000_000), chunks=True, compression="gzip")
+
+
+SAMPLES = ("when", "x")
+STATE = ("/state:@time", "/state:x")
+BOMBS: dict[str, tuple[Callable[[Path], None], str, dict[str, Any], str]] = {
+    "wide_text.h5": (wide_text, "dates", {}, "a text of 100000 bytes, expected a date"),
+    "wide_chunk.h5": (wide_chunk, "log", {}, "a chunk would unpack to 1001 MB, for samples of"),
+    "long_chunk.h5": (long_chunk, "", {}, "a chunk would unpack to 269 MB, for samples of 0.016"),
+    "shared_text.h5": (shared_text, "dates", {}, "a text of 1000019 characters, expected"),
+    "dictionary.parquet": (dictionary, "dates", {}, "column 'when': a text of 1000019 bytes"),
+    "page.parquet": (page, "dates", {}, "column 'when': a page would unpack to 300 MB"),
+    "chunk.mcap": (mcap(1, 300 << 20), "state", {}, "kB would unpack to more than 256 MB"),
+    "chunks.mcap": (mcap(4, 80 << 20), "state", {}, "chunks of the same time would unpack to"),
+    "bz2.bag": (ros1("bz2"), "state", {}, "a chunk of 0 kB would unpack to more than 256 MB"),
+    "lz4.bag": (ros1("lz4"), "state", {}, "kB would unpack to more than 256 MB"),
+    "view.db3": (view, "state", {}, "not a sound bag"),
+    "generated.db3": (generated, "state", {}, "not a sound bag"),
+    "brackets.json": (brackets, "", {"largest_bytes": 1 << 30}, "a JSON text that unpacks to"),
+    "sound.h5": (sound_hdf5, "", {}, "10000000 samples"),
+}  # fmt: skip
+MEASURE = """
+import json, re, resource, sys
+from pathlib import Path
+from bampipe.data.readers import read_trial
+from bampipe.errors import InputError
+import pandas, h5py, nptdms, mcap.reader, rosbags.highlevel
+
+def memory(kind):
+    text = Path("/proc/self/status").read_text()
+    return int(re.search(kind + r":\\s*(\\d+) kB", text)[1]) * 1024
+
+used = int(re.search(r"VmSize:\\s*(\\d+) kB", Path("/proc/self/status").read_text())[1]) * 1024
+resource.setrlimit(resource.RLIMIT_AS, (used + (3 << 30),) * 2)
+for line in sys.stdin:
+    path, columns, options = json.loads(line)
+    Path("/proc/self/clear_refs").write_text("5")
+    before = memory("VmRSS")
+    try:
+        trial = read_trial(Path(path), columns, name=Path(path).name, **options)
+        said = f"{len(trial.columns[columns[0]])} samples"
+        del trial
+    except InputError as error:
+        said = str(error)
+    print(json.dumps([said, memory("VmHWM") - before]), flush=True)
+"""
+
+
+@pytest.fixture(scope="module")
+def reader() -> Iterator[subprocess.Popen[str]]:
+    """A process with 3 GB left that reads files and says what came of it."""
+    with subprocess.Popen(
+        [sys.executable, "-c", MEASURE],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+        env={**os.environ, "MALLOC_ARENA_MAX": "1", "ARROW_DEFAULT_MEMORY_POOL": "system"},
+    ) as process:  # fmt: skip
+        yield process
+        assert process.stdin is not None
+        process.stdin.close()
+
+
+@pytest.mark.parametrize("name", BOMBS)
+def test_a_bomb_does_not_go_off(name: str, tmp_path: Path, reader: subprocess.Popen[str]) -> None:
+    write, kind, options, words = BOMBS[name]
+    path = tmp_path / name
+    write(path)
+    columns = {"state": STATE, "log": ("log.when", "log.x")}.get(kind, SAMPLES)
+    if kind in ("dates", "log"):
+        options = options | {"datetimes": {columns[0]: ""}}
+    assert reader.stdin is not None and reader.stdout is not None
+    reader.stdin.write(json.dumps([str(path), columns, options]) + "\n")
+    reader.stdin.flush()
+    line = reader.stdout.readline()
+    assert line, "the process died"
+    said, peak = json.loads(line)
+    trial = 160_000_000 if name == "sound.h5" else 0
+    assert words in said and "\n" not in said, said
+    assert words.endswith("samples") or said.startswith(name)
+    assert peak < 3 * trial + (200 << 20), f"{peak >> 20} MB"
+
+
+def test_a_matlab_file_that_unpacks_to_too_much(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "a.mat"
+
+    def element(kind: int, data: bytes) -> bytes:
+        return struct.pack("<II", kind, len(data)) + data + bytes(-len(data) % 8)
+
+    def head(kind: int, *extents: int) -> bytes:
+        flags = element(6, struct.pack("<II", kind, 0))
+        return flags + element(5, struct.pack(f"<{len(extents)}i", *extents)) + element(1, b"s")
+
+    inner = bytes(64 << 20)
+    struct_head = head(2, 1, 1) + element(5, struct.pack("<i", 8)) + element(1, b"x" + bytes(7))
+    field = head(6, 1, 1)[:-8] + element(1, b"") + inner
+    array = struct_head + struct.pack("<II", 14, len(field)) + field
+    packed = zlib.compress(struct.pack("<II", 14, len(array)) + array)
+    path.write_bytes(bytes(124) + b"\x00\x01IM" + struct.pack("<II", 15, len(packed)) + packed)
+    monkeypatch.setattr(level5, "_LARGEST_INFLATED", 16 << 20)
+    with pytest.raises(InputError, match=r"a\.mat: its variables would unpack to more than 16 MB"):
+        read_trial(path, SAMPLES, name="a.mat")
