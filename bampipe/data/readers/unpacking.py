@@ -10,7 +10,6 @@ import bz2
 import heapq
 import struct
 import zlib
-from collections.abc import Iterator
 from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO
@@ -29,7 +28,8 @@ def check_unpacked(size: int, trial_bytes: int, where: str, what: str) -> None:
     """Raise InputError where ``size`` bytes are far more than a trial of ``trial_bytes`` needs."""
     if size > max(3 * trial_bytes, MARGIN):
         raise InputError(
-            f"{what} would unpack to {size / 1e6:.0f} MB, for samples of {trial_bytes / 1e6:.3g} MB",
+            f"{what} would unpack to {size / 1e6:.0f} MB, for samples of"
+            f" {trial_bytes / 1e6:.3g} MB",
             where=where,
             remedy="is it damaged? export it again, with parts of some MB",
         )
@@ -51,8 +51,7 @@ def inflated_size(data: bytes, limit: int) -> int:
 def check_ros1(path: Path, name: str) -> None:
     """Raise InputError where a chunk of a ROS 1 bag unpacks to more than `MARGIN`.
 
-    Raises:
-        ValueError, struct.error: the bag is damaged.
+    A damaged bag raises what struct and the codecs raise.
     """
     with path.open("rb") as stream:
         end = stream.seek(0, 2)
@@ -72,10 +71,8 @@ def check_mcap(path: Path, largest_bytes: int, name: str) -> None:
     """Raise InputError where an MCAP file unpacks to too much.
 
     A chunk, and chunks that overlap in time and so are held together, may unpack to `MARGIN`;
-    chunks without an index, which are read at once, to ``largest_bytes``.
-
-    Raises:
-        ValueError, struct.error: the file is damaged.
+    chunks without an index, which are read at once, to ``largest_bytes``. A damaged file raises
+    what struct and the codecs raise.
     """
     sizes: dict[int, int] = {}
     spans: list[tuple[int, int, int]] = []
@@ -116,40 +113,32 @@ def _chunk_size(data: bytes, codec: str, name: str) -> int:
     """Bytes that a chunk unpacks to.
 
     Raises:
-        InputError: more than `MARGIN`, or in an unknown way.
-        ValueError: it is damaged.
+        InputError: more than `MARGIN`, or compressed in an unknown way.
     """
     size = 0
-    for part in _unpacked(data, codec, name):
-        size += part
-        if size > MARGIN:
-            raise InputError(
-                f"a chunk of {len(data) / 1e3:.0f} kB would unpack to more than {MARGIN >> 20} MB",
-                where=name,
-                remedy="is it damaged? copy it again, or record with smaller chunks",
-            )
+    with _unpacked(data, codec, name) as stream:
+        while part := stream.read(_STEP):
+            size += len(part)
+            if size > MARGIN:
+                raise InputError(
+                    f"a chunk of {len(data) / 1e3:.1f} kB would unpack to more than"
+                    f" {MARGIN >> 20} MB",
+                    where=name,
+                    remedy="is it damaged? copy it again, or record with smaller chunks",
+                )
     return size
 
 
-def _unpacked(data: bytes, codec: str, name: str) -> Iterator[int]:
-    """Sizes of the parts that ``data`` unpacks to, one after the other."""
-    damage: type[Exception] = OSError
+def _unpacked(data: bytes, codec: str, name: str) -> BinaryIO:
+    """What ``data`` unpacks to, as a stream."""
     if codec == "bz2":
-        stream: BinaryIO = bz2.open(BytesIO(data))
-    elif codec == "lz4":
-        stream, damage = need("lz4.frame", "ros", name).open(BytesIO(data)), RuntimeError
-    elif codec == "zstd":
-        zstandard = need("zstandard", "ros", name)
-        decompressor = zstandard.ZstdDecompressor()
-        stream = decompressor.stream_reader(BytesIO(data), read_across_frames=True)
-        damage = zstandard.ZstdError
-    else:
-        raise InputError(f"chunks are compressed as {codec!r:.20}", where=name)
-    try:
-        while part := stream.read(_STEP):
-            yield len(part)
-    except (damage, EOFError, OSError) as error:
-        raise ValueError("a chunk is damaged") from error
+        return bz2.BZ2File(BytesIO(data))
+    if codec == "lz4":
+        return need("lz4.frame", "ros", name).LZ4FrameFile(BytesIO(data))
+    if codec == "zstd":
+        decompressor = need("zstandard", "ros", name).ZstdDecompressor()
+        return decompressor.stream_reader(BytesIO(data), read_across_frames=True)
+    raise InputError(f"chunks are compressed as {codec!r:.20}", where=name)
 
 
 def _ros1_fields(header: bytes) -> dict[bytes, bytes]:
