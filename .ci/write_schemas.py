@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from bampipe.data.session import Session
 from bampipe.declarations.accepted import Accepted
 from bampipe.declarations.model import ModelFile
 from bampipe.declarations.pipeline import Pipeline
@@ -28,6 +29,7 @@ FILES: dict[str, type[Declaration]] = {
     "effect": Effect,
     "model": ModelFile,
     "pipeline": Pipeline,
+    "session": Session,
     "compare": CompareResult,
     "diagnose": DiagnoseResult,
     "filter": FilterResult,

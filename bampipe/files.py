@@ -83,7 +83,7 @@ def read_toml(path: Path) -> dict[str, Any]:
     except ValueError as error:  # TOMLDecodeError, or a number of thousands of digits
         what, _, place = str(error).rpartition(" (at ")
         found = re.match(r"line (\d+)", place)
-        line = found[1] if found else data.rstrip().count(b"\n") + 1
+        line = int(found[1]) if found else data.rstrip().count(b"\n") + 1
         raise InputError(f"not TOML: {what}", where=f"{path}, line {line}") from error
     except RecursionError as error:
         raise InputError("nested too deeply", where=str(path)) from error

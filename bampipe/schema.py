@@ -6,7 +6,7 @@ import ast
 import json
 import math
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import cache
 from typing import Annotated, Any, Self, TypeVar, get_args
 
@@ -72,6 +72,18 @@ T = TypeVar("T")
 def fault(what: str, remedy: str = "") -> PydanticCustomError:
     """Return what the validator of a field raises: the words of an `InputError`."""
     return PydanticCustomError("faults", "faults", {"found": [InputError(what, remedy=remedy)]})
+
+
+def checked_by(check: Callable[[Any], T]) -> Callable[[Any], T]:
+    """Return ``check``, which raises `InputError`, as the validator of a field."""
+
+    def validate(value: Any) -> T:
+        try:
+            return check(value)
+        except InputError as error:
+            raise fault(error.what, error.remedy) from None
+
+    return validate
 
 
 def _refuse_rounded(value: Any) -> Any:
@@ -230,9 +242,15 @@ _EXPECTED = {
 
 
 def _faults(error: ValidationError, kind: type[Declaration], where: str) -> list[InputError]:
-    found = error.errors(include_url=False)
+    # A list is counted short where its entries are wrong: they are reported instead.
+    found = [
+        e
+        for e in error.errors(include_url=False)
+        if e["type"] != "too_short" or len(e["input"]) < e["ctx"]["min_length"]
+    ]
     # A key that is not known often is a missing one misspelt: it comes first.
-    found.sort(key=lambda e: (len(e["loc"]) > 1, e["type"] != "extra_forbidden"))
+    keys = ("extra_forbidden", "missing")
+    found.sort(key=lambda e: (e["type"] not in keys or len(e["loc"]) > 1, e["type"] != keys[0]))
     said = []
     for e in found:
         path = [part for part in e["loc"] if not str(part).startswith("#")]

@@ -84,7 +84,7 @@ class Layout:
         names += [*(f"brake_{b.axis}" for b in session.brakes), *(c.name for c in session.channels)]
         names += list(force.names) if force else []
         gain, offset = np.zeros((len(columns), len(names))), np.zeros(len(names))
-        gain[0, 0] = session.clock.seconds
+        gain[0, 0] = session.tick
         at = 1
         scales = [(e.scale, -e.zero * e.scale) for e in session.encoders]
         scales += [(1.0, 0.0) for _ in session.brakes]

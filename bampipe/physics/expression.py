@@ -17,7 +17,7 @@ from typing import Annotated, Any
 from pydantic import BeforeValidator, PlainValidator, WithJsonSchema
 
 from bampipe.errors import InputError, did_you_mean
-from bampipe.schema import fault
+from bampipe.schema import checked_by
 
 MAX_LENGTH = 2000
 MAX_NODES = 500
@@ -180,28 +180,14 @@ def check_name(name: object, where: str) -> str:
     return name
 
 
-def _parsed(text: object) -> ast.expr:
-    try:
-        return parse(text, "")
-    except InputError as error:
-        raise fault(error.what, error.remedy) from None
-
-
-def _named(name: object) -> str:
-    try:
-        return check_name(name, "")
-    except InputError as error:
-        raise fault(error.what, error.remedy) from None
-
-
 Expression = Annotated[
     ast.expr,
-    PlainValidator(_parsed),
+    PlainValidator(checked_by(lambda text: parse(text, ""))),
     WithJsonSchema({"type": "string", "minLength": 1, "maxLength": MAX_LENGTH}),
 ]
 Name = Annotated[
     str,
-    BeforeValidator(_named),
+    BeforeValidator(checked_by(lambda name: check_name(name, ""))),
     WithJsonSchema({"type": "string", "pattern": "^[A-Za-z_][A-Za-z0-9_]*$"}),
 ]
 

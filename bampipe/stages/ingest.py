@@ -245,7 +245,7 @@ def _trial(session: Session, entry: TrialEntry, config: Config, reason: str) -> 
         session.columns,
         name=entry.file,
         largest_bytes=config.largest_trial_mb << 20,
-        datetimes={clock.column: clock.form} if clock.datetime else {},
+        datetimes={clock.column: clock.format} if clock.datetime else {},
         dialect=session.dialect,
     )
     if clock.nanoseconds:

@@ -10,9 +10,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from jsonschema import Draft202012Validator
 
-from bampipe.data import schema
 from bampipe.data.session import inside, session_from
 from bampipe.errors import InputError
 
@@ -96,10 +94,6 @@ def test_brakes_with_other_names_follow_the_order_of_the_axes():
     table = copy.deepcopy(TABLE)
     table["brakes"] = {"columns": ["b1", "b2"], "unit": "N.m, N"}
     assert [b.axis for b in session_from(table, Path()).brakes] == ["yaw", "slide"]
-
-
-def test_the_schema_is_a_schema():
-    Draft202012Validator.check_schema(schema.load("session"))
 
 
 def test_the_error_names_the_field_and_counts_the_others():

@@ -248,7 +248,7 @@ REFUSED: dict[str, tuple[Damage, str]] = {
     ),
     "device file is no device": (
         both(put("device", "my.toml"), file('name = "x"\nfoo = 1', "my.toml")),
-        "my.toml: unknown table 'foo'",
+        'my.toml: unknown key "foo"',
     ),
     "no encoders": (put("encoders", {}), "expected at least 1 entry"),
     "axis of another device": (

@@ -18,8 +18,8 @@ def refuse_other_units(table: Table, stated: Mapping[str, str]) -> None:
     """Refuse a column whose unit in the file is not that of the session file."""
     clock = table.session.clock
     declared = {**table.session.raw_units}
-    if not clock.datetime:
-        declared[clock.column] = {v: k for k, v in SECONDS.items()}.get(clock.seconds, "")
+    if clock.unit in SECONDS:
+        declared[clock.column] = clock.unit
     for column, text in stated.items():
         found, expected = unit(text), unit(declared.get(column, ""))
         if found is None or expected is None or "" in (found.si, expected.si):

@@ -29,15 +29,15 @@ def time_to_seconds(table: Table) -> None:
             remedy="is this the time column?",
         )
     # The first stamp goes first: stamps since 1970 in s have no room for fractions of 1 us.
-    table.t = (table.t - table.t[0]) * table.session.clock.seconds
+    table.t = (table.t - table.t[0]) * table.session.tick
     nominal = table.session.sample_rate
-    ratio = float(np.median(steps)) * table.session.clock.seconds * nominal
+    ratio = float(np.median(steps)) * table.session.tick * nominal
     power = 3 * round(np.log10(ratio) / 3)
     if power in (-9, -6, -3, 3, 6, 9) and 0.5 < ratio / 10.0**power < 2.0:
         table.t = table.t * 10.0**-power
         unit = {seconds: name for name, seconds in SECONDS.items()}
-        declared = unit[table.session.clock.seconds]
-        real = unit.get(float(f"{table.session.clock.seconds * 10.0**-power:.0e}"))
+        declared = table.session.clock.unit
+        real = unit.get(float(f"{table.session.tick * 10.0**-power:.0e}"))
         words = f"in {real}, not {declared}" if real else f"wrong by a factor of 1e{power}"
         table.repairs.append(f"time stamps are {words}, by the nominal rate: converted")
     elif not 0.1 < ratio < 10.0:

@@ -4,30 +4,29 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
+from pydantic import Field
 
 from bampipe.errors import InputError, did_you_mean
+from bampipe.schema import Declaration, Distinct, Text
 
 LARGEST_BYTES = 4 << 30
 """A trial larger than this in memory is refused unless the caller allows more."""
 
 
-@dataclass(frozen=True)
-class Dialect:
-    """What a session says about its text files; what it leaves open is found in the file.
+class Dialect(Declaration):
+    """What a session says about its text files; what it leaves open is found in the file."""
 
-    Attributes:
-        delimiter: what stands between columns: ``,`` ``;`` a tab, ``|`` or a blank (any number).
-        decimal: decimal sign, ``.`` or ``,``.
-        encoding: of the text, ``utf-8``, ``utf-16``, ``latin-1`` or ``cp1252``.
-        names: names of the columns, for files without a header.
-    """
-
-    delimiter: str = ""
-    decimal: str = ""
-    encoding: str = ""
-    names: tuple[str, ...] = ()
+    delimiter: Literal["", ",", ";", "\t", "|", " "] = Field(
+        default="", description="What stands between columns; a blank: any number of them"
+    )
+    decimal: Literal["", ".", ","] = Field(default="", description="Decimal sign")
+    encoding: Literal["", "utf-8", "utf-16", "latin-1", "cp1252"] = ""
+    names: Distinct[Text] = Field(
+        default=(), description="Names of the columns, for files without a header"
+    )
 
 
 @dataclass(frozen=True)
@@ -44,7 +43,7 @@ class Wanted:
 
     columns: tuple[str, ...]
     datetimes: Mapping[str, str] = field(default_factory=dict)
-    dialect: Dialect = Dialect()
+    dialect: Dialect = field(default_factory=Dialect)
     largest_bytes: int = LARGEST_BYTES
 
 

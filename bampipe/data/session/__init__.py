@@ -5,20 +5,18 @@ Everything that can be known from the session file alone is checked here, and a 
 is wrong with one trial's file is the reader's and the quality rules' business.
 """
 
-from bampipe.data.session.channels import SECONDS
-from bampipe.data.session.file import read_session, session_from
-from bampipe.data.session.places import inside, is_device_path, lexically_inside
-from bampipe.data.session.records import (
-    FILE_NAME,
+from bampipe.data.session.channels import (
+    SECONDS,
     Brake,
     Channel,
     Clock,
     Encoder,
     Force,
-    Session,
-    TrialEntry,
     Velocity,
 )
+from bampipe.data.session.file import read_session, session_from
+from bampipe.data.session.places import inside, is_device_path, lexically_inside
+from bampipe.data.session.records import FILE_NAME, Session, TrialEntry
 
 __all__ = [
     "FILE_NAME",

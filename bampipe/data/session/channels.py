@@ -1,16 +1,30 @@
-"""The tables of a session file that say what the columns mean."""
+"""The tables of a session file that say what the columns mean, and what follows in SI units."""
 
 from __future__ import annotations
 
+import json
+import re
 from collections import Counter
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Iterator
+from functools import cached_property
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
+from pydantic import AfterValidator, Field
 
 from bampipe.data import units
-from bampipe.data.session.records import Brake, Channel, Clock, Encoder, Force, Velocity
 from bampipe.errors import InputError, did_you_mean
+from bampipe.schema import (
+    Declaration,
+    Distinct,
+    NamedDeclaration,
+    NotNegative,
+    Number,
+    Positive,
+    Several,
+    Text,
+    fault,
+)
 
 LARGEST_CONDITION = 1e8
 """A calibration matrix with a larger condition number counts as singular."""
@@ -19,195 +33,287 @@ SECONDS = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0}
 _FORCE_SUFFIXES = ("_nm", "_v", "_n")
 
 
-def clock_from(entry: Mapping[str, Any] | None, rate: float, where: str) -> Clock:
-    """The time column; without a table it is ``time_us``.
+def _name(text: str) -> str:
+    if re.fullmatch("[A-Za-z][A-Za-z0-9_]{0,59}", text) is None:
+        raise fault(
+            f"found {json.dumps(text)}, expected a name of letters, digits and '_', a letter first"
+        )
+    return text
 
-    Args:
-        entry: the table ``[time]``, None where there is none.
-        rate: nominal sample rate, Hz, of samples that are counted.
-        where: file and table, for messages.
 
-    Raises:
-        InputError: a column is missing, or a key makes no sense beside the unit.
-    """
-    if entry is None:
-        return Clock("time_us", SECONDS["us"])
-    kind = entry["unit"]
-    if kind == "samples":
-        if "column" in entry:
-            raise InputError(
+Name = Annotated[
+    str,
+    AfterValidator(_name),
+    Field(json_schema_extra={"pattern": "^[A-Za-z][A-Za-z0-9_]*$"}),
+]
+Column = Annotated[Text, Field(description="A column (or MATLAB variable) of the trial files")]
+Columns = Annotated[Distinct[Column], Field(min_length=1)]
+
+
+def _unit(text: str) -> units.Unit:
+    """A unit that its declaration allows only where it is known."""
+    found = units.unit(text)
+    assert found is not None
+    return found
+
+
+class Clock(Declaration):
+    """The time column."""
+
+    column: str = Field(default="", description="Its name; left out where samples are counted")
+    unit: Literal["ns", "us", "ms", "s", "datetime", "samples"] = Field(
+        description="datetime: dates and times; samples: no column, one sample each"
+        " 1/sample_rate_hz"
+    )
+    format: str = Field(
+        default="",
+        description="How dates and times are written, as of strptime; ISO 8601 where left out",
+    )
+    nanoseconds: str = Field(
+        default="",
+        description="A second column of nanoseconds on top of whole seconds, as in ROS stamps",
+    )
+
+    @property
+    def datetime(self) -> bool:
+        """Whether it holds dates and times, which are read as s since the first."""
+        return self.unit == "datetime"
+
+    def cross_faults(self) -> Iterator[InputError]:
+        if self.unit == "samples" and self.column:
+            yield InputError(
                 'given although unit = "samples" counts them',
-                where=f"{where}.column",
+                where="column",
                 remedy="leave it out",
             )
-        return Clock("", 1.0 / rate)
-    if "column" not in entry:
-        raise InputError(
-            "'column' is missing",
-            where=where,
-            remedy='name the time column, or say unit = "samples" where there is none',
-        )
-    if "format" in entry and kind != "datetime":
-        raise InputError('only for unit = "datetime"', where=f"{where}.format")
-    if "nanoseconds" in entry and kind != "s":
-        raise InputError('only for unit = "s"', where=f"{where}.nanoseconds")
-    moments = kind == "datetime"
-    return Clock(
-        entry["column"],
-        1.0 if moments else SECONDS[kind],
-        moments,
-        str(entry.get("format", "")),
-        str(entry.get("nanoseconds", "")),
+        if self.unit != "samples" and not self.column:
+            yield InputError(
+                "'column' is missing",
+                remedy='name the time column, or say unit = "samples" where there is none',
+            )
+        if self.format and not self.datetime:
+            yield InputError('only for unit = "datetime"', where="format")
+        if self.nanoseconds and self.unit != "s":
+            yield InputError('only for unit = "s"', where="nanoseconds")
+
+
+class Velocity(Declaration):
+    """A recorded velocity of one axis, for checking its position: SI value = raw * scale."""
+
+    column: Column
+    unit: str
+
+    @property
+    def scale(self) -> float:
+        """rad/s or m/s for one raw unit."""
+        return _unit(self.unit).scale
+
+
+class Encoder(NamedDeclaration):
+    """Position of one axis: (counts - zero_counts) / counts_per_unit, or as it stands."""
+
+    column: Column
+    counts_per_unit: Number | None = Field(
+        default=None, description="Counts in one unit, negative to turn the axis round"
+    )
+    zero: Number = Field(default=0.0, alias="zero_counts", description="Raw reading at position 0")
+    stated_unit: Literal[
+        "rad", "deg", "mrad", "rev", "m", "mm", "cm", "um", "in",
+        "rad/s", "deg/s", "rev/s", "rev/min", "m/s", "cm/s", "mm/s", "in/s",
+    ] = Field(
+        alias="unit",
+        description="A unit of velocity where no position was recorded: it is integrated",
+    )  # fmt: skip
+    velocity: Velocity | None = Field(
+        default=None,
+        description="A velocity recorded beside it: checks unit and sign of the position",
+    )
+    stated_resolution: Positive | None = Field(
+        default=None,
+        alias="resolution",
+        description="Smallest step of a column that is not in counts, in its unit",
     )
 
+    @property
+    def axis(self) -> str:
+        """Name of the axis."""
+        return self.name
 
-def encoder_from(axis: str, entry: Mapping[str, Any], where: str) -> Encoder:
-    """One entry of ``[encoders]``; a column in a unit of velocity is to be integrated.
+    @property
+    def unit(self) -> str:
+        """Unit of the position, "rad" or "m"."""
+        return _unit(self.stated_unit).si.removesuffix("/s")
 
-    Raises:
-        InputError: a count that makes no sense, or a velocity of another kind.
-    """
-    raw = units.unit(entry["unit"])
-    assert raw is not None  # by the schema
-    factor = raw.scale
-    if raw.si in ("rad/s", "m/s"):
-        for key in ("counts_per_unit", "zero_counts", "resolution", "velocity"):
-            if key in entry:
-                raise InputError(
-                    f'given although unit = "{entry["unit"]}" makes the column a velocity',
-                    where=f"{where}.{key}",
-                    remedy="leave it out, or give the column of the position",
+    @property
+    def integrate(self) -> bool:
+        """Whether the column is a velocity, whose integral from 0 is the position."""
+        return _unit(self.stated_unit).si.endswith("/s")
+
+    @property
+    def counts(self) -> bool:
+        """Whether the raw readings are whole counts."""
+        return self.counts_per_unit is not None
+
+    @property
+    def scale(self) -> float:
+        """rad or m for one raw unit: SI value = (raw - zero) * scale."""
+        return _unit(self.stated_unit).scale / (self.counts_per_unit or 1.0)
+
+    @property
+    def resolution(self) -> float | None:
+        """Smallest step, rad or m; None where only the data can tell."""
+        if self.counts:
+            return abs(self.scale)
+        return None if self.stated_resolution is None else self.stated_resolution * self.scale
+
+    @property
+    def raw_unit(self) -> str:
+        """Unit of the column; "counts" where it counts."""
+        return "counts" if self.counts else self.stated_unit
+
+    def cross_faults(self) -> Iterator[InputError]:
+        unit = self.stated_unit
+        if self.integrate:
+            for key in ("counts_per_unit", "zero_counts", "resolution", "velocity"):
+                field = {"zero_counts": "zero", "resolution": "stated_resolution"}.get(key, key)
+                if field in self.model_fields_set:
+                    yield InputError(
+                        f'given although unit = "{unit}" makes the column a velocity',
+                        where=key,
+                        remedy="leave it out, or give the column of the position",
+                    )
+            return
+        if self.velocity is not None:
+            found = units.unit(self.velocity.unit)
+            if found is None or found.si != f"{self.unit}/s":
+                yield InputError(
+                    f'found "{self.velocity.unit}", expected a unit of velocity such as'
+                    f' "{self.unit}/s"',
+                    where="velocity.unit",
                 )
-        return Encoder(
-            axis=axis, column=entry["column"], unit=raw.si.removesuffix("/s"), zero=0.0,
-            scale=factor, counts=False, resolution=None, raw_unit=entry["unit"], integrate=True,
-        )  # fmt: skip
-    velocity = _velocity(entry.get("velocity"), raw.si, f"{where}.velocity")
-    if "counts_per_unit" not in entry:
-        resolution = entry.get("resolution")
-        return Encoder(
-            axis=axis,
-            column=entry["column"],
-            unit=raw.si,
-            zero=float(entry.get("zero_counts", 0.0)),
-            scale=factor,
-            counts=False,
-            resolution=None if resolution is None else resolution * factor,
-            raw_unit=entry["unit"],
-            velocity=velocity,
-        )
-    per_unit = float(entry["counts_per_unit"])
-    if not 1e-6 < abs(per_unit) < 1e15:
-        raise InputError(
-            f"found {per_unit:g}, expected the number of counts in one {entry['unit']}, not zero",
-            where=f"{where}.counts_per_unit",
-            remedy="negative turns the axis round; leave the key out for a column already in units",
-        )
-    if "resolution" in entry:
-        raise InputError(
-            "given beside counts_per_unit, which sets it already", where=f"{where}.resolution"
-        )
-    return Encoder(
-        axis=axis,
-        column=entry["column"],
-        unit=raw.si,
-        zero=float(entry.get("zero_counts", 0.0)),
-        scale=factor / per_unit,
-        counts=True,
-        resolution=factor / abs(per_unit),
-        raw_unit="counts",
-        velocity=velocity,
+        if self.counts_per_unit is None:
+            return
+        if not 1e-6 < abs(self.counts_per_unit) < 1e15:
+            yield InputError(
+                f"found {self.counts_per_unit:g}, expected the number of counts in one {unit},"
+                " not zero",
+                where="counts_per_unit",
+                remedy="negative turns the axis round; leave the key out for a column already in"
+                " units",
+            )
+        if self.stated_resolution is not None:
+            yield InputError(
+                "given beside counts_per_unit, which sets it already", where="resolution"
+            )
+
+
+class Force(Declaration):
+    """Force sensor or motor force; unit V: calibration_n_per_v @ (volts - zero_v)."""
+
+    columns: Columns
+    given_components: Annotated[Distinct[Name], Field(min_length=1)] | None = Field(
+        default=None,
+        alias="components",
+        description="Names of the components, where the columns are not called"
+        " force_<component>; fewer than columns where the calibration joins several, one row a"
+        " component",
+    )
+    raw_unit: Literal[
+        "V", "N", "N.m", "mN", "kN", "mN.m", "N.cm", "N.mm", "kN.m", "kgf", "lbf", "lbf.in",
+        "lbf.ft",
+    ] = Field(alias="unit", description="Of the columns; only V needs a calibration")  # fmt: skip
+    frame: str = ""
+    calibration_n_per_v: (
+        Annotated[Several[Annotated[Several[Number], Field(min_length=1)]], Field(min_length=1)]
+        | None
+    ) = None
+    zero_v: Several[Number] | None = None
+    noise_sd: NotNegative | None = Field(
+        default=None,
+        alias="noise_sd_n",
+        description="Standard deviation at rest, after calibration",
     )
 
+    @property
+    def components(self) -> tuple[str, ...]:
+        """Names of the components, as given or as the columns say."""
+        return self.given_components or tuple(map(_component, self.columns))
 
-def _velocity(entry: Mapping[str, Any] | None, position: str, where: str) -> Velocity | None:
-    if entry is None:
-        return None
-    raw = units.unit(entry["unit"])
-    if raw is None or raw.si != f"{position}/s":
-        raise InputError(
-            f'found "{entry["unit"]}", expected a unit of velocity such as "{position}/s"',
-            where=f"{where}.unit",
-        )
-    return Velocity(entry["column"], entry["unit"], raw.scale)
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the calibrated components, ``force_<component>``."""
+        return tuple(f"force_{component}" for component in self.components)
 
+    @property
+    def volts(self) -> bool:
+        """Whether the raw readings are a sensor's voltages."""
+        return self.raw_unit == "V"
 
-def force_from(entry: Mapping[str, Any], where: str) -> Force:
-    """The table ``[force]``.
+    @property
+    def unit(self) -> str:
+        """Unit after calibration, "N" or "N.m"."""
+        return "N" if self.volts else _unit(self.raw_unit).si
 
-    Raises:
-        InputError: names that are not clear, or a calibration that does not fit the columns.
-    """
-    columns = tuple(entry["columns"])
-    volts = entry["unit"] == "V"
-    components = entry.get("components", [_component(column) for column in columns])
-    if len(components) != len(columns) and not (volts and len(components) < len(columns)):
-        raise InputError(
-            f"found {len(components)} names, expected {len(columns)}, one a column",
-            where=f"{where}.components",
-            remedy=None if volts else 'several columns make one component only where unit = "V"',
-        )
-    for component, times in Counter(components).items():
-        if times > 1 or not component.isidentifier():
-            raise InputError(
-                f"the columns give no clear name to component '{component}'",
-                where=f"{where}.columns",
-                remedy='name the components: components = ["x", ...]',
+    @cached_property
+    def calibration(self) -> tuple[tuple[float, ...], ...]:
+        """One row a component, one number a column: ``unit`` for one raw unit."""
+        if self.calibration_n_per_v is not None:
+            return self.calibration_n_per_v
+        matrix = _unit(self.raw_unit).scale * np.eye(len(self.columns))
+        return tuple(tuple(float(v) for v in row) for row in matrix)
+
+    @property
+    def zero(self) -> tuple[float, ...]:
+        """Raw readings without force: SI value = calibration @ (raw - zero)."""
+        return self.zero_v or (0.0,) * len(self.columns)
+
+    def cross_faults(self) -> Iterator[InputError]:
+        components, columns = self.components, len(self.columns)
+        if len(components) != columns and not (self.volts and len(components) < columns):
+            yield InputError(
+                f"found {len(components)} names, expected {columns}, one a column",
+                where="components",
+                remedy=""
+                if self.volts
+                else 'several columns make one component only where unit = "V"',
             )
-    raw = units.unit(entry["unit"])
-    assert raw is not None  # by the schema
-    for key in ("calibration_n_per_v", "zero_v"):
-        if volts and key not in entry:
-            raise InputError(
-                f"'{key}' is missing", where=where, remedy='it is needed where unit = "V"'
+        for component, times in Counter(components).items():
+            if times > 1 or not component.isidentifier():
+                yield InputError(
+                    f"the columns give no clear name to component '{component}'",
+                    where="columns",
+                    remedy='name the components: components = ["x", ...]',
+                )
+        for key in ("calibration_n_per_v", "zero_v"):
+            given = getattr(self, key) is not None
+            if self.volts and not given:
+                yield InputError(f"'{key}' is missing", remedy='it is needed where unit = "V"')
+            if not self.volts and given:
+                yield InputError(
+                    f'given although unit = "{self.raw_unit}" needs no calibration',
+                    where=key,
+                    remedy='give unit = "V" or leave it out',
+                )
+        if self.volts and self.zero_v is not None and len(self.zero_v) != columns:
+            yield InputError(
+                f"found {len(self.zero_v)}, expected {columns} numbers, one a column",
+                where="zero_v",
             )
-        if not volts and key in entry:
-            raise InputError(
-                f'given although unit = "{entry["unit"]}" needs no calibration',
-                where=f"{where}.{key}",
-                remedy='give unit = "V" or leave it out',
-            )
-    if volts:
-        calibration, zero = _calibration(entry, len(components), len(columns), where)
-    else:
-        calibration, zero = raw.scale * np.eye(len(columns)), [0.0] * len(columns)
-    return Force(
-        columns=columns,
-        names=tuple(f"force_{component}" for component in components),
-        unit="N" if volts else raw.si,
-        calibration=tuple(tuple(float(v) for v in row) for row in calibration),
-        zero=tuple(float(v) for v in zero),
-        noise_sd=None if "noise_sd_n" not in entry else float(entry["noise_sd_n"]),
-        volts=volts,
-        raw_unit=entry["unit"],
-    )
-
-
-def _calibration(
-    entry: Mapping[str, Any], components: int, columns: int, where: str
-) -> tuple[np.ndarray, list[float]]:
-    """Matrix, one row a component and one column a raw column, and zero readings."""
-    rows, zero = entry["calibration_n_per_v"], entry["zero_v"]
-    lengths = sorted({len(row) for row in rows})
-    if len(rows) != components or lengths != [columns]:
-        raise InputError(
-            f"found {len(rows)} rows of {' and '.join(map(str, lengths))} numbers,"
-            f" expected {components} rows of {columns}, for {columns} columns",
-            where=f"{where}.calibration_n_per_v",
-        )
-    if len(zero) != columns:
-        raise InputError(
-            f"found {len(zero)}, expected {columns} numbers, one a column", where=f"{where}.zero_v"
-        )
-    calibration = np.array(rows, dtype=float)
-    condition = float(np.linalg.cond(calibration))
-    if not condition < LARGEST_CONDITION:
-        raise InputError(
-            "the matrix is singular: some force gives no voltage",
-            where=f"{where}.calibration_n_per_v",
-            remedy="check for equal or zero rows",
-        )
-    return calibration, zero
+        if self.volts and self.calibration_n_per_v is not None:
+            rows = self.calibration_n_per_v
+            lengths = sorted({len(row) for row in rows})
+            if len(rows) != len(components) or lengths != [columns]:
+                yield InputError(
+                    f"found {len(rows)} rows of {' and '.join(map(str, lengths))} numbers,"
+                    f" expected {len(components)} rows of {columns}, for {columns} columns",
+                    where="calibration_n_per_v",
+                )
+            elif not np.linalg.cond(np.array(rows)) < LARGEST_CONDITION:
+                yield InputError(
+                    "the matrix is singular: some force gives no voltage",
+                    where="calibration_n_per_v",
+                    remedy="check for equal or zero rows",
+                )
 
 
 def _component(column: str) -> str:
@@ -220,79 +326,98 @@ def _component(column: str) -> str:
     return name.removeprefix("force_")
 
 
-def brakes_from(
-    entry: Mapping[str, Any] | None, encoders: tuple[Encoder, ...], where: str
-) -> tuple[Brake, ...]:
-    """The table ``[brakes]``.
+class Brake(NamedTuple):
+    """Commanded braking torque (N.m) or force (N) of one axis, already in SI units."""
 
-    Raises:
-        InputError: a column that names no axis, or a unit that does not fit one.
-    """
-    if entry is None:
-        return ()
-    columns = entry["columns"]
-    axes = {encoder.axis: encoder for encoder in encoders}
-    named = [column.removeprefix("brake_") for column in columns]
-    if not set(named) <= set(axes):
-        unknown = next(name for name in named if name not in axes)
-        if len(columns) != len(axes) or any(name in axes for name in named):
+    axis: str
+    column: str
+    unit: str
+
+
+class BrakeTable(Declaration):
+    """Commanded braking torque or force, one column a braked axis."""
+
+    columns: Columns
+    unit: str = Field(description="One unit an axis, N.m or N, separated by commas")
+
+    def brakes(self, encoders: tuple[Encoder, ...]) -> tuple[Brake, ...]:
+        """Which column brakes which axis.
+
+        Raises:
+            InputError: a column that names no axis, or a unit that does not fit one.
+        """
+        axes = {encoder.axis: encoder for encoder in encoders}
+        named = [column.removeprefix("brake_") for column in self.columns]
+        if not set(named) <= set(axes):
+            unknown = next(name for name in named if name not in axes)
+            if len(self.columns) != len(axes) or any(name in axes for name in named):
+                raise InputError(
+                    f"column 'brake_{unknown}' names no axis{did_you_mean(unknown, axes)}",
+                    where="brakes.columns",
+                    remedy=f"call it brake_<axis>; the axes are {', '.join(axes)}",
+                )
+            named = list(axes)
+        stated = [unit.strip() for unit in self.unit.split(",")]
+        if len(stated) == 1:
+            stated *= len(self.columns)
+        if len(stated) != len(self.columns):
             raise InputError(
-                f"column 'brake_{unknown}' names no axis{did_you_mean(unknown, axes)}",
-                where=f"{where}.columns",
-                remedy=f"call it brake_<axis>; the axes are {', '.join(axes)}",
+                f"found {len(stated)} units, expected {len(self.columns)}, one a column",
+                where="brakes.unit",
             )
-        named = list(axes)
-    stated = [unit.strip() for unit in entry["unit"].split(",")]
-    if len(stated) == 1:
-        stated *= len(columns)
-    if len(stated) != len(columns):
-        raise InputError(
-            f"found {len(stated)} units, expected {len(columns)}, one a column",
-            where=f"{where}.unit",
-        )
-    for axis, unit in zip(named, stated, strict=True):
-        expected = "N.m" if axes[axis].unit == "rad" else "N"
-        if unit != expected:
-            raise InputError(
-                f'found "{unit}" for {axis}, expected "{expected}"', where=f"{where}.unit"
-            )
-    return tuple(Brake(*brake) for brake in zip(named, columns, stated, strict=True))
+        for axis, unit in zip(named, stated, strict=True):
+            expected = "N.m" if axes[axis].unit == "rad" else "N"
+            if unit != expected:
+                raise InputError(
+                    f'found "{unit}" for {axis}, expected "{expected}"', where="brakes.unit"
+                )
+        return tuple(map(Brake, named, self.columns, stated))
 
 
-def channels_from(entries: Mapping[str, Any], where: str) -> tuple[Channel, ...]:
-    """The table ``[channels]``; a unit with a prefix or the like becomes SI by its scale.
+class Channel(NamedDeclaration):
+    """Any other recorded input: scale * raw + offset, in the unit given, which becomes SI."""
 
-    Raises:
-        InputError: a name that is taken, or a scale of zero.
-    """
-    channels = []
-    for name, entry in entries.items():
-        if name in ("trial_id", "t") or name.startswith(("q_", "force_", "brake_")):
-            raise InputError(
-                f"the name '{name}' is taken by ingest's own columns",
-                where=where,
-                remedy="choose another name, or use [encoders], [force] or [brakes]",
-            )
-        scale = float(entry.get("scale", 1.0))
-        if scale == 0.0:
-            raise InputError("found 0, expected another number", where=f"{where}.{name}.scale")
-        if entry.get("signed", False) != ("wrap_bits" in entry):
-            raise InputError(
+    column: Column
+    stated_unit: str = Field(alias="unit")
+    stated_scale: Number = Field(default=1.0, alias="scale")
+    stated_offset: Number = Field(default=0.0, alias="offset")
+    wrap_bits: Literal[8, 16, 24, 32] | None = Field(
+        default=None,
+        description="The column is a register of so many bits; with signed = true its upper half"
+        " stands for negative numbers (two's complement)",
+    )
+    signed: bool = False
+
+    @property
+    def _raw(self) -> units.Unit:
+        return units.unit(self.stated_unit) or units.Unit(self.stated_unit)
+
+    @property
+    def unit(self) -> str:
+        """SI unit of the value."""
+        return self._raw.si
+
+    @property
+    def scale(self) -> float:
+        """SI value = scale * raw + offset."""
+        return self.stated_scale * self._raw.scale
+
+    @property
+    def offset(self) -> float:
+        """SI value where the raw reading is 0."""
+        return self.stated_offset * self._raw.scale + self._raw.offset
+
+    @property
+    def raw_unit(self) -> str:
+        """Unit of the column, "" where the session file rescales it."""
+        rescaled = {"stated_scale", "stated_offset", "wrap_bits"} & self.model_fields_set
+        return "" if rescaled else self.stated_unit
+
+    def cross_faults(self) -> Iterator[InputError]:
+        if self.stated_scale == 0.0:
+            yield InputError("found 0, expected another number", where="scale")
+        if self.signed != (self.wrap_bits is not None):
+            yield InputError(
                 "signed and wrap_bits belong together",
-                where=f"{where}.{name}",
                 remedy="give wrap_bits = 16, signed = true for a signed register read as unsigned",
             )
-        raw = units.unit(entry["unit"]) or units.Unit(entry["unit"])
-        rescaled = not {"scale", "offset", "wrap_bits"}.isdisjoint(entry)
-        channels.append(
-            Channel(
-                name=name,
-                column=entry["column"],
-                unit=raw.si,
-                scale=scale * raw.scale,
-                offset=float(entry.get("offset", 0.0)) * raw.scale + raw.offset,
-                wrap_bits=int(entry.get("wrap_bits", 0)),
-                raw_unit="" if rescaled else entry["unit"],
-            )
-        )
-    return tuple(channels)

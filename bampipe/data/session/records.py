@@ -1,191 +1,190 @@
-"""What a checked session file says: its channels, its trials, and where they lie."""
+"""What a session file says: its channels, its trials, and where they lie."""
 
 from __future__ import annotations
 
+import datetime
 import math
-from dataclasses import dataclass, field
-from pathlib import Path
+import re
+from collections import Counter
+from collections.abc import Iterator
+from functools import cached_property
+from pathlib import Path, PurePosixPath
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, BeforeValidator, Field, PrivateAttr, StringConstraints
 
 from bampipe.data.readers.trial import Dialect
-from bampipe.data.session.places import inside, is_device_path
+from bampipe.data.session.channels import (
+    SECONDS,
+    Brake,
+    BrakeTable,
+    Channel,
+    Clock,
+    Encoder,
+    Force,
+    Name,
+)
+from bampipe.data.session.places import inside, is_device_path, lexically_inside
+from bampipe.errors import InputError, did_you_mean
+from bampipe.schema import (
+    ByName,
+    Declaration,
+    NamedDeclaration,
+    NotNegative,
+    Positive,
+    Several,
+    Text,
+    checked_by,
+    fault,
+)
 
 FILE_NAME = "session.toml"
 
 
-@dataclass(frozen=True)
-class Clock:
-    """The time column.
-
-    Attributes:
-        column: its name; "" where samples are counted instead, at the nominal rate.
-        seconds: length of one tick, s.
-        datetime: whether it holds dates and times, which are read as s since the first.
-        form: how they are written, as of ``strptime``; "" for ISO 8601.
-        nanoseconds: column of what comes on top of whole seconds, ns; "" where there is none.
-    """
-
-    column: str
-    seconds: float
-    datetime: bool = False
-    form: str = ""
-    nanoseconds: str = ""
+def _inside(path: str) -> str:
+    lexically_inside(path, where="")
+    return PurePosixPath(path).as_posix()
 
 
-@dataclass(frozen=True)
-class Velocity:
-    """A recorded velocity of one axis, for checking its position: SI value = raw * scale.
-
-    Attributes:
-        column: column of the trial files.
-        unit: as the session file says.
-        scale: rad/s or m/s for one raw unit.
-    """
-
-    column: str
-    unit: str
-    scale: float
+def _device(text: str) -> str:
+    return _inside(text) if is_device_path(text) else text
 
 
-@dataclass(frozen=True)
-class Encoder:
-    """Position of one axis: SI value = (raw - zero) * scale.
-
-    Attributes:
-        axis: name of the axis.
-        column: column of the trial files.
-        unit: "rad" or "m".
-        zero: raw reading at position 0.
-        scale: rad or m for one raw unit.
-        counts: whether the raw readings are whole counts.
-        resolution: smallest step, rad or m; None where only the data can tell.
-        raw_unit: unit of the column; "counts" where it counts.
-        velocity: the velocity recorded beside it, None where there is none.
-        integrate: whether the column is a velocity, whose integral from 0 is the position.
-    """
-
-    axis: str
-    column: str
-    unit: str
-    zero: float
-    scale: float
-    counts: bool
-    resolution: float | None
-    raw_unit: str = ""
-    velocity: Velocity | None = None
-    integrate: bool = False
+def _moment(value: Any) -> Any:
+    if isinstance(value, datetime.date):
+        return value.isoformat()
+    if isinstance(value, str):
+        try:
+            datetime.datetime.fromisoformat(value)
+        except ValueError:
+            said = f'found "{value}", expected a date and time like 2026-10-03T10:12:00Z'
+            raise fault(said) from None
+    return value
 
 
-@dataclass(frozen=True)
-class Force:
-    """Force sensor or motor force: SI value = calibration @ (raw - zero).
+class TrialEntry(NamedDeclaration):
+    """One ``[[trials]]`` entry."""
 
-    Attributes:
-        columns: columns of the trial files.
-        names: names of the calibrated components, ``force_<component>``.
-        unit: "N" or "N.m", after calibration.
-        calibration: one row a component, one number a column: N (N.m) for one raw unit.
-        zero: raw readings without force.
-        noise_sd: standard deviation at rest, in ``unit``; None if not measured.
-        volts: whether the raw readings are a sensor's voltages.
-        raw_unit: unit of the columns.
-    """
+    file: Annotated[Text, AfterValidator(checked_by(_inside))] = Field(
+        description="Path relative to the session folder"
+    )
+    kind: Literal["free", "locked", "viscous"]
+    locked_axis: Name | None = Field(default=None, description="The locked axis, of a locked trial")
+    viscous: Positive | None = Field(
+        default=None,
+        alias="viscous_n_s_per_m",
+        description="Commanded Cartesian damping, N.s/m, of a viscous trial",
+    )
+    start_s: NotNegative = Field(
+        default=0.0, description="Where in the record the trial starts, s after its first sample"
+    )
+    end_s: Positive = Field(
+        default=math.inf,
+        description="Where it ends, s after the first sample of the record; this moment excluded",
+    )
+    hold_out: bool = Field(default=False, description="Never fitted, only for judging models")
+    notes: str = Field(default="", description="Free text")
 
-    columns: tuple[str, ...]
-    names: tuple[str, ...]
-    unit: str
-    calibration: tuple[tuple[float, ...], ...]
-    zero: tuple[float, ...]
-    noise_sd: float | None
-    volts: bool
-    raw_unit: str = ""
-
-
-@dataclass(frozen=True)
-class Brake:
-    """Commanded braking torque (N.m) or force (N) of one axis, already in SI units."""
-
-    axis: str
-    column: str
-    unit: str
-
-
-@dataclass(frozen=True)
-class Channel:
-    """Any other recorded input: SI value = scale * raw + offset, in ``unit``.
-
-    ``raw_unit`` is the unit of the column, "" where the session file rescales it. Where
-    ``wrap_bits`` is not 0 the raw readings are the unsigned register of a signed number of
-    so many bits (two's complement): those in the upper half stand for negative numbers.
-    """
-
-    name: str
-    column: str
-    unit: str
-    scale: float
-    offset: float
-    wrap_bits: int = 0
-    raw_unit: str = ""
-
-
-@dataclass(frozen=True)
-class TrialEntry:
-    """One ``[[trials]]`` entry.
-
-    Attributes:
-        trial_id: the file's name without its ending (with its folders where that is not unique).
-        file: path relative to the session folder, as given.
-        kind: "free", "locked" or "viscous".
-        locked_axis: for "locked".
-        viscous: commanded Cartesian damping, N.s/m, for "viscous".
-        start_s, end_s: the stretch of the record that is this trial, s after its first sample;
-            0 and infinity for all of it.
-        hold_out: never fitted, only for judging.
-    """
-
-    trial_id: str
-    file: str
-    kind: str
-    locked_axis: str | None
-    viscous: float | None
-    start_s: float = 0.0
-    end_s: float = math.inf
-    hold_out: bool = False
+    @property
+    def trial_id(self) -> str:
+        """The file's name without its extension, with its folders where that is not unique."""
+        return self.name
 
     def overlaps(self, other: TrialEntry) -> bool:
         """Whether the stretches of two trials of one record have samples in common."""
         return self.start_s < other.end_s and other.start_s < self.end_s
 
+    def cross_faults(self) -> Iterator[InputError]:
+        for key, value, only in (
+            ("locked_axis", self.locked_axis, "locked"),
+            ("viscous_n_s_per_m", self.viscous, "viscous"),
+        ):
+            if value is None and self.kind == only:
+                yield InputError(f"'{key}' is missing", remedy=f'needed for a "{only}" trial')
+            if value is not None and self.kind != only:
+                yield InputError(
+                    f'given for a "{self.kind}" trial', where=key, remedy=f'only for "{only}"'
+                )
+        if not self.start_s < self.end_s:
+            yield InputError(
+                f"found {self.end_s:g}, expected more than start_s = {self.start_s:g}",
+                where="end_s",
+            )
 
-@dataclass(frozen=True)
-class Session:
-    """A checked session file.
 
-    Attributes:
-        root: the session folder.
-        session_id: its name.
-        device: name of a built-in device, or path of a device file relative to ``root``.
-        recorded_at: ISO 8601, None if not given.
-        sample_rate: nominal, Hz.
-        clock: the time column.
-        encoders, force, brakes, channels: what the columns mean; ``force`` may be None.
-        trials: in the order of the file.
-        dialect: what the file says about text files.
-    """
+def _with_ids(trials: tuple[TrialEntry, ...]) -> tuple[TrialEntry, ...]:
+    """Give distinct names: the stem, else the whole path, else the path and a number."""
+    stems = Counter(PurePosixPath(file).stem for file in {trial.file for trial in trials})
+    seen: Counter[str] = Counter()
+    for trial in trials:
+        stem, flat = PurePosixPath(trial.file).stem, re.sub(r"[/.]", "_", trial.file)
+        name = stem if stems[stem] == 1 else flat
+        seen[name] += 1
+        trial._name = name if seen[name] == 1 else f"{name}_{seen[name]}"
+    return trials
 
-    root: Path
-    session_id: str
-    device: str
-    recorded_at: str | None
-    sample_rate: float
-    clock: Clock
-    encoders: tuple[Encoder, ...]
-    force: Force | None
-    brakes: tuple[Brake, ...]
-    channels: tuple[Channel, ...]
-    trials: tuple[TrialEntry, ...]
-    dialect: Dialect = field(default_factory=Dialect)
+
+class Session(Declaration):
+    """session.toml: one recording session, its channels and its trials."""
+
+    schema_: Literal["bampipe.session/1"] = Field(
+        alias="schema", description='the version of this format, "bampipe.session/1"'
+    )
+    session_id: Annotated[
+        str, StringConstraints(pattern="^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=100)
+    ] = Field(
+        description="the name of the session and of its run folder, of letters, digits, '.', '_'"
+        " and '-'"
+    )
+    device: Annotated[Text, AfterValidator(checked_by(_device))] = Field(
+        description="A built-in device, or the path of a device file (.toml) in the session folder"
+    )
+    recorded_at: Annotated[str, BeforeValidator(_moment)] | None = Field(
+        default=None, description="Date and time of the recording, ISO 8601"
+    )
+    sample_rate: Positive = Field(
+        alias="sample_rate_hz", description="Nominal sample rate; the time column rules"
+    )
+    notes: str = Field(default="", description="Free text")
+    clock: Clock = Field(
+        default=Clock(column="time_us", unit="us"),
+        alias="time",
+        description="The time column, where it is not time_us in microseconds",
+    )
+    dialect: Dialect = Field(
+        default=Dialect(),
+        alias="csv",
+        description="Layout of text files, where it cannot be found in them",
+    )
+    encoders: Annotated[tuple[Encoder, ...], ByName(Name, least=1)] = Field(
+        description="One entry an axis"
+    )
+    force: Force | None = None
+    brake_table: BrakeTable | None = Field(default=None, alias="brakes")
+    channels: Annotated[tuple[Channel, ...], ByName(Name)] = Field(
+        default=(), description="Any other recorded input"
+    )
+    trials: Annotated[Several[TrialEntry], Field(min_length=1), AfterValidator(_with_ids)]
+    _root: Path = PrivateAttr(Path())
 
     @property
+    def root(self) -> Path:
+        """The session folder."""
+        return self._root
+
+    @cached_property
+    def brakes(self) -> tuple[Brake, ...]:
+        """Which column brakes which axis."""
+        return self.brake_table.brakes(self.encoders) if self.brake_table else ()
+
+    @property
+    def tick(self) -> float:
+        """Length of one unit of the time column, s; of one sample where samples are counted."""
+        if self.clock.unit == "samples":
+            return 1.0 / self.sample_rate
+        return SECONDS.get(self.clock.unit, 1.0)
+
+    @cached_property
     def columns(self) -> tuple[str, ...]:
         """The columns that every trial file must have, the time column first."""
         force = self.force.columns if self.force else ()
@@ -214,3 +213,54 @@ class Session:
         if not is_device_path(self.device):
             return None
         return inside(self.root, self.device, where=f"{self.root / FILE_NAME}: device")
+
+    def cross_faults(self) -> Iterator[InputError]:
+        for channel in self.channels:
+            name = channel.name
+            if name in ("trial_id", "t") or name.startswith(("q_", "force_", "brake_")):
+                yield InputError(
+                    f"the name '{name}' is taken by ingest's own columns",
+                    where="channels",
+                    remedy="choose another name, or use [encoders], [force] or [brakes]",
+                )
+        try:
+            columns = self.columns
+        except InputError as error:
+            yield error
+            columns = ()
+        for column, times in Counter(columns).items():
+            if times > 1:
+                yield InputError(
+                    f"column '{column}' is used for {times} channels",
+                    remedy="each channel has its own column",
+                )
+        yield from self._faults_of_trials()
+
+    def _faults_of_trials(self) -> Iterator[InputError]:
+        axes = [encoder.axis for encoder in self.encoders]
+        for number, trial in enumerate(self.trials):
+            place = f"trials[{number}]"
+            if trial.locked_axis is not None and trial.locked_axis not in axes:
+                yield InputError(
+                    f"no axis '{trial.locked_axis}'{did_you_mean(trial.locked_axis, axes)}",
+                    where=f"{place}.locked_axis",
+                    remedy=f"the axes are {', '.join(axes)}",
+                )
+            for other in self.trials[:number]:
+                # The same file twice without stretches is left to ingest, which uses it once.
+                stretches = {(t.start_s, t.end_s) for t in (trial, other)}
+                twice = stretches == {(0.0, math.inf)}
+                if other.file == trial.file and other.overlaps(trial) and not twice:
+                    yield InputError(
+                        f"overlaps trial {other.trial_id} of the same file",
+                        where=place,
+                        remedy="give each stretch its own start_s and end_s: held-out samples"
+                        " must not be in another trial",
+                    )
+        free = [trial for trial in self.trials if trial.kind == "free"]
+        if any(trial.hold_out for trial in self.trials) and all(t.hold_out for t in free):
+            yield InputError(
+                "every free trial is held out: nothing is left to identify from",
+                where="trials",
+                remedy="leave hold_out away from some",
+            )
