@@ -11,6 +11,7 @@ import hashlib
 import json
 import os
 import re
+import stat
 import tomllib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -21,10 +22,14 @@ from typing import Any, BinaryIO
 from bampipe.errors import InputError
 
 LARGEST_TOML_BYTES = 4_000_000
-"""A settings file larger than this is taken for something else, and not parsed."""
+LARGEST_JSON_BYTES = 100_000_000
+"""A file larger than this is taken for something else, and not parsed."""
 
-DEEPEST_TOML = 40
-"""Settings nested more deeply than this are refused (code that walks them may recurse)."""
+DEEPEST = 40
+"""Tables nested more deeply than this are refused (code that walks them may recurse)."""
+
+MOST_DIGITS = 300
+"""Whole numbers of more digits are refused: no floating-point number is that large."""
 
 STORAGE_FAULTS = {
     errno.ENOSPC: "the disk is full",
@@ -35,6 +40,7 @@ STORAGE_FAULTS = {
     errno.EFBIG: "a file would be larger than this system allows",
     errno.ENOTDIR: "a file is in the way of a folder",
     errno.EEXIST: "a file is in the way of a folder",
+    errno.EISDIR: "a folder is in the way of a file",
     errno.ENAMETOOLONG: "a name is too long",
 }
 """What the disk may refuse, in words."""
@@ -52,14 +58,47 @@ def read_json(path: Path) -> Any:
     Raises:
         InputError: no such file, or not JSON (file and line are named).
     """
+    return parse_json(_read_bytes(path, LARGEST_JSON_BYTES), str(path))
+
+
+def read_json_table(path: Path) -> dict[str, Any]:
+    """The table in a JSON file that bampipe wrote.
+
+    Raises:
+        InputError: as :func:`read_json`, or it holds something else than a table.
+    """
     try:
-        return json.loads(_read_bytes(path))
+        content = read_json(path)
+        if isinstance(content, dict):
+            return content
+        raise InputError("not a table", where=str(path))
+    except InputError as error:
+        remedy = "make it again (--force)"
+        raise InputError(error.what, where=error.where, remedy=remedy) from error
+
+
+def parse_json(data: bytes, where: str) -> Any:
+    """The value that the text ``data`` of a JSON file stands for.
+
+    Args:
+        data: the bytes of the file.
+        where: the file, for messages.
+
+    Raises:
+        InputError: not JSON, nested too deeply, or a number that nothing can hold.
+    """
+    try:
+        value = json.loads(data, parse_int=_whole_number)
     except json.JSONDecodeError as error:
-        raise InputError(f"not JSON: {error.msg}", where=f"{path}, line {error.lineno}") from error
+        raise InputError(f"not JSON: {error.msg}", where=f"{where}, line {error.lineno}") from error
     except UnicodeDecodeError as error:
-        raise InputError("not JSON: not UTF-8 text", where=str(path)) from error
-    except (ValueError, RecursionError) as error:
-        raise InputError("not JSON of a sensible size", where=str(path)) from error
+        raise InputError("not JSON: not UTF-8 text", where=where) from error
+    except RecursionError as error:
+        raise InputError("nested too deeply", where=where) from error
+    except ValueError as error:
+        raise InputError(f"not JSON that bampipe can hold: {error}", where=where) from error
+    _refuse_deep(value, where)
+    return value
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -68,7 +107,7 @@ def read_toml(path: Path) -> dict[str, Any]:
     Raises:
         InputError: no such file, not UTF-8, or not TOML (file and line are named).
     """
-    data = _read_bytes(path, limit=LARGEST_TOML_BYTES)
+    data = _read_bytes(path, LARGEST_TOML_BYTES)
     if data.startswith((b"\xff\xfe", b"\xfe\xff")):
         raise InputError(
             "UTF-16 text, where TOML is UTF-8", where=str(path), remedy="save it as UTF-8"
@@ -87,9 +126,75 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise InputError(f"not TOML: {what}", where=f"{path}, line {line}") from error
     except RecursionError as error:
         raise InputError("nested too deeply", where=str(path)) from error
-    if _deeper(table, DEEPEST_TOML):
-        raise InputError("nested too deeply", where=str(path))
+    _refuse_deep(table, str(path))
     return table
+
+
+def is_normal(name: object) -> bool:
+    """Whether ``name`` is the normal form of a path below a folder: ``a``, ``a/b``, ``a/b/c``.
+
+    Not normal are absolute paths, empty parts, ``.`` and ``..``, backslashes, and characters that
+    are not printable (some file systems leave them out when they compare names).
+    """
+    return (
+        isinstance(name, str)
+        and name.isprintable()
+        and "\\" not in name
+        and not any(part in ("", ".", "..") for part in name.split("/"))
+    )
+
+
+def is_inside(folder: Path, name: object) -> bool:
+    """Whether ``name`` is a normal path that stays in ``folder``, links followed."""
+    if not is_normal(name):
+        return False
+    try:
+        return (folder / str(name)).resolve().is_relative_to(folder.resolve())
+    except (OSError, RuntimeError):  # a link to itself, a name that is too long
+        return False
+
+
+def refuse_links(folder: Path) -> None:
+    """Refuse a folder of results that holds anything but files and folders.
+
+    A link would lead what is read, written or removed to another place; a pipe or a device
+    would be waited for without end.
+
+    Raises:
+        InputError: names the first entry that is no file and no folder.
+    """
+    try:
+        entries = sorted(os.scandir(folder), key=lambda entry: entry.name)
+    except (FileNotFoundError, NotADirectoryError):
+        return
+    for entry in entries:
+        if entry.is_dir(follow_symlinks=False):
+            refuse_links(Path(entry.path))
+        elif not entry.is_file(follow_symlinks=False) and os.path.lexists(entry.path):
+            what = "a link" if entry.is_symlink() else "neither a file nor a folder"
+            raise InputError(
+                f"{what}, which has no place among results", where=entry.path, remedy="remove it"
+            )
+
+
+def require_regular(path: Path) -> os.stat_result:
+    """Return the status of ``path``, which is to be read.
+
+    Raises:
+        InputError: no such file, or no regular one: a pipe could be waited for without end, and
+            a device has none.
+    """
+    try:
+        status = os.stat(path)
+    except FileNotFoundError as error:
+        raise InputError("no such file", where=str(path)) from error
+    except (OSError, ValueError) as error:
+        raise _unreadable(path, error) from error
+    if stat.S_ISDIR(status.st_mode):
+        raise InputError("a folder, where a file is expected", where=str(path))
+    if not stat.S_ISREG(status.st_mode):
+        raise InputError("not a regular file", where=str(path), remedy="give a file on a disk")
+    return status
 
 
 @contextmanager
@@ -150,6 +255,7 @@ def digest_file(path: Path) -> str:
     Raises:
         InputError: the file cannot be read.
     """
+    require_regular(path)
     try:
         with path.open("rb") as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()
@@ -191,27 +297,35 @@ def cannot(verb: str, path: Path, error: OSError) -> InputError:
     )
 
 
-def _read_bytes(path: Path, limit: int | None = None) -> bytes:
+def _read_bytes(path: Path, limit: int) -> bytes:
     path = Path(path)
+    if require_regular(path).st_size > limit:
+        raise InputError(f"larger than {limit // 1_000_000} MB", where=str(path))
     try:
-        if path.is_dir():
-            raise InputError("a folder, where a file is expected", where=str(path))
-        if limit is not None and path.stat().st_size > limit:
-            raise InputError(f"larger than {limit // 1_000_000} MB", where=str(path))
         return path.read_bytes()
-    except FileNotFoundError as error:
-        raise InputError("no such file", where=str(path)) from error
     except OSError as error:
         raise cannot("read", path, error) from error
 
 
-def _deeper(value: object, limit: int) -> bool:
-    """Whether containers are nested more than ``limit`` deep (no recursion beyond that)."""
-    if isinstance(value, Mapping):
-        value = list(value.values())
-    if not isinstance(value, list):
-        return False
-    return limit == 0 or any(_deeper(item, limit - 1) for item in value)
+def _unreadable(path: Path, error: OSError | ValueError) -> InputError:
+    if isinstance(error, OSError):
+        return cannot("read", path, error)
+    return InputError("no path of a file", where=str(path))
+
+
+def _whole_number(text: str) -> int:
+    if len(text) > MOST_DIGITS:
+        raise ValueError(f"a whole number of {len(text)} digits")
+    return int(text)
+
+
+def _refuse_deep(value: object, where: str, depth: int = DEEPEST) -> None:
+    if not isinstance(value, Mapping | list):
+        return
+    if depth == 0:
+        raise InputError("nested too deeply", where=where)
+    for item in value.values() if isinstance(value, Mapping) else value:
+        _refuse_deep(item, where, depth - 1)
 
 
 def _discard(partial: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -122,11 +123,15 @@ def test_a_file_that_changed_on_the_way_is_refused(tmp_path: Path, url: str) -> 
 @pytest.mark.parametrize(
     ("field", "value", "said"),
     [
-        ("files", {"../../out.txt": "0"}, "leads out of the run folder"),
-        ("files", {"figures/../../../out.txt": "0"}, "leads out of the run folder"),
-        ("files", {"/tmp/out.txt": "0"}, "leads out of the run folder"),
-        ("files", {"out\0.txt": "0"}, "leads out of the run folder"),
-        ("files", {".bampipe/staging/x/.commit.json": "0"}, "leads out of the run folder"),
+        ("files", {"../../out.txt": "0"}, "is not that of a result"),
+        ("files", {"figures/../../../out.txt": "0"}, "is not that of a result"),
+        ("files", {"/tmp/out.txt": "0"}, "is not that of a result"),
+        ("files", {"out\0.txt": "0"}, "is not that of a result"),
+        ("files", {".bampipe/staging/x/.commit.json": "0"}, "is not that of a result"),
+        ("files", {"./.bampipe/staging/x/.commit.json": "0"}, "is not that of a result"),
+        ("files", {".//.bampipe/lock": "0"}, "is not that of a result"),
+        ("files", {"./run.json": "0"}, "is not that of a result"),
+        ("files", {".Bampipe/lock": "0"}, "is not that of a result"),
         ("files", {"run.json": None}, "damaged"),
         ("files", ["run.json"], "damaged"),
         ("version", "../../s2/current", "damaged"),
@@ -205,3 +210,37 @@ def test_run_publishes_and_fetch_fetches(
     code, out, _ = command("run", toy.session, *arguments, "--json")
     states = {step["state"] for step in json.loads(out)["sessions"][0]["steps"].values()}
     assert code == 0 and states == {"unchanged"}
+
+
+@pytest.mark.parametrize("url", ["nowhere://x", "dir://x", "generic://x", "hdfs://x", "zip://x"])
+def test_an_address_of_no_use_is_said_before_the_run(
+    toy: Toy, command: Callable[..., tuple[int, str, str]], url: str
+) -> None:
+    arguments = ("--pipeline", toy.pipeline_file, "--runs", toy.runs, "--publish", url)
+    code, _, said = command("run", toy.session, *arguments)
+    assert code == 2 and said.count("\n") == 1 and "no such file system" in said
+    assert toy.ran() == []
+    assert command("fetch", url, "--runs", toy.runs)[0] == 2
+
+
+@pytest.mark.parametrize("kind", ["fifo", "endless", "folder"])
+def test_what_is_no_file_is_not_fetched(tmp_path: Path, kind: str) -> None:
+    url = f"file://{tmp_path / 'published'}"
+    publish(make_run(tmp_path / "runs/s1"), url)
+    for path in [
+        *(tmp_path / "published/s1").glob("*/run.json"),
+        tmp_path / "published/s1" / CURRENT,
+    ]:
+        content = path.read_bytes()
+        path.unlink()
+        if kind == "fifo":
+            os.mkfifo(path)
+        elif kind == "folder":
+            path.mkdir()
+        else:
+            path.symlink_to("/dev/zero")
+        with pytest.raises(InputError, match=r"not a file|cannot be fetched"):
+            fetch(url, "s1", tmp_path / "elsewhere")
+        path.rmdir() if kind == "folder" else path.unlink()
+        path.write_bytes(content)
+    assert fetch(url, "s1", tmp_path / "elsewhere").is_dir()

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError
+from bampipe.files import is_normal
 from bampipe.run import models, record
 from bampipe.run.events import Listener
 from bampipe.run.request import Request
@@ -82,8 +83,12 @@ def settings_of(root: Path, model: str) -> dict[str, dict[str, object]]:
 
 
 def current_model(root: Path) -> str:
-    """Return the model with the most effects added; of several the one made last."""
-    known = models.names(root)
+    """Return the model with the most effects added; of several the one made last.
+
+    A model counts once it stands in the ladder: what a killed `extend` left unfinished does not.
+    """
+    compared = record.read(root)["stages"].get("compare", {}).get("inputs", {})
+    known = [name for name in models.names(root) if f"models/{name}/validate.json" in compared]
     if not known:
         return models.BASE
     made = {name: (root / "models" / name / "model.toml").stat().st_mtime_ns for name in known}
@@ -142,7 +147,9 @@ def extend(options: Options, parent: str, effect: str) -> str:
     root = options.root
     name, file = _named(effect)
     child = models.child_name(parent, name)
-    fresh = not (root / "models" / child).exists()
+    if "/" in child or not is_normal(child):
+        raise InputError(f"{name!r} is no name of an effect", remedy="see `bampipe effects`")
+    fresh = f"identify:{child}" not in record.read(root)["stages"]
     try:
         with options.lock():
             models.ensure_base(root, *options.pipeline.base_model)

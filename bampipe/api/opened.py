@@ -12,6 +12,7 @@ import pandas as pd
 
 from bampipe.api.loop import current_model
 from bampipe.errors import InputError
+from bampipe.files import refuse_links
 from bampipe.report.results import Results
 from bampipe.run import record
 
@@ -195,9 +196,10 @@ def open_run(path: str | Path) -> Run:
         path: as ``runs/2026-10-03_s01``, or ``2026-10-03_s01``.
 
     Raises:
-        InputError: there is no such run.
+        InputError: there is no such run, or it holds a link.
     """
     for candidate in (Path(path), Path("runs") / path):
         if (candidate / record.FILE).is_file():
+            refuse_links(candidate)
             return Run(candidate)
     return Run(path)

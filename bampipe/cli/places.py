@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from bampipe.errors import InputError, choose_from
+from bampipe.files import refuse_links
 from bampipe.run import record
 from bampipe.run.session_name import session_id
 
@@ -31,19 +32,22 @@ def find_run(argument: str | None, runs: Path) -> Path:
         runs: the folder of runs.
 
     Raises:
-        InputError: there is no such run.
+        InputError: there is no such run, or it holds a link.
     """
     if argument is None:
         known = known_runs(runs)
         if not known:
             raise InputError(f"no run yet in {runs}", remedy="start with `bampipe run SESSION`")
+        refuse_links(known[0])
         return known[0]
     for path in (Path(argument), runs / argument):
         if (path / record.FILE).is_file():
+            refuse_links(path)
             return path
     if (Path(argument) / "session.toml").is_file():
         root = runs / session_id(Path(argument))
         if (root / record.FILE).is_file():
+            refuse_links(root)
             return root
         raise InputError(
             "this session has not been run", where=argument, remedy=f"`bampipe run {argument}`"

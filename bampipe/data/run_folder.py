@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, cast
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from bampipe.errors import InputError
+from bampipe.files import is_inside, read_json_table
 
 if TYPE_CHECKING:
     from bampipe.results.record import Result
@@ -29,7 +29,13 @@ class RunFolder:
     root: Path
 
     def path(self, relative: str) -> Path:
-        """Return the path of ``relative``, a path relative to the run folder."""
+        """Return the path of ``relative``, a path relative to the run folder.
+
+        Raises:
+            InputError: it leads out of the run folder.
+        """
+        if not is_inside(self.root, relative):
+            raise InputError(f"{relative!r} leads out of the run folder", where=str(self.root))
         return self.root / relative
 
     def exists(self, relative: str) -> bool:
@@ -62,17 +68,12 @@ class RunFolder:
         """Return the contents of the JSON file ``relative``.
 
         Raises:
-            InputError: the file is missing or is not JSON.
+            InputError: the file is missing, or is no table in JSON.
         """
         path = self.path(relative)
-        try:
-            return cast(dict[str, Any], json.loads(path.read_text(encoding="utf-8")))
-        except FileNotFoundError as error:
-            raise InputError(f"{relative} is missing", where=str(self.root)) from error
-        except (json.JSONDecodeError, UnicodeDecodeError) as error:
-            raise InputError(
-                f"not readable as JSON ({error})", where=str(path), remedy="run with --force"
-            ) from error
+        if not path.exists():
+            raise InputError(f"{relative} is missing", where=str(self.root))
+        return read_json_table(path)
 
     def glob(self, pattern: str) -> tuple[str, ...]:
         """Return the files that match ``pattern``, relative to the run folder, sorted."""

@@ -11,7 +11,7 @@ from typing import Any
 
 from bampipe.data import lab_tables
 from bampipe.errors import InputError
-from bampipe.files import atomic_writer, write_json, write_text
+from bampipe.files import atomic_writer, refuse_links, write_json, write_text
 from bampipe.lab import rows, trends
 from bampipe.lab.place import FILE, LOCK, is_foreign, run_folders
 from bampipe.progress import Progress, silent
@@ -121,4 +121,5 @@ def _alone(folder: Path) -> Iterator[None]:
             stack.enter_context(hold(folder / LOCK))
         except OSError as error:
             raise InputError(f"cannot be written: {error.strerror}", where=str(folder)) from error
+        refuse_links(folder)
         yield

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
+from bampipe.errors import InputError
+from bampipe.files import read_json_table
 from bampipe.run import record
 
 FILE = "lab.json"
@@ -36,8 +37,11 @@ def is_current(runs: Path, folder: Path) -> bool:
     if any((root / record.FILE).stat().st_mtime_ns > written for root in roots):
         return False
     try:
-        kept = json.loads(about.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError):
+        kept = read_json_table(about)
+    except InputError:
         return False
-    known: list[str] = [*kept["sessions"], *(line.split(":")[0] for line in kept["skipped"])]
+    sessions, skipped = kept.get("sessions"), kept.get("skipped")
+    if not isinstance(sessions, list) or not isinstance(skipped, list):
+        return False
+    known = [*map(str, sessions), *(str(line).partition(":")[0] for line in skipped)]
     return sorted(known) == sorted(root.name for root in roots)

@@ -11,6 +11,7 @@ from typing import Any
 from bampipe.data import lab_tables, store
 from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError
+from bampipe.files import refuse_links
 from bampipe.run import models, record
 
 NORMAL_95 = 1.959963984540054
@@ -45,6 +46,7 @@ def of_run(root: Path) -> SessionRows:
     Raises:
         InputError: ingest has not run, or a result is damaged or was changed since it was written.
     """
+    refuse_links(root)
     made = models.names(root)
     of_models = [f"models/{model}/{name}" for model in made for name in _OF_MODELS]
     record.require_untouched(root, [*_OF_SESSION, *of_models])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 
+from bampipe.files import read_json_table
 from bampipe.report import page, style, typeset, wording
 from bampipe.report.build import Report
 from bampipe.report.document import Block, Callout, Document, Figure, Section, Table, Text
@@ -27,7 +27,7 @@ def build(folder: Path) -> Report:
     Args:
         folder: where ``trends.json`` and the tables are.
     """
-    trends = json.loads((folder / "trends.json").read_text(encoding="utf-8"))
+    trends = read_json_table(folder / "trends.json")
     with style.look():
         sections = [
             section

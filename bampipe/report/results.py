@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import tomllib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -14,6 +12,7 @@ import pandas as pd
 
 from bampipe.declarations.model import read_model_file
 from bampipe.errors import InputError
+from bampipe.files import read_json_table, read_toml
 
 _RATES = {"rad": "rad/s", "m": "m/s"}
 _FORCES = {"rad": "N.m", "m": "N"}
@@ -40,7 +39,7 @@ class Results:
         """
         if relative not in self._json:
             path = self.root / relative
-            self._json[relative] = _read_json(path) if path.is_file() else None
+            self._json[relative] = read_json_table(path) if path.is_file() else None
         return self._json[relative]
 
     def table(
@@ -213,25 +212,11 @@ class Results:
     def paper(self) -> dict[str, Any] | None:
         """What the device's paper published, or None where there is none for this device."""
         path = Path(__file__).parent / "templates" / f"paper-{self.session.get('device')}.toml"
-        return tomllib.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
+        return read_toml(path) if path.is_file() else None
 
     def as_in(self, place: str) -> str:
         """Return " (the paper's <place>)" where the device has a paper, else ""."""
         return f" (the paper's {place})" if self.paper else ""
-
-
-def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise InputError(
-            f"not readable as JSON ({error})",
-            where=str(path),
-            remedy="make it again (--force)",
-        ) from error
-    if not isinstance(content, dict):
-        raise InputError("not a table", where=str(path), remedy="make it again (--force)")
-    return content
 
 
 def _differs(name: str, maker: dict[str, Any], digest: str) -> bool:

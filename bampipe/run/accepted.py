@@ -38,11 +38,6 @@ def file_of(folder: Path, device: str) -> Path:
     return folder / f"{quote(device, safe='')}.json"
 
 
-def device_of(root: Path) -> str:
-    """Return the device of the run folder ``root``."""
-    return str(RunFolder(root).read_json("ingest/session.json")["device"])
-
-
 def read(folder: Path, device: str) -> Accepted | None:
     """Return what was accepted for ``device``; None where nothing was.
 

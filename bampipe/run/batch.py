@@ -12,7 +12,7 @@ from typing import Any
 from bampipe.errors import InputError
 from bampipe.run import record
 from bampipe.run.events import Event, Listener
-from bampipe.run.publish import publish
+from bampipe.run.publish import check_address, publish
 from bampipe.run.request import Outcome, Request
 from bampipe.run.runner import run_session
 from bampipe.workers import end_with_parent
@@ -51,6 +51,8 @@ def run_and_publish(request: Request, listen: Listener) -> Outcome:
     Raises:
         InputError: bad input, or it could not be published.
     """
+    if request.publish:
+        check_address(request.publish)
     outcome = run_session(request, listen)
     if request.publish:
         with record.lock(request.root, request.wait, listen):

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bampipe.run import accepted
+from bampipe.files import read_json_table
+from bampipe.run import accepted, models
 
 if TYPE_CHECKING:
     from bampipe.declarations.pipeline import Gate
@@ -76,13 +76,13 @@ def judge(gate: Gate, root: Path, model: str, baseline: Path) -> list[Verdict]:
         baseline: folder of the values last accepted.
 
     Raises:
-        InputError: the file of accepted values is damaged.
+        InputError: the result or the file of accepted values is damaged.
     """
     relative = gate.result.replace("{model}", model)
     path = root / relative
     if not path.is_file():
         return [_missing(gate, "", f"there is no {relative}")]
-    content = json.loads(path.read_text(encoding="utf-8"))
+    content = read_json_table(path)
     values = _pick(content, gate.value)
     divisors = _pick(content, gate.divide_by) if gate.divide_by else {}
     if not values:
@@ -120,7 +120,7 @@ def _against_accepted(
     gate: Gate, root: Path, model: str, baseline: Path, content: Mapping[str, Any]
 ) -> list[Verdict]:
     """Hold the change since the accepted values, beyond its uncertainty, against the limit."""
-    kept = accepted.read(baseline, accepted.device_of(root))
+    kept = accepted.read(baseline, models.device_of(root)[0])
     if kept is None:
         return [_missing(gate, "", f"nothing accepted yet in {baseline}: run `bampipe accept`")]
     if kept.model != model:

@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.metadata
 import importlib.util
-import json
 import os
 import platform
 import time
 from collections.abc import Iterable, Mapping
 from functools import cache
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import bampipe
 from bampipe.errors import InputError
-from bampipe.files import digest_content, digest_file, digest_input, read_toml
+from bampipe.files import (
+    digest_content,
+    digest_file,
+    digest_input,
+    is_inside,
+    read_json_table,
+    read_toml,
+)
+from bampipe.run.record import SESSION
 
 PACKAGES = (
     "h5py",
@@ -62,12 +70,8 @@ class HashMemory:
         self.path = path
         self.changed = False
         self.notes: dict[str, list[object]] = {}
-        try:
-            notes = json.loads(path.read_text(encoding="utf-8"))
-        except (FileNotFoundError, json.JSONDecodeError, UnicodeDecodeError):
-            notes = {}
-        if isinstance(notes, dict):
-            self.notes = notes
+        with contextlib.suppress(InputError):
+            self.notes = read_json_table(path)
 
     def digest(self, path: Path) -> str:
         """Return the hash of the file ``path`` as :func:`digest_input` would."""
@@ -85,18 +89,6 @@ class HashMemory:
         return value
 
 
-def _inside(folder: Path, name: object) -> Path | None:
-    """Return the file ``name`` of a session if it lies inside ``folder``."""
-    if not isinstance(name, str) or not name or "\0" in name:
-        return None
-    path = folder / name
-    try:
-        inside = path.resolve().is_relative_to(folder.resolve())
-    except (OSError, RuntimeError):  # a link to itself, a name that is too long
-        return None
-    return path if inside else None
-
-
 def session_files(folder: Path) -> dict[str, Path]:
     """Return the files a session consists of, by the name the session file gives them.
 
@@ -112,17 +104,18 @@ def session_files(folder: Path) -> dict[str, Path]:
         content = read_toml(session)
     except InputError:  # ingest says what is wrong with it
         return files
-    trials = content.get("trials")
-    names = [trial.get("file") for trial in trials if isinstance(trial, dict)] if trials else []
-    for name in names:
-        path = _inside(folder, name)
-        if path is not None:
-            files[str(name)] = path
-    device = content.get("device")
+    trials, device = content.get("trials"), content.get("device")
+    names = (
+        [trial.get("file") for trial in trials if isinstance(trial, dict)]
+        if isinstance(trials, list)
+        else []
+    )
     if isinstance(device, str) and device.endswith(".toml"):
-        path = _inside(folder, device)
-        if path is not None:
-            files[device] = path
+        names.append(device)
+    for name in names:
+        # The session file may say ./a.csv for a.csv.
+        if isinstance(name, str) and is_inside(folder, PurePosixPath(name).as_posix()):
+            files[name] = folder / name
     return files
 
 
@@ -135,7 +128,7 @@ def digest_session(folder: Path, memory: HashMemory | None = None) -> dict[str, 
     """
     digest = memory.digest if memory is not None else digest_input
     return {
-        f"session:{name}": digest(path) if path.is_file() else ABSENT
+        f"{SESSION}{name}": digest(path) if path.is_file() else ABSENT
         for name, path in sorted(session_files(folder).items())
     }
 

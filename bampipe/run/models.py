@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError, choose_from
+from bampipe.files import read_toml
 from bampipe.run import record
 
 if TYPE_CHECKING:
@@ -42,9 +43,9 @@ def write(root: Path, model: ModelFile) -> None:
     text = model.text()
     if path.is_file():
         try:
-            if tomllib.loads(path.read_text(encoding="utf-8")) == tomllib.loads(text):
+            if read_toml(path) == tomllib.loads(text):
                 return
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError):
+        except InputError:
             path.unlink()
     record.replace_text(path, text)
 
@@ -61,17 +62,24 @@ def ensure_base(root: Path, device: str, effects: tuple[str, ...]) -> None:
     from bampipe.declarations.model import ModelFile
 
     if not device:
-        session = root / "ingest" / "session.json"
-        if not session.is_file():
-            raise InputError(
-                "ingest/session.json is missing",
-                where=str(root),
-                remedy="run `bampipe ingest SESSION` first",
-            )
-        about = json.loads(session.read_text(encoding="utf-8"))
-        device = str(about["device"])
-        effects = effects or tuple(map(str, about.get("default_effects", [])))
+        device, default_effects = device_of(root)
+        effects = effects or default_effects
     write(root, ModelFile(name=BASE, device=device, effects=effects))
+
+
+def device_of(root: Path) -> tuple[str, tuple[str, ...]]:
+    """Return the device that ingest found, and the effects that its file gives the base model.
+
+    Raises:
+        InputError: ingest has not run, or its result is damaged.
+    """
+    run = RunFolder(root)
+    path = run.require("ingest/session.json", "ingest")
+    content = run.read_json("ingest/session.json")
+    device, effects = content.get("device"), content.get("default_effects", [])
+    if not isinstance(device, str) or not isinstance(effects, list):
+        raise InputError("does not name a device", where=str(path), remedy="run with --force")
+    return device, tuple(map(str, effects))
 
 
 def child_name(parent: str, effect: str) -> str:

@@ -22,10 +22,10 @@ def recorded(content: Mapping[str, Any]) -> Pipeline:
     from bampipe.schema import read
 
     kept = content.get("pipeline")
-    if kept is None:
+    if not isinstance(kept, Mapping):
         return load()
-    table = {key: kept[key] for key in ("name", "stages", "settings")}
-    table |= {"schema": SCHEMA, "model": {key: kept[key] for key in ("device", "effects")}}
+    table = {key: kept.get(key) for key in ("name", "stages", "settings")}
+    table |= {"schema": SCHEMA, "model": {key: kept.get(key) for key in ("device", "effects")}}
     return read(Pipeline, table, "run.json: pipeline")
 
 

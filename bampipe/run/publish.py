@@ -13,15 +13,23 @@ completes it. Versions that no longer count are left: somebody may be reading th
 
 from __future__ import annotations
 
-import json
+import contextlib
 import os
 import shutil
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from bampipe.errors import InputError
-from bampipe.files import digest_content, digest_file, json_text
+from bampipe.files import (
+    LARGEST_JSON_BYTES,
+    digest_content,
+    digest_file,
+    json_text,
+    parse_json,
+    refuse_links,
+)
 from bampipe.run import record
 from bampipe.run.session_name import is_name
 
@@ -42,8 +50,10 @@ def publish(root: Path, url: str) -> str:
         The version.
 
     Raises:
-        InputError: fsspec or the driver of that file system is not installed, or it refuses.
+        InputError: fsspec or the driver of that file system is not installed, or it refuses; or
+            the run folder holds a link.
     """
+    refuse_links(root)
     files = {
         path.relative_to(root).as_posix(): path
         for path in sorted(root.rglob("*"))
@@ -53,7 +63,7 @@ def publish(root: Path, url: str) -> str:
     version = digest_content(hashes)[:16]
     system, base = _open(url)
     here = f"{base}/{root.name}"
-    try:
+    with _driver("cannot be published", url):
         current = _current(system, here)
         if current is not None and current["version"] == version:
             return version
@@ -66,8 +76,6 @@ def publish(root: Path, url: str) -> str:
         # The transaction renames or completes the upload: no half-written file is ever seen.
         with system.transaction, system.open(f"{here}/{CURRENT}", "wb") as stream:
             stream.write(json_text(content).encode())
-    except _faults() as error:
-        raise InputError(f"cannot be published: {_first_line(error)}", where=url) from error
     return version
 
 
@@ -78,7 +86,7 @@ def published(url: str) -> list[str]:
         InputError: as :func:`publish`.
     """
     system, base = _open(url)
-    try:
+    with _driver("cannot be read", url):
         if not system.exists(base):
             return []
         system.invalidate_cache()
@@ -86,8 +94,6 @@ def published(url: str) -> list[str]:
         # Other names are no sessions of ours, and ".." would lead out of the folder.
         sessions = [name for name in names if is_name(name)]
         return sorted(name for name in sessions if system.exists(f"{base}/{name}/{CURRENT}"))
-    except _faults() as error:
-        raise InputError(f"cannot be read: {_first_line(error)}", where=url) from error
 
 
 def fetch(url: str, session: str, runs: Path, force: bool = False) -> Path:
@@ -109,7 +115,7 @@ def fetch(url: str, session: str, runs: Path, force: bool = False) -> Path:
         raise InputError(f"{session!r} is no name of a session", where=url)
     system, base = _open(url)
     here, root = f"{base}/{session}", runs / session
-    try:
+    with _driver("cannot be fetched", url):
         current = _current(system, here)
         if current is None:
             raise InputError(f"no session {session!r} is published", where=url)
@@ -125,9 +131,11 @@ def fetch(url: str, session: str, runs: Path, force: bool = False) -> Path:
         draft = Path(tempfile.mkdtemp(prefix=f".{session}.", dir=runs))
         try:
             for name, known in current["files"].items():
-                target = draft / name
+                source, target = f"{here}/{current['version']}/{name}", draft / name
+                if system.info(source)["type"] != "file":
+                    raise InputError(f"{name} is not a file", where=f"{url}/{session}")
                 target.parent.mkdir(parents=True, exist_ok=True)
-                system.get_file(f"{here}/{current['version']}/{name}", str(target))
+                system.get_file(source, str(target))
                 if digest_file(target) != known:
                     raise InputError(f"{name} is not as it was published", where=f"{url}/{session}")
             draft.chmod(0o777 & ~_umask())
@@ -140,9 +148,16 @@ def fetch(url: str, session: str, runs: Path, force: bool = False) -> Path:
                 draft.replace(root)
         finally:
             shutil.rmtree(draft, ignore_errors=True)
-    except _faults() as error:
-        raise InputError(f"cannot be fetched: {_first_line(error)}", where=url) from error
     return root
+
+
+def check_address(url: str) -> None:
+    """Refuse an address at which nothing can be published, before hours of work.
+
+    Raises:
+        InputError: no such file system, or fsspec or its driver is not installed.
+    """
+    _open(url)
 
 
 def _open(url: str) -> tuple[Any, str]:
@@ -153,30 +168,31 @@ def _open(url: str) -> tuple[Any, str]:
         raise InputError(
             "publishing needs fsspec", remedy="pip install 'bampipe[remote]'"
         ) from error
-    try:
+    with _driver("no such file system", url):
         system, path = url_to_fs(url)
-    except (ImportError, ValueError) as error:
-        raise InputError(f"no such file system: {_first_line(error)}", where=url) from error
-    except _faults() as error:
-        raise InputError(f"cannot be reached: {_first_line(error)}", where=url) from error
     return system, str(path).rstrip("/")
 
 
-def _faults() -> tuple[type[BaseException], ...]:
-    """What a file system raises: drivers derive their errors from OSError or from these."""
-    return (OSError, RuntimeError, TimeoutError)
+@contextlib.contextmanager
+def _driver(what: str, url: str) -> Iterator[None]:
+    """Whatever a driver of fsspec raises is one line: each has errors of its own."""
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        raise InputError(f"{what}: {_first_line(error)}", where=url) from error
 
 
 def _current(system: Any, here: str) -> dict[str, Any] | None:
     try:
         system.invalidate_cache(here)
-        content = json.loads(system.cat_file(f"{here}/{CURRENT}"))
+        about = system.info(f"{here}/{CURRENT}")
+        if about["type"] != "file" or int(about["size"]) > LARGEST_JSON_BYTES:
+            raise InputError("not a file of this size", where=f"{here}/{CURRENT}")
+        content = parse_json(system.cat_file(f"{here}/{CURRENT}"), f"{here}/{CURRENT}")
     except FileNotFoundError:
         return None
-    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise InputError(
-            f"not readable as JSON ({error})", where=f"{here}/{CURRENT}", remedy="publish anew"
-        ) from error
     if not isinstance(content, dict) or content.get("schema") != SCHEMA:
         raise InputError("not a published run", where=f"{here}/{CURRENT}")
     version, files = content.get("version"), content.get("files")
@@ -188,8 +204,8 @@ def _current(system: Any, here: str) -> dict[str, Any] | None:
     ):
         raise InputError("damaged", where=f"{here}/{CURRENT}", remedy="publish anew")
     for name in files:
-        if not record.are_inside([name]) or name.split("/")[0] == record.PRIVATE or "\0" in name:
-            raise InputError(f"the name {name!r} leads out of the run folder", where=here)
+        if name != record.FILE and not record.are_results([name]):
+            raise InputError(f"the name {name!r} is not that of a result", where=here)
     return content
 
 

@@ -3,22 +3,31 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 from bampipe.errors import InputError
-from bampipe.files import STORAGE_FAULTS, digest_file, json_text
+from bampipe.files import (
+    STORAGE_FAULTS,
+    digest_file,
+    is_inside,
+    is_normal,
+    json_text,
+    read_json_table,
+    refuse_links,
+)
 from bampipe.run.events import Event, Listener, unheard
 from bampipe.run.lock import hold
 
 SCHEMA = "bampipe.run/1"
 FILE = "run.json"
 PRIVATE = ".bampipe"
+SESSION = "session:"
+"""What the names of a session's files begin with among the inputs of a step."""
 
-_TABLES = ("stages", "timings", "failures", "place")
+_TABLES = ("stages", "timings", "failures", "place", "gates")
 _FIELDS = {
     "key": str,
     "config": dict,
@@ -43,9 +52,12 @@ def read(root: Path) -> dict[str, Any]:
     stages = found.get("stages")
     kept = stages.items() if isinstance(stages, dict) else ()
     sound: dict[str, Any] = {"stages": {name: made for name, made in kept if is_sound(made)}}
-    for name in ("timings", "failures", "place"):
+    for name, kind in (("timings", dict), ("failures", str), ("place", str)):
         if isinstance(found.get(name), dict):
-            sound[name] = found[name]
+            sound[name] = {k: v for k, v in found[name].items() if isinstance(v, kind)}
+    gates = found.get("gates")
+    if isinstance(gates, list) and all(isinstance(gate, dict) for gate in gates):
+        sound["gates"] = gates
     others = {name: value for name, value in found.items() if name not in _TABLES}
     return {**others, **sound}
 
@@ -60,10 +72,10 @@ def is_damaged(root: Path) -> bool:
 
 def _content(root: Path) -> dict[str, Any] | None:
     try:
-        content = json.loads((root / FILE).read_text(encoding="utf-8"))
-    except (FileNotFoundError, ValueError, RecursionError):
+        content = read_json_table(root / FILE)
+    except InputError:
         return None
-    if not isinstance(content, dict) or content.get("schema") != SCHEMA:
+    if content.get("schema") != SCHEMA:
         return None
     return content if isinstance(content.get("stages"), dict) else None
 
@@ -75,13 +87,20 @@ def is_sound(made: object) -> bool:
     if not all(isinstance(made.get(name), kind) for name, kind in _FIELDS.items()):
         return False
     hashes = {**made["inputs"], **made["outputs"]}
-    texts = [*made["declared_inputs"], *hashes.values()]
-    return all(isinstance(text, str) for text in texts) and are_inside(hashes)
+    inputs = [name for name in made["inputs"] if not name.startswith(SESSION)]
+    return (
+        all(isinstance(digest, str) for digest in hashes.values())
+        and all(is_normal(name) for name in (*inputs, *made["declared_inputs"]))
+        and are_results(made["outputs"])
+    )
 
 
-def are_inside(names: Iterable[str]) -> bool:
-    """Whether paths stay in the folder they are relative to."""
-    return not any(Path(name).is_absolute() or ".." in Path(name).parts for name in names)
+def are_results(names: Iterable[object]) -> bool:
+    """Whether all ``names`` can be those of results: normal, and none of the runner's own files."""
+    return all(
+        is_normal(name) and name != FILE and str(name).partition("/")[0].casefold() != PRIVATE
+        for name in names
+    )
 
 
 def require_untouched(root: Path, names: Iterable[str]) -> None:
@@ -153,16 +172,20 @@ def lock(root: Path, wait: bool, listen: Listener = unheard) -> Iterator[None]:
         listen: told before waiting, and where the last holder was killed.
 
     Raises:
-        InputError: another process holds it and ``wait`` is false; or the disk is full, read-only
-            or the like.
+        InputError: another process holds it and ``wait`` is false; it holds a link; or the disk
+            is full, read-only or the like.
     """
 
     def tell(kind: str) -> Callable[[str], None]:
         return lambda holder: listen(Event(root.name, "", kind, message=holder))
 
+    private = root / PRIVATE
+    if private.exists() and not is_inside(root, f"{PRIVATE}/lock"):
+        refuse_links(root)
     try:
-        _make(root / PRIVATE)
-        with hold(root / PRIVATE / "lock", wait, tell("waiting"), tell("taken over")):
+        _make(private)
+        with hold(private / "lock", wait, tell("waiting"), tell("taken over")):
+            refuse_links(root)
             yield
     except OSError as error:
         if error.errno not in STORAGE_FAULTS:

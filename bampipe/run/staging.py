@@ -6,12 +6,12 @@ then on a kill loses nothing, since the next run repeats the moves that the comm
 
 from __future__ import annotations
 
-import json
 import shutil
 from pathlib import Path
 from typing import Any
 
-from bampipe.files import digest_file
+from bampipe.errors import InputError
+from bampipe.files import digest_file, is_inside, read_json_table
 from bampipe.run import record
 from bampipe.run.request import Step
 from bampipe.run.state import RunState
@@ -21,7 +21,12 @@ COMMIT = ".commit.json"
 
 def folder(root: Path, step: Step) -> Path:
     """Return the staging folder of ``step`` in the run folder ``root``."""
-    return root / record.PRIVATE / "staging" / step.name.replace(":", "@")
+    return root / record.PRIVATE / "staging" / folder_name(step.name)
+
+
+def folder_name(step: str) -> str:
+    """Return what the staging folder of the step named ``step`` is called."""
+    return step.replace(":", "@")
 
 
 def prepare(root: Path, step: Step, outputs: tuple[str, ...]) -> Path:
@@ -80,7 +85,7 @@ def seal(
 
 def commit(state: RunState, staging: Path) -> None:
     """Move the outputs of a sealed step into the run folder; may be repeated."""
-    entry = json.loads((staging / COMMIT).read_text(encoding="utf-8"))
+    entry = read_json_table(staging / COMMIT)
     for relative in entry["record"]["outputs"]:
         source, target = staging / relative, state.root / relative
         if source.is_file():
@@ -102,22 +107,34 @@ def recover(state: RunState) -> None:
         draft.unlink()
     parent = state.root / record.PRIVATE / "staging"
     for staging in sorted(parent.glob("*")):
-        if (staging / COMMIT).is_file() and _is_whole(staging):
+        if not staging.is_dir():
+            staging.unlink()
+        elif (staging / COMMIT).is_file() and _is_whole(state.root, staging):
             commit(state, staging)
         else:
             shutil.rmtree(staging)
 
 
-def _is_whole(staging: Path) -> bool:
+def _is_whole(root: Path, staging: Path) -> bool:
     """Whether the commit file, and what it names and is still here, is as it was sealed."""
     try:
-        entry = json.loads((staging / COMMIT).read_text(encoding="utf-8"))
-        if not record.is_sound(entry["record"]) or not record.are_inside(entry["remove"]):
-            return False
-        return all(
-            digest_file(staging / name) == digest
-            for name, digest in entry["record"]["outputs"].items()
-            if (staging / name).is_file()
-        )
-    except (ValueError, KeyError, TypeError, AttributeError):
+        entry = read_json_table(staging / COMMIT)
+    except InputError:
         return False
+    step, made, remove = entry.get("step"), entry.get("record"), entry.get("remove")
+    if not isinstance(step, str) or folder_name(step) != staging.name:
+        return False
+    if not record.is_sound(made) or not isinstance(entry.get("timing"), dict):
+        return False
+    if not isinstance(made, dict) or not isinstance(remove, list):
+        return False
+    if not record.are_results(remove):
+        return False
+    names = (*made["outputs"], *remove)
+    if not all(is_inside(root, name) and not (root / name).is_dir() for name in names):
+        return False
+    return all(
+        is_inside(staging, name) and digest_file(staging / name) == digest
+        for name, digest in made["outputs"].items()
+        if (staging / name).is_file()
+    )

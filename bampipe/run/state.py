@@ -180,7 +180,7 @@ class RunState:
             return "settings changed"
         for name in sorted(inputs.keys() | made["inputs"].keys()):
             if inputs.get(name) != made["inputs"].get(name):
-                return f"{name.removeprefix('session:')} changed"
+                return f"{name.removeprefix(record.SESSION)} changed"
         if dict(hashing.versions()) != made["versions"]:
             return "versions changed"
         return "the code of the stage changed"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from bampipe.files import digest_file, digest_input
+from bampipe.files import digest_file, digest_input, refuse_links
 from bampipe.run import hashing, record
 from bampipe.stages import base
 
@@ -18,7 +18,11 @@ def verify(root: Path) -> list[tuple[str, str]]:
     Returns:
         Pairs of a file and what became of it: "changed", "gone", or "unknown" for a file that no
         stage recorded; ``run.json`` itself may be "damaged". Empty where all is as it was written.
+
+    Raises:
+        InputError: the run folder holds a link, or something else that is no file.
     """
+    refuse_links(root)
     content = record.read(root)
     found: dict[str, str] = {record.FILE: "damaged"} if record.is_damaged(root) else {}
     recorded: set[str] = {record.FILE}
@@ -31,7 +35,7 @@ def verify(root: Path) -> list[tuple[str, str]]:
             elif digest_file(path) != written:
                 found[name] = "changed"
         for name, written in made.get("inputs", {}).items():
-            if name.startswith("session:"):
+            if name.startswith(record.SESSION):
                 continue
             recorded.add(name)
             path = root / name
@@ -51,7 +55,7 @@ def verify(root: Path) -> list[tuple[str, str]]:
             continue
         now = hashing.digest_session(Path(place))
         for name in sorted(noted.keys() | now.keys()):
-            if name.startswith("session:") and noted.get(name) != now.get(name):
+            if name.startswith(record.SESSION) and noted.get(name) != now.get(name):
                 gone = now.get(name) in (None, hashing.ABSENT)
                 found[name] = "gone" if gone else "changed"
     for path in sorted(root.rglob("*")):

@@ -172,7 +172,7 @@ def test_sessions_without_a_date_come_first_and_a_damaged_run_is_named(tmp_path:
     found = collect(runs, tmp_path / "lab", report=False)
     assert found.sessions == ("undated", "s01", "s03")
     assert len(found.skipped) == 1
-    assert re.match(r"s02: .*identify\.json: not readable as JSON", found.skipped[0])
+    assert re.match(r"s02: .*identify\.json, line 1: not JSON", found.skipped[0])
 
 
 @pytest.mark.parametrize(

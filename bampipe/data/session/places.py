@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from bampipe.errors import InputError
+from bampipe.files import is_inside
 
 
 def is_device_path(device: str) -> bool:
@@ -38,11 +38,10 @@ def inside(root: Path, path: str, where: str) -> Path:
     lexically_inside(path, where)
     full = Path(root) / path
     try:
-        real, real_root = os.path.realpath(full), os.path.realpath(root)
         exists, regular = full.exists(), full.is_file()
     except (OSError, ValueError) as error:
         raise InputError(f"path '{path}' cannot be used", where=where) from error
-    if os.path.commonpath([real, real_root]) != real_root:
+    if exists and not is_inside(Path(root), PurePosixPath(path).as_posix()):
         raise InputError(
             f"'{path}' is a link to a place outside the session folder",
             where=where,

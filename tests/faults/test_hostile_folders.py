@@ -1,0 +1,400 @@
+"""Run folders that somebody else prepared: nothing outside them is read, written or removed."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from conftest import Toy
+
+from bampipe.api import loop
+from bampipe.api.opened import open_run
+from bampipe.data.session import read_session
+from bampipe.declarations.model import ModelFile
+from bampipe.errors import InputError
+from bampipe.files import is_inside, is_normal, read_json, read_toml
+from bampipe.lab.collect import collect
+from bampipe.run import models, record
+from bampipe.run.events import unheard
+from bampipe.run.publish import publish
+from bampipe.run.verify import verify
+
+Command = Callable[..., tuple[int, str, str]]
+
+
+def digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def everything(folder: Path) -> dict[str, bytes | None]:
+    return {str(path): path.read_bytes() if path.is_file() else None for path in folder.rglob("*")}
+
+
+@pytest.fixture
+def outside(toy: Toy) -> Path:
+    """A folder beside the run folders that no command has any business in."""
+    toy.run()
+    folder = toy.folder / "outside"
+    for name in ("toy_double/mine.txt", "other/mine.txt", "double.json", "lock"):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text("mine")
+    return folder
+
+
+def plant(
+    toy: Toy,
+    outputs: dict[str, str],
+    remove: tuple[str, ...] = (),
+    step: str = "toy_double",
+    files: tuple[str, ...] = (),
+) -> Path:
+    """Leave a commit file as a killed run would, which names ``outputs`` and ``remove``."""
+    made = json.loads((toy.root / "run.json").read_text())["stages"]["toy_double"]
+    folder = toy.root / ".bampipe" / "staging" / "toy_double"
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in files or outputs:
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("planted")
+    entry = {
+        "step": step,
+        "record": {**made, "outputs": {**made["outputs"], **outputs}},
+        "timing": {},
+        "remove": list(remove),
+    }
+    (folder / ".commit.json").write_text(json.dumps(entry))
+    return folder
+
+
+# Links
+
+
+LINKS = {
+    "staging": ".bampipe/staging",
+    "private": ".bampipe",
+    "results": "toy",
+    "a result": "toy/double.json",
+    "a new folder": "models/base/effects",
+    "at the top": "link",
+    "the record": "run.json",
+}
+
+
+@pytest.mark.parametrize("name", LINKS.values(), ids=LINKS)
+def test_a_link_in_a_run_folder_is_refused_by_name(
+    toy: Toy, outside: Path, command: Command, name: str
+) -> None:
+    path = toy.root / name
+    if path.is_dir():
+        shutil.rmtree(path)
+    path.unlink(missing_ok=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    target = outside / "double.json" if path.suffix else outside
+    if name == "run.json":
+        target.write_text(json.dumps({"schema": record.SCHEMA, "stages": {}}))
+    path.symlink_to(os.path.relpath(target, path.parent))
+    before = everything(outside)
+    arguments = ("--pipeline", toy.pipeline_file, "--runs", toy.runs)
+    for given in (
+        ("run", toy.session, *arguments),
+        ("run", toy.session, "--force", *arguments),
+        ("run", toy.session, "--publish", f"file://{toy.folder}/far", *arguments),
+        ("status", "first", "--runs", toy.runs),
+        ("verify", "first", "--runs", toy.runs),
+        ("extend", "first", "stribeck:yaw", "--runs", toy.runs),
+        ("accept", "first", "--runs", toy.runs),
+    ):
+        code, _, said = command(*given)
+        assert code == 2, (given, said)
+        assert name in said and "link" in said and said.count("\n") == 1, said
+    for refused in (
+        lambda: verify(toy.root),
+        lambda: publish(toy.root, f"file://{toy.folder}/far"),
+        lambda: open_run(toy.root),
+        lambda: collect(toy.runs, toy.folder / "lab"),
+    ):
+        with pytest.raises(InputError, match="link"):
+            refused()
+    assert everything(outside) == before
+    assert not (toy.folder / "far").exists()
+
+
+def test_a_link_in_the_folder_of_the_lab_is_refused(toy: Toy, outside: Path) -> None:
+    (outside / "mine.svg").write_text("mine")
+    lab = toy.folder / "lab"
+    lab.mkdir()
+    (lab / ".lock").touch()
+    (lab / "figures").symlink_to(outside)
+    (toy.root / "ingest").mkdir(exist_ok=True)
+    about = {"device": "bam", "axes": {}, "recorded_at": "2026-10-03T10:00:00Z"}
+    (toy.root / "ingest/session.json").write_text(json.dumps(about))
+    record.write(toy.root, {"schema": record.SCHEMA, "stages": {}})
+    with pytest.raises(InputError, match="a link"):
+        collect(toy.runs, lab)
+    assert (outside / "mine.svg").read_text() == "mine"
+
+
+@pytest.mark.parametrize("kind", ["fifo", "device"])
+@pytest.mark.parametrize("name", ["run.json", ".bampipe/hashes.json", "toy/double.json", "note"])
+def test_what_is_no_file_is_refused_by_name(
+    toy: Toy, outside: Path, command: Command, name: str, kind: str
+) -> None:
+    path = toy.root / name
+    path.unlink(missing_ok=True)
+    if kind == "fifo":
+        os.mkfifo(path)
+    elif os.geteuid() == 0:
+        try:
+            os.mknod(path, 0o020666, os.makedev(1, 5))
+        except PermissionError:
+            pytest.skip("no device can be made here")
+    else:
+        pytest.skip("only root makes devices")
+    code, _, said = command("run", toy.session, "--pipeline", toy.pipeline_file, "--runs", toy.runs)
+    assert code == 2 and name in said and "neither a file nor a folder" in said
+
+
+@pytest.mark.parametrize("name", ["run.json", ".bampipe/hashes.json", ".bampipe/staging", "toy"])
+def test_a_folder_for_a_file_or_a_file_for_a_folder_is_one_line_or_mended(
+    toy: Toy, outside: Path, command: Command, name: str
+) -> None:
+    path = toy.root / name
+    if path.is_dir():
+        shutil.rmtree(path)
+        path.write_text("in the way")
+    else:
+        path.unlink(missing_ok=True)
+        path.mkdir()
+    # Long enough ago for the hash of the session's files to be noted.
+    for file in toy.session.iterdir():
+        os.utime(file, (1e9, 1e9))
+    arguments = ("--pipeline", toy.pipeline_file, "--runs", toy.runs, "--force")
+    code, _, said = command("run", toy.session, *arguments)
+    assert code == 2 and "in the way" in said.splitlines()[-1]
+    assert "Traceback" not in said
+
+
+# Names
+
+
+NOT_NORMAL = [
+    "",
+    ".",
+    "..",
+    "/etc/passwd",
+    "./a",
+    "a/./b",
+    "a//b",
+    "a/",
+    "a/../b",
+    "../a",
+    "./.bampipe/staging/x/.commit.json",
+    "a\\b",
+    "a\0b",
+    "a\nb",
+    ".bam\u200cpipe/x",
+    "\ud800",
+    None,
+    5,
+]
+
+
+@pytest.mark.parametrize("name", NOT_NORMAL)
+def test_a_name_that_is_not_normal_is_no_name_of_a_result(tmp_path: Path, name: object) -> None:
+    assert not is_normal(name)
+    assert not is_inside(tmp_path, name)
+    assert not record.are_results([name])
+
+
+@pytest.mark.parametrize(
+    "name", ["run.json", ".bampipe", ".bampipe/lock", ".bampipe/staging/x", ".BAMPIPE/lock"]
+)
+def test_files_of_the_runner_are_no_results(name: str) -> None:
+    assert is_normal(name) and not record.are_results([name])
+
+
+def test_inside_means_links_followed(tmp_path: Path) -> None:
+    (tmp_path / "a/b").mkdir(parents=True)
+    (tmp_path / "a/out").symlink_to("../..")
+    (tmp_path / "a/in").symlink_to("b")
+    (tmp_path / "a/self").symlink_to("self")
+    assert is_inside(tmp_path, "a/b/new.json") and is_inside(tmp_path, "a/in/new.json")
+    assert not is_inside(tmp_path, "a/out/new.json")
+    assert not is_inside(tmp_path, "a/self/new.json")
+
+
+# Planted commits
+
+
+@pytest.mark.parametrize(
+    ("outputs", "remove", "step"),
+    [
+        ({"../../../../outside/double.json": digest("planted")}, (), "toy_double"),
+        ({"./toy/more.json": digest("planted")}, (), "toy_double"),
+        ({"run.json": digest("planted")}, (), "toy_double"),
+        ({".bampipe/hashes.json": digest("planted")}, (), "toy_double"),
+        ({"toy/more.json": digest("planted")}, ("../../outside/double.json",), "toy_double"),
+        ({"toy/more.json": digest("planted")}, ("run.json",), "toy_double"),
+        ({"toy/more.json": digest("planted")}, ("toy",), "toy_double"),
+        ({"toy/more.json": digest("planted")}, (), "toy_read"),
+        ({"toy/more.json": digest("planted")}, (), "../toy_double"),
+    ],
+)
+def test_a_planted_commit_that_reaches_further_is_dropped(
+    toy: Toy, outside: Path, outputs: dict[str, str], remove: tuple[str, ...], step: str
+) -> None:
+    good, kept = toy.files(), everything(outside)
+    plant(toy, outputs, remove, step, files=("toy/more.json",))
+    toy.run()
+    assert toy.files() == good
+    assert everything(outside) == kept
+
+
+def test_a_commit_through_a_link_in_staging_is_refused(toy: Toy, outside: Path) -> None:
+    staging = plant(toy, {"toy/link/double.json": digest("mine")}, files=("toy/x",))
+    (staging / "toy/link").symlink_to(outside)
+    with pytest.raises(InputError, match="a link"):
+        toy.run()
+    assert (outside / "double.json").read_text() == "mine"
+
+
+# The record
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        (("stages", "toy_double", "declared_inputs"), ["../../outside/*"]),
+        (("stages", "toy_double", "declared_inputs"), [5]),
+        (("stages", "toy_double", "outputs"), {"../../outside/double.json": digest("mine")}),
+        (("stages", "toy_double", "outputs"), {"./toy/double.json": digest("mine")}),
+        (("stages", "toy_double", "inputs"), {"../../outside/double.json": digest("mine")}),
+        (("timings",), {"toy_double": 5}),
+        (("timings",), [5]),
+        (("failures",), {"toy_double": 5}),
+        (("place",), {"session": 5}),
+        (("place",), {"session": "\0"}),
+        (("gates",), [5]),
+        (("gates",), "x"),
+        (("pipeline",), 5),
+        (("pipeline",), {}),
+        (("pipeline",), {"name": "x", "stages": 5, "settings": [], "device": 5, "effects": 5}),
+        (("stages",), []),
+    ],
+)
+def test_an_edited_record_is_one_line_or_rebuilt(
+    toy: Toy, outside: Path, command: Command, path: tuple[str, ...], value: object
+) -> None:
+    good, kept = toy.files(), everything(outside)
+    content = json.loads((toy.root / "run.json").read_text())
+    table = content
+    for key in path[:-1]:
+        table = table[key]
+    table[path[-1]] = value
+    (toy.root / "run.json").write_text(json.dumps(content))
+    arguments = ("--pipeline", toy.pipeline_file, "--runs", toy.runs)
+    for given in (
+        ("status", "first", "--runs", toy.runs),
+        ("verify", "first", "--runs", toy.runs),
+        ("extend", "first", "stribeck:yaw", "--runs", toy.runs),
+        ("accept", "first", "--runs", toy.runs),
+    ):
+        code, _, said = command(*given)
+        assert code in (0, 1, 2) and said.count("\n") <= 1, said
+    code, _, said = command("run", toy.session, *arguments)
+    assert code == 0, said
+    assert toy.files() == good and everything(outside) == kept
+
+
+UNREADABLE = {
+    "empty": b"",
+    "digits": b'{"schema": ' + b"9" * 5000 + b"}",
+    "a large number": b'{"schema": ' + b"9" * 400 + b"}",
+    "brackets": b"[" * 200_000,
+    "tables": b'{"a":' * 200_000,
+    "bytes": b"\xff\xfe\x00",
+    "nul": b"\0" * 100,
+    "a list": b"[]",
+}
+
+
+@pytest.mark.parametrize("content", UNREADABLE.values(), ids=UNREADABLE)
+@pytest.mark.parametrize(
+    "name",
+    [
+        "run.json",
+        ".bampipe/hashes.json",
+        ".bampipe/staging/toy_double/.commit.json",
+        "toy/double.json",
+        "models/base/model.toml",
+    ],
+)
+def test_what_json_and_toml_can_do_is_one_line_or_rebuilt(
+    toy: Toy, outside: Path, command: Command, name: str, content: bytes
+) -> None:
+    good = toy.files()
+    path = toy.root / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(content)
+    for given in (("status", "first"), ("verify", "first")):
+        code, _, said = command(*given, "--runs", toy.runs)
+        assert code in (0, 1, 2) and said.count("\n") <= 1, said
+    code, _, said = command("run", toy.session, "--pipeline", toy.pipeline_file, "--runs", toy.runs)
+    assert code == 0, said
+    assert toy.files() == good
+
+
+@pytest.mark.parametrize("read", [read_json, read_toml])
+@pytest.mark.parametrize("kind", ["folder", "fifo", "endless", "nothing", "nul"])
+def test_only_regular_files_are_opened(
+    tmp_path: Path, read: Callable[[Path], object], kind: str
+) -> None:
+    path = tmp_path / "x"
+    if kind == "folder":
+        path.mkdir()
+    elif kind == "fifo":
+        os.mkfifo(path)
+    elif kind == "endless":
+        path = Path("/dev/zero")
+    elif kind == "nul":
+        path = tmp_path / "\0"
+    with pytest.raises(InputError):
+        read(path)
+
+
+@pytest.mark.parametrize("trials", ["5", '"x"', "[5]", "[[1]]", '{ file = "a" }', "1979-05-27"])
+def test_trials_that_are_no_tables_are_one_line(toy: Toy, command: Command, trials: str) -> None:
+    file = toy.session / "session.toml"
+    head = file.read_text().partition("[[trials]]")[0]
+    file.write_text(f"{head}trials = {trials}\n")
+    code, _, said = command("run", toy.session, "--pipeline", toy.pipeline_file, "--runs", toy.runs)
+    assert code == 0, said  # the toys want no trials
+    with pytest.raises(InputError, match="trials"):
+        read_session(toy.session)
+
+
+# Extending
+
+
+def test_an_effect_whose_name_is_a_path_writes_nothing(toy: Toy, outside: Path) -> None:
+    """A diagnosis in a run folder names effects: `extend --auto` takes them from there."""
+    options = loop.Options(toy.root, toy.request().pipeline, False, False, unheard)
+    before = everything(toy.folder)
+    for name in ("../../../outside/x", "a/b:yaw", "x:../../y", "\0", ".."):
+        with pytest.raises(InputError):
+            loop.extend(options, "base", name)
+    changed = {k for k, v in everything(toy.folder).items() if before.get(k, 0) != v}
+    assert changed <= {str(toy.root / ".bampipe/lock")}
+
+
+def test_an_unfinished_model_is_not_the_one_to_extend(tmp_path: Path) -> None:
+    models.write(tmp_path, ModelFile(name="base", device="slider"))
+    effect = "stribeck:carriage"
+    child = models.child_name("base", effect)
+    models.write(tmp_path, ModelFile(name=child, parent="base", device="slider", effects=(effect,)))
+    assert loop.current_model(tmp_path) == "base"
