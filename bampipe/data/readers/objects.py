@@ -31,7 +31,7 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
     Raises:
         InputError: not JSON, no such list, a column missing or not of numbers.
     """
-    samples, constants = _samples(path, wanted.largest_bytes, name)
+    samples, constants, notes = _samples(path, wanted.largest_bytes, name)
     values: dict[str, np.ndarray] = {c: np.empty(len(samples)) for c in wanted.columns}
     texts: dict[str, list[str | None]] = {column: [] for column in wanted.datetimes}
     for number, sample in enumerate(samples, 1):
@@ -54,7 +54,7 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
         where = f"{name}, '{column}'"
         stamps = moments.nanoseconds(cells, wanted.datetimes[column], where)
         values[column] = moments.seconds(stamps)
-    return RawTrial(values, first_row=1)
+    return RawTrial(values, first_row=1, notes=notes)
 
 
 def columns(path: Path, largest_bytes: int, name: str) -> dict[str, str]:
@@ -63,7 +63,7 @@ def columns(path: Path, largest_bytes: int, name: str) -> dict[str, str]:
     Raises:
         InputError: as :func:`read`.
     """
-    samples, constants = _samples(path, largest_bytes, name)
+    samples, constants, _ = _samples(path, largest_bytes, name)
     first = samples[0]
     if not isinstance(first, dict):
         raise InputError("not an object with named values", where=f"{name}, sample 1")
@@ -79,8 +79,8 @@ def columns(path: Path, largest_bytes: int, name: str) -> dict[str, str]:
 
 def _samples(
     path: Path, largest_bytes: int, name: str
-) -> tuple[list[object], Mapping[str, object]]:
-    """Samples of a file, and the numbers beside them."""
+) -> tuple[list[object], Mapping[str, object], tuple[str, ...]]:
+    """Samples of a file, the numbers beside them, and what was left out."""
     size = 3 * path.stat().st_size
     if size <= largest_bytes:
         data = path.read_bytes()
@@ -99,14 +99,21 @@ def _samples(
         raise InputError("not UTF-8 text", where=name, remedy="save it as UTF-8") from error
     del data
     constants: Mapping[str, object] = {}
+    notes: tuple[str, ...] = ()
     if path.suffix.lower() in (".jsonl", ".ndjson"):
         lines = [line for line in text.splitlines() if line.strip()]
-        samples = [_parsed(x, f"{name}, sample {n}") for n, x in enumerate(lines, 1)]
+        samples = [_parsed(x, f"{name}, sample {n}") for n, x in enumerate(lines[:-1], 1)]
+        try:
+            samples += [_parsed(x, f"{name}, sample {len(lines)}") for x in lines[-1:]]
+        except InputError:
+            if text.endswith("\n"):
+                raise
+            notes = ("last line is cut off: 1 row dropped",)
     else:
         samples, constants = _list_of_samples(_parsed(text, name), name)
     if not samples:
         raise InputError("a header but no samples", where=name)
-    return samples, constants
+    return samples, constants, notes
 
 
 def _parsed(text: str, where: str) -> object:

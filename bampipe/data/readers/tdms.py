@@ -6,8 +6,10 @@ properties give it, for files without a time channel.
 
 from __future__ import annotations
 
+import logging
 import struct
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -32,7 +34,7 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
         InputError: npTDMS is not installed, the file is damaged, a channel is missing, not of
             numbers, or not as long as the others.
     """
-    library = need("nptdms", "tdms", name)
+    library = _library(name)
     values: dict[str, np.ndarray] = {}
     units = {}
     try:
@@ -61,7 +63,7 @@ def columns(path: Path, name: str) -> dict[str, str]:
     Raises:
         InputError: as :func:`read`.
     """
-    library = need("nptdms", "tdms", name)
+    library = _library(name)
     found = {}
     try:
         # A stream: by its path, npTDMS would take an index file beside it for the truth.
@@ -76,6 +78,13 @@ def columns(path: Path, name: str) -> dict[str, str]:
     except _FAULTS as error:
         raise _unsound(name) from error
     return found
+
+
+def _library(name: str) -> ModuleType:
+    """npTDMS, quiet: it would print pages about a damaged file."""
+    library = need("nptdms", "tdms", name)
+    need("nptdms.log", "tdms", name).log_manager.set_level(logging.CRITICAL)
+    return library
 
 
 def _channels(file: Any) -> dict[str, Any]:

@@ -1,0 +1,121 @@
+"""A log that is still being written: its sound part is read, or it is refused in one line."""
+
+from __future__ import annotations
+
+import io
+import json
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pandas as pd
+import pytest
+import scipy.io
+
+from bampipe.data.readers import columns_of, read_trial
+from bampipe.errors import InputError
+
+ROWS = 300
+TABLE = {"t": np.arange(ROWS) / 64.0, "x": np.arange(ROWS) * 0.25 + 1000.125}
+
+
+def as_lines() -> bytes:
+    rows = (json.dumps({name: float(TABLE[name][n]) for name in TABLE}) for n in range(ROWS))
+    return "\n".join(rows).encode()
+
+
+def as_hdf5() -> bytes:
+    stream = io.BytesIO()
+    with h5py.File(stream, "w") as file:
+        for name, values in TABLE.items():
+            file[name] = values
+    return stream.getvalue()
+
+
+def as_tdms() -> bytes:
+    nptdms = pytest.importorskip("nptdms")
+    stream = io.BytesIO()
+    with nptdms.TdmsWriter(stream) as writer:
+        for part in np.array_split(np.arange(ROWS), 5):
+            writer.write_segment([nptdms.ChannelObject("g", c, v[part]) for c, v in TABLE.items()])
+    return stream.getvalue()
+
+
+def as_mcap() -> bytes:
+    writer_module = pytest.importorskip("mcap.writer")
+    stream = io.BytesIO()
+    writer = writer_module.Writer(stream, chunk_size=1000)
+    writer.start()
+    schema = writer.register_schema("state", "jsonschema", b'{"type": "object"}')
+    channel = writer.register_channel("/g", "json", schema)
+    for n in range(ROWS):
+        moment = n * 15_625_000
+        writer.add_message(channel, moment, b'{"x": %.3f}' % TABLE["x"][n], moment)
+    writer.finish()
+    return stream.getvalue()
+
+
+def binary(write: Callable[[io.BytesIO], object]) -> bytes:
+    stream = io.BytesIO()
+    write(stream)
+    return stream.getvalue()
+
+
+FRAME = pd.DataFrame(TABLE)
+LOGS: dict[str, tuple[Callable[[], bytes], tuple[str, str]]] = {
+    ".csv": (lambda: FRAME.to_csv(index=False, float_format="%.6f").encode(), ("t", "x")),
+    ".jsonl": (as_lines, ("t", "x")),
+    ".json": (lambda: FRAME.to_json(orient="records").encode(), ("t", "x")),
+    ".parquet": (lambda: binary(FRAME.to_parquet), ("t", "x")),
+    ".mat": (lambda: binary(lambda s: scipy.io.savemat(s, TABLE)), ("t", "x")),
+    ".h5": (as_hdf5, ("t", "x")),
+    ".tdms": (as_tdms, ("g/t", "g/x")),
+    ".mcap": (as_mcap, ("/g:@time", "/g:x")),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("ending", LOGS)
+def test_a_log_read_while_it_grows(
+    ending: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    write, columns = LOGS[ending]
+    content, path = write(), tmp_path / f"a{ending}"
+    cuts = np.linspace(0, len(content), 120).astype(int)
+    started, refused, lengths = threading.Event(), [], []
+
+    def log() -> None:
+        with path.open("wb", buffering=0) as stream:
+            for first, last in zip(cuts[:-1], cuts[1:], strict=True):
+                stream.write(content[first:last])
+                started.set()
+                threading.Event().wait(0.002)
+
+    def look() -> None:
+        try:
+            columns_of(path, name="log")
+            trial = read_trial(path, columns, name="log")
+        except InputError as error:
+            refused.append(str(error))
+            return
+        time, x = (trial.columns[column] for column in columns)
+        lengths.append(len(time))
+        np.testing.assert_allclose(time, TABLE["t"][: len(time)], atol=1e-6)
+        np.testing.assert_allclose(x, TABLE["x"][: len(time)], atol=1e-6)
+
+    writer = threading.Thread(target=log)
+    writer.start()
+    started.wait()
+    while writer.is_alive():
+        look()
+    writer.join()
+    for cut in cuts[1:-1:7]:
+        path.write_bytes(content[:cut])
+        look()
+    path.write_bytes(content)
+    look()
+    assert lengths[-1] == ROWS
+    assert ending not in (".csv", ".jsonl") or len(lengths) > 20  # what is there is read
+    assert all("\n" not in line and line.startswith("log") for line in refused), refused
+    assert capfd.readouterr() == ("", "")
