@@ -11,9 +11,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from made_results import write_result
 
 from bampipe.declarations.pipeline import Gate
 from bampipe.errors import InputError
+from bampipe.results.identify import IdentifyResult
+from bampipe.results.ingest import IngestResult
+from bampipe.results.validate import ValidateResult
 from bampipe.run import accepted, gates, pipeline
 from bampipe.run.gates import Verdict
 from bampipe.run.markdown import summary
@@ -41,8 +45,8 @@ def made(root: Path, sd: float = 0.01, **estimates: float) -> Path:
         name.replace("__", "."): {"estimate": value, "sd": sd, "unit": "N.m"}
         for name, value in estimates.items()
     }
-    write(root / "ingest/session.json", {"device": "bam", "recorded_at": None})
-    write(root / "models/base/identify.json", {"parameters": entries, "headline": "long"})
+    write_result(root, IngestResult, device="bam", axes={"yaw": {}})
+    write_result(root, IdentifyResult, parameters=entries)
     write(root / "run.json", {"schema": "bampipe.run/1", "stages": {}, "gates": []})
     return root
 
@@ -117,7 +121,7 @@ def test_the_summary_is_a_table_that_no_text_breaks(tmp_path: Path) -> None:
     bad = Verdict("error | floor", "yaw", "failed", 2.0, "2 is above 1.15;\nsee <b>")
     root = made(tmp_path / "runs/s1", mass=2.0)
     axes = {"yaw": {"held_out_rmse": 0.2, "noise_floor": 0.1}}
-    write(root / "models/base/validate.json", {"axes": axes})
+    write_result(root, ValidateResult, axes=axes)
     text = summary(
         [
             Outcome(root, "done", (), (bad,)),

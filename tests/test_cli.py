@@ -13,10 +13,13 @@ from pathlib import Path
 import install_toys
 import pytest
 from conftest import Toy
+from made_results import write_result
 
 import bampipe
 from bampipe.cli import places, show
 from bampipe.errors import InputError
+from bampipe.results.diagnose import DiagnoseResult
+from bampipe.results.ingest import IngestResult
 
 Command = Callable[..., tuple[int, str, str]]
 
@@ -354,8 +357,7 @@ def test_nothing_is_printed_outside_the_command_line() -> None:
 def ingested(tmp_path: Path) -> Path:
     """A run folder of the BAM in which nothing but ingest has run."""
     root = tmp_path / "runs" / "s"
-    (root / "ingest").mkdir(parents=True)
-    (root / "ingest" / "session.json").write_text('{"device": "bam"}')
+    write_result(root, IngestResult, device="bam", axes={"yaw": {}})
     (root / "run.json").write_text('{"schema": "bampipe.run/1", "stages": {}}')
     return root
 
@@ -400,7 +402,5 @@ def test_the_next_effect_is_the_first_that_the_diagnosis_selects(
 ) -> None:
     from bampipe.api.loop import next_effect
 
-    path = tmp_path / "models" / "base" / "diagnose.json"
-    path.parent.mkdir(parents=True)
-    path.write_text(json.dumps({"selected": selected}))
+    write_result(tmp_path, DiagnoseResult, axes={"yaw": {}}, selected=selected)
     assert next_effect(tmp_path, "base") == effect

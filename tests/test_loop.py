@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pytest
+from made_results import filled, write_result
 
 from bampipe.api import loop
 from bampipe.declarations.model import ModelFile
+from bampipe.results.diagnose import DiagnoseResult
+from bampipe.results.ingest import IngestResult
 from bampipe.run import models, pipeline, record
 from bampipe.run.events import unheard
 
@@ -42,7 +44,8 @@ def test_following_judges_the_model_that_it_starts_from(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ran: list[tuple[str, ...]] = []
-    found = {"axes": {"joint": {"verdict": "unknown_effect"}}, "selected": []}
+    content = {"axes": {"joint": {"verdict": "unknown_effect"}}}
+    found = DiagnoseResult.model_validate(filled(DiagnoseResult, content))
     monkeypatch.setattr(loop.Options, "run", lambda _, *steps: ran.append(steps))
     monkeypatch.setattr(loop, "_diagnosis", lambda *_: found)
     options = loop.Options(tmp_path, pipeline.load(), False, True, unheard)
@@ -53,9 +56,8 @@ def test_following_judges_the_model_that_it_starts_from(
 
 
 def test_the_device_file_gives_the_base_model_its_effects(tmp_path: Path) -> None:
-    (tmp_path / "ingest").mkdir()
-    about = {"device": "axis", "default_effects": ["stribeck:carriage"]}
-    (tmp_path / "ingest/session.json").write_text(json.dumps(about))
+    effects = ["stribeck:carriage"]
+    write_result(tmp_path, IngestResult, device="axis", axes={"x": {}}, default_effects=effects)
     models.ensure_base(tmp_path, "", ())
     assert models.read(tmp_path, "base").effects == ("stribeck:carriage",)
     models.ensure_base(tmp_path, "", ("return_spring:carriage",))

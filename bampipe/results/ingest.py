@@ -9,7 +9,7 @@ from pydantic import Field
 from bampipe.results.record import Names, Positive, Record, Result, Size
 
 
-class Encoder(Record):
+class EncoderChannel(Record):
     """One axis."""
 
     unit: Literal["rad", "m"]
@@ -18,7 +18,7 @@ class Encoder(Record):
     )
 
 
-class Force(Record):
+class ForceChannels(Record):
     """The measured force."""
 
     columns: Names
@@ -55,7 +55,7 @@ class IngestResult(Result):
     recorded_at: str | None = Field(description="ISO 8601, or null")
     sample_rate_hz: Positive = Field(description="Median over the trials, from their clocks")
     announced_rate_hz: Positive | None = Field(description="What session.toml says, or null")
-    axes: dict[str, Encoder] = Field(min_length=1)
-    force: Force
+    axes: dict[str, EncoderChannel] = Field(min_length=1)
+    force: ForceChannels
     brakes: dict[str, Channel]
     channels: dict[str, Channel]

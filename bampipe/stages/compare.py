@@ -6,13 +6,14 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.declarations.model import ModelFile, read_model_file
 from bampipe.errors import InputError
-from bampipe.files import write_json
 from bampipe.progress import Progress
+from bampipe.results.compare import CompareResult, FreeRunPosition, Moved, Rung, Value
+from bampipe.results.identify import IdentifyResult
+from bampipe.results.validate import ValidateResult
 
 NAME = "compare"
 SUMMARY = "Held-out error of every model version, and which parameters moved"
@@ -61,50 +62,48 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         )
     order = sorted(models, key=lambda n: (len(models[n].effects), n))
     ladder = [_rung(run, name, models) for name in order]
-    parameters: dict[str, dict[str, object]] = {}
+    parameters: dict[str, dict[str, Value]] = {}
     for name in order:
-        found = run.read_json(f"models/{name}/identify.json")["parameters"]
-        for key, entry in found.items():
-            kept = {k: entry.get(k) for k in ("estimate", "sd", "unit")}
-            parameters.setdefault(key, {})[name] = kept
-    result: dict[str, object] = {
-        "ladder": ladder,
-        "parameters": parameters,
-        "moved": _moved(parameters, models, order, config.sigmas),
-    }
-    write_json(out / "compare.json", result)
-    return result
+        for key, found in run.read(IdentifyResult, name).parameters.items():
+            value = Value(estimate=found.estimate, sd=found.sd, unit=found.unit)
+            parameters.setdefault(key, {})[name] = value
+    moved = _moved(parameters, models, order, config.sigmas)
+    return CompareResult(ladder=tuple(ladder), parameters=parameters, moved=tuple(moved)).write(out)
 
 
-def _rung(run: RunFolder, name: str, models: Mapping[str, ModelFile]) -> dict[str, object]:
-    validated = run.read_json(f"models/{name}/validate.json")
-    axes = validated["axes"]
+def _rung(run: RunFolder, name: str, models: Mapping[str, ModelFile]) -> Rung:
+    validated = run.read(ValidateResult, name)
+    axes, free = validated.axes, validated.free_run
     parent, effects = models[name].parent, models[name].effects
     had = models[parent].effects if parent in models else ()
-    added = [e for e in effects if e not in had]
-    rung: dict[str, object] = {
-        "model": name,
-        "parent": parent or None,
-        "added": ", ".join(added) or None,
-        "effects": list(effects),
-        "held_out_rmse": {a: entry["held_out_rmse"] for a, entry in axes.items()},
-        "noise_floor": {a: entry.get("noise_floor") for a, entry in axes.items()},
-        "unit": {a: entry["unit"] for a, entry in axes.items()},
-    }
-    free = validated.get("free_run", {})
-    if "axes" in free:
-        kept = ("mean_absolute", "rmse", "relative_error_percent", "unit")
-        rung["free_run_mode"] = free["mode"]
-        rung["free_run"] = {a: {k: e[k] for k in kept} for a, e in free["axes"].items()}
-    return rung
+    positions = free.axes if free else {}
+    return Rung(
+        model=name,
+        parent=parent or None,
+        added=", ".join(e for e in effects if e not in had) or None,
+        effects=effects,
+        held_out_rmse={axis: entry.held_out_rmse for axis, entry in axes.items()},
+        noise_floor={axis: entry.noise_floor for axis, entry in axes.items()},
+        unit={axis: entry.unit for axis, entry in axes.items()},
+        free_run_mode=free.mode if free else None,
+        free_run={
+            axis: FreeRunPosition(
+                mean_absolute=entry.mean_absolute,
+                rmse=entry.rmse,
+                relative_error_percent=entry.relative_error_percent,
+                unit=entry.unit,
+            )
+            for axis, entry in positions.items()
+        },
+    )
 
 
 def _moved(
-    parameters: Mapping[str, Mapping[str, Any]],
+    parameters: Mapping[str, Mapping[str, Value]],
     models: Mapping[str, ModelFile],
     order: list[str],
     sigmas: float,
-) -> list[dict[str, object]]:
+) -> list[Moved]:
     """Parameters that changed from parent to child by more than their uncertainty."""
     moved = []
     for model in order:
@@ -113,22 +112,21 @@ def _moved(
             if parent not in by_model or model not in by_model:
                 continue
             old, new = by_model[parent], by_model[model]
-            sd = math.hypot(float(old["sd"]), float(new["sd"]))
-            change = float(new["estimate"]) - float(old["estimate"])
+            sd, change = math.hypot(old.sd, new.sd), new.estimate - old.estimate
             if abs(change) > sigmas * sd:
+                sentence = (
+                    f"{name} moved from {old.estimate:.4g} to {new.estimate:.4g} {new.unit}: "
+                    "without the effect it was biased."
+                )
                 moved.append(
-                    {
-                        "parameter": name,
-                        "model": model,
-                        "parent": parent,
-                        "change": change,
-                        "sd": sd,
-                        "unit": new["unit"],
-                        "sentence": (
-                            f"{name} moved from {float(old['estimate']):.4g} to "
-                            f"{float(new['estimate']):.4g} {new['unit']}: without the effect it "
-                            f"was biased."
-                        ),
-                    }
+                    Moved(
+                        parameter=name,
+                        model=model,
+                        parent=parent,
+                        change=change,
+                        sd=sd,
+                        unit=new.unit,
+                        sentence=sentence,
+                    )
                 )
     return moved

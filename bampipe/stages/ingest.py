@@ -20,11 +20,12 @@ from bampipe.data.run_folder import RunFolder
 from bampipe.data.session import SECONDS, Session, TrialEntry, inside, read_session
 from bampipe.data.store import ParquetAppender, write_parquet
 from bampipe.errors import InputError
-from bampipe.files import digest_content, digest_file, read_toml, write_json
+from bampipe.files import digest_content, digest_file, read_toml
 from bampipe.physics import registry
 from bampipe.physics.device import Device
 from bampipe.physics.units import parse_unit
 from bampipe.progress import Progress
+from bampipe.results.ingest import Channel, EncoderChannel, ForceChannels, IngestResult
 
 NAME = "ingest"
 SUMMARY = "Read a session's raw logs, check and repair the trials, bring them to SI units"
@@ -110,7 +111,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     trials = _trials_table(rows)
     write_parquet(out / "ingest/trials.parquet", trials)
     rate = _rate(session, trials)
-    write_json(out / "ingest/session.json", _description(session, device, rate))
+    _description(session, device, rate).write(out)
     if session.device_file is not None:
         (out / "ingest/device.toml").write_bytes(session.device_file.read_bytes())
     return _summary(session, rows)
@@ -306,35 +307,31 @@ def _rate(session: Session, trials: pd.DataFrame) -> float:
     return measured
 
 
-def _description(session: Session, device: Device, rate: float) -> dict[str, object]:
+def _description(session: Session, device: Device, rate: float) -> IngestResult:
     force = session.force
-    more: dict[str, object] = {}
-    if session.device_file is not None:
-        more["device_digest"] = digest_content(device.declaration)
-    if device.drive:
-        more["driven"] = True
-    if device.default_effects:
-        more["default_effects"] = list(device.default_effects)
-    return {
-        "session_id": session.session_id,
-        "device": device.name,
-        "device_file": session.device if session.device_file is not None else None,
-        "recorded_at": session.recorded_at,
-        "sample_rate_hz": rate,
-        "announced_rate_hz": session.sample_rate,
-        "axes": {
-            encoder.axis: {"unit": encoder.unit, "resolution": encoder.resolution}
+    own = session.device_file is not None
+    return IngestResult(
+        session_id=session.session_id,
+        device=device.name,
+        device_file=session.device if own else None,
+        device_digest=digest_content(device.declaration) if own else "",
+        driven=bool(device.drive),
+        default_effects=device.default_effects,
+        recorded_at=session.recorded_at,
+        sample_rate_hz=rate,
+        announced_rate_hz=session.sample_rate,
+        axes={
+            encoder.axis: EncoderChannel(unit=encoder.unit, resolution=encoder.resolution)
             for encoder in session.encoders
         },
-        "force": {
-            "columns": list(force.names) if force else [],
-            "unit": device.force_unit,
-            "noise_sd": force.noise_sd if force else None,
-        },
-        "brakes": {f"brake_{brake.axis}": {"unit": brake.unit} for brake in session.brakes},
-        "channels": {channel.name: {"unit": channel.unit} for channel in session.channels},
-        **more,
-    }
+        force=ForceChannels(
+            columns=force.names if force else (),
+            unit=device.force_unit,
+            noise_sd=force.noise_sd if force else None,
+        ),
+        brakes={f"brake_{brake.axis}": Channel(unit=brake.unit) for brake in session.brakes},
+        channels={channel.name: Channel(unit=channel.unit) for channel in session.channels},
+    )
 
 
 def _summary(session: Session, rows: list[dict[str, object]]) -> dict[str, object]:

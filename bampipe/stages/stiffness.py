@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -16,9 +15,17 @@ from bampipe.data.store import ParquetAppender, read_parquet
 from bampipe.errors import InputError
 from bampipe.estimate.differentiation import uniform_grid
 from bampipe.estimate.hysteresis import Branch, Cycle, Hysteresis, hysteresis
-from bampipe.files import read_toml, write_json
+from bampipe.files import read_toml
 from bampipe.physics import Model, System, compile_model, registry
 from bampipe.progress import Progress
+from bampipe.results.ingest import IngestResult
+from bampipe.results.stiffness import (
+    AxisStiffness,
+    Bandwidth,
+    LockedTrial,
+    LoopCycle,
+    StiffnessResult,
+)
 
 NAME = "stiffness"
 SUMMARY = "Stiffness, loop width and bandwidth of the locked axes"
@@ -73,7 +80,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     """Find the stiffness of every axis that has a locked trial."""
     if not 0.0 < config.largest_drift:
         raise InputError("must be positive", where="stiffness.largest_drift")
-    session = run.read_json("ingest/session.json")
+    session = run.read(IngestResult)
     system = _system(run, session)
     samples = run.require("ingest/samples.parquet", "ingest")
     trials = read_parquet(run.require("ingest/trials.parquet", "ingest"))
@@ -97,34 +104,29 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
             loops.setdefault(axis, []).append(result)
     if locked.empty:
         notes.append("No locked trials in this session: no stiffness to report.")
-    axes: dict[str, object] = {
+    axes = {
         axis: _axis(axis, loops[axis], system, config, notes)
         for axis in system.coordinates
         if axis in loops
     }
     _write_loops(out / "stiffness/loops.parquet", loops)
-    content: dict[str, object] = {
-        "axes": axes,
-        "notes": notes,
-        "headline": _headline(axes) if axes else notes[-1],
-    }
-    write_json(out / "stiffness/stiffness.json", content)
-    return content
+    headline = _headline(axes) if axes else notes[-1]
+    return StiffnessResult(axes=axes, notes=tuple(notes), headline=headline).write(out)
 
 
-def _system(run: RunFolder, session: Mapping[str, Any]) -> System:
+def _system(run: RunFolder, session: IngestResult) -> System:
     """Return the bare device of the session, compiled."""
     if run.exists("ingest/device.toml"):
         path = run.path("ingest/device.toml")
         return compile_model(Model(registry.device_from(read_toml(path), str(path))))
-    return compile_model(Model(registry.device(str(session["device"]))))
+    return compile_model(Model(registry.device(session.device)))
 
 
 def _loops_of(
-    samples: Path, trial_id: str, axis: str, system: System, session: Mapping[str, Any]
+    samples: Path, trial_id: str, axis: str, system: System, session: IngestResult
 ) -> _Loops | str:
     """Return the loops of one trial, or why there are none."""
-    rate = float(session["sample_rate_hz"])
+    rate = session.sample_rate_hz
     frame = read_parquet(samples, trial=trial_id)
     frame = frame[frame.drop(columns="trial_id").notna().all(axis=1)]
     t = frame["t"].to_numpy(dtype=np.float64)
@@ -162,7 +164,7 @@ def _loops_of(
 
 def _axis(
     axis: str, trials: list[_Loops], system: System, config: Config, notes: list[str]
-) -> dict[str, object]:
+) -> AxisStiffness:
     """Return the entry of one axis; add to ``notes`` what a reader must know."""
     number = system.coordinates.index(axis)
     unit = f"{system.torque_units[number]}/{system.coordinate_units[number]}"
@@ -188,39 +190,38 @@ def _axis(
     poses = _poses(system, trials[0].pose)
     bandwidths = {name: _bandwidth(system, number, stiffness, pose) for name, pose in poses.items()}
     stated = "maximum_extension" if "maximum_extension" in bandwidths else "recorded"
-    return {
-        "stiffness": stiffness,
-        "sd": sd,
-        "standard_error": error,
-        "unit": unit,
-        "n_cycles": len(cycles),
-        "bandwidth_rad_s": bandwidths[stated]["rad_s"],
-        "bandwidth_hz": bandwidths[stated]["hz"],
-        "bandwidth_pose": stated,
-        "bandwidths": bandwidths,
-        "poses": {
-            name: dict(zip(system.coordinates, map(float, pose), strict=True))
-            for name, pose in poses.items()
+    return AxisStiffness(
+        stiffness=stiffness,
+        sd=sd,
+        standard_error=error,
+        unit=unit,
+        n_cycles=len(cycles),
+        bandwidth_rad_s=bandwidths[stated].rad_s,
+        bandwidth_hz=bandwidths[stated].hz,
+        bandwidth_pose=stated,
+        bandwidths=bandwidths,
+        poses={
+            name: dict(zip(system.coordinates, pose, strict=True)) for name, pose in poses.items()
         },
-        "loop_width": float(np.mean([cycle.width_torque for _, cycle in cycles])),
-        "loop_width_unit": system.torque_units[number],
-        "loop_width_deflection": float(np.mean([cycle.width_deflection for _, cycle in cycles])),
-        "loop_width_deflection_unit": system.coordinate_units[number],
-        "energy_per_cycle": float(np.mean([cycle.energy for _, cycle in cycles])),
-        "energy_unit": "J",
-        "yielded": all(trial.found.yielded for trial in trials),
-        "cycles": [_cycle(trial, cycle) for trial, cycle in cycles],
-        "trials": {
-            trial.trial_id: {
-                "stiffness": trial.found.stiffness,
-                "standard_error": trial.found.standard_error,
-                "transition": trial.found.transition,
-                "bend": trial.found.bend,
-                "drift": _drift(trial),
-            }
+        loop_width=np.mean([cycle.width_torque for _, cycle in cycles]),
+        loop_width_unit=system.torque_units[number],
+        loop_width_deflection=np.mean([cycle.width_deflection for _, cycle in cycles]),
+        loop_width_deflection_unit=system.coordinate_units[number],
+        energy_per_cycle=np.mean([cycle.energy for _, cycle in cycles]),
+        energy_unit="J",
+        yielded=all(trial.found.yielded for trial in trials),
+        cycles=tuple(_cycle(trial, cycle) for trial, cycle in cycles),
+        trials={
+            trial.trial_id: LockedTrial(
+                stiffness=trial.found.stiffness,
+                standard_error=trial.found.standard_error,
+                transition=trial.found.transition,
+                bend=trial.found.bend,
+                drift=_drift(trial),
+            )
             for trial in trials
         },
-    }
+    )
 
 
 def _drift(trial: _Loops) -> float:
@@ -230,18 +231,18 @@ def _drift(trial: _Loops) -> float:
     return (cycles[-1].centre - cycles[0].centre) / reach
 
 
-def _cycle(trial: _Loops, cycle: Cycle) -> dict[str, object]:
+def _cycle(trial: _Loops, cycle: Cycle) -> LoopCycle:
     """Return what is stored of one cycle."""
-    return {
-        "trial_id": trial.trial_id,
-        "duration_s": (cycle.stop - cycle.start) / trial.rate,
-        "stiffness": cycle.stiffness,
-        "loop_width": cycle.width_torque,
-        "loop_width_deflection": cycle.width_deflection,
-        "energy": cycle.energy,
-        "amplitude": cycle.amplitude,
-        "centre": cycle.centre,
-    }
+    return LoopCycle(
+        trial_id=trial.trial_id,
+        duration_s=(cycle.stop - cycle.start) / trial.rate,
+        stiffness=cycle.stiffness,
+        loop_width=cycle.width_torque,
+        loop_width_deflection=cycle.width_deflection,
+        energy=cycle.energy,
+        amplitude=cycle.amplitude,
+        centre=cycle.centre,
+    )
 
 
 def _poses(system: System, recorded: Array) -> dict[str, Array]:
@@ -261,11 +262,11 @@ def _poses(system: System, recorded: Array) -> dict[str, Array]:
     return poses
 
 
-def _bandwidth(system: System, number: int, stiffness: float, pose: Array) -> dict[str, float]:
+def _bandwidth(system: System, number: int, stiffness: float, pose: Array) -> Bandwidth:
     """Return sqrt(K / M_ii) at ``pose`` in both units, and M_ii."""
     inertia = float(system.mass_matrix(pose[None, :], system.prior)[0, number, number])
     speed = float(np.sqrt(stiffness / inertia))
-    return {"rad_s": speed, "hz": speed / (2.0 * np.pi), "inertia": inertia}
+    return Bandwidth(rad_s=speed, hz=speed / (2.0 * np.pi), inertia=inertia)
 
 
 def _write_loops(path: Path, loops: Mapping[str, list[_Loops]]) -> None:
@@ -316,10 +317,10 @@ def _side(branch: Branch) -> str:
     return "rising" if branch.direction > 0 else "falling"
 
 
-def _headline(axes: Mapping[str, Any]) -> str:
+def _headline(axes: Mapping[str, AxisStiffness]) -> str:
     """Return one sentence with the stiffness of every axis."""
     return "; ".join(
-        f"{axis} {entry['stiffness']:.4g} ± {entry['sd']:.2g} {entry['unit']} "
-        f"({entry['bandwidth_rad_s']:.3g} rad/s, {entry['bandwidth_hz']:.3g} Hz)"
+        f"{axis} {entry.stiffness:.4g} ± {entry.sd:.2g} {entry.unit} "
+        f"({entry.bandwidth_rad_s:.3g} rad/s, {entry.bandwidth_hz:.3g} Hz)"
         for axis, entry in axes.items()
     )

@@ -6,8 +6,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from made_results import write_result
+
 from bampipe.data import store
 from bampipe.files import write_json, write_text
+from bampipe.results.diagnose import DiagnoseResult
+from bampipe.results.identify import IdentifyResult
+from bampipe.results.ingest import IngestResult
+from bampipe.results.stiffness import StiffnessResult
+from bampipe.results.validate import ValidateResult
 
 AXES = ("yaw", "pitch")
 
@@ -40,14 +47,15 @@ class Made:
 
     def write(self, runs: Path) -> Path:
         root = runs / self.name
-        session = {
-            "session_id": self.name,
-            "device": self.device,
-            "recorded_at": self.recorded,
-            "sample_rate_hz": 500.0,
-            "axes": {axis: {"unit": "rad", "resolution": 1e-4} for axis in AXES},
-        }
-        write_json(root / "ingest/session.json", session)
+        write_result(
+            root,
+            IngestResult,
+            session_id=self.name,
+            device=self.device,
+            recorded_at=self.recorded,
+            sample_rate_hz=500.0,
+            axes={axis: {"unit": "rad", "resolution": 1e-4} for axis in AXES},
+        )
         trials = {
             "trial_id": ["t1", "t2"],
             "kind": ["free", "free"],
@@ -60,7 +68,7 @@ class Made:
         }
         store.write_parquet(root / "ingest/trials.parquet", trials)  # type: ignore[arg-type]
         axes = {} if self.stiffness is None else {"yaw": _stiffness(self.stiffness)}
-        write_json(root / "stiffness/stiffness.json", {"axes": axes})
+        write_result(root, StiffnessResult, axes=axes)
         self._model(root, "base", [], self.parameters, self.error)
         if self.verdicts is not None:
             told = {
@@ -73,7 +81,7 @@ class Made:
                 }
                 for axis, (verdict, effects) in self.verdicts.items()
             }
-            write_json(root / "models/base/diagnose.json", {"axes": told})
+            write_result(root, DiagnoseResult, model="base", axes=told)
         if self.child is not None:
             effect, parameters = self.child
             name = f"base+{effect.replace(':', '.')}"
@@ -99,24 +107,20 @@ class Made:
             key: {"estimate": value, "sd": self.sd, "unit": "N.m", "at_bound": False}
             for key, value in parameters.items()
         }
-        content = {"method": "ukf", "parameters": entries, "nis": {"by_trial": {"t1": 1.1}}}
-        write_json(root / f"models/{name}/identify.json", content)
-        write_json(
-            root / f"models/{name}/validate.json",
-            {
-                "axes": {
-                    axis: {
-                        "rmse": 0.1,
-                        "rmse_without_friction": 2.0,
-                        "held_out_rmse": 0.02 * ratio,
-                        "noise_floor": 0.02,
-                        "fit_percent": 99.0,
-                        "unit": "N.m",
-                    }
-                    for axis, ratio in error.items()
-                }
-            },
-        )
+        nis = {"by_trial": {"t1": 1.1}}
+        write_result(root, IdentifyResult, model=name, method="ukf", parameters=entries, nis=nis)
+        axes = {
+            axis: {
+                "rmse": 0.1,
+                "rmse_without_friction": 2.0,
+                "held_out_rmse": 0.02 * ratio,
+                "noise_floor": 0.02,
+                "fit_percent": 99.0,
+                "unit": "N.m",
+            }
+            for axis, ratio in error.items()
+        }
+        write_result(root, ValidateResult, model=name, axes=axes)
 
 
 def _stiffness(value: float) -> dict[str, object]:
@@ -126,4 +130,5 @@ def _stiffness(value: float) -> dict[str, object]:
         "unit": "N.m/rad",
         "bandwidth_hz": 4.0,
         "n_cycles": 6,
+        "cycles": [{"trial_id": "t3"}],
     }

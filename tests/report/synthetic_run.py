@@ -9,9 +9,17 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from made_results import write_result
 
 from bampipe.data.store import write_parquet
 from bampipe.files import write_json, write_text
+from bampipe.results.compare import CompareResult
+from bampipe.results.diagnose import DiagnoseResult
+from bampipe.results.filter import FilterResult
+from bampipe.results.identify import IdentifyResult
+from bampipe.results.ingest import IngestResult
+from bampipe.results.stiffness import StiffnessResult
+from bampipe.results.validate import ValidateResult
 
 AXES = ("yaw", "pitch", "extension")
 TORQUE_UNIT = {"yaw": "N.m", "pitch": "N.m", "extension": "N"}
@@ -61,15 +69,16 @@ def write_ingest(root: Path, trials: tuple[str, ...] = FREE) -> None:
     samples = {"trial_id": [trials[0]], "t": [0.0], **columns}
     write_parquet(root / "ingest/samples.parquet", pd.DataFrame(samples))
     units = {"yaw": ("rad", 47e-6), "pitch": ("rad", 98e-6), "extension": ("m", 30e-6)}
-    session = {
-        "session_id": root.name,
-        "device": "bam",
-        "axes": {axis: {"unit": u, "resolution": r} for axis, (u, r) in units.items()},
-        "force": {"noise_sd": 0.05, "unit": "N", "columns": ["force_x", "force_y", "force_z"]},
-        "sample_rate_hz": RATE,
-        "recorded_at": "2026-10-03T10:12:00+00:00",
-    }
-    write_json(root / "ingest/session.json", session)
+    write_result(
+        root,
+        IngestResult,
+        session_id=root.name,
+        device="bam",
+        axes={axis: {"unit": u, "resolution": r} for axis, (u, r) in units.items()},
+        force={"noise_sd": 0.05, "unit": "N", "columns": ["force_x", "force_y", "force_z"]},
+        sample_rate_hz=RATE,
+        recorded_at="2026-10-03T10:12:00+00:00",
+    )
 
 
 def _trial(name: str, kind: str) -> dict[str, object]:
@@ -113,8 +122,7 @@ def write_filter(root: Path) -> None:
         }
         for axis in AXES
     }  # fmt: skip
-    content = {"method": "kalman", "method_reason": "default", "axes": axes, "skipped": {}}
-    write_json(root / "filter/filter.json", content)
+    write_result(root, FilterResult, method="kalman", method_reason="default", axes=axes)
 
 
 def write_stiffness(root: Path) -> None:
@@ -135,8 +143,9 @@ def write_stiffness(root: Path) -> None:
         "bandwidth_rad_s": 25.13, "bandwidth_hz": 4.0, "bandwidth_pose": "recorded",
         "poses": {"recorded": {"yaw": 0.1, "pitch": 0.05, "extension": 1.1}},
         "loop_width": 5.53, "loop_width_unit": "N.m", "energy_per_cycle": 0.197, "energy_unit": "J",
+        "cycles": [{"trial_id": "t05_locked_yaw"}],
     }  # fmt: skip
-    write_json(root / "stiffness/stiffness.json", {"axes": {"yaw": yaw}, "notes": []})
+    write_result(root, StiffnessResult, axes={"yaw": yaw})
 
 
 def parameters(model: str) -> dict[str, tuple[float, float, str]]:
@@ -161,13 +170,12 @@ def write_model(root: Path, model: str) -> None:
         "pitch": {"position": 5.2e-3, "velocity": 62e-3},
         "extension": {"position": 0.9e-3, "velocity": 19e-3},
     }
-    content = {
-        "model": model, "method": "ukf", "parameters": named, "state_3sigma": bounds,
-        "convergence": {"converged": True, "total_s": 48.0, "settled_s": {"mass": 16.93}},
-        "nis": {"mean": 1.0231, "by_trial": {}},
-        "input_timing": {"estimate": 1.2e-4, "sd": 3.1e-5, "unit": "s"},
-    }  # fmt: skip
-    write_json(root / f"models/{model}/identify.json", content)
+    write_result(
+        root, IdentifyResult, model=model, method="ukf", parameters=named, state_3sigma=bounds,
+        convergence={"converged": True, "total_s": 48.0, "settled_s": {"mass": 16.93}},
+        nis={"mean": 1.0231, "by_trial": {}},
+        input_timing={"estimate": 1.2e-4, "sd": 3.1e-5, "unit": "s"},
+    )  # fmt: skip
 
     def states(number: int) -> pd.DataFrame:
         frame = motion(number)
@@ -206,15 +214,16 @@ def write_validation(root: Path, model: str) -> None:
         }
         for axis, error in held_out(model).items()
     }  # fmt: skip
-    content = {
-        "model": model,
-        "axes": axes,
-        "trials": {name: {**axes, "held_out": True} for name in FREE},
-        "forces": {"force_x": {"rmse": 0.1234, "unit": "N"}},
-        "cutoff_hz": 8.0,
-        "notes": ["A note of the validation."],
-    }
-    write_json(root / f"models/{model}/validate.json", content)
+    write_result(
+        root,
+        ValidateResult,
+        model=model,
+        axes=axes,
+        trials={name: {**axes, "held_out": True} for name in FREE},
+        forces={"force_x": {"rmse": 0.1234, "unit": "N"}},
+        cutoff_hz=8.0,
+        notes=["A note of the validation."],
+    )
 
     def residuals(number: int) -> pd.DataFrame:
         frame = motion(number)
@@ -267,22 +276,23 @@ def write_diagnosis(root: Path, model: str) -> None:
         "axis": "yaw", "trial_id": FREE[1], "t_start": 3.2, "t_end": 3.7, "rmse": 1.234,
         "doing": "reversing slowly with the arm extended",
     }  # fmt: skip
-    content = {
-        "model": model,
-        "axes": axes,
-        "ranking": ranking if missing else [],
-        "selected": ["stribeck:yaw"] if missing else [],
-        "suggested_trial": {"sentence": "Move yaw back and forth at 0.02 rad/s for 20 s."}
+    write_result(
+        root,
+        DiagnoseResult,
+        model=model,
+        axes=axes,
+        ranking=ranking if missing else [],
+        selected=["stribeck:yaw"] if missing else [],
+        suggested_trial={"sentence": "Move yaw back and forth at 0.02 rad/s for 20 s."}
         if missing
         else None,
-        "maps": maps,
-        "worst_windows": [window],
-        "next": "bampipe extend RUN stribeck:yaw --model base" if missing else "nothing to add",
-        "sentence": "Yaw lacks friction that rises as it slows down."
+        maps=maps,
+        worst_windows=[window],
+        next="bampipe extend RUN stribeck:yaw --model base" if missing else "nothing to add",
+        sentence="Yaw lacks friction that rises as it slows down."
         if missing
         else "Nothing that could be explained is left.",
-    }
-    write_json(root / f"models/{model}/diagnose.json", content)
+    )
 
 
 def _map(unit: str, centre: object, mean: np.ndarray) -> dict[str, object]:
@@ -320,8 +330,7 @@ def write_comparison(root: Path) -> None:
             "sentence": "coulomb.yaw fell by 0.21 N.m, twice its uncertainty.",
         }
     ]  # fmt: skip
-    content = {"ladder": ladder, "parameters": named, "moved": moved}
-    write_json(root / "compare.json", content)
+    write_result(root, CompareResult, ladder=ladder, parameters=named, moved=moved)
 
 
 def write_record(root: Path) -> None:

@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from made_results import write_result
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import write_parquet
-from bampipe.files import write_json
+from bampipe.results.ingest import IngestResult
 
 SESSIONS = Path(__file__).resolve().parents[3] / "shared" / "sessions"
 
@@ -43,12 +44,11 @@ def write_ingested(
         parts.append(part)
     write_parquet(root / "ingest/trials.parquet", pd.DataFrame(rows))
     write_parquet(root / "ingest/samples.parquet", pd.concat(parts, ignore_index=True))
-    session = {
-        "session_id": root.name, "device": device, "axes": axes, "sample_rate_hz": rate,
-        "force": {"noise_sd": 0.05, "unit": "N", "columns": ["force_x", "force_y", "force_z"]},
-        "recorded_at": "2026-10-03T10:12:00+00:00",
-    }  # fmt: skip
-    write_json(root / "ingest/session.json", session)
+    write_result(
+        root, IngestResult, session_id=root.name, device=device, axes=axes, sample_rate_hz=rate,
+        force={"noise_sd": 0.05, "unit": "N", "columns": ["force_x", "force_y", "force_z"]},
+        recorded_at="2026-10-03T10:12:00+00:00",
+    )  # fmt: skip
     return RunFolder(root)
 
 

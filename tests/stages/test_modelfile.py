@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pytest
+from made_results import write_result
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.declarations.model_file import identified
 from bampipe.errors import InputError
 from bampipe.physics import Model, compile_model, registry
+from bampipe.results.identify import IdentifyResult
 
 
 def test_what_is_fixed_stands_at_its_prior_and_what_is_missing_is_named(tmp_path):
@@ -19,16 +19,14 @@ def test_what_is_fixed_stands_at_its_prior_and_what_is_missing_is_named(tmp_path
     )
     free = [item.name for item in system.parameters if not item.fixed]
     assert len(free) < len(system.parameters)
-    path = tmp_path / "models/base/identify.json"
-    path.parent.mkdir(parents=True)
     found = {name: {"estimate": 1.0 + k, "sd": 0.1} for k, name in enumerate(free)}
-    path.write_text(json.dumps({"parameters": found}))
+    write_result(tmp_path, IdentifyResult, parameters=found)
     p = identified(RunFolder(tmp_path), "base", system)
     for item, value in zip(system.parameters, p, strict=True):
         assert value == (item.prior if item.fixed else found[item.name]["estimate"])
     assert np.isfinite(p).all()
     del found["armature"]
-    path.write_text(json.dumps({"parameters": found}))
+    write_result(tmp_path, IdentifyResult, parameters=found)
     with pytest.raises(InputError, match=r"identify\.json: no parameter 'armature'; bampipe iden"):
         identified(RunFolder(tmp_path), "base", system)
     with pytest.raises(InputError, match="bampipe identify"):

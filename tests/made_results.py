@@ -1,0 +1,49 @@
+"""Results for tests: what a test says of them, the rest made up."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from types import UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+
+from bampipe.files import write_json
+from bampipe.results.record import Record, Result
+
+_ABSENT: Any = object()
+_MADE_UP = {str: "?", float: 1.0, int: 1, bool: False, tuple: [], dict: {}}
+
+
+def filled(kind: Any, value: Any = _ABSENT) -> Any:
+    """``value`` as a field of type ``kind`` holds it, every required field of records filled."""
+    origin, inner = get_origin(kind), get_args(kind)
+    if origin is Annotated:
+        return filled(inner[0], value)
+    if origin in (Union, UnionType):
+        return None if value in (_ABSENT, None) else filled(inner[0], value)
+    if isinstance(kind, type) and issubclass(kind, Record):
+        given = {} if value is _ABSENT else value
+        fields = {field.alias or name: field for name, field in kind.model_fields.items()}
+        others = get_args(get_type_hints(kind).get("__pydantic_extra__")) or (str, object)
+        return {
+            **{k: filled(others[1], v) for k, v in given.items() if k not in fields},
+            **{
+                name: filled(field.annotation, given.get(name, _ABSENT))
+                for name, field in fields.items()
+                if name in given or field.is_required()
+            },
+        }
+    if value is _ABSENT:
+        return inner[0] if origin is Literal else _MADE_UP[origin or kind]
+    if origin is tuple and inner[-1] is ...:
+        return [filled(inner[0], item) for item in value]
+    if origin is dict and isinstance(value, Mapping):
+        return {key: filled(inner[1], item) for key, item in value.items()}
+    return value
+
+
+def write_result(root: Path, kind: type[Result], **given: Any) -> dict[str, Any]:
+    """Write the result ``kind`` below ``root`` and return its content."""
+    content: dict[str, Any] = filled(kind, given)
+    write_json(root / kind.file(str(given.get("model", "base"))), content)
+    return content
