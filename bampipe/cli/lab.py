@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -12,6 +13,7 @@ from bampipe.errors import InputError
 
 if TYPE_CHECKING:
     from bampipe.lab.collect import Lab
+    from bampipe.results.lab import ControlChart
 
 MOST_SESSIONS = 60
 
@@ -42,7 +44,7 @@ def lab(
         raise InputError("no such folder of runs", where=str(folder))
     found = gather(folder, out, quiet or json)
     if json:
-        show.as_json(found.content)
+        show.as_json(found.content.model_dump(mode="json"))
         return
     table(found)
     if not quiet:
@@ -92,51 +94,47 @@ def refresh(runs: Path, several: bool, quiet: bool) -> None:
 
 def table(found: Lab) -> None:
     """Print the sessions that stand out, else that none does; then the trends."""
-    sessions = found.content["sessions"]
-    odd = [one for one in sessions if one["verdict"] != "in control"]
+    sessions = found.content.sessions
+    odd = [one for one in sessions if one.verdict != "in control"]
     many = "session" if len(sessions) == 1 else "sessions"
     stand = "stands" if len(odd) == 1 else "stand"
     show.say(f"{found.folder}: {len(sessions)} {many}, {len(odd)} {stand} out")
     rows = [
         [
-            one["session"],
-            one["recorded"][:16].replace("T", " "),
-            f"{one['worst'][0]:.3g} {one['worst'][1]}" if one["worst"] else None,
-            one["verdict"],
-            _first(one),
+            one.session,
+            one.recorded[:16].replace("T", " "),
+            f"{one.worst[0]:.3g} {one.worst[1]}" if one.worst else None,
+            one.verdict,
+            one.sentence,
         ]
         for one in (sessions if len(sessions) <= MOST_SESSIONS else odd)
     ]
     if rows:
         show.table(["session", "recorded", "error / floor", "verdict", ""], rows)
-    for line in _trend_lines(found.content["series"]):
+    for line in _trend_lines(found.content.series):
         show.say(line)
-    fewest = found.content["fewest_sessions"]
+    fewest = found.content.fewest_sessions
     if len(sessions) < fewest:
         show.say(f"no control limits yet: they need {fewest} sessions of a device")
     for line in found.skipped:
         show.say(f"left out: {line}")
 
 
-def _first(one: dict[str, Any]) -> str:
-    return str(one["sentence"])
-
-
-def _trend_lines(series: list[dict[str, Any]]) -> list[str]:
+def _trend_lines(series: Iterable[ControlChart]) -> list[str]:
     lines = []
     for chart in series:
-        if chart["drifts"]:
-            percent = 100.0 * chart["slope_per_session"] / abs(chart["centre"] or 1.0)
-            lines.append(f"trend: {chart['name']} {percent:+.2g} % a session")
-        if chart["run"]:
-            first, last = chart["run"]
-            lines.append(f"shift: {chart['name']} on one side of its median, {first} to {last}")
+        if chart.drifts and chart.slope_per_session is not None:
+            percent = 100.0 * chart.slope_per_session / abs(chart.centre or 1.0)
+            lines.append(f"trend: {chart.name} {percent:+.2g} % a session")
+        if chart.run:
+            first, last = chart.run
+            lines.append(f"shift: {chart.name} on one side of its median, {first} to {last}")
     return lines
 
 
 def advice(found: Lab) -> str:
     """Return the command to go on with."""
-    for one in found.content["sessions"]:
-        if one["remedy"]:
-            return str(one["remedy"])
+    for one in found.content.sessions:
+        if one.remedy:
+            return one.remedy
     return f"open {found.folder / 'report.pdf'}"

@@ -7,18 +7,16 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 from bampipe.data import lab_tables
 from bampipe.errors import InputError
-from bampipe.files import atomic_writer, refuse_links, write_json, write_text
+from bampipe.files import atomic_writer, refuse_links, write_text
 from bampipe.lab import rows, trends
-from bampipe.lab.place import FILE, LOCK, is_foreign, run_folders
+from bampipe.lab.place import LOCK, is_foreign, run_folders
 from bampipe.progress import Progress, silent
+from bampipe.results.lab import LabResult, TrendsResult
 from bampipe.run.lock import hold
 
-SCHEMA = "bampipe.lab/1"
-TRENDS = "trends.json"
 _EARLIEST = datetime.min.replace(tzinfo=UTC)
 
 
@@ -35,7 +33,7 @@ class Lab:
     """
 
     folder: Path
-    content: dict[str, Any]
+    content: TrendsResult
     sessions: tuple[str, ...]
     skipped: tuple[str, ...]
     tables: Mapping[str, int]
@@ -82,18 +80,14 @@ def collect(runs: Path, folder: Path, *, report: bool = True, progress: Progress
         )
     with _alone(folder):
         counts = lab_tables.write(folder, tables)
-        write_json(folder / TRENDS, content)
+        content.write(folder)
         if report:
             progress(0.7, "report")
             _report(folder)
         sessions = tuple(str(one.key["session_id"]) for one in found)
-        about = {
-            "schema": SCHEMA,
-            "sessions": list(sessions),
-            "skipped": skipped,
-            "tables": counts,
-        }
-        write_json(folder / FILE, about)
+        LabResult(
+            schema="bampipe.lab/1", sessions=sessions, skipped=tuple(skipped), tables=counts
+        ).write(folder)
     return Lab(folder, content, sessions, tuple(skipped), counts)
 
 

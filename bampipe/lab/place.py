@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 from bampipe.errors import InputError
-from bampipe.files import read_json_table
 from bampipe.run import record
 
 FILE = "lab.json"
@@ -36,12 +35,11 @@ def is_current(runs: Path, folder: Path) -> bool:
     roots = run_folders(runs)
     if any((root / record.FILE).stat().st_mtime_ns > written for root in roots):
         return False
+    from bampipe.results.lab import LabResult
+
     try:
-        kept = read_json_table(about)
+        lab = LabResult.read(about)
     except InputError:
         return False
-    sessions, skipped = kept.get("sessions"), kept.get("skipped")
-    if not isinstance(sessions, list) or not isinstance(skipped, list):
-        return False
-    known = [*map(str, sessions), *(str(line).partition(":")[0] for line in skipped)]
+    known = [*lab.sessions, *(line.split(":")[0] for line in lab.skipped)]
     return sorted(known) == sorted(root.name for root in roots)

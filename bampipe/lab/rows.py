@@ -12,6 +12,11 @@ from bampipe.data import lab_tables, store
 from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError
 from bampipe.files import refuse_links
+from bampipe.results.diagnose import DiagnoseResult
+from bampipe.results.identify import IdentifyResult
+from bampipe.results.ingest import IngestResult
+from bampipe.results.stiffness import StiffnessResult
+from bampipe.results.validate import ValidateResult
 from bampipe.run import models, record
 
 NORMAL_95 = 1.959963984540054
@@ -50,52 +55,45 @@ def of_run(root: Path) -> SessionRows:
     made = models.names(root)
     of_models = [f"models/{model}/{name}" for model in made for name in _OF_MODELS]
     record.require_untouched(root, [*_OF_SESSION, *of_models])
+    run = RunFolder(root)
+    session = run.read(IngestResult)
     try:
-        return _of_sound(RunFolder(root), made)
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        recorded = lab_tables.moment(session.recorded_at)
+    except ValueError as error:
         raise InputError(
-            f"a result is not as bampipe writes it ({type(error).__name__}: {error})",
-            where=str(root),
+            f"recorded_at is no moment ({error})",
+            where=str(run.path(IngestResult.FILE)),
             remedy="make it again (--force)",
         ) from error
-
-
-def _of_sound(run: RunFolder, made: tuple[str, ...]) -> SessionRows:
-    root = run.root
-    session = run.read_json("ingest/session.json")
-    try:
-        recorded = lab_tables.moment(session.get("recorded_at"))
-        key = {"session_id": root.name, "device": str(session["device"])}
-    except (KeyError, ValueError) as error:
-        raise InputError(
-            f"no description of a session ({error})",
-            where=str(root / "ingest/session.json"),
-            remedy="make it again (--force)",
-        ) from error
-    rows = SessionRows({**key, "recorded_at": recorded})
-    axes = tuple(str(axis) for axis in session.get("axes", {}))
-    nis: Mapping[str, Any] = {}
+    rows = SessionRows({"session_id": root.name, "device": session.device, "recorded_at": recorded})
+    nis: Mapping[str, float] = {}
     for model in made:
-        found = _model(run, rows, model, axes)
+        found = _model(run, rows, model, tuple(session.axes))
         nis = nis or found
     _trials(run, rows, nis)
-    if run.exists("stiffness/stiffness.json"):
-        for axis, entry in run.read_json("stiffness/stiffness.json").get("axes", {}).items():
-            _stiffness(rows, axis, entry)
+    if run.exists(StiffnessResult.FILE):
+        for axis, entry in run.read(StiffnessResult).axes.items():
+            rows.add(
+                "stiffness",
+                axis=axis,
+                unit=entry.unit,
+                bandwidth_hz=entry.bandwidth_hz,
+                n_cycles=entry.n_cycles,
+                **_interval("stiffness", entry.stiffness, entry.sd),
+            )
     _session(root, rows, session, made)
     return rows
 
 
 def _model(
     run: RunFolder, rows: SessionRows, model: str, axes: tuple[str, ...]
-) -> Mapping[str, Any]:
+) -> Mapping[str, float]:
     """Add the rows of one model; return its consistency (NIS) by trial."""
-    nis: Mapping[str, Any] = {}
-    folder = f"models/{model}"
-    if run.exists(f"{folder}/identify.json"):
-        content = run.read_json(f"{folder}/identify.json")
-        nis = content.get("nis", {}).get("by_trial", {}) or {}
-        for name, entry in sorted(content["parameters"].items()):
+    nis: Mapping[str, float] = {}
+    if run.exists(IdentifyResult.file(model)):
+        identified = run.read(IdentifyResult, model)
+        nis = identified.nis.by_trial if identified.nis else {}
+        for name, found in identified.parameters.items():
             last = name.rpartition(".")[2]
             inner = name.split(".")[1:2]
             axis = last if last in axes else next((part for part in inner if part in axes), None)
@@ -104,47 +102,46 @@ def _model(
                 model=model,
                 parameter=name,
                 axis=axis,
-                unit=entry.get("unit"),
-                at_bound=entry.get("at_bound"),
-                method=content.get("method"),
-                **_interval("estimate", entry),
+                unit=found.unit,
+                at_bound=found.at_bound,
+                method=identified.method,
+                **_interval("estimate", found.estimate, found.sd),
             )
-    if run.exists(f"{folder}/validate.json"):
-        for axis, entry in sorted(run.read_json(f"{folder}/validate.json")["axes"].items()):
-            error, floor = _number(entry.get("held_out_rmse")), _number(entry.get("noise_floor"))
+    if run.exists(ValidateResult.file(model)):
+        for axis, error in run.read(ValidateResult, model).axes.items():
+            floor = error.noise_floor
             rows.add(
                 "errors",
                 model=model,
                 axis=axis,
-                held_out_rmse=error,
+                held_out_rmse=error.held_out_rmse,
                 noise_floor=floor,
-                error_over_floor=error / floor if error is not None and floor else None,
-                unit=entry.get("unit"),
-                **_numbers(entry, "rmse", "rmse_without_friction", "fit_percent"),
+                error_over_floor=error.held_out_rmse / floor if floor else None,
+                unit=error.unit,
+                rmse=error.rmse,
+                rmse_without_friction=error.rmse_without_friction,
+                fit_percent=error.fit_percent,
             )
-    if run.exists(f"{folder}/diagnose.json"):
-        for axis, entry in sorted(run.read_json(f"{folder}/diagnose.json")["axes"].items()):
+    if run.exists(DiagnoseResult.file(model)):
+        for axis, said in run.read(DiagnoseResult, model).axes.items():
             rows.add(
                 "verdicts",
                 model=model,
                 axis=axis,
-                verdict=entry["verdict"],
-                effects=[str(effect) for effect in entry.get("effects", ())],
-                unit=entry.get("unit"),
-                sentence=entry.get("sentence"),
-                **_numbers(
-                    entry,
-                    "explainable_share",
-                    "explainable_chance",
-                    "rmse_before",
-                    "rmse_after",
-                    "noise_floor",
-                ),
+                verdict=said.verdict,
+                effects=list(said.effects),
+                unit=said.unit,
+                sentence=said.sentence,
+                explainable_share=said.explainable_share,
+                explainable_chance=said.explainable_chance,
+                rmse_before=said.rmse_before,
+                rmse_after=said.rmse_after,
+                noise_floor=said.noise_floor,
             )
     return nis
 
 
-def _trials(run: RunFolder, rows: SessionRows, nis: Mapping[str, Any]) -> None:
+def _trials(run: RunFolder, rows: SessionRows, nis: Mapping[str, float]) -> None:
     if not run.exists("ingest/trials.parquet"):
         return
     frame = store.read_parquet(run.path("ingest/trials.parquet"))
@@ -153,27 +150,13 @@ def _trials(run: RunFolder, rows: SessionRows, nis: Mapping[str, Any]) -> None:
             "quality",
             trial_id=str(trial["trial_id"]),
             n_samples=int(trial["n_samples"]),
-            nis=_number(nis.get(str(trial["trial_id"]))),
+            nis=nis.get(str(trial["trial_id"])),
             **{name: str(trial[name]) for name in ("kind", "status", "reason", "repairs")},
-            **_numbers(trial, "duration_s", "sample_rate_hz"),
+            **{name: _finite(trial[name]) for name in ("duration_s", "sample_rate_hz")},
         )
 
 
-def _stiffness(rows: SessionRows, axis: str, entry: Mapping[str, Any]) -> None:
-    cycles = _number(entry.get("n_cycles"))
-    rows.add(
-        "stiffness",
-        axis=axis,
-        unit=entry.get("unit"),
-        bandwidth_hz=_number(entry.get("bandwidth_hz")),
-        n_cycles=None if cycles is None else int(cycles),
-        **_interval("stiffness", entry),
-    )
-
-
-def _session(
-    root: Path, rows: SessionRows, session: Mapping[str, Any], made: tuple[str, ...]
-) -> None:
+def _session(root: Path, rows: SessionRows, session: IngestResult, made: tuple[str, ...]) -> None:
     kept = record.read(root)
     states = [trial["status"] for trial in rows.tables.get("quality", ())]
     verdicts = [gate.get("state") for gate in kept.get("gates", ())]
@@ -181,7 +164,7 @@ def _session(
     added = [e for name in made for e in models.read(root, name).effects if e not in had]
     rows.add(
         "sessions",
-        sample_rate_hz=_number(session.get("sample_rate_hz")),
+        sample_rate_hz=session.sample_rate_hz,
         trials=len(states),
         trials_repaired=states.count("repaired"),
         trials_set_aside=states.count("set_aside"),
@@ -194,23 +177,11 @@ def _session(
     )
 
 
-def _number(value: object) -> float | None:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return None
+def _finite(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
 
 
-def _numbers(entry: Mapping[str, Any], *names: str) -> dict[str, float | None]:
-    return {name: _number(entry.get(name)) for name in names}
-
-
-def _interval(name: str, entry: Mapping[str, Any]) -> dict[str, float | None]:
+def _interval(name: str, value: float, sd: float) -> dict[str, float]:
     """Return an estimate, its standard deviation and its 95 % interval."""
-    value, sd = _number(entry.get(name)), _number(entry.get("sd"))
-    half = None if value is None or sd is None else NORMAL_95 * sd
-    return {
-        name: value,
-        "sd": sd,
-        "lower": None if half is None else (value or 0.0) - half,
-        "upper": None if half is None else (value or 0.0) + half,
-    }
+    half = NORMAL_95 * sd
+    return {name: value, "sd": sd, "lower": value - half, "upper": value + half}

@@ -9,10 +9,17 @@ in the session's own model with that effect; back within the limits, the device 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from bampipe.lab.control_chart import FEWEST, Chart, chart
+from bampipe.results.lab import (
+    ChartPoint,
+    ControlChart,
+    MovedParameter,
+    SessionVerdict,
+    TrendsResult,
+)
 from bampipe.run.models import BASE
 
 Row = Mapping[str, Any]
@@ -71,7 +78,7 @@ class Judged:
         device: the device.
         recorded: when it was recorded, ISO 8601, or "".
         verdict: one of the module's five.
-        moved: parameter beyond its limits: {parameter, estimate, centre, percent, unit}.
+        moved: parameters beyond their limits.
         effects: those its diagnosis names; without one, those its models add to the base model.
         unexplained: axes on which something unknown is missing.
         diagnosed: whether a diagnosis was made.
@@ -84,7 +91,7 @@ class Judged:
     device: str
     recorded: str
     verdict: str = IN_CONTROL
-    moved: list[dict[str, Any]] = field(default_factory=list)
+    moved: tuple[MovedParameter, ...] = ()
     effects: tuple[str, ...] = ()
     unexplained: tuple[str, ...] = ()
     diagnosed: bool = False
@@ -147,7 +154,7 @@ def _judge(row: Row, tables: Mapping[str, Sequence[Row]], charts: Sequence[Serie
     judged.unexplained = tuple(r["axis"] for r in first if r["verdict"] == "unknown_effect")
     judged.diagnosed = bool(first)
     beyond = [c for c in charts if c.device == device and _is_beyond(c, session)]
-    judged.moved = [_moved(c, session) for c in beyond]
+    judged.moved = tuple(_moved(c, session) for c in beyond)
     _decide(judged, beyond, mine)
     return judged
 
@@ -156,16 +163,12 @@ def _is_beyond(c: Series, session: str) -> bool:
     return session in c.sessions and bool(c.chart.beyond[c.sessions.index(session)])
 
 
-def _moved(c: Series, session: str) -> dict[str, Any]:
+def _moved(c: Series, session: str) -> MovedParameter:
     value, centre = c.estimates[c.sessions.index(session)], c.chart.centre
     percent = 100.0 * (value - centre) / abs(centre) if centre else None
-    return {
-        "parameter": c.name,
-        "estimate": value,
-        "centre": centre,
-        "percent": percent,
-        "unit": c.unit,
-    }
+    return MovedParameter(
+        parameter=c.name, estimate=value, centre=centre, percent=percent, unit=c.unit
+    )
 
 
 def _decide(judged: Judged, beyond: Sequence[Series], mine: Mapping[str, Sequence[Row]]) -> None:
@@ -239,48 +242,44 @@ def _with_the_effect(
     return back, still
 
 
-def _in_words(entry: Mapping[str, Any]) -> str:
-    percent = entry["percent"]
-    if percent is None:
-        return f"{entry['parameter']} {entry['estimate']:.4g} {entry['unit']}"
-    return f"{entry['parameter']} {percent:+.2g} %".replace("-", "−")
+def _in_words(moved: MovedParameter) -> str:
+    if moved.percent is None:
+        return f"{moved.parameter} {moved.estimate:.4g} {moved.unit}"
+    return f"{moved.parameter} {moved.percent:+.2g} %".replace("-", "−")
 
 
-def content(charts: Sequence[Series], judged: Sequence[Judged]) -> dict[str, object]:
-    """Return charts and verdicts as a table that JSON can hold."""
-    return {
-        "schema": "bampipe.trends/1",
-        "fewest_sessions": FEWEST,
-        "series": [_series_content(c) for c in charts],
-        "sessions": [
-            {**vars(j), "worst": None if j.worst is None else list(j.worst)} for j in judged
-        ],
-    }
+def content(charts: Sequence[Series], judged: Sequence[Judged]) -> TrendsResult:
+    """Return charts and verdicts as ``trends.json`` holds them."""
+    return TrendsResult(
+        schema="bampipe.trends/1",
+        fewest_sessions=FEWEST,
+        series=tuple(_chart(c) for c in charts),
+        sessions=tuple(SessionVerdict(**vars(j)) for j in judged),
+    )
 
 
-def _series_content(c: Series) -> dict[str, object]:
+def _chart(c: Series) -> ControlChart:
     known = len(c.sessions) >= FEWEST
     k = c.chart
-    run = None if k.run is None else [c.sessions[k.run[0]], c.sessions[k.run[1]]]
-    return {
-        "device": c.device,
-        "name": c.name,
-        "unit": c.unit,
-        "centre": k.centre,
-        "between_sd": k.between_sd if known else None,
-        "slope_per_session": k.slope if known else None,
-        "slope_p": k.slope_p if known else None,
-        "drifts": k.drifts,
-        "run": run,
-        "points": [
-            {
-                "session": session,
-                "estimate": c.estimates[i],
-                "sd": c.sds[i],
-                "lower": float(k.lower[i]) if known else None,
-                "upper": float(k.upper[i]) if known else None,
-                "beyond": bool(k.beyond[i]),
-            }
+    return ControlChart(
+        device=c.device,
+        name=c.name,
+        unit=c.unit,
+        centre=k.centre,
+        between_sd=k.between_sd if known else None,
+        slope_per_session=k.slope if known else None,
+        slope_p=k.slope_p if known else None,
+        drifts=k.drifts,
+        run=None if k.run is None else (c.sessions[k.run[0]], c.sessions[k.run[1]]),
+        points=tuple(
+            ChartPoint(
+                session=session,
+                estimate=c.estimates[i],
+                sd=c.sds[i],
+                lower=k.lower[i] if known else None,
+                upper=k.upper[i] if known else None,
+                beyond=k.beyond[i],
+            )
             for i, session in enumerate(c.sessions)
-        ],
-    }
+        ),
+    )

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from datetime import datetime
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 
-from bampipe.files import read_json_table
 from bampipe.report import page, style, typeset, wording
 from bampipe.report.build import Report
 from bampipe.report.document import Block, Callout, Document, Figure, Section, Table, Text
 from bampipe.report.verdicts import NEAR_FLOOR
+from bampipe.results.lab import ControlChart, SessionVerdict, TrendsResult
 
 _COLUMNS = 3
 _MOST_PANELS = 12
@@ -27,7 +26,7 @@ def build(folder: Path) -> Report:
     Args:
         folder: where ``trends.json`` and the tables are.
     """
-    trends = read_json_table(folder / "trends.json")
+    trends = TrendsResult.read(folder / TrendsResult.FILE)
     with style.look():
         sections = [
             section
@@ -46,50 +45,50 @@ def build(folder: Path) -> Report:
         for block in section.blocks
         if isinstance(block, Figure)
     }
-    moments = [datetime.fromisoformat(one["recorded"]) for one in _dated(trends)]
+    moments = [datetime.fromisoformat(one.recorded) for one in _dated(trends)]
     stamp = max((int(moment.timestamp()) for moment in moments), default=0)
     printed = typeset.pdf(document, max(0, stamp))
     titles = tuple(section.title for section in sections)
     return Report(printed, page.page(document), figures, titles)
 
 
-def _dated(trends: dict[str, Any]) -> list[dict[str, Any]]:
-    return [one for one in trends["sessions"] if one["recorded"]]
+def _dated(trends: TrendsResult) -> list[SessionVerdict]:
+    return [one for one in trends.sessions if one.recorded]
 
 
-def _subtitle(trends: dict[str, Any]) -> str:
-    devices = sorted({one["device"] for one in trends["sessions"]})
-    parts = [wording.count(len(trends["sessions"]), "session")]
+def _subtitle(trends: TrendsResult) -> str:
+    devices = sorted({one.device for one in trends.sessions})
+    parts = [wording.count(len(trends.sessions), "session")]
     parts.append(f"device{'s' if len(devices) > 1 else ''} {wording.listing(devices)}")
-    days = sorted({one["recorded"][:10] for one in _dated(trends)})
+    days = sorted({one.recorded[:10] for one in _dated(trends)})
     if days:
         parts.append(days[0] if len(days) == 1 else f"recorded {days[0]} to {days[-1]}")
     return ", ".join(parts)
 
 
-def _summary(trends: dict[str, Any]) -> Section:
-    sessions = trends["sessions"]
-    odd = [one for one in sessions if one["verdict"] != "in control"]
+def _summary(trends: TrendsResult) -> Section:
+    sessions = trends.sessions
+    odd = [one for one in sessions if one.verdict != "in control"]
     blocks: list[Block] = []
     if not odd:
         blocks.append(Callout("good", "No session stands out", _limits_in_words(trends)))
     for one in odd[:6]:
-        remedy = f" To go on: `{one['remedy']}`." if one["remedy"] else ""
-        title = f"{one['session']}: {one['verdict']}"
-        text = _sentence(one["sentence"]) + remedy
+        remedy = f" To go on: `{one.remedy}`." if one.remedy else ""
+        title = f"{one.session}: {one.verdict}"
+        text = _sentence(one.sentence) + remedy
         blocks.append(
-            Callout("unknown" if one["verdict"] == "not diagnosed" else "attention", title, text)
+            Callout("unknown" if one.verdict == "not diagnosed" else "attention", title, text)
         )
     if len(odd) > 6:
         more = wording.count(len(odd) - 6, "session")
         blocks.append(Text(f"Besides these, {more} in the table below."))
     rows = [
         (
-            one["session"],
-            one["recorded"][:16].replace("T", " ") or "–",
-            f"{wording.significant(one['worst'][0])} ({one['worst'][1]})" if one["worst"] else "–",
-            ", ".join(entry["parameter"] for entry in one["moved"]) or "–",
-            one["verdict"],
+            one.session,
+            one.recorded[:16].replace("T", " ") or "–",
+            f"{wording.significant(one.worst[0])} ({one.worst[1]})" if one.worst else "–",
+            ", ".join(moved.parameter for moved in one.moved) or "–",
+            one.verdict,
         )
         for one in sessions
     ]
@@ -118,21 +117,21 @@ def _sentence(text: str) -> str:
     return f"{text}." if "." in first else f"{text[:1].upper()}{text[1:]}."
 
 
-def _limits_in_words(trends: dict[str, Any]) -> str:
-    few = [c for c in trends["series"] if len(c["points"]) < trends["fewest_sessions"]]
-    if few and len(few) == len(trends["series"]):
+def _limits_in_words(trends: TrendsResult) -> str:
+    few = [c for c in trends.series if len(c.points) < trends.fewest_sessions]
+    if few and len(few) == len(trends.series):
         return (
-            f"Control limits need {trends['fewest_sessions']} sessions of a device; until then "
+            f"Control limits need {trends.fewest_sessions} sessions of a device; until then "
             "only the diagnoses of single sessions count."
         )
     return "Every parameter lies within its control limits, and no diagnosis names an effect."
 
 
-def _charts(trends: dict[str, Any]) -> list[Section]:
+def _charts(trends: TrendsResult) -> list[Section]:
     sections = []
-    devices = sorted({c["device"] for c in trends["series"]})
+    devices = sorted({c.device for c in trends.series})
     for place, device in enumerate(devices, start=1):
-        charts = [c for c in trends["series"] if c["device"] == device]
+        charts = [c for c in trends.series if c.device == device]
         title = "Parameters over time" + (f", {device}" if len(devices) > 1 else "")
         blocks: list[Block] = [
             Text(
@@ -151,7 +150,7 @@ def _charts(trends: dict[str, Any]) -> list[Section]:
     return sections
 
 
-def _picture(charts: list[dict[str, Any]], name: str) -> Figure:
+def _picture(charts: list[ControlChart], name: str) -> Figure:
     rows = -(-len(charts) // _COLUMNS)
     figure, panels = style.panels(rows, _COLUMNS, 1.75 * rows + 0.25)
     for panel, chart in zip(panels.ravel(), charts, strict=False):
@@ -162,24 +161,24 @@ def _picture(charts: list[dict[str, Any]], name: str) -> Figure:
     return Figure(name, caption, style.svg(figure))
 
 
-def _panel(panel: Axes, chart: dict[str, Any]) -> None:
-    points = chart["points"]
+def _panel(panel: Axes, chart: ControlChart) -> None:
+    points = chart.points
     x = np.arange(len(points))
-    y = np.array([point["estimate"] for point in points])
-    error = 2.0 * np.array([point["sd"] for point in points])
-    scale, unit = wording.scale(list(np.abs(y)), chart["unit"])
+    y = np.array([point.estimate for point in points])
+    error = 2.0 * np.array([point.sd for point in points])
+    scale, unit = wording.scale(list(np.abs(y)), chart.unit)
     y, error = y * scale, error * scale
-    panel.axhline(chart["centre"] * scale, color=style.FAINT, lw=0.9)
+    panel.axhline(chart.centre * scale, color=style.FAINT, lw=0.9)
     shown = [y - error, y + error]
-    if points[0]["lower"] is not None:
-        low = scale * np.array([point["lower"] for point in points])
-        high = scale * np.array([point["upper"] for point in points])
+    if points[0].lower is not None:
+        low = scale * np.array([point.lower for point in points], dtype=float)
+        high = scale * np.array([point.upper for point in points], dtype=float)
         edges = np.concatenate([[-0.5], np.repeat(x[1:] - 0.5, 2), [len(x) - 0.5]])
         panel.fill_between(
             edges, np.repeat(low, 2), np.repeat(high, 2), color=style.SKY, alpha=0.22, lw=0
         )
         shown += [low, high]
-    beyond = np.array([point["beyond"] for point in points])
+    beyond = np.array([point.beyond for point in points])
     for chosen, colour, mark in ((~beyond, style.BLUE, "o"), (beyond, style.VERMILLION, "D")):
         panel.errorbar(
             x[chosen], y[chosen], error[chosen], fmt=mark, ms=3.2, color=colour, elinewidth=0.8
@@ -189,14 +188,14 @@ def _panel(panel: Axes, chart: dict[str, Any]) -> None:
         above = y[place] > middle
         left = place > len(x) / 2
         panel.annotate(
-            points[place]["session"], (x[place], y[place]), (-5 if left else 5, 0),
+            points[place].session, (x[place], y[place]), (-5 if left else 5, 0),
             textcoords="offset points", fontsize=7, color=style.VERMILLION,
             ha="right" if left else "left", va="center_baseline" if above else "center",
         )  # fmt: skip
     style.limits(panel, shown)
     panel.set_xlim(-0.5, len(x) - 0.5)
-    _name_sessions(panel, [point["session"] for point in points])
-    panel.set_title(wording.parameter(chart["name"]))
+    _name_sessions(panel, [point.session for point in points])
+    panel.set_title(wording.parameter(chart.name))
     panel.set_ylabel(unit)
 
 
@@ -210,28 +209,28 @@ def _name_sessions(panel: Axes, names: list[str]) -> None:
     panel.tick_params(axis="x", labelsize=6)
 
 
-def _chart_table(charts: list[dict[str, Any]]) -> Table:
+def _chart_table(charts: list[ControlChart]) -> Table:
     rows = []
     for chart in charts:
-        sds = [point["sd"] for point in chart["points"]]
-        within, centre = float(np.median(sds)), chart["centre"]
-        slope, chance = chart["slope_per_session"], chart["slope_p"]
+        sds = [point.sd for point in chart.points]
+        within, centre = float(np.median(sds)), chart.centre
+        slope, chance = chart.slope_per_session, chart.slope_p
         trend = "–"
         if slope is not None and centre:
             trend = f"{wording.significant(100.0 * slope / abs(centre), 2)} %"
             trend += f" (p {wording.probability(chance)})"
-        outside = [point["session"] for point in chart["points"] if point["beyond"]]
+        outside = [point.session for point in chart.points if point.beyond]
         signs = [f"beyond: {', '.join(outside)}"] if outside else []
-        if chart["drifts"]:
+        if chart.drifts:
             signs.append("trend")
-        if chart["run"]:
-            signs.append(f"shift from {chart['run'][0]} to {chart['run'][1]}")
+        if chart.run:
+            signs.append(f"shift from {chart.run[0]} to {chart.run[1]}")
         rows.append(
             (
-                wording.parameter(chart["name"]),
-                wording.with_sd(centre, chart["between_sd"] or within),
-                wording.unit(chart["unit"]),
-                wording.significant(chart["between_sd"], 2),
+                wording.parameter(chart.name),
+                wording.with_sd(centre, chart.between_sd or within),
+                wording.unit(chart.unit),
+                wording.significant(chart.between_sd, 2),
                 wording.significant(within, 2),
                 trend,
                 "; ".join(signs) or "–",
@@ -249,12 +248,12 @@ def _chart_table(charts: list[dict[str, Any]]) -> Table:
     )
 
 
-def _errors(folder: Path, trends: dict[str, Any]) -> Section | None:
+def _errors(folder: Path, trends: TrendsResult) -> Section | None:
     frame = pd.read_parquet(folder / "errors")
     frame = frame[frame["error_over_floor"].notna()]
     if frame.empty:
         return None
-    order = [one["session"] for one in trends["sessions"]]
+    order = [one.session for one in trends.sessions]
     sessions = [name for name in order if name in set(frame["session_id"])]
     axes = list(dict.fromkeys(frame["axis"]))
     columns = min(_COLUMNS, len(axes))

@@ -18,6 +18,7 @@ from bampipe.errors import InputError
 from bampipe.files import write_json, write_text
 from bampipe.physics.device import Device
 from bampipe.progress import Progress, silent
+from bampipe.results.truth import TruthResult
 from bampipe.simulator.hand import locked_trial, moving_trial
 from bampipe.simulator.logger import read_out, session_toml
 from bampipe.simulator.plant import Config, draw_plant
@@ -71,17 +72,15 @@ def simulate_session(out: Path, config: Config, progress: Progress = silent) -> 
         progress((number + 1) / len(trials), trial["file"])
     write_text(out / "session.toml", session_toml(out.name, plant.device, config, trials))
     truth = out.with_name(out.name + ".truth.json")
-    write_json(
-        truth,
-        {
-            "schema": "bampipe.truth/1",
-            "device": plant.device.name,
-            "effects": strengths,
-            "configuration": asdict(config),
-            "parameters": dict(plant.values),
-            "stiffness": dict(plant.stiffness) if config.locked_trials else {},
-        },
+    found = TruthResult(
+        schema="bampipe.truth/1",
+        device=plant.device.name,
+        effects=strengths,
+        configuration=asdict(config),
+        parameters=dict(plant.values),
+        stiffness=dict(plant.stiffness) if config.locked_trials else {},
     )
+    write_json(truth, found.model_dump(mode="json"))
     return {
         "session": str(out),
         "truth": str(truth),

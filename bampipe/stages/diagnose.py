@@ -21,9 +21,9 @@ from bampipe.discover.settings import Settings
 from bampipe.discover.shape import residual_map, variables, worst_windows
 from bampipe.errors import InputError
 from bampipe.estimate.low_pass import Band
-from bampipe.files import write_json
 from bampipe.physics import compile_model
 from bampipe.progress import Progress
+from bampipe.results.diagnose import DiagnoseResult
 from bampipe.trials.recordings import read_session, recipe_of
 
 NAME = "diagnose"
@@ -108,8 +108,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     )
     found = diagnose(session, recipe, start, settings, progress)
     result = _result(found, session, recipe, config.model)
-    write_json(out / f"models/{config.model}/diagnose.json", result)
-    return _summary(result)
+    return _summary(DiagnoseResult.model_validate(result).write(out))
 
 
 def _summary(result: dict[str, Any]) -> dict[str, object]:

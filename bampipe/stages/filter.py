@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,9 +20,10 @@ from bampipe.estimate.differentiation import (
     UniformGrid,
     uniform_grid,
 )
-from bampipe.files import write_json
 from bampipe.physics.device import LAST_ORDER, derivative
 from bampipe.progress import Progress
+from bampipe.results.filter import FilterResult
+from bampipe.results.ingest import EncoderChannel, IngestResult
 
 NAME = "filter"
 SUMMARY = "Velocity and acceleration from the encoders, with error bands"
@@ -96,9 +97,8 @@ class _Choice:
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
     """Differentiate every free and viscous trial."""
     _check(config)
-    session = run.read_json("ingest/session.json")
-    axes: dict[str, dict[str, object]] = session["axes"]
-    rate = float(session["sample_rate_hz"])
+    session = run.read(IngestResult)
+    axes, rate = session.axes, session.sample_rate_hz
     samples = run.require("ingest/samples.parquet", "ingest")
     trials = read_parquet(run.require("ingest/trials.parquet", "ingest"))
     wanted = trials[trials["kind"].isin(MOVING) & (trials["status"] != "set_aside")]
@@ -114,8 +114,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
             remedy="look at ingest/trials.parquet for the reasons",
         )
     choices = {
-        axis: _choose(records[axis], rate, float(str(axes[axis]["resolution"] or 0.0)), config)
-        for axis in axes
+        axis: _choose(records[axis], rate, axes[axis].resolution or 0.0, config) for axis in axes
     }
     levels: dict[str, list[tuple[float, float, float]]] = {axis: [] for axis in axes}
     interpolated: dict[str, float] = {}
@@ -132,8 +131,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
             for axis in axes:
                 levels[axis].append(bands[axis])
     content = _report(config, axes, choices, levels, interpolated, skipped, rate)
-    write_json(out / "filter/filter.json", content)
-    return content
+    return FilterResult.model_validate(content).write(out)
 
 
 def _check(config: Config) -> None:
@@ -306,7 +304,7 @@ def _forces(
 
 def _report(
     config: Config,
-    axes: dict[str, dict[str, object]],
+    axes: Mapping[str, EncoderChannel],
     choices: dict[str, _Choice],
     levels: dict[str, list[tuple[float, float, float]]],
     interpolated: dict[str, float],
@@ -318,7 +316,7 @@ def _report(
     entries: dict[str, object] = {}
     for axis, choice in choices.items():
         typical = np.median(np.array(levels[axis]), axis=0)
-        unit = str(axes[axis]["unit"])
+        unit = axes[axis].unit
         entries[axis] = choice.report | {
             "unit": unit,
             "position_sd": float(typical[0]),

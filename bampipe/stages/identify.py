@@ -16,7 +16,6 @@ from bampipe.discover.start import search_start
 from bampipe.errors import InputError
 from bampipe.estimate.least_squares import fit
 from bampipe.estimate.low_pass import Band
-from bampipe.files import write_json
 from bampipe.identification.estimates import content
 from bampipe.identification.filter_choice import FilterChoice, check_among, check_choice
 from bampipe.identification.filter_estimate import estimate_by_filter
@@ -32,6 +31,7 @@ from bampipe.identification.squares_estimate import (
 )
 from bampipe.physics import System, compile_model
 from bampipe.progress import Progress
+from bampipe.results.identify import IdentifyResult
 from bampipe.trials.motions import problem_of, read_motions
 from bampipe.trials.recordings import read_session, recipe_of
 
@@ -154,10 +154,9 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     engine = config.engine if method == "ukf" else "compiled"
     found = content(system, estimate, can_say, motions, config.model, method, engine)
     found["notes"] = [*notes, *can_say.sentences]
-    write_json(out / f"models/{config.model}/identify.json", found)
     write_parquet(out / f"models/{config.model}/states.parquet", estimate.states)
     write_parquet(out / f"models/{config.model}/trace.parquet", estimate.trace)
-    return found
+    return IdentifyResult.model_validate(found).write(out)
 
 
 def _start(run: RunFolder, system: System, rate: float, config: Config) -> Array:

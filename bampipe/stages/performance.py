@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,9 +13,18 @@ from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import read_parquet
 from bampipe.declarations.model_file import identified, load_model, model_inputs
 from bampipe.errors import InputError
-from bampipe.files import write_json
 from bampipe.physics import System, compile_model
 from bampipe.progress import Progress
+from bampipe.results.ingest import IngestResult
+from bampipe.results.performance import (
+    DeviceConstant,
+    Handle,
+    PerformanceResult,
+    Quantity,
+    Range,
+    Resolution,
+)
+from bampipe.results.stiffness import StiffnessResult
 
 NAME = "performance"
 SUMMARY = "Workspace, stiffness, friction, inertia and force at the handle"
@@ -67,39 +74,33 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     device = system.model.device
     p = identified(run, config.model, system)
     reach = _reach(run, system)
-    content: dict[str, object] = {
-        "model": config.model,
-        "constants": {
-            name: {
-                "value": item.value,
-                "unit": item.unit,
-                "source": item.source,
-                "description": item.description,
-            }
-            for name, item in device.constants.items()
-        },
-        "range": {
-            axis: {"lower": float(low), "upper": float(high), "unit": unit}
-            for axis, unit, (low, high) in zip(
-                system.coordinates, system.coordinate_units, reach, strict=True
-            )
-        },
-        "resolution": {
-            axis: {"value": entry.get("resolution"), "unit": entry.get("unit", "")}
-            for axis, entry in run.read_json("ingest/session.json")["axes"].items()
-        },
-        "largest_force": _largest_force(run, system),
-    }
     # Only a handle that can be pushed as many ways as there are axes has a stiffness of its own;
     # where a motor drives the device, there is none.
     ways = len(device.forces) == len(system.coordinates)
     at_handle = device.force_unit == "N" and ways and not device.drive
-    if at_handle:
-        content["handle"] = _handle(run, system, p, reach, config.points)
-    told = content.get("handle")
-    content["headline"] = _headline(told) if isinstance(told, dict) else "No handle on this device."
-    write_json(out / f"models/{config.model}/performance.json", content)
-    return content
+    handle = _handle(run, system, p, reach, config.points) if at_handle else None
+    return PerformanceResult(
+        model=config.model,
+        headline=_headline(handle) if handle else "No handle on this device.",
+        constants={
+            name: DeviceConstant(
+                value=item.value, unit=item.unit, source=item.source, description=item.description
+            )
+            for name, item in device.constants.items()
+        },
+        range={
+            axis: Range(lower=low, upper=high, unit=unit)
+            for axis, unit, (low, high) in zip(
+                system.coordinates, system.coordinate_units, reach, strict=True
+            )
+        },
+        resolution={
+            axis: Resolution(value=entry.resolution, unit=entry.unit)
+            for axis, entry in run.read(IngestResult).axes.items()
+        },
+        largest_force=_largest_force(run, system),
+        handle=handle,
+    ).write(out)
 
 
 def _reach(run: RunFolder, system: System) -> Array:
@@ -110,7 +111,7 @@ def _reach(run: RunFolder, system: System) -> Array:
     return np.stack([np.nanmin(values, axis=0), np.nanmax(values, axis=0)], axis=1)
 
 
-def _largest_force(run: RunFolder, system: System) -> dict[str, object] | None:
+def _largest_force(run: RunFolder, system: System) -> Quantity | None:
     """Return the largest force that the sensor read, its noise left out by the 99.9 % quantile."""
     device = system.model.device
     frame = read_parquet(run.require("ingest/samples.parquet", "ingest"), columns=[*device.forces])
@@ -118,7 +119,7 @@ def _largest_force(run: RunFolder, system: System) -> dict[str, object] | None:
     size = size[np.isfinite(size)]
     if not size.size:
         return None
-    return {"value": float(np.quantile(size, 0.999)), "unit": device.force_unit}
+    return Quantity(value=np.quantile(size, 0.999), unit=device.force_unit)
 
 
 def _handle(
@@ -127,7 +128,7 @@ def _handle(
     p: Array,
     reach: Array,
     points: int,
-) -> dict[str, object]:
+) -> Handle:
     """Return ranges over poses and directions of what acts at the handle.
 
     With v = B^T q' the handle's velocity: its volume element is |det B| dq, joint stiffness K is
@@ -148,26 +149,27 @@ def _handle(
         )
     back = np.linalg.inv(gain[regular])
     swept = "m" if len(axes) == 1 else f"m{len(axes)}"
-    entry: dict[str, object] = {
-        "directions": list(device.components),
-        "workspace": {"value": _volume(system, reach, p, points), "unit": swept},
-    }
+    within = None
     if all(limit is not None for limit in limits):
-        whole = np.array(limits, dtype=float)
-        entry["workspace_limits"] = {"value": _volume(system, whole, p, points), "unit": swept}
+        volume = _volume(system, np.array(limits, dtype=float), p, points)
+        within = Quantity(value=volume, unit=swept)
     known = {item.name: value for item, value in zip(system.parameters, p, strict=True)}
     coulomb = np.array([known.get(f"coulomb.{axis}", 0.0) for axis in axes])
-    entry["friction"] = _range(np.abs(back) @ coulomb, "N")
     compliance = np.linalg.inv(system.mass_matrix(grid[regular], p))
     mobility = np.einsum("tij,tik,tkl->tjl", gain[regular], compliance, gain[regular])
-    entry["inertia"] = _range(1.0 / np.diagonal(mobility, axis1=1, axis2=2), "kg")
-    if run.exists("stiffness/stiffness.json"):
-        found = run.read_json("stiffness/stiffness.json").get("axes", {})
-        if all(axis in found for axis in axes):
-            joint = np.diag([found[axis]["stiffness"] for axis in axes])
-            felt = np.einsum("tfi,ij,tfj->tf", back, joint, back)
-            entry["stiffness"] = _range(felt, "N/m")
-    return entry
+    locked = run.read(StiffnessResult).axes if run.exists(StiffnessResult.FILE) else {}
+    felt = None
+    if all(axis in locked for axis in axes):
+        joint = np.diag([locked[axis].stiffness for axis in axes])
+        felt = _range(np.einsum("tfi,ij,tfj->tf", back, joint, back), "N/m")
+    return Handle(
+        directions=device.components,
+        workspace=Quantity(value=_volume(system, reach, p, points), unit=swept),
+        workspace_limits=within,
+        friction=_range(np.abs(back) @ coulomb, "N"),
+        inertia=_range(1.0 / np.diagonal(mobility, axis1=1, axis2=2), "kg"),
+        stiffness=felt,
+    )
 
 
 def _grid(reach: Array, points: int) -> Array:
@@ -184,15 +186,15 @@ def _volume(system: System, reach: Array, p: Array, points: int) -> float:
     return float(np.abs(np.linalg.det(gain)).sum() * np.prod(width))
 
 
-def _range(values: Array, unit: str) -> dict[str, object]:
-    return {"lower": float(values.min()), "upper": float(values.max()), "unit": unit}
+def _range(values: Array, unit: str) -> Range:
+    return Range(lower=values.min(), upper=values.max(), unit=unit)
 
 
-def _headline(handle: Mapping[str, Any]) -> str:
-    swept = handle["workspace"]
-    parts = [f"workspace moved through {swept['value']:.2g} {swept['unit']}"]
-    for name, unit in (("stiffness", "N/m"), ("friction", "N"), ("inertia", "kg")):
-        if name in handle:
-            entry = handle[name]
-            parts.append(f"{name} {entry['lower']:.3g} to {entry['upper']:.3g} {unit}")
+def _headline(handle: Handle) -> str:
+    swept = handle.workspace
+    parts = [f"workspace moved through {swept.value:.2g} {swept.unit}"]
+    for name in ("stiffness", "friction", "inertia"):
+        found = getattr(handle, name)
+        if found is not None:
+            parts.append(f"{name} {found.lower:.3g} to {found.upper:.3g} {found.unit}")
     return "At the handle: " + ", ".join(parts)

@@ -18,10 +18,10 @@ from bampipe.errors import InputError
 from bampipe.estimate.least_squares import Problem, fit
 from bampipe.estimate.low_pass import Band
 from bampipe.estimate.standstill import moving
-from bampipe.files import write_json
 from bampipe.identification.free_run import free_runs
 from bampipe.physics import System, compile_model
 from bampipe.progress import Progress
+from bampipe.results.validate import ValidateResult
 from bampipe.trials.motions import (
     Motion,
     free_trials,
@@ -144,9 +144,8 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     if config.free_run:
         progress(0.8, "free runs")
         content["free_run"] = free_runs(run, system, motions, held_out, judged)
-    write_json(out / f"models/{config.model}/validate.json", content)
     write_parquet(out / f"models/{config.model}/residuals.parquet", _table(system, compared))
-    return content
+    return ValidateResult.model_validate(content).write(out)
 
 
 def _compare(

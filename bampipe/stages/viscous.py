@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -18,7 +17,6 @@ from bampipe.declarations.model_file import load_model, model_inputs
 from bampipe.errors import InputError
 from bampipe.estimate.filter_uncertainty import sandwich_covariance
 from bampipe.estimate.unscented import Trial
-from bampipe.files import write_json
 from bampipe.identification.filter_choice import FilterChoice, check_choice
 from bampipe.identification.filter_run import (
     Attempt,
@@ -34,6 +32,8 @@ from bampipe.physics import Model, System, compile_model
 from bampipe.physics.viscous_field import NAME as FIELD
 from bampipe.physics.viscous_field import viscous_field
 from bampipe.progress import Progress
+from bampipe.results.identify import IdentifyResult
+from bampipe.results.viscous import Damping, ViscousResult
 from bampipe.trials.motions import Motion, read_motion
 
 NAME = "viscous"
@@ -95,17 +95,11 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     trials = _viscous_trials(run)
     target = f"models/{config.model}/viscous"
     if trials.empty:
-        content: dict[str, object] = {
-            "model": config.model,
-            "directions": {},
-            "trials": [],
-            "headline": "No trials in a viscous field in this session.",
-        }
-        write_json(out / f"{target}.json", content)
         write_parquet(out / f"{target}.parquet", _no_rows())
-        return content
-    run.require(f"models/{config.model}/identify.json", "identify")
-    identified = run.read_json(f"models/{config.model}/identify.json")
+        headline = "No trials in a viscous field in this session."
+        empty = ViscousResult(model=config.model, directions={}, trials=(), headline=headline)
+        return empty.write(out)
+    identified = run.read(IdentifyResult, config.model)
     bare = load_model(run, config.model)
     own = [item.effect for item in bare.effects]
     names = [item.name for item in bare.effects]
@@ -113,10 +107,9 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     progress(0.1, "reading the trials")
     motions = [_unbraked(read_motion(run, str(t), system), system) for t in trials["trial_id"]]
     commanded = trials["viscous_n_s_per_m"].to_numpy(dtype=float)
-    content, frame = _estimated(run, system, motions, commanded, identified, config, progress)
-    write_json(out / f"{target}.json", content)
+    result, frame = _estimated(run, system, motions, commanded, identified, config, progress)
     write_parquet(out / f"{target}.parquet", frame)
-    return content
+    return result.write(out)
 
 
 def _viscous_trials(run: RunFolder) -> pd.DataFrame:
@@ -151,24 +144,23 @@ def _estimated(
     system: System,
     motions: Sequence[Motion],
     commanded: Array,
-    identified: Mapping[str, Any],
+    identified: IdentifyResult,
     config: Config,
     progress: Progress,
-) -> tuple[dict[str, object], pd.DataFrame]:
+) -> tuple[ViscousResult, pd.DataFrame]:
     """Return what viscous.json says, and how the estimates converged."""
     session = run.read_json("ingest/session.json")
-    known = identified["parameters"]
+    known = identified.parameters
     start = np.array(
         [
-            known[item.name]["estimate"] if item.name in known else item.prior
+            known[item.name].estimate if item.name in known else item.prior
             for item in system.parameters
         ]
     )
     noise = sensor_noise(session, system, motions, start, config)
     settings = untuned(system, noise, config)
-    levels = identified.get("noise")
-    if levels is not None and config.force_noise == 0.0:
-        found_sd = [levels["process_sd"][name] for name in system.noise]
+    if identified.noise is not None and config.force_noise == 0.0:
+        found_sd = [identified.noise.process_sd[name] for name in system.noise]
         settings = replace(settings, noise_sd=np.array(found_sd))
     stride = stride_of(motions)
     settings = replace(settings, stride=stride)
@@ -179,14 +171,14 @@ def _estimated(
         u[:, _brakes(system)] = 0.0
         readings.append(Trial(trial.t, u, trial.y, trial.x, trial.x_sd))
     free = [item for item in system.parameters if not item.fixed]
-    timing = float(identified["input_timing"]["estimate"])
+    timing = identified.input_timing.estimate
     model = filter_model(system, readings, start, timing=False)
     model = replace(model, parameters=np.append(start, timing))
     command = float(np.nanmean(commanded)) if np.isfinite(commanded).any() else None
     value = np.array(
-        [known[item.name]["estimate"] if item.name in known else (command or 0.0) for item in free]
+        [known[item.name].estimate if item.name in known else (command or 0.0) for item in free]
     )
-    sd = np.array([known[item.name]["sd"] if item.name in known else item.sd for item in free])
+    sd = np.array([known[item.name].sd if item.name in known else item.sd for item in free])
     sd = np.maximum(sd, 1e-9 * np.maximum(np.abs(value), 1e-6))
 
     def told(done: int, place: int) -> None:
@@ -213,19 +205,19 @@ def _estimated(
     frame = trace(names, model, motions, found, config.trace_rows)
     kept = [c for c in frame if c in ("t_total", "trial_id") or str(c).startswith(f"{FIELD}.")]
     frame = frame[kept].rename(columns=lambda c: str(c).removeprefix(f"{FIELD}."))
-    content: dict[str, object] = {
-        "model": config.model,
-        "trials": [motion.trial_id for motion in motions],
-        "directions": directions,
-        "blocks": blocks,
-        "process_noise_factor": float(attempts[found.restarts][2]),
-        "headline": "; ".join(
-            f"{name} {entry['estimate']:.4g} ± {entry['sd']:.2g} N.s/m"
-            + ("" if command is None else f" ({entry['verdict']})")
+    result = ViscousResult(
+        model=config.model,
+        trials=tuple(motion.trial_id for motion in motions),
+        directions=directions,
+        blocks=blocks,
+        process_noise_factor=attempts[found.restarts][2],
+        headline="; ".join(
+            f"{name} {entry.estimate:.4g} ± {entry.sd:.2g} N.s/m"
+            + ("" if command is None else f" ({entry.verdict})")
             for name, entry in directions.items()
         ),
-    }
-    return content, frame
+    )
+    return result, frame
 
 
 def _block_sd(
@@ -271,26 +263,25 @@ def _own_damping(system: System, motions: Sequence[Motion], p: Array) -> Array:
 
 def _direction(
     estimate: float, sd: float, own: float, command: float | None, blocks: int
-) -> dict[str, Any]:
+) -> Damping:
     """Return what is stored of one direction; the test is two-sided, Student's t over blocks."""
-    entry: dict[str, Any] = {
-        "estimate": float(estimate),
-        "sd": float(sd),
-        "own_friction": float(own),
-        "felt": float(estimate + own),
-        "unit": "N.s/m",
-    }
+    felt = estimate + own
+    found = {"estimate": estimate, "sd": sd, "own_friction": own, "felt": felt, "unit": "N.s/m"}
     if command is None:
-        return entry
-    degrees = max(blocks - 1, 1)
-    for name, value in (("", estimate), ("felt_", estimate + own)):
-        ratio = abs(value - command) / sd if sd > 0.0 else np.inf
-        entry[f"{name}p_value"] = float(2.0 * stats.t.sf(ratio, degrees))
-        entry[f"{name}differs"] = bool(entry[f"{name}p_value"] < _SIGNIFICANT)
-    entry["commanded"] = command
-    entry["verdict"] = (
-        f"differs from {command:.4g} commanded, p = {entry['p_value']:.2g}"
-        if entry["differs"]
-        else f"no difference from {command:.4g} commanded shown, p = {entry['p_value']:.2g}"
+        return Damping.model_validate(found)
+    ratios = [abs(value - command) / sd if sd > 0.0 else np.inf for value in (estimate, felt)]
+    p, felt_p = (float(2.0 * stats.t.sf(ratio, max(blocks - 1, 1))) for ratio in ratios)
+    what = (
+        f"differs from {command:.4g} commanded"
+        if p < _SIGNIFICANT
+        else f"no difference from {command:.4g} commanded shown"
     )
-    return entry
+    tested = {
+        "commanded": command,
+        "p_value": p,
+        "differs": p < _SIGNIFICANT,
+        "felt_p_value": felt_p,
+        "felt_differs": felt_p < _SIGNIFICANT,
+        "verdict": f"{what}, p = {p:.2g}",
+    }
+    return Damping.model_validate(found | tested)

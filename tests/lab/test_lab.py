@@ -53,7 +53,7 @@ def changed(number: int, parameters: dict[str, float], **more: object) -> Made:
 
 def verdicts(runs: Path) -> dict[str, dict[str, object]]:
     found = collect(runs, runs.parent / "lab", report=False)
-    return {one["session"]: one for one in found.content["sessions"]}
+    return {one["session"]: one for one in found.content.model_dump()["sessions"]}
 
 
 def test_a_parameter_that_moved_with_nothing_missing_is_the_device(tmp_path: Path) -> None:
