@@ -13,11 +13,12 @@ from pathlib import Path
 import install_toys
 import pytest
 from conftest import Toy
-from made_results import write_result
+from made_results import filled, write_result
 
 import bampipe
 from bampipe.cli import places, show
 from bampipe.errors import InputError
+from bampipe.results.compare import CompareResult
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.ingest import IngestResult
 
@@ -311,22 +312,23 @@ def test_summary_prints_tables(capsys: pytest.CaptureFixture[str]) -> None:
         {
             "headline": "two axes",
             "parameters": {"mass": {"unit": "kg", "estimate": 3.5, "sd": 0.1}},
-            "ladder": [
-                {
-                    "model": "base",
-                    "added": "",
-                    "held_out_rmse": {"yaw": 0.5},
-                    "noise_floor": {"yaw": 0.25},
-                    "unit": {"yaw": "N.m"},
-                }
-            ],
             "notes": ["mind the gap"],
         }
     )
     out = capsys.readouterr().out
     assert "estimate   sd  unit" in out
-    assert any(line.split() == ["base", "0.5", "2"] for line in out.splitlines())
     assert "note: mind the gap" in out
+
+
+def test_summary_prints_the_ladder(capsys: pytest.CaptureFixture[str]) -> None:
+    rung = {"held_out_rmse": {"yaw": 0.5}, "noise_floor": {"yaw": 0.25}, "unit": {"yaw": "N.m"}}
+    axis = {"mean_absolute": 0.1, "rmse": 0.2, "relative_error_percent": 3.0, "unit": "rad"}
+    free = {"free_run_mode": "open_loop", "free_run": {"yaw": axis}}
+    ladder = [{"model": "base", **rung}, {"model": "base+x", "added": "x", **rung, **free}]
+    show.summary(filled(CompareResult, {"ladder": ladder}))
+    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert ["base", "0.5", "2"] in lines and ["base+x", "x", "0.5", "2"] in lines
+    assert ["base+x", "open", "loop", "0.1", "0.2", "3"] in lines
 
 
 def test_closed_pipe_makes_no_noise() -> None:

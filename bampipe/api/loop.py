@@ -7,7 +7,7 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError
@@ -20,6 +20,7 @@ from bampipe.stages import base
 
 if TYPE_CHECKING:
     from bampipe.declarations.pipeline import Pipeline
+    from bampipe.results.diagnose import DiagnoseResult
 
 MOST_EFFECTS = 5
 
@@ -95,8 +96,10 @@ def current_model(root: Path) -> str:
     return max(known, key=lambda name: (name.count("+"), made[name]))
 
 
-def _diagnosis(root: Path, model: str) -> dict[str, Any]:
-    return RunFolder(root).read_json(f"models/{model}/diagnose.json")
+def _diagnosis(root: Path, model: str) -> DiagnoseResult:
+    from bampipe.results.diagnose import DiagnoseResult
+
+    return RunFolder(root).read(DiagnoseResult, model)
 
 
 def next_effect(root: Path, model: str) -> str:
@@ -106,8 +109,7 @@ def next_effect(root: Path, model: str) -> str:
         root: the run folder; the model must have been diagnosed.
         model: name of the model.
     """
-    selected = _diagnosis(root, model)["selected"]
-    return str(selected[0]) if selected else ""
+    return next(iter(_diagnosis(root, model).selected), "")
 
 
 def _own_file(text: str) -> tuple[Path, str] | None:
@@ -211,8 +213,8 @@ def follow(options: Options, model: str, tell: Callable[[str], None]) -> str:
     for _ in range(MOST_EFFECTS):
         options.run("diagnose", "diagnose", model)
         effect = next_effect(options.root, model)
-        for axis, entry in sorted(_diagnosis(options.root, model)["axes"].items()):
-            tell(f"{model}, {axis}: {str(entry['verdict']).replace('_', ' ')}")
+        for axis, entry in sorted(_diagnosis(options.root, model).axes.items()):
+            tell(f"{model}, {axis}: {entry.verdict.replace('_', ' ')}")
         if not effect:
             break
         tell(f"adding {effect}")
@@ -229,6 +231,8 @@ def follow(options: Options, model: str, tell: Callable[[str], None]) -> str:
 
 def _better(root: Path, parent: str, child: str) -> bool:
     """Whether ``child`` has a lower held-out error than ``parent`` on some axis."""
+    from bampipe.results.validate import ValidateResult
+
     run = RunFolder(root)
-    before, after = (run.read_json(f"models/{m}/validate.json")["axes"] for m in (parent, child))
-    return any(after[axis]["held_out_rmse"] < before[axis]["held_out_rmse"] for axis in before)
+    before, after = (run.read(ValidateResult, model).axes for model in (parent, child))
+    return any(after[axis].held_out_rmse < before[axis].held_out_rmse for axis in before)

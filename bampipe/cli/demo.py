@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -33,6 +32,10 @@ def demonstrate(runs: Path, force: bool, listen: Listener, tell: Callable[[str],
     Raises:
         InputError: the session does not ship with this installation.
     """
+    from bampipe.results.compare import CompareResult
+    from bampipe.results.truth import TruthResult
+    from bampipe.results.validate import ValidateResult
+
     samples = next((folder for folder in _SAMPLES if folder.is_dir()), None)
     if samples is None:
         raise InputError("this installation has no sample sessions", where=str(_SAMPLES[0]))
@@ -41,26 +44,24 @@ def demonstrate(runs: Path, force: bool, listen: Listener, tell: Callable[[str],
     chosen = pipeline.load()
     tell(f"1. {session}: an arm with something wrong that its model does not know.")
     run_session(Request(root, chosen, session=session, force=force, judged=models.BASE), listen)
-    validated = RunFolder(root).read_json(f"models/{models.BASE}/validate.json")
-    for axis, entry in sorted(validated["axes"].items()):
+    for axis, error in RunFolder(root).read(ValidateResult, models.BASE).axes.items():
         tell(
-            f"   {axis}: error on unseen trials {entry['held_out_rmse']:.3g} {entry['unit']}, "
-            f"sensor noise alone would leave {entry['noise_floor']:.3g} {entry['unit']}"
+            f"   {axis}: error on unseen trials {error.held_out_rmse:.3g} {error.unit}, "
+            f"sensor noise alone would leave {error.noise_floor:.3g} {error.unit}"
         )
     tell("2. Which effect is missing? The diagnosis, then the model extended, until nothing is.")
     options = Options(root, chosen.with_every_stage(), force, True, listen)
     last = follow(options, models.BASE, lambda line: tell(f"   {line}"))
     tell("3. The error on unseen trials, model by model.")
-    ladder = RunFolder(root).read_json("compare.json")["ladder"]
-    for rung in ladder:
+    for rung in RunFolder(root).read(CompareResult).ladder:
         errors = ", ".join(
-            f"{axis} {value:.3g} (floor {rung['noise_floor'][axis]:.3g})"
-            for axis, value in sorted(rung["held_out_rmse"].items())
+            f"{axis} {value:.3g} (floor {rung.noise_floor[axis]:.3g})"
+            for axis, value in sorted(rung.held_out_rmse.items())
         )
-        tell(f"   {rung['model']}: {errors}")
+        tell(f"   {rung.model}: {errors}")
     options.run("report", "report", "")
-    truth = json.loads((samples / "demo.truth.json").read_text(encoding="utf-8"))
-    hidden = ", ".join(truth["configuration"]["effects"])
+    truth = TruthResult.read(samples / "demo.truth.json")
+    hidden = ", ".join(truth.configuration["effects"])
     found = ", ".join(models.read(root, last).effects) or "nothing"
     tell(f"4. Found: {found}. What was hidden: {hidden}.")
     tell(f"   The story with its figures: {places.next_to(root, runs)}: {root}/report/report.pdf")

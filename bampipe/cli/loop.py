@@ -105,6 +105,7 @@ def extend(
     Example: bampipe extend 2026-10-03_s01 --auto
     """
     from bampipe.api import loop
+    from bampipe.results.compare import CompareResult
 
     batch.limit_threads(1)
     if auto and second is not None:
@@ -123,7 +124,7 @@ def extend(
             last = loop.follow(options, parent, lambda line: None if json else show.say(line))
         else:
             last = loop.extend(options, parent, second or "")
-    ladder = RunFolder(root).read_json("compare.json")
+    ladder = RunFolder(root).read(CompareResult).model_dump(mode="json")
     if json:
         show.as_json(ladder)
         return

@@ -6,11 +6,14 @@ import json
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from types import TracebackType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from bampipe.errors import printable
 from bampipe.run.events import Event
 from bampipe.run.request import Outcome
+
+if TYPE_CHECKING:
+    from bampipe.results.compare import Rung
 
 LARGEST_TABLE = 40
 MOST_TRIALS = 10
@@ -132,7 +135,10 @@ def summary(content: Mapping[str, object]) -> None:
             [column.replace("_", " ") for column in head],
             [[row.get(column) for column in head] for row in flat],
         )
-    _ladder(content.get("ladder"))
+    if "ladder" in content:
+        from bampipe.results.compare import CompareResult
+
+        _ladder(CompareResult.model_validate(content).ladder)
     for row in [*(_records(content.get("axes")) or []), *(_records(content.get("moved")) or [])]:
         if isinstance(row.get("sentence"), str):
             say(str(row["sentence"]))
@@ -157,51 +163,40 @@ def trials(content: Mapping[str, object]) -> None:
             say(f"{word}: {len(rows) - MOST_TRIALS} trials more; `bampipe ingest --json` lists all")
 
 
-def _ladder(value: object) -> None:
+def _ladder(rungs: Sequence[Rung]) -> None:
     """Print one row a model version: its held-out error over the noise floor, axis by axis."""
-    rows = _records(value)
-    if not rows:
-        return
-    axes = list(dict.fromkeys(axis for row in rows for axis in row["held_out_rmse"]))
+    axes = list(dict.fromkeys(axis for rung in rungs for axis in rung.held_out_rmse))
     body = []
-    for row in rows:
-        cells = [row["model"], row.get("added") or ""]
+    for rung in rungs:
+        cells = [rung.model, rung.added or ""]
         for axis in axes:
-            error, floor = row["held_out_rmse"].get(axis), row["noise_floor"].get(axis)
+            error, floor = rung.held_out_rmse.get(axis), rung.noise_floor.get(axis)
             cells += [number(error), number(error / floor) if error and floor else ""]
         body.append(cells)
     head = ["model", "added"]
     for axis in axes:
-        unit = (rows[0].get("unit") or {}).get(axis, "")
-        head += [f"{axis}, {unit}", "/ floor"]
+        head += [f"{axis}, {rungs[0].unit.get(axis, '')}", "/ floor"]
     say("")
     say("ladder: error on held-out trials, and over its noise floor")
     table(head, body)
-    _free_runs(rows)
+    if any(rung.free_run for rung in rungs):
+        _free_runs(rungs)
     say("")
 
 
-def _free_runs(rows: list[dict[str, Any]]) -> None:
+def _free_runs(rungs: Sequence[Rung]) -> None:
     """Print how far each model version, left to itself, ends up from the measured positions."""
-    if not any(row.get("free_run") for row in rows):
-        return
-    axes = list(dict.fromkeys(axis for row in rows for axis in row.get("free_run") or ()))
+    units = {axis: found.unit for rung in rungs for axis, found in rung.free_run.items()}
     body = []
-    for row in rows:
-        found = row.get("free_run") or {}
-        cells = [row["model"], str(row.get("free_run_mode") or "").replace("_", " ")]
-        for axis in axes:
-            entry = found.get(axis) or {}
-            cells += [
-                number(entry[key]) if key in entry else ""
-                for key in ("mean_absolute", "rmse", "relative_error_percent")
-            ]
+    for rung in rungs:
+        cells = [rung.model, (rung.free_run_mode or "").replace("_", " ")]
+        for axis in units:
+            found = rung.free_run.get(axis)
+            shown = (found.mean_absolute, found.rmse, found.relative_error_percent) if found else ()
+            cells += [number(value) for value in shown] or [""] * 3
         body.append(cells)
     head = ["model", "loop"]
-    for axis in axes:
-        unit = next(
-            (r["free_run"][axis]["unit"] for r in rows if axis in r.get("free_run", {})), ""
-        )
+    for axis, unit in units.items():
         head += [f"{axis}, mean abs., {unit}", f"RMS, {unit}", "%"]
     say("")
     say("free run: position error of the model left to itself over held-out trials")

@@ -49,10 +49,11 @@ class RunFolder:
             InputError: the file is not there yet; the remedy names ``stage``.
         """
         if not self.exists(relative):
+            reads = "SESSION" if stage == "ingest" else self.root
             raise InputError(
                 f"{relative} is missing",
                 where=str(self.root),
-                remedy=f"run `bampipe {stage} {self.root}` first",
+                remedy=f"run `bampipe {stage} {reads}` first",
             )
         return self.path(relative)
 

@@ -15,7 +15,7 @@ from pydantic import (
 )
 
 from bampipe.errors import InputError
-from bampipe.files import read_json, write_json
+from bampipe.files import read_json_table, write_json
 from bampipe.schema import Declaration, refusal
 
 Size = Annotated[float, Field(ge=0)]
@@ -68,7 +68,7 @@ class Result(Record):
         Raises:
             InputError: no such file, or it is not as bampipe writes it: names the field.
         """
-        content = read_json(path)
+        content = read_json_table(path)
         try:
             return cls._checked(content)
         except ValidationError as error:

@@ -19,13 +19,8 @@ from bampipe.run import record
 if TYPE_CHECKING:
     from bampipe.declarations.accepted import Accepted
 
-SCHEMA = "bampipe.accepted/1"
 ACCEPTED = "accepted"
 """Name of the folder, and what a gate's ``against`` says."""
-
-KEPT = ("estimate", "stiffness", "sd", "unit")
-RESULTS = {"models/{model}/identify.json": "parameters", "stiffness/stiffness.json": "axes"}
-"""Files whose values are accepted, and the table of each that is kept."""
 
 
 def beside(runs: Path) -> Path:
@@ -72,10 +67,15 @@ def accept(root: Path, model: str, folder: Path, force: bool = False) -> Path:
     Raises:
         InputError: the model is not identified, a gate failed, or a result was changed by hand.
     """
+    from bampipe.declarations.accepted import Accepted
+    from bampipe.results.identify import IdentifyResult
+    from bampipe.results.ingest import IngestResult
+    from bampipe.results.stiffness import StiffnessResult
+
     run = RunFolder(root)
-    names = [name.replace("{model}", model) for name in RESULTS]
-    record.require_untouched(root, [*names, "ingest/session.json"])
-    run.require(f"models/{model}/identify.json", "identify")
+    names = (IdentifyResult.file(model), StiffnessResult.FILE, IngestResult.FILE)
+    record.require_untouched(root, names)
+    run.require(IdentifyResult.file(model), IdentifyResult.STAGE)
     failed = [gate["gate"] for gate in record.read(root).get("gates", ()) if _failed(gate)]
     if failed and not force:
         raise InputError(
@@ -83,32 +83,31 @@ def accept(root: Path, model: str, folder: Path, force: bool = False) -> Path:
             where=str(root),
             remedy="accept it all the same with --force",
         )
-    results = {}
-    for name, table in RESULTS.items():
-        if not run.exists(name.replace("{model}", model)):
-            continue
-        content = run.read_json(name.replace("{model}", model)).get(table, {})
-        results[name] = {
-            table: {
-                key: {field: entry[field] for field in KEPT if field in entry}
-                for key, entry in content.items()
+    session = run.read(IngestResult)
+    results: dict[str, dict[str, dict[str, dict[str, object]]]] = {
+        IdentifyResult.FILE: {
+            "parameters": {
+                name: {"estimate": found.estimate, "sd": found.sd, "unit": found.unit}
+                for name, found in run.read(IdentifyResult, model).parameters.items()
             }
         }
-    session = run.read_json("ingest/session.json")
-    path = file_of(folder, str(session["device"]))
-    draft = path.with_name(f".{path.name}.part")
-    write_json(
-        draft,
-        {
-            "schema": SCHEMA,
-            "device": session["device"],
-            "session": root.name,
-            "recorded_at": session.get("recorded_at"),
-            "model": model,
-            "results": results,
-        },
+    }
+    if run.exists(StiffnessResult.FILE):
+        results[StiffnessResult.FILE] = {
+            "axes": {
+                axis: {"stiffness": found.stiffness, "sd": found.sd, "unit": found.unit}
+                for axis, found in run.read(StiffnessResult).axes.items()
+            }
+        }
+    path = file_of(folder, session.device)
+    content = Accepted(
+        device=session.device,
+        session=root.name,
+        recorded_at=session.recorded_at,
+        model=model,
+        results=results,
     )
-    draft.replace(path)
+    write_json(path, content.model_dump(by_alias=True))
     return path
 
 

@@ -8,8 +8,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from bampipe.data.run_folder import RunFolder
 from bampipe.files import read_json_table
-from bampipe.run import accepted, models
+from bampipe.run import accepted
 
 if TYPE_CHECKING:
     from bampipe.declarations.pipeline import Gate
@@ -120,7 +121,9 @@ def _against_accepted(
     gate: Gate, root: Path, model: str, baseline: Path, content: Mapping[str, Any]
 ) -> list[Verdict]:
     """Hold the change since the accepted values, beyond its uncertainty, against the limit."""
-    kept = accepted.read(baseline, models.device_of(root)[0])
+    from bampipe.results.ingest import IngestResult
+
+    kept = accepted.read(baseline, RunFolder(root).read(IngestResult).device)
     if kept is None:
         return [_missing(gate, "", f"nothing accepted yet in {baseline}: run `bampipe accept`")]
     if kept.model != model:

@@ -78,19 +78,19 @@ def _count(verdicts: Iterable[Verdict], state: str) -> int:
 
 def _errors(run: RunFolder, model: str) -> str:
     """Return held-out error over floor, axis by axis."""
-    path = f"models/{model}/validate.json"
-    if not run.exists(path):
+    from bampipe.results.validate import ValidateResult
+
+    if not run.exists(ValidateResult.file(model)):
         return ""
     try:
-        axes = run.read_json(path)["axes"]
-    except (InputError, KeyError):
+        axes = run.read(ValidateResult, model).axes
+    except InputError:
         return "not readable"
-    shown = []
-    for axis, entry in axes.items():
-        error, floor = entry.get("held_out_rmse"), entry.get("noise_floor")
-        if error is not None and floor:
-            shown.append(f"{axis} {error / floor:.2f}")
-    return ", ".join(shown)
+    return ", ".join(
+        f"{axis} {error.held_out_rmse / error.noise_floor:.2f}"
+        for axis, error in axes.items()
+        if error.noise_floor
+    )
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:

@@ -60,26 +60,13 @@ def ensure_base(root: Path, device: str, effects: tuple[str, ...]) -> None:
             gives it.
     """
     from bampipe.declarations.model import ModelFile
+    from bampipe.results.ingest import IngestResult
 
     if not device:
-        device, default_effects = device_of(root)
-        effects = effects or default_effects
+        session = RunFolder(root).read(IngestResult)
+        device = session.device
+        effects = effects or session.default_effects
     write(root, ModelFile(name=BASE, device=device, effects=effects))
-
-
-def device_of(root: Path) -> tuple[str, tuple[str, ...]]:
-    """Return the device that ingest found, and the effects that its file gives the base model.
-
-    Raises:
-        InputError: ingest has not run, or its result is damaged.
-    """
-    run = RunFolder(root)
-    path = run.require("ingest/session.json", "ingest")
-    content = run.read_json("ingest/session.json")
-    device, effects = content.get("device"), content.get("default_effects", [])
-    if not isinstance(device, str) or not isinstance(effects, list):
-        raise InputError("does not name a device", where=str(path), remedy="run with --force")
-    return device, tuple(map(str, effects))
 
 
 def child_name(parent: str, effect: str) -> str:

@@ -43,7 +43,13 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         numbers = [int(word) + config.offset for word in text.split()]
     except ValueError as error:
         raise InputError(str(error), where="numbers.txt", remedy="write whole numbers") from error
-    write_json(out / "ingest/session.json", {"device": "bam"})
+    session = {
+        "session_id": "toy", "device": "bam", "device_file": None, "recorded_at": None,
+        "sample_rate_hz": 1.0, "announced_rate_hz": None, "brakes": {}, "channels": {},
+        "axes": {"yaw": {"unit": "rad", "resolution": None}},
+        "force": {"columns": [], "unit": "N", "noise_sd": None},
+    }  # fmt: skip
+    write_json(out / "ingest/session.json", session)
     write_json(out / "toy/numbers.json", {"numbers": numbers})
     return {"headline": f"{len(numbers)} numbers"}
 
