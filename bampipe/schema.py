@@ -6,7 +6,7 @@ import ast
 import json
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from typing import Annotated, Any, Self, TypeVar, get_args
 
@@ -20,6 +20,7 @@ from pydantic import (
     PrivateAttr,
     Strict,
     StringConstraints,
+    TypeAdapter,
     ValidationError,
     model_validator,
 )
@@ -28,6 +29,9 @@ from pydantic_core import PydanticCustomError, core_schema
 
 from bampipe.errors import InputError, did_you_mean
 
+STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+"""Unknown keys are refused, and nothing is converted; of declarations and of stage settings."""
+
 
 class Declaration(BaseModel):
     """A table of a file: unknown keys are refused, and nothing is converted but lists to tuples.
@@ -35,13 +39,7 @@ class Declaration(BaseModel):
     What is wrong between fields is found by `cross_faults`, once every field is right by itself.
     """
 
-    model_config = ConfigDict(
-        extra="forbid",
-        frozen=True,
-        strict=True,
-        allow_inf_nan=False,
-        arbitrary_types_allowed=True,
-    )
+    model_config = ConfigDict(**STRICT, frozen=True, arbitrary_types_allowed=True)
 
     def cross_faults(self) -> Iterator[InputError]:
         """Everything wrong between the fields; ``where`` is a key below this table, or empty."""
@@ -101,6 +99,7 @@ def _refuse_twice(values: tuple[T, ...]) -> tuple[T, ...]:
 Text = Annotated[str, StringConstraints(min_length=1)]
 Number = Annotated[float, BeforeValidator(_refuse_rounded)]
 Positive = Annotated[float, Field(gt=0), BeforeValidator(_refuse_rounded)]
+Count = Annotated[int, Field(ge=0)]
 NotNegative = Annotated[float, Field(ge=0), BeforeValidator(_refuse_rounded)]
 Several = Annotated[tuple[T, ...], Strict(False)]
 Distinct = Annotated[
@@ -155,9 +154,11 @@ def read(kind: type[D], content: object, where: str) -> D:
         raise refusal(error, kind, where) from None
 
 
-def refusal(error: ValidationError, kind: type[Declaration], where: str) -> InputError:
-    """What `read` raises for an ``error`` of pydantic."""
-    first, *others = _faults(error, kind, where)
+def refusal(
+    error: ValidationError, kind: type, where: str, inside: Sequence[str] = ()
+) -> InputError:
+    """What `read` raises for an ``error`` of pydantic; ``inside``: the table that was checked."""
+    first, *others = _faults(error, kind, where, inside)
     more = f" (and {len(others)} more)" if others else ""
     return InputError(first.what + more, where=first.where, remedy=first.remedy)
 
@@ -185,9 +186,9 @@ class _Generator(GenerateJsonSchema):
 
 
 @cache
-def json_schema(kind: type[Declaration]) -> dict[str, Any]:
-    """The JSON Schema of a file."""
-    content = kind.model_json_schema(schema_generator=_Generator)
+def json_schema(kind: type) -> dict[str, Any]:
+    """The JSON Schema of a file, or of the settings of a stage."""
+    content = TypeAdapter(kind).json_schema(schema_generator=_Generator)
     name = content["properties"].get("schema", {}).get("const")
     head = {"$schema": GenerateJsonSchema.schema_dialect} | ({"$id": name} if name else {})
     return head | content
@@ -222,6 +223,7 @@ def dotted(path: Iterable[str | int]) -> str:
     return text.removeprefix(".")
 
 
+_UNKNOWN = ("extra_forbidden", "unexpected_keyword_argument")
 _EXPECTED = {
     "string_type": "text",
     "float_type": "a number",
@@ -241,7 +243,9 @@ _EXPECTED = {
 }
 
 
-def _faults(error: ValidationError, kind: type[Declaration], where: str) -> list[InputError]:
+def _faults(
+    error: ValidationError, kind: type, where: str, inside: Sequence[str] = ()
+) -> list[InputError]:
     # A list is counted short where its entries are wrong: they are reported instead.
     found = [
         e
@@ -249,11 +253,11 @@ def _faults(error: ValidationError, kind: type[Declaration], where: str) -> list
         if e["type"] != "too_short" or len(e["input"]) < e["ctx"]["min_length"]
     ]
     # A key that is not known often is a missing one misspelt: it comes first.
-    keys = ("extra_forbidden", "missing")
-    found.sort(key=lambda e: (e["type"] not in keys or len(e["loc"]) > 1, e["type"] != keys[0]))
+    unknown, keys = _UNKNOWN, {*_UNKNOWN, "missing"}
+    found.sort(key=lambda e: (e["type"] not in keys or len(e["loc"]) > 1, e["type"] not in unknown))
     said = []
     for e in found:
-        path = [part for part in e["loc"] if not str(part).startswith("#")]
+        path = [*inside, *(part for part in e["loc"] if not str(part).startswith("#"))]
         path = path[:-2] if path and path[-1] == "[key]" else path
         if e["type"] == "faults":
             said += [_placed(f, [*path, f.where], where) for f in e["ctx"]["found"]]
@@ -264,7 +268,7 @@ def _faults(error: ValidationError, kind: type[Declaration], where: str) -> list
 
 def _placed(fault: InputError, path: list[Any], where: str) -> InputError:
     place = dotted(part for part in path if part != "")
-    there = f"{where}: {place}" if place else where
+    there = ": ".join(part for part in (where, place) if part)
     return InputError(fault.what, where=there, remedy=fault.remedy)
 
 
@@ -272,7 +276,7 @@ def _in_words(error: Any, path: list[Any], schema: Mapping[str, Any], where: str
     """One error of pydantic in plain words."""
     kind, given, more = error["type"], error["input"], error.get("ctx", {})
     remedy = ""
-    if kind in ("missing", "extra_forbidden"):
+    if kind in ("missing", *_UNKNOWN):
         *path, key = path
         known = _node(schema, error["loc"][:-1]).get("properties", {})
         if kind == "missing":

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import Annotated, Literal
 
-from bampipe.errors import InputError
+from pydantic import Field
+from pydantic.dataclasses import dataclass as checked_dataclass
 
-ENGINES = ("compiled", "filterpy")
-MEASURES = ("position", "position_velocity")
+from bampipe.schema import STRICT, NotNegative, Positive
 
 
-@dataclass(frozen=True)
+@checked_dataclass(frozen=True, config=STRICT)
 class FilterChoice:
     """Settings of the filter.
 
@@ -28,31 +28,11 @@ class FilterChoice:
         trace_rows: most rows a trial in tables of states and of parameters along the data.
     """
 
-    engine: str = "compiled"
-    measure: str = "position"
-    random_walk: float = 0.0
-    reading_noise: float = 0.0
-    force_noise: float = 0.0
-    longest_step_s: float = 1e-3
-    block_s: float = 2.0
-    trace_rows: int = 2000
-
-
-def check_choice(choice: FilterChoice, stage: str) -> None:
-    """Raise :class:`InputError` where a setting of the filter makes no sense."""
-    for name, known in (("engine", ENGINES), ("measure", MEASURES)):
-        check_among(getattr(choice, name), known, f"{stage}.{name}")
-    for name in ("longest_step_s", "block_s", "trace_rows"):
-        if not getattr(choice, name) > 0:
-            raise InputError("must be positive", where=f"{stage}.{name}")
-    for name in ("random_walk", "reading_noise", "force_noise"):
-        if getattr(choice, name) < 0:
-            raise InputError("must not be negative", where=f"{stage}.{name}")
-
-
-def check_among(value: str, known: tuple[str, ...], where: str) -> None:
-    """Raise :class:`InputError` unless ``value`` is one of ``known``."""
-    if value not in known:
-        name = where.rpartition(".")[2]
-        remedy = f"choose from {', '.join(known)}"
-        raise InputError(f"no {name} {value!r}", where=where, remedy=remedy)
+    engine: Literal["compiled", "filterpy"] = "compiled"
+    measure: Literal["position", "position_velocity"] = "position"
+    random_walk: NotNegative = 0.0
+    reading_noise: NotNegative = 0.0
+    force_noise: NotNegative = 0.0
+    longest_step_s: Positive = 1e-3
+    block_s: Positive = 2.0
+    trace_rows: Annotated[int, Field(gt=0)] = 2000

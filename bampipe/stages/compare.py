@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
+
+from pydantic.dataclasses import dataclass as checked_dataclass
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.declarations.model import ModelFile, read_model_file
@@ -14,12 +15,13 @@ from bampipe.progress import Progress
 from bampipe.results.compare import CompareResult, FreeRunPosition, Moved, Rung, Value
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.validate import ValidateResult
+from bampipe.schema import STRICT, Positive
 
 NAME = "compare"
 SUMMARY = "Held-out error of every model version, and which parameters moved"
 
 
-@dataclass(frozen=True)
+@checked_dataclass(frozen=True, config=STRICT)
 class Config:
     """What the stage can be told.
 
@@ -28,7 +30,7 @@ class Config:
             of the change.
     """
 
-    sigmas: float = 3.0
+    sigmas: Positive = 3.0
 
 
 def inputs(config: Config) -> tuple[str, ...]:
@@ -47,8 +49,6 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     Raises:
         InputError: no model has been validated, or the parent of one is missing.
     """
-    if not config.sigmas > 0:
-        raise InputError("must be positive", where="compare.sigmas")
     models: dict[str, ModelFile] = {}
     for path in run.glob("models/*/model.toml"):
         name = Path(path).parent.name

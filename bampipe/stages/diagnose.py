@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import Field
+from pydantic.dataclasses import dataclass as checked_dataclass
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.declarations.model_file import identified, load_model, model_inputs
@@ -24,13 +25,14 @@ from bampipe.estimate.low_pass import Band
 from bampipe.physics import compile_model
 from bampipe.progress import Progress
 from bampipe.results.diagnose import DiagnoseResult
+from bampipe.schema import STRICT, Count, Positive
 from bampipe.trials.recordings import read_session, recipe_of
 
 NAME = "diagnose"
 SUMMARY = "Find which physical effect the model lacks"
 
 
-@dataclass(frozen=True)
+@checked_dataclass(frozen=True, config=STRICT)
 class Config:
     """What the stage can be told.
 
@@ -45,12 +47,12 @@ class Config:
     """
 
     model: str = "base"
-    replicates: int = 10
-    cutoff_hz: float = 8.0
-    kinematics_cutoff_hz: float = 25.0
-    significance: float = 0.01
-    jobs: int = 0
-    seed: int = 0
+    replicates: Annotated[int, Field(ge=4)] = 10
+    cutoff_hz: Positive = 8.0
+    kinematics_cutoff_hz: Positive = 25.0
+    significance: Annotated[float, Field(gt=0, lt=1)] = 0.01
+    jobs: Count = 0
+    seed: Count = 0
 
 
 def inputs(config: Config) -> tuple[str, ...]:
@@ -77,8 +79,6 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         InputError: fewer than two moving trials, a setting out of range, or an axis that no force
             acts on.
     """
-    if config.replicates < 4:
-        raise InputError("must be 4 or more", where="diagnose.replicates")
     model = load_model(run, config.model)
     system = compile_model(model)
     if system.undriven:

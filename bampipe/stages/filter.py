@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, Literal
 
 import numpy as np
 import pandas as pd
+from pydantic import Field
+from pydantic.dataclasses import dataclass as checked_dataclass
 
 from bampipe.data.run_folder import MOVING, RunFolder
 from bampipe.data.store import ParquetAppender, read_parquet
@@ -24,17 +27,17 @@ from bampipe.physics.device import LAST_ORDER, derivative
 from bampipe.progress import Progress
 from bampipe.results.filter import FilterResult
 from bampipe.results.ingest import EncoderChannel, IngestResult
+from bampipe.schema import STRICT, NotNegative, Positive
 
 NAME = "filter"
 SUMMARY = "Velocity and acceleration from the encoders, with error bands"
 
-METHODS = ("auto", "kalman", "butterworth", "savitzky_golay")
 _SHORTEST = 32
 _TUNING_PART = 2000
 """Least length, samples, of the parts that the bandwidth is chosen from, where trials are many."""
 
 
-@dataclass(frozen=True)
+@checked_dataclass(frozen=True, config=STRICT)
 class Config:
     """What the stage can be told.
 
@@ -55,11 +58,11 @@ class Config:
             there are very many.
     """
 
-    method: str = "auto"
-    cutoff_hz: float = 0.0
-    minimum_bandwidth_hz: float = 20.0
-    force_cutoff_hz: float = 25.0
-    tuning_samples: int = 120_000
+    method: Literal["auto", "kalman", "butterworth", "savitzky_golay"] = "auto"
+    cutoff_hz: NotNegative = 0.0
+    minimum_bandwidth_hz: NotNegative = 20.0
+    force_cutoff_hz: Positive = 25.0
+    tuning_samples: Annotated[int, Field(ge=1000)] = 120_000
 
 
 def inputs(config: Config) -> tuple[str, ...]:
@@ -96,7 +99,6 @@ class _Choice:
 
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
     """Differentiate every free and viscous trial."""
-    _check(config)
     session = run.read(IngestResult)
     axes, rate = session.axes, session.sample_rate_hz
     samples = run.require("ingest/samples.parquet", "ingest")
@@ -132,23 +134,6 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
                 levels[axis].append(bands[axis])
     content = _report(config, axes, choices, levels, interpolated, skipped, rate)
     return FilterResult.model_validate(content).write(out)
-
-
-def _check(config: Config) -> None:
-    """Raise :class:`InputError` where a setting makes no sense."""
-    if config.method not in METHODS:
-        raise InputError(
-            f"no method {config.method!r}",
-            where="filter.method",
-            remedy=f"choose from {', '.join(METHODS)}",
-        )
-    for name in ("cutoff_hz", "minimum_bandwidth_hz"):
-        if getattr(config, name) < 0.0:
-            raise InputError("must not be negative", where=f"filter.{name}")
-    if config.force_cutoff_hz <= 0.0:
-        raise InputError("must be positive", where="filter.force_cutoff_hz")
-    if config.tuning_samples < 1000:
-        raise InputError("must be 1000 or more", where="filter.tuning_samples")
 
 
 def _load(samples: Path, trial_id: str, rate: float) -> _Trial | str:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic.dataclasses import dataclass as checked_dataclass
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import write_parquet
@@ -17,7 +19,7 @@ from bampipe.errors import InputError
 from bampipe.estimate.least_squares import fit
 from bampipe.estimate.low_pass import Band
 from bampipe.identification.estimates import content
-from bampipe.identification.filter_choice import FilterChoice, check_among, check_choice
+from bampipe.identification.filter_choice import FilterChoice
 from bampipe.identification.filter_estimate import estimate_by_filter
 from bampipe.identification.filter_run import MotionLost, trial_of
 from bampipe.identification.identifiability import identifiability
@@ -32,17 +34,17 @@ from bampipe.identification.squares_estimate import (
 from bampipe.physics import System, compile_model
 from bampipe.progress import Progress
 from bampipe.results.identify import IdentifyResult
+from bampipe.schema import STRICT, Positive
 from bampipe.trials.motions import problem_of, read_motions
 from bampipe.trials.recordings import read_session, recipe_of
 
 NAME = "identify"
 SUMMARY = "Parameters of the model with uncertainties, from the free trials"
 
-METHODS = ("auto", "ukf", "least-squares", "output-error")
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
+@checked_dataclass(frozen=True, config=STRICT)
 class Config(FilterChoice):
     """What the stage can be told.
 
@@ -69,9 +71,9 @@ class Config(FilterChoice):
     """
 
     model: str = "base"
-    method: str = "auto"
-    start_factor: float = 1.0
-    cutoff_hz: float = 8.0
+    method: Literal["auto", "ukf", "least-squares", "output-error"] = "auto"
+    start_factor: Positive = 1.0
+    cutoff_hz: Positive = 8.0
     input_timing: bool = True
     remove_bias: bool = True
 
@@ -96,7 +98,6 @@ def outputs(config: Config) -> tuple[str, ...]:
 
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
     """Estimate one model from the free trials; effects of brakes from braked ones too."""
-    _check(config)
     session = run.read_json("ingest/session.json")
     system = compile_model(load_model(run, config.model))
     progress(0.0, "reading the trials")
@@ -170,12 +171,3 @@ def _start(run: RunFolder, system: System, rate: float, config: Config) -> Array
         count = len(system.model.device.parameters)
         start[count:] = found[count:]
     return start
-
-
-def _check(config: Config) -> None:
-    """Raise :class:`InputError` where a setting makes no sense."""
-    check_among(config.method, METHODS, "identify.method")
-    check_choice(config, "identify")
-    for name in ("start_factor", "cutoff_hz"):
-        if not getattr(config, name) > 0:
-            raise InputError("must be positive", where=f"identify.{name}")

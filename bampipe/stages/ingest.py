@@ -7,12 +7,15 @@ cannot be trusted is set aside with a reason (file, row, column), and the others
 from __future__ import annotations
 
 from collections import defaultdict
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import pandas as pd
 import pyarrow as pa
+from pydantic import Field
+from pydantic.dataclasses import dataclass as checked_dataclass
 
 from bampipe.data.quality import CleanTrial, Limits, clean
 from bampipe.data.readers import read_trial
@@ -26,6 +29,7 @@ from bampipe.physics.device import Device
 from bampipe.physics.units import parse_unit
 from bampipe.progress import Progress
 from bampipe.results.ingest import Channel, EncoderChannel, ForceChannels, IngestResult
+from bampipe.schema import STRICT
 
 NAME = "ingest"
 SUMMARY = "Read a session's raw logs, check and repair the trials, bring them to SI units"
@@ -34,7 +38,7 @@ RATE_TOLERANCE = 0.02
 """The announced sample rate stands where the time stamps agree with it this well."""
 
 
-@dataclass(frozen=True)
+@checked_dataclass(frozen=True, config=STRICT)
 class Config(Limits):
     """What the stage can be told.
 
@@ -58,7 +62,7 @@ class Config(Limits):
     """
 
     session: str = ""
-    largest_trial_mb: int = 4096
+    largest_trial_mb: Annotated[int, Field(ge=1)] = 4096
 
 
 def inputs(config: Config) -> tuple[str, ...]:
@@ -82,7 +86,8 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     Raises:
         InputError: a mistake in the session file, or no trial is sound.
     """
-    _check(config)
+    if not config.session:
+        raise InputError("no session folder given", remedy="bampipe ingest SESSION")
     session = read_session(Path(config.session))
     device = _device(session)
     _match(session, device)
@@ -115,16 +120,6 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     if session.device_file is not None:
         (out / "ingest/device.toml").write_bytes(session.device_file.read_bytes())
     return _summary(session, rows)
-
-
-def _check(config: Config) -> None:
-    if not config.session:
-        raise InputError("no session folder given", remedy="bampipe ingest SESSION")
-    for name in Limits.__dataclass_fields__:
-        if not getattr(config, name) >= 0:
-            raise InputError("must not be negative", where=f"ingest.{name}")
-    if config.largest_trial_mb < 1:
-        raise InputError("must be 1 or more", where="ingest.largest_trial_mb")
 
 
 def _device(session: Session) -> Device:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
+from pydantic.dataclasses import dataclass as checked_dataclass
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import read_parquet
@@ -25,6 +27,7 @@ from bampipe.results.performance import (
     Resolution,
 )
 from bampipe.results.stiffness import StiffnessResult
+from bampipe.schema import STRICT
 
 NAME = "performance"
 SUMMARY = "Workspace, stiffness, friction, inertia and force at the handle"
@@ -32,7 +35,7 @@ SUMMARY = "Workspace, stiffness, friction, inertia and force at the handle"
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
+@checked_dataclass(frozen=True, config=STRICT)
 class Config:
     """What the stage can be told.
 
@@ -42,7 +45,7 @@ class Config:
     """
 
     model: str = "base"
-    points: int = 15
+    points: Annotated[int, Field(ge=2)] = 15
 
 
 def inputs(config: Config) -> tuple[str, ...]:
@@ -68,8 +71,6 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     Raises:
         InputError: a setting out of range, or a handle that no pose lets move every way.
     """
-    if config.points < 2:
-        raise InputError("must be 2 or more", where="performance.points")
     system = compile_model(load_model(run, config.model))
     device = system.model.device
     p = identified(run, config.model, system)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
+
+from pydantic.dataclasses import dataclass as checked_dataclass
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.progress import Progress
+from bampipe.schema import STRICT
 
 NAME = "report"
 SUMMARY = "PDF and web page of everything found so far"
@@ -25,7 +27,7 @@ _PER_MODEL = (
 )
 
 
-@dataclass(frozen=True)
+@checked_dataclass(frozen=True, config=STRICT)
 class Config:
     """What the stage can be told.
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from pydantic.dataclasses import dataclass as checked_dataclass
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import ParquetAppender, read_parquet
@@ -26,6 +27,7 @@ from bampipe.results.stiffness import (
     LoopCycle,
     StiffnessResult,
 )
+from bampipe.schema import STRICT, Positive
 
 NAME = "stiffness"
 SUMMARY = "Stiffness, loop width and bandwidth of the locked axes"
@@ -33,7 +35,7 @@ SUMMARY = "Stiffness, loop width and bandwidth of the locked axes"
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
+@checked_dataclass(frozen=True, config=STRICT)
 class Config:
     """What the stage can be told.
 
@@ -42,7 +44,7 @@ class Config:
             than this share of their range is reported as a slipping brake.
     """
 
-    largest_drift: float = 0.05
+    largest_drift: Positive = 0.05
 
 
 def inputs(config: Config) -> tuple[str, ...]:
@@ -78,8 +80,6 @@ class _Loops:
 
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
     """Find the stiffness of every axis that has a locked trial."""
-    if not 0.0 < config.largest_drift:
-        raise InputError("must be positive", where="stiffness.largest_drift")
     session = run.read(IngestResult)
     system = _system(run, session)
     samples = run.require("ingest/samples.parquet", "ingest")

@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from pydantic import Field
+from pydantic.dataclasses import dataclass as checked_dataclass
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import read_parquet, write_parquet
@@ -22,6 +24,7 @@ from bampipe.identification.free_run import free_runs
 from bampipe.physics import System, compile_model
 from bampipe.progress import Progress
 from bampipe.results.validate import ValidateResult
+from bampipe.schema import STRICT, Count, Positive
 from bampipe.trials.motions import (
     Motion,
     free_trials,
@@ -45,7 +48,7 @@ MOST_GROUPS = 10
 alone grows with the square of their number."""
 
 
-@dataclass(frozen=True)
+@checked_dataclass(frozen=True, config=STRICT)
 class Config:
     """What the stage can be told.
 
@@ -61,10 +64,10 @@ class Config:
     """
 
     model: str = "base"
-    cutoff_hz: float = 8.0
+    cutoff_hz: Positive = 8.0
     noise_floor: bool = True
-    repeats: int = 1
-    seed: int = 0
+    repeats: Annotated[int, Field(ge=1)] = 1
+    seed: Count = 0
     free_run: bool = True
     hold_out_by: str = ""
 
@@ -110,10 +113,6 @@ class _Compared:
 
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
     """Compare one identified model with all free trials, and those in a viscous field."""
-    if not config.cutoff_hz > 0.0:
-        raise InputError("must be positive", where="validate.cutoff_hz")
-    if config.repeats < 1:
-        raise InputError("must be 1 or more", where="validate.repeats")
     session = run.read_json("ingest/session.json")
     system = compile_model(load_model(run, config.model))
     p = identified(run, config.model, system)

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from pydantic import Field
+from pydantic.dataclasses import dataclass as checked_dataclass
 from scipy import stats
 
 from bampipe.data.run_folder import RunFolder
@@ -17,7 +20,7 @@ from bampipe.declarations.model_file import load_model, model_inputs
 from bampipe.errors import InputError
 from bampipe.estimate.filter_uncertainty import sandwich_covariance
 from bampipe.estimate.unscented import Trial
-from bampipe.identification.filter_choice import FilterChoice, check_choice
+from bampipe.identification.filter_choice import FilterChoice
 from bampipe.identification.filter_run import (
     Attempt,
     FilterRun,
@@ -34,6 +37,7 @@ from bampipe.physics.viscous_field import viscous_field
 from bampipe.progress import Progress
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.viscous import Damping, ViscousResult
+from bampipe.schema import STRICT, Positive
 from bampipe.trials.motions import Motion, read_motion
 
 NAME = "viscous"
@@ -45,7 +49,7 @@ _SIGNIFICANT = 0.05
 _RESTARTS = 4
 
 
-@dataclass(frozen=True)
+@checked_dataclass(frozen=True, config=STRICT)
 class Config(FilterChoice):
     """What the stage can be told.
 
@@ -63,8 +67,8 @@ class Config(FilterChoice):
     """
 
     model: str = "base"
-    longest_step_s: float = 2e-3
-    trace_rows: int = 1000
+    longest_step_s: Positive = 2e-3
+    trace_rows: Annotated[int, Field(gt=0)] = 1000
 
 
 def inputs(config: Config) -> tuple[str, ...]:
@@ -91,7 +95,6 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     The brakes' commands are taken out of the model and what they did is put into the filter's
     state; friction and inertia stay as identified, with their uncertainty.
     """
-    check_choice(config, "viscous")
     trials = _viscous_trials(run)
     target = f"models/{config.model}/viscous"
     if trials.empty:

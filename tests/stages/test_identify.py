@@ -15,9 +15,9 @@ from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import read_parquet
 from bampipe.errors import InputError
 from bampipe.files import digest_file, read_json, write_text
-from bampipe.identification.filter_choice import ENGINES
 from bampipe.identification.filter_run import MotionLost
 from bampipe.progress import silent
+from bampipe.run.settings import configure
 from bampipe.stages import identify
 
 TOLERANCE = {"viscous": 0.03, "coulomb": 0.05, "mass": 0.01}
@@ -136,19 +136,21 @@ def test_tables_and_determinism(simulated: RunFolder, tmp_path: Path) -> None:
 def test_filterpy_gives_the_same_numbers(tmp_path: Path) -> None:
     run = simulated_run(tmp_path / "short", trials=1, seconds=1.2)
     numbers = []
-    for engine in ENGINES:
+    for engine in ("compiled", "filterpy"):
         content = identified(run, replace(FAST, engine=engine, block_s=0.1))
         numbers.append([entry["estimate"] for entry in content["parameters"].values()])
     np.testing.assert_allclose(numbers[0], numbers[1], rtol=1e-8)
 
 
 def test_mistakes_are_told(simulated: RunFolder, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="choose from auto, ukf, least-squares"):
-        identified(simulated, replace(FAST, method="magic"))
-    with pytest.raises(InputError, match="must be positive"):
-        identified(simulated, replace(FAST, block_s=0.0))
-    with pytest.raises(InputError, match="must not be negative"):
-        identified(simulated, replace(FAST, random_walk=-1.0))
+    for settings, words in (
+        ({"method": "magic"}, r'identify\.method: found "magic", expected "auto" or "ukf" or'),
+        ({"engine": "filterpi"}, "engine: .* did you mean 'filterpy'"),
+        ({"block_s": 0.0}, r"identify\.block_s: found 0.0, expected more than 0"),
+        ({"random_walk": -1.0}, r"identify\.random_walk: found -1.0, expected 0 or more"),
+    ):
+        with pytest.raises(InputError, match=words):
+            configure("identify", settings)
     with pytest.raises(InputError, match="missing"):
         identified(simulated, replace(FAST, model="base+none"))
 

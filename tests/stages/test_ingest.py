@@ -21,6 +21,7 @@ from bampipe.data.store import read_parquet
 from bampipe.errors import InputError
 from bampipe.files import read_json
 from bampipe.progress import silent
+from bampipe.run.settings import configure
 from bampipe.stages import ingest
 
 NAMES = [f"open-0{number}" for number in range(1, 10)]
@@ -115,8 +116,8 @@ def test_a_limit_can_be_changed(tmp_path):
     session = Made().write(tmp_path / "session")
     with pytest.raises(InputError, match="less than 3 s"):
         run_ingest(session, tmp_path / "out", shortest_s=3.0)
-    with pytest.raises(InputError, match=r"ingest\.gap_s: must not be negative"):
-        run_ingest(session, tmp_path / "out", gap_s=-1.0)
+    with pytest.raises(InputError, match=r"ingest\.gap_s: found -1.0, expected 0 or more"):
+        configure("ingest", {"gap_s": -1.0})
 
 
 SLED = """

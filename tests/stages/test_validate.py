@@ -16,6 +16,7 @@ from bampipe.data.store import read_parquet
 from bampipe.errors import InputError
 from bampipe.files import digest_file, read_json, write_json, write_text
 from bampipe.progress import silent
+from bampipe.run.settings import configure
 from bampipe.simulator import session as simulation
 from bampipe.stages import identify, validate
 
@@ -135,10 +136,10 @@ def test_one_trial_holds_nothing_out(tmp_path: Path) -> None:
 
 
 def test_mistakes_are_told(simulated: RunFolder, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="must be positive"):
-        validated(simulated, validate.Config(cutoff_hz=0.0))
-    with pytest.raises(InputError, match="1 or more"):
-        validated(simulated, validate.Config(repeats=0))
+    with pytest.raises(InputError, match=r"validate\.cutoff_hz: found 0.0, expected more than 0"):
+        configure("validate", {"cutoff_hz": 0.0})
+    with pytest.raises(InputError, match=r"repeats: found 0, expected 1 or more"):
+        configure("validate", {"repeats": 0})
     bare = simulated_run(tmp_path / "bare", trials=1, seconds=3.0)
     with pytest.raises(InputError, match="bampipe identify"):
         validated(bare)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +17,7 @@ from bampipe.files import read_json
 from bampipe.physics import Model, compile_model, registry
 from bampipe.physics.viscous_field import viscous_field
 from bampipe.progress import silent
+from bampipe.run.settings import configure
 from bampipe.simulator import session as simulation
 from bampipe.stages import identify, performance, viscous
 
@@ -99,13 +99,13 @@ def test_a_session_without_a_field_says_so(run: RunFolder) -> None:
         write_parquet(path, trials)
     assert content["directions"] == {}
     assert "No trials" in content["headline"]
-    with pytest.raises(InputError, match="must be positive"):
-        found(run, replace(viscous.Config(), block_s=0.0))
+    with pytest.raises(InputError, match=r"viscous\.block_s: found 0.0, expected more than 0"):
+        configure("viscous", {"block_s": 0.0})
 
 
-def test_a_setting_of_performance_that_makes_no_sense_is_refused(run: RunFolder) -> None:
-    with pytest.raises(InputError, match=r"performance\.points: must be 2 or more"):
-        performance.execute(run, run.root, performance.Config(points=1), silent)
+def test_a_setting_of_performance_that_makes_no_sense_is_refused() -> None:
+    with pytest.raises(InputError, match=r"performance\.points: found 1, expected 2 or more"):
+        configure("performance", {"points": 1})
 
 
 def test_performance_at_the_handle(run: RunFolder) -> None:

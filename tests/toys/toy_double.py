@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import os
 import time
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+
+from pydantic.dataclasses import dataclass as checked_dataclass
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.files import write_json
 from bampipe.progress import Progress
+from bampipe.schema import STRICT
 from bampipe.stages.toy_read import log
 from bampipe.workers import process_pool
 
@@ -18,7 +20,7 @@ NAME = "toy_double"
 SUMMARY = "Double the numbers"
 
 
-@dataclass(frozen=True)
+@checked_dataclass(frozen=True, config=STRICT)
 class Config:
     """factor: of the doubling; label: a text."""
 

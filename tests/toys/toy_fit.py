@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
+
+from pydantic.dataclasses import dataclass as checked_dataclass
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.files import write_json
 from bampipe.progress import Progress
+from bampipe.schema import STRICT
 from bampipe.stages.toy_read import log
 
 NAME = "toy_fit"
 SUMMARY = "Fit the numbers"
 
 
-@dataclass(frozen=True)
+@checked_dataclass(frozen=True, config=STRICT)
 class Config:
     """model: its name."""
 

@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import dataclass
 from pathlib import Path
+
+from pydantic.dataclasses import dataclass as checked_dataclass
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError
 from bampipe.files import write_json
 from bampipe.progress import Progress
+from bampipe.schema import STRICT
 
 NAME = "toy_read"
 SUMMARY = "Read the numbers"
 
 
-@dataclass(frozen=True)
+@checked_dataclass(frozen=True, config=STRICT)
 class Config:
     """session: the folder; offset: added to each number."""
 

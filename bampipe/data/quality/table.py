@@ -6,13 +6,15 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
+from pydantic.dataclasses import dataclass as checked_dataclass
 
 from bampipe.data.readers import RawTrial
 from bampipe.data.session import Session, TrialEntry
 from bampipe.errors import InputError
+from bampipe.schema import STRICT, Count, NotNegative
 
 
-@dataclass(frozen=True)
+@checked_dataclass(frozen=True, config=STRICT)
 class Limits:
     """What still counts as a sound trial.
 
@@ -31,20 +33,20 @@ class Limits:
         brake_on: brake command above which a trial is not free, N.m or N.
     """
 
-    shortest_s: float = 1.0
-    gap_s: float = 0.25
-    sound_share: float = 0.6
-    dropped_share: float = 0.01
-    nan_run: int = 5
-    nan_share: float = 0.01
-    saturated_share: float = 0.01
-    frozen_share: float = 0.2
-    still_rad: float = 0.005
-    still_m: float = 0.0005
-    locked_rad: float = 0.2
-    locked_m: float = 0.02
-    locked_steps: int = 5
-    brake_on: float = 0.5
+    shortest_s: NotNegative = 1.0
+    gap_s: NotNegative = 0.25
+    sound_share: NotNegative = 0.6
+    dropped_share: NotNegative = 0.01
+    nan_run: Count = 5
+    nan_share: NotNegative = 0.01
+    saturated_share: NotNegative = 0.01
+    frozen_share: NotNegative = 0.2
+    still_rad: NotNegative = 0.005
+    still_m: NotNegative = 0.0005
+    locked_rad: NotNegative = 0.2
+    locked_m: NotNegative = 0.02
+    locked_steps: Count = 5
+    brake_on: NotNegative = 0.5
 
 
 @dataclass
