@@ -3,23 +3,22 @@
 Where nothing is compiled yet, the first stage that wants compiled code would wait for it, and the
 next one again. Instead, processes beside the run import the modules with most to compile, and so
 leave their code on disk. No function is compiled twice, for what one process is at, the others wait
-for (`bampipe.compiled`). They start with the first stage, unless a file says that they once came
-to their end with these sources; then only if a function turns out to be missing all the same. A
-process that fails leaves its part to the run, which then says what is wrong.
+for (`bampipe.compiled`). They start with the first stage, unless there is a folder of code compiled
+from these sources; then only if a function turns out to be missing all the same. A process that
+fails leaves its part to the run, which then says what is wrong.
 """
 
 from __future__ import annotations
 
-import hashlib
 import os
 import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib.metadata import version
 from pathlib import Path
 
 from bampipe.errors import InputError
+from bampipe.generated_code import compiled_folder
 
 _PARTS = (
     ("bampipe.estimate.propagation", "bampipe.estimate.square_root"),
@@ -50,8 +49,6 @@ def beside(processes: int) -> Iterator[None]:
         yield
     finally:
         _allowed.clear()
-        if _running and all(process.poll() == 0 for process in _running):
-            _note()
         while _running:
             process = _running.pop()
             process.terminate()
@@ -60,11 +57,14 @@ def beside(processes: int) -> Iterator[None]:
 
 def begin() -> None:
     """Called when a stage is about to run; the first time counts."""
-    if _allowed and not _noted():
-        _start()
+    try:
+        if _allowed and not compiled_folder(Path(__file__).with_name("estimate")).exists():
+            _start()
+    except InputError:  # the run itself says so, with what to do
+        return
 
 
-def missing() -> None:
+def report_missing() -> None:
     """Called where a function of bampipe itself is not found compiled; the first time counts."""
     if _allowed:
         _start()
@@ -84,31 +84,3 @@ def _start() -> None:
                 start_new_session=True,
             )
         )
-
-
-def _place() -> Path | None:
-    """The file that says that everything was compiled once; None where there is no place for it."""
-    from bampipe.physics.generated import folder_of_user
-
-    digest = hashlib.sha256(f"{version('numba')} {os.environ.get('NUMBA_CACHE_DIR')}".encode())
-    for path in sorted((Path(__file__).parent / "estimate").glob("*.py")):
-        digest.update(path.read_bytes())
-    try:
-        return folder_of_user() / f"compiled_{digest.hexdigest()[:24]}"
-    except InputError:  # the run itself says so, with what to do
-        return None
-
-
-def _noted() -> bool:
-    place = _place()
-    return place is not None and place.exists()
-
-
-def _note() -> None:
-    place = _place()
-    if place is None:
-        return
-    try:
-        place.touch(mode=0o600)
-    except OSError:  # a full disk: the next run asks again
-        return

@@ -198,8 +198,12 @@ def require_regular(path: Path) -> os.stat_result:
 
 
 @contextmanager
-def atomic_writer(path: Path) -> Iterator[BinaryIO]:
+def atomic_writer(path: Path, *, durable: bool = True) -> Iterator[BinaryIO]:
     """A binary file that takes the place of ``path`` only when the block ends without error.
+
+    Args:
+        path: the file.
+        durable: survive a loss of power; not needed for what can be made again.
 
     Raises:
         InputError: the folder is read-only, the disk is full, or the like.
@@ -210,8 +214,9 @@ def atomic_writer(path: Path) -> Iterator[BinaryIO]:
         path.parent.mkdir(parents=True, exist_ok=True)
         with partial.open("wb") as stream:
             yield stream
-            stream.flush()
-            os.fsync(stream.fileno())
+            if durable:
+                stream.flush()
+                os.fsync(stream.fileno())
         partial.replace(path)
     except OSError as error:
         _discard(partial)
@@ -221,9 +226,9 @@ def atomic_writer(path: Path) -> Iterator[BinaryIO]:
         raise
 
 
-def write_text(path: Path, text: str) -> None:
-    """Write ``text`` as UTF-8 with ``\\n`` line ends, whole or not at all."""
-    with atomic_writer(path) as stream:
+def write_text(path: Path, text: str, *, durable: bool = True) -> None:
+    """Write ``text`` as UTF-8 with ``\\n`` line ends, whole or not at all; see `atomic_writer`."""
+    with atomic_writer(path, durable=durable) as stream:
         stream.write(text.encode())
 
 

@@ -56,7 +56,7 @@ def main() -> None:
     print(f"| | {', s | '.join(RESULTS)}, s | processor time, s |")
     print("|-|" + "-|" * (len(RESULTS) + 1), flush=True)
     with tempfile.TemporaryDirectory() as name:
-        caches = {"BAMPIPE_CACHE_DIR": f"{name}/generated", "NUMBA_CACHE_DIR": f"{name}/compiled"}
+        caches = {"BAMPIPE_CACHE_DIR": f"{name}/code", "NUMBA_CACHE_DIR": f"{name}/compiled"}
         for title in ("nothing compiled", "compiled"):
             runs = Path(name) / title.replace(" ", "_")
             times, processor = measured(given.session, runs, {**os.environ, **caches})

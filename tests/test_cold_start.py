@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from bampipe import compile_ahead
+from bampipe import compile_ahead, generated_code
 
 
 class Started:
@@ -18,14 +18,10 @@ class Started:
     def __init__(self) -> None:
         self.codes: list[str] = []
         self.ended = 0
-        self.status: int | None = None
 
     def __call__(self, command: list[str], **_: Any) -> Started:
         self.codes.append(command[-1])
         return self
-
-    def poll(self) -> int | None:
-        return self.status
 
     def terminate(self) -> None:
         self.ended += 1
@@ -46,47 +42,46 @@ def test_the_first_missing_function_starts_them_and_the_end_of_the_run_ends_them
 ) -> None:
     with compile_ahead.beside(2):
         assert not started.codes, "nothing is missing yet"
-        compile_ahead.missing()
-        compile_ahead.missing()
+        compile_ahead.report_missing()
+        compile_ahead.report_missing()
         assert len(started.codes) == len(compile_ahead._PARTS)
         assert not started.ended
     assert started.ended == len(started.codes)
-    compile_ahead.missing()
+    compile_ahead.report_missing()
     assert started.ended == len(started.codes), "none is started outside a run"
 
 
-def test_the_first_stage_starts_them_until_they_have_come_to_their_end(
+def test_the_first_stage_starts_them_where_nothing_was_compiled_from_these_sources(
     started: Started, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("BAMPIPE_CACHE_DIR", str(tmp_path))
-    for status, wanted in ((None, True), (1, True), (0, True), (0, False)):
-        started.codes.clear()
-        started.status = status
-        with compile_ahead.beside(2):
-            compile_ahead.begin()
-            compile_ahead.begin()
-            assert len(started.codes) == (len(compile_ahead._PARTS) if wanted else 0), status
     with compile_ahead.beside(2):
         compile_ahead.begin()
-        compile_ahead.missing()
+        compile_ahead.begin()
+    assert len(started.codes) == len(compile_ahead._PARTS)
+    started.codes.clear()
+    generated_code.make_compiled_folder(Path(compile_ahead.__file__).with_name("estimate"))
+    with compile_ahead.beside(2):
+        compile_ahead.begin()
+        assert not started.codes
+        compile_ahead.report_missing()
     assert started.codes, "a function is missing all the same"
 
 
-def test_without_a_place_to_note_it_the_run_goes_on(
+def test_without_a_folder_the_run_itself_says_so(
     started: Started, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("BAMPIPE_CACHE_DIR", str(tmp_path / "file"))
     (tmp_path / "file").touch()
-    started.status = 0
     with compile_ahead.beside(2):
         compile_ahead.begin()
-    assert started.codes
+    assert not started.codes
 
 
 def test_one_core_is_left_to_the_run(started: Started) -> None:
     with compile_ahead.beside(1):
         compile_ahead.begin()
-        compile_ahead.missing()
+        compile_ahead.report_missing()
     assert not started.codes
 
 

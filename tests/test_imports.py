@@ -36,6 +36,7 @@ LAWS = {
         "llvmlite",
         "pydantic",
         "bampipe.compiled",
+        "bampipe.generated_code",
         "bampipe.errors",
         "bampipe.model_functions",
         "bampipe.schema",

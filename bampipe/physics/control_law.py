@@ -7,8 +7,9 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from bampipe import generated_code
 from bampipe.errors import InputError
-from bampipe.physics import expression, generated
+from bampipe.physics import expression
 from bampipe.physics.device import Device
 from bampipe.physics.model import code_version
 
@@ -48,11 +49,7 @@ def compile_law(device: Device) -> ControlLaw | None:
     inputs = (*controller.channels, *device.channels, "t")
     content = json.dumps(["law", code_version(), device.declaration], sort_keys=True, default=str)
     key = hashlib.sha256(content.encode()).hexdigest()[:24]
-    folder = generated.folder_of_user()
-    code = generated.read(folder, key)
-    if code is None:
-        code = generated.Generated(key, folder, {}, {"law": _source(device, inputs)})
-        code.write()
+    code = generated_code.load(key, lambda: ({}, {"law": _source(device, inputs)}))
     command = code.module("law").command
     states = controller.states
     limits = tuple((state.lower, state.upper) for state in states.values())

@@ -6,11 +6,11 @@ import hashlib
 import json
 from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 from bampipe.errors import InputError, did_you_mean
+from bampipe.generated_code import hash_sources
 from bampipe.physics import registry
 from bampipe.physics.device import Device
 from bampipe.physics.effect import BoundEffect, Effect, bind
@@ -77,10 +77,6 @@ class Model:
         return hashlib.sha256(text.encode()).hexdigest()[:24]
 
 
-@cache
 def code_version() -> str:
     """Hash of this package's source, so that generated code never outlives its generator."""
-    digest = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.glob("*.py")):
-        digest.update(path.read_bytes())
-    return digest.hexdigest()
+    return hash_sources(Path(__file__).parent)

@@ -16,7 +16,7 @@ import numpy as np
 import sympy as sp
 from numpy.typing import NDArray
 
-from bampipe.physics import generated
+from bampipe import generated_code
 from bampipe.physics.codegen import ARRAY_HEADER, function_source
 from bampipe.physics.derivation import derive
 from bampipe.physics.equations import Equations
@@ -87,9 +87,8 @@ def structure(system: System) -> Structure:
     Args:
         system: the compiled model.
     """
-    folder, key = generated.folder_of_user(), f"{system.model.key}_structure"
-    code = generated.read(folder, key)
-    if code is None:
+
+    def generate() -> tuple[dict[str, Any], dict[str, str]]:
         equations = derive(system.model, named_constants=True)
         groups, numbers, pivots = _split(system.model, equations)
         facts = {
@@ -97,8 +96,9 @@ def structure(system: System) -> Structure:
             "numbers": [[n.name, n.value, n.unit] for n in numbers],
         }
         source = ARRAY_HEADER + _slope_source(system.model, equations, pivots)
-        code = generated.Generated(key, folder, facts, {"slopes": source})
-        code.write()
+        return facts, {"slopes": source}
+
+    code = generated_code.load(f"{system.model.key}_structure", generate)
     together = tuple(Together(tuple(m), tuple(c)) for m, c in code.facts["together"])
     found = tuple(Number(*entry) for entry in code.facts["numbers"])
     return Structure(together, found, code.module("slopes").slopes)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bampipe.physics import generated
+from bampipe import generated_code
 from bampipe.physics.model import Model
 from bampipe.physics.parameter import Parameter
 
@@ -40,7 +40,7 @@ class System:
         braked: whether what the effects add depends on a brake's command.
     """
 
-    def __init__(self, model: Model, code: generated.Generated) -> None:
+    def __init__(self, model: Model, code: generated_code.Generated) -> None:
         self.model = model
         self._code = code
         meta = code.facts
@@ -284,10 +284,11 @@ def compile_model(model: Model) -> System:
     Raises:
         InputError: an expression of the model is wrong, or the cache cannot be used.
     """
-    folder = generated.folder_of_user()
-    known = generated.read(folder, model.key)
-    if known is not None:
-        return System(model, known)
+    return System(model, generated_code.load(model.key, lambda: _generate(model)))
+
+
+def _generate(model: Model) -> tuple[dict[str, Any], dict[str, str]]:
+    """What the generator says of a model, and the source of its modules."""
     from bampipe.model_functions import ROWS
     from bampipe.physics.codegen import array_source, memory_source, rows_source, scalar_source
     from bampipe.physics.derivation import derive
@@ -318,6 +319,4 @@ def compile_model(model: Model) -> System:
     }
     if equations.z:
         sources["memory"] = memory_source(equations)
-    made = generated.Generated(model.key, folder, facts, sources)
-    made.write()
-    return System(model, made)
+    return facts, sources

@@ -7,18 +7,19 @@ import json
 import os
 import subprocess
 import sys
+import time
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-import numba
 import numpy as np
 import pytest
 
-from bampipe import compiled
+from bampipe import compiled, generated_code
 from bampipe.errors import InputError
-from bampipe.physics import generated, registry
+from bampipe.physics import registry
 from bampipe.physics.model import Model
 from bampipe.physics.system import System, compile_model
 
@@ -43,7 +44,7 @@ def outer(x):
 
 def load(path: Path) -> ModuleType:
     """A fresh copy of a module, as a new process would load it."""
-    compiled._sources.cache_clear()
+    generated_code.hash_sources.cache_clear()
     spec = importlib.util.spec_from_file_location(path.stem, path)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -53,128 +54,218 @@ def load(path: Path) -> ModuleType:
 
 
 @pytest.fixture
-def function(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Compile a function that calls another; returns how to load both again, and their files."""
-    # Beside the sources, wherever the environment keeps the code of other modules.
-    # The variable too: numba reads it again when it first compiles.
-    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
-    monkeypatch.setattr(numba.config, "CACHE_DIR", "")
-    folder = tmp_path / "code"
-    folder.mkdir()
+def cached(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder of all cached code."""
+    monkeypatch.setenv("BAMPIPE_CACHE_DIR", str(tmp_path / "cache"))
+    return tmp_path / "cache"
 
-    def again(factor: float) -> float:
-        text = CALLED.format(factor=factor)
-        inner = folder / "inner_of_test.py"
-        if not inner.exists() or inner.read_text() != text:
-            inner.write_text(text)
-        (folder / "outer_of_test.py").write_text(CALLER)
-        load(inner)
+
+Call = Callable[..., float]
+
+
+@pytest.fixture
+def call(tmp_path: Path, cached: Path) -> Call:
+    """Compile a function that calls another, as a new process would, and call it."""
+
+    def load_and_call(factor: float, checkout: str = "code") -> float:
+        folder = tmp_path / checkout
+        folder.mkdir(exist_ok=True)
+        for name, text in (("inner", CALLED.format(factor=factor)), ("outer", CALLER)):
+            (folder / f"{name}_of_test.py").write_text(text)
+        load(folder / "inner_of_test.py")
         return float(load(folder / "outer_of_test.py").outer(3.0))
 
-    assert again(2.0) == 7.0
-    return again, folder / "__pycache__"
+    assert load_and_call(2.0) == 7.0
+    return load_and_call
 
 
-def kept(folder: Path) -> dict[str, Path]:
-    return {path.name.partition("-")[0]: path for path in sorted(folder.glob("*.nbc"))}
+def code_files(cached: Path) -> dict[str, Path]:
+    return {path.name.partition("-")[0]: path for path in sorted(cached.rglob("*.nb[ci]"))}
 
 
-def test_code_is_kept_and_read_again(function: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    again, folder = function
-    assert set(kept(folder)) == {"inner_of_test.inner", "outer_of_test.outer"}
-    saved: list[object] = []
-    monkeypatch.setattr(compiled._CodeFiles, "save", lambda self, key, data: saved.append(key))
-    assert again(2.0) == 7.0
+@pytest.fixture
+def saved(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Names of the files that are written from here on."""
+    names: list[str] = []
+    write = compiled._CheckedFiles._open_for_write
+
+    def noting(self: Any, path: str) -> Any:
+        names.append(Path(path).name.partition("-")[0] + Path(path).suffix)
+        return write(self, path)
+
+    monkeypatch.setattr(compiled._CheckedFiles, "_open_for_write", noting)
+    return names
+
+
+def test_code_is_cached_and_read_again(call: Call, cached: Path, saved: list[str]) -> None:
+    assert set(code_files(cached)) == {"inner_of_test.inner", "outer_of_test.outer"}
+    assert call(2.0) == 7.0
     assert saved == [], "nothing was compiled again"
+    assert not list(cached.rglob("*.lock")), "no lock is left"
 
 
-def test_a_changed_callee_recompiles_its_callers_in_other_files(function: Any) -> None:
-    again, folder = function
-    before = set(folder.glob("*.nbc"))
-    assert again(5.0) == 16.0
-    after = set(folder.glob("*.nbc"))
-    assert len(after) == 2 and not after & before, "what older sources left is dropped"
+def test_the_same_sources_elsewhere_find_the_same_code(call: Call, saved: list[str]) -> None:
+    assert call(2.0, checkout="another") == 7.0
+    assert saved == []
 
 
+def test_a_changed_callee_recompiles_its_callers_in_other_files(
+    call: Call, saved: list[str]
+) -> None:
+    assert call(5.0) == 16.0
+    assert {"inner_of_test.inner.nbc", "outer_of_test.outer.nbc"} <= set(saved)
+    saved.clear()
+    assert call(2.0) == 7.0 and saved == [], "both versions stay side by side"
+
+
+def test_code_that_nothing_used_for_a_month_is_removed(call: Call, cached: Path) -> None:
+    (old,) = {path.parent for path in code_files(cached).values()}
+    os.utime(old, (0.0, 0.0))
+    assert call(2.0) == 7.0 and old.stat().st_mtime > 0.0
+    os.utime(old, (0.0, 0.0))
+    assert call(5.0) == 16.0
+    assert not old.exists()
+
+
+@pytest.mark.parametrize("suffix", [".nbi", ".nbc"])
 @pytest.mark.parametrize("damage", ["truncated", "flipped", "garbage", "empty", "swapped"])
-def test_damaged_code_is_compiled_again(function: Any, damage: str) -> None:
-    again, folder = function
-    files = kept(folder)
-    sound = {name: path.read_bytes() for name, path in files.items()}
-    target, other = files["outer_of_test.outer"], files["inner_of_test.inner"]
-    content = bytearray(target.read_bytes())
-    content[-100] ^= 1
+def test_damaged_code_is_compiled_again(
+    call: Call, cached: Path, saved: list[str], suffix: str, damage: str
+) -> None:
+    (target,) = cached.rglob(f"outer_of_test*{suffix}")
+    (other,) = cached.rglob(f"inner_of_test*{suffix}")
+    sound = target.read_bytes()
+    flipped = bytearray(sound)
+    flipped[-100] ^= 1
     target.write_bytes(
         {
-            "truncated": target.read_bytes()[:200],
-            "flipped": bytes(content),
+            "truncated": sound[:100],
+            "flipped": bytes(flipped),
             "garbage": os.urandom(4000),
             "empty": b"",
             "swapped": other.read_bytes(),
         }[damage]
     )
-    broken = target.read_bytes()
-    assert again(2.0) == 7.0
-    assert target.read_bytes() != broken
-    assert kept(folder).keys() == sound.keys()
+    assert call(2.0) == 7.0
+    assert f"outer_of_test.outer{suffix}" in saved
+    saved.clear()
+    assert call(2.0) == 7.0 and saved == []
 
 
-@pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a file to somebody else")
-def test_code_of_another_user_is_not_run(function: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    again, folder = function
-    for path in folder.glob("*.nbc"):
-        os.chown(path, 4321, 4321)
-    monkeypatch.setattr(compiled.pickle, "loads", lambda content: pytest.fail("it was read"))
-    assert again(2.0) == 7.0
+@pytest.mark.parametrize("fault", ["owner", "mode"])
+def test_a_folder_of_compiled_code_that_is_not_private_is_not_read(
+    call: Call, cached: Path, saved: list[str], monkeypatch: pytest.MonkeyPatch, fault: str
+) -> None:
+    (folder,) = {path.parent for path in code_files(cached).values()}
+    assert folder.stat().st_mode & 0o777 == 0o700
+    if fault == "mode":
+        folder.chmod(0o777)
+    elif os.geteuid() == 0:
+        os.chown(folder, 4321, 4321)
+    else:
+        pytest.skip("only root can give a folder to somebody else")
+    monkeypatch.setattr(compiled, "_is_sound", lambda path: pytest.fail("it was read"))
+    assert call(2.0) == 7.0
+    assert saved == []
 
 
-def test_a_full_disk_costs_the_cache_only(function: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    again, folder = function
-
+def test_a_full_disk_costs_the_cache_only(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(compiled.tempfile, "mkstemp", full)
-    assert again(4.0) == 13.0
-    assert not list(folder.glob(".*"))
+    monkeypatch.setattr(compiled._CheckedFiles, "_open_for_write", full)
+    monkeypatch.setattr(compiled.os, "open", full)
+    assert call(4.0) == 13.0
 
 
-def code_files(folder: Path) -> compiled._CodeFiles:
-    """What another process would see of one function: claims of files are the file's, not ours."""
-    return compiled._CodeFiles(folder, "module.function", "stamp", {os.geteuid()})
+def test_without_a_folder_every_process_compiles_for_itself(
+    call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("BAMPIPE_CACHE_DIR", str(tmp_path / "file" / "cache"))
+    assert call(4.0) == 13.0
+
+
+COMPILE = """
+import sys, time
+sys.path.insert(0, {folder!r})
+from bampipe import compiled, generated_code
+save = compiled._CheckedCache.save_overload
+def slow_save(self, *given):
+    time.sleep(0.5)
+    print(self._impl.filename_base.partition("-")[0])
+    save(self, *given)
+compiled._CheckedCache.save_overload = slow_save
+import outer_of_test
+assert outer_of_test.outer(3.0) == 7.0
+"""
+
+
+def test_processes_that_start_together_compile_once(
+    call: Call, cached: Path, tmp_path: Path
+) -> None:
+    for path in code_files(cached).values():
+        for each in path.parent.iterdir():
+            each.unlink()
+        break
+    command = [sys.executable, "-c", COMPILE.format(folder=str(tmp_path / "code"))]
+    running = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(3)]
+    printed = "".join(process.communicate()[0] for process in running)
+    assert all(process.returncode == 0 for process in running)
+    assert sorted(printed.split()) == ["inner_of_test.inner", "outer_of_test.outer"]
+
+
+class Cache(compiled._CheckedCache):
+    """A function's cache as another process would see it: nothing compiled yet."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    @property
+    def index(self) -> Path:
+        return self.folder / "function.nbi"
 
 
 def test_what_another_process_compiles_is_waited_for(tmp_path: Path) -> None:
-    first, second = code_files(tmp_path), code_files(tmp_path)
-    assert first.load("key") is None
+    def wait() -> bool:
+        with compiled._one_process_at_a_time(Cache(tmp_path)):
+            return (tmp_path / "function.nbi").exists()
+
     with ThreadPoolExecutor(1) as pool:
-        waiting = pool.submit(second.load, "key")
-        with pytest.raises(TimeoutError):
-            waiting.result(timeout=0.2)
-        first.save("key", "code")
-        assert waiting.result(timeout=10.0) == "code"
-    assert [path.suffix for path in tmp_path.iterdir()] == [".nbc"], "no claim is left"
+        with compiled._one_process_at_a_time(Cache(tmp_path)):
+            waiting = pool.submit(wait)
+            with pytest.raises(TimeoutError):
+                waiting.result(timeout=0.2)
+            (tmp_path / "function.nbi").touch()
+        assert waiting.result(timeout=10.0), "what it waited for is there"
+    assert [path.name for path in tmp_path.iterdir()] == ["function.nbi"], "no lock is left"
 
 
 def test_a_process_that_dies_while_compiling_holds_up_nobody(tmp_path: Path) -> None:
-    first, second = code_files(tmp_path), code_files(tmp_path)
-    assert first.load("key") is None
-    for handle in first._claims.values():
-        os.close(handle)  # as its end would
-    assert second.load("key") is None
-    second.save("key", "code")
-    assert first.load("key") == "code"
+    code = (
+        "import os, sys\n"
+        "from pathlib import Path\n"
+        "sys.path.insert(0, sys.argv[2])\n"
+        "from test_code_cache import Cache, compiled\n"
+        "with compiled._one_process_at_a_time(Cache(Path(sys.argv[1]))):\n"
+        "    os._exit(0)\n"
+    )
+    command = [sys.executable, "-c", code, str(tmp_path), str(Path(__file__).parent)]
+    subprocess.run(command, check=True)
+    assert (tmp_path / "function.lock").exists(), "it had begun"
+    begun = time.monotonic()
+    with compiled._one_process_at_a_time(Cache(tmp_path)):
+        assert time.monotonic() - begun < 10.0
 
 
 def test_a_process_that_hangs_while_compiling_is_not_waited_for_without_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(compiled, "_PATIENCE_S", 0.1)
-    first, second = code_files(tmp_path), code_files(tmp_path)
-    assert first.load("key") is None
-    assert second.load("key") is None
-    second.save("key", "code")
-    assert code_files(tmp_path).load("key") == "code"
+    with compiled._one_process_at_a_time(Cache(tmp_path)):
+        begun = time.monotonic()
+        with compiled._one_process_at_a_time(Cache(tmp_path)):
+            assert 0.1 <= time.monotonic() - begun < 10.0
 
 
 # Generated source
@@ -219,7 +310,7 @@ def test_damaged_generated_code_is_generated_again(
 
 def test_code_that_nobody_vouches_for_is_not_run(model: Model, tmp_path: Path) -> None:
     """A module planted for a model that was never generated is overwritten, not executed."""
-    folder = generated.folder_of_user()
+    folder = generated_code.folder_of_user()
     planted = folder / f"columns_{model.key}.py"
     planted.write_text("raise SystemExit('planted code ran')\n")
     energy(compile_model(model))
@@ -231,20 +322,17 @@ def test_no_byte_code_stands_beside_generated_source(model: Model, tmp_path: Pat
     assert not list((tmp_path / "cache").rglob("*.pyc"))
 
 
-@pytest.mark.parametrize("place", ["python", "__pycache__"])
-def test_a_cache_that_others_may_write_is_refused(model: Model, tmp_path: Path, place: str) -> None:
-    folder = generated.folder_of_user()
+def test_a_cache_that_others_may_write_is_refused(model: Model) -> None:
+    folder = generated_code.folder_of_user()
     assert folder.stat().st_mode & 0o777 == 0o700
-    target = folder if place == "python" else folder / place
-    target.mkdir(exist_ok=True)
-    target.chmod(0o777)
+    folder.chmod(0o777)
     with pytest.raises(InputError, match=r"other users may write .*BAMPIPE_CACHE_DIR"):
         compile_model(model)
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a folder to somebody else")
 def test_a_cache_of_another_user_is_refused(model: Model, tmp_path: Path) -> None:
-    os.chown(generated.folder_of_user(), 4321, 4321)
+    os.chown(generated_code.folder_of_user(), 4321, 4321)
     with pytest.raises(InputError, match="belongs to another user"):
         compile_model(model)
 
@@ -264,8 +352,8 @@ def test_generated_code_that_cannot_be_written_is_said(
     def full(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(generated.tempfile, "mkstemp", full)
-    with pytest.raises(InputError, match=r"no space left on device; set BAMPIPE_CACHE_DIR"):
+    monkeypatch.setattr(Path, "replace", full)
+    with pytest.raises(InputError, match=r"the disk is full; set BAMPIPE_CACHE_DIR"):
         compile_model(model)
 
 
@@ -276,6 +364,7 @@ def test_facts_are_json(model: Model, tmp_path: Path) -> None:
     assert set(content) == {"format", "facts", "sources", "hash"}
 
 
+@pytest.mark.slow
 def test_a_read_only_home_needs_one_line(tmp_path: Path) -> None:
     """The cache is only wanted once a model is; then its place is named."""
     (tmp_path / "home").write_text("no folder")
