@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
 import os
 import signal
+import socket
+import subprocess
 import sys
 import threading
 import time
@@ -19,7 +23,7 @@ from conftest import TOYS, Toy, contents
 from bampipe.errors import InputError
 from bampipe.run import pipeline as pipelines
 from bampipe.run.cluster import _placed, run_on_cluster
-from bampipe.run.events import unheard
+from bampipe.run.events import Event, unheard
 from bampipe.run.request import Request, Step
 from bampipe.run.runner import run_session
 from bampipe.run.state import RunState
@@ -121,3 +125,129 @@ def test_a_stage_on_a_worker_starts_no_processes(tmp_path: Path) -> None:
 def test_no_scheduler_is_one_line(toy: Toy) -> None:
     with pytest.raises(InputError, match="no Dask scheduler answers"):
         run_on_cluster([toy.request()], "tcp://127.0.0.1:1", unheard)
+
+
+# A cluster that is not there, or not any longer
+
+
+class Listener:
+    """A server that takes connections and answers each with the same bytes, or not at all."""
+
+    def __init__(self, answer: bytes) -> None:
+        self.socket = socket.create_server(("127.0.0.1", 0))
+        self.address = f"tcp://127.0.0.1:{self.socket.getsockname()[1]}"
+        self.open: list[socket.socket] = []
+        threading.Thread(target=self._answer, args=(answer,), daemon=True).start()
+
+    def _answer(self, answer: bytes) -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                connection, _ = self.socket.accept()
+                self.open.append(connection)
+                connection.sendall(answer)
+
+
+ANSWERS = {"silence": b"", "HTTP": b"HTTP/1.1 400 Bad Request\r\n\r\n" * 20, "bytes": b"\xff" * 999}
+
+
+@pytest.mark.parametrize("answer", ANSWERS.values(), ids=ANSWERS)
+def test_what_is_no_scheduler_is_one_line(toy: Toy, answer: bytes) -> None:
+    server = Listener(answer)
+    began = time.monotonic()
+    with pytest.raises(InputError, match="no Dask scheduler answers"):
+        run_on_cluster([toy.request()], server.address, unheard)
+    assert time.monotonic() - began < 15.0
+    server.socket.close()
+
+
+@pytest.mark.parametrize("address", ["tls://127.0.0.1:1", "nothing://x:1", "tcp://127.0.0.1"])
+def test_an_address_that_cannot_be_is_one_line(toy: Toy, address: str) -> None:
+    with pytest.raises(InputError, match="no Dask scheduler answers"):
+        run_on_cluster([toy.request()], address, unheard)
+
+
+@contextlib.contextmanager
+def scheduler(tmp_path: Path, *workers: str) -> Iterator[tuple[str, list[Any]]]:
+    """A scheduler, and workers, in processes of their own; gives its address and them."""
+    file = tmp_path / "scheduler.json"
+    plain = ("--scheduler-file", str(file), "--no-dashboard")
+    program = [sys.executable, "-m", "distributed.cli"]
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    commands = [
+        [
+            *program[:2],
+            "distributed.cli.dask_scheduler",
+            *plain,
+            "--host",
+            "127.0.0.1",
+            "--port",
+            "0",
+        ]
+    ]
+    for name in workers:
+        commands.append(
+            [
+                *program[:2],
+                "distributed.cli.dask_worker",
+                *plain,
+                "--nthreads",
+                "1",
+                "--name",
+                name,
+                "--no-nanny",
+                "--preload",
+                str(TOYS / "toy_worker.py"),
+            ]
+        )
+    started = [subprocess.Popen(commands[0], cwd=tmp_path, **quiet)]
+    try:
+        deadline = time.monotonic() + 30.0
+        while not file.exists() or not file.read_text().strip().endswith("}"):
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        started += [subprocess.Popen(command, cwd=tmp_path, **quiet) for command in commands[1:]]
+        yield json.loads(file.read_text())["address"], started
+    finally:
+        for process in started:
+            process.kill()
+            process.wait()
+
+
+def test_a_scheduler_without_workers_is_one_line(toy: Toy) -> None:
+    with scheduler(toy.folder) as (address, _):
+        began = time.monotonic()
+        with pytest.raises(InputError, match="has had no workers for 10 s"):
+            run_on_cluster([toy.request()], address, unheard)
+        assert time.monotonic() - began < 15.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP], ids=["killed", "frozen"])
+def test_a_scheduler_lost_in_mid_run_keeps_what_was_done(
+    toy: Toy, number: signal.Signals, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TOY_PAUSE", "0.2")
+    first = install_toys.make_session(toy.folder / "many" / "a", "1")
+    second = install_toys.make_session(toy.folder / "many" / "b", "1 " * 400)
+    given = [
+        replace(toy.request(), root=toy.runs / folder.name, session=folder)
+        for folder in (first, second)
+    ]
+    lost: list[float] = []
+    with scheduler(toy.folder, "one") as (address, processes):
+
+        def lose(event: Event) -> None:
+            lost.append(time.monotonic())
+            processes[0].send_signal(number)
+
+        outcomes = run_on_cluster(given, address, lose)
+        assert time.monotonic() - lost[0] < 15.0
+        processes[0].send_signal(signal.SIGCONT)
+    assert [outcome.state for outcome in outcomes] == ["done", "refused"]
+    assert "the Dask scheduler was lost" in outcomes[1].error
+    assert [outcome.exit_code for outcome in outcomes] == [0, 2]
+    processes[1].wait()
+    monkeypatch.setenv("TOY_PAUSE", "0")
+    run_session(replace(given[1], root=toy.folder / "alone/b"))
+    run_session(given[1])
+    assert contents(given[1].root) == contents(toy.folder / "alone/b")

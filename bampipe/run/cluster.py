@@ -7,20 +7,36 @@ the finished run folders elsewhere (see :mod:`bampipe.run.publish`).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+import logging
+import queue
+import threading
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
 
 from bampipe.errors import InputError
 from bampipe.run.batch import guarded
 from bampipe.run.events import Event, Listener, unheard
 from bampipe.run.request import Outcome, Request
 
+if TYPE_CHECKING:
+    from distributed import Client, Future
+
+PATIENCE_S = 10.0
+"""How long a scheduler may be silent, or without workers."""
+POLL_S = 1.0
+
+Answer = TypeVar("Answer")
+
 
 def run_on_cluster(requests: Sequence[Request], scheduler: str, listen: Listener) -> list[Outcome]:
     """Run several sessions on a Dask cluster.
 
     A session whose worker dies is run again on another; one that kills worker after worker is
-    reported as crashed.
+    reported as crashed. Where the cluster is lost, what was not done is refused.
 
     Args:
         requests: one for each session; no two may share a run folder.
@@ -32,33 +48,124 @@ def run_on_cluster(requests: Sequence[Request], scheduler: str, listen: Listener
         The outcomes, in the order of the requests.
 
     Raises:
-        InputError: Dask is not installed, or the scheduler does not answer.
+        InputError: Dask is not installed, the scheduler does not answer, or has no workers.
     """
     try:
-        from distributed import Client, KilledWorker, as_completed
+        from distributed import Client
     except ImportError as error:
         raise InputError(
             "--engine dask needs Dask", remedy="pip install 'bampipe[dask]'"
         ) from error
-    options = {"address": scheduler} if scheduler else {"threads_per_worker": 1}
-    try:
-        client = Client(**options, timeout="10s")
-    except (OSError, ValueError) as error:
-        raise InputError(f"no Dask scheduler answers: {error}", where=scheduler) from error
+    # What it logs of lost connections is said below, once.
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    client = _connect(Client, scheduler) if scheduler else Client(threads_per_worker=1)
     outcomes: dict[int, Outcome] = {}
-    with client:
-        tasks = {}
-        for number, request in enumerate(requests):
-            tasks[client.submit(guarded, _placed(request), unheard, pure=False)] = number
-        for task in as_completed(tasks):
-            number = tasks[task]
-            root = requests[number].root
-            try:
-                outcomes[number] = replace(task.result(), root=root)
-            except KilledWorker as error:
-                outcomes[number] = Outcome(root, "crashed", error=f"its workers died: {error}")
-            listen(Event(root.name, "", "done", 1.0))
+    lost = ""
+    try:
+        tasks = {
+            client.submit(guarded, _placed(request), unheard, pure=False): number
+            for number, request in enumerate(requests)
+        }
+        watch = _Watch(client)
+        while tasks and not lost:
+            for task in [task for task in tasks if task.done()]:
+                number = tasks.pop(task)
+                root = requests[number].root
+                if task.status in ("cancelled", "lost"):
+                    lost = "the Dask scheduler was lost"
+                    continue
+                outcomes[number] = _outcome(task, root=root)
+                listen(Event(root.name, "", "done", 1.0))
+            lost = lost or watch.fault()
+            time.sleep(0.0 if lost or not tasks else 0.05)
+    finally:
+        _close(client)
+    if lost and not outcomes:
+        raise InputError(lost, where=scheduler, remedy="finished steps are kept: run it again")
+    for number, request in enumerate(requests):
+        said = f"{lost}; finished steps are kept: run it again"
+        outcomes.setdefault(number, Outcome(request.root, "refused", error=said))
     return [outcomes[number] for number in range(len(requests))]
+
+
+def _connect(kind: type[Client], scheduler: str) -> Client:
+    """Return a client of the scheduler at this address.
+
+    Raises:
+        InputError: nothing answers there, or something that is no scheduler.
+    """
+    try:
+        return _within(PATIENCE_S, lambda: kind(scheduler, timeout=f"{PATIENCE_S - 1.0:g}s"))
+    except TimeoutError as error:
+        raise InputError(
+            f"no Dask scheduler answers within {PATIENCE_S:g} s", where=scheduler
+        ) from error
+    # What is at the other end decides what is raised: no memory for what it announces, say.
+    except Exception as error:
+        what = str(error).partition("\n")[0] or type(error).__name__
+        raise InputError(f"no Dask scheduler answers: {what}", where=scheduler) from error
+
+
+def _within(seconds: float, call: Callable[[], Answer]) -> Answer:
+    """Return what ``call`` returns; Dask itself waits without end for a connection that is silent.
+
+    Raises:
+        TimeoutError: it takes longer.
+    """
+    answers: queue.SimpleQueue[tuple[Answer | None, Exception | None]] = queue.SimpleQueue()
+
+    def ask() -> None:
+        try:
+            answers.put((call(), None))
+        except Exception as error:
+            answers.put((None, error))
+
+    threading.Thread(target=ask, daemon=True).start()
+    try:
+        answer, error = answers.get(timeout=seconds)
+    except queue.Empty:
+        raise TimeoutError(f"no answer within {seconds:g} s") from None
+    if error is not None:
+        raise error
+    return answer  # type: ignore[return-value]
+
+
+class _Watch:
+    """Asks the scheduler now and then whether it is there and has workers."""
+
+    def __init__(self, client: Client) -> None:
+        self._client = client
+        self._asked = self._manned = time.monotonic()
+
+    def fault(self) -> str:
+        """What is wrong with the cluster, "" while it works."""
+        now = time.monotonic()
+        if now - self._asked < POLL_S:
+            return ""
+        self._asked = now
+        try:
+            found = _within(PATIENCE_S, lambda: self._client.scheduler_info()["workers"])
+        except Exception:
+            return "the Dask scheduler was lost"
+        if found:
+            self._manned = now
+        if now - self._manned > PATIENCE_S:
+            return f"the Dask scheduler has had no workers for {PATIENCE_S:g} s"
+        return ""
+
+
+def _outcome(task: Future[Outcome], root: Path) -> Outcome:
+    """What came of a task that is done; what its worker could not even begin is crashed."""
+    try:
+        found: Outcome = task.result()
+        return replace(found, root=root)
+    except Exception as error:
+        return Outcome(root, "crashed", error=f"its worker failed: {type(error).__name__}: {error}")
+
+
+def _close(client: Client) -> None:
+    with contextlib.suppress(Exception):
+        _within(PATIENCE_S / 5.0, client.close)
 
 
 def _placed(request: Request) -> Request:
