@@ -189,6 +189,8 @@ class _Generator(GenerateJsonSchema):
 def json_schema(kind: type) -> dict[str, Any]:
     """The JSON Schema of a file, or of the settings of a stage."""
     content = TypeAdapter(kind).json_schema(schema_generator=_Generator)
+    for definition in (content, *content.get("$defs", {}).values()):
+        del definition["title"]
     name = content["properties"].get("schema", {}).get("const")
     head = {"$schema": GenerateJsonSchema.schema_dialect} | ({"$id": name} if name else {})
     return head | content
@@ -199,8 +201,8 @@ def json_schema_text(kind: type[Declaration]) -> str:
 
     def lines(value: Any, indent: str, used: int) -> str:
         short = json.dumps(value, ensure_ascii=False)
-        room = 100 if "{" in short[1:] or "[" in short else 200
-        if len(indent) + used + len(short) < room or not isinstance(value, dict | list):
+        flat = "{" not in short[1:] and "[" not in short[1:]
+        if flat or len(indent) + used + len(short) < 160:
             return short
         inner = indent + " "
         if isinstance(value, list):

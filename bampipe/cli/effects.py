@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 from bampipe.cli import show
 from bampipe.errors import InputError, choose_from
+
+if TYPE_CHECKING:
+    from bampipe.physics.effect import Effect
 
 COLUMNS, ROWS = 61, 13
 
@@ -88,7 +92,7 @@ def show_one(text: str, device_name: str, json: bool) -> None:
     for line in _formulas(effect.declaration):
         show.say(f"  {line}")
     show.say("")
-    rows = [_parameter_row(*item) for item in _parameters(effect.declaration)]
+    rows = list(_parameter_rows(effect))
     head = ["parameter", "axis", "unit", "prior", "sd", "lower", "upper", "typical", ""]
     used = [
         column
@@ -132,22 +136,20 @@ def _formulas(declaration: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def _parameters(declaration: Mapping[str, Any]) -> list[tuple[str, str, Mapping[str, Any]]]:
-    found: list[tuple[str, str, Mapping[str, Any]]] = []
-    for name, entry in declaration.get("parameters", {}).items():
-        text = entry.get("description", "")
-        if "unit" in entry:
-            found.append((name, "", {"description": text, **entry}))
-        for kind in ("rotary", "linear"):
-            if kind in entry:
-                found.append((name, kind, {"description": text, **entry[kind]}))
-    return found
+def _parameter_rows(effect: Effect) -> Iterator[list[object]]:
+    """Name, kind of axis, unit, numbers and description of each parameter."""
+    from bampipe.physics.effect import ParameterByKind
 
-
-def _parameter_row(name: str, kind: str, entry: Mapping[str, Any]) -> list[object]:
-    keys = ("prior", "sd", "lower", "upper", "typical")
-    numbers = [None if entry.get(key) is None else float(entry[key]) for key in keys]
-    return [name, kind, entry["unit"], *numbers, entry["description"]]
+    for name, entry in effect.parameters.items():
+        if isinstance(entry, ParameterByKind):
+            by_kind = {"rotary": entry.rotary, "linear": entry.linear}
+        else:
+            by_kind = {"": entry}
+        for kind, p in by_kind.items():
+            if p is not None:
+                bounds = (value if math.isfinite(value) else None for value in (p.lower, p.upper))
+                about = p.description or entry.description
+                yield [name, kind, p.unit, p.prior, p.sd, *bounds, p.typical, about]
 
 
 def plot(abscissa: Sequence[float], ordinate: Sequence[float]) -> list[str]:
