@@ -3,55 +3,79 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import float64, int64, void
 from numpy.typing import NDArray
 
-from bampipe.compiled import njit
+from bampipe.compiled import njit, record_type
 from bampipe.estimate.runge_kutta import runge_kutta
-from bampipe.estimate.simulation import require_finite, stable_steps
+from bampipe.estimate.simulation import PLANT, make_plant, require_finite, stable_steps
 from bampipe.model_functions import COMMAND, DERIVATIVE, MEASURE
 
 Array = NDArray[np.float64]
 
 _V = float64[::1]
 _M = float64[:, ::1]
-_I = int64[::1]
 
 
-@njit(void(_V, _V, int64, _M, float64), cache=True)
-def _remember(kept, told, nf, limits, dt):  # type: ignore[no-untyped-def]
-    """Advance the states of the controller by the rates that follow its commands in ``told``."""
-    for i in range(kept.shape[0]):
-        kept[i] = min(max(kept[i] + dt * told[nf + i], limits[i, 0]), limits[i, 1])
+class _Controller(NamedTuple):
+    """The controller besides its law.
+
+    Attributes:
+        columns: of the inputs that it commands; ticks: how often it acts in a sample.
+        states: (n_s,) what it integrates; limits: (n_s, 2) of these.
+        start, end: (nu,) inputs of a tick; given: (nr,) references then.
+        out: (nf + n_s,) its commands and the rates of its states.
+    """
+
+    columns: NDArray[np.int64]
+    ticks: int
+    states: Array
+    limits: Array
+    start: Array
+    end: Array
+    given: Array
+    out: Array
+
+
+_CONTROLLER = record_type(_Controller, int64[::1], int64, _V, _M, _V, _V, _V, _V)
+
+
+@njit(void(COMMAND, _CONTROLLER, _V, _V, float64), cache=True)
+def _act(command, controller, y, r, dt):  # type: ignore[no-untyped-def]
+    """Command from readings and references, and advance the states of the controller by ``dt``."""
+    states, limits, out = controller.states, controller.limits, controller.out
+    nf = controller.columns.shape[0]
+    command(y, r, states, out)
+    for i in range(states.shape[0]):
+        states[i] = min(max(states[i] + dt * out[nf + i], limits[i, 0]), limits[i, 1])
 
 
 @njit(
     void(
-        DERIVATIVE, MEASURE, COMMAND, _M, _M, _M, _V, _V, int64, _V, float64, float64,
-        int64, _I, _M, _M, _V, _M,
+        DERIVATIVE, MEASURE, COMMAND, _M, _M, _M, _M, PLANT, _CONTROLLER, float64, _M
     ),
     cache=True,
 )  # fmt: skip
 def _close(  # type: ignore[no-untyped-def]
-    derivative, measure, command, x, u, r, p, w, n, width, dt, max_step, ticks, force, seen, work,
-    kept, limits,
-):  # fmt: skip
-    """Fill the rows of ``x`` after the first, the commands in ``u``, the readings in ``seen``."""
-    nu, nr, nf, ns = u.shape[1], r.shape[1], force.shape[0], kept.shape[0]
-    start, end = np.empty(nu), np.empty(nu)
-    given, told = np.empty(nr), np.empty(nf + ns)
+    derivative, measure, command, x, u, r, readings, plant, controller, dt, work
+):
+    """Fill the rows of ``x`` after the first, the commands in ``u``, and the readings."""
+    p, w = plant.p, plant.w
+    columns, ticks, out = controller.columns, controller.ticks, controller.out
+    start, end, given = controller.start, controller.end, controller.given
+    nu, nr, nf = u.shape[1], r.shape[1], columns.shape[0]
+    tick_s = dt / ticks
     for k in range(x.shape[0]):
         if k > 0:
             for j in range(nf):  # the encoders may be moved by the load
-                u[k, force[j]] = told[j]
-        measure(x[k], u[k], p, seen[k])
-        command(seen[k], r[k], kept, told)
-        _remember(kept, told, nf, limits, dt / ticks)
+                u[k, columns[j]] = out[j]
+        measure(x[k], u[k], p, readings[k])
+        _act(command, controller, readings[k], r[k], tick_s)
         for j in range(nf):
-            u[k, force[j]] = told[j]
+            u[k, columns[j]] = out[j]
         if k + 1 == x.shape[0]:
             break
         x[k + 1] = x[k]
@@ -60,20 +84,17 @@ def _close(  # type: ignore[no-untyped-def]
                 start[j] = u[k, j] + (u[k + 1, j] - u[k, j]) * tick / ticks
                 end[j] = u[k, j] + (u[k + 1, j] - u[k, j]) * (tick + 1) / ticks
             for j in range(nf):
-                start[force[j]] = told[j]
+                start[columns[j]] = out[j]
             if tick > 0:
                 for j in range(nr):
                     given[j] = r[k, j] + (r[k + 1, j] - r[k, j]) * tick / ticks
-                measure(x[k + 1], start, p, seen[k + 1])
-                command(seen[k + 1], given, kept, told)
-                _remember(kept, told, nf, limits, dt / ticks)
+                measure(x[k + 1], start, p, readings[k + 1])
+                _act(command, controller, readings[k + 1], given, tick_s)
             for j in range(nf):
-                start[force[j]] = told[j]
-                end[force[j]] = told[j]
-            steps = stable_steps(
-                derivative, x[k + 1], start, p, w, n, width, dt / ticks, max_step, work
-            )
-            runge_kutta(derivative, x[k + 1], start, end, p, w, dt / ticks, steps, work)
+                start[columns[j]] = out[j]
+                end[columns[j]] = out[j]
+            steps = stable_steps(derivative, x[k + 1], start, plant, tick_s, work)
+            runge_kutta(derivative, x[k + 1], start, end, p, w, tick_s, steps, work)
 
 
 def simulate_controlled(
@@ -116,43 +137,50 @@ def simulate_controlled(
     Raises:
         InputError: the motion grows without bounds.
     """
-    n = len(width)
     x, total = np.zeros((len(u), len(x0))), np.array(u, dtype=np.float64, order="C")
+    columns, references = np.array(force, dtype=np.int64), np.array(r, dtype=np.float64, order="C")
     x[0] = x0
-    told = total[0, list(force)].copy()
-    total[:, list(force)] = 0.0
-    seen = np.zeros((len(u), 2 * n))
+    recorded = total[0, columns]
+    total[:, columns] = 0.0
+    readings = np.zeros((len(u), 2 * len(width)))
     bounds = np.array(limits, dtype=np.float64).reshape(-1, 2)
-    measure(x[0], total[0], np.ascontiguousarray(p, dtype=np.float64), seen[0])
-    kept = _first_states(command, seen[0], np.array(r[0], dtype=np.float64), told, bounds)
-    ticks = max(1, round(dt * rate_hz) if rate_hz > 0.0 else int(np.ceil(dt / 1e-3 - 1e-9)))
+    plant = make_plant(p, n_noise, width, max_step)
+    measure(x[0], total[0], plant.p, readings[0])
+    states = _first_states(command, readings[0], references[0], recorded, bounds)
+    controller = _Controller(
+        columns=columns,
+        ticks=max(1, round(dt * rate_hz) if rate_hz > 0.0 else int(np.ceil(dt / 1e-3 - 1e-9))),
+        states=states,
+        limits=bounds,
+        start=np.empty(total.shape[1]),
+        end=np.empty(total.shape[1]),
+        given=np.empty(references.shape[1]),
+        out=np.empty(columns.size + states.size),
+    )
+    work = np.zeros((8, max(len(x0), total.shape[1])))
     _close(
-        derivative, measure, command, x, total, np.array(r, dtype=np.float64, order="C"),
-        np.ascontiguousarray(p, dtype=np.float64), np.zeros(n_noise), n,
-        np.ascontiguousarray(width, dtype=np.float64), dt, max_step, ticks,
-        np.array(force, dtype=np.int64), seen, np.zeros((8, max(len(x0), total.shape[1]))),
-        kept, bounds,
-    )  # fmt: skip
+        derivative, measure, command, x, total, references, readings, plant, controller, dt, work
+    )
     require_finite(x, dt)
-    return x, total, seen
+    return x, total, readings
 
 
-def _first_states(command: Any, y: Array, r: Array, told: Array, limits: Array) -> Array:
+def _first_states(command: Any, y: Array, r: Array, recorded: Array, limits: Array) -> Array:
     """States (n_s,) of the controller at which it commands what was recorded, within ``limits``.
 
     By one step of Newton's method from zero, which is exact where the command is linear in them;
     of several that will do, the smallest.
     """
-    count, nf = len(limits), len(told)
-    kept, out = np.clip(np.zeros(count), *limits.T), np.zeros(nf + count)
+    count, nf = len(limits), len(recorded)
+    states, out = np.clip(np.zeros(count), *limits.T), np.zeros(nf + count)
     if count == 0:
-        return kept
-    command(y, r, kept, out)
+        return states
+    command(y, r, states, out)
     now, slope = out[:nf].copy(), np.zeros((nf, count))
     for i in range(count):
-        other = kept.copy()
+        other = states.copy()
         other[i] += 1e-6
         command(y, r, other, out)
         slope[:, i] = (out[:nf] - now) / 1e-6
-    step = np.linalg.lstsq(slope, told - now, rcond=None)[0]
-    return np.asarray(np.clip(kept + step, *limits.T))
+    step = np.linalg.lstsq(slope, recorded - now, rcond=None)[0]
+    return np.asarray(np.clip(states + step, *limits.T))

@@ -16,12 +16,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import factorial
+from typing import NamedTuple
 
 import numpy as np
 from numba import boolean, float64, void
 from scipy.optimize import minimize_scalar
 
-from bampipe.compiled import njit
+from bampipe.compiled import njit, record_type
 from bampipe.estimate.differentiation import Array, Derivatives, Flags
 
 ORDERS = (3, 4)
@@ -101,25 +102,38 @@ def _update(x: Array, p: Array, y: float, gain: Array) -> tuple[float, float]:
     return innovation, spread
 
 
-@njit(void(_V, _SEEN, _M, _M, _V, _M, _M, float64[:, :, ::1], _M, _V, _V, _M), cache=True)
+class _Pass(NamedTuple):
+    """What the filter leaves for the smoother, by sample: states (T, n) and their covariances.
+
+    Also gains (T, n), innovations (T,) and their variances (T,).
+    """
+
+    states: Array
+    covariances: Array
+    gains: Array
+    innovations: Array
+    spreads: Array
+
+
+_PASS = record_type(_Pass, _M, float64[:, :, ::1], _M, _V, _V)
+
+
+def _allocate_pass(count: int, order: int) -> _Pass:
+    return _Pass(
+        np.empty((count, order)), np.empty((count, order, order)), np.zeros((count, order)),
+        np.zeros(count), np.ones(count),
+    )  # fmt: skip
+
+
+@njit(void(_V, _SEEN, _M, _M, _V, _M, _PASS, _M), cache=True)
 def _filter(
-    y: Array,
-    seen: Flags,
-    step: Array,
-    noise: Array,
-    x: Array,
-    p: Array,
-    states: Array,
-    covariances: Array,
-    gains: Array,
-    innovations: Array,
-    spreads: Array,
-    work: Array,
+    y: Array, seen: Flags, step: Array, noise: Array, x: Array, p: Array, passed: _Pass, work: Array
 ) -> None:
-    """Run the filter from prior ``x``, ``p`` for the first sample and keep what it passes.
+    """Run the filter from prior ``x``, ``p`` for the first sample and note what it passes.
 
     ``work`` (n, n) is scratch.
     """
+    states, covariances, gains, innovations, spreads = passed
     for t in range(y.shape[0]):
         if t > 0:
             _predict(x, p, step, noise, work)
@@ -131,24 +145,21 @@ def _filter(
                 covariances[t, i, j] = p[i, j]
 
 
-@njit(void(_SEEN, _M, _M, float64[:, :, ::1], _M, _V, _V, _M, _M, _M, _M), cache=True)
+@njit(void(_SEEN, _M, _PASS, _M, _M, _M, _M), cache=True)
 def _smooth(
     seen: Flags,
     step: Array,
-    states: Array,
-    covariances: Array,
-    gains: Array,
-    innovations: Array,
-    spreads: Array,
+    passed: _Pass,
     variances: Array,
     vectors: Array,
     weight: Array,
     left: Array,
 ) -> None:
-    """Turn filtered ``states`` (T, n) into smoothed ones, in place; fill ``variances`` (T, n).
+    """Turn the filtered states (T, n) into smoothed ones, in place; fill ``variances`` (T, n).
 
     ``vectors`` (2, n) and ``weight`` (n, n), zeros, and ``left`` (n, n) are scratch.
     """
+    states, covariances, gains, innovations, spreads = passed
     n = states.shape[1]
     adjoint, pull = vectors[0], vectors[1]
     for t in range(states.shape[0] - 1, -1, -1):
@@ -276,13 +287,10 @@ def _informed_prior(y: Array, seen: Flags, step: Array, noise: Array) -> tuple[A
     signs = (-1.0) ** np.arange(order)
     reverse = np.ascontiguousarray(y[::-1])
     start, spread = _prior(reverse, order)
-    states, covariances = np.empty((count, order)), np.empty((count, order, order))
-    _filter(
-        reverse, np.ascontiguousarray(seen[::-1]), step, noise, start, spread, states,
-        covariances, np.zeros((count, order)), np.zeros(count), np.ones(count),
-        np.empty((order, order)),
-    )  # fmt: skip
-    return states[-1] * signs, 100.0 * covariances[-1] * np.outer(signs, signs)
+    passed = _allocate_pass(count, order)
+    flags = np.ascontiguousarray(seen[::-1])
+    _filter(reverse, flags, step, noise, start, spread, passed, np.empty((order, order)))
+    return passed.states[-1] * signs, 100.0 * passed.covariances[-1] * np.outer(signs, signs)
 
 
 @dataclass(frozen=True)
@@ -326,19 +334,12 @@ def smooth(position: Array, model: MotionModel, seen: Flags | None = None) -> De
     step, noise = transition(order)
     y = (position - position[0]) / model.noise_sd
     start, spread = _informed_prior(y, seen, step, model.ratio * noise)
-    states, variances = np.empty((count, order)), np.empty((count, order))
-    covariances, gains = np.empty((count, order, order)), np.zeros((count, order))
-    innovations, spreads = np.zeros(count), np.ones(count)
-    _filter(
-        y, seen, step, model.ratio * noise, start, spread,
-        states, covariances, gains, innovations, spreads, np.empty((order, order)),
-    )  # fmt: skip
-    _smooth(
-        seen, step, states, covariances, gains, innovations, spreads, variances,
-        np.zeros((2, order)), np.zeros((order, order)), np.empty((order, order)),
-    )  # fmt: skip
+    passed, variances = _allocate_pass(count, order), np.empty((count, order))
+    work = np.empty((order, order))
+    _filter(y, seen, step, model.ratio * noise, start, spread, passed, work)
+    _smooth(seen, step, passed, variances, np.zeros((2, order)), np.zeros((order, order)), work)
     scale = model.noise_sd * model.rate_hz ** np.arange(3)
-    x, sd = states[:, :3] * scale, np.sqrt(variances[:, :3]) * scale
+    x, sd = passed.states[:, :3] * scale, np.sqrt(variances[:, :3]) * scale
     return Derivatives(x[:, 0] + position[0], x[:, 1], x[:, 2], sd[:, 0], sd[:, 1], sd[:, 2])
 
 

@@ -11,13 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import boolean, float64, int64, void
 from numpy.typing import NDArray
 
-from bampipe.compiled import njit
+from bampipe.compiled import njit, record_type
 from bampipe.errors import InputError
 from bampipe.estimate.runge_kutta import runge_kutta
 from bampipe.estimate.triangular import cholesky, forward_substitute
@@ -55,28 +55,84 @@ class Impedance:
     bandwidth: float = 120.0
 
 
-@njit(int64(DERIVATIVE, _V, _V, _V, _V, int64, _V, float64, float64, _M), cache=True)
-def stable_steps(derivative, x, u, p, w, n, width, dt, max_step, work):  # type: ignore[no-untyped-def]
+class Plant(NamedTuple):
+    """What kernels simulate besides the derivative.
+
+    Attributes:
+        p: (np,) parameters; w: (nw,) process noise, zeros.
+        width: (n_q,) velocity over which friction changes sign, rad/s or m/s.
+        max_step: longest integration step, s.
+    """
+
+    p: Array
+    w: Array
+    width: Array
+    max_step: float
+
+
+class _Arm(NamedTuple):
+    """The arm: columns of the inputs with its force and derivatives, and its `Impedance`."""
+
+    force: NDArray[np.int64]
+    rate: NDArray[np.int64]
+    curvature: NDArray[np.int64]
+    natural_frequency: float
+    damping_ratio: float
+    bandwidth: float
+
+
+class _Brakes(NamedTuple):
+    """Columns with the commands, gain (T, n_q) and the time over which the speed is averaged, s."""
+
+    columns: NDArray[np.int64]
+    gain: Array
+    time: float
+
+
+class _Workspace(NamedTuple):
+    """Memory: rows of a step's states (8, nx or nu), and what the arm's force is solved with.
+
+    Attributes:
+        response: (n, nf) acceleration by force; normal, factor: (nf, nf).
+        pull, pull_rate, goal: (nf,) force of the arm, its rate, what it is drawn to.
+        speed: (n,) as the brakes' controller sees it.
+    """
+
+    steps: Array
+    response: Array
+    normal: Array
+    factor: Array
+    pull: Array
+    pull_rate: Array
+    goal: Array
+    speed: Array
+
+
+PLANT = record_type(Plant, _V, _V, _V, float64)
+_ARM = record_type(_Arm, _I, _I, _I, float64, float64, float64)
+_WORKSPACE = record_type(_Workspace, _M, _M, _M, _M, _V, _V, _V, _V)
+
+
+@njit(int64(DERIVATIVE, _V, _V, PLANT, float64, _M), cache=True)
+def stable_steps(derivative, x, u, plant, dt, work):  # type: ignore[no-untyped-def]
     """Number of Runge-Kutta steps that ``dt`` needs from state ``x`` on.
 
-    At most ``max_step`` long, and no longer than the time constant of any axis: the derivative is
-    probed at both sides of standstill where it may come to rest within ``dt``, else at a rate
-    nearby, for heavy damping on a small mass is stiff at any speed.
+    At most ``plant.max_step`` long, and no longer than the time constant of any axis: the
+    derivative is probed at both sides of standstill where it may come to rest within ``dt``, else
+    at a rate nearby, for heavy damping on a small mass is stiff at any speed.
 
     Args:
         derivative: f(x, u, p, w, dx).
-        x: (nx,) positions (n), rates (n), internal states.
-        u, p, w: inputs, parameters, process noise.
-        n: number of coordinates.
-        width: (n,) velocity over which friction changes sign, rad/s or m/s.
-        dt, max_step: s.
+        x: (nx,) positions, rates, internal states; u: (nu,) inputs.
+        plant: the rest of what is simulated; dt: s.
         work: (8, >= nx) scratch; rows 5 to 7 are used.
     """
-    nx = x.shape[0]
+    p, w, width = plant.p, plant.w, plant.width
+    nx, n = x.shape[0], width.shape[0]
     moved = work[5, :nx]
     dx = work[6, :nx]
     probe = work[7, :nx]
-    fastest = 1.0 / max_step
+    fastest = 1.0 / plant.max_step
     derivative(x, u, p, w, dx)
     for i in range(nx):
         probe[i] = x[i]
@@ -97,24 +153,15 @@ def stable_steps(derivative, x, u, p, w, n, width, dt, max_step, work):  # type:
     return min(int(np.ceil(dt * fastest)), _MOST_STEPS)
 
 
-@njit(
-    void(
-        DERIVATIVE, _V, _V, _V, _V, int64, _V, _V, _I, float64, float64, _M, _M, _M, _M, _V
-    ),
-    cache=True,
-)  # fmt: skip
-def _demand(  # type: ignore[no-untyped-def]
-    derivative, x, u, p, w, n, q_ref, qd_ref, force, frequency, damping, work, response, normal,
-    factor, out,
-):  # fmt: skip
-    """Handle force that alone would give the acceleration which the arm demands, into ``out``.
-
-    ``response`` (n, nf), ``normal`` and ``factor`` (nf, nf) are scratch.
-    """
-    nx = x.shape[0]
-    nf = force.shape[0]
-    still = work[6, :nx]
-    moved = work[7, :nx]
+@njit(void(DERIVATIVE, _V, _V, PLANT, _ARM, _V, _V, _WORKSPACE), cache=True)
+def _solve_goal(derivative, x, u, plant, arm, q_ref, qd_ref, work):  # type: ignore[no-untyped-def]
+    """Handle force that alone would give the acceleration which the arm demands: ``work.goal``."""
+    p, w, force, out = plant.p, plant.w, arm.force, work.goal
+    response, normal, factor = work.response, work.normal, work.factor
+    frequency, damping = arm.natural_frequency, arm.damping_ratio
+    nx, n, nf = x.shape[0], plant.width.shape[0], force.shape[0]
+    still = work.steps[6, :nx]
+    moved = work.steps[7, :nx]
     derivative(x, u, p, w, still)
     for j in range(nf):
         u[force[j]] += 1.0
@@ -151,32 +198,25 @@ def _demand(  # type: ignore[no-untyped-def]
 
 @njit(
     void(
-        DERIVATIVE, _M, _M, _V, _V, int64, _M, _M, _V, float64, float64, boolean,
-        _I, _I, _I, _I, _M, float64, _V, _M, _M, _M, _M, _M,
+        DERIVATIVE, _M, _M, PLANT, _ARM, record_type(_Brakes, _I, _M, float64), _M, _M, float64,
+        boolean, _WORKSPACE,
     ),
     cache=True,
 )  # fmt: skip
-def _run(  # type: ignore[no-untyped-def]
-    derivative, x, u, p, w, n, q_ref, qd_ref, width, dt, max_step, hold,
-    force, rate, curvature, brake, brake_gain, brake_time, arm,
-    work, kept, response, normal, factor,
-):  # fmt: skip
+def _run(derivative, x, u, plant, arm, brakes, q_ref, qd_ref, dt, hold, work):  # type: ignore[no-untyped-def]
     """Fill the rows of ``x`` after the first and add arm force and brake commands to ``u``.
 
-    Without columns of ``force`` there is no arm, and ``q_ref``, ``qd_ref`` are not read.
-    ``kept`` (4, >= n and nf), zeros, and the matrices of `_demand` are scratch.
+    Without columns of force there is no arm, and ``q_ref``, ``qd_ref`` are not read.
     """
-    nf = force.shape[0]
-    frequency, damping, bandwidth = arm[0], arm[1], arm[2]
-    pull, pull_rate, goal, speed = kept[0], kept[1], kept[2], kept[3]
+    force, rate, curvature, bandwidth = arm.force, arm.rate, arm.curvature, arm.bandwidth
+    pull, pull_rate, goal, speed = work.pull, work.pull_rate, work.goal, work.speed
+    brake, brake_gain, steps = brakes.columns, brakes.gain, work.steps
+    n, nf = plant.width.shape[0], force.shape[0]
     fade = np.exp(-bandwidth * dt)
-    follow = 1.0 - np.exp(-dt / brake_time)
+    follow = 1.0 - np.exp(-dt / brakes.time)
     for k in range(x.shape[0] - 1):
         if nf > 0:
-            _demand(
-                derivative, x[k], u[k], p, w, n, q_ref[k], qd_ref[k], force, frequency, damping,
-                work, response, normal, factor, goal,
-            )  # fmt: skip
+            _solve_goal(derivative, x[k], u[k], plant, arm, q_ref[k], qd_ref[k], work)
         for j in range(nf):  # the low-pass, exact for a goal that is constant over dt
             gap = pull[j] - goal[j]
             slope = pull_rate[j] + bandwidth * gap
@@ -186,16 +226,16 @@ def _run(  # type: ignore[no-untyped-def]
             if rate.shape[0] > 0 and rate[j] >= 0:
                 u[k + 1, rate[j]] += pull_rate[j]
             if curvature.shape[0] > 0 and curvature[j] >= 0:
-                bend = bandwidth * (goal[j] - pull[j]) - 2.0 * pull_rate[j]
-                u[k + 1, curvature[j]] += bandwidth * bend
+                second = bandwidth * (goal[j] - pull[j]) - 2.0 * pull_rate[j]
+                u[k + 1, curvature[j]] += bandwidth * second
         for i in range(brake.shape[0]):
             speed[i] += follow * (x[k, n + i] - speed[i])
             u[k + 1, brake[i]] += brake_gain[k, i] * abs(speed[i])
         for i in range(x.shape[1]):
             x[k + 1, i] = x[k, i]
-        steps = stable_steps(derivative, x[k], u[k], p, w, n, width, dt, max_step, work)
+        count = stable_steps(derivative, x[k], u[k], plant, dt, steps)
         end = u[k] if hold else u[k + 1]
-        runge_kutta(derivative, x[k + 1], u[k], end, p, w, dt, steps, work)
+        runge_kutta(derivative, x[k + 1], u[k], end, plant.p, plant.w, dt, count, steps)
 
 
 def simulate(
@@ -317,18 +357,31 @@ def _integrate(
     gain = np.zeros((0, 0)) if brake_gain is None else np.ascontiguousarray(brake_gain)
     n, nf = len(width), len(force)
     _run(
-        derivative, x, total, np.ascontiguousarray(p, dtype=np.float64), np.zeros(n_noise), n,
+        derivative, x, total, make_plant(p, n_noise, width, max_step),
+        _Arm(
+            np.array(force, dtype=np.int64), np.array(rate, dtype=np.int64),
+            np.array(curvature, dtype=np.int64),
+            arm.natural_frequency, arm.damping_ratio, arm.bandwidth,
+        ),
+        _Brakes(np.array(brake, dtype=np.int64), gain, brake_time),
         np.array(q_ref, dtype=np.float64, order="C"),  # a copy: columns of a table are read-only
-        np.array(qd_ref, dtype=np.float64, order="C"),
-        np.ascontiguousarray(width, dtype=np.float64), dt, max_step, hold,
-        np.array(force, dtype=np.int64), np.array(rate, dtype=np.int64),
-        np.array(curvature, dtype=np.int64), np.array(brake, dtype=np.int64), gain, brake_time,
-        np.array([arm.natural_frequency, arm.damping_ratio, arm.bandwidth]),
-        np.zeros((8, max(len(x0), total.shape[1]))), np.zeros((4, max(n, nf))),
-        np.empty((n, nf)), np.empty((nf, nf)), np.zeros((nf, nf)),
+        np.array(qd_ref, dtype=np.float64, order="C"), dt, hold,
+        _Workspace(
+            np.zeros((8, max(len(x0), total.shape[1]))),
+            np.empty((n, nf)), np.empty((nf, nf)), np.zeros((nf, nf)),
+            np.zeros(nf), np.zeros(nf), np.zeros(nf), np.zeros(n),
+        ),
     )  # fmt: skip
     require_finite(x, dt)
     return x, total
+
+
+def make_plant(p: Array, n_noise: int, width: Array, max_step: float) -> Plant:
+    """Return what is simulated as kernels take it; without process noise."""
+    return Plant(
+        np.ascontiguousarray(p, dtype=np.float64), np.zeros(n_noise),
+        np.ascontiguousarray(width, dtype=np.float64), max_step,
+    )  # fmt: skip
 
 
 def require_finite(x: Array, dt: float) -> None:
