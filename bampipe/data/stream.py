@@ -22,7 +22,7 @@ MOST_COMPLAINTS = 3
 
 
 @dataclass(frozen=True)
-class Layout:
+class StreamLayout:
     """What the columns of a stream mean: SI values = raw @ gain + offset, time first.
 
     Attributes:
@@ -39,16 +39,16 @@ class Layout:
     may_lack: NDArray[np.bool_]
 
     @staticmethod
-    def in_si(names: Sequence[str]) -> Layout:
+    def in_si(names: Sequence[str]) -> StreamLayout:
         """Columns that are named and measured as in ``ingest/samples.parquet``."""
         columns = ("t", *names)
-        return Layout(
+        return StreamLayout(
             columns, columns, np.eye(len(columns)), np.zeros(len(columns)),
             np.array([name.startswith("q_") for name in columns]),
         )  # fmt: skip
 
     @staticmethod
-    def of_session(session: Session) -> Layout:
+    def of_session(session: Session) -> StreamLayout:
         """Columns as a session file describes its raw logs.
 
         Raises:
@@ -98,7 +98,7 @@ class Layout:
             offset[at:] = -np.array(force.zero) @ matrix
         may_lack = np.zeros(len(columns), dtype=bool)
         may_lack[1 : 1 + len(session.encoders)] = True
-        return Layout(tuple(columns), tuple(names), gain, offset, may_lack)
+        return StreamLayout(tuple(columns), tuple(names), gain, offset, may_lack)
 
 
 @dataclass
@@ -110,24 +110,24 @@ class SampleStream:
         name: what messages call it.
         layouts: what its header may look like, the first that fits counts.
         strict: raise at the first bad line instead of skipping it.
-        complain: told of the first few lines that are skipped.
+        complain: called with each of the first few lines that are skipped.
         ended: whether the last read found no more bytes.
         bad_lines: how many were skipped.
     """
 
     descriptor: int
     name: str
-    layouts: Sequence[Layout]
+    layouts: Sequence[StreamLayout]
     strict: bool
     complain: Callable[[str], None]
     ended: bool = False
     bad_lines: int = 0
-    _layout: Layout | None = None
+    _layout: StreamLayout | None = None
     _rest: bytes = b""
     _line: int = 0
     _delimiter: str = ","
     _width: int = 0
-    _places: tuple[int, ...] = ()
+    _indices: tuple[int, ...] = ()
     _last: float = field(default=-np.inf)
 
     @property
@@ -139,7 +139,7 @@ class SampleStream:
         """Return the samples, (T, m), of what has come since; T may be 0.
 
         Args:
-            last: whether an unfinished line at the end is taken for whole.
+            last: whether an unfinished line at the end is taken as complete.
 
         Raises:
             InputError: the header lacks a column, a line has no end, or, where strict, is bad.
@@ -175,7 +175,7 @@ class SampleStream:
                 if set(layout.columns) <= set(found):
                     self._layout = layout
                     self._width = len(found)
-                    self._places = tuple(found.index(name) for name in layout.columns)
+                    self._indices = tuple(found.index(name) for name in layout.columns)
                     break
             else:
                 missing = [name for name in self.layouts[0].columns if name not in found]
@@ -186,17 +186,17 @@ class SampleStream:
                 )
         return lines
 
-    def _samples(self, lines: list[str], layout: Layout) -> Array:
+    def _samples(self, lines: list[str], layout: StreamLayout) -> Array:
         rows: list[list[float]] = []
         numbers: list[int] = []
-        places, width, delimiter = self._places, self._width, self._delimiter
+        indices, width, delimiter = self._indices, self._width, self._delimiter
         for line in lines:
             self._line += 1
             cells = line.split(delimiter)
             try:
                 if len(cells) != width:
                     raise ValueError
-                row = [float(cells[place]) for place in places]
+                row = [float(cells[index]) for index in indices]
             except ValueError:
                 if not line.strip() or line.startswith("#"):
                     continue
@@ -219,26 +219,26 @@ class SampleStream:
             np.concatenate([[self._last], np.where(good, time, -np.inf)])
         )
         late = good & ~(time > before[:-1])
-        for place in np.flatnonzero(~good | late):
-            if late[place]:
-                self._skip(numbers[place], layout.columns[0], "the time does not increase")
+        for row in np.flatnonzero(~good | late):
+            if late[row]:
+                self._skip(numbers[row], layout.columns[0], "the time does not increase")
             else:
-                column = int(np.argmin(finite[place] | layout.may_lack))
-                self._skip(numbers[place], layout.columns[column], "no number")
+                column = int(np.argmin(finite[row] | layout.may_lack))
+                self._skip(numbers[row], layout.columns[column], "no number")
         keep = good & ~late
         self._last = float(before[-1])
         return _in_si(raw[keep], layout)
 
-    def _carefully(self, cells: list[str], layout: Layout) -> list[float] | None:
+    def _carefully(self, cells: list[str], layout: StreamLayout) -> list[float] | None:
         """Read a line that is not plain numbers; None where it is bad."""
         if len(cells) != self._width:
             self._skip(self._line, "", f"{len(cells)} cells where the header has {self._width}")
             return None
         row = []
-        for place, column, may_lack in zip(
-            self._places, layout.columns, layout.may_lack, strict=True
+        for index, column, may_lack in zip(
+            self._indices, layout.columns, layout.may_lack, strict=True
         ):
-            text = cells[place].strip().strip("\"'")
+            text = cells[index].strip().strip("\"'")
             try:
                 row.append(np.nan if may_lack and not text else float(text))
             except ValueError:
@@ -256,7 +256,7 @@ class SampleStream:
             self.complain(f"{where}: {what}: skipped{more}")
 
 
-def _in_si(raw: Array, layout: Layout) -> Array:
+def _in_si(raw: Array, layout: StreamLayout) -> Array:
     """Apply gains; a missing position stays missing and spoils nothing else."""
     lost = np.isnan(raw)
     values = np.where(lost, 0.0, raw) @ layout.gain + layout.offset

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bampipe.data.readers import ENDINGS, columns_of, read_trial
+from bampipe.data.readers import EXTENSIONS, columns_of, read_trial
 from bampipe.data.units import unit
 from bampipe.errors import InputError
 
@@ -104,7 +104,7 @@ def survey(folder: Path) -> Survey:
     paths = sorted(
         path
         for path in folder.rglob("*")
-        if path.suffix.lower() in ENDINGS
+        if path.suffix.lower() in EXTENSIONS
         and path.is_file()
         and not any(part.startswith(".") for part in path.relative_to(folder).parts)
     )
@@ -112,7 +112,7 @@ def survey(folder: Path) -> Survey:
         raise InputError(
             "no log in this folder",
             where=str(folder),
-            remedy=f"logs end in {', '.join(ENDINGS)}",
+            remedy=f"supported file extensions are {', '.join(EXTENSIONS)}",
         )
     if len(paths) > MOST_FILES:
         raise InputError(f"{len(paths)} logs are more than {MOST_FILES}", where=str(folder))
@@ -174,6 +174,6 @@ def _unit(name: str, stated: str, role: str) -> str:
     if stated:
         return stated
     parts = re.split(r"[_\W]+", name)
-    ending = parts[-1] if len(parts) > 1 else ""
-    matches = [u for u in _UNIT_WORDS.get(role, ()) if u.lower() == ending.lower()]
+    suffix = parts[-1] if len(parts) > 1 else ""
+    matches = [u for u in _UNIT_WORDS.get(role, ()) if u.lower() == suffix.lower()]
     return matches[0] if matches else ""

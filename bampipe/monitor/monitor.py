@@ -63,7 +63,7 @@ class Monitor:
             self._begin(start)
 
     def push(self, names: Sequence[str], values: Array) -> None:
-        """Take samples (T, m), columns ``names`` as a `Layout` has them."""
+        """Take samples (T, m), columns ``names`` as a `StreamLayout` has them."""
         for first in range(0, len(values), PORTION):
             part = values[first : first + PORTION]
             if not np.isfinite(self._first_t):

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from bampipe.data.run_folder import RunFolder
 from bampipe.data.session import Session, read_session
 from bampipe.data.store import read_parquet
-from bampipe.data.stream import Layout, SampleStream
+from bampipe.data.stream import SampleStream, StreamLayout
 from bampipe.declarations.model_file import load_model
 from bampipe.errors import InputError
 from bampipe.estimate.consistency import Reference, window_means
@@ -99,7 +99,7 @@ class Start:
         return state_at(system, p[:-1], (q, none, none), u, self.settings.reading_sd, self.speed_sd)
 
 
-def layouts(system: System, session: Session | None) -> tuple[Layout, ...]:
+def layouts(system: System, session: Session | None) -> tuple[StreamLayout, ...]:
     """What the header of a stream for this model may look like.
 
     SI columns named as in ``ingest/samples.parquet``, brake commands being zero where their
@@ -121,11 +121,11 @@ def layouts(system: System, session: Session | None) -> tuple[Layout, ...]:
     positions = [f"q_{axis}" for axis in system.coordinates]
     others = [name for name in system.inputs if name not in brakes and name != "t"]
     commands = [brakes[name] for name in system.inputs if name in brakes]
-    found = [Layout.in_si([*positions, *others, *commands])]
+    found = [StreamLayout.in_si([*positions, *others, *commands])]
     if commands:
-        found.append(Layout.in_si([*positions, *others]))
+        found.append(StreamLayout.in_si([*positions, *others]))
     if session is not None:
-        found.append(Layout.of_session(session))
+        found.append(StreamLayout.of_session(session))
     return tuple(found)
 
 

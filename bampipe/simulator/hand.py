@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from bampipe.estimate.simulation import Impedance, simulate_tracking
 from bampipe.physics.device import Coordinate, Device, derivative
-from bampipe.physics.system import System
-from bampipe.simulator.plant import Config, Plant
+from bampipe.simulator.plant import Config, Plant, input_column
 
 Array = NDArray[np.float64]
 
@@ -30,7 +29,7 @@ BAND = (0.1, 2.0)
 
 
 @dataclass(frozen=True)
-class Recording:
+class TrueTrial:
     """True course of one trial: t (T,) s; q, qd (T, n_q); force (T, n_f); brake (T, n_b)."""
 
     t: Array
@@ -65,7 +64,7 @@ def _wanted(
 
 def moving_trial(
     plant: Plant, config: Config, rng: np.random.Generator, viscous: bool
-) -> Recording:
+) -> TrueTrial:
     """A free trial, or one in a viscous field."""
     system, device = plant.motion, plant.device
     dt = 1.0 / config.sample_rate
@@ -76,7 +75,7 @@ def moving_trial(
     if "t" in system.inputs:
         u[:, system.inputs.index("t")] = t
     force = [system.inputs.index(f) for f in device.forces]
-    slopes = [[_column(system, derivative(f, k)) for f in device.forces] for k in (1, 2)]
+    slopes = [[input_column(system, derivative(f, k)) for f in device.forces] for k in (1, 2)]
     n = len(device.coordinates)
     brakes = [system.inputs.index(device.brakes[c.name]) for c in device.coordinates] if (
         viscous or set(device.brakes) == {c.name for c in device.coordinates}
@@ -95,14 +94,10 @@ def moving_trial(
         )  # fmt: skip
         pose = x[:, :n]
     brake = [system.inputs.index(b) for b in device.brakes.values()]
-    return Recording(t, x[:, :n], x[:, n : 2 * n], total[:, force], total[:, brake])
+    return TrueTrial(t, x[:, :n], x[:, n : 2 * n], total[:, force], total[:, brake])
 
 
-def _column(system: System, name: str) -> int:
-    return system.inputs.index(name) if name in system.inputs else -1
-
-
-def locked_trial(plant: Plant, config: Config, rng: np.random.Generator, axis: str) -> Recording:
+def locked_trial(plant: Plant, config: Config, rng: np.random.Generator, axis: str) -> TrueTrial:
     """An axis held by its brake while the handle is loaded: the transmission winds up.
 
     The load is stiffness times deflection plus friction that builds up over a tenth of the
@@ -134,7 +129,7 @@ def locked_trial(plant: Plant, config: Config, rng: np.random.Generator, axis: s
     force += np.where(others, 1.2 * np.sin(2 * np.pi * 0.17 * t[:, None] + wander), 0.0)
     brake = np.zeros((len(t), len(device.brakes)))
     brake[:, list(device.brakes).index(axis)] = LOCKED_BRAKE
-    return Recording(t, q, np.zeros_like(q), force, brake)
+    return TrueTrial(t, q, np.zeros_like(q), force, brake)
 
 
 def _forces(input_map: Array, load: Array) -> Array:

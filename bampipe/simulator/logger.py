@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from bampipe.errors import InputError
 from bampipe.physics.device import INPUT_ORDERS, Coordinate, Device, derivative
 from bampipe.physics.system import System
-from bampipe.simulator.hand import Recording
-from bampipe.simulator.plant import Config, Plant
+from bampipe.simulator.hand import TrueTrial
+from bampipe.simulator.plant import Config, Plant, input_column
 
 Array = NDArray[np.float64]
 
@@ -30,7 +30,7 @@ _TOO_HIGH = range(3, len(INPUT_ORDERS))
 
 
 def read_out(
-    plant: Plant, config: Config, rng: np.random.Generator, true: Recording, locked: bool
+    plant: Plant, config: Config, rng: np.random.Generator, true: TrueTrial, locked: bool
 ) -> pd.DataFrame:
     """What the logger writes: whole counts, volts, brake commands."""
     device = plant.device
@@ -51,7 +51,7 @@ def read_out(
     return pd.DataFrame(columns)
 
 
-def _inputs(system: System, true: Recording, force: Array) -> Array:
+def _inputs(system: System, true: TrueTrial, force: Array) -> Array:
     """Columns of u for the sensor models."""
     u = np.zeros((len(true.t), len(system.inputs)))
     for j, f in enumerate(system.model.device.forces):
@@ -64,7 +64,7 @@ def _inputs(system: System, true: Recording, force: Array) -> Array:
     return u
 
 
-def _sensed_position(plant: Plant, true: Recording, force: Array) -> Array:
+def _sensed_position(plant: Plant, true: TrueTrial, force: Array) -> Array:
     """The reading q_m that solves q_true = q_m + offset(q_m), by iteration; ``force`` loads it."""
     if plant.position is None:
         return true.q
@@ -79,7 +79,7 @@ def _sensed_position(plant: Plant, true: Recording, force: Array) -> Array:
     raise InputError("a position effect is too strong to be simulated", remedy="weaken it")
 
 
-def _sensed_force(plant: Plant, true: Recording) -> Array:
+def _sensed_force(plant: Plant, true: TrueTrial) -> Array:
     """The reading of the force sensor, without noise.
 
     The effects say true = T(reading). T is affine in the reading and its two derivatives, so its
@@ -104,12 +104,12 @@ def _sensed_force(plant: Plant, true: Recording) -> Array:
 
     zero = _inputs(system, true, np.zeros_like(late))
     constant = corrected(zero)
-    if any(_input_column(system, derivative(f, k)) >= 0 for f in names for k in _TOO_HIGH):
+    if any(input_column(system, derivative(f, k)) >= 0 for f in names for k in _TOO_HIGH):
         raise InputError("an input effect with a third derivative cannot be simulated")
     response = np.zeros((3, len(late), nf, nf))
     for order in range(3):
         for j, f in enumerate(names):
-            column = _input_column(system, derivative(f, order))
+            column = input_column(system, derivative(f, order))
             if column >= 0:
                 u = zero.copy()
                 u[:, column] = 1.0
@@ -129,10 +129,6 @@ def _sensed_force(plant: Plant, true: Recording) -> Array:
         reading[k] = np.linalg.solve(a + b + c, known)
         before, now = now, reading[k]
     return reading
-
-
-def _input_column(system: System, name: str) -> int:
-    return system.inputs.index(name) if name in system.inputs else -1
 
 
 def _encoder(c: Coordinate) -> tuple[str, float, int]:

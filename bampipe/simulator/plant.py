@@ -91,6 +91,11 @@ class Plant:
         return np.array([self.values[p.name] for p in system.parameters])
 
 
+def input_column(system: System, name: str) -> int:
+    """Column of an input in u, -1 where the model has no use for it."""
+    return system.inputs.index(name) if name in system.inputs else -1
+
+
 def draw_plant(config: Config) -> tuple[Plant, dict[str, float]]:
     """Draw the plant; also the strength of each effect by canonical name."""
     device = registry.device(config.device)
@@ -98,10 +103,10 @@ def draw_plant(config: Config) -> tuple[Plant, dict[str, float]]:
     strengths = dict(_strength(text, config.strength) for text in config.effects)
     if len(strengths) < len(config.effects):
         raise InputError("an effect is named twice")
-    whole = Model(device, strengths, extra)
+    full = Model(device, strengths, extra)
     rng = np.random.default_rng([config.seed, 0])
     values = _base_values(device, rng)
-    for item in whole.effects:
+    for item in full.effects:
         values |= _effect_values(item, strengths[item.name], rng)
     for name, value in config.parameters.items():
         if name not in values:
@@ -110,10 +115,10 @@ def draw_plant(config: Config) -> tuple[Plant, dict[str, float]]:
         values[name] = float(value)
 
     def part(*kinds: str) -> System | None:
-        chosen = [e.name for e in whole.effects if e.effect.kind in kinds and not _is_delay(e)]
+        chosen = [e.name for e in full.effects if e.effect.kind in kinds and not _is_delay(e)]
         return compile_model(Model(device, chosen, extra)) if chosen else None
 
-    delay = sum(values[f"{e.prefix}.delay"] for e in whole.effects if _is_delay(e))
+    delay = sum(values[f"{e.prefix}.delay"] for e in full.effects if _is_delay(e))
     stiffness = {c.name: STIFFNESS[c.kind] * float(rng.uniform(0.95, 1.05)) for c in
                  device.coordinates}  # fmt: skip
     motion = part("torque", "energy") or compile_model(Model(device))

@@ -25,9 +25,6 @@ from bampipe.simulator.plant import Config, draw_plant
 
 __all__ = ["Config", "simulate_session"]
 
-NAME = "simulate"
-SUMMARY = "Make a session from the model, with known effects hidden in it"
-
 
 def simulate_session(out: Path, config: Config, progress: Progress = silent) -> dict[str, object]:
     """Write a session folder ``out`` and the truth about it to ``out`` + ``.truth.json``.
@@ -35,7 +32,7 @@ def simulate_session(out: Path, config: Config, progress: Progress = silent) -> 
     Args:
         out: folder to make; must not exist, or be empty.
         config: what to simulate; equal configurations give equal bytes.
-        progress: told after each trial.
+        progress: called after each trial.
 
     Returns:
         ``session``, ``truth`` (paths), ``effects``, ``trials`` (file names).
@@ -60,10 +57,10 @@ def simulate_session(out: Path, config: Config, progress: Progress = silent) -> 
     for number, trial in enumerate(trials):
         rng = np.random.default_rng([config.seed, 1 + number])
         if trial["kind"] == "locked":
-            recording = locked_trial(plant, config, rng, trial["locked_axis"])
+            true = locked_trial(plant, config, rng, trial["locked_axis"])
         else:
-            recording = moving_trial(plant, config, rng, trial["kind"] == "viscous")
-        frame = read_out(plant, config, rng, recording, trial["kind"] == "locked")
+            true = moving_trial(plant, config, rng, trial["kind"] == "viscous")
+        frame = read_out(plant, config, rng, true, trial["kind"] == "locked")
         path = out / trial["file"]
         if config.file_format == "csv":
             write_text(path, frame.to_csv(index=False, lineterminator="\n"))

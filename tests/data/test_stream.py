@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from bampipe.data.session import read_session
-from bampipe.data.stream import Layout, SampleStream
+from bampipe.data.stream import SampleStream, StreamLayout
 from bampipe.errors import InputError
 
 SAMPLES = Path(__file__).parents[2] / "sample_runs"
-SI = Layout.in_si(["q_yaw", "force_x"])
+SI = StreamLayout.in_si(["q_yaw", "force_x"])
 
 
 class Pipe:
@@ -107,7 +107,7 @@ def test_what_is_no_text_is_refused():
 
 
 def test_raw_columns_of_a_session_become_si():
-    layout = Layout.of_session(read_session(SAMPLES / "first"))
+    layout = StreamLayout.of_session(read_session(SAMPLES / "first"))
     pipe = Pipe((SI, layout))
     rows = pipe.write(
         "time_us,enc_yaw,enc_pitch,enc_extension,brake_yaw,brake_pitch,brake_extension,"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import itertools
 import json
 import threading
 from collections.abc import Callable
@@ -87,7 +88,7 @@ def test_a_log_read_while_it_grows(
 
     def log() -> None:
         with path.open("wb", buffering=0) as stream:
-            for first, last in zip(cuts[:-1], cuts[1:], strict=True):
+            for first, last in itertools.pairwise(cuts):
                 stream.write(content[first:last])
                 started.set()
                 threading.Event().wait(0.002)

@@ -408,7 +408,7 @@ ASIDE: dict[str, tuple[Damage, str]] = {
             put("trials.0.file", "trials/t01.xlsx")(made)
             or file(b"PK\x03\x04" + bytes(99), "trials/t01.xlsx")(made)
         ),
-        "ending '.xlsx'",
+        "unsupported file extension '.xlsx'",
     ),
     "a spreadsheet called CSV": (file(b"PK\x03\x04" + bytes(99)), "zip archive or spreadsheet"),
     "a gzip archive called CSV": (file(b"\x1f\x8b" + bytes(99)), "gzip archive"),

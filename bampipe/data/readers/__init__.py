@@ -1,4 +1,4 @@
-"""Readers of trial files, one module a format; :func:`read_trial` chooses by the file's ending.
+"""Readers of trial files, one module a format; :func:`read_trial` chooses by the file extension.
 
 Every reader returns the wanted columns as float64, with NaN where a cell is empty, and raises
 :class:`bampipe.errors.InputError` naming file, row and column where the file cannot be trusted.
@@ -11,26 +11,35 @@ taken (:mod:`.unpacking`).
 from __future__ import annotations
 
 import stat
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import ModuleType
 
 from bampipe.data.readers import bag, hdf5, mat, objects, parquet, tdms, text
 from bampipe.data.readers.trial import LARGEST_BYTES, Dialect, RawTrial, Wanted
 from bampipe.errors import InputError
 
-__all__ = ["ENDINGS", "LARGEST_BYTES", "Dialect", "RawTrial", "Wanted", "columns_of", "read_trial"]
+__all__ = [
+    "EXTENSIONS",
+    "LARGEST_BYTES",
+    "Dialect",
+    "RawTrial",
+    "Wanted",
+    "columns_of",
+    "read_trial",
+]
 
-_READERS: dict[str, Callable[[Path, Wanted, str], RawTrial]] = {
-    **dict.fromkeys((".csv", ".tsv", ".txt", ".dat", ".asc", ".log"), text.read),
-    ".parquet": parquet.read,
-    ".mat": mat.read,
-    **dict.fromkeys((".h5", ".hdf5", ".hdf"), hdf5.read),
-    **dict.fromkeys((".json", ".jsonl", ".ndjson"), objects.read),
-    ".tdms": tdms.read,
-    **dict.fromkeys((".bag", ".mcap", ".db3"), bag.read),
+_READERS: dict[str, ModuleType] = {
+    **dict.fromkeys((".csv", ".tsv", ".txt", ".dat", ".asc", ".log"), text),
+    ".parquet": parquet,
+    ".mat": mat,
+    **dict.fromkeys((".h5", ".hdf5", ".hdf"), hdf5),
+    **dict.fromkeys((".json", ".jsonl", ".ndjson"), objects),
+    ".tdms": tdms,
+    **dict.fromkeys((".bag", ".mcap", ".db3"), bag),
 }
-ENDINGS = tuple(_READERS)
-"""Endings of the files that can be read."""
+EXTENSIONS = tuple(_READERS)
+"""File extensions that can be read."""
 
 _HEAD = 1 << 10
 _KINDS = (
@@ -54,7 +63,7 @@ def read_trial(
     datetimes: Mapping[str, str] | None = None,
     dialect: Dialect | None = None,
 ) -> RawTrial:
-    """Read the wanted columns of one trial file; its ending says what kind of file it is.
+    """Read the wanted columns of one trial file; its extension says of what format.
 
     Args:
         path: the file.
@@ -71,10 +80,10 @@ def read_trial(
             cell that is not a number, or a library that is not installed.
     """
     path, name = Path(path), name or str(path)
-    ending = _checked_ending(path, name)
+    reader = _READERS[_checked_extension(path, name)]
     wanted = Wanted(tuple(columns), datetimes or {}, dialect or Dialect(), largest_bytes)
     try:
-        trial = _READERS[ending](path, wanted, name)
+        trial: RawTrial = reader.read(path, wanted, name)
     except MemoryError as error:
         raise InputError("does not fit into memory", where=name) from error
     if len(trial.columns[columns[0]]) == 0:
@@ -82,7 +91,7 @@ def read_trial(
     return trial
 
 
-def columns_of(path: Path, *, name: str = "", dialect: Dialect | None = None) -> dict[str, str]:
+def columns_of(path: Path, *, name: str = "") -> dict[str, str]:
     """Names of what one trial file holds that can be read as a column, with units it states.
 
     The unit is "datetime" for dates and times, "" where the file does not say.
@@ -91,27 +100,17 @@ def columns_of(path: Path, *, name: str = "", dialect: Dialect | None = None) ->
         InputError: as :func:`read_trial`.
     """
     path, name = Path(path), name or str(path)
-    ending = _checked_ending(path, name)
-    if _READERS[ending] is text.read:
-        return text.columns(path, dialect or Dialect(), name)[0]
-    if ending == ".parquet":
-        return parquet.columns(path, name)
-    if ending == ".mat":
-        return mat.columns(path, name)
-    if _READERS[ending] is hdf5.read:
-        return hdf5.columns(path, name)
-    if _READERS[ending] is objects.read:
-        return objects.columns(path, LARGEST_BYTES, name)
-    return tdms.columns(path, name) if ending == ".tdms" else bag.columns(path, name)
+    columns: dict[str, str] = _READERS[_checked_extension(path, name)].columns(path, name)
+    return columns
 
 
-def _checked_ending(path: Path, name: str) -> str:
-    """Ending of the file, after a look at whether its first bytes agree with it.
+def _checked_extension(path: Path, name: str) -> str:
+    """Extension of the file, after a look at whether its first bytes agree with it.
 
     Raises:
-        InputError: cannot be read, empty, of no known ending, or of another kind.
+        InputError: cannot be read, empty, an unsupported extension, or of another kind.
     """
-    ending = path.suffix.lower()
+    extension = path.suffix.lower()
     try:
         state = path.stat()
         if not stat.S_ISREG(state.st_mode):
@@ -122,11 +121,11 @@ def _checked_ending(path: Path, name: str) -> str:
         raise InputError(
             f"cannot be read: {(error.strerror or 'error').lower()}", where=name
         ) from error
-    if ending not in _READERS:
+    if extension not in _READERS:
         raise InputError(
-            f"ending '{ending}' is of no file that can be read",
+            f"unsupported file extension '{extension}'",
             where=name,
-            remedy=f"give {', '.join(ENDINGS)}",
+            remedy=f"supported are {', '.join(EXTENSIONS)}",
         )
     if state.st_size == 0:
         raise InputError("the file is empty", where=name)
@@ -134,7 +133,7 @@ def _checked_ending(path: Path, name: str) -> str:
     kinds = [(magic, right, words) for magic, right, words in _KINDS if head.startswith(magic)]
     kinds += [(b"", (".mat",), "a MATLAB file")] if matlab else []
     for _, right, words in kinds:
-        if ending not in right:
+        if extension not in right:
             remedy = f"name it *{right[0]}" if right else "unpack it, or export it as CSV"
-            raise InputError(f"this is {words}, not *{ending}", where=name, remedy=remedy)
-    return ending
+            raise InputError(f"this is {words}, not *{extension}", where=name, remedy=remedy)
+    return extension

@@ -14,6 +14,7 @@ import json
 import sqlite3
 from collections.abc import Iterator, Sequence
 from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ import numpy as np
 
 from bampipe.data.readers import moments
 from bampipe.data.readers.extras import need
-from bampipe.data.readers.messages import RECORDED, STAMP, Field, leaves
+from bampipe.data.readers.nested import MISSING, as_number, find, leaves
 from bampipe.data.readers.trial import (
     LARGEST_BYTES,
     RawTrial,
@@ -31,6 +32,39 @@ from bampipe.data.readers.trial import (
 )
 from bampipe.data.readers.unpacking import check_mcap, check_ros1
 from bampipe.errors import InputError
+
+RECORDED = "@time"
+STAMP = "header.stamp"
+
+
+@dataclass(frozen=True)
+class Field:
+    """One number of the messages of a topic.
+
+    Attributes:
+        topic: name of the topic.
+        path: of the number in the message, such as ``wrench.force.x`` or ``position[elbow]``.
+    """
+
+    topic: str
+    path: str
+
+    @property
+    def is_time(self) -> bool:
+        """Whether it says when the message was recorded or stamped."""
+        return self.path in (RECORDED, STAMP)
+
+    def number(self, message: Any, where: str) -> float:
+        """The number in a message; NaN where it is null.
+
+        Raises:
+            InputError: it is not there, or is no number.
+        """
+        value = find(message, self.path)
+        if value is MISSING:
+            near = ", ".join(path for path in _numbers_in(message) if path != STAMP)
+            raise InputError(f"no field '{self.path}'", where=where, remedy=f"it has {near:.200}")
+        return as_number(value, where)
 
 
 def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
@@ -49,11 +83,11 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
     for number, (topic, moment, message) in enumerate(messages, 1):
         check_size(number, wanted, name)
         recorded[topic].append(moment)
-        stamped[topic].append(Field(topic, STAMP).moment(message))
+        stamped[topic].append(_stamp(message))
         for column, field in fields.items():
             if field.topic == topic and not field.is_time:
-                place = f"{name}, column '{column}', message {len(recorded[topic])}"
-                cells[column].append(field.number(message, place))
+                where = f"{name}, column '{column}', message {len(recorded[topic])}"
+                cells[column].append(field.number(message, where))
     clock = fields[wanted.columns[0]]
     if not clock.is_time:
         raise InputError(
@@ -97,9 +131,24 @@ def columns(path: Path, name: str) -> dict[str, str]:
             continue
         seen.add(topic)
         found[f"{topic}:{RECORDED}"] = "s"
-        for leaf in leaves(message):
+        for leaf in _numbers_in(message):
             found[f"{topic}:{leaf}"] = "s" if leaf == STAMP else ""
     return found
+
+
+def _numbers_in(message: Any) -> dict[str, None]:
+    """Paths of the numbers in a message, its time stamp as one of them."""
+    numbers = (path for path, leaf in leaves(message) if isinstance(leaf, int | float | np.number))
+    return {STAMP if path.startswith(f"{STAMP}.") else path: None for path in numbers}
+
+
+def _stamp(message: Any) -> int | None:
+    """Time stamp in a message, ns since 1970; None where it has none."""
+    sec, nanosec, nsec = (find(message, f"{STAMP}.{key}") for key in ("sec", "nanosec", "nsec"))
+    nanosec = nsec if nanosec is MISSING else nanosec
+    if not isinstance(sec, int | np.integer) or not isinstance(nanosec, int | np.integer):
+        return None
+    return int(sec) * moments.NANOSECONDS + int(nanosec)
 
 
 def _field(column: str, name: str) -> Field:
@@ -186,8 +235,8 @@ def _check_tables(path: Path) -> None:
     """Raise ValueError unless a database holds plain tables: views, generated columns and virtual
     tables can make rows without end of nothing.
     """
-    place = f"{path.absolute().as_uri()}?mode=ro&immutable=1"
-    with closing(sqlite3.connect(place, uri=True)) as database:
+    uri = f"{path.absolute().as_uri()}?mode=ro&immutable=1"
+    with closing(sqlite3.connect(uri, uri=True)) as database:
         for kind, label, sql in database.execute("SELECT type, name, sql FROM sqlite_master"):
             if kind not in ("table", "index") or "VIRTUAL" in str(sql).upper().split():
                 raise ValueError(f"{label} is no plain table")

@@ -34,7 +34,7 @@ _TRIED = 400
 
 
 @dataclass(frozen=True)
-class Layout:
+class TableLayout:
     """Where the samples of a text file start and how they are written.
 
     Attributes:
@@ -70,7 +70,7 @@ def cells(text: str, delimiter: str) -> list[str]:
     return [cell.strip() for cell in next(csv.reader([text], delimiter=delimiter), [])]
 
 
-def find_layout(head: bytes, columns: Sequence[str], dialect: Dialect, name: str) -> Layout:
+def find_layout(head: bytes, columns: Sequence[str], dialect: Dialect, name: str) -> TableLayout:
     """Layout of the text file that begins with ``head``.
 
     Args:
@@ -86,16 +86,16 @@ def find_layout(head: bytes, columns: Sequence[str], dialect: Dialect, name: str
     if not any(line.text.strip() for line in lines):
         raise InputError("the file holds no text", where=name)
     delimiters = [dialect.delimiter] if dialect.delimiter else list(DELIMITERS)
-    place, delimiter, header = _header(lines, columns, dialect, delimiters, name)
-    body = lines[place + 1 :]
+    index, delimiter, header = _header(lines, columns, dialect, delimiters, name)
+    body = lines[index + 1 :]
     units = _units_in(header)
     remarks = []
     if delimiter != "," and not dialect.delimiter:
         remarks.append(f"columns are separated by {DELIMITERS[delimiter]}")
-    above = sum(bool(line.text.strip()) for line in lines[: max(place, 0)])
+    above = sum(bool(line.text.strip()) for line in lines[: max(index, 0)])
     if above:
         remarks.append(f"{above} lines above the header passed over")
-    passed = place
+    passed = index
     for line in body:
         row = cells(line.text, delimiter)
         if line.text.strip() and not _is_remark(line.text):
@@ -112,10 +112,10 @@ def find_layout(head: bytes, columns: Sequence[str], dialect: Dialect, name: str
         remarks.append("decimal commas")
     start = lines[passed].end if passed >= 0 else _mark(head)
     number = lines[passed].number + 1 if passed >= 0 else 1
-    return Layout(delimiter, decimal, tuple(header), number, start, tuple(remarks), units)
+    return TableLayout(delimiter, decimal, tuple(header), number, start, tuple(remarks), units)
 
 
-def numeric_columns(head: bytes, layout: Layout) -> tuple[str, ...]:
+def numeric_columns(head: bytes, layout: TableLayout) -> tuple[str, ...]:
     """Names of the columns that hold numbers in nearly all of the first lines."""
     good: Counter[int] = Counter()
     rows = 0
@@ -130,17 +130,6 @@ def numeric_columns(head: bytes, layout: Layout) -> tuple[str, ...]:
         for n, name in enumerate(layout.header)
         if name and rows and good[n] > 0.5 * rows and layout.header.count(name) == 1
     )
-
-
-def first_cells(head: bytes, layout: Layout, column: str) -> list[str]:
-    """What stands in ``column`` in the first lines, as text."""
-    place = layout.header.index(column)
-    rows = [
-        cells(line.text, layout.delimiter)
-        for line in _lines(head, "")
-        if line.number >= layout.first_line and line.text.strip()
-    ]
-    return [row[place] for row in rows[:_TRIED] if len(row) > place]
 
 
 def _is_number(cell: str, decimal: str) -> bool:
@@ -183,28 +172,28 @@ def _header(
     """Place of the header among the lines (-1 where the session gives the names), and its cells."""
     if dialect.names:
         check_columns(dialect.names, columns, f"{name}: csv.names")
-        place, delimiter = _guess(lines, delimiters)[0]
-        above = [n for n, line in enumerate(lines[:place]) if line.text.strip()]
+        index, delimiter = _guess(lines, delimiters)[0]
+        above = [n for n, line in enumerate(lines[:index]) if line.text.strip()]
         return (above[-1] if above else -1), delimiter, list(dialect.names)
-    for place, line in enumerate(lines[:_SEARCHED]) if columns else ():
+    for index, line in enumerate(lines[:_SEARCHED]) if columns else ():
         for delimiter in delimiters:
-            row = _names(line.text, delimiter, lines[place + 1 :])
+            row = _names(line.text, delimiter, lines[index + 1 :])
             if set(columns) <= set(row):
                 check_columns(row, columns, f"{name}, row {line.number}")
-                return place, delimiter, row
+                return index, delimiter, row
     guesses = _guess(lines, delimiters)
     found = [(_above(lines, first, delimiter), delimiter) for first, delimiter in guesses]
-    place, delimiter = next((each for each in found if each[0] >= 0), (-1, ""))
-    if place < 0:
+    index, delimiter = next((each for each in found if each[0] >= 0), (-1, ""))
+    if index < 0:
         shown = ",".join(columns) or "time,position,..."
         raise InputError(
             "no header: the first line holds numbers",
             where=f"{name}, row {lines[0].number}",
             remedy=f"add a line {shown}, or give names under [csv]",
         )
-    row = _names(lines[place].text, delimiter, lines[place + 1 :])
-    check_columns(row, columns, f"{name}, row {lines[place].number}")
-    return place, delimiter, row
+    row = _names(lines[index].text, delimiter, lines[index + 1 :])
+    check_columns(row, columns, f"{name}, row {lines[index].number}")
+    return index, delimiter, row
 
 
 def _names(text: str, delimiter: str, below: list[_Line]) -> list[str]:
@@ -233,10 +222,10 @@ def _guess(lines: list[_Line], delimiters: list[str]) -> list[tuple[int, str]]:
         if score < best:
             break
         first = len(lines)
-        for place, line in enumerate(lines):
+        for index, line in enumerate(lines):
             row = cells(line.text, delimiter)
             if len(row) == width and _number_cells(row, delimiter) > 0.5 * width:
-                first = place
+                first = index
                 break
         found.append((first, delimiter))
     return found
@@ -276,14 +265,14 @@ def _decimal(
     Raises:
         InputError: both signs, or digits that may be grouped in thousands.
     """
-    places = [n for n, column in enumerate(header) if column in columns or not columns]
+    indices = [n for n, column in enumerate(header) if column in columns or not columns]
     seen: dict[str, tuple[str, int]] = {}
     grouped = plain = 0
     for line in body[:_TRIED]:
         row = cells(line.text, delimiter)
-        for place in places:
-            cell = row[place] if place < len(row) else ""
-            at = f"{name}, row {line.number}, column '{header[place]}'"
+        for index in indices:
+            cell = row[index] if index < len(row) else ""
+            at = f"{name}, row {line.number}, column '{header[index]}'"
             if _GROUPED.match(cell):
                 raise InputError(
                     f"'{cell}' groups its digits in thousands",

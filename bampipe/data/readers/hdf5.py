@@ -59,20 +59,20 @@ def read(path: Path, wanted: Wanted, name: str, what: str = "dataset") -> RawTri
         with h5py.File(path, "r") as file:
             values, units = {}, {}
             for column in wanted.columns:
-                place = f"{name}, {what} '{column}'"
-                data, field, index = _found(file, column, wanted.columns, name, place)
+                where = f"{name}, {what} '{column}'"
+                data, field, index = _found(file, column, wanted.columns, name, where)
                 kind = data.dtype if field is None else data.dtype[field]
                 moment = column in wanted.datetimes
-                _check(data, kind, moment, place)
+                _check(data, kind, moment, where)
                 count = math.prod(data.shape)
                 check_size(count, wanted, name)
-                _check_chunks(data, 8 * count * len(wanted.columns), place)
+                _check_chunks(data, 8 * count * len(wanted.columns), where)
                 if moment:
-                    stamps = _stamps(data, field, index, wanted.datetimes[column], longest, place)
+                    stamps = _stamps(data, field, index, wanted.datetimes[column], longest, where)
                     values[column] = moments.seconds(stamps)
                 else:
                     cells = data[()] if field is None else data[field]
-                    values[column] = np.asarray(pick(cells, index, place), dtype=np.float64)
+                    values[column] = np.asarray(pick(cells, index, where), dtype=np.float64)
                 unit = "" if matlab else _unit(data)
                 units |= {column: unit} if unit else {}
     except FAULTS as error:
@@ -100,8 +100,8 @@ def columns(path: Path, name: str) -> dict[str, str]:
                 for field in data.dtype.names or (None,):
                     kind = data.dtype if field is None else data.dtype[field]
                     if kind.kind in "iufb" and data.attrs.get("MATLAB_class") != b"char":
-                        whole = label if field is None else f"{label}.{field}"
-                        found |= dict.fromkeys(labels(whole, data.shape), _unit(data))
+                        column = label if field is None else f"{label}.{field}"
+                        found |= dict.fromkeys(labels(column, data.shape), _unit(data))
     except FAULTS as error:
         raise InputError("not a sound HDF5 file", where=name) from error
     return found
@@ -126,7 +126,7 @@ def _datasets(group: Any, prefix: str = "", depth: int = 0) -> Iterator[tuple[st
 
 
 def _found(
-    file: Any, column: str, wanted: tuple[str, ...], name: str, place: str
+    file: Any, column: str, wanted: tuple[str, ...], name: str, where: str
 ) -> tuple[Any, str | None, int | None]:
     """The dataset of a column, and which field and which column of it."""
     import h5py
@@ -147,38 +147,38 @@ def _found(
     parts = path.split("/")
     for end in range(1, len(parts) + 1):
         if not isinstance(file.get("/".join(parts[:end]), getlink=True), h5py.HardLink):
-            raise InputError("a link, expected numbers in this file", where=place)
+            raise InputError("a link, expected numbers in this file", where=where)
     data = file[path]
     if not isinstance(data, h5py.Dataset):
         inside = [f"{path}/{key}" for key in data][:6]
         raise InputError(
             "a structure, expected a vector of numbers",
-            where=place,
+            where=where,
             remedy=f"name what is in it: {', '.join(inside)}" if inside else "",
         )
     if field is not None and field not in (data.dtype.names or ()):
         raise InputError(
             f"no field '{field}'",
-            where=place,
+            where=where,
             remedy=f"it has {', '.join(data.dtype.names or ['none'])}",
         )
     return data, field, index
 
 
-def _check(data: Any, kind: Any, moment: bool, place: str) -> None:
+def _check(data: Any, kind: Any, moment: bool, where: str) -> None:
     if data.external or data.is_virtual:
-        raise InputError("stored outside this file", where=place)
+        raise InputError("stored outside this file", where=where)
     text = kind.kind in "OS" or data.attrs.get("MATLAB_class") == b"char"
     if moment != text or (not moment and kind.kind not in "iufb"):
         raise InputError(
             "not text, expected dates and times"
             if moment
             else "not numbers, expected a vector of real numbers",
-            where=place,
+            where=where,
         )
 
 
-def _check_chunks(data: Any, trial_bytes: int, place: str) -> None:
+def _check_chunks(data: Any, trial_bytes: int, where: str) -> None:
     """Raise InputError where a chunk unpacks to far more than the trial takes.
 
     What zlib unpacks counts, not what the file claims: HDF5 enlarges its buffer until all fits.
@@ -188,20 +188,20 @@ def _check_chunks(data: Any, trial_bytes: int, place: str) -> None:
     if data.chunks is None:
         return
     claimed = math.prod(data.chunks) * data.dtype.itemsize
-    check_unpacked(claimed, trial_bytes, place, "a chunk")
+    check_unpacked(claimed, trial_bytes, where, "a chunk")
     limit = max(3 * trial_bytes, MARGIN)
     plan = data.id.get_create_plist()
     filters = [plan.get_filter(n)[0] for n in range(plan.get_nfilters())]
     if h5py.h5z.FILTER_DEFLATE not in filters:
         return
     if filters.count(h5py.h5z.FILTER_DEFLATE) > 1:
-        raise InputError("compressed twice", where=place, remedy="compress it once")
+        raise InputError("compressed twice", where=where, remedy="compress it once")
     chunks: list[Any] = []
     data.id.chunk_iter(chunks.append)
     for chunk in chunks:
         if chunk.size * _MOST_FROM_ZLIB > limit:
             packed = data.id.read_direct_chunk(chunk.chunk_offset)[1]
-            check_unpacked(inflated_size(packed, limit), trial_bytes, place, "a chunk")
+            check_unpacked(inflated_size(packed, limit), trial_bytes, where, "a chunk")
 
 
 def _longest_text(path: Path) -> int:
@@ -220,14 +220,14 @@ def _longest_text(path: Path) -> int:
 
 
 def _stamps(
-    data: Any, field: str | None, index: int | None, form: str, longest: int, place: str
+    data: Any, field: str | None, index: int | None, form: str, longest: int, where: str
 ) -> np.ndarray:
     """Dates and times as ns, (T,) int64, read in blocks of bounded size."""
     kind = data.dtype if field is None else data.dtype[field]
     width = longest if kind.kind == "O" else kind.itemsize
     if kind.kind == "S" and width > moments.LONGEST:
-        raise InputError(f"a text of {width} bytes, expected a date and time", where=place)
-    stamps = np.empty(len(pick(np.empty(data.shape, dtype="V0"), index, place)), dtype=np.int64)
+        raise InputError(f"a text of {width} bytes, expected a date and time", where=where)
+    stamps = np.empty(len(pick(np.empty(data.shape, dtype="V0"), index, where)), dtype=np.int64)
     axis = int(np.argmax(data.shape))
     rows = max(_BLOCK_BYTES // (width * (math.prod(data.shape) // len(stamps))), 1)
     for start in range(0, len(stamps), rows):
@@ -235,7 +235,7 @@ def _stamps(
         cells = np.moveaxis(block if field is None else block[field], axis, 0)
         cells = cells.reshape(len(cells), -1)[:, index or 0]
         text = [x.decode("utf-8", "replace") if isinstance(x, bytes) else str(x) for x in cells]
-        stamps[start : start + rows] = moments.nanoseconds(text, form, place, start + 1)
+        stamps[start : start + rows] = moments.nanoseconds(text, form, where, start + 1)
     return stamps
 
 

@@ -45,7 +45,7 @@ class Variable:
             ``struct[0].field``.
         shape: of the array.
         real: whether it is an array of real numbers.
-        start, size: place in the file of the element of the whole variable, bytes.
+        start, size: of the element of the variable in the file, bytes.
         compressed: whether that element is compressed.
         within: bytes of that element, inflated, before the array itself.
     """
@@ -81,38 +81,38 @@ def variables(path: Path) -> list[Variable]:
     with path.open("rb") as stream:
         order = _order(stream)
         end = stream.seek(0, 2)
-        place = _HEADER
-        while place + 8 <= end:
-            stream.seek(place)
+        offset = _HEADER
+        while offset + 8 <= end:
+            stream.seek(offset)
             kind, size = struct.unpack(order + "II", stream.read(8))
-            place += 8
-            if size > end - place or kind not in (_MATRIX, _COMPRESSED):
+            offset += 8
+            if size > end - offset or kind not in (_MATRIX, _COMPRESSED):
                 raise ValueError("an element is not what it says")
-            source = _Source(stream, place, size, kind == _COMPRESSED, order)
-            whole = Variable("", (), False, place, size, kind == _COMPRESSED)
+            source = _Source(stream, offset, size, kind == _COMPRESSED, order)
+            variable = Variable("", (), False, offset, size, kind == _COMPRESSED)
             source.most = _LARGEST_INFLATED - inflated
-            found += [item for item in _arrays(source, whole, "", 0) if item.name]
-            inflated += source.place if whole.compressed else 0
-            place += size
+            found += [item for item in _arrays(source, variable, "", 0) if item.name]
+            inflated += source.position if variable.compressed else 0
+            offset += size
     return found
 
 
-def _arrays(source: _Source, whole: Variable, label: str, depth: int) -> Iterator[Variable]:
+def _arrays(source: _Source, variable: Variable, label: str, depth: int) -> Iterator[Variable]:
     """The array that comes next, and where it is a struct, those in its fields.
 
     Args:
         source: at the beginning of an array.
-        whole: the variable that holds it, for its place in the file.
+        variable: that holds it, for where it is in the file.
         label: what the array is called; "" for a variable, which has a name of its own.
         depth: how many structs it is inside of.
 
     Raises:
         ValueError: the file is damaged.
     """
-    within = source.place
+    within = source.position
     name, shape, real, kind = source.matrix_head()
     label = label or name
-    yield replace(whole, name=label, shape=shape, real=real, within=within)
+    yield replace(variable, name=label, shape=shape, real=real, within=within)
     if kind != _STRUCT_CLASS or depth >= _DEEPEST:
         return
     fields = source.field_names()
@@ -123,10 +123,10 @@ def _arrays(source: _Source, whole: Variable, label: str, depth: int) -> Iterato
         own = label if count == 1 else f"{label}[{number}]"
         for field in fields:
             size = source.array_size()
-            end = source.place + size
+            end = source.position + size
             if size:
-                yield from _arrays(source, whole, f"{own}.{field}", depth + 1)
-            source.skip(end - source.place)
+                yield from _arrays(source, variable, f"{own}.{field}", depth + 1)
+            source.skip(end - source.position)
 
 
 def values(path: Path, variable: Variable) -> np.ndarray:
@@ -164,12 +164,12 @@ class _Source:
         self._next, self._left = start, size
         self._inflate = zlib.decompressobj() if compressed else None
         self._ahead = b""
-        self.place = 0
+        self.position = 0
         self.most = _LARGEST_INFLATED
         self.order = order
         if compressed and struct.unpack(order + "II", self._take(8))[0] != _MATRIX:
             raise ValueError("a compressed element holds no array")
-        self.place = 0
+        self.position = 0
 
     def matrix_head(self) -> tuple[str, tuple[int, ...], bool, int]:
         """Name and shape of the array, whether it holds real numbers, and its class."""
@@ -222,14 +222,14 @@ class _Source:
             raise ValueError("an element is larger than it should be")
         data = self._take(size)
         if size <= _LARGEST_HEAD and size % 8:
-            self._take(-size % 8, whole=False)
+            self._take(-size % 8, exactly=False)
         return word, data
 
-    def _take(self, size: int, whole: bool = True) -> bytes:
+    def _take(self, size: int, exactly: bool = True) -> bytes:
         data = self._raw(size) if self._inflate is None else self._inflated(size)
-        if whole and len(data) != size:
+        if exactly and len(data) != size:
             raise ValueError("an element ends early")
-        self.place += len(data)
+        self.position += len(data)
         return data
 
     def _raw(self, size: int) -> bytes:
@@ -240,7 +240,7 @@ class _Source:
         return data
 
     def _inflated(self, size: int) -> bytes:
-        if self.place + size > self.most:
+        if self.position + size > self.most:
             raise TooLargeError(
                 f"its variables would unpack to more than {_LARGEST_INFLATED >> 20} MB"
             )

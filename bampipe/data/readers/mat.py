@@ -72,25 +72,25 @@ def _read_level_5(path: Path, wanted: Wanted, name: str) -> RawTrial:
             variable_name, index = split_index(column, known)
             check_columns(list(known), [variable_name], name)
             variable = known[variable_name]
-            place = f"{name}, variable '{column}'"
+            where = f"{name}, variable '{column}'"
             inside = [other for other in known if other.startswith(f"{variable_name}.")]
             inside += [other for other in known if other.startswith(f"{variable_name}[0].")]
             if inside:
                 raise InputError(
                     "a struct, expected a vector of numbers",
-                    where=place,
+                    where=where,
                     remedy=f"name what is in it: {', '.join(inside[:8])}",
                 )
             if not variable.real:
                 raise InputError(
                     "not numbers, expected a vector of real numbers",
-                    where=place,
+                    where=where,
                     remedy="save it as a numeric array: cells, tables and objects are not",
                 )
             check_size(variable.length, wanted, name)
             flat = level5.values(path, variable)
             shaped = flat.reshape(variable.shape, order="F")
-            values[column] = pick(shaped, index, place)
+            values[column] = pick(shaped, index, where)
     return RawTrial(aligned(values, name, "variable"), first_row=1)
 
 

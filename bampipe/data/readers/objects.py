@@ -7,20 +7,18 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
 from bampipe.data.readers import moments
-from bampipe.data.readers.trial import RawTrial, Wanted, check_columns
+from bampipe.data.readers.nested import MISSING, as_number, find, leaves
+from bampipe.data.readers.trial import LARGEST_BYTES, RawTrial, Wanted, check_columns
 from bampipe.errors import InputError
 
 _COSTS = {b"{": 184, b"[": 96, b",": 40, b"\n": 16}
 """Bytes of memory that each of these characters stands for once parsed (CPython 3.11)."""
-
-_MOST_ITEMS = 64
-_DEEPEST = 6
 
 
 def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
@@ -32,24 +30,25 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
         InputError: not JSON, no such list, a column missing or not of numbers.
     """
     samples, constants, notes = _samples(path, wanted.largest_bytes, name)
+    first = _first(samples, name)
+    fixed = {column for column in wanted.columns if find(first, column) is MISSING}
+    for column in fixed - set(constants):
+        check_columns([path for path, _ in leaves(first)] + list(constants), [column], name)
     values: dict[str, np.ndarray] = {c: np.empty(len(samples)) for c in wanted.columns}
     texts: dict[str, list[str | None]] = {column: [] for column in wanted.datetimes}
-    for number, sample in enumerate(samples, 1):
+    for count, sample in enumerate(samples, 1):
         if not isinstance(sample, dict):
-            raise InputError("not an object with named values", where=f"{name}, sample {number}")
-        if number == 1:
-            known = [*_names(sample), *(c for c in constants if c not in sample)]
-            check_columns(known, wanted.columns, name)
+            raise InputError("not an object with named values", where=f"{name}, sample {count}")
         for column in wanted.columns:
-            found, cell = _cell(sample, column)
-            cell = cell if found else constants.get(column)
-            where = f"{name}, sample {number}, '{column}'"
+            cell = constants[column] if column in fixed else find(sample, column)
+            cell = None if cell is MISSING else cell
+            where = f"{name}, sample {count}, '{column}'"
             if column in texts:
                 if not isinstance(cell, str | None):
                     raise InputError(f"found {cell!r:.40}, expected a date and time", where=where)
                 texts[column].append(cell)
             else:
-                values[column][number - 1] = _number(cell, where)
+                values[column][count - 1] = as_number(cell, where)
     for column, cells in texts.items():
         where = f"{name}, '{column}'"
         stamps = moments.nanoseconds(cells, wanted.datetimes[column], where)
@@ -57,24 +56,26 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
     return RawTrial(values, first_row=1, notes=notes)
 
 
-def columns(path: Path, largest_bytes: int, name: str) -> dict[str, str]:
+def columns(path: Path, name: str) -> dict[str, str]:
     """Names of the values that are numbers, or moments (unit "datetime"), in the first sample.
 
     Raises:
         InputError: as :func:`read`.
     """
-    samples, constants, _ = _samples(path, largest_bytes, name)
-    first = samples[0]
-    if not isinstance(first, dict):
-        raise InputError("not an object with named values", where=f"{name}, sample 1")
+    samples, constants, _ = _samples(path, LARGEST_BYTES, name)
     found = {}
-    for column in _names(first):
-        _, cell = _cell(first, column)
+    for column, cell in leaves(_first(samples, name)):
         if isinstance(cell, int | float):
             found[column] = ""
         elif isinstance(cell, str) and re.match(r"\d{4}-\d\d-\d\d[T ]\d\d:", cell):
             found[column] = "datetime"
     return found | {c: "" for c in constants if c not in found}
+
+
+def _first(samples: list[object], name: str) -> dict[str, object]:
+    if not isinstance(samples[0], dict):
+        raise InputError("not an object with named values", where=f"{name}, sample 1")
+    return samples[0]
 
 
 def _samples(
@@ -120,9 +121,9 @@ def _parsed(text: str, where: str) -> object:
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
-        place = f" at line {error.lineno}" if isinstance(error, json.JSONDecodeError) else ""
+        line = f" at line {error.lineno}" if isinstance(error, json.JSONDecodeError) else ""
         raise InputError(
-            f"not sound JSON{place}", where=where, remedy="was the log cut off? copy it again"
+            f"not sound JSON{line}", where=where, remedy="was the log cut off? copy it again"
         ) from error
 
 
@@ -145,42 +146,3 @@ def _list_of_samples(content: object, name: str) -> tuple[list[object], dict[str
         )
     constants = {k: v for k, v in content.items() if isinstance(v, int | float)}
     return next(iter(lists.values())), constants
-
-
-def _names(value: object, prefix: str = "", depth: int = 0) -> Iterator[str]:
-    """Every value of a sample by its path, those of lists and objects too."""
-    if isinstance(value, dict) and depth < _DEEPEST:
-        for key, item in value.items():
-            yield from _names(item, f"{prefix}.{key}" if prefix else str(key), depth + 1)
-    elif isinstance(value, list) and prefix and len(value) <= _MOST_ITEMS and depth < _DEEPEST:
-        for number, item in enumerate(value):
-            yield from _names(item, f"{prefix}[{number}]", depth + 1)
-    elif prefix:
-        yield prefix
-
-
-def _cell(sample: Mapping[str, object], column: str) -> tuple[bool, object]:
-    """Whether the sample has the value ``column``, a key or a path, and the value."""
-    if column in sample:
-        return True, sample[column]
-    value: object = sample
-    for key, number in re.findall(r"([^.\[\]]+)|\[(\d+)\]", column):
-        if key and isinstance(value, dict) and key in value:
-            value = value[key]
-        elif number and isinstance(value, list) and int(number) < len(value):
-            value = value[int(number)]
-        else:
-            return False, None
-    return True, value
-
-
-def _number(cell: object, where: str) -> float:
-    """A JSON value as a number: null is missing, true is 1."""
-    if cell is None:
-        return float("nan")
-    if not isinstance(cell, int | float):
-        raise InputError(f"found {str(cell)[:40]!r}, expected a number", where=where)
-    try:
-        return float(cell)
-    except OverflowError as error:
-        raise InputError("found a number beyond all range", where=where) from error

@@ -96,23 +96,23 @@ def _check_pages(path: Path, metadata: pq.FileMetaData, wanted: Wanted, name: st
                 chunk = metadata.row_group(group).column(number)
                 if chunk.path_in_schema not in wanted.columns:
                     continue
-                place = chunk.data_page_offset
+                offset = chunk.data_page_offset
                 if chunk.has_dictionary_page and chunk.dictionary_page_offset:
-                    place = min(place, chunk.dictionary_page_offset)
-                end = place + chunk.total_compressed_size
+                    offset = min(offset, chunk.dictionary_page_offset)
+                end = offset + chunk.total_compressed_size
                 where = f"{name}, column '{chunk.path_in_schema}'"
-                while place < end:
-                    header, length = _page_header(stream, place)
+                while offset < end:
+                    header, length = _page_header(stream, offset)
                     if not length:  # damaged: Arrow ends here, too
                         break
                     check_unpacked(header.get(2, 0), trial_bytes, where, "a page")
-                    place += length + max(header.get(3, 0), 0)
+                    offset += length + max(header.get(3, 0), 0)
 
 
-def _page_header(stream: BinaryIO, place: int) -> tuple[dict[int, int], int]:
+def _page_header(stream: BinaryIO, offset: int) -> tuple[dict[int, int], int]:
     """Whole numbers in a page's header by field, and its length; 0 where it is none."""
     for length in (1 << 12, _LONGEST_HEADER):
-        stream.seek(place)
+        stream.seek(offset)
         with suppress(IndexError):
             return _numbers_of_struct(stream.read(length), 0)
     return {}, 0

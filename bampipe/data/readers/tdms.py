@@ -49,8 +49,8 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
                 if column not in known:
                     values[column] = np.asarray(channel.time_track(), dtype=np.float64)
                     continue
-                place = f"{name}, channel '{column}'"
-                values[column] = _values(channel, wanted.datetimes.get(column), place)
+                where = f"{name}, channel '{column}'"
+                values[column] = _values(channel, wanted.datetimes.get(column), where)
                 units |= {column: _unit(channel)} if _unit(channel) else {}
     except _FAULTS as error:
         raise _unsound(name) from error
@@ -101,18 +101,18 @@ def _unit(channel: Any) -> str:
     return str(channel.properties.get("unit_string", "")).strip()
 
 
-def _values(channel: Any, form: str | None, place: str) -> np.ndarray:
+def _values(channel: Any, form: str | None, where: str) -> np.ndarray:
     data = np.asarray(channel[:])
     if form is not None:
         if data.dtype.kind not in "MOU":
-            raise InputError("not text, expected dates and times", where=place)
+            raise InputError("not text, expected dates and times", where=where)
         stamps = data if data.dtype.kind == "M" else [str(x) for x in data]
-        return moments.seconds(moments.nanoseconds(stamps, form, place))
+        return moments.seconds(moments.nanoseconds(stamps, form, where))
     if data.dtype.kind not in "iufb":
         stamped = data.dtype.kind == "M"
         raise InputError(
             "holds dates and times, expected numbers" if stamped else "not numbers",
-            where=place,
+            where=where,
             remedy='is it the time? then say unit = "datetime" under [time]' if stamped else "",
         )
     return data.astype(np.float64)

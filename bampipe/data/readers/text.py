@@ -19,7 +19,7 @@ import pyarrow.csv as pa_csv
 
 from bampipe.data.readers import dialect as dialects
 from bampipe.data.readers import moments
-from bampipe.data.readers.dialect import HEAD, NULLS, Layout
+from bampipe.data.readers.dialect import HEAD, NULLS, TableLayout
 from bampipe.data.readers.trial import (
     Dialect,
     RawTrial,
@@ -95,17 +95,18 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
     return RawTrial(values, layout.first_line, notes, (*said, *layout.remarks), units)
 
 
-def columns(path: Path, dialect: Dialect, name: str) -> tuple[dict[str, str], Layout, bytes]:
-    """Names and units of the columns that hold numbers, the layout, and the first lines.
+def columns(path: Path, name: str) -> dict[str, str]:
+    """Names and units of the columns that hold numbers.
 
     Raises:
         InputError: as :func:`read`.
     """
-    with opened(path, dialect, name) as (stream, _):
+    with opened(path, Dialect(), name) as (stream, _):
         head = _head(stream, name)
-        layout = dialects.find_layout(head, (), dialect, name)
-    names = dialects.numeric_columns(head, layout)
-    return {column: layout.units.get(column, "") for column in names}, layout, head
+    layout = dialects.find_layout(head, (), Dialect(), name)
+    return {
+        column: layout.units.get(column, "") for column in dialects.numeric_columns(head, layout)
+    }
 
 
 @contextmanager
@@ -176,12 +177,12 @@ def _head(stream: BinaryIO, name: str) -> bytes:
     return head
 
 
-def _layout(stream: BinaryIO, wanted: Wanted, name: str) -> Layout:
+def _layout(stream: BinaryIO, wanted: Wanted, name: str) -> TableLayout:
     return dialects.find_layout(_head(stream, name), wanted.columns, wanted.dialect, name)
 
 
 def _read_samples(
-    stream: BinaryIO, layout: Layout, end: int, wanted: Wanted, name: str
+    stream: BinaryIO, layout: TableLayout, end: int, wanted: Wanted, name: str
 ) -> tuple[dict[str, np.ndarray], int]:
     """The wanted columns of the samples before byte ``end``, and how many samples there are."""
     kinds = {c: pa.string() if c in wanted.datetimes else pa.float64() for c in wanted.columns}
@@ -231,7 +232,7 @@ def _read_samples(
     return values, rows
 
 
-def _sound_end(stream: BinaryIO, layout: Layout) -> tuple[int, tuple[str, ...]]:
+def _sound_end(stream: BinaryIO, layout: TableLayout) -> tuple[int, tuple[str, ...]]:
     """Byte where the last whole row ends, and what is said about the rest.
 
     A last line is cut off when it has too few cells, or when it has no line end and its last
@@ -259,11 +260,11 @@ def _sound_end(stream: BinaryIO, layout: Layout) -> tuple[int, tuple[str, ...]]:
     return start + cut + 1, ("last line is cut off: 1 row dropped",)
 
 
-def _split(line: bytes, layout: Layout) -> list[bytes]:
+def _split(line: bytes, layout: TableLayout) -> list[bytes]:
     return line.split() if layout.delimiter == " " else line.split(layout.delimiter.encode())
 
 
-def _fault(stream: BinaryIO, message: str, layout: Layout, name: str) -> InputError:
+def _fault(stream: BinaryIO, message: str, layout: TableLayout, name: str) -> InputError:
     """The plain form of what Arrow says about a text file."""
     torn = re.search(
         r"Row #(\d+): Expected (\d+) columns, got (\d+): (.*?)(?: \.\.\.)?$", message, re.DOTALL
@@ -289,17 +290,17 @@ def _fault(stream: BinaryIO, message: str, layout: Layout, name: str) -> InputEr
     shown = value if value.isprintable() and len(value) <= 40 else ascii(value)[1:41]
     other = "," if layout.decimal == "." else "."
     sign = re.fullmatch(rf"\s*[-+]?\d+{re.escape(other)}\d+\s*", value)
-    place = f", row {_line(stream, layout, int(row_number))}" if row_number else ""
+    at = f", row {_line(stream, layout, int(row_number))}" if row_number else ""
     return InputError(
         f"found '{shown}', expected a number",
-        where=f"{name}{place}, column '{column}'",
+        where=f"{name}{at}, column '{column}'",
         remedy=f"export with one decimal sign; '{layout.decimal}' was taken from the first rows"
         if sign
         else "",
     )
 
 
-def _line(stream: BinaryIO, layout: Layout, row: int) -> int:
+def _line(stream: BinaryIO, layout: TableLayout, row: int) -> int:
     """Line of the file that holds Arrow's row ``row``: Arrow does not count blank lines."""
     stream.seek(layout.start)
     full = 0

@@ -121,8 +121,8 @@ def aligned(values: dict[str, np.ndarray], name: str, what: str) -> dict[str, np
 
 def joined(parts: dict[str, list[np.ndarray]]) -> dict[str, np.ndarray]:
     """Concatenate column by column, letting go of the parts, so that only one column is double."""
-    whole = {}
+    columns = {}
     for column in list(parts):
         chunks = parts.pop(column)
-        whole[column] = np.concatenate(chunks) if chunks else np.empty(0)
-    return whole
+        columns[column] = np.concatenate(chunks) if chunks else np.empty(0)
+    return columns

@@ -98,12 +98,12 @@ def check_mcap(path: Path, largest_bytes: int, name: str) -> None:
         check_unpacked(sum(sizes.values()), largest_bytes // 3, name, "a file without an index")
     held: list[tuple[int, int]] = []
     together = 0
-    for first, last, place in sorted(spans):
-        if place not in sizes:
+    for first, last, offset in sorted(spans):
+        if offset not in sizes:
             raise ValueError("the index names a chunk that is not there, or one twice")
         while held and held[0][0] < first:
             together -= heapq.heappop(held)[1]
-        size = sizes.pop(place)
+        size = sizes.pop(offset)
         heapq.heappush(held, (last, size))
         together += size
         check_unpacked(together, 0, name, "chunks of the same time")
@@ -142,12 +142,12 @@ def _unpacked(data: bytes, codec: str, name: str) -> BinaryIO:
 
 
 def _ros1_fields(header: bytes) -> dict[bytes, bytes]:
-    fields, place = {}, 0
-    while place < len(header):
-        (length,) = struct.unpack_from("<I", header, place)
-        key, _, value = header[place + 4 : place + 4 + length].partition(b"=")
+    fields, offset = {}, 0
+    while offset < len(header):
+        (length,) = struct.unpack_from("<I", header, offset)
+        key, _, value = header[offset + 4 : offset + 4 + length].partition(b"=")
         fields[key] = value
-        place += 4 + length
+        offset += 4 + length
     return fields
 
 
