@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import pandas as pd
 
@@ -14,7 +14,15 @@ from bampipe.api.loop import current_model
 from bampipe.errors import InputError
 from bampipe.files import refuse_links
 from bampipe.report.results import Results
+from bampipe.results.compare import CompareResult
+from bampipe.results.diagnose import DiagnoseResult
+from bampipe.results.identify import IdentifyResult
+from bampipe.results.record import Record, Result
+from bampipe.results.stiffness import StiffnessResult
+from bampipe.results.validate import ValidateResult
 from bampipe.run import record
+
+R = TypeVar("R", bound=Result)
 
 
 @dataclass(frozen=True)
@@ -64,7 +72,7 @@ class Run:
     @property
     def session(self) -> dict[str, Any]:
         """What ingest says of the session: axes, channels, units, sample rate."""
-        return self._results.session
+        return self._results.session.model_dump(mode="json")
 
     @property
     def trials(self) -> pd.DataFrame:
@@ -84,8 +92,7 @@ class Run:
     @cached_property
     def stiffness(self) -> pd.DataFrame:
         """One row an axis with a locked trial: stiffness, sd, bandwidth; empty without any."""
-        content = self._json("stiffness/stiffness.json", "stiffness")
-        return pd.DataFrame.from_dict(content["axes"], orient="index")
+        return _rows(self._read(StiffnessResult).axes)
 
     @property
     def models(self) -> tuple[str, ...]:
@@ -103,17 +110,15 @@ class Run:
 
     def parameters(self, model: str = "") -> pd.DataFrame:
         """One row a parameter: estimate, sd, unit, and what else identification says."""
-        content = self._json(f"models/{self._known(model)}/identify.json", "identify")
-        frame = pd.DataFrame.from_dict(content["parameters"], orient="index")
+        frame = _rows(self._read(IdentifyResult, model).parameters)
         first = [name for name in ("estimate", "sd", "unit") if name in frame]
         order = self._results.in_order(frame.index)
         return frame.loc[list(order), first + [c for c in frame if c not in first]]
 
     def covariance(self, model: str = "") -> pd.DataFrame:
         """Covariance of the estimates, parameters by parameters."""
-        content = self._json(f"models/{self._known(model)}/identify.json", "identify")
-        found = content["covariance"]
-        return pd.DataFrame(found["matrix"], found["names"], found["names"])
+        found = self._read(IdentifyResult, model).covariance
+        return pd.DataFrame(found.matrix, list(found.names), list(found.names))
 
     def states(self, model: str = "") -> pd.DataFrame:
         """The filtered motion with standard deviations."""
@@ -121,13 +126,12 @@ class Run:
 
     def validation(self, model: str = "") -> pd.DataFrame:
         """One row an axis: error on all and on unseen trials, noise floor, fit, unit."""
-        content = self._json(f"models/{self._known(model)}/validate.json", "validate")
-        return pd.DataFrame.from_dict(content["axes"], orient="index")
+        return _rows(self._read(ValidateResult, model).axes)
 
     def free_run(self, model: str = "") -> dict[str, Any]:
         """How far the model left to itself ends up from the measurement, or why it cannot be."""
-        content = self._json(f"models/{self._known(model)}/validate.json", "validate")
-        return dict(content.get("free_run", {}))
+        found = self._read(ValidateResult, model).free_run
+        return {} if found is None else found.model_dump(mode="json")
 
     def residuals(self, model: str = "") -> pd.DataFrame:
         """Measured and predicted torque and force, by parameters that have not seen the trial."""
@@ -135,7 +139,7 @@ class Run:
 
     def diagnosis(self, model: str = "") -> dict[str, Any]:
         """What the model lacks: verdict of each axis, ranking, residual maps, advice."""
-        return self._json(f"models/{self._known(model)}/diagnose.json", "diagnose")
+        return self._read(DiagnoseResult, model).model_dump(mode="json")
 
     def ranking(self, model: str = "") -> pd.DataFrame:
         """The candidate effects, best first: error before and after, chance level."""
@@ -145,11 +149,11 @@ class Run:
     def ladder(self) -> pd.DataFrame:
         """One row a model: what was added, and per axis the held-out error and noise floor."""
         rows = []
-        for rung in self._json("compare.json", "compare")["ladder"]:
-            row = {"model": rung["model"], "added": rung.get("added") or ""}
-            for axis in rung["held_out_rmse"]:
-                row[f"held_out_rmse.{axis}"] = rung["held_out_rmse"][axis]
-                row[f"noise_floor.{axis}"] = rung["noise_floor"].get(axis)
+        for rung in self._read(CompareResult).ladder:
+            row: dict[str, object] = {"model": rung.model, "added": rung.added or ""}
+            for axis in rung.held_out_rmse:
+                row[f"held_out_rmse.{axis}"] = rung.held_out_rmse[axis]
+                row[f"noise_floor.{axis}"] = rung.noise_floor.get(axis)
             rows.append(row)
         return pd.DataFrame(rows).set_index("model")
 
@@ -169,11 +173,12 @@ class Run:
             )
         return chosen
 
-    def _json(self, relative: str, stage: str) -> dict[str, Any]:
-        content = self._results.json(relative)
-        if content is None:
-            raise self._missing(relative, stage)
-        return content
+    def _read(self, kind: type[R], model: str = "") -> R:
+        name = self._known(model) if "{model}" in kind.FILE else ""
+        found = self._results.read(kind, name)
+        if found is None:
+            raise self._missing(kind.file(name), kind.STAGE)
+        return found
 
     def _table(self, relative: str, stage: str) -> pd.DataFrame:
         frame = self._results.table(relative)
@@ -187,6 +192,12 @@ class Run:
             where=str(self.root),
             remedy=f"`bampipe {stage} {self.root}` makes it, or bampipe.{stage}(run)",
         )
+
+
+def _rows(entries: Mapping[str, Record]) -> pd.DataFrame:
+    """One row an entry, its fields as columns."""
+    plain = {name: entry.model_dump(mode="json") for name, entry in entries.items()}
+    return pd.DataFrame.from_dict(plain, orient="index")
 
 
 def open_run(path: str | Path) -> Run:

@@ -50,7 +50,7 @@ def build(results: Results, progress: Callable[[float, str], None]) -> Report:
             sections.append(section)
     sections[0] = replace(sections[0], blocks=(*_warnings(results), *sections[0].blocks))
     document = Document(
-        f"Session {results.session['session_id']}", _subtitle(results), tuple(sections)
+        f"Session {results.session.session_id}", _subtitle(results), tuple(sections)
     )
     progress(0.7, "typesetting")
     printed = typeset.pdf(document, _recorded(results))
@@ -75,10 +75,10 @@ def _warnings(results: Results) -> tuple[Block, ...]:
 
 
 def _subtitle(results: Results) -> str:
-    parts = [f"device {results.session.get('device', 'unknown')}"]
-    recorded = results.session.get("recorded_at")
+    parts = [f"device {results.session.device}"]
+    recorded = results.session.recorded_at
     if recorded:
-        when = datetime.datetime.fromisoformat(str(recorded))
+        when = datetime.datetime.fromisoformat(recorded)
         parts.append(f"recorded {when:%Y-%m-%d %H:%M}{' UTC' if _is_utc(when) else ''}")
     return ", ".join(parts)
 
@@ -89,10 +89,10 @@ def _is_utc(when: datetime.datetime) -> bool:
 
 def _recorded(results: Results) -> int:
     """Return when the session was recorded, in seconds since 1970; 0 where that is not known."""
-    recorded = results.session.get("recorded_at")
+    recorded = results.session.recorded_at
     if not recorded:
         return 0
-    when = datetime.datetime.fromisoformat(str(recorded))
+    when = datetime.datetime.fromisoformat(recorded)
     if when.tzinfo is None:
         when = when.replace(tzinfo=datetime.UTC)
     return max(0, int(when.timestamp()))

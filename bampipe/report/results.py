@@ -6,13 +6,19 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import pandas as pd
 
 from bampipe.declarations.model import read_model_file
 from bampipe.errors import InputError
 from bampipe.files import read_json_table, read_toml
+from bampipe.results.compare import CompareResult
+from bampipe.results.ingest import IngestResult
+from bampipe.results.record import Result
+from bampipe.results.run import RunResult, StepRecord
+
+R = TypeVar("R", bound=Result)
 
 _RATES = {"rad": "rad/s", "m": "m/s"}
 _FORCES = {"rad": "N.m", "m": "N"}
@@ -30,9 +36,22 @@ class Results:
     root: Path
     detail_model: str = ""
     _json: dict[str, dict[str, Any] | None] = field(default_factory=dict, repr=False)
+    _results: dict[str, Result | None] = field(default_factory=dict, repr=False)
+
+    def read(self, kind: type[R], model: str = "") -> R | None:
+        """Return the result ``kind`` of ``model`` (default: the one in detail), None without it.
+
+        Raises:
+            InputError: the file is damaged.
+        """
+        relative = kind.file(model or (self.model if "{model}" in kind.FILE else ""))
+        if relative not in self._results:
+            path = self.root / relative
+            self._results[relative] = kind.read(path) if path.is_file() else None
+        return cast("R | None", self._results[relative])
 
     def json(self, relative: str) -> dict[str, Any] | None:
-        """Return the contents of a JSON file, or None where there is none.
+        """Return the contents of a JSON file as plain tables, or None where there is none.
 
         Raises:
             InputError: the file is damaged.
@@ -78,15 +97,16 @@ class Results:
     @cached_property
     def outdated(self) -> tuple[str, ...]:
         """Steps whose inputs were made anew after they ran, as ``run.json`` tells, sorted."""
-        stages: dict[str, Any] = (self.json("run.json") or {}).get("stages", {})
-        makers = {name: step for step, made in stages.items() for name in made.get("outputs", {})}
+        run = self.read(RunResult)
+        stages = run.stages if run else {}
+        makers = {name: step for step, made in stages.items() for name in made.outputs}
         found: set[str] = set()
         while True:
             more = {
                 step
                 for step, made in stages.items()
                 if step not in found
-                for name, digest in (made.get("inputs") or {}).items()
+                for name, digest in made.inputs.items()
                 if name in makers
                 and (makers[name] in found or _differs(name, stages[makers[name]], digest))
             } - {"report"}
@@ -95,20 +115,16 @@ class Results:
             found |= more
 
     @cached_property
-    def session(self) -> dict[str, Any]:
+    def session(self) -> IngestResult:
         """What ingest says of the session.
 
         Raises:
             InputError: ingest has not run.
         """
-        content = self.json("ingest/session.json")
-        if content is None:
-            raise InputError(
-                "ingest/session.json is missing",
-                where=str(self.root),
-                remedy=f"run `bampipe ingest SESSION` for {self.root} first",
-            )
-        return content
+        found = self.read(IngestResult)
+        if found is None:
+            raise self._not_ingested(IngestResult.FILE)
+        return found
 
     @cached_property
     def trials(self) -> pd.DataFrame:
@@ -119,24 +135,24 @@ class Results:
         """
         frame = self.table("ingest/trials.parquet")
         if frame is None:
-            raise InputError(
-                "ingest/trials.parquet is missing",
-                where=str(self.root),
-                remedy=f"run `bampipe ingest SESSION` for {self.root} first",
-            )
+            raise self._not_ingested("ingest/trials.parquet")
         return frame
+
+    def _not_ingested(self, relative: str) -> InputError:
+        remedy = f"run `bampipe ingest SESSION` for {self.root} first"
+        return InputError(f"{relative} is missing", where=str(self.root), remedy=remedy)
 
     @cached_property
     def axes(self) -> tuple[str, ...]:
         """Names of the axes, in the order of the recorded channels (JSON sorts them)."""
-        found = [str(name) for name in self.session.get("axes", {})]
+        found = list(self.session.axes)
         channels = self.columns("ingest/samples.parquet")
         order = [name.removeprefix("q_") for name in channels if name.startswith("q_")]
         return tuple(sorted(found, key=lambda axis: (order + found).index(axis)))
 
     def unit(self, axis: str) -> str:
         """Return the unit of the position of ``axis``."""
-        return str(self.session["axes"][axis].get("unit", ""))
+        return self.session.axes[axis].unit
 
     def rate_unit(self, axis: str) -> str:
         """Return the unit of the velocity of ``axis``."""
@@ -149,9 +165,9 @@ class Results:
     @property
     def pusher(self) -> str:
         """What the measured force is that of: ``hand``, ``motor``, or else ``input``."""
-        if self.session.get("driven"):
+        if self.session.driven:
             return "motor"
-        return "hand" if self.session.get("brakes") else "input"
+        return "hand" if self.session.brakes else "input"
 
     def is_rotary(self, axis: str) -> bool:
         """Return whether ``axis`` turns."""
@@ -164,9 +180,8 @@ class Results:
             (path.parent.name for path in (self.root / "models").glob("*/identify.json")),
             key=lambda name: (name != "base", name.count("+"), name),
         )
-        ladder = [
-            str(rung.get("model")) for rung in (self.json("compare.json") or {}).get("ladder", ())
-        ]
+        compared = self.read(CompareResult)
+        ladder = [rung.model for rung in compared.ladder] if compared else []
         ranked = [name for name in ladder if name in found]
         return (*ranked, *(name for name in found if name not in ranked))
 
@@ -211,7 +226,7 @@ class Results:
     @cached_property
     def paper(self) -> dict[str, Any] | None:
         """What the device's paper published, or None where there is none for this device."""
-        path = Path(__file__).parent / "templates" / f"paper-{self.session.get('device')}.toml"
+        path = Path(__file__).parent / "templates" / f"paper-{self.session.device}.toml"
         return read_toml(path) if path.is_file() else None
 
     def as_in(self, place: str) -> str:
@@ -219,10 +234,10 @@ class Results:
         return f" (the paper's {place})" if self.paper else ""
 
 
-def _differs(name: str, maker: dict[str, Any], digest: str) -> bool:
+def _differs(name: str, maker: StepRecord, digest: str) -> bool:
     """Whether an input is not what its maker left.
 
     Inputs in TOML count by what they say, outputs by their bytes: those two cannot be compared, and
     ``ingest/session.json`` has the digest of the one such file, the device's.
     """
-    return not name.endswith(".toml") and maker["outputs"][name] != digest
+    return not name.endswith(".toml") and maker.outputs[name] != digest

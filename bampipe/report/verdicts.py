@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Collection
 
 from bampipe.report import wording
 from bampipe.report.document import Callout
 from bampipe.report.results import Results
+from bampipe.results.diagnose import DiagnoseResult
+from bampipe.results.validate import ValidateResult
 
 NEAR_FLOOR = 1.15
 """A held-out error below this many noise floors counts as at the floor."""
@@ -20,26 +22,25 @@ IN_WORDS = {
 
 def above_floor(results: Results, model: str) -> dict[str, float] | None:
     """Return, by axis, held-out error over noise floor; None where it was not validated."""
-    content = results.json(results.of_model("validate.json", model))
-    if content is None:
+    validated = results.read(ValidateResult, model)
+    if validated is None:
         return None
-    found: dict[str, float] = {}
-    for axis in ordered(results, content.get("axes", {})):
-        entry = content["axes"][axis]
-        error, floor = entry.get("held_out_rmse"), entry.get("noise_floor")
-        if error is not None and floor:
-            found[axis] = float(error) / float(floor)
-    return found
+    axes = validated.axes
+    return {
+        axis: axes[axis].held_out_rmse / floor
+        for axis in ordered(results, axes)
+        if (floor := axes[axis].noise_floor)
+    }
 
 
-def ordered(results: Results, by_axis: dict[str, Any]) -> tuple[str, ...]:
+def ordered(results: Results, by_axis: Collection[str]) -> tuple[str, ...]:
     """Return the axes in ``by_axis`` in the order of the session."""
     return tuple(axis for axis in results.axes if axis in by_axis)
 
 
 def overall(results: Results) -> Callout:
     """Return the verdict on the session."""
-    diagnosis = results.json(results.of_model("diagnose.json"))
+    diagnosis = results.read(DiagnoseResult)
     if diagnosis is not None:
         return _diagnosed(results, diagnosis)
     ratios = above_floor(results, results.model)
@@ -78,18 +79,17 @@ def _ratios(ratios: dict[str, float]) -> str:
     return f"{wording.listing(parts)} the noise floor"
 
 
-def _diagnosed(results: Results, diagnosis: dict[str, Any]) -> Callout:
-    axes = diagnosis.get("axes", {})
-    found = {axis: str(axes[axis].get("verdict", "")) for axis in ordered(results, axes)}
+def _diagnosed(results: Results, diagnosis: DiagnoseResult) -> Callout:
+    axes = diagnosis.axes
+    found = {axis: axes[axis].verdict for axis in ordered(results, axes)}
     by_verdict = {
         verdict: [axis for axis in found if found[axis] == verdict] for verdict in IN_WORDS
     }
     effects = results.effects(results.model)
     with_effects = f" with {wording.listing(f'`{name}`' for name in effects)}" if effects else ""
-    sentence = wording.sentence(diagnosis.get("sentence") or "")
+    sentence = wording.sentence(diagnosis.sentence)
     if by_verdict["missing"]:
-        selected = [str(name) for name in diagnosis.get("selected") or ()]
-        what = wording.listing(f"`{name}`" for name in selected) or "an effect"
+        what = wording.listing(f"`{name}`" for name in diagnosis.selected) or "an effect"
         where = wording.listing(by_verdict["missing"])
         return Callout("attention", f"The model{with_effects} lacks {what} ({where})", sentence)
     if by_verdict["unknown_effect"]:

@@ -9,6 +9,9 @@ from pydantic import Field
 from bampipe.results.record import Names, Record, Result, Size
 
 Digest = Annotated[str, Field(pattern="^[0-9a-f]{64}$", description="SHA-256")]
+InputDigest = Annotated[
+    str, Field(pattern="^([0-9a-f]{64}|absent)$", description="SHA-256, or that it was absent")
+]
 
 
 class Place(Record):
@@ -35,7 +38,7 @@ class StepRecord(Record):
     config: dict[str, Any] = Field(description="Every setting, defaults included")
     settings: dict[str, Any] = Field(description="Settings as given")
     declared_inputs: Names
-    inputs: dict[str, Digest | Literal["absent"]]
+    inputs: dict[str, InputDigest]
     outputs: dict[str, Digest]
     code: Digest = Field(description="Of the sources that the stage uses")
     versions: dict[str, str]

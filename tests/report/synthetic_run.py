@@ -12,12 +12,13 @@ import pandas as pd
 from made_results import write_result
 
 from bampipe.data.store import write_parquet
-from bampipe.files import write_json, write_text
+from bampipe.files import write_text
 from bampipe.results.compare import CompareResult
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.filter import FilterResult
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.ingest import IngestResult
+from bampipe.results.run import RunResult
 from bampipe.results.stiffness import StiffnessResult
 from bampipe.results.validate import ValidateResult
 
@@ -339,10 +340,12 @@ def write_record(root: Path) -> None:
     order = ("ingest", "filter", "stiffness", "identify:base")
     stages = {
         name: {
-            "key": f"{number}bcdef0123456789", "config": {"model": "base"},
-            "inputs": {f"{order[number - 1]}/x": "y"} if number else
+            "key": f"{number}bcdef0123456789".ljust(64, "0"), "code": "c" * 64,
+            "config": {"model": "base"},
+            "inputs": {f"{order[number - 1]}/x": "e" * 64} if number else
             {"session/session.toml": "a" * 64, **hashes},
-            "outputs": {f"{name}/x": "y"}, "versions": {"bampipe": "0.1.0", "python": "3.11.9"},
+            "outputs": {f"{name}/x": "e" * 64},
+            "versions": {"bampipe": "0.1.0", "python": "3.11.9"},
         }
         for number, name in enumerate(order)
     }  # fmt: skip
@@ -350,7 +353,4 @@ def write_record(root: Path) -> None:
         name: {"started_at": "2026-11-21T07:00:00+00:00", "seconds": 1.25 + number}
         for number, name in enumerate(stages)
     }
-    content = {
-        "schema": "bampipe.run/1", "stages": stages, "timings": timings,
-    }  # fmt: skip
-    write_json(root / "run.json", content)
+    write_result(root, RunResult, stages=stages, timings=timings)

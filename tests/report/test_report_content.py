@@ -170,11 +170,11 @@ def test_results_older_than_their_inputs_are_named_first(
     shutil.copytree(full_run, root)
     record = json.loads((root / "run.json").read_text())
     # A device file counts by what it says where it is read, by its bytes where it is written.
-    record["stages"]["ingest"]["outputs"]["ingest/device.toml"] = "its bytes"
-    record["stages"]["identify:base"]["inputs"]["ingest/device.toml"] = "what it says"
+    record["stages"]["ingest"]["outputs"]["ingest/device.toml"] = "b" * 64
+    record["stages"]["identify:base"]["inputs"]["ingest/device.toml"] = "d" * 64
     (root / "run.json").write_text(json.dumps(record))
     assert Results(root).outdated == ()
-    record["stages"]["ingest"]["outputs"]["ingest/x"] = "new"
+    record["stages"]["ingest"]["outputs"]["ingest/x"] = "f" * 64
     (root / "run.json").write_text(json.dumps(record))
     assert Results(root).outdated == ("filter", "identify:base", "stiffness")
     report = build(Results(root), quiet)

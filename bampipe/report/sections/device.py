@@ -2,28 +2,28 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Iterable, Mapping
 
 from bampipe.report import wording
 from bampipe.report.document import Block, Section, Table, Text
 from bampipe.report.results import Results
+from bampipe.results.identify import Combined, DeviceNumber, IdentifyResult
+from bampipe.results.performance import DeviceConstant, PerformanceResult
 
 
 def section(results: Results) -> Section | None:
     """Return the section; None where no constants are stored."""
-    content = results.json(results.of_model("performance.json")) or {}
-    constants = content.get("constants") or {}
-    identified = results.json(results.of_model("identify.json")) or {}
-    known = identified.get("identifiability") or {}
-    numbers = {number["name"]: number for number in known.get("numbers", ())}
+    performance, identified = results.read(PerformanceResult), results.read(IdentifyResult)
+    known = identified.identifiability if identified else None
+    together = known.together if known else ()
     blocks: list[Block] = []
-    if constants:
-        blocks.append(_constants(results, constants, known))
-    if numbers:
-        blocks.append(_numbers(numbers))
-    for group in known.get("together", ()):
-        members = wording.listing(f"`{name}`" for name in group["members"])
-        sums = wording.listing(f"`{name}`" for name in group["combinations"])
+    if performance and performance.constants:
+        blocks.append(_constants(results, performance.constants, together))
+    if known and known.numbers:
+        blocks.append(_numbers(known.numbers))
+    for group in together:
+        members = wording.listing(f"`{name}`" for name in group.members)
+        sums = wording.listing(f"`{name}`" for name in group.combinations)
         blocks.append(
             Text(
                 f"{members} enter the equations only as {sums}. No motion, however rich, tells the "
@@ -33,18 +33,20 @@ def section(results: Results) -> Section | None:
     return Section("Device", tuple(blocks)) if blocks else None
 
 
-def _constants(results: Results, constants: dict[str, Any], known: dict[str, Any]) -> Table:
-    grouped = {name for group in known.get("together", ()) for name in group["members"]}
+def _constants(
+    results: Results, constants: Mapping[str, DeviceConstant], together: Iterable[Combined]
+) -> Table:
+    grouped = {name for group in together for name in group.members}
     rows = []
     for name in sorted(constants, key=lambda name: (name in grouped, name.lower())):
         entry = constants[name]
         rows.append(
             (
                 f"`{name}`",
-                str(entry.get("description") or "–"),
-                wording.significant(entry["value"], 4),
-                wording.unit(str(entry.get("unit", ""))) or "1",
-                str(entry.get("source") or "–"),
+                entry.description or "–",
+                wording.significant(entry.value, 4),
+                wording.unit(entry.unit) or "1",
+                entry.source or "–",
             )
         )
     return Table(
@@ -56,24 +58,22 @@ def _constants(results: Results, constants: dict[str, Any], known: dict[str, Any
     )
 
 
-def _numbers(numbers: dict[str, dict[str, Any]]) -> Table:
+def _numbers(numbers: Iterable[DeviceNumber]) -> Table:
     """Return what the trials say of these numbers, and which estimates rest on them."""
     rows = []
-    for name, entry in numbers.items():
-        moved = sorted(entry["moves_percent"].items(), key=lambda item: -abs(item[1]))
+    for entry in numbers:
+        moved = sorted(entry.moves_percent.items(), key=lambda item: -abs(item[1]))
         most = [
             f"`{parameter}` {wording.plain(size, 2)} %"
             for parameter, size in moved[:2]
             if abs(size) >= 0.005
         ]
-        unit = wording.unit(str(entry["unit"])) or "1"
+        unit = wording.unit(entry.unit) or "1"
         rows.append(
             (
-                f"`{name}`",
-                f"{wording.significant(entry['value'], 4)} {unit}",
-                "–"
-                if entry["bound_sd"] is None
-                else f"{wording.significant(entry['bound_sd'], 2)}",
+                f"`{entry.name}`",
+                f"{wording.significant(entry.value, 4)} {unit}",
+                wording.significant(entry.bound_sd, 2),
                 ", ".join(most) or "none by 0.01 %",
             )
         )

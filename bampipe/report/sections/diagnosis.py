@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,15 @@ from bampipe.report.document import (
     Text,
 )
 from bampipe.report.results import Results
+from bampipe.results.diagnose import (
+    AxisVerdict,
+    DiagnoseResult,
+    RankedEffect,
+    ResidualMap,
+    WorstWindow,
+)
 
+Maps = Mapping[str, ResidualMap]
 TITLE = "Diagnosis"
 _RANKED = 8
 _WINDOWS = 6
@@ -32,7 +41,7 @@ def section(results: Results) -> Section:
     found = [
         (model, content)
         for model in results.models
-        if (content := results.json(results.of_model("diagnose.json", model))) is not None
+        if (content := results.read(DiagnoseResult, model)) is not None
     ]
     if not found:
         command = f"`bampipe diagnose {results.root.name}`"
@@ -43,67 +52,50 @@ def section(results: Results) -> Section:
     for model, content in found:
         if len(found) > 1:
             blocks.append(Subheading(f"Model `{model}`"))
-        later = None if model == last else after.get("maps")
+        later = None if model == last else after.maps
         blocks += _model(results, model, content, later)
     return Section(TITLE, tuple(blocks), new_page=True)
 
 
 def _model(
-    results: Results, model: str, content: dict[str, Any], later: dict[str, Any] | None
+    results: Results, model: str, found: DiagnoseResult, later: Mapping[str, Maps] | None
 ) -> list[Block]:
-    axes = content.get("axes", {})
+    axes = found.axes
     names = verdicts.ordered(results, axes)
-    blocks: list[Block] = []
-    sentences = tuple(
-        wording.sentence(axes[axis]["sentence"]) for axis in names if axes[axis].get("sentence")
-    )
-    if sentences:
-        blocks.append(Bullets(sentences))
-    elif content.get("sentence"):
-        blocks.append(Text(wording.sentence(content["sentence"])))
-    blocks.append(_verdicts(results, names, axes))
-    lacking = any(axes[axis].get("verdict") != "nothing_missing" for axis in names)
-    ranking = content.get("ranking") or []
-    if ranking and lacking:
-        blocks.append(_ranking(results, ranking))
-    following = str(content.get("next") or "")
-    if following:
-        command = following.startswith("bampipe ")
-        blocks.append(Text(f"Next: `{following}`" if command else f"Next: {following}."))
-    suggestion = content.get("suggested_trial")
-    if isinstance(suggestion, dict) and suggestion.get("sentence"):
-        blocks.append(
-            Callout(
-                "note", "A trial that would tell more", wording.sentence(suggestion["sentence"])
-            )
-        )
-    maps = content.get("maps") or {}
+    sentences = tuple(wording.sentence(axes[axis].sentence) for axis in names)
+    blocks: list[Block] = [Bullets(sentences), _verdicts(names, axes)]
+    lacking = [axis for axis in names if axes[axis].verdict != "nothing_missing"]
+    if found.ranking and lacking:
+        blocks.append(_ranking(results, found.ranking))
+    command = found.next.startswith("bampipe ")
+    blocks.append(Text(f"Next: `{found.next}`" if command else f"Next: {found.next}."))
+    if found.suggested_trial is not None:
+        words = wording.sentence(found.suggested_trial.sentence)
+        blocks.append(Callout("note", "A trial that would tell more", words))
     blocks += [
-        _maps(results, model, axis, axes[axis], maps[axis], (later or {}).get(axis))
-        for axis in names
-        if maps.get(axis) and axes[axis].get("verdict") != "nothing_missing"
+        _maps(model, axis, axes[axis], found.maps[axis], (later or {}).get(axis))
+        for axis in lacking
+        if found.maps.get(axis)
     ]
-    windows = content.get("worst_windows") or []
-    if windows and lacking:
-        blocks.append(_windows(results, windows))
+    if found.worst_windows and lacking:
+        blocks.append(_windows(results, found.worst_windows))
     return blocks
 
 
-def _verdicts(results: Results, names: tuple[str, ...], axes: dict[str, Any]) -> Table:
+def _verdicts(names: tuple[str, ...], axes: Mapping[str, AxisVerdict]) -> Table:
     rows = []
     for axis in names:
         entry = axes[axis]
-        verdict = str(entry.get("verdict", ""))
         rows.append(
             (
                 axis,
-                verdicts.IN_WORDS.get(verdict, wording.words(verdict)),
-                wording.percent(entry.get("explainable_share")),
-                wording.percent(entry.get("explainable_chance")),
-                wording.significant(entry.get("rmse_before")),
-                wording.significant(entry.get("rmse_after")),
-                wording.significant(entry.get("noise_floor")),
-                wording.unit(str(entry.get("unit", results.force_unit(axis)))),
+                verdicts.IN_WORDS.get(entry.verdict, wording.words(entry.verdict)),
+                wording.percent(entry.explainable_share),
+                wording.percent(entry.explainable_chance),
+                wording.significant(entry.rmse_before),
+                wording.significant(entry.rmse_after),
+                wording.significant(entry.noise_floor),
+                wording.unit(entry.unit),
             )
         )
     return Table(
@@ -126,23 +118,19 @@ def _verdicts(results: Results, names: tuple[str, ...], axes: dict[str, Any]) ->
     )
 
 
-def _ranking(results: Results, ranking: list[dict[str, Any]]) -> Table:
-    rows = []
-    for entry in ranking[:_RANKED]:
-        axis = str(entry.get("axis") or "")
-        unit = wording.unit(results.force_unit(axis)) if axis in results.axes else ""
-        alike = [f"`{name}`" for name in entry.get("indistinguishable_from") or ()]
-        rows.append(
-            (
-                f"`{entry['effect']}`",
-                axis or "–",
-                wording.significant(entry.get("held_out_rmse_before")),
-                wording.significant(entry.get("held_out_rmse_after")),
-                unit,
-                wording.probability(entry.get("p_value")),
-                ", ".join(alike) or "–",
-            )
+def _ranking(results: Results, ranking: Sequence[RankedEffect]) -> Table:
+    rows = [
+        (
+            f"`{entry.effect}`",
+            entry.axis,
+            wording.significant(entry.held_out_rmse_before),
+            wording.significant(entry.held_out_rmse_after),
+            wording.unit(results.force_unit(entry.axis)) if entry.axis in results.axes else "",
+            wording.probability(entry.p_value),
+            ", ".join(f"`{name}`" for name in entry.indistinguishable_from) or "–",
         )
+        for entry in ranking[:_RANKED]
+    ]
     more = len(ranking) - len(rows)
     note = "p: chance of such a fall in error where the effect is absent."
     if more:
@@ -158,24 +146,23 @@ def _ranking(results: Results, ranking: list[dict[str, Any]]) -> Table:
 
 
 def _maps(
-    results: Results,
     model: str,
     axis: str,
-    entry: dict[str, Any],
-    maps: dict[str, Any],
-    later: dict[str, Any] | None,
+    entry: AxisVerdict,
+    maps: Maps,
+    later: Maps | None,
 ) -> Figure:
-    names = sorted(maps, key=lambda name: -float(maps[name].get("variance_share") or 0.0))
+    names = sorted(maps, key=lambda name: -maps[name].variance_share)
     names = names[:_MAPS]
     columns = min(3, len(names))
     rows = math.ceil(len(names) / columns)
     figure, panels = style.panels(
         rows, columns, 0.35 + 1.65 * rows, width=min(style.WIDTH, 1.0 + 1.9 * columns)
     )
-    unit = wording.unit(str(entry.get("unit", results.force_unit(axis))))
+    unit = wording.unit(entry.unit)
     for number, (panel, name) in enumerate(zip(panels.flat, names, strict=False)):
         extents = [_map(panel, name, maps[name], style.VERMILLION, f"model {model}")]
-        if later and later.get(name):
+        if later and name in later:
             extents.append(_map(panel, name, later[name], style.BLUE, "with the effects found"))
         panel.axhline(0.0, color=style.INK, lw=0.6, zorder=1)
         style.limits(panel, [item for pair in extents for item in pair], zero=True)
@@ -193,17 +180,14 @@ def _maps(
 
 
 def _map(
-    panel: Any, name: str, content: dict[str, Any], colour: str, title: str
+    panel: Any, name: str, drawn: ResidualMap, colour: str, title: str
 ) -> tuple[np.ndarray, np.ndarray]:
     """Draw one map; return its lower and upper band."""
-    centre = content["center"]
-    mean = _numbers(content["mean"])
-    low = _numbers(content.get("low") or content["mean"])
-    high = _numbers(content.get("high") or content["mean"])
-    unit = str(content.get("unit") or "")
-    levels = _levels(name, centre) if not unit else None
+    centre = drawn.center
+    mean, low, high = (np.array(values) for values in (drawn.mean, drawn.low, drawn.high))
+    levels = _levels(name, centre) if not drawn.unit else None
     if levels is None:
-        x, shown = style.scaled(_numbers(centre), unit)
+        x, shown = style.scaled(np.array(centre), drawn.unit)
         panel.fill_between(x, low, high, color=colour, alpha=0.2, lw=0)
         panel.plot(x, mean, color=colour, lw=1.1, label=title)
         panel.set_xlabel(style.label(wording.words(name), shown))
@@ -217,32 +201,26 @@ def _map(
     return low, high
 
 
-def _levels(name: str, centre: list[Any]) -> list[str] | None:
+def _levels(name: str, centre: Sequence[float]) -> list[str] | None:
     """Return the names of the levels of a variable that counts or sorts, else None."""
-    if not all(isinstance(value, int | float) and float(value).is_integer() for value in centre):
+    if not all(value.is_integer() for value in centre):
         return None
     first = 1 if name == "trial" else 0
     signed = {-1: "−", 0: "0", 1: "+"} if name == "direction" else {}
     return [signed.get(int(value), str(int(value) + first)) for value in centre]
 
 
-def _numbers(values: list[float | None]) -> np.ndarray:
-    return np.array([math.nan if value is None else float(value) for value in values])
-
-
-def _windows(results: Results, windows: list[dict[str, Any]]) -> Table:
+def _windows(results: Results, windows: Sequence[WorstWindow]) -> Table:
     rows = []
     for entry in windows[:_WINDOWS]:
-        axis = str(entry.get("axis", ""))
-        start, stop = float(entry["t_start"]), float(entry["t_end"])
-        unit = wording.unit(results.force_unit(axis)) if axis in results.axes else ""
+        unit = wording.unit(results.force_unit(entry.axis)) if entry.axis in results.axes else ""
         rows.append(
             (
-                axis,
-                str(entry.get("trial_id", "")),
-                f"{wording.plain(start, 1)} to {wording.plain(stop, 1)}",
-                f"{wording.significant(entry.get('rmse'))} {unit}",
-                str(entry.get("doing") or "–"),
+                entry.axis,
+                entry.trial_id,
+                f"{wording.plain(entry.t_start, 1)} to {wording.plain(entry.t_end, 1)}",
+                f"{wording.significant(entry.rmse)} {unit}",
+                entry.doing or "–",
             )
         )
     return Table(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import textwrap
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ import pandas as pd
 from bampipe.report import style, verdicts, wording
 from bampipe.report.document import Block, Figure, Section, Table, Text
 from bampipe.report.results import Results
+from bampipe.results.identify import Estimate, IdentifyResult, StateBound
 
 TITLE = "Identification"
 _NORMAL_95 = 1.959964
@@ -21,48 +23,46 @@ _DASHES = ("-", (0, (5, 1.5)), (0, (1.5, 1.2)), (0, (5, 1.5, 1, 1.5)))
 
 def section(results: Results) -> Section:
     """Return the section."""
-    content = results.json(results.of_model("identify.json"))
-    if content is None:
+    identified = results.read(IdentifyResult)
+    if identified is None:
         command = f"`bampipe identify {results.root.name}`"
         return Section(TITLE, (Text(f"No parameters have been identified: {command} does it."),))
-    blocks: list[Block] = [_parameters(results, content)]
-    checks = _checks(content)
+    blocks: list[Block] = [_parameters(results, identified)]
+    checks = _checks(identified)
     if checks:
         blocks.append(Text(checks))
-    bounds = content.get("state_3sigma")
-    if bounds:
-        blocks.append(_bounds(results, bounds))
+    if identified.state_3sigma:
+        blocks.append(_bounds(results, identified.state_3sigma))
     trace = results.table(results.of_model("trace.parquet"))
     if trace is not None and len(trace):
-        blocks.append(_convergence(results, content, trace))
+        blocks.append(_convergence(results, identified, trace))
     motion = _motion(results)
     if motion is not None:
         blocks.append(motion)
     return Section(TITLE, tuple(blocks))
 
 
-def _parameters(results: Results, content: dict[str, Any]) -> Table:
-    parameters = content.get("parameters", {})
+def _parameters(results: Results, identified: IdentifyResult) -> Table:
+    parameters = identified.parameters
     names = results.in_order(parameters)
-    checked = any("least_squares" in parameters[name] for name in names)
-    bounded = any(parameters[name].get("bound_sd") is not None for name in names)
+    checked = any(parameters[name].least_squares is not None for name in names)
+    bounded = any(parameters[name].bound_sd is not None for name in names)
     rows = []
     for name in names:
         entry = parameters[name]
-        value, sd = entry["estimate"], entry.get("sd")
+        value, sd, other = entry.estimate, entry.sd, entry.least_squares
         decimals = wording.decimals_for(sd, value)
         half = _NORMAL_95 * sd if sd else 0.0
-        other = entry.get("least_squares")
         rows.append(
             (
                 wording.parameter(name),
                 f"`{name}`",
-                wording.plain(value, decimals) + (" *" if entry.get("at_bound") else ""),
+                wording.plain(value, decimals) + (" *" if entry.at_bound else ""),
                 wording.significant(sd, 2) if sd else "fixed",
-                *((wording.significant(entry.get("bound_sd"), 2),) if bounded else ()),
+                *((wording.significant(entry.bound_sd, 2),) if bounded else ()),
                 wording.interval(value - half, value + half, sd) if sd else "–",
                 *(("–" if other is None else wording.plain(other, decimals),) if checked else ()),
-                wording.unit(str(entry.get("unit", ""))),
+                wording.unit(entry.unit),
             )
         )
     note = "Interval: estimate ± 1.96 standard deviations."
@@ -70,10 +70,10 @@ def _parameters(results: Results, content: dict[str, Any]) -> Table:
         note += " Bound: the least SD that these sensors allow on these trials (Cramér-Rao)."
     if checked:
         note += " Least squares on the inverse dynamics, for comparison."
-    if any(parameters[name].get("at_bound") for name in names):
+    if any(parameters[name].at_bound for name in names):
         note += " * At the limit of its range: the data ask for a value beyond it."
     return Table(
-        f"Parameters of model `{content.get('model', 'base')}`{_method(content)}"
+        f"Parameters of model `{identified.model}`{_method(identified)}"
         f"{results.as_in('Table VII')}",
         (
             "Parameter",
@@ -91,50 +91,45 @@ def _parameters(results: Results, content: dict[str, Any]) -> Table:
     )
 
 
-def _checks(content: dict[str, Any]) -> str:
+def _checks(identified: IdentifyResult) -> str:
     """Return what the filter says of itself: when it settled, whether its noise levels fit."""
     parts = []
-    convergence = content.get("convergence") or {}
-    settled = convergence.get("settled_s") or {}
-    if settled and convergence.get("total_s"):
-        last = max(settled, key=lambda name: (float(settled[name]), name))
+    convergence, timing = identified.convergence, identified.input_timing
+    settled = convergence.settled_s
+    if settled and convergence.total_s:
+        last = max(settled, key=lambda name: (settled[name], name))
         parts.append(
-            f"All estimates had settled after {wording.plain(float(settled[last]), 1)} s of "
-            f"{wording.plain(float(convergence['total_s']), 1)} s (the last was `{last}`)."
+            f"All estimates had settled after {wording.plain(settled[last], 1)} s of "
+            f"{wording.plain(convergence.total_s, 1)} s (the last was `{last}`)."
         )
-    if convergence.get("converged") is False:
+    if not convergence.converged:
         parts.append("**The estimates have not converged.**")
-    nis = (content.get("nis") or {}).get("mean")
-    if nis is not None:
+    if identified.nis is not None:
+        mean = wording.significant(identified.nis.mean, 2)
         parts.append(
-            f"The mean normalised innovation squared is {wording.significant(nis, 2)}; it is 1 "
-            "where the noise levels are right."
+            f"The mean normalised innovation squared is {mean}; it is 1 where the noise levels "
+            "are right."
         )
-    timing = content.get("input_timing") or {}
-    if timing.get("estimate") is not None:
-        sd = timing.get("sd")
-        shown = wording.with_sd(1e3 * timing["estimate"], None if sd is None else 1e3 * sd)
-        parts.append(f"The force lags the encoders by {shown} ms.")
+    if timing.sd > 0.0:  # else it was not estimated
+        lag = wording.with_sd(1e3 * timing.estimate, 1e3 * timing.sd)
+        parts.append(f"The force lags the encoders by {lag} ms.")
     return " ".join(parts)
 
 
-def _method(content: dict[str, Any]) -> str:
+def _method(identified: IdentifyResult) -> str:
     how = {"ukf": "unscented Kalman filter", "least-squares": "least squares"}
-    name = str(content.get("method", ""))
-    return f", {how.get(name, wording.words(name))}" if name else ""
+    return f", {how.get(identified.method, wording.words(identified.method))}"
 
 
-def _bounds(results: Results, bounds: dict[str, Any]) -> Table:
-    rows = []
-    for axis in verdicts.ordered(results, bounds):
-        entry = bounds[axis]
-        rows.append(
-            (
-                axis,
-                _scaled(entry.get("position"), results.unit(axis)),
-                _scaled(entry.get("velocity"), results.rate_unit(axis)),
-            )
+def _bounds(results: Results, bounds: Mapping[str, StateBound]) -> Table:
+    rows = [
+        (
+            axis,
+            _scaled(bounds[axis].position, results.unit(axis)),
+            _scaled(bounds[axis].velocity, results.rate_unit(axis)),
         )
+        for axis in verdicts.ordered(results, bounds)
+    ]
     return Table(
         f"Error of the filtered state, 3σ bounds{results.as_in('Table VI')}",
         ("Axis", "Position", "Velocity"),
@@ -151,23 +146,21 @@ def _scaled(value: float | None, unit: str) -> str:
 
 
 def _groups(
-    results: Results, content: dict[str, Any], trace: pd.DataFrame
+    results: Results, parameters: Mapping[str, Estimate], trace: pd.DataFrame
 ) -> list[tuple[str, str, list[str]]]:
     """Return title, unit and parameters of each panel: those of one kind and unit together."""
     groups: dict[tuple[str, str], list[str]] = {}
-    parameters = content.get("parameters", {})
     for name in results.in_order(parameters):
         if name in trace.columns:
             kind = wording.parameter(name)
             if name.startswith(("viscous.", "coulomb.")):
                 kind = wording.parameter(name.split(".")[0])
-            unit = str(parameters[name].get("unit", ""))
-            groups.setdefault((kind, unit), []).append(name)
+            groups.setdefault((kind, parameters[name].unit), []).append(name)
     return [(kind, unit, names) for (kind, unit), names in groups.items()]
 
 
-def _convergence(results: Results, content: dict[str, Any], trace: pd.DataFrame) -> Figure:
-    groups = _groups(results, content, trace)
+def _convergence(results: Results, identified: IdentifyResult, trace: pd.DataFrame) -> Figure:
+    groups = _groups(results, identified.parameters, trace)
     columns = 2 if len(groups) <= _TWO_COLUMNS else 3
     rows = math.ceil(len(groups) / columns)
     figure, panels = style.panels(rows, columns, 0.35 + 1.35 * rows, sharex=True)
@@ -197,7 +190,7 @@ def _convergence(results: Results, content: dict[str, Any], trace: pd.DataFrame)
         f"Convergence of the parameters{results.as_in('Fig. 7')}, with the filter's own 95 % "
         "bounds. Dotted verticals: a new trial starts."
     )
-    if content.get("repeats", 0):
+    if identified.repeats:
         caption += " The filter's last run, which starts around the answer of the one before."
     return Figure("convergence", caption, style.svg(figure))
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
 from bampipe.report import style, verdicts, wording
 from bampipe.report.document import Block, Bullets, Figure, Section, Table
 from bampipe.report.results import Results
+from bampipe.results.compare import CompareResult, Rung, Value
 
 TITLE = "Model versions"
 _MOST_COLUMNS = 3
@@ -16,46 +17,35 @@ _MOST_COLUMNS = 3
 
 def section(results: Results) -> Section | None:
     """Return the section; None where there is one model only."""
-    content = results.json("compare.json")
-    rungs = (content or {}).get("ladder") or []
-    if content is None or len(rungs) < 2:
+    compared = results.read(CompareResult)
+    if compared is None or len(compared.ladder) < 2:
         return None
+    rungs = compared.ladder
     blocks: list[Block] = [_steps(results, rungs), _picture(results, rungs)]
-    if any(rung.get("free_run") for rung in rungs):
+    if any(rung.free_run for rung in rungs):
         blocks.append(_free_runs(results, rungs))
-    parameters = content.get("parameters") or {}
-    if parameters:
-        blocks.append(_parameters(results, rungs, parameters))
-    moved = [
-        wording.sentence(entry["sentence"])
-        for entry in content.get("moved") or ()
-        if entry.get("sentence")
-    ]
-    if moved:
-        blocks.append(Bullets(tuple(moved)))
+    if compared.parameters:
+        blocks.append(_parameters(results, rungs, compared.parameters))
+    if compared.moved:
+        blocks.append(Bullets(tuple(wording.sentence(one.sentence) for one in compared.moved)))
     return Section(TITLE, tuple(blocks))
 
 
-def _axes(results: Results, rungs: list[dict[str, Any]]) -> tuple[str, ...]:
-    return verdicts.ordered(
-        results,
-        {axis: None for rung in rungs for axis in rung.get("held_out_rmse", {})},
-    )
+def _axes(results: Results, rungs: Sequence[Rung]) -> tuple[str, ...]:
+    return verdicts.ordered(results, {axis for rung in rungs for axis in rung.held_out_rmse})
 
 
-def _steps(results: Results, rungs: list[dict[str, Any]]) -> Table:
+def _steps(results: Results, rungs: Sequence[Rung]) -> Table:
     axes = _axes(results, rungs)
     rows = []
     for rung in rungs:
         cells = []
         for axis in axes:
-            error = rung.get("held_out_rmse", {}).get(axis)
-            floor = rung.get("noise_floor", {}).get(axis)
+            error = rung.held_out_rmse.get(axis)
+            floor = rung.noise_floor.get(axis)
             text = wording.significant(error)
             cells.append(f"{text} ({wording.significant(floor)})" if floor else text)
-        added = rung.get("added")
-        added = added if isinstance(added, str) else ", ".join(added or ())
-        rows.append((_version(rungs, rung), f"`{added}`" if added else "–", *cells))
+        rows.append((_version(rungs, rung), f"`{rung.added}`" if rung.added else "–", *cells))
     units = (f"{axis} ({wording.unit(results.force_unit(axis))})" for axis in axes)
     return Table(
         "RMSE on the same held-out trials (noise floor)",
@@ -65,20 +55,20 @@ def _steps(results: Results, rungs: list[dict[str, Any]]) -> Table:
     )
 
 
-def _free_runs(results: Results, rungs: list[dict[str, Any]]) -> Table:
+def _free_runs(results: Results, rungs: Sequence[Rung]) -> Table:
     """Position error of each version left to itself: mean absolute, and relative to the motion."""
     axes = _axes(results, rungs)
     rows = []
     for rung in rungs:
         cells = []
         for axis in axes:
-            entry = (rung.get("free_run") or {}).get(axis)
+            entry = rung.free_run.get(axis)
             if entry is None:
                 cells += ["–", "–"]
                 continue
-            cells.append(wording.significant(entry["mean_absolute"]))
-            cells.append(wording.significant(entry["relative_error_percent"]))
-        loop = str(rung.get("free_run_mode") or "–").replace("_", " ")
+            cells.append(wording.significant(entry.mean_absolute))
+            cells.append(wording.significant(entry.relative_error_percent))
+        loop = (rung.free_run_mode or "–").replace("_", " ")
         rows.append((_version(rungs, rung), loop, *cells))
     units = [
         column
@@ -93,19 +83,19 @@ def _free_runs(results: Results, rungs: list[dict[str, Any]]) -> Table:
     )
 
 
-def _version(rungs: list[dict[str, Any]], rung: dict[str, Any]) -> str:
+def _version(rungs: Sequence[Rung], rung: Rung) -> str:
     """Return a short name: the base model's own, then numbers (names grow with every effect)."""
     number = rungs.index(rung)
-    return str(rung["model"]) if number == 0 else f"version {number}"
+    return rung.model if number == 0 else f"version {number}"
 
 
-def _picture(results: Results, rungs: list[dict[str, Any]]) -> Figure:
+def _picture(results: Results, rungs: Sequence[Rung]) -> Figure:
     axes = _axes(results, rungs)
     figure, panels = style.panels(1, len(axes), 2.3, width=min(style.WIDTH, 1.2 + 1.9 * len(axes)))
     x = np.arange(len(rungs))
     for panel, axis in zip(panels[0], axes, strict=True):
-        error = _values(rungs, "held_out_rmse", axis)
-        floor = _values(rungs, "noise_floor", axis)
+        error = _values(rung.held_out_rmse.get(axis) for rung in rungs)
+        floor = _values(rung.noise_floor.get(axis) for rung in rungs)
         panel.plot(x, error, "o-", color=style.BLUE, ms=4.5, lw=1.3, label="held-out error")
         panel.plot(x, floor, "s--", color=style.VERMILLION, ms=3.0, lw=1.0, label="noise floor")
         for place, value, least in zip(x, error, floor, strict=True):
@@ -118,7 +108,7 @@ def _picture(results: Results, rungs: list[dict[str, Any]]) -> Figure:
         top = np.nanmax(np.concatenate([error, floor, [0.0]]))
         panel.set_ylim(0.0, 1.22 * top or 1.0)
         panel.set_xlim(-0.4, len(rungs) - 0.6)
-        panel.set_xticks(x, [str(rungs[0]["model"]), *(str(number) for number in x[1:])])
+        panel.set_xticks(x, [rungs[0].model, *(str(number) for number in x[1:])])
         panel.set_xlabel("version")
         panel.set_title(axis)
         panel.set_ylabel(style.label("RMSE", wording.unit(results.force_unit(axis))))
@@ -127,23 +117,21 @@ def _picture(results: Results, rungs: list[dict[str, Any]]) -> Figure:
     return Figure("ladder", caption, style.svg(figure))
 
 
-def _values(rungs: list[dict[str, Any]], key: str, axis: str) -> np.ndarray:
-    found = (rung.get(key, {}).get(axis) for rung in rungs)
-    return np.array([np.nan if value is None else float(value) for value in found])
+def _values(found: Iterable[float | None]) -> np.ndarray:
+    return np.array([np.nan if value is None else value for value in found])
 
 
-def _parameters(results: Results, rungs: list[dict[str, Any]], parameters: dict[str, Any]) -> Table:
+def _parameters(
+    results: Results, rungs: Sequence[Rung], parameters: Mapping[str, Mapping[str, Value]]
+) -> Table:
     shown = rungs if len(rungs) <= _MOST_COLUMNS else [rungs[0], *rungs[-(_MOST_COLUMNS - 1) :]]
     rows = []
     for name in results.in_order(parameters):
         by_model = parameters[name]
-        entries = [by_model.get(rung["model"]) for rung in shown]
-        unit = next((entry["unit"] for entry in entries if entry), "")
-        cells = [
-            wording.with_sd(entry["estimate"], entry.get("sd")) if entry else "–"
-            for entry in entries
-        ]
-        rows.append((wording.parameter(name), *cells, wording.unit(str(unit))))
+        entries = [by_model.get(rung.model) for rung in shown]
+        unit = next((entry.unit for entry in entries if entry), "")
+        cells = [wording.with_sd(entry.estimate, entry.sd) if entry else "–" for entry in entries]
+        rows.append((wording.parameter(name), *cells, wording.unit(unit)))
     return Table(
         "Parameters of each version (± one standard deviation): a missing effect biases the others",
         ("Parameter", *(_version(rungs, rung) for rung in shown), "Unit"),

@@ -6,10 +6,11 @@ the machine stand in ``run.json``, and ``bampipe status`` prints them.
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
 
 from bampipe.report.document import Block, Section, Subheading, Table, Text
 from bampipe.report.results import Results
+from bampipe.results.run import RunResult, StepRecord
 
 TITLE = "Provenance"
 _DIGITS = 12
@@ -17,13 +18,11 @@ _DIGITS = 12
 
 def section(results: Results) -> Section:
     """Return the section."""
-    content = results.json("run.json")
-    if content is None:
+    run = results.read(RunResult)
+    if run is None:
         text = "This run folder has no run.json: what was run on what is not recorded."
         return Section(TITLE, (Text(text),), new_page=True)
-    stages: dict[str, Any] = {
-        name: made for name, made in content.get("stages", {}).items() if name != "report"
-    }
+    stages = {name: made for name, made in run.stages.items() if name != "report"}
     blocks: list[Block] = [Text(_versions(stages))]
     inputs = _inputs(stages)
     if inputs is not None:
@@ -35,21 +34,21 @@ def section(results: Results) -> Section:
     return Section(TITLE, tuple(blocks), new_page=True)
 
 
-def _versions(stages: dict[str, Any]) -> str:
+def _versions(stages: Mapping[str, StepRecord]) -> str:
     found: dict[str, set[str]] = {}
     for made in stages.values():
-        for name, version in (made.get("versions") or {}).items():
+        for name, version in made.versions.items():
             found.setdefault(name, set()).add(version)
     shown = ", ".join(f"{name} {' and '.join(sorted(found[name]))}" for name in sorted(found))
     text = f"Made with {shown}. " if shown else ""
     return f"{text}Full hashes are in `run.json`; equal inputs and versions give equal results."
 
 
-def _inputs(stages: dict[str, Any]) -> Table | None:
-    ingest = stages.get("ingest", {}).get("inputs") or {}
-    if not ingest:
+def _inputs(stages: Mapping[str, StepRecord]) -> Table | None:
+    if "ingest" not in stages:
         return None
-    rows = tuple((f"`{name}`", f"`{str(digest)[:_DIGITS]}`") for name, digest in ingest.items())
+    read = stages["ingest"].inputs
+    rows = tuple((f"`{name}`", f"`{digest[:_DIGITS]}`") for name, digest in read.items())
     return Table(
         f"Files that were read (first {_DIGITS} digits of their hash)",
         ("File", "Hash"),
@@ -58,13 +57,9 @@ def _inputs(stages: dict[str, Any]) -> Table | None:
     )
 
 
-def _stages(stages: dict[str, Any]) -> Table:
+def _stages(stages: Mapping[str, StepRecord]) -> Table:
     rows = tuple(
-        (
-            f"`{name}`",
-            str(len(made.get("outputs") or ())),
-            f"`{str(made.get('key') or '–')[:_DIGITS]}`",
-        )
+        (f"`{name}`", str(len(made.outputs)), f"`{made.key[:_DIGITS]}`")
         for name, made in _in_order(stages)
     )
     return Table(
@@ -77,26 +72,25 @@ def _stages(stages: dict[str, Any]) -> Table:
     )
 
 
-def _in_order(stages: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:
+def _in_order(stages: Mapping[str, StepRecord]) -> list[tuple[str, StepRecord]]:
     """Return the steps, a stage before those that read what it wrote."""
-    made_by = {name: step for step, made in stages.items() for name in made.get("outputs") or ()}
+    made_by = {name: step for step, made in stages.items() for name in made.outputs}
     ranks: dict[str, int] = {}
 
     def rank(step: str) -> int:
         if step not in ranks:
             ranks[step] = 0  # a record that was tampered with may go round in circles
-            before = {made_by.get(name, step) for name in stages[step].get("inputs") or ()} - {step}
+            before = {made_by.get(name, step) for name in stages[step].inputs} - {step}
             ranks[step] = 1 + max(map(rank, before), default=0)
         return ranks[step]
 
     return sorted(stages.items(), key=lambda item: (rank(item[0]), item[0]))
 
 
-def _settings(stages: dict[str, Any]) -> Table | None:
+def _settings(stages: Mapping[str, StepRecord]) -> Table | None:
     rows = []
     for name, made in _in_order(stages):
-        values = made.get("config") or {}
-        shown = ", ".join(f"{key} = {_value(value)}" for key, value in values.items())
+        shown = ", ".join(f"{key} = {_value(value)}" for key, value in made.config.items())
         if shown:
             rows.append((f"`{name}`", shown))
     if not rows:

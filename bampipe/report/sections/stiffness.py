@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -10,20 +11,20 @@ import pandas as pd
 from bampipe.report import style, verdicts, wording
 from bampipe.report.document import Block, Bullets, Figure, Section, Table, Text
 from bampipe.report.results import Results
+from bampipe.results.stiffness import AxisStiffness, StiffnessResult
 
 TITLE = "Stiffness"
 
 
 def section(results: Results) -> Section | None:
     """Return the section; None for a session without locked trials."""
-    content = results.json("stiffness/stiffness.json")
-    if content is None:
+    found = results.read(StiffnessResult)
+    if found is None:
         if not (results.trials["kind"] == "locked").any():
             return None
         command = f"`bampipe stiffness {results.root.name}`"
         return Section(TITLE, (Text(f"The locked trials have not been used: {command} does it."),))
-    axes = content.get("axes", {})
-    notes = tuple(str(note) for note in content.get("notes", ()))
+    axes, notes = found.axes, found.notes
     if not axes:
         return Section(TITLE, (Text(" ".join(notes) or "There are no locked trials."),))
     blocks: list[Block] = [_table(results, axes)]
@@ -35,22 +36,22 @@ def section(results: Results) -> Section | None:
     return Section(TITLE, tuple(blocks))
 
 
-def _table(results: Results, axes: dict[str, Any]) -> Table:
+def _table(results: Results, axes: Mapping[str, AxisStiffness]) -> Table:
     rows = []
     poses: dict[str, str] = {}
     for axis in verdicts.ordered(results, axes):
         entry = axes[axis]
-        factor, unit = wording.scale([entry["stiffness"]], entry["unit"])
-        value = wording.with_sd(factor * entry["stiffness"], factor * entry["sd"])
+        factor, unit = wording.scale([entry.stiffness], entry.unit)
+        value = wording.with_sd(factor * entry.stiffness, factor * entry.sd)
         rows.append(
             (
                 axis,
                 f"{value} {unit}",
-                str(entry.get("n_cycles", "–")),
-                _scaled(entry.get("loop_width"), entry.get("loop_width_unit", "")),
-                _scaled(entry.get("energy_per_cycle"), entry.get("energy_unit", "J")),
-                wording.significant(entry.get("bandwidth_rad_s")),
-                wording.significant(entry.get("bandwidth_hz")),
+                str(entry.n_cycles),
+                _scaled(entry.loop_width, entry.loop_width_unit),
+                _scaled(entry.energy_per_cycle, entry.energy_unit),
+                wording.significant(entry.bandwidth_rad_s),
+                wording.significant(entry.bandwidth_hz),
             )
         )
         pose = _pose(results, entry)
@@ -77,24 +78,21 @@ def _table(results: Results, axes: dict[str, Any]) -> Table:
     )
 
 
-def _pose(results: Results, entry: dict[str, Any]) -> str:
-    name = str(entry.get("bandwidth_pose", ""))
-    pose = (entry.get("poses") or {}).get(name, {})
+def _pose(results: Results, entry: AxisStiffness) -> str:
+    name = entry.bandwidth_pose
+    pose = entry.poses.get(name, {})
     parts = [
-        f"{axis} {float(pose[axis]):.3g} {results.unit(axis)}"
-        for axis in verdicts.ordered(results, pose)
+        f"{axis} {pose[axis]:.3g} {results.unit(axis)}" for axis in verdicts.ordered(results, pose)
     ]
     return f"{wording.words(name)} ({', '.join(parts)})" if parts else wording.words(name)
 
 
-def _scaled(value: float | None, unit: str) -> str:
-    if value is None:
-        return "–"
+def _scaled(value: float, unit: str) -> str:
     factor, shown = wording.scale([value], unit) if unit != "J" else (1e3, "mJ")
     return f"{wording.significant(factor * value)} {shown}"
 
 
-def _loops(results: Results, axes: dict[str, Any], loops: pd.DataFrame) -> Figure:
+def _loops(results: Results, axes: Mapping[str, AxisStiffness], loops: pd.DataFrame) -> Figure:
     names = [axis for axis in verdicts.ordered(results, axes) if (loops["axis"] == axis).any()]
     figure, panels = style.panels(
         1, len(names), 2.35, width=min(style.WIDTH, 1.6 + 1.9 * len(names))
@@ -111,7 +109,7 @@ def _loops(results: Results, axes: dict[str, Any], loops: pd.DataFrame) -> Figur
 
 
 def _loop(
-    results: Results, panel: Any, axis: str, entry: dict[str, Any], rows: pd.DataFrame
+    results: Results, panel: Any, axis: str, entry: AxisStiffness, rows: pd.DataFrame
 ) -> None:
     rows = rows.iloc[style.pick(len(rows), 6000)]
     deflection = rows["deflection"].to_numpy()
@@ -127,7 +125,7 @@ def _loop(
     reach = 0.5 * (torque.max() - torque.min())
     line = np.array([-reach, reach])
     panel.plot(
-        factor * line / entry["stiffness"], level + line,
+        factor * line / entry.stiffness, level + line,
         color=style.VERMILLION, ls=(0, (4, 2)), lw=1.2, label="stiffness",
     )  # fmt: skip
     panel.set_title(axis)

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from bampipe.report import verdicts, wording
 from bampipe.report.document import Block, Section, Table, Text
 from bampipe.report.results import Results
+from bampipe.results.compare import CompareResult
+from bampipe.results.identify import Estimate, IdentifyResult
+from bampipe.results.stiffness import AxisStiffness, StiffnessResult
+from bampipe.results.validate import AxisError, ValidateResult
 
 
 def section(results: Results) -> Section:
@@ -35,17 +40,16 @@ def _done(results: Results) -> str:
     ]
     aside = len(trials) - len(kept)
     parts[0] += f"; {wording.count(aside, 'trial')} set aside." if aside else "."
-    identified = results.json(results.of_model("identify.json"))
+    identified = results.read(IdentifyResult)
     if identified is not None:
-        names = len(identified.get("parameters", {}))
+        names = len(identified.parameters)
         effects = results.effects(results.model)
         added = f", with {wording.listing(f'`{name}`' for name in effects)}" if effects else ""
         parts.append(
             f"{wording.count(names, 'parameter')} of model `{results.model}`{added} were identified"
             f"{_how(identified)}."
         )
-    validated = results.json(results.of_model("validate.json"))
-    if validated is not None:
+    if results.read(ValidateResult) is not None:
         parts.append(
             "The force that the model predicts was held against the measured one on trials not "
             "used for identification."
@@ -53,40 +57,37 @@ def _done(results: Results) -> str:
     return " ".join(parts)
 
 
-def _how(identified: dict[str, Any]) -> str:
+def _how(identified: IdentifyResult) -> str:
     method = {"ukf": "an unscented Kalman filter", "least-squares": "least squares"}
-    name = str(identified.get("method", ""))
-    return f" by {method.get(name, wording.words(name))}" if name else ""
+    return f" by {method.get(identified.method, wording.words(identified.method))}"
 
 
 def _ladder(results: Results) -> str:
-    rungs = (results.json("compare.json") or {}).get("ladder", [])
-    if len(rungs) < 2:
+    compared = results.read(CompareResult)
+    if compared is None or len(compared.ladder) < 2:
         return ""
-    first, last = rungs[0], rungs[-1]
+    first, last = compared.ladder[0], compared.ladder[-1]
     changes = []
-    for axis in verdicts.ordered(results, first.get("held_out_rmse", {})):
-        before, after = (
-            first["held_out_rmse"][axis],
-            last.get("held_out_rmse", {}).get(axis),
-        )
-        floor = last.get("noise_floor", {}).get(axis)
-        if before is None or after is None:
+    for axis in verdicts.ordered(results, first.held_out_rmse):
+        before, after = first.held_out_rmse[axis], last.held_out_rmse.get(axis)
+        floor = last.noise_floor.get(axis)
+        if after is None:
             continue
         unit = wording.unit(results.force_unit(axis))
         text = f"{axis} {wording.significant(before)} to {wording.significant(after)} {unit}"
         changes.append(text + (f" (floor {wording.significant(floor)})" if floor else ""))
     return (
-        f"From model `{first['model']}` to version {len(rungs) - 1} (`{last['model']}`) the error "
-        "on held-out trials went: "
-        f"{'; '.join(changes)}."
+        f"From model `{first.model}` to version {len(compared.ladder) - 1} (`{last.model}`) the "
+        f"error on held-out trials went: {'; '.join(changes)}."
     )
 
 
 def _numbers(results: Results) -> Table | None:
-    identified = (results.json(results.of_model("identify.json")) or {}).get("parameters", {})
-    validated = (results.json(results.of_model("validate.json")) or {}).get("axes", {})
-    stiff = (results.json("stiffness/stiffness.json") or {}).get("axes", {})
+    identify, validate = results.read(IdentifyResult), results.read(ValidateResult)
+    stiffness = results.read(StiffnessResult)
+    identified = identify.parameters if identify else {}
+    validated = validate.axes if validate else {}
+    stiff = stiffness.axes if stiffness else {}
     axes = results.axes
     rows = [
         _row(
@@ -103,7 +104,7 @@ def _numbers(results: Results) -> Table | None:
         _row(
             title,
             axes,
-            lambda axis, key=key: _error(results, axis, validated.get(axis), key),
+            lambda axis, key=key: _error(validated.get(axis), key),
         )
         for title, key in (
             ("Error on held-out trials (RMSE)", "held_out_rmse"),
@@ -130,33 +131,32 @@ def _row(title: str, axes: tuple[str, ...], cell: Any) -> tuple[str, ...]:
     return (title, *(cell(axis) for axis in axes))
 
 
-def _estimate(entry: dict[str, Any] | None) -> str:
+def _estimate(entry: Estimate | None) -> str:
     if entry is None:
         return "–"
-    value = wording.with_sd(entry["estimate"], entry.get("sd"))
-    return f"{value} {wording.unit(entry['unit'])}".rstrip()
+    return f"{wording.with_sd(entry.estimate, entry.sd)} {wording.unit(entry.unit)}".rstrip()
 
 
-def _error(results: Results, axis: str, entry: dict[str, Any] | None, key: str) -> str:
-    if entry is None or entry.get(key) is None:
+def _error(entry: AxisError | None, key: str) -> str:
+    value = None if entry is None else getattr(entry, key)
+    if entry is None or value is None:
         return "–"
-    unit = wording.unit(str(entry.get("unit", results.force_unit(axis))))
-    return f"{wording.significant(entry[key])} {unit}"
+    return f"{wording.significant(value)} {wording.unit(entry.unit)}"
 
 
-def _percent(entry: dict[str, Any] | None) -> str:
-    value = None if entry is None else entry.get("fit_percent")
-    return "–" if value is None else f"{wording.plain(float(value), 1)} %"
+def _percent(entry: AxisError | None) -> str:
+    value = None if entry is None else entry.fit_percent
+    return "–" if value is None else f"{wording.plain(value, 1)} %"
 
 
-def _stiffness(entry: dict[str, Any] | None) -> str:
+def _stiffness(entry: AxisStiffness | None) -> str:
     if entry is None:
         return "–"
-    factor, unit = wording.scale([entry["stiffness"]], entry["unit"])
-    return f"{wording.with_sd(factor * entry['stiffness'], factor * entry['sd'])} {unit}"
+    factor, unit = wording.scale([entry.stiffness], entry.unit)
+    return f"{wording.with_sd(factor * entry.stiffness, factor * entry.sd)} {unit}"
 
 
-def _others(results: Results, parameters: dict[str, Any]) -> str:
+def _others(results: Results, parameters: Mapping[str, Estimate]) -> str:
     named = results.in_order(parameters)
     others = [name for name in named if not name.startswith(("viscous.", "coulomb."))]
     if not others:

@@ -9,6 +9,8 @@ from typing import Any
 from bampipe.report import verdicts, wording
 from bampipe.report.document import Block, Section, Table, Text
 from bampipe.report.results import Results
+from bampipe.results.filter import FilterResult
+from bampipe.results.ingest import IngestResult
 
 _STATES = {"ok": "sound", "repaired": "repaired", "set_aside": "**set aside**"}
 
@@ -18,7 +20,7 @@ def section(results: Results) -> Section:
     session = results.session
     blocks: list[Block] = [Text(_sampling(session))]
     blocks.append(_trials(results))
-    filtered = results.json("filter/filter.json")
+    filtered = results.read(FilterResult)
     if filtered is None:
         blocks.append(
             Text(
@@ -31,14 +33,13 @@ def section(results: Results) -> Section:
     return Section("Data", tuple(blocks))
 
 
-def _sampling(session: dict[str, Any]) -> str:
-    rate = session.get("sample_rate_hz")
-    text = f"Sampled at {wording.plain(float(rate), 0)} Hz." if rate else ""
-    noise = (session.get("force") or {}).get("noise_sd")
-    if noise:
-        unit = wording.unit(str(session["force"].get("unit", "N")))
-        text += f" Noise of the force sensor {wording.significant(float(noise), 2)} {unit}."
-    return text.strip()
+def _sampling(session: IngestResult) -> str:
+    text = f"Sampled at {wording.plain(session.sample_rate_hz, 0)} Hz."
+    if session.force.noise_sd:
+        unit = wording.unit(session.force.unit)
+        noise = wording.significant(session.force.noise_sd, 2)
+        text += f" Noise of the force sensor {noise} {unit}."
+    return text
 
 
 def _trials(results: Results) -> Table:
@@ -100,35 +101,32 @@ def _flat(value: object) -> str:
     return "; ".join(str(item) for item in content)
 
 
-def _filter(results: Results, filtered: dict[str, Any]) -> list[Block]:
-    axes = filtered.get("axes", {})
+def _filter(results: Results, filtered: FilterResult) -> list[Block]:
     rows = []
-    for axis in verdicts.ordered(results, axes):
-        entry = axes[axis]
-        unit = str(entry.get("unit", results.unit(axis)))
+    for axis in verdicts.ordered(results, filtered.axes):
+        entry = filtered.axes[axis]
         rows.append(
             (
                 axis,
-                _scaled(entry.get("resolution"), unit),
-                wording.significant(entry.get("bandwidth_hz")),
-                _scaled(entry.get("position_sd"), unit),
-                _scaled(entry.get("velocity_sd"), f"{unit}/s"),
-                _scaled(entry.get("acceleration_sd"), f"{unit}/s2"),
+                _scaled(entry.resolution, entry.unit),
+                wording.significant(entry.bandwidth_hz),
+                _scaled(entry.position_sd, entry.unit),
+                _scaled(entry.velocity_sd, f"{entry.unit}/s"),
+                _scaled(entry.acceleration_sd, f"{entry.unit}/s2"),
             )
         )
-    method = str(filtered.get("method", ""))
+    method = filtered.method
     names = {
         "kalman": "a Kalman smoother",
         "butterworth": "a zero-phase Butterworth filter",
         "savitzky_golay": "a Savitzky-Golay filter",
         "savitzky-golay": "a Savitzky-Golay filter",
     }
-    reason = filtered.get("method_reason")
     text = f"Velocity and acceleration come from {names.get(method, method)}"
-    blocks: list[Block] = [Text(f"{text} ({reason})." if reason else f"{text}.")]
-    skipped = filtered.get("skipped") or {}
-    if skipped:
-        blocks.append(Text("Not differentiated: " + _pairs(skipped) + "."))
+    blocks: list[Block] = [Text(f"{text} ({filtered.method_reason}).")]
+    if filtered.skipped:
+        skipped = "; ".join(f"{name}: {reason}" for name, reason in filtered.skipped.items())
+        blocks.append(Text(f"Not differentiated: {skipped}."))
     if rows:
         blocks.append(
             Table(
@@ -149,12 +147,6 @@ def _filter(results: Results, filtered: dict[str, Any]) -> list[Block]:
     return blocks
 
 
-def _pairs(reasons: dict[str, Any]) -> str:
-    return "; ".join(f"{name}: {reason}" for name, reason in reasons.items())
-
-
-def _scaled(value: float | None, unit: str) -> str:
-    if value is None:
-        return "–"
-    factor, shown = wording.scale([float(value)], unit)
-    return f"{wording.significant(factor * float(value), 2)} {shown}"
+def _scaled(value: float, unit: str) -> str:
+    factor, shown = wording.scale([value], unit)
+    return f"{wording.significant(factor * value, 2)} {shown}"

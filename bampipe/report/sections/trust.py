@@ -2,36 +2,42 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
 
 from bampipe.report import verdicts, wording
 from bampipe.report.document import Block, Bullets, Section, Table, Text
 from bampipe.report.results import Results
+from bampipe.results.identify import (
+    IdentifiabilityReport,
+    IdentifyResult,
+    Innovations,
+    TrialGrowth,
+)
 
 TITLE = "What the estimates are worth"
 
 
 def section(results: Results) -> Section | None:
     """Return the section; None where nothing of it is stored."""
-    content = results.json(results.of_model("identify.json")) or {}
-    known = content.get("identifiability")
+    identified = results.read(IdentifyResult)
+    if identified is None:
+        return None
+    known = identified.identifiability
     blocks: list[Block] = []
     if known:
         blocks.append(Text(_words(known)))
-        said = tuple(str(line) for line in known.get("sentences", ()))
-        if said:
-            blocks.append(Bullets(said))
-        blocks.append(_parameters(results, content, known))
-        if len(known.get("trials", {})) > 1:
-            blocks.append(_trials(known["trials"]))
-    tests = content.get("innovations")
-    if tests:
-        blocks.append(_innovations(results, tests))
+        if known.sentences:
+            blocks.append(Bullets(known.sentences))
+        blocks.append(_parameters(results, identified, known))
+        if len(known.trials) > 1:
+            blocks.append(_trials(known.trials))
+    if identified.innovations:
+        blocks.append(_innovations(results, identified.innovations))
     return Section(TITLE, tuple(blocks)) if blocks else None
 
 
-def _words(known: dict[str, Any]) -> str:
-    if known.get("weak_directions"):
+def _words(known: IdentifiabilityReport) -> str:
+    if known.weak_directions:
         return "Not everything below is known as well as its interval alone suggests."
     return (
         "Each parameter is determined on its own: no two hide each other in these trials. What "
@@ -39,22 +45,26 @@ def _words(known: dict[str, Any]) -> str:
     )
 
 
-def _parameters(results: Results, content: dict[str, Any], known: dict[str, Any]) -> Table:
-    parameters = content.get("parameters", {})
+def _parameters(
+    results: Results, identified: IdentifyResult, known: IdentifiabilityReport
+) -> Table:
     rows = []
-    for name in results.in_order(known["parameters"]):
-        entry, found = known["parameters"][name], parameters.get(name, {})
-        partner = entry.get("partner")
-        bias = found.get("least_squares_bias")
+    for name in results.in_order(known.parameters):
+        entry, found = known.parameters[name], identified.parameters[name]
+        partner = (
+            "–"
+            if entry.correlation is None
+            else f"`{entry.partner}` {wording.plain(entry.correlation, 2)}"
+        )
         rows.append(
             (
                 f"`{name}`",
-                wording.significant(found.get("sd"), 2),
-                wording.significant(entry.get("bound_sd"), 2),
-                wording.significant(entry.get("alone_sd"), 2),
-                "–" if partner is None else f"`{partner}` {wording.plain(entry['correlation'], 2)}",
-                wording.significant(bias, 2),
-                wording.unit(str(found.get("unit", ""))) or "1",
+                wording.significant(found.sd, 2),
+                wording.significant(entry.bound_sd, 2),
+                wording.significant(entry.alone_sd, 2),
+                partner,
+                wording.significant(found.least_squares_bias, 2),
+                wording.unit(found.unit) or "1",
             )
         )
     return Table(
@@ -69,9 +79,9 @@ def _parameters(results: Results, content: dict[str, Any], known: dict[str, Any]
     )
 
 
-def _trials(trials: dict[str, Any]) -> Table:
+def _trials(trials: Mapping[str, TrialGrowth]) -> Table:
     rows = tuple(
-        (name, wording.percent(entry["growth"]), f"`{entry['parameter']}`")
+        (name, wording.percent(entry.growth), f"`{entry.parameter}`")
         for name, entry in trials.items()
     )
     return Table(
@@ -82,19 +92,18 @@ def _trials(trials: dict[str, Any]) -> Table:
     )
 
 
-def _innovations(results: Results, tests: dict[str, Any]) -> Table:
+def _innovations(results: Results, tests: Mapping[str, Innovations]) -> Table:
     rows = []
     for axis in verdicts.ordered(results, tests):
-        entry = tests[axis]
-        own, driven = entry.get("whiteness") or {}, entry.get("inputs") or {}
+        own, driven = tests[axis].whiteness, tests[axis].inputs
         rows.append(
             (
                 axis,
-                _outcome(own, "white"),
-                wording.percent(own.get("share")),
-                _outcome(driven, "independent"),
-                wording.percent(driven.get("share")),
-                str(entry["sentence"]),
+                _outcome(own.white if own else None),
+                wording.percent(own.share if own else None),
+                _outcome(driven.independent if driven else None),
+                wording.percent(driven.share if driven else None),
+                tests[axis].sentence,
             )
         )
     return Table(
@@ -108,5 +117,5 @@ def _innovations(results: Results, tests: dict[str, Any]) -> Table:
     )
 
 
-def _outcome(entry: dict[str, Any], key: str) -> str:
-    return "–" if key not in entry else ("passes" if entry[key] else "**fails**")
+def _outcome(passed: bool | None) -> str:
+    return "–" if passed is None else ("passes" if passed else "**fails**")

@@ -10,6 +10,7 @@ import pandas as pd
 from bampipe.report import style, verdicts, wording
 from bampipe.report.document import Block, Bullets, Figure, Section, Table, Text
 from bampipe.report.results import Results
+from bampipe.results.validate import ValidateResult
 
 TITLE = "Validation"
 _WINDOW_S = 12.0
@@ -18,21 +19,18 @@ _SETTLE_S = 1.0
 
 def section(results: Results) -> Section:
     """Return the section."""
-    content = results.json(results.of_model("validate.json"))
-    if content is None:
+    validated = results.read(ValidateResult)
+    if validated is None:
         command = f"`bampipe validate {results.root.name}`"
         text = f"Predicted and measured force have not been compared: {command} does it."
         return Section(TITLE, (Text(text),))
-    blocks: list[Block] = [_by_axis(results, content)]
-    trials = _by_trial(results, content)
-    if trials is not None:
-        blocks.append(trials)
-    handle = _at_the_handle(content, results.pusher)
-    if handle:
-        blocks.append(Text(handle))
-    notes = tuple(str(note) for note in content.get("notes") or ())
-    if notes:
-        blocks.append(Bullets(notes))
+    blocks: list[Block] = [_by_axis(results, validated)]
+    if validated.trials:
+        blocks.append(_by_trial(results, validated))
+    if validated.forces:
+        blocks.append(Text(_at_the_handle(validated, results.pusher)))
+    if validated.notes:
+        blocks.append(Bullets(validated.notes))
     residuals = _shown_trial(results)
     if residuals is not None:
         blocks.append(_forces(results, residuals))
@@ -42,25 +40,24 @@ def section(results: Results) -> Section:
     return Section(TITLE, tuple(blocks))
 
 
-def _by_axis(results: Results, content: dict[str, Any]) -> Table:
-    axes = content.get("axes", {})
+def _by_axis(results: Results, validated: ValidateResult) -> Table:
     rows = []
-    for axis in verdicts.ordered(results, axes):
-        entry = axes[axis]
-        fit = entry.get("fit_percent")
+    for axis in verdicts.ordered(results, validated.axes):
+        entry = validated.axes[axis]
+        fit = entry.fit_percent
         rows.append(
             (
                 axis,
-                wording.significant(entry.get("held_out_rmse")),
-                wording.significant(entry.get("noise_floor")),
-                wording.significant(entry.get("rmse")),
-                wording.significant(entry.get("rmse_without_friction")),
-                "–" if fit is None else wording.plain(float(fit), 1),
-                wording.unit(str(entry.get("unit", results.force_unit(axis)))),
+                wording.significant(entry.held_out_rmse),
+                wording.significant(entry.noise_floor),
+                wording.significant(entry.rmse),
+                wording.significant(entry.rmse_without_friction),
+                "–" if fit is None else wording.plain(fit, 1),
+                wording.unit(entry.unit),
             )
         )
     return Table(
-        f"Error of the predicted force, model `{content.get('model', results.model)}`",
+        f"Error of the predicted force, model `{validated.model}`",
         (
             "Axis",
             "Held-out RMSE",
@@ -76,27 +73,19 @@ def _by_axis(results: Results, content: dict[str, Any]) -> Table:
         "Held out: each trial predicted with parameters that never saw it. Noise floor: what "
         "sensor noise, quantisation and filtering alone would leave. Fit: share of the measured "
         "force that is explained, as 100 (1 − held-out RMSE / standard deviation)."
-        + _filtered(content),
+        " Measured and predicted force are low-passed at "
+        f"{wording.significant(validated.cutoff_hz, 2)} Hz.",
     )
 
 
-def _filtered(content: dict[str, Any]) -> str:
-    cutoff = content.get("cutoff_hz")
-    if cutoff is None:
-        return ""
-    return f" Measured and predicted force are low-passed at {wording.significant(cutoff, 2)} Hz."
-
-
-def _by_trial(results: Results, content: dict[str, Any]) -> Table | None:
-    trials = content.get("trials") or {}
-    if not trials:
-        return None
+def _by_trial(results: Results, validated: ValidateResult) -> Table:
     rows = []
-    for name, entry in trials.items():
-        key = "held_out_rmse" if entry.get("held_out") else "rmse"
-        errors = ((entry.get(axis) or {}).get(key) for axis in results.axes)
-        cells = (wording.significant(error) for error in errors)
-        rows.append((name, "yes" if entry.get("held_out") else "no", *cells))
+    for name, trial in validated.trials.items():
+        key = "held_out_rmse" if trial.held_out else "rmse"
+        cells = (
+            wording.significant(getattr(trial.axes.get(axis), key, None)) for axis in results.axes
+        )
+        rows.append((name, "yes" if trial.held_out else "no", *cells))
     units = (f"{axis} ({wording.unit(results.force_unit(axis))})" for axis in results.axes)
     return Table(
         "RMSE by trial",
@@ -106,16 +95,14 @@ def _by_trial(results: Results, content: dict[str, Any]) -> Table | None:
     )
 
 
-def _at_the_handle(content: dict[str, Any], pusher: str) -> str:
-    """Return the error of the measured force in words, where it is stored."""
-    forces = content.get("forces") or {}
+def _at_the_handle(validated: ValidateResult, pusher: str) -> str:
+    """Return the error of the measured force in words."""
     shown = (
-        f"{wording.words(name)} {wording.significant(entry['rmse'])} "
-        f"{wording.unit(str(entry.get('unit', 'N')))}"
-        for name, entry in forces.items()
+        f"{wording.words(name)} {wording.significant(entry.rmse)} {wording.unit(entry.unit)}"
+        for name, entry in validated.forces.items()
     )
     place = "At the handle" if pusher == "hand" else f"Of the {pusher}"
-    return f"{place} the error is {wording.listing(shown)} (RMSE)." if forces else ""
+    return f"{place} the error is {wording.listing(shown)} (RMSE)."
 
 
 def _shown_trial(results: Results) -> pd.DataFrame | None:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
 
 import pandas as pd
 
 from bampipe.report import style, wording
 from bampipe.report.document import Block, Figure, Section, Table, Text
 from bampipe.report.results import Results
+from bampipe.results.viscous import Damping, ViscousResult
 
 TITLE = "Viscous field"
 _NORMAL_95 = 1.959964
@@ -16,13 +17,13 @@ _NORMAL_95 = 1.959964
 
 def section(results: Results) -> Section | None:
     """Return the section; None for a session without trials in a viscous field."""
-    content = results.json(results.of_model("viscous.json"))
-    if content is None:
+    found = results.read(ViscousResult)
+    if found is None:
         if not (results.trials["kind"] == "viscous").any():
             return None
         command = f"`bampipe viscous {results.root.name}`"
         return Section(TITLE, (Text(f"The viscous trials have not been used: {command} does it."),))
-    directions = content.get("directions") or {}
+    directions = found.directions
     if not directions:
         return None
     blocks: list[Block] = [Text(_words(directions)), _table(directions)]
@@ -32,12 +33,12 @@ def section(results: Results) -> Section | None:
     return Section(TITLE, tuple(blocks))
 
 
-def _words(directions: dict[str, Any]) -> str:
+def _words(directions: Mapping[str, Damping]) -> str:
     """Say along which directions the brakes rendered what they were told."""
-    tested = [name for name, entry in directions.items() if "differs" in entry]
+    tested = [name for name, entry in directions.items() if entry.differs is not None]
     if not tested:
         return "What was commanded is not recorded, so the estimates are held against nothing."
-    wrong = [name for name in tested if directions[name]["differs"]]
+    wrong = [name for name in tested if directions[name].differs]
     right = [name for name in tested if name not in wrong]
     parts = []
     if right:
@@ -47,25 +48,24 @@ def _words(directions: dict[str, Any]) -> str:
         )
     if wrong:
         parts.append(f"Along {wording.listing(wrong)} it does differ (p < 0.05).")
-    if any(directions[name].get("felt_differs") for name in tested):
+    if any(directions[name].felt_differs for name in tested):
         parts.append(
             "A hand feels more: the device's own viscous friction comes on top of the field."
         )
     return " ".join(parts)
 
 
-def _table(directions: dict[str, Any]) -> Table:
+def _table(directions: Mapping[str, Damping]) -> Table:
     rows = []
     for name, entry in directions.items():
-        value, sd = float(entry["estimate"]), float(entry["sd"])
         rows.append(
             (
                 name,
-                wording.significant(entry.get("commanded")),
-                wording.with_sd(value, sd),
-                wording.probability(entry.get("p_value")),
-                wording.significant(entry.get("own_friction")),
-                wording.significant(entry.get("felt")),
+                wording.significant(entry.commanded),
+                wording.with_sd(entry.estimate, entry.sd),
+                wording.probability(entry.p_value),
+                wording.significant(entry.own_friction),
+                wording.significant(entry.felt),
             )
         )
     return Table(
@@ -79,7 +79,7 @@ def _table(directions: dict[str, Any]) -> Table:
     )
 
 
-def _figure(results: Results, directions: dict[str, Any], trace: pd.DataFrame) -> Figure:
+def _figure(results: Results, directions: Mapping[str, Damping], trace: pd.DataFrame) -> Figure:
     names = [name for name in directions if f"damping_{name}" in trace]
     figure, panels = style.panels(
         1, len(names), 2.1, width=min(style.WIDTH, 1.2 + 1.9 * len(names))
@@ -93,7 +93,7 @@ def _figure(results: Results, directions: dict[str, Any], trace: pd.DataFrame) -
         colour = style.SERIES[number % len(style.SERIES)]
         panel.fill_between(t, value - half, value + half, color=colour, alpha=0.18, lw=0)
         panel.plot(t, value, color=colour, label="estimate")
-        command = directions[name].get("commanded")
+        command = directions[name].commanded
         if command is not None:
             panel.axhline(command, color=style.INK, lw=0.8, ls="--", label="commanded")
         for start in starts[1:]:
