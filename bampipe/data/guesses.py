@@ -117,20 +117,23 @@ def driven(t: np.ndarray, q: np.ndarray, column: np.ndarray, angle: bool = False
     spread = float(np.sum((target - target.mean()) ** 2)) if len(target) else 0.0
     if spread == 0.0:
         return Driven(0.0)
-    found = np.linalg.lstsq(design, target, rcond=None)[0]
-    left = float(np.sum((target - design @ found) ** 2))
-    share, gravity = max(0.0, 1.0 - left / spread), (0.0, 0.0)
+    found, rest = _fit(design, target)
+    share, gravity = max(0.0, 1.0 - rest / spread), (0.0, 0.0)
     if angle:
-        turned = np.column_stack([*sides[:3], np.sin(sides[3]), np.cos(sides[3])])[inner]
-        flat = design[:, [0, 1, 2, 4]]
-        light = flat @ np.linalg.lstsq(flat, target, rcond=None)[0]
-        none = float(np.sum((target - light) ** 2))
-        heavy = np.linalg.lstsq(turned, target, rcond=None)[0]
-        lifted = float(np.sum((target - turned @ heavy) ** 2))
+        # Acceleration, velocity, its sign, sine and cosine of the angle; and without the angle.
+        swinging = np.column_stack([*sides[:3], np.sin(sides[3]), np.cos(sides[3])])[inner]
+        balanced = design[:, [0, 1, 2, 4]]
+        swinging_fit, swinging_rest = _fit(swinging, target)
         # Friction apart, this is what a link that hangs on the axis shows most.
-        if lifted < 0.8 * none and lifted < 1.05 * left:
-            found, gravity = heavy, (float(heavy[3]), float(heavy[4]))
+        if swinging_rest < 0.8 * _fit(balanced, target)[1] and swinging_rest < 1.05 * rest:
+            found, gravity = swinging_fit, (float(swinging_fit[3]), float(swinging_fit[4]))
     return Driven(share, *(float(value) for value in found[:3]), gravity)
+
+
+def _fit(design: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, float]:
+    """Least squares, and the sum of squares that they leave."""
+    found = np.linalg.lstsq(design, target, rcond=None)[0]
+    return found, float(np.sum((target - design @ found) ** 2))
 
 
 def signed_register(values: np.ndarray) -> int:
@@ -159,6 +162,6 @@ def stretches(t: np.ndarray, q: np.ndarray) -> list[float]:
     cuts = []
     for k in range(1, parts):
         near = np.abs(t - t[-1] * k / parts) < 0.15 * t[-1] / parts
-        place = np.flatnonzero(near)[int(np.argmin(speed[near]))]
-        cuts.append(round(float(t[place]), 2))
+        slowest = np.flatnonzero(near)[int(np.argmin(speed[near]))]
+        cuts.append(round(float(t[slowest]), 2))
     return cuts

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from bampipe.data.readers import EXTENSIONS, columns_of, read_trial
-from bampipe.data.units import unit
+from bampipe.data.units import Unit, unit
 from bampipe.errors import InputError
 
 MOST_FILES = 500
@@ -60,13 +60,18 @@ class Column:
     values: np.ndarray
 
     @property
-    def whole(self) -> bool:
-        """Whether all values are whole numbers, as counts are."""
+    def conversion(self) -> Unit | None:
+        """How its unit becomes SI; None where it has none, or none that is known."""
+        return unit(self.unit) if self.unit else None
+
+    @property
+    def is_integer(self) -> bool:
+        """Whether all values are integers, as counts are."""
         known = self.values[np.isfinite(self.values)]
         return bool(len(known)) and bool(np.all(known == np.rint(known)))
 
     @property
-    def constant(self) -> bool:
+    def is_constant(self) -> bool:
         """Whether the value never changes."""
         known = self.values[np.isfinite(self.values)]
         return len(known) == 0 or bool(np.ptp(known) == 0.0)

@@ -23,6 +23,11 @@ class Agreement:
     correlation: float
 
 
+def integral(t: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+    """Position (T,) from 0 by trapezia, of a velocity (T,) at ``t`` (T,), s."""
+    return np.concatenate([[0.0], np.cumsum(0.5 * (velocity[1:] + velocity[:-1]) * np.diff(t))])
+
+
 def compare(t: np.ndarray, position: np.ndarray, velocity: np.ndarray) -> Agreement | None:
     """Integral of the velocity against the change of the position over short stretches.
 
@@ -35,11 +40,8 @@ def compare(t: np.ndarray, position: np.ndarray, velocity: np.ndarray) -> Agreem
         None where nothing moves.
     """
     step = max(1, round(WINDOW_S / float(np.median(np.diff(t)))))
-    travelled = np.concatenate(
-        [[0.0], np.cumsum(0.5 * (velocity[1:] + velocity[:-1]) * np.diff(t))]
-    )
     moved = np.diff(position[::step])
-    expected = np.diff(travelled[::step])
+    expected = np.diff(integral(t, velocity)[::step])
     squares = float(moved @ moved), float(expected @ expected)
     if len(moved) < 10 or not all(squares):
         return None

@@ -13,7 +13,7 @@ from bampipe.data.units import spelled
 from bampipe.proposal.notes import UNKNOWN, Notes, quoted
 
 _LIKELY_RATE_HZ = 100.0
-"""Taken for the other guesses where nothing tells the rate."""
+"""Assumed for the other guesses where nothing shows the rate."""
 
 
 @dataclass(frozen=True)
@@ -34,12 +34,12 @@ class Clock:
 
 
 def clock_of(found: Survey, notes: Notes) -> Clock:
-    """Propose how time is told: by stamps in one column or two, else by counting samples."""
+    """Propose a clock: by stamps in one column or two, else by counting samples."""
     times = found.of("time")
-    whole = [c for c in times if _whole_seconds(c)]
+    seconds = [c for c in times if _whole_seconds(c)]
     rest = [c for c in times if _nanoseconds_on_top(c)]
-    if whole and rest:
-        return _in_two_columns(whole[-1], rest[-1], notes)
+    if seconds and rest:
+        return _in_two_columns(seconds[-1], rest[-1], notes)
     column = next((c for c in times if _increases(c.values)), None)
     return _counted(found, notes) if column is None else _in_one_column(column, notes)
 
@@ -60,17 +60,17 @@ def _in_one_column(column: Column, notes: Notes) -> Clock:
     return Clock(t, (column.name,), _table(*lines), _stamped_rate(rate_hz, notes))
 
 
-def _in_two_columns(whole: Column, rest: Column, notes: Notes) -> Clock:
+def _in_two_columns(seconds: Column, rest: Column, notes: Notes) -> Clock:
     """Whole seconds and the nanoseconds on top of them, as ROS has them."""
-    t = whole.values - whole.values[0] + 1e-9 * (rest.values - rest.values[0])
+    t = seconds.values - seconds.values[0] + 1e-9 * (rest.values - rest.values[0])
     rate_hz = guesses.sample_rate(t)
-    note = notes.guess(f"seconds in {whole.name}, nanoseconds on top in {rest.name}")
+    note = notes.guess(f"seconds in {seconds.name}, nanoseconds on top in {rest.name}")
     lines = (
-        f"column = {quoted(whole.name)}",
+        f"column = {quoted(seconds.name)}",
         'unit = "s"',
         f"nanoseconds = {quoted(rest.name)}{note}",
     )
-    return Clock(t, (whole.name, rest.name), _table(*lines), _stamped_rate(rate_hz, notes))
+    return Clock(t, (seconds.name, rest.name), _table(*lines), _stamped_rate(rate_hz, notes))
 
 
 def _counted(found: Survey, notes: Notes) -> Clock:
@@ -79,7 +79,7 @@ def _counted(found: Survey, notes: Notes) -> Clock:
     steps = [
         (guesses.interval_of(column.name, float(column.values[0])), column.name)
         for column in found.columns
-        if column.constant
+        if column.is_constant
     ]
     step_s, name = max(steps, default=(0.0, ""))
     if step_s > 0.0:
@@ -102,14 +102,14 @@ def _stamped_rate(rate_hz: float, notes: Notes) -> str:
 
 def _whole_seconds(column: Column) -> bool:
     named = not {"sec", "secs", "seconds"}.isdisjoint(words(column.name))
-    return named and column.whole and bool(np.all(np.diff(column.values) >= 0))
+    return named and column.is_integer and bool(np.all(np.diff(column.values) >= 0))
 
 
 def _nanoseconds_on_top(column: Column) -> bool:
     said = {"nanosec", "nsec", "nsecs", "nanosecs", "nanoseconds"}
     named = not said.isdisjoint(words(column.name))
     within = (column.values >= 0) & (column.values < 1e9)
-    return named and column.whole and bool(np.all(within))
+    return named and column.is_integer and bool(np.all(within))
 
 
 def _increases(values: np.ndarray) -> bool:

@@ -108,7 +108,7 @@ def new_device(folder: Path, match: Matcher, notes: Notes) -> ChosenDevice:
     driver, role = match.driver(position)
     supply = match.supply(driver) if role == "duty" else None
     # A current recorded beside a force is that of a coil or a brake.
-    coil = role == "force" and any(not c.constant for c in found.of("current"))
+    coil = role == "force" and any(not c.is_constant for c in found.of("current"))
     fit = _rough_fit(position, driver, role, linear, match.t)
     drive = Drive(role, driver.name if driver is not None else "", supply is not None, coil)
     starter = starter_device(position.name, linear, drive, fit)
@@ -116,7 +116,7 @@ def new_device(folder: Path, match: Matcher, notes: Notes) -> ChosenDevice:
     notes.check.append(
         f"{DEVICE}: one {kind} axis '{starter.axis}' driven by a {role}; put in what you know of it"
     )
-    for constant in starter.own:
+    for constant in starter.placeholders:
         notes.check.append(
             f"{DEVICE}: {constant} is not yours yet: all forces and inertias scale with it"
         )
@@ -139,5 +139,5 @@ def _rough_fit(
         return guesses.Driven(0.0)
     si = {"current": "A", "voltage": "V", "duty": ""}.get(role, "N" if linear else "N.m")
     drive = np.nan_to_num(driver.values * scale_to(si, driver))
-    place = position_in_si(position, t, "m" if linear else "rad")
-    return guesses.driven(t, place, drive, angle=not linear and not in_counts(position))
+    q = position_in_si(position, t, "m" if linear else "rad")
+    return guesses.driven(t, q, drive, angle=not linear and not in_counts(position))

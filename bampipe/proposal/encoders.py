@@ -6,7 +6,7 @@ import numpy as np
 
 from bampipe.data import guesses
 from bampipe.data.survey import Column, words
-from bampipe.data.units import spelled, unit
+from bampipe.data.units import spelled
 from bampipe.physics.device import Coordinate, Device
 from bampipe.proposal.matching import Matcher
 from bampipe.proposal.notes import UNKNOWN, Notes, bare, entry, quoted
@@ -56,7 +56,7 @@ def _encoder(axis: Coordinate, alone: bool, column: Column, match: Matcher, note
     if in_counts(column):
         return _counted(axis, column, notes)
     velocity = _velocity_beside(axis, alone, match, notes)
-    known = unit(column.unit)
+    known = column.conversion
     if known is not None and known.si == axis.unit:
         said = spelled(column.unit, _POSITION_UNITS) or axis.unit
         note = "" if column.stated else notes.guess(f"{column.name} in {column.unit}")
@@ -69,7 +69,7 @@ def _encoder(axis: Coordinate, alone: bool, column: Column, match: Matcher, note
 
 
 def _integrated(axis: Coordinate, column: Column, notes: Notes) -> str:
-    known = unit(column.unit)
+    known = column.conversion
     si = f"{axis.unit}/s"
     said = spelled(column.unit, _SPEED_UNITS) if known is not None and known.si == si else ""
     return entry(column.name, said or si) + notes.guess(
@@ -90,8 +90,8 @@ def _counted(axis: Coordinate, column: Column, notes: Notes) -> str:
 def _velocity_beside(axis: Coordinate, alone: bool, match: Matcher, notes: Notes) -> str:
     """The field of a recorded velocity, against which the position is checked; "" without one."""
     for column in match.found.of("velocity"):
-        known = unit(column.unit) if column.unit else None
-        fits = known is not None and known.si == f"{axis.unit}/s" and not column.constant
+        known = column.conversion
+        fits = known is not None and known.si == f"{axis.unit}/s" and not column.is_constant
         if fits and (alone or axis.name in words(column.name)):
             match.used.add(column.name)
             notes.check.append(f"{column.name} is used to check the position only")

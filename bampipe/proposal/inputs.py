@@ -108,8 +108,8 @@ def _channel(name: str, si: str, column: Column, why: str, notes: Notes) -> str:
     """Column and unit of one input; its register or its scale, where the unit does not do."""
     bits = guesses.signed_register(column.values)
     register = f", wrap_bits = {bits}, signed = true" if bits else ""
-    known = unit(column.unit)
-    if column.unit and known is not None and known.si == si:
+    known = column.conversion
+    if known is not None and known.si == si:
         table = entry(column.name, bare(column.unit), register)
         if column.stated and not why and not bits:
             return table
@@ -132,5 +132,5 @@ def _unscaled(si: str, column: Column, bits: int) -> str:
     """What to add of a column that may be in counts, with ``bits`` where it is a register."""
     if bits:
         return f", a signed register of {bits} bits: give its scale"
-    counts = column.whole and not column.unit and si
+    counts = column.is_integer and not column.unit and si
     return "; if in counts, give their scale too" if counts else ""

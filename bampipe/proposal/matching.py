@@ -10,7 +10,6 @@ import numpy as np
 
 from bampipe.data import guesses
 from bampipe.data.survey import Column, Survey, words
-from bampipe.data.units import unit
 from bampipe.proposal.positions import travelled
 
 DRIVERS = ("force", "current", "voltage")
@@ -55,13 +54,12 @@ class Matcher:
         named = self.named(axis, "position") if axis else None
         if named is not None or axes > 1:
             return named, []
-        found = [c for c in self.found.of("position") if not c.constant]
-        found = found or [
-            c for c in self.found.of("") if not c.constant and re.match(r"q\w?\Z", c.name.lower())
-        ]
+        moving = [c for c in self.found.columns if not c.is_constant]
+        found = [c for c in moving if c.role == "position"]
+        found = found or [c for c in moving if not c.role and re.match(r"q\w?\Z", c.name.lower())]
         # A test stand may log the velocity only, which is integrated then.
-        found = found or [c for c in self.found.of("velocity") if not c.constant]
-        found = found or [c for c in self.found.columns if not c.constant and c.name in ("v", "V")]
+        found = found or [c for c in moving if c.role == "velocity"]
+        found = found or [c for c in moving if c.name in ("v", "V")]
         if len(found) < 2:
             return (found[0] if found else None), []
         best = found[0]
@@ -92,7 +90,7 @@ class Matcher:
         named = exact or self.named(name, role) or self.named(name.removeprefix("force_"), role)
         if named is not None and named in free:
             return named, ""
-        fitting = [c for c in free if c.role == role and not c.constant and (si or not c.unit)]
+        fitting = [c for c in free if c.role == role and not c.is_constant and (si or not c.unit)]
         if len(fitting) == 1 and _compatible(fitting[0], si):
             return fitting[0], ""
         for position in axes:
@@ -106,7 +104,7 @@ class Matcher:
 
         The kind is that of the column, ``duty`` for a voltage given as a share of the supply.
         """
-        named = [c for role in DRIVERS for c in self.found.of(role) if not c.constant]
+        named = [c for role in DRIVERS for c in self.found.of(role) if not c.is_constant]
         best = self.driving(position) or next(iter(named), None)
         if best is None or best.role not in DRIVERS:
             return best, "force"
@@ -116,7 +114,7 @@ class Matcher:
     def supply(self, driver: Column | None) -> Column | None:
         """The supply voltage beside a duty cycle: in volts or of no unit, and never negative."""
         for column in self.found.of("voltage"):
-            known = unit(column.unit) if column.unit else None
+            known = column.conversion
             volts = known is None or known.si == "V"
             if column is not driver and volts and np.nanmin(column.values) > 0.0:
                 return column
@@ -127,10 +125,10 @@ class Matcher:
         share = {}
         for column in self.found.columns:
             free = column.name not in self.used and column.role not in ("time", "velocity")
-            if not free or column.role == "reference" or column.constant or column is position:
+            if not free or column.role == "reference" or column.is_constant or column is position:
                 continue
             values = np.nan_to_num(column.values)
-            known = unit(column.unit) if column.unit else None
+            known = column.conversion
             if known is not None and known.si in ("rad", "m"):  # of another axis
                 continue
             if abs(float(np.corrcoef(position.values, values)[0, 1])) > 0.98:
@@ -147,5 +145,5 @@ class Matcher:
 
 def _compatible(column: Column, si: str) -> bool:
     """Whether nothing that the column says of its unit contradicts ``si``."""
-    known = unit(column.unit) if column.unit else None
+    known = column.conversion
     return known is None or known.si == si

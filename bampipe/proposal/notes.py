@@ -1,11 +1,11 @@
-"""The comments of a proposal, of which its reader is told again, and the values of its tables."""
+"""The comments of a proposal, which are printed once more for its reader, and TOML values."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
 UNKNOWN = "?"
-"""Stands for a column that could not be told."""
+"""Stands for a column that could not be found."""
 
 
 @dataclass
@@ -21,7 +21,7 @@ class Notes:
     check: list[str] = field(default_factory=list)
 
     def guess(self, text: str) -> str:
-        """The comment that marks a guess; the same guess is told once."""
+        """The comment that marks a guess; the same guess is listed once."""
         if text not in self.check:
             self.check.append(text)
         return f"  # guess: {text}"

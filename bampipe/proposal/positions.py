@@ -7,6 +7,7 @@ import numpy as np
 from bampipe.data import guesses
 from bampipe.data.survey import Column, Survey, words
 from bampipe.data.units import unit
+from bampipe.data.velocity import integral
 
 _SLIDING = frozenset(["stroke", "displacement", "disp", "weg", "hub", "carriage", "piston"])
 _FEWEST_COUNTS = 100
@@ -19,18 +20,21 @@ def is_velocity(column: Column) -> bool:
 
 def in_counts(column: Column) -> bool:
     """Whether a position is in whole counts of no known unit."""
-    known = unit(column.unit or "?")
-    return known is None and column.whole and bool(np.ptp(column.values) > _FEWEST_COUNTS)
+    return (
+        column.conversion is None
+        and column.is_integer
+        and bool(np.ptp(column.values) > _FEWEST_COUNTS)
+    )
 
 
 def slides(column: Column, found: Survey) -> bool:
     """Whether an axis slides rather than turns: by its unit, its name, or a force in newtons."""
-    known = unit(column.unit) if column.unit else None
+    known = column.conversion
     if known is not None and known.si:
         return known.si in ("m", "m/s")
     if set(words(column.name)) & _SLIDING:
         return True
-    forces = [unit(c.unit) for c in found.of("force") if c.unit]
+    forces = [column.conversion for column in found.of("force")]
     return any(force is not None and force.si == "N" for force in forces)
 
 
@@ -39,23 +43,21 @@ def travelled(column: Column, t: np.ndarray) -> np.ndarray:
     values: np.ndarray = np.nan_to_num(column.values)
     if not is_velocity(column):
         return values
-    steps = 0.5 * (values[1:] + values[:-1]) * np.diff(t)
-    return np.concatenate([[0.0], np.cumsum(steps)])
+    return integral(t, values)
 
 
 def position_in_si(column: Column, t: np.ndarray, si: str) -> np.ndarray:
     """Position (T,) in ``si``, rad or m; an angle that wraps at a full turn is unwrapped."""
     values = travelled(column, t)
     if is_velocity(column):
-        known = unit(column.unit) if column.unit else None
-        return values * (known.scale if known is not None else 1.0)
+        return values * (column.conversion.scale if column.conversion is not None else 1.0)
     values = values * scale_to(si, column)
     return np.unwrap(values) if si == "rad" and not in_counts(column) else values
 
 
 def scale_to(si: str, column: Column) -> float:
     """What brings the values of a column to ``si``, by its unit or by the likely one."""
-    known = unit(column.unit) if column.unit else None
+    known = column.conversion
     if known is None or known.si != si:
         known = unit(guesses.likely_unit(si, column.values) or si)
     return known.scale if known is not None else 1.0

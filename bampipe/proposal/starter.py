@@ -29,13 +29,13 @@ class Starter:
         text: of the file.
         axis: name of its axis.
         input: name of the input that drives the axis.
-        own: names of the constants that only its user knows.
+        placeholders: names of the constants that only its user knows.
     """
 
     text: str
     axis: str
     input: str
-    own: tuple[str, ...]
+    placeholders: tuple[str, ...]
 
 
 def starter_device(position: str, linear: bool, drive: Drive, found: Driven) -> Starter:
@@ -64,7 +64,7 @@ def starter_device(position: str, linear: bool, drive: Drive, found: Driven) -> 
         *(_coil_parameters(axis, found) if drive.coil else []),
     ]
     text = "\n".join(section for section in sections if section)
-    return Starter(text, axis.name, source.name, source.own)
+    return Starter(text, axis.name, source.name, source.placeholders)
 
 
 def _coordinate(axis: Axis, drive: Drive) -> str:

@@ -70,7 +70,7 @@ class Input:
         si: its unit.
         applied: expression of what it does to the axis.
         constants: the table of the constants in that expression, "" where there are none.
-        own: names of those that only the user knows.
+        placeholders: names of those that only the user knows.
         beside: a channel that is needed too, "" where none is.
     """
 
@@ -78,7 +78,7 @@ class Input:
     si: str
     applied: str
     constants: str = ""
-    own: tuple[str, ...] = ()
+    placeholders: tuple[str, ...] = ()
     beside: str = ""
 
 
@@ -100,9 +100,9 @@ def input_of(axis: Axis, drive: Drive) -> Input:
         return Input("duty", "", "force_at_full*duty", constants, ("force_at_full",))
     if drive.role == "duty":
         applied = f"torque_constant/resistance*(duty*supply - torque_constant*qd_{axis.name})"
-        own = ("torque_constant", "resistance")
+        motor = ("torque_constant", "resistance")
         if drive.supply:
-            return Input("duty", "", applied, _MOTOR, own, 'supply = "V"')
-        return Input("duty", "", applied, _MOTOR + _SUPPLY, (*own, "supply"))
+            return Input("duty", "", applied, _MOTOR, motor, 'supply = "V"')
+        return Input("duty", "", applied, _MOTOR + _SUPPLY, (*motor, "supply"))
     coil = 'coil_current = "A"' if drive.coil else ""
     return Input("force_drive", axis.torque, "force_drive", beside=coil)

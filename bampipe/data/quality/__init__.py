@@ -27,9 +27,9 @@ from bampipe.data.quality.clock import (
     time_to_seconds,
 )
 from bampipe.data.quality.encoders import (
-    hold_against_velocity,
+    check_velocity,
     integrate,
-    mend_jumps,
+    interpolate_jumps,
     refuse_fractions,
     unwrap,
 )
@@ -69,12 +69,12 @@ def clean(raw: RawTrial, session: Session, entry: TrialEntry, limits: Limits) ->
     fill_missing(table)
     for encoder in session.encoders:
         integrate(table, encoder)
-        mend_jumps(table, encoder)
+        interpolate_jumps(table, encoder)
     table.t -= table.t[0]
     refuse_short(table)
     note_clock(table)
     for encoder in session.encoders:
-        hold_against_velocity(table, encoder)
+        check_velocity(table, encoder)
     if session.force is not None and session.force.volts:
         for column in session.force.columns:
             refuse_frozen(table, column)

@@ -39,9 +39,7 @@ def integrate(table: Table, encoder: Encoder) -> None:
     """
     if not encoder.integrate:
         return
-    speed = table.columns[encoder.column]
-    moved = np.cumsum(0.5 * (speed[1:] + speed[:-1]) * np.diff(table.t))
-    table.columns[encoder.column] = np.concatenate([[0.0], moved])
+    table.columns[encoder.column] = velocity.integral(table.t, table.columns[encoder.column])
     table.notes.append(f"position is the integral of the velocity '{encoder.column}', from 0")
 
 
@@ -74,7 +72,7 @@ def unwrap(table: Table, encoder: Encoder) -> None:
         return
 
 
-def mend_jumps(table: Table, encoder: Encoder) -> None:
+def interpolate_jumps(table: Table, encoder: Encoder) -> None:
     """Interpolate isolated wild readings; refuse a lasting jump (lost counts, a reset).
 
     A step is wild when it is 20 times what all but one step in twenty stay below, and faster
@@ -128,7 +126,7 @@ def mend_jumps(table: Table, encoder: Encoder) -> None:
     fill_missing(table)
 
 
-def hold_against_velocity(table: Table, encoder: Encoder) -> None:
+def check_velocity(table: Table, encoder: Encoder) -> None:
     """Refuse an axis whose recorded velocity is in another unit, or of another sign."""
     if encoder.velocity is None:
         return
@@ -137,20 +135,20 @@ def hold_against_velocity(table: Table, encoder: Encoder) -> None:
     found = velocity.compare(table.t, position, speed)
     if found is None:
         return
-    place = encoder.velocity.column
+    column = encoder.velocity.column
     if abs(found.correlation) < 0.9:
         table.notes.append(
-            f"column '{place}' is not the velocity of {encoder.axis} by its position"
+            f"column '{column}' is not the velocity of {encoder.axis} by its position"
             f" (correlation {found.correlation:.2f}); it is not used"
         )
         return
     if not 1 / VELOCITY_RATIO < found.ratio < VELOCITY_RATIO:
         raise table.fault(
             f"is {found.ratio:.3g} times the change of '{encoder.column}'",
-            column=place,
+            column=column,
             remedy="check the units and signs of both in session.toml",
         )
     if not 0.95 < found.ratio < 1.05:
         table.notes.append(
-            f"column '{place}' is {found.ratio:.3g} times the change of '{encoder.column}'"
+            f"column '{column}' is {found.ratio:.3g} times the change of '{encoder.column}'"
         )
