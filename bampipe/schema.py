@@ -173,7 +173,11 @@ def faults(kind: type[Declaration], content: object, where: str) -> list[InputEr
 
 
 class _Generator(GenerateJsonSchema):
-    """JSON Schema without a title for every field, and without a default that JSON has not."""
+    """JSON Schema without titles of fields, defaults that JSON has not, keys of another form."""
+
+    def dict_schema(self, schema: Any) -> dict[str, Any]:
+        content = super().dict_schema(schema)
+        return content | ({"additionalProperties": False} if "patternProperties" in content else {})
 
     def default_schema(self, schema: Any) -> dict[str, Any]:
         content = super().default_schema(schema)

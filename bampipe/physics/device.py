@@ -13,7 +13,7 @@ from pydantic import Field, PrivateAttr
 from bampipe.errors import InputError, did_you_mean
 from bampipe.physics.controller import Controller
 from bampipe.physics.expression import MAX_NUMBER, Expression, Name
-from bampipe.physics.parameter import Parameter, Size
+from bampipe.physics.parameter import Parameter, PhysicalNumber
 from bampipe.schema import (
     ByName,
     Declaration,
@@ -122,8 +122,8 @@ class Friction(Declaration):
 class Limits(Declaration):
     """Range of one coordinate."""
 
-    lower: Size
-    upper: Size
+    lower: PhysicalNumber
+    upper: PhysicalNumber
 
     def cross_faults(self) -> Iterator[InputError]:
         if not self.lower < self.upper:

@@ -24,20 +24,24 @@ def _refuse_huge(value: Any) -> Any:
     return value
 
 
-Size = Annotated[float, BeforeValidator(_refuse_huge)]
+PhysicalNumber = Annotated[float, BeforeValidator(_refuse_huge)]
 
 
 class Parameter(NamedDeclaration):
     """One number of a model that data can estimate; its name is such as ``viscous.yaw``."""
 
     unit: str = Field(description="Coherent SI; empty for a pure number")
-    prior: Size = Field(description="Value assumed before seeing data, in its unit")
-    sd: Size = Field(ge=0, description="Standard deviation of that assumption")
-    lower: Size = Field(default=-math.inf, allow_inf_nan=True, description="Physical bound")
-    upper: Size = Field(default=math.inf, allow_inf_nan=True, description="Physical bound")
+    prior: PhysicalNumber = Field(description="Value assumed before seeing data, in its unit")
+    sd: PhysicalNumber = Field(ge=0, description="Standard deviation of that assumption")
+    lower: PhysicalNumber = Field(
+        default=-math.inf, allow_inf_nan=True, description="Physical bound"
+    )
+    upper: PhysicalNumber = Field(
+        default=math.inf, allow_inf_nan=True, description="Physical bound"
+    )
     strength: bool = Field(default=False, description="The effect is absent where this is 0")
     fixed: bool = Field(default=False, description="Held at its prior, never estimated")
-    typical: Size | None = Field(
+    typical: PhysicalNumber | None = Field(
         default=None,
         description="Size at which the effect is clearly there; strength 1 of the simulator",
     )

@@ -41,7 +41,7 @@ def _name(text: str) -> str:
     return text
 
 
-Name = Annotated[
+ChannelName = Annotated[
     str,
     AfterValidator(_name),
     Field(json_schema_extra={"pattern": "^[A-Za-z][A-Za-z0-9_]*$"}),
@@ -211,7 +211,7 @@ class Force(Declaration):
     """Force sensor or motor force; unit V: calibration_n_per_v @ (volts - zero_v)."""
 
     columns: Columns
-    given_components: Annotated[Distinct[Name], Field(min_length=1)] | None = Field(
+    given_components: Annotated[Distinct[ChannelName], Field(min_length=1)] | None = Field(
         default=None,
         alias="components",
         description="Names of the components, where the columns are not called"

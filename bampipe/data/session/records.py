@@ -19,10 +19,10 @@ from bampipe.data.session.channels import (
     Brake,
     BrakeTable,
     Channel,
+    ChannelName,
     Clock,
     Encoder,
     Force,
-    Name,
 )
 from bampipe.data.session.places import inside, is_device_path, lexically_inside
 from bampipe.errors import InputError, did_you_mean
@@ -69,7 +69,9 @@ class TrialEntry(NamedDeclaration):
         description="Path relative to the session folder"
     )
     kind: Literal["free", "locked", "viscous"]
-    locked_axis: Name | None = Field(default=None, description="The locked axis, of a locked trial")
+    locked_axis: ChannelName | None = Field(
+        default=None, description="The locked axis, of a locked trial"
+    )
     viscous: Positive | None = Field(
         default=None,
         alias="viscous_n_s_per_m",
@@ -156,12 +158,12 @@ class Session(Declaration):
         alias="csv",
         description="Layout of text files, where it cannot be found in them",
     )
-    encoders: Annotated[tuple[Encoder, ...], ByName(Name, least=1)] = Field(
+    encoders: Annotated[tuple[Encoder, ...], ByName(ChannelName, least=1)] = Field(
         description="One entry an axis"
     )
     force: Force | None = None
     brake_table: BrakeTable | None = Field(default=None, alias="brakes")
-    channels: Annotated[tuple[Channel, ...], ByName(Name)] = Field(
+    channels: Annotated[tuple[Channel, ...], ByName(ChannelName)] = Field(
         default=(), description="Any other recorded input"
     )
     trials: Annotated[Several[TrialEntry], Field(min_length=1), AfterValidator(_with_ids)]
