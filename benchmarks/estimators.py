@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.estimate.least_squares import Problem, Stacked, fit, stacked_residual
-from bampipe.estimate.low_pass import Band
 from bampipe.estimate.unscented import Trial
 from bampipe.files import read_json, write_text
 from bampipe.identification.filter_choice import FilterChoice
@@ -35,7 +34,10 @@ from bampipe.progress import silent
 from bampipe.simulator import session as simulate
 from bampipe.stages import filter as filter_stage
 from bampipe.stages import identify, ingest
-from bampipe.trials.motions import Motion, problem_of, read_motions
+from bampipe.trials.band import read_band
+from bampipe.trials.motion import Motion
+from bampipe.trials.reading import read_motions, read_sensors
+from bampipe.trials.residuals import problem_of
 
 Array = NDArray[np.float64]
 
@@ -85,21 +87,21 @@ def by_stage(run: RunFolder, names: Sequence[str], settings: dict[str, object]) 
 def by_instruments(run: RunFolder, system: System) -> Found:
     """Instrumental variables, from the motion that output error simulates."""
     begun = time.process_time()
-    session = read_json(run.path("ingest/session.json"))
     motions = list(read_motions(run, system, fitted=True))
-    rate = float(session["sample_rate_hz"])
-    problem = problem_of(system, motions, Band(rate))
+    sensors = read_sensors(run, system)
+    band = read_band(read_json(run.path("filter/filter.json")), system.coordinates)
+    problem = problem_of(system, motions, band, timing=True)
     squares = fit(problem, np.append(system.prior, 0.0))
     choice = FilterChoice()
     near = squares.p[: len(system.parameters)]
-    noise = sensor_noise(session, system, motions, near, choice)
+    noise = sensor_noise(sensors, system, motions, near, choice)
     trials = [trial_of(run, motion, system, near, noise, 1, choice) for motion in motions]
     simulated = [
         _simulated(system, motion, trial, squares.p)
         for motion, trial in zip(motions, trials, strict=True)
     ]
     p, covariance = fit_with_instruments(
-        problem, replace(problem_of(system, simulated, Band(rate)), resting=problem.resting),
+        problem, replace(problem_of(system, simulated, band, timing=True), resting=problem.resting),
         squares.p,
     )  # fmt: skip
     seconds = time.process_time() - begun
@@ -169,9 +171,10 @@ def _simulated(system: System, motion: Motion, trial: Trial, p: Array) -> Motion
     rate = np.empty(2 * n)
     qd = np.gradient(q, motion.t, axis=0)
     qdd = np.empty_like(q)
+    u = motion.inputs(system.inputs)
     for k in range(len(q)):
         x = np.concatenate([q[k], qd[k]])
-        system.derivative(x, motion.u[k].copy(), p[:-1], np.zeros(len(system.noise)), rate)
+        system.derivative(x, u[k].copy(), p[:-1], np.zeros(len(system.noise)), rate)
         qdd[k] = rate[n:]
     return replace(motion, q=q, qd=qd, qdd=qdd)
 

@@ -14,21 +14,21 @@ import tempfile
 import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from bampipe.data.run_folder import RunFolder
-from bampipe.discover.chance import Recipe, Session
+from bampipe.discover.chance import Recipe
 from bampipe.discover.diagnosis import diagnose
 from bampipe.discover.settings import Settings
-from bampipe.estimate.low_pass import Band
 from bampipe.physics import Model, compile_model, registry
 from bampipe.progress import silent
 from bampipe.simulator import session as simulate
+from bampipe.stages import filter as filter_stage
 from bampipe.stages import ingest
-from bampipe.trials.recordings import read_session
+from bampipe.trials.measured import read_measured_trials
 
 SINGLES = (
     "stribeck:yaw", "stribeck:pitch", "stribeck:extension", "presliding:yaw", "presliding:pitch",
@@ -126,18 +126,17 @@ def run_case(case: Case) -> Outcome:
             locked_trials=False, effect_files=tuple(str(f) for f in sorted(PLANTS.glob("*.toml"))),
         )  # fmt: skip
         simulate.simulate_session(root / "session", config, silent)
-        for part in ("ingest",):
+        for part in ("ingest", "filter"):
             (root / "run" / part).mkdir(parents=True)
-        ingest.execute(
-            RunFolder(root / "run"), root / "run",
-            ingest.Config(session=str(root / "session")), silent,
-        )  # fmt: skip
+        run = RunFolder(root / "run")
+        ingest.execute(run, run.root, ingest.Config(session=str(root / "session")), silent)
+        filter_stage.execute(run, run.root, filter_stage.Config(), silent)
         device = registry.device("bam")
         system = compile_model(Model(device))
         begun = time.perf_counter()
-        sensors, motions = read_session(RunFolder(root / "run"), system)
+        trials = read_measured_trials(run, system, every_input=True)
         found = diagnose(
-            Session(tuple(motions), sensors, Band(sensors.rate_hz)),
+            replace(trials, motions=tuple(trials.motions)),
             Recipe(device.declaration, (), ()),
             system.prior,
             Settings(replicates=case.replicates, jobs=1, seed=case.seed),

@@ -10,63 +10,63 @@ import numpy as np
 import pytest
 
 from bampipe.data import store
-from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError
 from bampipe.identification.filter_run import stride_of
-from bampipe.stages import validate
-from bampipe.trials.motions import Motion, put_aside
-from bampipe.trials.trial_cache import Shelf
+from bampipe.trials.cache import TrialCache
+from bampipe.trials.folds import Folds
+from bampipe.trials.motion import Motion
+from bampipe.trials.replay import store_motions
 
 
-def test_trials_are_held_out_one_by_one_up_to_ten_then_in_ten_groups(tmp_path: Path) -> None:
-    names = np.array([f"t{number}" for number in range(57)])
-    store.write_parquet(tmp_path / "ingest/trials.parquet", {"trial_id": names})
-
-    def groups(trials: int) -> list[int]:
-        motions = [SimpleNamespace(trial_id=name) for name in names[:trials]]
-        return validate._groups(RunFolder(tmp_path), motions, "")  # type: ignore[arg-type]
-
-    assert groups(10) == list(range(10))
-    many = groups(57)
+def test_trials_are_held_out_one_by_one_up_to_ten_then_in_ten_groups() -> None:
+    names = [f"t{number}" for number in range(57)]
+    assert Folds.of_trials(names[:10], (), names).groups == tuple(range(10))
+    many = Folds.of_trials(names, (), names).groups
     assert len(many) == 57 and set(many) == set(range(10))
     assert max(many.count(k) for k in range(10)) - min(many.count(k) for k in range(10)) <= 1
 
 
-def test_a_shelf_holds_no_more_than_it_may_and_fetches_the_rest_again() -> None:
+def test_a_cache_holds_no_more_than_it_may_and_fetches_the_rest_again() -> None:
     fetched: list[int] = []
 
     def fetch(place: int) -> list[int]:
         fetched.append(place)
         return [place] * 10
 
-    shelf = Shelf(fetch, 5, len, most=20)
-    assert [item[0] for item in shelf] == [0, 1, 2, 3, 4]
+    cache = TrialCache(fetch, 5, len, most=20)
+    assert [item[0] for item in cache] == [0, 1, 2, 3, 4]
     assert fetched == [0, 1, 2, 3, 4]
-    assert shelf[-1][0] == 4 and shelf[3][0] == 3 and len(fetched) == 5
-    assert shelf[0][0] == 0 and len(fetched) == 6
-    assert [item[0] for item in shelf[1:3]] == [1, 2]
+    assert cache[-1][0] == 4 and cache[3][0] == 3 and len(fetched) == 5
+    assert cache[0][0] == 0 and len(fetched) == 6
+    assert [item[0] for item in cache[1:3]] == [1, 2]
     with pytest.raises(IndexError):
-        shelf[5]
-    one = Shelf(fetch, 1, len, most=1)
+        cache[5]
+    one = TrialCache(fetch, 1, len, most=1)
     assert one[0] is one[0]
 
 
-def test_trials_put_aside_come_back_bit_by_bit_and_leave_nothing(
+def test_stored_trials_come_back_bit_by_bit_and_leave_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     rng = np.random.default_rng(0)
-    names = ("q", "qd", "qdd", "qd_sd", "u", "u_rate")
+    names = ("q", "qd", "qdd", "qd_sd")
     given = [
-        Motion(f"t{k} free", np.arange(7.0), **{name: rng.normal(size=(7, 2)) for name in names})
+        Motion(
+            f"t{k} free",
+            np.arange(7.0),
+            **{name: rng.normal(size=(7, 2)) for name in names},
+            channels={"force_x": rng.normal(size=7)},
+        )
         for k in range(3)
     ]
-    shelf = put_aside(iter(given))
-    for motion, back in zip(given, shelf, strict=True):
+    cache = store_motions(iter(given))
+    for motion, back in zip(given, cache, strict=True):
         assert back.trial_id == motion.trial_id
         assert all(np.array_equal(getattr(motion, name), getattr(back, name)) for name in names)
+        assert np.array_equal(motion.channels["force_x"], back.channels["force_x"])
     assert len(list(tmp_path.iterdir())) == 1
-    del shelf
+    del cache
     assert list(tmp_path.iterdir()) == []
 
 

@@ -61,6 +61,7 @@ LAWS = {
         "bampipe.errors",
         "bampipe.physics",
         "bampipe.estimate",
+        "bampipe.results",
         "bampipe.trials",
         "bampipe.workers",
     },
@@ -88,7 +89,6 @@ LAWS = {
         "bampipe.results",
         "bampipe.physics",
         "bampipe.estimate",
-        "bampipe.discover",
         "bampipe.data",
     },
     "identification": {

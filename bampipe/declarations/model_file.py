@@ -10,6 +10,8 @@ from bampipe.declarations.model import read_model_file
 from bampipe.errors import InputError
 from bampipe.files import read_toml
 from bampipe.physics import Model, System, registry
+from bampipe.physics.device import Device
+from bampipe.physics.recipe import Recipe
 
 
 def load_model(run: RunFolder, name: str) -> Model:
@@ -27,10 +29,25 @@ def load_model(run: RunFolder, name: str) -> Model:
     own = []
     for file in run.glob(f"models/{name}/effects/*.toml"):
         own.append(registry.effect_from(read_toml(run.path(file)), str(run.path(file))))
+    return Model(load_device(run, model.device), model.effects, own)
+
+
+def load_device(run: RunFolder, name: str) -> Device:
+    """Return the device of a run folder: the lab's own file, else the built-in one.
+
+    Args:
+        run: the run folder; name: of the built-in device.
+    """
     if run.exists("ingest/device.toml"):
-        place = run.path("ingest/device.toml")
-        return Model(registry.device_from(read_toml(place), str(place)), model.effects, own)
-    return Model(registry.device(model.device), model.effects, own)
+        path = run.path("ingest/device.toml")
+        return registry.device_from(read_toml(path), str(path))
+    return registry.device(name)
+
+
+def read_recipe(run: RunFolder, name: str, model: Model) -> Recipe:
+    """Return ``model``, called ``name`` in the run folder, as plain data for worker processes."""
+    own = [read_toml(run.path(path)) for path in run.glob(f"models/{name}/effects/*.toml")]
+    return Recipe(model.device.declaration, tuple(e.name for e in model.effects), tuple(own))
 
 
 def model_inputs(name: str) -> tuple[str, ...]:

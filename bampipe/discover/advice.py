@@ -9,12 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.discover.candidates import candidate
-from bampipe.discover.chance import Recipe, Session
-from bampipe.discover.evidence import Evidence
 from bampipe.physics import System
 from bampipe.physics.device import INPUT_ORDERS, derivative
+from bampipe.physics.recipe import Recipe
 from bampipe.physics.registry import device_from, effect_from
-from bampipe.trials.observation import Motion
+from bampipe.trials.measured import MeasuredTrials
+from bampipe.trials.motion import Motion
+from bampipe.trials.residuals import Evidence
 
 Array = NDArray[np.float64]
 
@@ -58,7 +59,7 @@ _DESIGNS = (
 
 
 def advise(
-    session: Session,
+    trials: MeasuredTrials,
     recipe: Recipe,
     evidence: Evidence,
     axis: int,
@@ -70,7 +71,7 @@ def advise(
     """The design under which confusing ``first`` with ``second`` would cost most.
 
     Args:
-        session: the trials at hand, for ranges and filters.
+        trials: the trials at hand, for ranges and filters.
         recipe: the model without either effect.
         evidence: its fit.
         axis: where the two act.
@@ -78,10 +79,10 @@ def advise(
         values: fitted parameters of each effect, in the order of its file.
         floor: noise floor of the axis, N.m or N.
     """
-    now = [_confusion(recipe, evidence, m, axis, first, second, values) for m in session.motions]
+    now = [_confusion(recipe, evidence, m, axis, first, second, values) for m in trials.motions]
     best: Advice | None = None
     for design in _DESIGNS:
-        motion = _motion(session, evidence.system, evidence.p, axis, design)
+        motion = _motion(trials, evidence.system, evidence.p, axis, design)
         cost = _confusion(recipe, evidence, motion, axis, first, second, values) / floor
         if best is None or cost > best.separation:
             words = design.words.format(axis=evidence.system.coordinates[axis])
@@ -113,7 +114,7 @@ def _confusion(
         moved[i] += size
         changed = system.residual(motion.q, motion.qd, motion.qdd, z, u, moved)[:, axis]
         columns.append((changed - base) / size)
-    thin = band.thin(np.column_stack(columns))
+    thin = band.thin(np.column_stack(columns), [axis] * len(columns))
     x = thin[:, 1:]
     scale = np.maximum(np.linalg.norm(x, axis=0), 1e-12)
     left = thin[:, 0] - (x / scale) @ np.linalg.lstsq(x / scale, thin[:, 0], rcond=1e-8)[0]
@@ -137,11 +138,11 @@ def _torque(recipe: Recipe, evidence: Evidence, motion: Motion, name: str, own: 
     return system.contribution(motion.q, motion.qd, motion.qdd, z, u, p)
 
 
-def _motion(session: Session, system: System, p: Array, axis: int, design: _Design) -> Motion:
+def _motion(trials: MeasuredTrials, system: System, p: Array, axis: int, design: _Design) -> Motion:
     """A designed motion within the range of the trials, with the force that the model needs."""
-    rate = session.sensors.rate_hz
+    rate = trials.sensors.rate_hz
     t = np.arange(int(_DURATION_S * rate)) / rate
-    every = np.concatenate([m.q for m in session.motions])
+    every = np.concatenate([m.q for m in trials.motions])
     low, high = np.quantile(every, 0.02, axis=0), np.quantile(every, 0.98, axis=0)
     n = every.shape[1]
     q, qd, qdd = (np.zeros((len(t), n)) for _ in range(3))
@@ -159,7 +160,7 @@ def _motion(session: Session, system: System, p: Array, axis: int, design: _Desi
     device = system.model.device
     channels |= {"t": t} | {b: np.zeros(len(t)) for b in device.brakes.values()}
     for name in device.channels:
-        typical = np.median(np.concatenate([m.channels[name] for m in session.motions]))
+        typical = np.median(np.concatenate([m.channels[name] for m in trials.motions]))
         channels[name] = np.full(len(t), typical)
     for f in device.forces:
         channels |= {derivative(f, k): np.zeros(len(t)) for k in range(len(INPUT_ORDERS))}
@@ -173,4 +174,4 @@ def _motion(session: Session, system: System, p: Array, axis: int, design: _Desi
         for order in range(len(INPUT_ORDERS)):
             channels[derivative(f, order)] = value
             value = np.gradient(value, t)
-    return Motion("design", t, q, qd, qdd, channels)
+    return Motion("design", t, q, qd, qdd, np.zeros_like(qd), channels)

@@ -12,19 +12,20 @@ from bampipe.discover.candidates import Score, Scorer
 from bampipe.discover.chance import (
     Pool,
     PrepareTask,
-    Recipe,
     Replicate,
     ReplicateTask,
     ScoreTask,
-    Session,
-    fit_session,
+    fit_trials,
     prepare,
     run_replicate,
     run_scores,
 )
-from bampipe.discover.evidence import Evidence
 from bampipe.discover.level import Level
 from bampipe.discover.settings import Settings
+from bampipe.physics.recipe import Recipe
+from bampipe.trials.measured import MeasuredTrials
+from bampipe.trials.noise_floor import FLOOR_SEED, floor_replays
+from bampipe.trials.residuals import Evidence
 
 Array = NDArray[np.float64]
 
@@ -34,13 +35,13 @@ class Bench:
     """What every step of a diagnosis works with.
 
     Attributes:
-        session: the measured trials.
+        trials: the measured trials.
         settings: how carefully to look.
         pool: a `map` over worker processes.
         names: every candidate.
     """
 
-    session: Session
+    trials: MeasuredTrials
     settings: Settings
     pool: Pool
     names: tuple[str, ...]
@@ -53,7 +54,7 @@ class Bench:
 
     def fit(self, recipe: Recipe, start: Array) -> Evidence:
         """Least squares of a model on the measured trials."""
-        return fit_session(self.session, recipe, start)
+        return fit_trials(self.trials, recipe, start)
 
     def replicas(
         self,
@@ -78,6 +79,11 @@ class Bench:
             for k in range(count)
         ]
         return list(self.pool(run_replicate, tasks))
+
+    def floor_replicas(self, recipe: Recipe, p: Array) -> list[Replicate]:
+        """Replays that give the noise floor of a model, those that `validate` makes of it."""
+        count = floor_replays(self.trials.motions)
+        return self.replicas(recipe, p, count, (), (FLOOR_SEED,), share=True)
 
     def scores(self, recipe: Recipe, p: Array, names: Sequence[str]) -> dict[str, Score]:
         """Scores of candidates against a model on the measured trials."""

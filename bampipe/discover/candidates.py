@@ -7,26 +7,28 @@ and strengths that act nonlinearly, are searched.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bampipe.discover.evidence import Evidence
+from bampipe.estimate.normal_equations import NormalEquations
 from bampipe.physics import Model, System, compile_model
 from bampipe.physics.device import Device
 from bampipe.physics.effect import Effect
 from bampipe.physics.parameter import Parameter
 from bampipe.physics.registry import effect as built_in
 from bampipe.physics.registry import effect_names
+from bampipe.trials.folds import Folds
+from bampipe.trials.residuals import Evidence
 
 Array = NDArray[np.float64]
 
 _GRID = 7
 _REFINE = 3
-_ALIKE = 0.7
+_SIMILAR = 0.7
 _DENSEST = 48
 _WORTH = 4.0
 _SHARES = (1.0, 0.9, 0.8, 0.65, 0.5, 0.35, 0.2, 0.1, 0.05)
@@ -114,44 +116,43 @@ def candidate(device: Device, name: str, extra: Sequence[Effect] = ()) -> Candid
     return Candidate(name, system, own, tuple(linear), tuple(searched))
 
 
-@dataclass(frozen=True)
-class _Sums:
-    """Sums of products by trial and axis: x'x (K, n_q, P, P), x'y (K, n_q, P), y'y (K, n_q)."""
-
-    xx: Array
-    xy: Array
-    yy: Array
-
-
 class Scorer:
     """Scores candidates against one evidence."""
 
     def __init__(self, evidence: Evidence) -> None:
         self.evidence = evidence
-        self.counts = np.array([u.sum(axis=0) for u in evidence.used])
-        self._base = _sums(evidence.jacobian, [-r for r in evidence.residual])
+        # The trials that a session holds out choose no model.
+        self.folds = evidence.folds.among_fitted()
+
+    def _folds(self, item: Candidate) -> Folds:
+        """What brakes do is part of the model with an effect of theirs, and fitted then."""
+        return self.folds.with_all_fitted() if item.system.braked else self.folds
 
     @cached_property
     def independent(self) -> Array:
-        """Number of independent samples by axis: the low-pass leaves two a cut-off period."""
-        band = self.evidence.band
-        spacing = band.step * 2.0 * band.cutoff_hz / band.rate_hz
-        return np.asarray(self.counts.sum(axis=0) * min(1.0, spacing))
-
-    @cached_property
-    def _cost_before(self) -> float:
-        weight = 1.0 / np.maximum(self.evidence.rmse(), 1e-12) ** 2
-        beta = _solve(self._base.xx, self._base.xy, weight)
-        left = _squares(self._base, beta).sum(axis=0) / np.maximum(self.counts.sum(axis=0), 1.0)
-        return float(np.sum(self.independent * np.log(np.maximum(left, 1e-30))))
+        """Number of independent samples that count in the error, by axis, (n_q,)."""
+        judged = [k for k, counts in enumerate(self.folds.judged) if counts]
+        count = self.evidence.sums.count[judged].sum(axis=0)
+        return np.asarray(count * self.evidence.band.independent_share)
 
     @cached_property
     def before(self) -> Score:
         """The model as it is."""
-        weight = 1.0 / np.maximum(self.evidence.rmse(), 1e-12) ** 2
-        shift = _solve(self._base.xx, self._base.xy, weight)
-        error = self._held_out(self._base, weight)
-        return Score("", error, np.zeros(0), shift, np.zeros(len(error)))
+        e = self.evidence
+        steps = self.folds.solve(e.sums, e.weight, e.lower, e.upper)
+        error = self.folds.error(e.sums, steps)
+        return Score("", error, np.zeros(0), np.zeros(len(e.free)), np.zeros(len(error)))
+
+    def _cost_before(self, item: Candidate) -> float:
+        """Cost of the model as it is, fitted to the trials that ``item`` is fitted to."""
+        e, folds = self.evidence, self._folds(item)
+        steps = e.sums.subset(folds.fitted_trials).solve(e.weight, e.lower, e.upper)
+        return self._cost(e.sums, steps, folds)
+
+    def _cost(self, sums: NormalEquations, values: Array, folds: Folds) -> float:
+        """Cost of a fit: sum over axes of n log(mean square)."""
+        left = sums.subset(folds.fitted_trials).mean_square(values)
+        return float(np.sum(self.independent * np.log(np.maximum(left, 1e-30))))
 
     def score(self, item: Candidate) -> Score | None:
         """Refit with ``item`` added; None where it does nothing in these trials.
@@ -161,7 +162,7 @@ class Scorer:
         """
         ranges = [_search_range(item.own[i]) for i in item.searched]
         at = [_middle(low, high) for low, high, _ in ranges]
-        hopeless = self._cost_before - _WORTH
+        hopeless = self._cost_before(item) - _WORTH
         for _ in range(min(len(ranges), 2)):
             for k, interval in enumerate(ranges):
                 found = self._scan(item, at, k, interval)
@@ -202,7 +203,12 @@ class Scorer:
         i = 0
         while i + 1 < len(grid) and len(grid) < _DENSEST:
             first, second = known[i], known[i + 1]
-            if item.linear and first and second and _likeness(first[1], second[1]) < _ALIKE:
+            if (
+                item.linear
+                and first
+                and second
+                and _column_similarity(first[1], second[1]) < _SIMILAR
+            ):
                 middle = _middle(grid[i], grid[i + 1])
                 grid.insert(i + 1, middle)
                 known.insert(i + 1, cost(middle))
@@ -223,67 +229,78 @@ class Scorer:
                 ends = [_middle(x, ends[0]), _middle(x, ends[1])]
         return float(x), float(best)
 
-    def _problem(self, item: Candidate, searched: Array) -> tuple[_Sums, Array] | None:
+    def _problem(self, item: Candidate, searched: Array) -> tuple[NormalEquations, Array] | None:
         columns, change = self._columns(item, searched)
         if all(not c.any() for c in columns) and all(not c.any() for c in change):
             return None
         if not all((np.abs(c) < _DIVERGED).all() for c in (*columns, *change)):
             return None
-        x = [
-            np.concatenate([j, c], axis=2)
-            for j, c in zip(self.evidence.jacobian, columns, strict=True)
-        ]
-        y = [-(r + c) for r, c in zip(self.evidence.residual, change, strict=True)]
-        shape = np.concatenate(columns)
-        return _sums(x, y), shape.reshape(
-            shape.shape[0] * shape.shape[1], -1
-        ) if item.linear else shape
+        e = self.evidence
+        slopes = [np.concatenate([j, c], axis=2) for j, c in zip(e.jacobian, columns, strict=True)]
+        residuals = [r + c for r, c in zip(e.residual, change, strict=True)]
+        shape = np.concatenate(columns if item.linear else change)
+        flat = shape.reshape(-1, shape.shape[-1]) if item.linear else shape
+        return NormalEquations.from_samples(slopes, residuals, e.used), flat
+
+    def _bounds(self, item: Candidate) -> tuple[Array, Array]:
+        """Bounds of the changes of the base parameters and of the linear strengths."""
+        own = [item.own[i] for i in item.linear]
+        return (
+            np.append(self.evidence.lower, [q.lower for q in own]),
+            np.append(self.evidence.upper, [q.upper for q in own]),
+        )
 
     def _in_sample(self, item: Candidate, searched: Array) -> tuple[float, Array] | None:
-        """Cost of the joint fit, sum over axes of n log(mean square), and the columns."""
+        """Cost of the joint fit, and the columns."""
         problem = self._problem(item, searched)
         if problem is None:
             return None
         sums, columns = problem
-        beta, _ = self._fit(item, sums)
-        left = _squares(sums, beta).sum(axis=0) / np.maximum(self.counts.sum(axis=0), 1.0)
-        return float(np.sum(self.independent * np.log(np.maximum(left, 1e-30)))), columns
+        values, _ = self._fit(item, sums)
+        return self._cost(sums, values, self._folds(item)), columns
 
-    def _fit(self, item: Candidate, sums: _Sums) -> tuple[Array, Array]:
+    def _fit(self, item: Candidate, sums: NormalEquations) -> tuple[Array, Array]:
         """Coefficients of the joint fit, reweighted once by what each axis is left with."""
-        weight = 1.0 / np.maximum(self.evidence.rmse(), 1e-12) ** 2
+        weight, bounds = self.evidence.weight, self._bounds(item)
+        fitted = sums.subset(self._folds(item).fitted_trials)
         for _ in range(2):
-            beta = _bounded(item, sums, weight)
-            left = _squares(sums, beta).sum(axis=0) / np.maximum(self.counts.sum(axis=0), 1.0)
-            weight = 1.0 / np.maximum(left, 1e-24)
-        return beta, weight
+            values = fitted.solve(weight, *bounds)
+            weight = 1.0 / np.maximum(fitted.mean_square(values), 1e-24)
+        return values, weight
 
     def _at(self, item: Candidate, searched: Array) -> Score | None:
         problem = self._problem(item, searched)
         if problem is None:
             return None
         sums, _ = problem
-        beta, weight = self._fit(item, sums)
+        values, weight = self._fit(item, sums)
+        folds, (lower, upper) = self._folds(item), self._bounds(item)
         own = np.array([p.prior for p in item.own])
         own[list(item.searched)] = searched
         start = len(self.evidence.free)
-        own[list(item.linear)] = beta[start:]
+        own[list(item.linear)] = values[start:]
+
+        def error_within(lower: Array, upper: Array) -> Array:
+            return folds.error(sums, folds.solve(sums, weight, lower, upper))
+
         if not item.system.driven:
-            error = self._held_out(sums, weight, item)
+            error = error_within(lower, upper)
             gain = self.independent * np.log(self.before.error / error)
-            return Score(item.name, error, own, beta[:start], gain)
+            return Score(item.name, error, own, values[:start], gain)
         best = None
         for share in _SHARES if item.linear else (1.0,):
-            values = own.copy()
-            values[list(item.linear)] *= share
-            held = dict(enumerate(values[list(item.linear)], start)) if item.linear else None
-            error = self._held_out(sums, weight, item, held)
-            gain = np.log(self.before.error / error) + self._sensitivity(item, values)
+            weaker = own.copy()
+            weaker[list(item.linear)] *= share
+            # Equal bounds hold the strengths at this share while the base parameters adapt.
+            low, high = lower.copy(), upper.copy()
+            if item.linear:
+                low[start:] = high[start:] = weaker[list(item.linear)]
+            error = error_within(low, high)
+            gain = np.log(self.before.error / error) + self._sensitivity(item, weaker)
             if best is None or self.independent @ gain > self.independent @ best.gain:
-                shift = (
-                    _solve_held(sums.xx, sums.xy, weight, held)[:start] if held else beta[:start]
-                )
-                best = Score(item.name, error, values, shift, gain)
+                fitted = sums.subset(folds.fitted_trials)
+                shift = fitted.solve(weight, low, high)[:start]
+                best = Score(item.name, error, weaker, shift, gain)
         assert best is not None
         return replace(best, gain=self.independent * best.gain)
 
@@ -307,29 +324,7 @@ class Scorer:
             bare = np.linalg.norm(plain, axis=2)
             share = np.linalg.norm(slope, axis=2) / np.where(bare > 0.0, bare, 1.0)
             total += np.sum(np.where(bare > 0.0, np.log(np.maximum(share, 1e-3)), 0.0) * used, 0)
-        return np.asarray(total / np.maximum(self.counts.sum(axis=0), 1.0))
-
-    def _held_out(
-        self,
-        sums: _Sums,
-        weight: Array,
-        item: Candidate | None = None,
-        held: Mapping[int, float] | None = None,
-    ) -> Array:
-        squares = np.zeros(sums.yy.shape[1])
-        for k in range(len(sums.yy)):
-            rest = [i for i in range(len(sums.yy)) if i != k] or [k]
-            part = _Sums(sums.xx[rest], sums.xy[rest], sums.yy[rest])
-            if held is not None:
-                beta = _solve_held(part.xx, part.xy, weight, held)
-            else:
-                beta = (
-                    _solve(part.xx, part.xy, weight)
-                    if item is None
-                    else _bounded(item, part, weight)
-                )
-            squares += _squares(_Sums(sums.xx[[k]], sums.xy[[k]], sums.yy[[k]]), beta)[0]
-        return np.asarray(np.sqrt(squares / np.maximum(self.counts.sum(axis=0), 1.0)))
+        return np.asarray(total / np.maximum(self.evidence.sums.count.sum(axis=0), 1.0))
 
     def _columns(self, item: Candidate, searched: Array) -> tuple[list[Array], list[Array]]:
         """Columns of the linear strengths (K, n_q, m) and change of the residual (K, n_q)."""
@@ -340,12 +335,13 @@ class Scorer:
         p[[count + i for i in item.linear]] = 0.0
         axes = list(range(len(system.coordinates)) if system.moves_sensors else system.touched)
         columns, changes = [], []
-        for motion, used, memory, plain in zip(e.motions, e.used, e.memory, e.plain, strict=True):
+        for trial, (motion, used) in enumerate(zip(e.motions, e.used, strict=True)):
             u = motion.inputs(system.inputs)
             rows = []
             if system.moves_sensors:
                 true = system.true_motion(motion.q, motion.qd, motion.qdd, u, p)
                 inputs = motion.inputs(e.system.inputs)
+                plain, memory = e.unfiltered(trial)
                 rows.append(e.system.residual(*true, memory, inputs, e.p) - plain)
             else:
                 z = system.memory(motion.q, motion.qd, motion.qdd, u, p, motion.t)
@@ -367,58 +363,8 @@ class Scorer:
         """Low-pass each (T, n_q) of ``rows``; only ``axes`` can differ from zero."""
         out = np.zeros((len(used), len(rows), used.shape[1]))
         for r, values in enumerate(rows):
-            out[:, r, axes] = self.evidence.band.thin(values[:, axes]) * used[:, axes]
+            out[:, r, axes] = self.evidence.band.thin(values[:, axes], axes) * used[:, axes]
         return out
-
-
-def _sums(x: Sequence[Array], y: Sequence[Array]) -> _Sums:
-    xx, xy, yy = [], [], []
-    for a, b in zip(x, y, strict=True):
-        axes = np.ascontiguousarray(a.transpose(1, 0, 2))
-        right = np.ascontiguousarray(b.T)
-        xx.append(axes.transpose(0, 2, 1) @ axes)
-        xy.append(np.einsum("akp,ak->ap", axes, right))
-        yy.append(np.sum(right**2, axis=1))
-    return _Sums(np.array(xx), np.array(xy), np.array(yy))
-
-
-def _solve(xx: Array, xy: Array, weight: Array) -> Array:
-    a = np.einsum("kapq,a->pq", xx, weight)
-    b = np.einsum("kap,a->p", xy, weight)
-    scale = np.sqrt(np.maximum(np.diag(a), 1e-30))
-    return np.asarray(
-        np.linalg.lstsq(a / np.outer(scale, scale), b / scale, rcond=1e-10)[0] / scale
-    )
-
-
-def _bounded(item: Candidate, sums: _Sums, weight: Array) -> Array:
-    """`_solve` with strengths held at a bound that they would cross."""
-    beta = _solve(sums.xx, sums.xy, weight)
-    start = sums.xx.shape[2] - len(item.linear)
-    held = {}
-    for k, i in enumerate(item.linear):
-        bounded = float(np.clip(beta[start + k], item.own[i].lower, item.own[i].upper))
-        if bounded != beta[start + k]:
-            held[start + k] = bounded
-    return _solve_held(sums.xx, sums.xy, weight, held) if held else beta
-
-
-def _solve_held(xx: Array, xy: Array, weight: Array, held: Mapping[int, float]) -> Array:
-    """`_solve` with the coefficients ``held``, by position, at given values."""
-    keep = [i for i in range(xx.shape[2]) if i not in held]
-    fixed = list(held)
-    values = np.array(list(held.values()))
-    rest = xy[..., keep] - np.einsum("kapq,q->kap", xx[:, :, keep][..., fixed], values)
-    out = np.empty(xx.shape[2])
-    out[fixed] = values
-    out[keep] = _solve(xx[:, :, keep][..., keep], rest, weight)
-    return out
-
-
-def _squares(sums: _Sums, beta: Array) -> Array:
-    """Sum of squares left with coefficients ``beta``, by trial and axis."""
-    fitted = np.einsum("kapq,p,q->ka", sums.xx, beta, beta)
-    return np.asarray(np.maximum(sums.yy - 2.0 * sums.xy @ beta + fitted, 0.0))
 
 
 def _search_range(parameter: Parameter) -> tuple[float, float, bool]:
@@ -434,7 +380,7 @@ def _search_range(parameter: Parameter) -> tuple[float, float, bool]:
     return lower, upper, False
 
 
-def _likeness(a: Array, b: Array) -> float:
+def _column_similarity(a: Array, b: Array) -> float:
     """Cosine between two sets of columns: one where they span the same, zero where nothing."""
     first, second = np.linalg.qr(a)[0], np.linalg.qr(b)[0]
     return float(np.linalg.norm(first.T @ second) / np.sqrt(a.shape[1]))

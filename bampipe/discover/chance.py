@@ -6,54 +6,25 @@ the model again and scores the same candidates. Replicates run in worker process
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
-from functools import cache
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.discover.candidates import Candidate, Score, Scorer, candidate
-from bampipe.discover.evidence import Evidence, fit
 from bampipe.discover.shape import explainable_share
-from bampipe.estimate.low_pass import Band
 from bampipe.physics import Model, System, compile_model
-from bampipe.physics.registry import device_from, effect_from
-from bampipe.trials.observation import Motion, Sensors, observe
-from bampipe.trials.replay import replay
+from bampipe.physics.recipe import Recipe
+from bampipe.physics.registry import effect_from
+from bampipe.trials.measured import MeasuredTrials
+from bampipe.trials.replay import replay_motions
+from bampipe.trials.residuals import Evidence, gather_evidence
 from bampipe.workers import process_pool
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Recipe:
-    """A model as plain data, so that a worker process can build it again.
-
-    Attributes:
-        device: the device's declaration.
-        effects: canonical names.
-        extra: declarations of effects that are not built in.
-    """
-
-    device: Mapping[str, Any]
-    effects: tuple[str, ...]
-    extra: tuple[Mapping[str, Any], ...]
-
-    def model(self) -> Model:
-        """Build the model."""
-        return Model(device_from(self.device), self.effects, [effect_from(e) for e in self.extra])
-
-
-@dataclass(frozen=True)
-class Session:
-    """What every replicate shares: the measured trials and how they were measured."""
-
-    motions: tuple[Motion, ...]
-    sensors: Sensors
-    band: Band
 
 
 @dataclass(frozen=True)
@@ -61,63 +32,69 @@ class Replicate:
     """What one replay of the session gave.
 
     Attributes:
-        error: held-out error of the model itself, by axis.
+        error: cross-validated error of the model itself among the trials that are fitted, by axis.
+        held_out_rmse: its error on the trials that count, by axis: the same, unless the session
+            holds trials out.
         p: parameters fitted to it.
         scores: by candidate.
         share: explainable share by axis, empty where not asked for.
     """
 
     error: Array
+    held_out_rmse: Array
     p: Array
     scores: dict[str, Score]
     share: Array
 
 
-_session: Session | None = None
+_open_trials: MeasuredTrials | None = None
 
 
-def _enter(session: Session) -> None:
-    global _session
-    _session = session
+def _enter(trials: MeasuredTrials) -> None:
+    global _open_trials
+    _open_trials = trials
+    _systems.clear()
+    _candidates.clear()
 
 
-def shared_session() -> Session:
-    """The session that this process works on.
+def open_trials() -> MeasuredTrials:
+    """The trials that this process works on.
 
     Raises:
         RuntimeError: no pool has been opened.
     """
-    if _session is None:
-        raise RuntimeError("no session is open in this process")
-    return _session
+    if _open_trials is None:
+        raise RuntimeError("no trials are open in this process")
+    return _open_trials
 
 
 _systems: dict[str, System] = {}
-_candidates: dict[tuple[str, str], Candidate] = {}
+_candidates: dict[str, Candidate] = {}
+"""Of the open trials, by `Model.key`: of two devices of one name and other contents it differs."""
 
 
 def system_of(recipe: Recipe) -> System:
-    """The compiled model of a recipe, built once a process."""
+    """The compiled model of a recipe, built once a process while its trials are open."""
     model = recipe.model()
     if model.key not in _systems:
         _systems[model.key] = compile_model(model)
     return _systems[model.key]
 
 
-def fit_session(session: Session, recipe: Recipe, start: Array) -> Evidence:
-    """Least squares of the model of ``recipe`` on the measured trials; see `fit`."""
-    return fit(system_of(recipe), session.motions, session.sensors, session.band, start)
+def fit_trials(trials: MeasuredTrials, recipe: Recipe, start: Array) -> Evidence:
+    """Least squares of the model of ``recipe`` on the measured trials."""
+    return gather_evidence(system_of(recipe), trials.motions, trials.band, start, trials.folds)
 
 
 def candidates_of(recipe: Recipe, names: Sequence[str]) -> list[Candidate]:
-    """Candidates by name, built once a process."""
-    device = device_from(recipe.device)
+    """Candidates by name, built once a process for each content of device and effects."""
+    bare = replace(recipe, effects=()).model()
     extra = [effect_from(e) for e in recipe.extra]
     out = []
     for name in names:
-        key = (device.name, name)
+        key = Model(bare.device, (name,), extra).key
         if key not in _candidates:
-            _candidates[key] = candidate(device, name, extra)
+            _candidates[key] = candidate(bare.device, name, extra)
         out.append(_candidates[key])
     return out
 
@@ -132,7 +109,7 @@ class PrepareTask:
 
 def prepare(task: PrepareTask) -> int:
     """Derive and compile candidates into the cache; returns how many."""
-    motion = shared_session().motions[0]
+    motion = open_trials().motions[0]
     for item in candidates_of(task.recipe, task.names):
         system = item.system
         if system.memory_names:
@@ -166,20 +143,18 @@ class ReplicateTask:
 
 def run_replicate(task: ReplicateTask) -> Replicate:
     """Replay, filter, fit and score one replicate."""
-    session, system = shared_session(), system_of(task.recipe)
-    motions = []
-    for k, motion in enumerate(session.motions):
-        rng = np.random.default_rng([*task.seed, k])
-        recording = replay(system, task.p, motion, session.sensors, rng)
-        motions.append(observe(recording, session.sensors, system))
+    trials, system = open_trials(), system_of(task.recipe)
+    replays = replay_motions(
+        system, task.p, trials.motions, trials.sensors, trials.kinematics, task.seed
+    )
     analysed = system_of(task.analysed)
-    evidence = fit(analysed, motions, session.sensors, session.band, task.start)
+    evidence = gather_evidence(analysed, replays, trials.band, task.start, trials.folds)
     scorer = Scorer(evidence)
     found = {c.name: scorer.score(c) for c in candidates_of(task.analysed, task.names)}
     axes = range(len(system.coordinates))
     share = np.array([explainable_share(evidence, a) for a in axes]) if task.share else np.zeros(0)
     scores = {name: score for name, score in found.items() if score is not None}
-    return Replicate(scorer.before.error, evidence.p, scores, share)
+    return Replicate(scorer.before.error, evidence.held_out_rmse, evidence.p, scores, share)
 
 
 @dataclass(frozen=True)
@@ -191,18 +166,13 @@ class ScoreTask:
     names: tuple[str, ...]
 
 
-@cache
-def _measured(model_key: str, p: bytes) -> Evidence:
-    session = shared_session()
-    system = _systems[model_key]
-    start = np.frombuffer(p)
-    return fit(system, session.motions, session.sensors, session.band, start.copy(), 1)
-
-
 def run_scores(task: ScoreTask) -> dict[str, Score]:
     """Score candidates against the measured session."""
-    system = system_of(task.recipe)
-    evidence = _measured(system.model.key, task.evidence_p.tobytes())
+    trials = open_trials()
+    evidence = gather_evidence(
+        system_of(task.recipe), trials.motions, trials.band, task.evidence_p, trials.folds,
+        most_iterations=1,
+    )  # fmt: skip
     scorer = Scorer(evidence)
     found = {c.name: scorer.score(c) for c in candidates_of(task.recipe, task.names)}
     return {name: score for name, score in found.items() if score is not None}
@@ -215,11 +185,11 @@ Pool = Callable[[Callable[[Any], Any], Sequence[Any]], Iterator[Any]]
 
 
 @contextmanager
-def workers(session: Session, jobs: int) -> Iterator[Pool]:
-    """A `map` over worker processes that share ``session``; over none if jobs is 1."""
-    _enter(session)
+def workers(trials: MeasuredTrials, jobs: int) -> Iterator[Pool]:
+    """A `map` over worker processes that share ``trials``; over none if jobs is 1."""
+    _enter(trials)
     if jobs <= 1:
         yield lambda function, tasks: map(function, tasks)
         return
-    with process_pool(jobs, _enter, session) as pool:
+    with process_pool(jobs, _enter, trials) as pool:
         yield lambda function, tasks: pool.map(function, tasks)

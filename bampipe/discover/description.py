@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bampipe.discover.evidence import Evidence
 from bampipe.discover.shape import BINS, Map, Variable, residual_map, variables
+from bampipe.trials.residuals import Evidence
 
 Array = NDArray[np.float64]
 
@@ -96,7 +96,7 @@ def _vibration(evidence: Evidence, axis: int) -> _Sine | None:
     """A sine in time, of any phase in each trial, whose frequency most trials agree on."""
     band = evidence.band
     longest = max(len(r) for r in evidence.residual) * band.step / band.rate_hz
-    grid = np.arange(2.0 / longest, band.cutoff_hz, 0.25 / longest)
+    grid = np.arange(2.0 / longest, band.cutoff_hz[axis], 0.25 / longest)
     found = []
     for k, motion in enumerate(evidence.motions):
         use = evidence.used[k][:, axis] > 0

@@ -17,18 +17,20 @@ from numpy.typing import NDArray
 
 from bampipe.discover.bench import Bench
 from bampipe.discover.candidates import library
-from bampipe.discover.chance import Progress, Recipe, Session, workers
+from bampipe.discover.chance import Progress, workers
 from bampipe.discover.findings import Diagnosis
 from bampipe.discover.search import search
 from bampipe.discover.settings import Settings
 from bampipe.discover.verdict import conclude
+from bampipe.physics.recipe import Recipe
 from bampipe.physics.registry import effect_from
+from bampipe.trials.measured import MeasuredTrials
 
 Array = NDArray[np.float64]
 
 
 def diagnose(
-    session: Session,
+    trials: MeasuredTrials,
     recipe: Recipe,
     start: Array,
     settings: Settings | None = None,
@@ -37,7 +39,7 @@ def diagnose(
     """Find what a model lacks.
 
     Args:
-        session: the measured trials, at least two.
+        trials: the measured trials, at least two of them fitted.
         recipe: the model.
         start: parameters to start its fit from, (n_p,).
         settings: how carefully to look.
@@ -47,9 +49,9 @@ def diagnose(
         ValueError: fewer than two trials.
     """
     settings = settings or Settings()
-    if len(session.motions) < 2:
+    if len(trials.motions) < 2:
         raise ValueError("a diagnosis needs at least two trials: one is held out")
     device, extra = recipe.model().device, [effect_from(e) for e in recipe.extra]
-    with workers(session, settings.jobs) as pool:
-        bench = Bench(session, settings, pool, tuple(library(device, recipe.effects, extra)))
+    with workers(trials, settings.jobs) as pool:
+        bench = Bench(trials, settings, pool, tuple(library(device, recipe.effects, extra)))
         return conclude(search(bench, recipe, start, progress), settings)

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from bampipe.discover.evidence import Evidence
+from bampipe.results.record import Standing
+from bampipe.trials.residuals import Evidence
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,7 @@ class AxisFinding:
         rmse_before, rmse_after: held-out error without and with the effects found, N.m or N.
         noise_floor: what the final model leaves when it is the whole truth, N.m or N.
         floor_sd: its scatter over replays.
+        standing: the error against the floor.
         explainable_share: share of the residual of the model as given that a flexible regressor
             predicts on unseen trials, beyond what it predicts on replays; zero where that is nil.
         explainable_after: the same with the effects found.
@@ -46,6 +48,7 @@ class AxisFinding:
     rmse_after: float
     noise_floor: float
     floor_sd: float
+    standing: Standing
     explainable_share: float
     explainable_after: float
     explainable_chance: float

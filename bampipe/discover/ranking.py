@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bampipe.discover.chance import Recipe
 from bampipe.discover.findings import Ranked
 from bampipe.discover.search import Search
 from bampipe.physics.parameter import Parameter
+from bampipe.physics.recipe import Recipe
 
 Array = NDArray[np.float64]
 

@@ -9,11 +9,12 @@ import numpy as np
 
 from bampipe.discover.bench import Bench
 from bampipe.discover.candidates import Score
-from bampipe.discover.chance import Progress, Recipe, Replicate
-from bampipe.discover.evidence import Evidence
+from bampipe.discover.chance import Progress, Replicate
 from bampipe.discover.level import Level
 from bampipe.discover.start import with_effect
 from bampipe.estimate.simulation import Runaway
+from bampipe.physics.recipe import Recipe
+from bampipe.trials.residuals import Evidence
 
 
 def choose(

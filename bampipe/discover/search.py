@@ -10,12 +10,14 @@ from numpy.typing import NDArray
 
 from bampipe.discover.bench import Bench
 from bampipe.discover.candidates import Score, Scorer
-from bampipe.discover.chance import Progress, Recipe, Replicate
-from bampipe.discover.evidence import Evidence
+from bampipe.discover.chance import Progress, Replicate
 from bampipe.discover.level import Level
 from bampipe.discover.rivals import choose
 from bampipe.discover.start import with_effect, without_effect
 from bampipe.estimate.simulation import Runaway
+from bampipe.physics.recipe import Recipe
+from bampipe.trials.noise_floor import AT_FLOOR, FLOOR_SEED
+from bampipe.trials.residuals import Evidence
 
 Array = NDArray[np.float64]
 
@@ -66,7 +68,7 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
     progress(0.05, "scoring every candidate on the measured trials")
     first = bench.scores(base, initial.p, bench.names)
     progress(0.15, "replaying the model for chance levels")
-    level = bench.level(base, initial, bench.gaining(first, Scorer(initial)), (0,))
+    level = bench.level(base, initial, bench.gaining(first, Scorer(initial)), (FLOOR_SEED,))
     recipe, evidence, scores = base, initial, first
     groups: dict[str, tuple[str, ...]] = {}
     main: dict[str, int] = {}
@@ -104,7 +106,7 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
         rest = [n for n in bench.names if n not in groups and n not in dropped]
         scores = bench.scores(recipe, evidence.p, rest)
     progress(0.85, "replaying the final model for its noise floor")
-    final = bench.replicas(recipe, evidence.p, s.final_replicates, (), (1,), share=True)
+    final = bench.floor_replicas(recipe, evidence.p)
     return Search(
         base, initial, level, first, groups, main, evidence, tuple(final)
     )  # fmt: skip
@@ -138,7 +140,7 @@ def _able(
     scorer, s = Scorer(evidence), bench.settings
     level.ask(bench.gaining(scores, scorer))
     errors = np.array([r.error for r in replayed])
-    ceiling = s.at_floor * errors.mean(axis=0) + 2.0 * errors.std(axis=0, ddof=1)
+    ceiling = AT_FLOOR * errors.mean(axis=0) + 2.0 * errors.std(axis=0, ddof=1)
     worth = np.where(scorer.before.error > ceiling, s.worth, s.worth_at_floor)
     able = []
     for name, score in scores.items():

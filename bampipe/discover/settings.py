@@ -11,17 +11,15 @@ class Settings:
 
     Attributes:
         replicates: replays of the model for the chance level.
-        final_replicates: replays of the final model for the noise floor.
         rival_replicates: replays of each rival when candidates come close.
         most_effects: the most effects tried, those dropped again among them.
         significance: chance of a false alarm in a session that is accepted.
         worth: least drop of log error beyond chance, on one axis, that is worth an effect.
-        worth_at_floor: the same on an axis whose error is already within ``at_floor`` times its
-            noise floor: no replay is perfect, and changes of direction blurred by sampling invite
+        worth_at_floor: the same on an axis whose error is already at its noise floor: no replay
+            is perfect, and changes of direction blurred by sampling invite
             spurious effects, up to a tenth of the error on a linear axis.
-        at_floor: see ``worth_at_floor``.
-        above_floor: error over floor beyond which an axis still lacks something, if some of it
-            could be predicted from the motion.
+        predictable: least share of the residual of an axis above its floor that a flexible
+            regressor must predict, beyond chance, for it to lack something.
         surely: error over floor beyond which it lacks something, predictable or not.
         explained: least share of the excess mean square that the effects found must remove, else
             the axis is reported as unknown.
@@ -33,14 +31,12 @@ class Settings:
     """
 
     replicates: int = 10
-    final_replicates: int = 6
     rival_replicates: int = 4
     most_effects: int = 4
     significance: float = 0.01
     worth: float = 0.03
     worth_at_floor: float = 0.16
-    at_floor: float = 1.12
-    above_floor: float = 1.3
+    predictable: float = 0.05
     surely: float = 2.0
     explained: float = 0.6
     far: float = 5.0

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bampipe.discover.evidence import Evidence
-from bampipe.trials.observation import Motion
+from bampipe.trials.motion import Motion
+from bampipe.trials.residuals import Evidence
 
 Array = NDArray[np.float64]
 
@@ -79,9 +79,8 @@ def variables(evidence: Evidence, axis: int) -> tuple[Variable, ...]:
     for index, motion in enumerate(evidence.motions):
         kept = band.kept(len(motion.t))
         u = motion.inputs(system.inputs)
-        load = system.applied(
-            motion.q, motion.qd, motion.qdd, evidence.memory[index], u, evidence.p
-        )[:, axis]
+        memory = evidence.unfiltered(index)[1]
+        load = system.applied(motion.q, motion.qd, motion.qdd, memory, u, evidence.p)[:, axis]
         since, distance = _since_reversal(motion, axis)
         put("position", unit, motion.q[kept, axis])
         put("velocity", f"{unit}/s", motion.qd[kept, axis])
@@ -95,7 +94,7 @@ def variables(evidence: Evidence, axis: int) -> tuple[Variable, ...]:
                 put(f"{other.name} position", other.unit, motion.q[kept, k])
                 put(f"{other.name} velocity", f"{other.unit}/s", motion.qd[kept, k])
         for k, name in enumerate(system.memory_names):
-            put(name, "", evidence.memory[index][kept, k])
+            put(name, "", memory[kept, k])
         put("time", "s", motion.t[kept])
         put("trial", "", np.full(len(kept), float(index)))
     return tuple(Variable(name, u, tuple(v)) for name, (u, v) in columns.items())
@@ -130,8 +129,8 @@ def residual_map(evidence: Evidence, axis: int, variable: Variable, bins: int = 
         if np.sum(which == b) >= _LEAST
     ]
     center, mean, sd, n = (np.array(c, dtype=float) for c in zip(*rows, strict=True))
-    independent = np.maximum(n * 2.0 * evidence.band.step * evidence.band.cutoff_hz, 1.0)
-    half = 1.96 * sd / np.sqrt(np.maximum(independent / evidence.band.rate_hz, 2.0))
+    independent = n * evidence.band.independent_share[axis]
+    half = 1.96 * sd / np.sqrt(np.maximum(independent, 2.0))
     share = float(np.sum(n * (mean - r.mean()) ** 2) / max(np.sum((r - r.mean()) ** 2), 1e-30))
     return Map(variable.name, variable.unit, center, mean, mean - half, mean + half, n, share)
 

@@ -8,9 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.discover.candidates import Score, Scorer, candidate
-from bampipe.discover.chance import Recipe, Session, fit_session, system_of
-from bampipe.discover.evidence import Evidence
+from bampipe.discover.chance import fit_trials, system_of
+from bampipe.physics.recipe import Recipe
 from bampipe.physics.registry import device_from, effect_from
+from bampipe.trials.measured import MeasuredTrials
+from bampipe.trials.residuals import Evidence
 
 Array = NDArray[np.float64]
 
@@ -44,14 +46,14 @@ def without_effect(recipe: Recipe, evidence: Evidence) -> Array:
     return np.array([known[q.name] for q in system_of(recipe).parameters])
 
 
-def search_start(session: Session, recipe: Recipe) -> Array:
+def search_start(trials: MeasuredTrials, recipe: Recipe) -> Array:
     """Starting values of every parameter of a model, its effects taken one after the other.
 
     The device's parameters start at their priors and are fitted; each effect's shape is scanned
     over its range, where a descent from the prior would stay in the nearest valley.
     """
     bare = replace(recipe, effects=())
-    evidence = fit_session(session, bare, system_of(bare).prior)
+    evidence = fit_trials(trials, bare, system_of(bare).prior)
     device = device_from(recipe.device)
     extra = [effect_from(e) for e in recipe.extra]
     for count, name in enumerate(recipe.effects, start=1):
@@ -63,5 +65,5 @@ def search_start(session: Session, recipe: Recipe) -> Array:
             start = prior
         else:
             start = with_effect(wider, evidence, score)
-        evidence = fit_session(session, wider, start)
+        evidence = fit_trials(trials, wider, start)
     return evidence.p

@@ -11,30 +11,31 @@ from bampipe.discover.ranking import rank
 from bampipe.discover.search import Search
 from bampipe.discover.settings import Settings
 from bampipe.discover.shape import explainable_share
+from bampipe.trials.noise_floor import NoiseFloor, standing
 
 
 def conclude(search: Search, s: Settings) -> Diagnosis:
     """Say of each axis whether something is missing, and whether what was found explains it."""
-    before = Scorer(search.initial).before.error
-    after = Scorer(search.evidence).before.error
-    floors = np.array([r.error for r in search.final])
-    bare_floor = np.array([r.error for r in search.level.replicates]).mean(axis=0)
+    before, after = search.initial.held_out_rmse, search.evidence.held_out_rmse
+    floor = NoiseFloor.of_errors([r.held_out_rmse for r in search.final])
+    bare_floor = NoiseFloor.of_errors([r.held_out_rmse for r in search.level.replicates]).mean
     shares = np.array([r.share for r in search.final])
     reach = {n: _reach(search, n, s.worth) for n in search.selected}
     findings = []
     unknown = set()
     for axis in range(len(before)):
-        floor, scatter = floors[:, axis].mean(), floors[:, axis].std(ddof=1)
-        luck = float(shares[:, axis].max())
-        given = _beyond(explainable_share(search.initial, axis), luck)
+        level, scatter = float(floor.mean[axis]), float(floor.sd[axis])
+        by_chance = float(shares[:, axis].max())
+        given = _share_beyond_chance(explainable_share(search.initial, axis), by_chance)
         share = given
         if search.selected:
-            share = _beyond(explainable_share(search.evidence, axis), luck)
+            share = _share_beyond_chance(explainable_share(search.evidence, axis), by_chance)
         here = tuple(n for n in search.selected if search.main[n] == axis or axis in reach[n])
-        excess = before[axis] ** 2 - min(floor, bare_floor[axis]) ** 2
-        left = max(after[axis] ** 2 - floor**2, 0.0)
-        above = after[axis] / (floor + 3.0 * scatter / s.above_floor)
-        lacking = bool(above > s.surely or (above > s.above_floor and share > 0.05))
+        excess = before[axis] ** 2 - min(level, bare_floor[axis]) ** 2
+        left = max(after[axis] ** 2 - level**2, 0.0)
+        against_floor = standing(float(after[axis]), level, scatter)
+        above = after[axis] / max(level, 1e-30)
+        lacking = against_floor == "above_floor" and (above > s.surely or share > s.predictable)
         verdict = "missing" if here else "nothing_missing"
         explained = max(0.0, 1.0 - left / max(excess, 1e-30)) if here else 0.0
         if lacking and explained < (s.explained_far if above > s.far else s.explained):
@@ -45,11 +46,12 @@ def conclude(search: Search, s: Settings) -> Diagnosis:
                 verdict,
                 float(before[axis]),
                 float(after[axis]),
-                float(floor),
-                float(scatter),
+                level,
+                scatter,
+                against_floor,
                 given,
                 share,
-                luck,
+                by_chance,
                 here if verdict == "missing" else (),
                 lacking and verdict == "missing",
                 here if verdict == "unknown_effect" else (),
@@ -74,6 +76,6 @@ def _reach(search: Search, name: str, worth: float) -> set[int]:
     return {axis for axis in acts if drop[axis] > worth}
 
 
-def _beyond(share: float, luck: float) -> float:
+def _share_beyond_chance(share: float, by_chance: float) -> float:
     """Explained share beyond the one that replays give, of what they leave."""
-    return float(max(0.0, (share - luck) / max(1.0 - luck, 1e-9)))
+    return float(max(0.0, (share - by_chance) / max(1.0 - by_chance, 1e-9)))

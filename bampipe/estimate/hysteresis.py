@@ -23,6 +23,8 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 from scipy.signal import butter, find_peaks, sosfiltfilt
 
+from bampipe.estimate.white_noise import white_noise_sd
+
 Array = NDArray[np.float64]
 
 _PROMINENCE = 0.3
@@ -105,15 +107,6 @@ class Hysteresis:
     transition: float
     bend: float
     yielded: bool
-
-
-def noise_of(signal: Array) -> float:
-    """Return the standard deviation of the white noise on a slow ``signal`` (T,).
-
-    From third differences, which a slow signal hardly has; their median resists spikes.
-    """
-    differences = np.abs(np.diff(signal, n=3))
-    return float(np.median(differences) / 0.6744897501960817 / np.sqrt(20.0))
 
 
 def smoothed(torque: Array, rate_hz: float, cutoff_hz: float = 5.0) -> Array:
@@ -281,7 +274,7 @@ def hysteresis(
         raise ValueError("no whole load cycle: the load must turn round three times at least")
     if min(len(branch.torque) for branch in branches) < 8:
         raise ValueError("the deflection changes by fewer than 8 encoder counts on a branch")
-    noise = noise_of(torque) if noise_sd is None else noise_sd
+    noise = white_noise_sd(torque) if noise_sd is None else noise_sd
     noise /= np.sqrt(2.0)  # a count change takes the mean of two samples
     start = transition_of(branches, noise)
     window = (start, np.inf)

@@ -122,7 +122,8 @@ def stacked_residual(problem: Problem, trial: int, p: Array) -> Stacked:
     base, slopes = residual_and_slopes(problem, trial, p)
     count, n_q, n_free = slopes.shape
     columns = np.concatenate([base[:, :, None], slopes], axis=2).reshape(count, -1)
-    thin = problem.band.thin(columns).reshape(-1, n_q, 1 + n_free)
+    axes = np.repeat(np.arange(n_q, dtype=np.int64), 1 + n_free)
+    thin = problem.band.thin(columns, axes).reshape(-1, n_q, 1 + n_free)
     used = moving(problem.resting[trial], problem.band)
     thin *= used[:, :, None]
     return Stacked(np.ascontiguousarray(thin[:, :, 0]), np.ascontiguousarray(thin[:, :, 1:]), used)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 
@@ -75,32 +76,68 @@ def low_pass_at(values: Array, cutoff_hz: float, rate_hz: float, kept: NDArray[n
 
 @dataclass(frozen=True)
 class Band:
-    """The low-pass that residuals go through.
+    """The low-pass that residuals go through, axis by axis.
 
     Attributes:
         rate_hz: sampling rate of what comes in.
-        cutoff_hz: half-power frequency of each of the two passes; a fifth of the sampling
-            rate where that is lower.
+        cutoff_hz: half-power frequency of each of the two passes, by axis, (n_q,), Hz; a fifth of
+            the sampling rate where that is lower.
         margin_s: left out at both ends of a trial, where the filter has no past or future.
     """
 
     rate_hz: float
-    cutoff_hz: float = 8.0
+    cutoff_hz: tuple[float, ...]
     margin_s: float = 0.2
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "cutoff_hz", min(self.cutoff_hz, 0.2 * self.rate_hz))
+        most = 0.2 * self.rate_hz
+        object.__setattr__(self, "cutoff_hz", tuple(min(float(f), most) for f in self.cutoff_hz))
+
+    @property
+    def widest_hz(self) -> float:
+        """The highest cut-off of all axes, Hz."""
+        return max(self.cutoff_hz)
 
     @property
     def step(self) -> int:
-        """Samples from one kept value to the next: five a period of the cut-off frequency."""
-        return max(1, int(self.rate_hz / (5.0 * self.cutoff_hz)))
+        """Samples from one thinned value to the next: five a period of the highest cut-off."""
+        return max(1, int(self.rate_hz / (5.0 * self.widest_hz)))
+
+    @property
+    def independent_share(self) -> Array:
+        """Share of the thinned samples that are independent, by axis, (n_q,).
+
+        A low-pass leaves two independent samples a period of its cut-off.
+        """
+        spacing = self.step * 2.0 * np.array(self.cutoff_hz) / self.rate_hz
+        return np.minimum(1.0, spacing)
 
     def kept(self, count: int) -> NDArray[np.int64]:
-        """Indices of the samples kept of ``count``."""
+        """Indices of the samples that thinning keeps of ``count``."""
         margin = int(self.margin_s * self.rate_hz)
         return np.arange(margin, count - margin, self.step, dtype=np.int64)
 
-    def thin(self, values: Array) -> Array:
-        """Low-pass (T, k) without phase and keep the rows `kept`."""
-        return low_pass_at(values, self.cutoff_hz, self.rate_hz, self.kept(len(values)))
+    def thin(self, values: Array, axes: Sequence[int] | NDArray[np.int64] | None = None) -> Array:
+        """Low-pass (T, k) without phase and keep the rows `kept`.
+
+        Args:
+            values: on a uniform grid.
+            axes: the axis whose cut-off each column has, (k,); by default column i has that of
+                axis i modulo n_q.
+        """
+        kept, cutoffs = self.kept(len(values)), np.array(self.cutoff_hz)
+        which = np.arange(values.shape[1]) % cutoffs.size if axes is None else np.asarray(axes)
+        by_column = cutoffs[which]
+        distinct = np.unique(by_column)
+        if distinct.size == 1:
+            return low_pass_at(values, float(distinct[0]), self.rate_hz, kept)
+        out = np.empty((len(kept), values.shape[1]))
+        for cutoff in distinct:
+            chosen = by_column == cutoff
+            out[:, chosen] = low_pass_at(values[:, chosen], float(cutoff), self.rate_hz, kept)
+        return out
+
+    def thin_input(self, values: Array) -> Array:
+        """`thin` for columns (T, k) that belong to no axis: with the highest cut-off."""
+        widest = int(np.argmax(self.cutoff_hz))
+        return self.thin(values, [widest] * values.shape[1])

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from bampipe.estimate.least_squares import Problem
 from bampipe.identification.identifiability import Identifiability
 from bampipe.physics import System
-from bampipe.trials.motions import Motion
+from bampipe.trials.motion import Motion
 
 Array = NDArray[np.float64]
 

@@ -38,8 +38,8 @@ from bampipe.identification.sensor_noise import Noise, noise_report, tuned, untu
 from bampipe.identification.squares_estimate import Squares, bias_details
 from bampipe.physics import System
 from bampipe.progress import Progress
-from bampipe.trials.motions import Motion
-from bampipe.trials.trial_cache import Shelf
+from bampipe.trials.cache import TrialCache
+from bampipe.trials.motion import Motion
 
 Array = NDArray[np.float64]
 
@@ -86,7 +86,7 @@ def estimate_by_filter(
     """
     stride = stride_of(motions)
     near = squares.raw.p[: len(start)]
-    trials = Shelf(
+    trials = TrialCache(
         lambda place: trial_of(run, motions[place], system, near, noise, stride, choice),
         len(motions),
         lambda trial: int(trial.t.size),

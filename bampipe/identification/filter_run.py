@@ -25,7 +25,8 @@ from bampipe.estimate.unscented import (
 from bampipe.identification.filter_choice import FilterChoice
 from bampipe.identification.sensor_noise import Noise
 from bampipe.physics import System
-from bampipe.trials.motions import Motion, input_columns
+from bampipe.trials.motion import Motion
+from bampipe.trials.reading import input_columns
 
 Array = NDArray[np.float64]
 
@@ -147,7 +148,7 @@ def trial_of(
     brakes = system.model.device.brakes.values()
     for place, name in enumerate(system.inputs):
         if name not in frame and name != "t" and name not in brakes:
-            frame[name] = np.interp(t, motion.t, motion.u[:, place])
+            frame[name] = np.interp(t, motion.t, motion.inputs(system.inputs)[:, place])
     u = input_columns(frame, system.inputs, system.model.device.brakes, t, str(path))
     for column in u.T:
         lost = np.isnan(column)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from bampipe.estimate.unscented import FilterModel, Stored
 from bampipe.identification.filter_run import FilterRun
 from bampipe.physics import System
-from bampipe.trials.motions import Motion
+from bampipe.trials.motion import Motion
 
 Array = NDArray[np.float64]
 
@@ -112,9 +112,10 @@ def with_torques(
         t: (K,) times of the rows; columns: each (K,).
         p: (n_p,) parameters.
     """
-    z = system.memory(motion.q, motion.qd, motion.qdd, motion.u, p, motion.t)
-    hand = system.applied(motion.q, motion.qd, motion.qdd, z, motion.u, p)
-    gravity = system.compensation(motion.q, motion.qd, z, motion.u, p)
+    u = motion.inputs(system.inputs)
+    z = system.memory(motion.q, motion.qd, motion.qdd, u, p, motion.t)
+    hand = system.applied(motion.q, motion.qd, motion.qdd, z, u, p)
+    gravity = system.compensation(motion.q, motion.qd, z, u, p)
     frame = pd.DataFrame({"trial_id": motion.trial_id, "t": t, **columns})
     for i, axis in enumerate(system.coordinates):
         frame[f"torque_user_{axis}"] = np.interp(t, motion.t, hand[:, i])

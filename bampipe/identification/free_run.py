@@ -22,7 +22,7 @@ from bampipe.estimate.simulation import simulate
 from bampipe.physics import System
 from bampipe.physics.control_law import ControlLaw, compile_law
 from bampipe.physics.device import INPUT_ORDERS, derivative
-from bampipe.trials.motions import Motion
+from bampipe.trials.motion import Motion
 
 Array = NDArray[np.float64]
 
@@ -123,29 +123,30 @@ def _closed(run: RunFolder, system: System, motion: Motion, p: Array, law: Contr
     r = np.empty((len(motion.t), len(law.inputs)))
     for place, name in enumerate(law.inputs):
         r[:, place] = motion.t if name == "t" else frame[name].to_numpy(dtype=float)
+    u = motion.inputs(system.inputs)
     force = [system.inputs.index(name) for name in law.forces]
     _, total, seen = simulate_controlled(
-        system.derivative, system.measure, law.command, _start(system, motion, p), motion.u, r,
+        system.derivative, system.measure, law.command, _start(system, motion, p), u, r,
         p[: len(system.parameters)], _interval(motion),
         width=_width(system), n_noise=len(system.noise), force=force, rate_hz=law.rate_hz,
         limits=law.limits,
     )  # fmt: skip
     measured = np.hstack([motion.q, motion.qd])
-    return _Run(motion.trial_id, measured, seen, motion.u[:, force], total[:, force])
+    return _Run(motion.trial_id, measured, seen, u[:, force], total[:, force])
 
 
 def _open(system: System, motion: Motion, p: Array, push: Array | None = None) -> _Run:
-    start = _start(system, motion, p)
+    start, u = _start(system, motion, p), motion.inputs(system.inputs)
     n = motion.q.shape[1]
     if push is not None:
         start[:n] += push
     x = simulate(
-        system.derivative, start, motion.u, p[: len(system.parameters)], _interval(motion),
+        system.derivative, start, u, p[: len(system.parameters)], _interval(motion),
         width=_width(system), n_noise=len(system.noise),
     )  # fmt: skip
     seen = np.empty((len(x), 2 * n))
     for i in range(len(x)):
-        system.measure(x[i], motion.u[i], p, seen[i])
+        system.measure(x[i], u[i], p, seen[i])
     none = np.zeros((len(x), 0))
     return _Run(motion.trial_id, np.hstack([motion.q, motion.qd]), seen, none, none)
 
@@ -161,10 +162,11 @@ def _forgets(system: System, motion: Motion, p: Array) -> bool:
 
 
 def _start(system: System, motion: Motion, p: Array) -> Array:
+    u = motion.inputs(system.inputs)
     q, qd, _ = system.true_motion(
-        motion.q[:1], motion.qd[:1], motion.qdd[:1], motion.u[:1], p[: len(system.parameters)]
+        motion.q[:1], motion.qd[:1], motion.qdd[:1], u[:1], p[: len(system.parameters)]
     )
-    memory = system.initial_memory(q[0], motion.u[0], p)
+    memory = system.initial_memory(q[0], u[0], p)
     return np.concatenate([q[0], qd[0], memory])
 
 

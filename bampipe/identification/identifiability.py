@@ -22,7 +22,7 @@ from bampipe.estimate.least_squares import Problem, residual_and_slopes
 from bampipe.identification.sensor_noise import Noise
 from bampipe.physics import System
 from bampipe.physics.structure import Number, Structure, structure
-from bampipe.trials.motions import Motion
+from bampipe.trials.motion import Motion
 
 Array = NDArray[np.float64]
 
@@ -144,7 +144,7 @@ def _of_trial(
     """Return the information of one trial on the parameters, then on the device's numbers."""
     motion, own = motions[trial], p[:-1]
     n = len(system.coordinates)
-    u = motion.u - p[-1] * motion.u_rate
+    u = motion.inputs(system.inputs) - p[-1] * motion.input_rates(system.inputs)
     z = system.memory(motion.q, motion.qd, motion.qdd, u, own, motion.t)
     moved = system.true_motion(motion.q, motion.qd, motion.qdd, u, own)
     slope = np.concatenate(

@@ -17,7 +17,7 @@ from bampipe.identification.filter_tables import as_filtered
 from bampipe.identification.squares_estimate import Squares
 from bampipe.physics import System
 from bampipe.progress import Progress
-from bampipe.trials.motions import Motion
+from bampipe.trials.motion import Motion
 
 Array = NDArray[np.float64]
 
@@ -45,7 +45,8 @@ def segments_of(system: System, motion: Motion, trial: Trial, p: Array) -> list[
     y, u = (np.stack([np.interp(t, trial.t, c) for c in x.T], axis=1) for x in (trial.y, trial.u))
     rate = np.gradient(u, dt, axis=0)
     width = np.array([c.sign_width for c in system.model.device.coordinates])
-    memory = system.memory(motion.q, motion.qd, motion.qdd, motion.u, p, motion.t)
+    given = motion.inputs(system.inputs)
+    memory = system.memory(motion.q, motion.qd, motion.qdd, given, p, motion.t)
     state = np.hstack([motion.qd, memory])
     count = max(4 * nx, round(SEGMENT_S / dt))
     found = []

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +18,8 @@ from bampipe.estimate.unscented import (
 )
 from bampipe.identification.filter_choice import FilterChoice
 from bampipe.physics import System
-from bampipe.trials.motions import Motion
+from bampipe.trials.motion import Motion
+from bampipe.trials.sensors import Sensors
 
 Array = NDArray[np.float64]
 
@@ -45,76 +45,57 @@ class Noise:
 
 
 def sensor_noise(
-    session: Mapping[str, Any],
+    sensors: Sensors,
     system: System,
     motions: Sequence[Motion],
     p: Array,
     choice: FilterChoice,
 ) -> Noise:
-    """Encoder steps spread evenly, sd = step / sqrt(12); force noise as the session says.
+    """Noise of the session's sensors as the filter wants it.
 
-    Where the session does not say, the second difference of the force gives it: the force
-    of a hand is smooth over two milliseconds. Process noise that is no force starts as the
-    torque of the same noise at an arm of 1 m. Where the load moves the encoder against the
-    handle, the noise of a force adds to what the model says that the encoder reads.
+    Process noise that is no force starts as the torque of the smallest force noise at an arm of
+    1 m. Where the load moves the encoder against the handle, the noise of a force adds to what
+    the model says that the encoder reads.
 
     Args:
-        session: ``ingest/session.json``; system: the model; motions: the trials.
+        sensors: of the session; system: the model; motions: the trials.
         p: (n_p,) parameters near the answer.
         choice: fixes levels that are not to be found.
     """
-    reading = []
-    for place, axis in enumerate(system.coordinates):
-        step = session["axes"][axis].get("resolution") or 0.0
-        if choice.reading_noise > 0.0 and step > 0.0:
-            reading.append(choice.reading_noise * step)
-        elif step > 0.0:
-            reading.append(step / np.sqrt(12.0))
-        else:
-            reading.append(white_part([motion.q[:, place] for motion in motions]))
+    reading = sensors.reading_sd.copy()
+    if choice.reading_noise > 0.0:
+        reading = choice.reading_noise * sensors.resolution
     if choice.measure == "position_velocity":
         velocity = np.concatenate([motion.qd_sd for motion in motions])
-        reading.extend(np.median(velocity, axis=0))
-    given = session.get("force", {}).get("noise_sd")
+        reading = np.append(reading, np.median(velocity, axis=0))
+    force_sd = dict(zip(system.model.device.forces, sensors.force_sd, strict=True))
     is_force = np.array([name in system.inputs for name in system.noise])
-    process = np.zeros(len(system.noise))
-    forces = [name for name, force in zip(system.noise, is_force, strict=True) if force]
-    for place, name in enumerate(system.noise):
-        if choice.force_noise > 0.0:
-            process[place] = choice.force_noise
-        elif name in forces and isinstance(given, int | float) and given > 0.0:
-            process[place] = float(given)
-        elif name in forces:
-            column = system.inputs.index(name)
-            process[place] = white_part([motion.u[:, column] for motion in motions])
+    process = np.array([float(force_sd.get(name, 0.0)) for name in system.noise])
+    if choice.force_noise > 0.0:
+        process[:] = choice.force_noise
     smallest = process[is_force].min() if is_force.any() else 0.05
     process[process == 0.0] = smallest or np.finfo(float).eps
-    noise = Noise(np.array(reading), process, is_force)
+    noise = Noise(reading, process, is_force)
     if not system.moves_sensors:
         return noise
     n = len(system.coordinates)
-    own = _force_in_positions(system, motions, p, noise)
-    return replace(noise, reading_sd=np.append(np.hypot(reading[:n], own), reading[n:]))
+    moved = _force_in_positions(system, motions, p, noise)
+    return replace(noise, reading_sd=np.append(np.hypot(reading[:n], moved), reading[n:]))
 
 
 def _force_in_positions(system: System, motions: Sequence[Motion], p: Array, noise: Noise) -> Array:
     """Return how far the noise of the forces moves the encoders in the model, RMS, (n_q,)."""
     square, count = np.zeros(len(system.coordinates)), 0
     for motion in motions:
-        here = system.true_motion(motion.q, motion.qd, motion.qdd, motion.u, p)[0]
+        given = motion.inputs(system.inputs)
+        here = system.true_motion(motion.q, motion.qd, motion.qdd, given, p)[0]
         for place in np.flatnonzero(noise.is_force):
-            u = motion.u.copy()
+            u = given.copy()
             u[:, system.inputs.index(system.noise[place])] += noise.process_sd[place]
             moved = system.true_motion(motion.q, motion.qd, motion.qdd, u, p)[0]
             square += np.sum((moved - here) ** 2, axis=0)
         count += len(motion.t)
     return np.asarray(np.sqrt(square / count))
-
-
-def white_part(records: Sequence[Array]) -> float:
-    """Standard deviation of the white part of a smooth signal, from its second differences."""
-    second = np.concatenate([np.diff(record, 2) for record in records])
-    return float(np.median(np.abs(second)) / (0.6745 * np.sqrt(6.0)))
 
 
 def untuned(system: System, noise: Noise, choice: FilterChoice) -> FilterSettings:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -15,8 +14,11 @@ from bampipe.estimate.least_squares import LeastSquares, Problem, fit
 from bampipe.identification.estimates import Estimate, timing_entry
 from bampipe.identification.filter_tables import as_filtered
 from bampipe.physics import System
-from bampipe.trials.motions import Motion, problem_of
-from bampipe.trials.replayed import replayed
+from bampipe.trials.kinematics import Kinematics
+from bampipe.trials.motion import Motion
+from bampipe.trials.replay import replay_motions
+from bampipe.trials.residuals import problem_of
+from bampipe.trials.sensors import Sensors
 
 Array = NDArray[np.float64]
 
@@ -26,19 +28,6 @@ _SAME = 1.0
 """Standard deviations within which the two fits are the same."""
 _SLOPE = (0.3, 3.0)
 """Range of how far the fit to a replay moves with a parameter: 1 where there is no bias."""
-
-
-def problem_with(problem: Problem, timing: bool) -> Problem:
-    """Return the problem with the timing of the inputs estimated or held as it is given."""
-    if timing:
-        return problem
-    return replace(
-        problem,
-        free=problem.free[:-1],
-        lower=problem.lower[:-1],
-        upper=problem.upper[:-1],
-        step=problem.step[:-1],
-    )
 
 
 @dataclass(frozen=True)
@@ -71,8 +60,8 @@ class Squares:
 
 
 def unbiased(
-    session: Mapping[str, Any],
-    settings: Mapping[str, Any],
+    sensors: Sensors,
+    kinematics: Kinematics,
     system: System,
     motions: Sequence[Motion],
     problem: Problem,
@@ -89,18 +78,18 @@ def unbiased(
     fitted as the measurement is (indirect inference, Gourieroux, Monfort and Renault 1993).
 
     Args:
-        session: ``ingest/session.json``; settings: ``filter/filter.json``.
+        sensors: that read the trials; kinematics: the filters they went through.
         system: the model; motions: the trials; problem: as fitted; raw: the fit.
     """
-    free, rate = problem.free, problem.band.rate_hz
+    free = problem.free
     count = len(system.parameters)
     timing = bool(free[-1] == count)
 
     def bias_at(p: Array) -> Array:
-        seen = replayed(
-            session, settings, system, motions, p[:count], rate, (0, 0), force_noise=False
+        replays = replay_motions(
+            system, p[:count], motions, sensors, kinematics, (0, 0), force_noise=False
         )
-        again = fit(problem_with(problem_of(system, seen, problem.band), timing), raw.p)
+        again = fit(problem_of(system, replays, problem.band, timing=timing), raw.p)
         return np.asarray((again.p - np.append(p[:count], 0.0))[free])
 
     def moved(bias: Array) -> Array:

@@ -26,15 +26,17 @@ from bampipe.estimate.unscented import (
     filter_trials,
 )
 from bampipe.identification.filter_run import filter_model, state_at
-from bampipe.identification.sensor_noise import white_part
 from bampipe.physics import System, compile_model
-from bampipe.trials.motions import free_trials, input_columns
+from bampipe.trials.reading import free_trials, input_columns
+from bampipe.trials.sensors import RecordNoise, settle_encoder, settle_force
 
 Array = NDArray[np.float64]
 
 Stream: TypeAlias = SampleStream
 """What `open_stream` returns."""
 
+_NO_STEP = 3e-6
+"""Noise of an encoder that did not move in the first samples, rad or m."""
 FIRST_LOOK = 500
 """Samples from which the noise is found where no run states it."""
 
@@ -227,8 +229,8 @@ def start_from_run(run: RunFolder, name: str, options: Options) -> tuple[System,
 def start_from_samples(system: System, t: Array, u: Array, q: Array, options: Options) -> Start:
     """Take parameters from the device's priors and the noise from the first samples.
 
-    The noise of a position is its smallest step, spread evenly; that of an input is what of it
-    is not smooth. The alarm's threshold is that of white Gaussian noise.
+    The noise of every channel is settled as `ingest` settles it. The alarm's threshold is that of
+    white Gaussian noise.
 
     Args:
         system: the model; t: (T,); u: (T, nu); q: (T, n_q): the first `FIRST_LOOK` samples.
@@ -239,13 +241,15 @@ def start_from_samples(system: System, t: Array, u: Array, q: Array, options: Op
     theta, spread = model.to_estimated(
         np.array([item.prior for item in free]), np.array([item.sd for item in free])
     )
-    reading = []
-    for column in q.T:
-        steps = np.abs(np.diff(column[np.isfinite(column)]))
-        moved = steps[steps > 1e-12]
-        reading.append((float(moved.min()) if moved.size else 1e-5) / np.sqrt(12.0))
-    sensed = {name: white_part([u[:, system.inputs.index(name)]]) for name in system.noise
-              if name in system.inputs}  # fmt: skip
+    reading = [
+        settle_encoder(axis, "", None, [RecordNoise.of(column)]).noise_sd or _NO_STEP
+        for axis, column in zip(system.coordinates, q.T, strict=True)
+    ]
+    sensed = {
+        name: settle_force(name, "", None, [RecordNoise.of(u[:, column])]).noise_sd
+        for column, name in enumerate(system.inputs)
+        if name in system.noise
+    }
     least = min((sd for sd in sensed.values() if sd > 0.0), default=0.05)
     n = len(system.coordinates)
     rate = 1.0 / float(np.median(np.diff(t)))

@@ -6,7 +6,7 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from bampipe.results.record import Names, Record, Result, Size
+from bampipe.results.record import Names, Record, Result, Size, Standing
 
 
 class FreeRunPosition(Record):
@@ -27,6 +27,7 @@ class Rung(Record):
     effects: Names
     held_out_rmse: dict[str, Size]
     noise_floor: dict[str, Size | None] = Field(description="null where none was computed")
+    standing: dict[str, Standing]
     unit: dict[str, str]
     free_run_mode: Literal["closed_loop", "open_loop"] | None = None
     free_run: dict[str, FreeRunPosition] = Field(default={}, description="By axis")

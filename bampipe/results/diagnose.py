@@ -6,7 +6,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from bampipe.results.record import Count, Names, Record, Result, Share, Size
+from bampipe.results.record import Count, Names, Record, Result, Share, Size, Standing
 
 Verdict = Literal["nothing_missing", "missing", "undecided", "unknown_effect"]
 UpToOne = Annotated[float, Field(le=1)]
@@ -21,6 +21,7 @@ class AxisVerdict(Record):
     rmse_after: Size = Field(description="With what was found")
     noise_floor: Size
     noise_floor_sd: Size
+    standing: Standing = Field(description="rmse_after against noise_floor")
     unit: str
     explainable_share: UpToOne = Field(
         description="Share of the residual that any flexible function predicts on unseen data"

@@ -9,6 +9,15 @@ from pydantic import Field
 from bampipe.results.record import Positive, Record, Result, Share, Size
 
 
+class ResidualBand(Record):
+    """The band in which residuals of one axis are compared, by every later stage."""
+
+    cutoff_hz: Positive
+    reason: str
+    force_hz: Size = Field(description="The applied force has 99 % of its power below this")
+    motion_hz: Positive = Field(description="Bandwidth of the filtered motion")
+
+
 class AxisFilter(Record):
     """How one axis was differentiated; standard deviations are medians over samples and trials."""
 
@@ -16,7 +25,7 @@ class AxisFilter(Record):
     bandwidth_hz: Positive
     bandwidth_reason: str
     order: int | None = Field(default=None, description="Of the motion model, Kalman smoother only")
-    resolution: Size = Field(description="0 where none is declared")
+    resolution: Size
     quantisation_sd: Size
     measurement_noise_sd: Size
     spectrum_floor_hz: Size = Field(description="Where the spectrum meets the encoder's noise")
@@ -25,6 +34,7 @@ class AxisFilter(Record):
     position_sd: Size
     velocity_sd: Size
     acceleration_sd: Size
+    band: ResidualBand
 
 
 class ForceFilter(Record):

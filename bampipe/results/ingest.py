@@ -13,9 +13,12 @@ class EncoderChannel(Record):
     """One axis."""
 
     unit: Literal["rad", "m"]
-    resolution: Size | None = Field(
-        description="Step of the encoder in that unit; null where none is declared"
+    resolution: Size = Field(description="Step of the encoder in that unit, as settled")
+    resolution_stated: Size | None = Field(description="By session.toml; null where it does not")
+    resolution_measured: Size | None = Field(
+        description="Step in which the readings move; null where they lie on no grid"
     )
+    noise_sd: Size = Field(description="Of a reading, its rounding included")
 
 
 class ForceChannels(Record):
@@ -23,7 +26,11 @@ class ForceChannels(Record):
 
     columns: Names
     unit: str
-    noise_sd: Size | None
+    noise_sd: dict[str, Size] = Field(description="Of a sample, by channel, as settled")
+    noise_sd_stated: Size | None = Field(description="By session.toml; null where it does not")
+    noise_sd_measured: dict[str, Size | None] = Field(
+        description="By channel; null where too little is recorded"
+    )
 
 
 class Channel(Record):
@@ -57,5 +64,8 @@ class IngestResult(Result):
     announced_rate_hz: Positive | None = Field(description="What session.toml says, or null")
     axes: dict[str, EncoderChannel] = Field(min_length=1)
     force: ForceChannels
+    sensor_warnings: Names = Field(
+        description="Where stated and measured noise or resolution disagree by more than twice"
+    )
     brakes: dict[str, Channel]
     channels: dict[str, Channel]

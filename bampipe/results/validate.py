@@ -6,7 +6,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import ConfigDict, Field
 
-from bampipe.results.record import Names, Positive, Record, Result, Size
+from bampipe.results.record import Count, Names, Positive, Record, Result, Size, Standing
 
 
 class AxisError(Record):
@@ -15,10 +15,7 @@ class AxisError(Record):
     rmse: Size = Field(description="Parameters as identified")
     rmse_without_friction: Size
     held_out_rmse: Size = Field(description="Each trial by the fit to the others")
-    noise_floor: Size | None = Field(
-        default=None,
-        description="held_out_rmse of the fitted model's own simulation, same sensors and filters",
-    )
+    published_rmse: Size = Field(description="Parameters as published, on the same trials")
     relative_error_percent: Size = Field(
         description="100 rmse / root mean square of the measured torque"
     )
@@ -30,6 +27,17 @@ class AxisError(Record):
         "an axis that nothing drives"
     )
     unit: str
+
+
+class JudgedError(AxisError):
+    """Error of one axis over all trials, held against its noise floor."""
+
+    noise_floor: Size | None = Field(
+        description="held_out_rmse of the fitted model's own replays, same sensors and filters; "
+        "null where none was computed"
+    )
+    noise_floor_sd: Size = Field(description="Scatter of one replay")
+    standing: Standing
 
 
 class TrialError(Record):
@@ -89,9 +97,14 @@ class ValidateResult(Result):
 
     model: str
     headline: str
-    cutoff_hz: Positive = Field(description="Low-pass of both sides, Hz")
+    cutoff_hz: dict[str, Positive] = Field(description="Low-pass of both sides by axis, Hz")
+    floor_replays: Count = Field(description="Replays that the noise floor is the mean of")
+    refused: Names = Field(
+        description="Why the published parameters are refused: they err by more than 1.2 times "
+        "what parameters refitted without each trial do"
+    )
     notes: Names
-    axes: dict[str, AxisError] = Field(
+    axes: dict[str, JudgedError] = Field(
         description="Over all free trials and those in a viscous field, stretches at rest left out"
     )
     trials: dict[str, TrialError]

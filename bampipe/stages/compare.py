@@ -84,6 +84,7 @@ def _rung(run: RunFolder, name: str, models: Mapping[str, ModelFile]) -> Rung:
         effects=effects,
         held_out_rmse={axis: entry.held_out_rmse for axis, entry in axes.items()},
         noise_floor={axis: entry.noise_floor for axis, entry in axes.items()},
+        standing={axis: entry.standing for axis, entry in axes.items()},
         unit={axis: entry.unit for axis, entry in axes.items()},
         free_run_mode=free.mode if free else None,
         free_run={

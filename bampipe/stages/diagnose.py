@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,21 +13,22 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass as checked_dataclass
 
 from bampipe.data.run_folder import RunFolder
-from bampipe.declarations.model_file import identified, load_model, model_inputs
+from bampipe.declarations.model_file import identified, load_model, model_inputs, read_recipe
 from bampipe.discover.advice import advise
-from bampipe.discover.chance import Recipe, Session
 from bampipe.discover.description import describe
 from bampipe.discover.diagnosis import diagnose
 from bampipe.discover.findings import Diagnosis
 from bampipe.discover.settings import Settings
 from bampipe.discover.shape import residual_map, variables, worst_windows
 from bampipe.errors import InputError
-from bampipe.estimate.low_pass import Band
 from bampipe.physics import compile_model
+from bampipe.physics.recipe import Recipe
 from bampipe.progress import Progress
 from bampipe.results.diagnose import DiagnoseResult
-from bampipe.schema import STRICT, Count, Positive
-from bampipe.trials.recordings import read_session, recipe_of
+from bampipe.results.identify import IdentifyResult
+from bampipe.schema import STRICT, Count
+from bampipe.trials.folds import HELD_OUT
+from bampipe.trials.measured import MeasuredTrials, read_measured_trials
 
 NAME = "diagnose"
 SUMMARY = "Find which physical effect the model lacks"
@@ -39,8 +41,6 @@ class Config:
     Attributes:
         model: which model version to diagnose.
         replicates: replays of the fitted model for the chance level; more is slower and sharper.
-        cutoff_hz: low-pass that both sides of the equation go through, Hz.
-        kinematics_cutoff_hz: low-pass of the velocities, Hz.
         significance: chance of a false alarm in a session that is accepted.
         jobs: worker processes; 0 means one for each processor, eight at most.
         seed: of the noise in the replays.
@@ -48,8 +48,6 @@ class Config:
 
     model: str = "base"
     replicates: Annotated[int, Field(ge=4)] = 10
-    cutoff_hz: Positive = 8.0
-    kinematics_cutoff_hz: Positive = 25.0
     significance: Annotated[float, Field(gt=0, lt=1)] = 0.01
     jobs: Count = 0
     seed: Count = 0
@@ -61,6 +59,7 @@ def inputs(config: Config) -> tuple[str, ...]:
         "ingest/session.json",
         "ingest/trials.parquet",
         "ingest/samples.parquet",
+        "filter/kinematics.parquet",
         "filter/filter.json",
         f"models/{config.model}/identify.json",
         *model_inputs(config.model),
@@ -88,17 +87,17 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
             where=f"device {model.device.name!r}",
             remedy="judge its models by validate and compare",
         )
-    sensors, motions = read_session(run, system, config.kinematics_cutoff_hz)
-    if len(motions) < 2:
+    late = run.read(IdentifyResult, config.model).input_timing
+    trials = read_measured_trials(run, system, every_input=True, late_s=late.estimate)
+    fitted = sum(group != HELD_OUT for group in trials.folds.groups)
+    if fitted < 2:
         raise InputError(
-            f"a diagnosis needs at least two moving trials, found {len(motions)}",
+            f"a diagnosis needs at least two moving trials, found {fitted}",
             where=str(run.root),
             remedy="one trial is held out to judge the others; record more free trials",
         )
-    session = Session(
-        tuple(motions), sensors, Band(sensors.rate_hz, min(config.cutoff_hz, 0.1 * sensors.rate_hz))
-    )
-    recipe = recipe_of(run, config.model, model)
+    trials = replace(trials, motions=tuple(trials.motions))
+    recipe = read_recipe(run, config.model, model)
     start = identified(run, config.model, system)
     settings = Settings(
         replicates=config.replicates,
@@ -106,8 +105,8 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         jobs=config.jobs or min(8, os.cpu_count() or 1),
         seed=config.seed,
     )
-    found = diagnose(session, recipe, start, settings, progress)
-    result = _result(found, session, recipe, config.model)
+    found = diagnose(trials, recipe, start, settings, progress)
+    result = _result(found, trials, recipe, config.model)
     return _summary(DiagnoseResult.model_validate(result).write(out))
 
 
@@ -130,7 +129,7 @@ def _summary(result: dict[str, Any]) -> dict[str, object]:
     }
 
 
-def _result(found: Diagnosis, session: Session, recipe: Recipe, model: str) -> dict[str, Any]:
+def _result(found: Diagnosis, trials: MeasuredTrials, recipe: Recipe, model: str) -> dict[str, Any]:
     names = found.evidence.system.coordinates
     units = found.evidence.system.torque_units
     shapes = {
@@ -150,6 +149,7 @@ def _result(found: Diagnosis, session: Session, recipe: Recipe, model: str) -> d
             "rmse_after": a.rmse_after,
             "noise_floor": a.noise_floor,
             "noise_floor_sd": a.floor_sd,
+            "standing": a.standing,
             "unit": units[i],
             "effects": list(a.effects),
             "remains": a.remains,
@@ -171,7 +171,7 @@ def _result(found: Diagnosis, session: Session, recipe: Recipe, model: str) -> d
         }
         for r in found.ranking
     ]
-    suggestion = _suggestion(found, session, recipe)
+    suggestion = _suggestion(found, trials, recipe)
     return {
         "model": model,
         "axes": axes,
@@ -252,7 +252,9 @@ def _maps(found: Diagnosis) -> dict[str, object]:
     return out
 
 
-def _suggestion(found: Diagnosis, session: Session, recipe: Recipe) -> dict[str, object] | None:
+def _suggestion(
+    found: Diagnosis, trials: MeasuredTrials, recipe: Recipe
+) -> dict[str, object] | None:
     for name in found.selected:
         group = found.groups.get(name, ())
         if not group:
@@ -263,7 +265,7 @@ def _suggestion(found: Diagnosis, session: Session, recipe: Recipe) -> dict[str,
         axis = ranked[name].axis
         values = {n: np.array(list(ranked[n].values.values())) for n in (name, group[0])}
         floor = found.axes[axis].noise_floor
-        advice = advise(session, recipe, found.initial, axis, name, group[0], values, floor)
+        advice = advise(trials, recipe, found.initial, axis, name, group[0], values, floor)
         return {
             "between": [name, group[0]],
             "axis": found.initial.system.coordinates[axis],

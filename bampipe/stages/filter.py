@@ -14,20 +14,26 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 
 from bampipe.data.run_folder import MOVING, RunFolder
 from bampipe.data.store import ParquetAppender, read_parquet
+from bampipe.declarations.model_file import load_device
 from bampipe.errors import InputError
-from bampipe.estimate import butterworth, kalman_smoother, savitzky_golay
+from bampipe.estimate import butterworth, kalman_smoother
 from bampipe.estimate.differentiation import (
     Array,
-    Derivatives,
     Flags,
     UniformGrid,
     uniform_grid,
 )
-from bampipe.physics.device import LAST_ORDER, derivative
+from bampipe.physics import Model, compile_model
 from bampipe.progress import Progress
 from bampipe.results.filter import FilterResult
 from bampipe.results.ingest import EncoderChannel, IngestResult
 from bampipe.schema import STRICT, NotNegative, Positive
+from bampipe.trials.band import AxisBand, find_band
+from bampipe.trials.cache import TrialCache
+from bampipe.trials.kinematics import AxisFilter, Kinematics
+from bampipe.trials.motion import input_derivatives, n_samples
+from bampipe.trials.reading import read_motion_of
+from bampipe.trials.sensors import Sensors
 
 NAME = "filter"
 SUMMARY = "Velocity and acceleration from the encoders, with error bands"
@@ -53,6 +59,8 @@ class Config:
             changes of direction must not be smeared, friction is read from them.
         force_cutoff_hz: half-amplitude frequency, Hz, of the derivatives of the force; the force
             itself is not filtered.
+        band_hz: upper end of the band in which residuals are compared, Hz, by every later stage; 0
+            takes it from the data, axis by axis: where motion and force carry signal above noise.
         tuning_samples: at most so many samples of each axis are used to choose the bandwidth,
             in equal parts from all trials, or from some that are spread over the session where
             there are very many.
@@ -62,12 +70,18 @@ class Config:
     cutoff_hz: NotNegative = 0.0
     minimum_bandwidth_hz: NotNegative = 20.0
     force_cutoff_hz: Positive = 25.0
+    band_hz: NotNegative = 0.0
     tuning_samples: Annotated[int, Field(ge=1000)] = 120_000
 
 
 def inputs(config: Config) -> tuple[str, ...]:
     """Return the paths the stage reads."""
-    return ("ingest/trials.parquet", "ingest/samples.parquet", "ingest/session.json")
+    return (
+        "ingest/trials.parquet",
+        "ingest/samples.parquet",
+        "ingest/session.json",
+        "ingest/device.toml?",
+    )
 
 
 def outputs(config: Config) -> tuple[str, ...]:
@@ -92,8 +106,7 @@ class _Trial:
 class _Choice:
     """How one axis is differentiated, and the words for it."""
 
-    model: kalman_smoother.MotionModel | None
-    cutoff_hz: float
+    filter: AxisFilter
     report: dict[str, object]
 
 
@@ -118,6 +131,13 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     choices = {
         axis: _choose(records[axis], rate, axes[axis].resolution or 0.0, config) for axis in axes
     }
+    method = "kalman" if config.method == "auto" else config.method
+    kinematics = Kinematics(
+        method,
+        rate,
+        {axis: choice.filter for axis, choice in choices.items()},
+        min(config.force_cutoff_hz, 0.2 * rate),
+    )
     levels: dict[str, list[tuple[float, float, float]]] = {axis: [] for axis in axes}
     interpolated: dict[str, float] = {}
     with ParquetAppender(out / "filter/kinematics.parquet") as file:
@@ -127,13 +147,32 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
             if isinstance(trial, str):
                 skipped[trial_id] = trial
                 continue
-            frame, bands = _differentiate(trial, choices, rate, config)
+            frame, bands = _differentiate(trial, kinematics)
             file.append(frame)
             interpolated[trial_id] = float(np.mean(trial.grid.bridged))
             for axis in axes:
                 levels[axis].append(bands[axis])
-    content = _report(config, axes, choices, levels, interpolated, skipped, rate)
+    progress(0.95, "the band of motion and force")
+    bands = _bands(run, out, session, kinematics, [k for k in ids if k in interpolated], config)
+    content = _report(config, kinematics, axes, choices, levels, interpolated, skipped, bands)
     return FilterResult.model_validate(content).write(out)
+
+
+def _bands(
+    run: RunFolder,
+    out: Path,
+    session: IngestResult,
+    kinematics: Kinematics,
+    ids: Sequence[str],
+    config: Config,
+) -> dict[str, AxisBand]:
+    """Find the band in which residuals are compared, from the trials just written."""
+    device = load_device(run, session.device)
+    system = compile_model(Model(device))
+    path = out / "filter/kinematics.parquet"
+    motions = TrialCache(lambda k: read_motion_of(path, ids[k], system), len(ids), n_samples)
+    sensors = Sensors.from_result(session, system.coordinates, device.forces)
+    return find_band(system, motions, sensors, kinematics, config.band_hz)
 
 
 def _load(samples: Path, trial_id: str, rate: float) -> _Trial | str:
@@ -195,8 +234,6 @@ def _choose(
             f"{cutoff:g} Hz is not below half the sampling rate of {rate:g} Hz",
             where="filter.cutoff_hz",
         )
-    ratio = kalman_smoother.ratio_for(cutoff, order, rate)
-    model = kalman_smoother.MotionModel(order, noise_sd, ratio, rate) if kalman else None
     if config.cutoff_hz:
         why = "set by the user"
     elif found < least:
@@ -219,27 +256,26 @@ def _choose(
     }
     if kalman:
         report["order"] = order
-    return _Choice(model, cutoff, report)
+    return _Choice(AxisFilter(cutoff, noise_sd, order if kalman else 0), report)
 
 
 def _differentiate(
-    trial: _Trial, choices: dict[str, _Choice], rate: float, config: Config
+    trial: _Trial, kinematics: Kinematics
 ) -> tuple[pd.DataFrame, dict[str, tuple[float, float, float]]]:
     """Return the rows of one trial and, per axis, the median error bands (position, ...)."""
     grid, frame = trial.grid, trial.frame
     columns: dict[str, object] = {"trial_id": trial.trial_id, "t": grid.t}
     bands: dict[str, tuple[float, float, float]] = {}
     motions = {
-        axis: _motion(
-            grid.resample(frame[f"q_{axis}"].to_numpy(dtype=np.float64)),
-            trial.seen, choice, rate, config.method,
+        axis: kinematics.differentiate(
+            axis, grid.resample(frame[f"q_{axis}"].to_numpy(dtype=np.float64)), trial.seen
         )
-        for axis, choice in choices.items()
-    }  # fmt: skip
+        for axis in kinematics.axes
+    }
     columns |= {f"q_{axis}": motion.position for axis, motion in motions.items()}
     columns |= {f"qd_{axis}": motion.velocity for axis, motion in motions.items()}
     columns |= {f"qdd_{axis}": motion.acceleration for axis, motion in motions.items()}
-    columns |= dict(_forces(grid, frame, rate, config.force_cutoff_hz))
+    columns |= dict(_inputs(grid, frame, kinematics))
     for name in _named(frame, "brake_"):
         columns[name] = grid.hold(frame[name].to_numpy(dtype=np.float64))
     for axis, motion in motions.items():
@@ -255,49 +291,34 @@ def _differentiate(
     return pd.DataFrame(columns), bands
 
 
-def _motion(position: Array, seen: Flags, choice: _Choice, rate: float, method: str) -> Derivatives:
-    """Return the motion of one axis of one trial."""
-    if choice.model is not None:
-        return kalman_smoother.smooth(position, choice.model, seen)
-    noise_sd = float(str(choice.report["measurement_noise_sd"]))
-    if method == "butterworth":
-        return butterworth.smooth(position, rate, choice.cutoff_hz, noise_sd)
-    return savitzky_golay.smooth(position, rate, choice.cutoff_hz, noise_sd)
-
-
 def _named(frame: pd.DataFrame, prefix: str) -> tuple[str, ...]:
     """Return the columns whose names start with ``prefix``."""
     return tuple(str(name) for name in frame.columns if str(name).startswith(prefix))
 
 
-def _forces(
-    grid: UniformGrid, frame: pd.DataFrame, rate: float, cutoff_hz: float
+def _inputs(
+    grid: UniformGrid, frame: pd.DataFrame, kinematics: Kinematics
 ) -> Iterator[tuple[str, Array]]:
-    """Yield the forces and other input channels, and their band-limited derivatives."""
+    """Yield the forces and other input channels, and their band-limited time derivatives."""
     taken = ("trial_id", "t", *_named(frame, "q_"), *_named(frame, "brake_"))
     names = [str(name) for name in frame.columns if name not in taken]
-    forces = {name: grid.resample(frame[name].to_numpy(dtype=np.float64)) for name in names}
-    cutoff = min(cutoff_hz, 0.2 * rate)
-    slopes = {n: butterworth.rates(force, rate, cutoff, LAST_ORDER) for n, force in forces.items()}
-    yield from forces.items()
-    for name, found in slopes.items():
-        yield derivative(name, 1), found[0]
-    for name, found in slopes.items():
-        for order, values in enumerate(found[1:], start=2):
-            yield derivative(name, order), values
+    inputs = {name: grid.resample(frame[name].to_numpy(dtype=np.float64)) for name in names}
+    yield from inputs.items()
+    for name, values in inputs.items():
+        yield from zip(input_derivatives(name), kinematics.input_rates(values), strict=True)
 
 
 def _report(
     config: Config,
+    kinematics: Kinematics,
     axes: Mapping[str, EncoderChannel],
     choices: dict[str, _Choice],
     levels: dict[str, list[tuple[float, float, float]]],
     interpolated: dict[str, float],
     skipped: dict[str, str],
-    rate: float,
+    bands: Mapping[str, AxisBand],
 ) -> dict[str, object]:
     """Return what filter.json holds."""
-    method = "kalman" if config.method == "auto" else config.method
     entries: dict[str, object] = {}
     for axis, choice in choices.items():
         typical = np.median(np.array(levels[axis]), axis=0)
@@ -307,17 +328,20 @@ def _report(
             "position_sd": float(typical[0]),
             "velocity_sd": float(typical[1]),
             "acceleration_sd": float(typical[2]),
+            "band": vars(bands[axis]),
         }
-    widest = ", ".join(f"{axis} {choice.cutoff_hz:.1f} Hz" for axis, choice in choices.items())
+    widest = ", ".join(f"{axis} {c.filter.bandwidth_hz:.1f} Hz" for axis, c in choices.items())
+    residuals = ", ".join(f"{axis} {band.cutoff_hz:.1f} Hz" for axis, band in bands.items())
     return {
-        "method": method,
+        "method": kinematics.method,
         "method_reason": "chosen by the user" if config.method != "auto" else (
             "default: bandwidth and order by maximum likelihood, gaps bridged with error bands"
         ),
-        "sample_rate_hz": rate,
+        "sample_rate_hz": kinematics.rate_hz,
         "axes": entries,
-        "force": {"derivative_cutoff_hz": min(config.force_cutoff_hz, 0.2 * rate)},
+        "force": {"derivative_cutoff_hz": kinematics.input_cutoff_hz},
         "bridged_fraction": interpolated,
         "skipped": skipped,
-        "headline": f"{method}, {len(interpolated)} trials; bandwidth {widest}",
+        "headline": f"{kinematics.method}, {len(interpolated)} trials; bandwidth {widest}; "
+        f"residuals compared below {residuals}",
     }  # fmt: skip

@@ -12,12 +12,10 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import write_parquet
-from bampipe.declarations.model_file import load_model, model_inputs
-from bampipe.discover.chance import Session
+from bampipe.declarations.model_file import load_model, model_inputs, read_recipe
 from bampipe.discover.start import search_start
 from bampipe.errors import InputError
 from bampipe.estimate.least_squares import fit
-from bampipe.estimate.low_pass import Band
 from bampipe.identification.estimates import content
 from bampipe.identification.filter_choice import FilterChoice
 from bampipe.identification.filter_estimate import estimate_by_filter
@@ -28,15 +26,21 @@ from bampipe.identification.sensor_noise import sensor_noise
 from bampipe.identification.squares_estimate import (
     Squares,
     estimate_by_squares,
-    problem_with,
     unbiased,
 )
 from bampipe.physics import System, compile_model
 from bampipe.progress import Progress
 from bampipe.results.identify import IdentifyResult
 from bampipe.schema import STRICT, Positive
-from bampipe.trials.motions import problem_of, read_motions
-from bampipe.trials.recordings import read_session, recipe_of
+from bampipe.trials.measured import read_measured_trials
+from bampipe.trials.reading import (
+    read_band,
+    read_kinematics,
+    read_motions,
+    read_sensors,
+    require_sound_motions,
+)
+from bampipe.trials.residuals import problem_of
 
 NAME = "identify"
 SUMMARY = "Parameters of the model with uncertainties, from the free trials"
@@ -63,7 +67,6 @@ class Config(FilterChoice):
             from the data.
         force_noise: of a force sample, N, model error included; 0 takes it from the data.
         longest_step_s: longest Runge-Kutta step, s.
-        cutoff_hz: low-pass of the least-squares residual, Hz.
         input_timing: whether the time by which inputs were sampled after positions is estimated.
         remove_bias: whether the bias that filters give least squares is measured and taken off.
         block_s: length of the blocks that are taken as independent of each other, s.
@@ -73,7 +76,6 @@ class Config(FilterChoice):
     model: str = "base"
     method: Literal["auto", "ukf", "least-squares", "output-error"] = "auto"
     start_factor: Positive = 1.0
-    cutoff_hz: Positive = 8.0
     input_timing: bool = True
     remove_bias: bool = True
 
@@ -98,17 +100,18 @@ def outputs(config: Config) -> tuple[str, ...]:
 
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
     """Estimate one model from the free trials; effects of brakes from braked ones too."""
-    session = run.read_json("ingest/session.json")
     system = compile_model(load_model(run, config.model))
     progress(0.0, "reading the trials")
     motions = read_motions(run, system, fitted=True, braked=system.braked)
-    rate = float(session["sample_rate_hz"])
+    require_sound_motions(system, motions)
+    sensors, kinematics = read_sensors(run, system), read_kinematics(run, system)
+    band = read_band(run, system)
     # A delay in the model and the timing of the inputs are one and the same to the data.
     free = {item.name for item in system.parameters if not item.fixed}
     timing = config.input_timing and free.isdisjoint(system.delays)
-    problem = problem_with(problem_of(system, motions, Band(rate, config.cutoff_hz)), timing)
+    problem = problem_of(system, motions, band, timing=timing)
     progress(0.1, "least squares")
-    start = _start(run, system, rate, config)
+    start = _start(run, system, config)
     own = problem.free[problem.free < len(start)]
     start[own] *= config.start_factor
     try:
@@ -117,11 +120,10 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         raise InputError(
             f"the free trials are too short to identify from ({error})", where=str(run.root)
         ) from error
-    settings = run.read_json("filter/filter.json")
     squares = Squares(raw, raw.p, None, problem)
     if config.remove_bias:
-        squares = unbiased(session, settings, system, motions, problem, raw)
-    noise = sensor_noise(session, system, motions, raw.p[: len(start)], config)
+        squares = unbiased(sensors, kinematics, system, motions, problem, raw)
+    noise = sensor_noise(sensors, system, motions, raw.p[: len(start)], config)
     method, notes = config.method, []
     if method in ("auto", "ukf"):
         try:
@@ -160,14 +162,12 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     return IdentifyResult.model_validate(found).write(out)
 
 
-def _start(run: RunFolder, system: System, rate: float, config: Config) -> Array:
+def _start(run: RunFolder, system: System, config: Config) -> Array:
     """Priors of the device; of effects, what a search over their range finds."""
     start = system.prior
     if system.model.effects:
-        sensors, motions = read_session(run, system)
-        recipe = recipe_of(run, config.model, system.model)
-        session = Session(tuple(motions), sensors, Band(rate, config.cutoff_hz))
-        found = search_start(session, recipe)
+        trials = read_measured_trials(run, system, every_input=True)
+        found = search_start(trials, read_recipe(run, config.model, system.model))
         count = len(system.model.device.parameters)
         start[count:] = found[count:]
     return start

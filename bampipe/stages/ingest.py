@@ -7,6 +7,7 @@ cannot be trusted is set aside with a reason (file, row, column), and the others
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -19,7 +20,7 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 
 from bampipe.data.quality import CleanTrial, Limits, clean
 from bampipe.data.readers import read_trial
-from bampipe.data.run_folder import RunFolder
+from bampipe.data.run_folder import MOVING, RunFolder
 from bampipe.data.session import SECONDS, Session, TrialEntry, inside, read_session
 from bampipe.data.store import ParquetAppender, write_parquet
 from bampipe.errors import InputError
@@ -30,6 +31,7 @@ from bampipe.physics.units import parse_unit
 from bampipe.progress import Progress
 from bampipe.results.ingest import Channel, EncoderChannel, ForceChannels, IngestResult
 from bampipe.schema import STRICT
+from bampipe.trials.sensors import RecordNoise, settle_encoder, settle_force
 
 NAME = "ingest"
 SUMMARY = "Read a session's raw logs, check and repair the trials, bring them to SI units"
@@ -97,6 +99,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     (out / "ingest").mkdir(parents=True, exist_ok=True)
     rows: list[dict[str, object]] = []
     reasons = _refused(session)
+    noise: dict[str, list[RecordNoise]] = defaultdict(list)
     total = len(session.trials)
     with ParquetAppender(out / "ingest/samples.parquet") as samples:
         for number, entry in enumerate(session.trials):
@@ -108,6 +111,8 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
                 continue
             rows.append(_row(entry, trial, ""))
             _append(samples, entry, trial)
+            if entry.kind in MOVING:
+                _measure_noise(noise, trial)
         if all(row["status"] == "set_aside" for row in rows):
             raise InputError(
                 f"none of the {total} trials is sound; the first: {rows[0]['reason']}",
@@ -116,10 +121,11 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     trials = _trials_table(rows)
     write_parquet(out / "ingest/trials.parquet", trials)
     rate = _rate(session, trials)
-    _description(session, device, rate).write(out)
+    description = _description(session, device, rate, noise)
+    description.write(out)
     if session.device_file is not None:
         (out / "ingest/device.toml").write_bytes(session.device_file.read_bytes())
-    return _summary(session, rows)
+    return _summary(session, rows) | {"warnings": list(description.sensor_warnings)}
 
 
 def _device(session: Session) -> Device:
@@ -268,6 +274,15 @@ def _append(samples: ParquetAppender, entry: TrialEntry, trial: CleanTrial) -> N
     samples.append({"trial_id": ids, "t": trial.t, **trial.columns})
 
 
+def _measure_noise(noise: dict[str, list[RecordNoise]], trial: CleanTrial) -> None:
+    """Note what a trial says of the noise of its encoders (``q_<axis>``) and inputs."""
+    for name, values in trial.columns.items():
+        if not name.startswith("brake_"):
+            # Encoders count: thinned, their records would only be shorter.
+            rate = 0.0 if name.startswith("q_") else trial.sample_rate
+            noise[name].append(RecordNoise.of(np.asarray(values, dtype=float), rate))
+
+
 def _row(entry: TrialEntry, trial: CleanTrial | None, reason: str) -> dict[str, object]:
     status = "set_aside"
     if trial is not None:
@@ -302,8 +317,20 @@ def _rate(session: Session, trials: pd.DataFrame) -> float:
     return measured
 
 
-def _description(session: Session, device: Device, rate: float) -> IngestResult:
+def _description(
+    session: Session, device: Device, rate: float, noise: Mapping[str, list[RecordNoise]]
+) -> IngestResult:
+    """Return what session.json says, the sensors settled."""
     force = session.force
+    stated = force.noise_sd if force else None
+    encoders = {
+        e.axis: settle_encoder(e.axis, e.unit, e.resolution, noise.get(f"q_{e.axis}", []))
+        for e in session.encoders
+    }
+    forces = {
+        name: settle_force(name, device.force_unit, stated, noise.get(name, []))
+        for name in device.forces
+    }
     own = session.device_file is not None
     return IngestResult(
         session_id=session.session_id,
@@ -316,14 +343,23 @@ def _description(session: Session, device: Device, rate: float) -> IngestResult:
         sample_rate_hz=rate,
         announced_rate_hz=session.sample_rate,
         axes={
-            encoder.axis: EncoderChannel(unit=encoder.unit, resolution=encoder.resolution)
+            encoder.axis: EncoderChannel(
+                unit=encoder.unit,
+                resolution=encoders[encoder.axis].resolution,
+                resolution_stated=encoders[encoder.axis].stated,
+                resolution_measured=encoders[encoder.axis].measured,
+                noise_sd=encoders[encoder.axis].noise_sd,
+            )
             for encoder in session.encoders
         },
         force=ForceChannels(
             columns=force.names if force else (),
             unit=device.force_unit,
-            noise_sd=force.noise_sd if force else None,
+            noise_sd={name: found.noise_sd for name, found in forces.items()},
+            noise_sd_stated=stated,
+            noise_sd_measured={name: found.measured for name, found in forces.items()},
         ),
+        sensor_warnings=[c.warning for c in (*encoders.values(), *forces.values()) if c.warning],
         brakes={f"brake_{brake.axis}": Channel(unit=brake.unit) for brake in session.brakes},
         channels={channel.name: Channel(unit=channel.unit) for channel in session.channels},
     )

@@ -2,50 +2,41 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from pydantic import Field
 from pydantic.dataclasses import dataclass as checked_dataclass
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import read_parquet, write_parquet
 from bampipe.declarations.model_file import identified, load_model, model_inputs
 from bampipe.errors import InputError
-from bampipe.estimate.least_squares import Problem, fit
-from bampipe.estimate.low_pass import Band
-from bampipe.estimate.standstill import moving
+from bampipe.estimate.least_squares import Problem
 from bampipe.identification.free_run import free_runs
 from bampipe.physics import System, compile_model
 from bampipe.progress import Progress
+from bampipe.results.identify import IdentifyResult
 from bampipe.results.validate import ValidateResult
-from bampipe.schema import STRICT, Count, Positive
-from bampipe.trials.motions import (
-    Motion,
-    free_trials,
-    held_out_trials,
-    problem_of,
-    read_motions,
-)
-from bampipe.trials.replayed import replayed
+from bampipe.schema import STRICT, Count
+from bampipe.trials.folds import HELD_OUT, Folds
+from bampipe.trials.measured import MeasuredTrials, read_measured_trials
+from bampipe.trials.motion import Motion
+from bampipe.trials.noise_floor import NoiseFloor, find_noise_floor, floor_replays, standing
+from bampipe.trials.reading import held_out_trials, require_sound_motions
+from bampipe.trials.residuals import Evidence, gather_evidence, problem_of
 
 NAME = "validate"
 SUMMARY = "Predicted against measured torque and force, on trials that the fit has not seen"
 
-HELD_OUT = -1
-"""Group of the trials that the session holds out."""
+REFUSED_BEYOND = 1.2
+"""Error of the published parameters over that of parameters refitted without each trial, beyond
+which they do not describe the trials they come from, and are refused."""
 
 Array = NDArray[np.float64]
-
-
-MOST_GROUPS = 10
-"""With more trials than this, they are held out in so many groups: the cost of leaving each out
-alone grows with the square of their number."""
 
 
 @checked_dataclass(frozen=True, config=STRICT)
@@ -54,9 +45,9 @@ class Config:
 
     Attributes:
         model: which model version.
-        cutoff_hz: low-pass that measured and predicted torque both go through, Hz.
         noise_floor: whether to compute what sensors and filters alone would leave.
-        repeats: simulated sessions for the noise floor.
+        repeats: replays for the noise floor; 0 takes as many as the length of the session asks
+            for, which is what `diagnose` does.
         seed: of their sensor noise.
         free_run: whether to run the model freely over every trial.
         hold_out_by: a channel that is constant in each trial, such as a gain or a supply voltage:
@@ -64,9 +55,8 @@ class Config:
     """
 
     model: str = "base"
-    cutoff_hz: Positive = 8.0
     noise_floor: bool = True
-    repeats: Annotated[int, Field(ge=1)] = 1
+    repeats: Count = 0
     seed: Count = 0
     free_run: bool = True
     hold_out_by: str = ""
@@ -113,98 +103,87 @@ class _Compared:
 
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
     """Compare one identified model with all free trials, and those in a viscous field."""
-    session = run.read_json("ingest/session.json")
     system = compile_model(load_model(run, config.model))
     p = identified(run, config.model, system)
-    late = run.read_json(f"models/{config.model}/identify.json")["input_timing"]
-    motions = read_motions(run, system, braked=True)
-    band = Band(float(session["sample_rate_hz"]), config.cutoff_hz)
-    timing = late["sd"] > 0.0  # zero where it was not estimated
-    problem = problem_of(system, motions, band, timing=timing)
-    p = np.append(p, late["estimate"])
+    late = run.read(IdentifyResult, config.model).input_timing
+    trials = read_measured_trials(run, system, late_s=late.estimate)
+    if config.hold_out_by:
+        trials = replace(trials, folds=_folds_by_channel(run, trials, config.hold_out_by))
+    require_sound_motions(system, trials.motions)
     progress(0.1, "held-out fits")
-    groups = _groups(run, motions, config.hold_out_by)
-    judged = _judged(groups)
-    fitted = _fitted(run, system, motions)
-    held_out = _held_out(problem, p, groups, fitted)
-    compared = _compare(system, motions, problem, p, held_out, judged)
+    evidence = gather_evidence(system, trials.motions, trials.band, p, trials.folds)
+    problem = problem_of(system, trials.motions, trials.band)
+    compared = [
+        _compare(system, motion, problem, evidence, number, p)
+        for number, motion in enumerate(trials.motions)
+    ]
     notes = []
-    if len(set(groups)) == 1:
+    if trials.folds.nothing_held_out:
         notes.append("One trial, or one group: nothing is held out; the error is that of the fit.")
-    floor: Array | None = None
+    floor: NoiseFloor | None = None
     if config.noise_floor:
-        progress(0.4, "noise floor")
+        count = config.repeats or floor_replays(trials.motions)
+
+        def report(done: int) -> None:
+            progress(0.4 + 0.4 * done / count, "noise floor")
+
+        report(0)
         try:
-            floor = _noise_floor(run, session, system, motions, band, p, config, groups, fitted)
+            floor = find_noise_floor(
+                evidence, trials.sensors, trials.kinematics, config.seed, count, report
+            )
         except InputError as error:
             notes.append(f"No noise floor: simulating the fitted model failed ({error}).")
-    used = replace(config, cutoff_hz=band.cutoff_hz)
-    content = _content(system, compared, floor, notes, used)
+    content = _content(system, trials, compared, floor, notes, config)
     if config.free_run:
         progress(0.8, "free runs")
-        content["free_run"] = free_runs(run, system, motions, held_out, judged)
+        unseen = [evidence.held_out_parameters(k) for k in range(len(trials.motions))]
+        content["free_run"] = free_runs(
+            run, system, trials.motions, unseen, [c.judged for c in compared]
+        )
     write_parquet(out / f"models/{config.model}/residuals.parquet", _table(system, compared))
     return ValidateResult.model_validate(content).write(out)
 
 
 def _compare(
-    system: System,
-    motions: Sequence[Motion],
-    problem: Problem,
-    p: Array,
-    held_out: Sequence[Array],
-    judged: Sequence[bool],
-) -> list[_Compared]:
-    """Compare every trial with the model as identified, held out, and without friction."""
+    system: System, motion: Motion, problem: Problem, evidence: Evidence, number: int, p: Array
+) -> _Compared:
+    """Compare one trial with the model as published, held out, and without friction."""
     frictionless = p.copy()
     for i, item in enumerate(system.parameters):
         if item.name.startswith(("viscous.", "coulomb.")):
             frictionless[i] = 0.0
-    compared = []
-    for k, motion in enumerate(motions):
-        n = len(system.parameters)
-        u = motion.u - p[n] * motion.u_rate
-        z = system.memory(motion.q, motion.qd, motion.qdd, u, p[:n], motion.t)
-        applied = system.applied(motion.q, motion.qd, motion.qdd, z, u, p[:n])
-        force = [system.inputs.index(name) for name in system.model.device.forces]
-        kept = problem.band.kept(len(motion.t))
-        thin = problem.band.thin
-        residual = thin(problem.residual(k, p))
-        push = np.linalg.pinv(system.input_map(motion.q[kept], u[kept], p[:n]))
-        compared.append(
-            _Compared(
-                trial_id=motion.trial_id,
-                t=motion.t[kept],
-                used=moving(problem.resting[k], problem.band),
-                measured=thin(applied),
-                residual=residual,
-                residual_held_out=thin(problem.residual(k, held_out[k])),
-                residual_without_friction=thin(problem.residual(k, frictionless)),
-                force=thin(motion.u[:, force]),
-                force_residual=np.einsum("tfq,tq->tf", push, residual),
-                judged=judged[k],
-            )
-        )
-    return compared
+    band, folds = problem.band, evidence.folds
+    u = motion.inputs(system.inputs)
+    z = system.memory(motion.q, motion.qd, motion.qdd, u, p, motion.t)
+    applied = system.applied(motion.q, motion.qd, motion.qdd, z, u, p)
+    force = [system.inputs.index(name) for name in system.model.device.forces]
+    rows = band.kept(len(motion.t))
+    residual = band.thin(problem.residual(number, np.append(p, 0.0)))
+    push = np.linalg.pinv(system.input_map(motion.q[rows], u[rows], p))
+    return _Compared(
+        trial_id=motion.trial_id,
+        t=motion.t[rows],
+        used=evidence.used[number],
+        measured=band.thin(applied),
+        residual=residual,
+        residual_held_out=evidence.held_out_residual(number),
+        residual_without_friction=band.thin(problem.residual(number, np.append(frictionless, 0.0))),
+        force=band.thin_input(u[:, force]),
+        force_residual=np.einsum("tfq,tq->tf", push, residual),
+        judged=folds.judged[number] and not folds.nothing_held_out,
+    )
 
 
-def _groups(run: RunFolder, motions: Sequence[Motion], channel: str) -> list[int]:
-    """Return the number of the group of each trial; trials of a group are held out together.
-
-    Trials that the session holds out are in the group `HELD_OUT`, which no fit sees.
+def _folds_by_channel(run: RunFolder, trials: MeasuredTrials, channel: str) -> Folds:
+    """Return folds that leave out together the trials at one value of a channel.
 
     Raises:
         InputError: the channel is not recorded, or changes within a trial.
     """
-    unseen = held_out_trials(run)
-    if not channel:
-        return [
-            HELD_OUT if motion.trial_id in unseen else number % MOST_GROUPS
-            for number, motion in enumerate(motions)
-        ]
     path = run.require("ingest/samples.parquet", "ingest")
     values = []
-    for motion in motions:
+    for motion in trials.motions:
         frame = read_parquet(path, trial=motion.trial_id)
         if channel not in frame:
             raise InputError(f"no channel {channel!r} is recorded", where="validate.hold_out_by")
@@ -217,73 +196,12 @@ def _groups(run: RunFolder, motions: Sequence[Motion], channel: str) -> list[int
             )
         values.append(float(column[0]))
     numbers = [sorted(set(values)).index(value) for value in values]
-    return [HELD_OUT if m.trial_id in unseen else k for m, k in zip(motions, numbers, strict=True)]
-
-
-def _fitted(run: RunFolder, system: System, motions: Sequence[Motion]) -> list[bool]:
-    """Return which trials a fit may see: those that `identify` does.
-
-    What brakes do is no part of a model without an effect of theirs: fitted to them, it would
-    be wrong where they are off as well.
-    """
-    seen = set(free_trials(run, fitted=True, braked=system.braked))
-    return [motion.trial_id in seen for motion in motions]
-
-
-def _judged(groups: Sequence[int]) -> list[bool]:
-    """Return which trials count as held out: those of the session, else all by turns."""
-    if HELD_OUT in groups:
-        return [group == HELD_OUT for group in groups]
-    return [len(set(groups)) > 1] * len(groups)
-
-
-def _held_out(
-    problem: Problem, p: Array, groups: Sequence[int], fitted: Sequence[bool]
-) -> list[Array]:
-    """Return, for each trial, the parameters that the fitted trials of other groups give."""
-    if len(set(groups)) == 1:
-        return [p] * problem.n_trials
-    start = fit(problem, p, trials=[i for i, fits in enumerate(fitted) if fits]).p
-    found = {}
-    for group in sorted(set(groups)):
-        others = [i for i, fits in enumerate(fitted) if fits and groups[i] != group]
-        found[group] = fit(problem, start, trials=others).p if others else p
-    return [found[group] for group in groups]
-
-
-def _noise_floor(
-    run: RunFolder,
-    session: Mapping[str, Any],
-    system: System,
-    motions: Sequence[Motion],
-    band: Band,
-    p: Array,
-    config: Config,
-    groups: Sequence[int],
-    fitted: Sequence[bool],
-) -> Array:
-    """Return the held-out error (n_q,) that the identified model leaves when it is the truth.
-
-    Every trial is replayed by the model under the measured force and an arm that keeps the
-    motion near the measured one; the replay goes through the same encoders, force noise,
-    filters and fits as the measurement.
-    """
-    settings = run.read_json("filter/filter.json")
-    squares, counts = np.zeros(len(system.coordinates)), np.zeros(len(system.coordinates))
-    parameters = p[: len(system.parameters)]
-    for repeat in range(config.repeats):
-        seed = (config.seed, repeat)
-        seen = replayed(session, settings, system, motions, parameters, band.rate_hz, seed)
-        problem = problem_of(system, seen, band)
-        start = np.append(parameters, 0.0)
-        for k, held in enumerate(_held_out(problem, start, groups, fitted)):
-            if HELD_OUT in groups and groups[k] != HELD_OUT:
-                continue
-            used = moving(problem.resting[k], band)
-            residual = band.thin(problem.residual(k, held)) * used
-            squares += np.sum(residual**2, axis=0)
-            counts += used.sum(axis=0)
-    return np.asarray(np.sqrt(squares / np.maximum(counts, 1.0)))
+    unseen = held_out_trials(run)
+    groups = [
+        HELD_OUT if motion.trial_id in unseen else number
+        for motion, number in zip(trials.motions, numbers, strict=True)
+    ]
+    return Folds.of_groups(groups, trials.folds.fitted)
 
 
 def _rms(values: Sequence[Array], used: Sequence[NDArray[np.bool_]]) -> Array:
@@ -298,9 +216,7 @@ def _percent(error: float, size: float) -> float:
     return float(100.0 * error / size) if size > 0.0 else 100.0
 
 
-def _entries(
-    system: System, compared: Sequence[_Compared], floor: Array | None
-) -> dict[str, dict[str, object]]:
+def _entries(system: System, compared: Sequence[_Compared]) -> dict[str, dict[str, object]]:
     """Return the numbers of each axis over some trials."""
     used = [c.used for c in compared]
     rmse = _rms([c.residual for c in compared], used)
@@ -309,6 +225,7 @@ def _entries(
     unseen = [c for c in compared if c.judged] or compared
     where = [c.used for c in unseen]
     held_out = _rms([c.residual_held_out for c in unseen], where)
+    published = _rms([c.residual for c in unseen], where)
     count = np.maximum(sum(keep.sum(axis=0) for keep in where), 1)
     mean = sum(np.sum(c.measured * c.used, axis=0) for c in unseen) / count
     spread = _rms([c.measured - mean for c in unseen], where)
@@ -321,30 +238,42 @@ def _entries(
             "rmse": float(rmse[i]),
             "rmse_without_friction": float(without[i]),
             "held_out_rmse": float(held_out[i]),
+            "published_rmse": float(published[i]),
             "relative_error_percent": _percent(rmse[i], size[i]),
             "held_out_relative_error_percent": _percent(held_out[i], unseen_size[i]),
             "fit_percent": None if fit is None else float(fit),
             "unit": system.torque_units[i],
         }
-        if floor is not None:
-            entries[axis]["noise_floor"] = float(floor[i])
     return entries
 
 
 def _content(
     system: System,
+    trials: MeasuredTrials,
     compared: Sequence[_Compared],
-    floor: Array | None,
+    floor: NoiseFloor | None,
     notes: Sequence[str],
     config: Config,
 ) -> dict[str, object]:
     """Return what validate.json says."""
-    axes = _entries(system, compared, floor)
+    axes = _entries(system, compared)
+    refused = []
+    for i, (axis, entry) in enumerate(axes.items()):
+        error, published = float(entry["held_out_rmse"]), float(entry["published_rmse"])  # type: ignore[arg-type]
+        level = None if floor is None else float(floor.mean[i])
+        scatter = 0.0 if floor is None else float(floor.sd[i])
+        entry["noise_floor"], entry["noise_floor_sd"] = level, scatter
+        entry["standing"] = standing(error, level, scatter)
+        if published > REFUSED_BEYOND * error:
+            refused.append(
+                f"{axis}: the published parameters err by {published:.3g} {entry['unit']} on the"
+                f" trials where parameters refitted without them err by {error:.3g}"
+            )
     forces = {}
     for column, name in enumerate(system.model.device.forces):
-        error = np.concatenate([c.force_residual[c.used.all(axis=1), column] for c in compared])
+        error_of = np.concatenate([c.force_residual[c.used.all(axis=1), column] for c in compared])
         forces[name] = {
-            "rmse": float(np.sqrt(np.mean(error**2))) if error.size else 0.0,
+            "rmse": float(np.sqrt(np.mean(error_of**2))) if error_of.size else 0.0,
             "unit": system.model.device.force_unit,
         }
     best = ", ".join(
@@ -353,16 +282,17 @@ def _content(
         if entry["fit_percent"] is not None
     )
     on = "held-out trials" if any(c.judged for c in compared) else "the trials it was fitted to"
+    refusal = f"estimate refused ({'; '.join(refused)}); " if refused else ""
     return {
         "model": config.model,
         "axes": axes,
-        "trials": {
-            c.trial_id: _entries(system, [c], None) | {"held_out": c.judged} for c in compared
-        },
+        "trials": {c.trial_id: _entries(system, [c]) | {"held_out": c.judged} for c in compared},
         "forces": forces,
-        "cutoff_hz": config.cutoff_hz,
+        "cutoff_hz": dict(zip(system.coordinates, trials.band.cutoff_hz, strict=True)),
+        "floor_replays": 0 if floor is None else floor.replays,
+        "refused": refused,
         "notes": list(notes),
-        "headline": f"fit on {on}: {best}",
+        "headline": f"{refusal}fit on {on}: {best}",
     }
 
 

@@ -38,7 +38,8 @@ from bampipe.progress import Progress
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.viscous import Damping, ViscousResult
 from bampipe.schema import STRICT, Positive
-from bampipe.trials.motions import Motion, read_motion
+from bampipe.trials.motion import Motion
+from bampipe.trials.reading import read_motion, read_sensors
 
 NAME = "viscous"
 SUMMARY = "Cartesian damping that the brakes rendered in the viscous trials, against the command"
@@ -132,9 +133,8 @@ def _no_rows() -> pd.DataFrame:
 
 def _unbraked(motion: Motion, system: System) -> Motion:
     """Return the trial as if no brake had been commanded."""
-    u = motion.u.copy()
-    u[:, _brakes(system)] = 0.0
-    return replace(motion, u=u)
+    none = np.zeros(motion.t.size)
+    return motion.with_channels({system.inputs[i]: none for i in _brakes(system)})
 
 
 def _brakes(system: System) -> list[int]:
@@ -152,7 +152,6 @@ def _estimated(
     progress: Progress,
 ) -> tuple[ViscousResult, pd.DataFrame]:
     """Return what viscous.json says, and how the estimates converged."""
-    session = run.read_json("ingest/session.json")
     known = identified.parameters
     start = np.array(
         [
@@ -160,7 +159,7 @@ def _estimated(
             for item in system.parameters
         ]
     )
-    noise = sensor_noise(session, system, motions, start, config)
+    noise = sensor_noise(read_sensors(run, system), system, motions, start, config)
     settings = untuned(system, noise, config)
     if identified.noise is not None and config.force_noise == 0.0:
         found_sd = [identified.noise.process_sd[name] for name in system.noise]
@@ -258,7 +257,8 @@ def _own_damping(system: System, motions: Sequence[Motion], p: Array) -> Array:
     total, count = 0.0, 0
     for motion in motions:
         rows = slice(None, None, max(1, len(motion.t) // 500))
-        back = np.linalg.pinv(system.input_map(motion.q[rows], motion.u[rows], p))
+        u = motion.inputs(system.inputs)[rows]
+        back = np.linalg.pinv(system.input_map(motion.q[rows], u, p))
         felt = np.einsum("tfi,ij,tfj->tf", back, joint, back)
         total, count = total + felt.sum(axis=0), count + len(felt)
     return np.asarray(total / count)

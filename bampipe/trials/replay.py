@@ -1,10 +1,18 @@
 """The fitted model in place of the machine: recordings that contain nothing the model lacks.
 
-Chance levels come from here. The model is driven along nearly the measured motion by the measured
-force plus an arm, and what it does is read by the same encoders and force sensor.
+Noise floors, chance levels and the bias of least squares come from here. The model is driven along
+nearly the measured motion by the measured force plus an arm; what it does is read by the same
+sensors and goes through the same filters.
 """
 
 from __future__ import annotations
+
+import shutil
+import tempfile
+import weakref
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +21,10 @@ from bampipe.estimate.butterworth import zero_phase
 from bampipe.estimate.simulation import simulate_tracking
 from bampipe.physics import System
 from bampipe.physics.device import derivative
-from bampipe.trials.observation import Motion, Recording, Sensors
+from bampipe.trials.cache import MOST_SAMPLES, TrialCache
+from bampipe.trials.kinematics import Kinematics
+from bampipe.trials.motion import Motion, Recording, n_samples
+from bampipe.trials.sensors import Sensors
 
 Array = NDArray[np.float64]
 
@@ -21,7 +32,7 @@ FOLLOWED_HZ = 10.0
 """Highest frequency of the motion to follow where encoder and handle move apart."""
 
 
-def replay(
+def replay_recording(
     system: System, p: Array, motion: Motion, sensors: Sensors, rng: np.random.Generator
 ) -> Recording:
     """Simulate one trial of a fitted model and read it with the session's sensors.
@@ -31,7 +42,7 @@ def replay(
         p: its parameters, (n_p,).
         motion: the measured trial to follow.
         sensors: resolution, noise and rate.
-        rng: source of the force noise and of where the encoders' counts fall.
+        rng: source of the noise and of where the encoders' counts fall.
 
     Raises:
         Runaway: the simulated motion grows without bounds.
@@ -55,18 +66,102 @@ def replay(
     for i in range(len(x)):
         system.measure(x[i], total[i], p, reading)
         seen[i] = reading[:n]
-    offset = rng.uniform(0.0, 1.0, n) * sensors.resolution
-    counts = np.floor((seen + offset) / sensors.resolution)
+    scatter = sensors.scatter_sd
+    if scatter.any():
+        seen += rng.normal(size=seen.shape) * scatter
+    step = np.where(sensors.resolution > 0.0, sensors.resolution, 1.0)
+    offset = rng.uniform(0.0, 1.0, n) * step
+    read = (np.floor((seen + offset) / step) + 0.5) * step - offset
+    read = np.where(sensors.resolution > 0.0, read, seen)
     force = total[:, [at[f] for f in forces]]
     force = force + rng.normal(size=force.shape) * sensors.force_sd
-    brakes = system.model.device.brakes
-    brake = np.zeros((len(x), n))
-    for i, axis in enumerate(system.coordinates):
-        if axis in brakes:
-            brake[:, i] = motion.channels[brakes[axis]]
-    other = {name: motion.channels[name] for name in system.model.device.channels}
-    read = (counts + 0.5) * sensors.resolution - offset
-    return Recording(motion.trial_id, read, force, brake, other)
+    return Recording(
+        motion.trial_id, read, {**motion.channels, **dict(zip(forces, force.T, strict=True))}
+    )
+
+
+def replay_motion(
+    system: System,
+    p: Array,
+    motion: Motion,
+    sensors: Sensors,
+    kinematics: Kinematics,
+    rng: np.random.Generator,
+) -> Motion:
+    """Replay one trial and filter it as the measured one was; arguments as `replay_recording`.
+
+    Time derivatives are made of the forces alone; other channels are the measured ones.
+    """
+    recording = replay_recording(system, p, motion, sensors, rng)
+    return kinematics.observe(recording, system.model.device.forces)
+
+
+def replay_motions(
+    system: System,
+    p: Array,
+    motions: Sequence[Motion],
+    sensors: Sensors,
+    kinematics: Kinematics,
+    seed: Sequence[int],
+    *,
+    force_noise: bool = True,
+) -> Sequence[Motion]:
+    """Replay every trial; long sessions are stored on disk, so that few trials are in memory.
+
+    Args:
+        system, p, motions, sensors, kinematics: as for `replay_motion`.
+        seed: of the sensor noise; the trial's number is added.
+        force_noise: whether the force sensor is noisy.
+
+    Raises:
+        Runaway: a simulated motion grows without bounds.
+    """
+    if not force_noise:
+        sensors = replace(sensors, force_sd=np.zeros_like(sensors.force_sd))
+
+    def replays() -> Iterator[Motion]:
+        for number, motion in enumerate(motions):
+            rng = np.random.default_rng([*seed, number])
+            yield replay_motion(system, p, motion, sensors, kinematics, rng)
+
+    if sum(n_samples(motion) for motion in motions) <= MOST_SAMPLES:
+        return list(replays())
+    return store_motions(replays())
+
+
+def store_motions(motions: Iterator[Motion]) -> Sequence[Motion]:
+    """Return trials that cannot be read again, from a folder that lasts as long as they do.
+
+    What comes back is bit by bit the same, and takes the memory of a few trials only.
+    """
+    folder = Path(tempfile.mkdtemp(prefix="bampipe-trials-"))
+    count = 0
+    try:
+        for count, motion in enumerate(motions, start=1):
+            arrays = {f"channel {name}": values for name, values in motion.channels.items()}
+            for name in _ARRAYS:
+                arrays[name] = getattr(motion, name)
+            np.savez(folder / f"{count - 1}.npz", trial_id=motion.trial_id, **arrays)
+    except BaseException:
+        shutil.rmtree(folder)
+        raise
+    trials = TrialCache(lambda number: _stored_motion(folder / f"{number}.npz"), count, n_samples)
+    weakref.finalize(trials, shutil.rmtree, folder)
+    return trials
+
+
+_ARRAYS = ("t", "q", "qd", "qdd", "qd_sd")
+
+
+def _stored_motion(path: Path) -> Motion:
+    with np.load(path) as stored:
+        channels = {
+            name.removeprefix("channel "): stored[name]
+            for name in stored.files
+            if name.startswith("channel ")
+        }
+        arrays = {name: stored[name] for name in _ARRAYS}
+        return Motion(trial_id=str(stored["trial_id"]), channels=channels, **arrays)
 
 
 def _reference(

@@ -7,12 +7,17 @@ from typing import Any
 
 import numpy as np
 
-from bampipe.discover.chance import Recipe, Session, system_of
+from bampipe.discover.chance import system_of
 from bampipe.estimate.butterworth import zero_phase
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import registry
-from bampipe.trials.observation import Motion, Sensors, observe
-from bampipe.trials.replay import replay
+from bampipe.physics.recipe import Recipe
+from bampipe.trials.folds import Folds
+from bampipe.trials.kinematics import AxisFilter, Kinematics
+from bampipe.trials.measured import MeasuredTrials
+from bampipe.trials.motion import Motion
+from bampipe.trials.replay import replay_motion
+from bampipe.trials.sensors import Sensors
 
 RATE = 250.0
 TRUTH = {
@@ -24,9 +29,24 @@ TRUTH = {
     "coulomb.extension": 3.6,
     "mass": 3.56,
 }
-SENSORS = Sensors(
-    RATE, np.array([1 / 21333.3333, 1 / 10191.0828, 1 / 33333.3333]), np.full(3, 0.05)
+RESOLUTION = np.array([1 / 21333.3333, 1 / 10191.0828, 1 / 33333.3333])
+SENSORS = Sensors(RATE, RESOLUTION, RESOLUTION / np.sqrt(12.0), np.full(3, 0.05))
+KINEMATICS = Kinematics(
+    "kalman",
+    RATE,
+    {
+        axis: AxisFilter(25.0, step / np.sqrt(12.0), 3)
+        for axis, step in zip(("yaw", "pitch", "extension"), RESOLUTION, strict=True)
+    },
+    25.0,
 )
+BAND = Band(RATE, (8.0, 8.0, 8.0))
+
+
+def folds(count: int) -> Folds:
+    """Each trial left out alone."""
+    names = [f"t{k}" for k in range(count)]
+    return Folds.of_trials(names, (), names)
 
 
 def bam(effects: Sequence[str] = (), extra: Sequence[Mapping[str, Any]] = ()) -> Recipe:
@@ -36,7 +56,7 @@ def bam(effects: Sequence[str] = (), extra: Sequence[Mapping[str, Any]] = ()) ->
 
 def made(
     recipe: Recipe, values: Mapping[str, float], trials: int = 4, seconds: float = 8.0
-) -> Session:
+) -> MeasuredTrials:
     """Replay designed motions with the model of ``recipe`` at TRUTH and ``values``."""
     system = system_of(recipe)
     known = TRUTH | {q.name: q.prior for q in system.parameters[len(TRUTH) :]} | dict(values)
@@ -69,7 +89,7 @@ def made(
             channels[f"{head}_rate_{component}"] = np.gradient(channels[name], t)
             for order in ("curvature", "third", "fourth", "fifth", "sixth"):
                 channels[f"{head}_{order}_{component}"] = np.zeros(len(t))
-        wanted = Motion(f"t{trial + 1:02d}", t, q, qd, qdd, channels)
-        recording = replay(system, p, wanted, SENSORS, np.random.default_rng([11, trial]))
-        motions.append(observe(recording, SENSORS, system))
-    return Session(tuple(motions), SENSORS, Band(RATE))
+        wanted = Motion(f"t{trial + 1:02d}", t, q, qd, qdd, np.zeros_like(qd), channels)
+        rng = np.random.default_rng([11, trial])
+        motions.append(replay_motion(system, p, wanted, SENSORS, KINEMATICS, rng))
+    return MeasuredTrials(tuple(motions), SENSORS, KINEMATICS, BAND, folds(trials))

@@ -17,5 +17,5 @@ def test_scores_come_in_one_order_for_any_number_of_jobs(jobs):
     def pool(function, tasks):
         return ({name: f"score of {name}" for name in task.names} for task in tasks)
 
-    bench = Bench(session=None, settings=Settings(jobs=jobs), pool=pool, names=names)
+    bench = Bench(trials=None, settings=Settings(jobs=jobs), pool=pool, names=names)
     assert list(bench.scores(bam(), np.zeros(7), names)) == list(names)

@@ -7,13 +7,13 @@ import pytest
 from sessions import bam, made
 
 from bampipe.discover.bench import Bench
-from bampipe.discover.chance import Session, fit_session, system_of
+from bampipe.discover.chance import fit_trials, system_of
 from bampipe.discover.description import describe
 from bampipe.discover.diagnosis import diagnose
 from bampipe.discover.settings import Settings
 from bampipe.estimate.simulation import Runaway
 
-QUICK = Settings(replicates=5, final_replicates=4, jobs=2)
+QUICK = Settings(replicates=5, jobs=2)
 
 SNAG = {
     "name": "snag",
@@ -108,17 +108,13 @@ def test_what_a_named_effect_leaves_is_said_to_remain():
 def test_one_trial_cannot_be_diagnosed():
     session = made(bam(), {}, trials=1)
     with pytest.raises(ValueError, match="two trials"):
-        diagnose(Session(session.motions, session.sensors, session.band), bam(), np.zeros(7))
+        diagnose(session, bam(), np.zeros(7))
 
 
 def test_the_same_session_gives_the_same_numbers_with_one_process_or_two():
     session = made(bam(), {}, trials=2, seconds=5.0)
-    one = diagnose(
-        session, bam(), system_of(bam()).prior, Settings(replicates=4, final_replicates=2, jobs=1)
-    )
-    two = diagnose(
-        session, bam(), system_of(bam()).prior, Settings(replicates=4, final_replicates=2, jobs=2)
-    )
+    one = diagnose(session, bam(), system_of(bam()).prior, Settings(replicates=4, jobs=1))
+    two = diagnose(session, bam(), system_of(bam()).prior, Settings(replicates=4, jobs=2))
     assert [r.p_value for r in one.ranking] == [r.p_value for r in two.ranking]
     assert [a.noise_floor for a in one.axes] == [a.noise_floor for a in two.axes]
 
@@ -160,7 +156,7 @@ HUM = RIPPLE | {
 )
 def test_the_period_of_an_unknown_effect_is_said(effect, pattern, truth):
     session = made(bam([f"{effect['name']}:yaw"], [effect]), {})
-    evidence = fit_session(session, bam(), system_of(bam()).prior)
+    evidence = fit_trials(session, bam(), system_of(bam()).prior)
     said = re.match(pattern, describe(evidence, 0))
     assert said
     assert float(said[1]) == pytest.approx(truth, rel=0.03)

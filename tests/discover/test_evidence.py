@@ -3,29 +3,56 @@
 import numpy as np
 import pytest
 from scipy.signal import butter, sosfiltfilt
-from sessions import RATE, SENSORS, TRUTH, bam, made
+from sessions import BAND, RATE, TRUTH, bam, folds, made
 
 from bampipe.discover.chance import system_of
-from bampipe.discover.evidence import fit, told, velocity_sd
 from bampipe.estimate.low_pass import Band
-from bampipe.trials.observation import Motion
+from bampipe.trials.motion import Motion
+from bampipe.trials.residuals import gather_evidence
 
 
 def test_thinning_equals_the_library_filter_away_from_the_ends():
-    band = Band(RATE)
+    band = Band(RATE, (8.0, 8.0))
     values = np.random.default_rng(0).normal(size=(3000, 2))
-    sections = butter(2, band.cutoff_hz, fs=RATE, output="sos")
+    sections = butter(2, 8.0, fs=RATE, output="sos")
     expected = sosfiltfilt(sections, values, axis=0)[band.kept(3000)]
     inner = slice(8, -8)
     assert np.allclose(band.thin(values)[inner], expected[inner], atol=1e-6)
 
 
+def test_each_axis_has_its_own_cut_off():
+    values = np.random.default_rng(1).normal(size=(3000, 2))
+    both = Band(RATE, (8.0, 20.0)).thin(values)
+    for column, cutoff in enumerate((8.0, 20.0)):
+        alone = butter(2, cutoff, fs=RATE, output="sos")
+        rows = Band(RATE, (8.0, 20.0)).kept(3000)
+        expected = sosfiltfilt(alone, values[:, column])[rows]
+        assert np.allclose(both[60:-60, column], expected[60:-60], atol=1e-6)
+
+
 def test_parameters_come_back_from_a_replayed_session():
     session = made(bam(), {}, trials=3)
     system = system_of(bam())
-    found = fit(system, session.motions, session.sensors, session.band, system.prior)
+    found = gather_evidence(system, session.motions, BAND, system.prior, session.folds)
     for parameter, value in zip(system.parameters, found.p, strict=True):
         assert value == pytest.approx(TRUTH[parameter.name], rel=0.02), parameter.name
+
+
+def test_held_out_errors_are_those_of_refits_without_each_trial():
+    """Up to the weights of the axes, which are those of the fit to all, for a linear model."""
+    recipe = bam(["stribeck:yaw"])
+    session = made(recipe, {"stribeck.yaw.force": 1.1, "stribeck.yaw.speed": 0.05}, trials=3)
+    for model, tolerance in ((bam(), 0.01), (recipe, 0.03)):
+        system = system_of(model)
+        found = gather_evidence(system, session.motions, BAND, system.prior, session.folds)
+        square, count = np.zeros(3), np.zeros(3)
+        for k, motion in enumerate(session.motions):
+            others = [m for i, m in enumerate(session.motions) if i != k]
+            refit = gather_evidence(system, others, BAND, found.p, folds(2))
+            unseen = gather_evidence(system, [motion], BAND, refit.p, folds(1), most_iterations=0)
+            square += unseen.sums.yy[0]
+            count += unseen.sums.count[0]
+        assert found.held_out_rmse == pytest.approx(np.sqrt(square / count), rel=tolerance)
 
 
 def test_standstill_is_left_out_and_quick_reversals_stay():
@@ -34,10 +61,11 @@ def test_standstill_is_left_out_and_quick_reversals_stay():
     qd[:, 0] = np.sin(2 * np.pi * 0.5 * t)
     qd[:, 1] = np.where((t > 3.0) & (t < 4.0), 0.0, 1.0)
     qd[:, 2] = 1.0
-    motion = Motion("t01", t, qd, qd, qd, {})
-    used = told(motion, SENSORS, Band(RATE))
-    kept_t = t[Band(RATE).kept(2000)]
+    system = system_of(bam())
+    channels = {name: np.zeros(2000) for name in system.inputs}
+    motion = Motion("t01", t, qd, qd, 0.0 * qd, np.full_like(qd, 1e-3), channels)
+    used = gather_evidence(system, [motion], BAND, system.prior, folds(1)).used[0]
+    rows = t[BAND.kept(2000)]
     assert used[:, 0].all() and used[:, 2].all()
-    assert not used[(kept_t > 3.1) & (kept_t < 3.9), 1].any()
-    assert used[kept_t < 2.7, 1].all()
-    assert np.all(velocity_sd(SENSORS) > 0)
+    assert not used[(rows > 3.1) & (rows < 3.9), 1].any()
+    assert used[rows < 2.7, 1].all()

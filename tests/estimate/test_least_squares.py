@@ -37,7 +37,7 @@ def problem(count: int = 3, truth: np.ndarray = TRUTH, **changes: object) -> Pro
         "upper": BOUNDS[1],
         "step": np.ones(3),
         "linear": True,
-        "band": Band(RATE),
+        "band": Band(RATE, (8.0,)),
         "resting": [np.zeros((len(m[0]), 1), dtype=bool) for m in motions],
     }
     return Problem(**(standard | changes))  # type: ignore[arg-type]
@@ -170,9 +170,9 @@ def test_too_short_a_record_is_refused() -> None:
 
 
 def test_the_low_pass_ends_at_a_fifth_of_a_low_sampling_rate():
-    assert Band(500.0).cutoff_hz == 8.0
-    slow = Band(20.0)
-    assert slow.cutoff_hz == 4.0 and slow.step == 1
+    assert Band(500.0, (8.0,)).cutoff_hz == (8.0,)
+    slow = Band(20.0, (8.0,))
+    assert slow.cutoff_hz == (4.0,) and slow.step == 1
     assert np.isfinite(slow.thin(np.ones((100, 1)))).all()
 
 

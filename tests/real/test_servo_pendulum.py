@@ -17,7 +17,8 @@ from bampipe.estimate.least_squares import fit
 from bampipe.estimate.low_pass import Band
 from bampipe.estimate.standstill import moving
 from bampipe.physics import Model, compile_model, registry
-from bampipe.trials.motions import free_trials, problem_of, read_motion
+from bampipe.trials.reading import free_trials, read_motion
+from bampipe.trials.residuals import problem_of
 
 HELD_OUT_GAIN = 200
 HEAD = """
@@ -36,7 +37,7 @@ supply = {{ column = "input_volts", unit = "V" }}
 goal = {{ column = "goal_position", unit = "rad" }}
 gain = {{ column = "kp", unit = "" }}
 """
-BAND = Band(188.0, 8.0)
+BAND = Band(188.0, (8.0,))
 
 
 def write_session(folder: Path, logs: list[Path], name: str) -> Path:

@@ -76,7 +76,11 @@ def write_ingest(root: Path, trials: tuple[str, ...] = FREE) -> None:
         session_id=root.name,
         device="bam",
         axes={axis: {"unit": u, "resolution": r} for axis, (u, r) in units.items()},
-        force={"noise_sd": 0.05, "unit": "N", "columns": ["force_x", "force_y", "force_z"]},
+        force={
+            "noise_sd": {"force_x": 0.05},
+            "unit": "N",
+            "columns": ["force_x", "force_y", "force_z"],
+        },
         sample_rate_hz=RATE,
         recorded_at="2026-10-03T10:12:00+00:00",
     )
@@ -222,7 +226,7 @@ def write_validation(root: Path, model: str) -> None:
         axes=axes,
         trials={name: {**axes, "held_out": True} for name in FREE},
         forces={"force_x": {"rmse": 0.1234, "unit": "N"}},
-        cutoff_hz=8.0,
+        cutoff_hz=dict.fromkeys(AXES, 8.0),
         notes=["A note of the validation."],
     )
 

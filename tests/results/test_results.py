@@ -12,26 +12,30 @@ from pydantic import ValidationError
 from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError
 from bampipe.results.ingest import IngestResult
-from bampipe.results.validate import AxisError, ForceError, TrialError, ValidateResult
+from bampipe.results.validate import AxisError, ForceError, JudgedError, TrialError, ValidateResult
 
 ERROR = AxisError(
     rmse=1.0,
     rmse_without_friction=2.0,
     held_out_rmse=1.5,
+    published_rmse=1.5,
     relative_error_percent=10.0,
     held_out_relative_error_percent=15.0,
     fit_percent=None,
     unit="N",
 )
+JUDGED = JudgedError(**ERROR.model_dump(), noise_floor=1.4, noise_floor_sd=0.1, standing="at_floor")
 
 
 def made(**changes: Any) -> ValidateResult:
     fields: dict[str, Any] = {
         "model": "base",
         "headline": "fit",
-        "cutoff_hz": 8.0,
+        "cutoff_hz": {"yaw": 8.0},
+        "floor_replays": 1,
+        "refused": (),
         "notes": (),
-        "axes": {"yaw": ERROR},
+        "axes": {"yaw": JUDGED},
         "trials": {"t01": TrialError(held_out=True, yaw=ERROR)},
         "forces": {"force_x": ForceError(rmse=0.1, unit="N")},
     }
@@ -56,7 +60,6 @@ def test_a_result_reads_back_as_it_was_written(tmp_path: Path) -> None:
 def test_a_field_without_a_default_is_written_even_if_null_and_others_only_if_held() -> None:
     content = made().model_dump(mode="json")
     assert content["axes"]["yaw"]["fit_percent"] is None
-    assert "noise_floor" not in content["axes"]["yaw"]
     assert "free_run" not in content
 
 

@@ -16,8 +16,9 @@ from bampipe.physics import Model, compile_model, registry
 from bampipe.progress import silent
 from bampipe.stages import filter as filter_stage
 from bampipe.stages import ingest
-from bampipe.trials.observation import Motion, Sensors
-from bampipe.trials.replay import replay
+from bampipe.trials.motion import Motion
+from bampipe.trials.replay import replay_recording
+from bampipe.trials.sensors import Sensors
 
 RATE = 500.0
 RESOLUTION = {"yaw": 4.6875e-5, "pitch": 9.8125e-5, "extension": 3.0e-5}
@@ -47,20 +48,21 @@ def simulated_run(
     system = compile_model(Model(registry.device("bam"), [effect] if effect else []))
     p = np.array([{**TRUTH, **(hidden or {})}[item.name] for item in system.parameters])
     resolution = np.array(list(RESOLUTION.values()))
-    sensors = Sensors(RATE, resolution, np.full(3, 0.05))
+    sensors = Sensors(RATE, resolution, resolution / np.sqrt(12.0), np.full(3, 0.05))
     frames = {}
     for number in range(trials):
         rng = np.random.default_rng([11, number])
         wanted = _wanted(rng, seconds, tuple(system.inputs), f"t{number:02d}")
-        recording = replay(system, p, wanted, sensors, rng)
-        force = recording.force[::-1] if scramble else np.roll(recording.force, late, axis=0)
+        recording = replay_recording(system, p, wanted, sensors, rng)
+        forces = np.column_stack([recording.channels[f"force_{c}"] for c in "xyz"])
+        force = forces[::-1] if scramble else np.roll(forces, late, axis=0)
         frame = pd.DataFrame({"t": wanted.t})
         for i, axis in enumerate(RESOLUTION):
             frame[f"q_{axis}"] = recording.q[:, i]
         for i, component in enumerate("xyz"):
             frame[f"force_{component}"] = force[:, i]
-        for i, axis in enumerate(RESOLUTION):
-            frame[f"brake_{axis}"] = recording.brake[:, i]
+        for axis in RESOLUTION:
+            frame[f"brake_{axis}"] = recording.channels[f"brake_{axis}"]
         frames[wanted.trial_id] = frame
     axes = {
         axis: {"unit": "m" if axis == "extension" else "rad", "resolution": step}
@@ -110,4 +112,6 @@ def _wanted(
             q[:, i] += size * np.sin(w * t + phase)
             qd[:, i] += size * w * np.cos(w * t + phase)
             qdd[:, i] -= size * w * w * np.sin(w * t + phase)
-    return Motion(trial_id, t, q, qd, qdd, {name: np.zeros(t.size) for name in inputs})
+    return Motion(
+        trial_id, t, q, qd, qdd, np.zeros_like(qd), {name: np.zeros(t.size) for name in inputs}
+    )

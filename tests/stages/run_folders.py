@@ -5,6 +5,7 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -13,6 +14,7 @@ from made_results import write_result
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import write_parquet
+from bampipe.physics import registry
 from bampipe.results.ingest import IngestResult
 
 SESSIONS = Path(__file__).resolve().parents[3] / "shared" / "sessions"
@@ -22,7 +24,7 @@ def write_ingested(
     root: Path,
     frames: Mapping[str, pd.DataFrame],
     kinds: Mapping[str, tuple[str, str | None]],
-    axes: Mapping[str, Mapping[str, object]],
+    axes: Mapping[str, Mapping[str, Any]],
     *,
     device: str = "bam",
     rate: float = 500.0,
@@ -44,9 +46,21 @@ def write_ingested(
         parts.append(part)
     write_parquet(root / "ingest/trials.parquet", pd.DataFrame(rows))
     write_parquet(root / "ingest/samples.parquet", pd.concat(parts, ignore_index=True))
+    forces = registry.device(device).forces
+    encoders = {
+        axis: {
+            "unit": entry["unit"], "resolution": entry["resolution"],
+            "resolution_stated": entry["resolution"], "resolution_measured": entry["resolution"],
+            "noise_sd": float(entry["resolution"]) / np.sqrt(12.0),
+        }
+        for axis, entry in axes.items()
+    }  # fmt: skip
     write_result(
-        root, IngestResult, session_id=root.name, device=device, axes=axes, sample_rate_hz=rate,
-        force={"noise_sd": 0.05, "unit": "N", "columns": ["force_x", "force_y", "force_z"]},
+        root, IngestResult, session_id=root.name, device=device, axes=encoders, sample_rate_hz=rate,
+        force={
+            "noise_sd": dict.fromkeys(forces, 0.05), "noise_sd_stated": 0.05,
+            "noise_sd_measured": dict.fromkeys(forces, 0.05), "unit": "N", "columns": list(forces),
+        },
         recorded_at="2026-10-03T10:12:00+00:00",
     )  # fmt: skip
     return RunFolder(root)

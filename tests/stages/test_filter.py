@@ -17,7 +17,11 @@ from bampipe.progress import silent
 from bampipe.run.settings import configure
 from bampipe.stages import filter as stage
 
-AXES = {"yaw": {"unit": "rad", "resolution": 5e-5}, "extension": {"unit": "m", "resolution": 3e-5}}
+AXES = {
+    "yaw": {"unit": "rad", "resolution": 5e-5},
+    "extension": {"unit": "m", "resolution": 3e-5},
+    "pitch": {"unit": "rad", "resolution": 5e-5},
+}
 KINEMATIC = ("q", "qd", "qdd", "q_sd", "qd_sd", "qdd_sd")
 
 
@@ -27,7 +31,7 @@ def free_trial(seed: int = 0, seconds: float = 6.0) -> tuple[pd.DataFrame, dict[
     t = np.arange(int(seconds * 500)) / 500.0
     frame, truth = pd.DataFrame({"t": t}), {}
     for number, (axis, entry) in enumerate(AXES.items()):
-        w = 2 * np.pi * (0.7 + 0.4 * number)
+        w = 2 * np.pi * (0.7, 1.1, 0.9)[number]
         phase = rng.uniform(0, 6)
         angle = w * t + phase + 0.5 * np.sin(1.7 * w * t)
         rate, bend = w + 0.85 * w * np.cos(1.7 * w * t), -1.445 * w**2 * np.sin(1.7 * w * t)
@@ -39,6 +43,7 @@ def free_trial(seed: int = 0, seconds: float = 6.0) -> tuple[pd.DataFrame, dict[
     truth["force_x"] = 10 * np.sin(2 * np.pi * 1.3 * t)
     truth["force_rate_x"] = 10 * 2 * np.pi * 1.3 * np.cos(2 * np.pi * 1.3 * t)
     frame["force_x"] = truth["force_x"] + 0.05 * rng.standard_normal(len(t))
+    frame["force_y"], frame["force_z"] = frame["force_x"], frame["force_x"]
     frame["brake_yaw"] = np.where(t > 3.0, 2.0, 0.0)
     return frame, truth
 
@@ -79,9 +84,9 @@ def test_columns_and_bands(run: RunFolder) -> None:
     _, kinematics = run_stage(run)
     expected = {f"{kind}_{axis}" for kind in KINEMATIC for axis in AXES}
     expected |= {"trial_id", "t", "bridged", "brake_yaw"}
-    expected |= {"force_x"}
+    expected |= {f"force_{c}" for c in "xyz"}
     orders = ("rate", "curvature", "third", "fourth", "fifth", "sixth")
-    expected |= {f"force_{order}_x" for order in orders}
+    expected |= {f"force_{order}_{c}" for order in orders for c in "xyz"}
     assert set(kinematics.columns) == expected
     assert kinematics.notna().all(axis=None)
     rows, truth = kinematics[kinematics["trial_id"] == "a"], free_trial(0)[1]

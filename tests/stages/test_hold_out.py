@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 from identified_run import simulated_run
 
@@ -14,8 +13,8 @@ from bampipe.files import read_json
 from bampipe.physics import Model, compile_model, registry
 from bampipe.progress import silent
 from bampipe.stages import identify, validate
-from bampipe.trials.motions import free_trials
-from bampipe.trials.recordings import read_session
+from bampipe.trials.measured import read_measured_trials
+from bampipe.trials.reading import free_trials
 
 SPOILT, KEPT = "t02", ("t00", "t01")
 
@@ -64,6 +63,9 @@ def test_neither_fits_nor_the_diagnosis_see_it(spoilt: RunFolder) -> None:
     judged(spoilt, True)
     assert free_trials(spoilt, fitted=True) == KEPT
     assert free_trials(spoilt) == (*KEPT, SPOILT)
-    _, motions = read_session(spoilt, compile_model(Model(registry.device("bam"))))
-    assert tuple(motion.trial_id for motion in motions) == KEPT
-    assert all(np.isfinite(motion.qdd).all() for motion in motions)
+    trials = read_measured_trials(spoilt, compile_model(Model(registry.device("bam"))))
+    names = [motion.trial_id for motion in trials.motions]
+    assert [names[k] for k in trials.folds.fitted_trials] == list(KEPT)
+    selection = trials.folds.among_fitted()
+    assert [n for n, counts in zip(names, selection.judged, strict=True) if counts] == list(KEPT)
+    assert [n for n, counts in zip(names, trials.folds.judged, strict=True) if counts] == [SPOILT]

@@ -69,12 +69,14 @@ def test_session_json_says_what_later_stages_need(tmp_path):
     run_ingest(Made().write(tmp_path / "session"), tmp_path / "out")
     content = read_json(tmp_path / "out/ingest/session.json")
     assert content["session_id"] == "made" and content["device"] == "bam"
-    assert content["axes"]["extension"] == {"unit": "m", "resolution": 1 / 33333.3333}
-    assert content["force"] == {
-        "columns": ["force_x", "force_y", "force_z"],
-        "unit": "N",
-        "noise_sd": 0.05,
-    }
+    extension = content["axes"]["extension"]
+    assert extension["unit"] == "m" and extension["resolution"] == 1 / 33333.3333
+    assert extension["resolution_measured"] == extension["resolution_stated"]
+    assert extension["noise_sd"] == pytest.approx(1 / 33333.3333 / np.sqrt(12.0))
+    force = content["force"]
+    assert force["columns"] == ["force_x", "force_y", "force_z"] and force["unit"] == "N"
+    assert force["noise_sd_stated"] == 0.05
+    assert force["noise_sd"] == force["noise_sd_measured"]
     assert content["sample_rate_hz"] == 500.0
     assert content["recorded_at"] == "2026-10-03T10:12:00+00:00"
 
@@ -180,7 +182,8 @@ def test_a_device_of_another_kind(tmp_path):
     assert frame.temperature[0] == pytest.approx(293.15)
     content = read_json(tmp_path / "out/ingest/session.json")
     assert content["device"] == "sled" and content["device_file"] == "my/sled.toml"
-    assert content["axes"]["slide"] == {"unit": "m", "resolution": pytest.approx(1e-5)}
+    assert content["axes"]["slide"]["unit"] == "m"
+    assert content["axes"]["slide"]["resolution"] == pytest.approx(1e-5)
     copy = tmp_path / "out/ingest/device.toml"
     assert copy.read_bytes() == (session / "my/sled.toml").read_bytes()
 

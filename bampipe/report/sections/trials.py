@@ -36,10 +36,11 @@ def section(results: Results) -> Section:
 def _sampling(session: IngestResult) -> str:
     text = f"Sampled at {wording.plain(session.sample_rate_hz, 0)} Hz."
     if session.force.noise_sd:
-        unit = wording.unit(session.force.unit)
-        noise = wording.significant(session.force.noise_sd, 2)
-        text += f" Noise of the force sensor {noise} {unit}."
-    return text
+        each = wording.listing(
+            f"{name} {wording.significant(sd, 2)}" for name, sd in session.force.noise_sd.items()
+        )
+        text += f" Noise of a sample: {each} {wording.unit(session.force.unit)}."
+    return " ".join([text, *(f"{w[:1].upper()}{w[1:]}." for w in session.sensor_warnings)])
 
 
 def _trials(results: Results) -> Table:

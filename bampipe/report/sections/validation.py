@@ -56,6 +56,9 @@ def _by_axis(results: Results, validated: ValidateResult) -> Table:
                 wording.unit(entry.unit),
             )
         )
+    each = wording.listing(
+        f"{axis} at {wording.significant(hz, 2)} Hz" for axis, hz in validated.cutoff_hz.items()
+    )
     return Table(
         f"Error of the predicted force, model `{validated.model}`",
         (
@@ -73,8 +76,7 @@ def _by_axis(results: Results, validated: ValidateResult) -> Table:
         "Held out: each trial predicted with parameters that never saw it. Noise floor: what "
         "sensor noise, quantisation and filtering alone would leave. Fit: share of the measured "
         "force that is explained, as 100 (1 − held-out RMSE / standard deviation)."
-        " Measured and predicted force are low-passed at "
-        f"{wording.significant(validated.cutoff_hz, 2)} Hz.",
+        f" Measured and predicted force are low-passed, {each}.",
     )
 
 

@@ -9,17 +9,17 @@ from typing import Any, Generic, TypeVar, overload
 Item = TypeVar("Item")
 
 MOST_SAMPLES = 500_000
-"""So many samples are kept at hand, those used last: all of a usual session (0.4 kB each)."""
+"""Most samples in memory, those used last: all of a usual session (0.4 kB each)."""
 
 
-class Shelf(Sequence[Item], Generic[Item]):
+class TrialCache(Sequence[Item], Generic[Item]):
     """A sequence whose items are fetched by their place, and forgotten when others need the room.
 
     Args:
         fetch: returns the item at a place; the same one every time.
         count: number of items.
         samples: size of an item, in samples.
-        most: so many samples are kept; one item always is.
+        most: samples in memory at most; the item used last always stays.
     """
 
     def __init__(
@@ -33,8 +33,8 @@ class Shelf(Sequence[Item], Generic[Item]):
         self._count = count
         self._samples = samples
         self._most = most
-        self._held = 0
-        self._kept: OrderedDict[int, Item] = OrderedDict()
+        self._size = 0
+        self._items: OrderedDict[int, Item] = OrderedDict()
 
     def __len__(self) -> int:
         return self._count
@@ -51,14 +51,14 @@ class Shelf(Sequence[Item], Generic[Item]):
             place += self._count
         if not 0 <= place < self._count:
             raise IndexError(place)
-        if place in self._kept:
-            self._kept.move_to_end(place)
-            return self._kept[place]
+        if place in self._items:
+            self._items.move_to_end(place)
+            return self._items[place]
         item = self._fetch(place)
         size = self._samples(item)
-        while self._kept and self._held + size > self._most:
-            _, old = self._kept.popitem(last=False)
-            self._held -= self._samples(old)
-        self._kept[place] = item
-        self._held += size
+        while self._items and self._size + size > self._most:
+            _, old = self._items.popitem(last=False)
+            self._size -= self._samples(old)
+        self._items[place] = item
+        self._size += size
         return item

@@ -1,0 +1,83 @@
+"""Linear least squares from sums of products by trial and axis: leaving a trial out costs nothing.
+
+A residual r + X b, linear in b, enters through X'X, X'r and r'r of every trial and axis. Any subset
+of trials, any weights of the axes and any bounds are then solved without touching a sample again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.estimate.bounded import solve_bounded
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class NormalEquations:
+    """Sums of products by trial and axis.
+
+    Attributes:
+        xx: X'X, (K, n_q, P, P).
+        xy: -X'r, (K, n_q, P).
+        yy: r'r, (K, n_q).
+        count: samples that they are of, (K, n_q).
+    """
+
+    xx: Array
+    xy: Array
+    yy: Array
+    count: Array
+
+    @classmethod
+    def from_samples(
+        cls, slopes: Sequence[Array], residuals: Sequence[Array], used: Sequence[Array]
+    ) -> NormalEquations:
+        """Sum over the samples of each trial.
+
+        Args:
+            slopes: X by trial, each (T, n_q, P), zero where a sample is not used.
+            residuals: r by trial, each (T, n_q), zero where a sample is not used.
+            used: which samples count, by trial, each (T, n_q).
+        """
+        xx, xy, yy = [], [], []
+        for slope, residual in zip(slopes, residuals, strict=True):
+            by_axis = np.ascontiguousarray(slope.transpose(1, 0, 2))
+            right = np.ascontiguousarray(residual.T)
+            xx.append(by_axis.transpose(0, 2, 1) @ by_axis)
+            xy.append(-np.einsum("atp,at->ap", by_axis, right))
+            yy.append(np.sum(right**2, axis=1))
+        count = np.array([np.sum(u, axis=0, dtype=float) for u in used])
+        return cls(np.array(xx), np.array(xy), np.array(yy), count)
+
+    def subset(self, trials: Sequence[int]) -> NormalEquations:
+        """The sums of some trials."""
+        chosen = list(trials)
+        return NormalEquations(
+            self.xx[chosen], self.xy[chosen], self.yy[chosen], self.count[chosen]
+        )
+
+    def solve(self, weight: Array, lower: Array, upper: Array) -> Array:
+        """Weighted least squares over all trials within bounds, (P,); see `solve_bounded`.
+
+        Args:
+            weight: of the squares of each axis, (n_q,).
+            lower, upper: (P,); equal where a coefficient is given.
+        """
+        normal = np.einsum("kapq,a->pq", self.xx, weight)
+        moment = np.einsum("kap,a->p", self.xy, weight)
+        return solve_bounded(normal, moment, lower, upper).x
+
+    def squares(self, values: Array) -> Array:
+        """Sum of squared residuals left with coefficients ``values`` (P,), (K, n_q)."""
+        fitted = np.einsum("kapq,p,q->ka", self.xx, values, values)
+        return np.asarray(np.maximum(self.yy - 2.0 * self.xy @ values + fitted, 0.0))
+
+    def mean_square(self, values: Array) -> Array:
+        """Mean squared residual over all trials with coefficients ``values``, (n_q,)."""
+        count = np.maximum(self.count.sum(axis=0), 1.0)
+        return np.asarray(self.squares(values).sum(axis=0) / count)

@@ -1,0 +1,106 @@
+"""The band in which a session's residuals are compared, found from its motion and force."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import welch
+
+from bampipe.physics import System
+from bampipe.trials.kinematics import Kinematics
+from bampipe.trials.motion import Motion
+from bampipe.trials.sensors import Sensors
+
+Array = NDArray[np.float64]
+
+LEAST_HZ = 8.0
+"""No band is narrower: a change of direction, from which friction is read, is that wide."""
+_COVERED = 0.99
+"""Share of the power of the applied force, above its noise, that the band covers."""
+_SEGMENT_S = 4.0
+_LONGEST = 5
+"""Trials from which the band is found, spread over the session."""
+
+
+@dataclass(frozen=True)
+class AxisBand:
+    """The band of one axis.
+
+    Attributes:
+        cutoff_hz: of the low-pass; reason: in words.
+        force_hz: frequency below which the applied force has its power; motion_hz: bandwidth of
+            the filtered motion.
+    """
+
+    cutoff_hz: float
+    reason: str
+    force_hz: float
+    motion_hz: float
+
+
+def find_band(
+    system: System,
+    motions: Sequence[Motion],
+    sensors: Sensors,
+    kinematics: Kinematics,
+    chosen_hz: float = 0.0,
+) -> dict[str, AxisBand]:
+    """Find where motion and force carry signal above noise, axis by axis.
+
+    The band ends where 99 % of the power of the applied force above its noise is covered, but not
+    above the bandwidth of the filtered motion, and not below `LEAST_HZ`.
+
+    Args:
+        system: the bare device, whose priors map channels to axes.
+        motions: the trials; sensors, kinematics: of the session.
+        chosen_hz: by the user for all axes, Hz; 0 takes it from the data.
+    """
+    rate = sensors.rate_hz
+    numbers = np.unique(np.linspace(0, len(motions) - 1, min(len(motions), _LONGEST)).round())
+    some = [motions[int(k)] for k in numbers]
+    covered = np.median([_covered_hz(system, motion, sensors) for motion in some], axis=0)
+    found = {}
+    for i, axis in enumerate(system.coordinates):
+        motion_hz = float(kinematics.axes[axis].bandwidth_hz)
+        force_hz = float(covered[i])
+        most = min(motion_hz, 0.2 * rate)
+        least = min(LEAST_HZ, 0.1 * rate)
+        if chosen_hz:
+            cutoff, reason = min(chosen_hz, 0.2 * rate), "set by the user"
+        elif force_hz <= least:
+            cutoff, reason = (
+                least,
+                f"the applied force has 99 % of its power below {force_hz:.2g} Hz",
+            )
+        elif force_hz <= most:
+            cutoff, reason = force_hz, "99 % of the power of the applied force above its noise"
+        else:
+            cutoff = max(most, least)
+            reason = f"the force goes on to {force_hz:.3g} Hz, the motion is known up to here"
+        found[axis] = AxisBand(cutoff, reason, force_hz, motion_hz)
+    return found
+
+
+def _covered_hz(system: System, motion: Motion, sensors: Sensors) -> Array:
+    """Frequency below which the applied force of each axis has its power, (n_q,)."""
+    rate, p = sensors.rate_hz, system.prior
+    u = motion.inputs(system.inputs)
+    z = system.memory(motion.q, motion.qd, motion.qdd, u, p, motion.t)
+    applied = system.applied(motion.q, motion.qd, motion.qdd, z, u, p)
+    gain = system.input_map(motion.q, u, p)
+    noise = np.sqrt(np.mean(np.square(gain) @ np.square(sensors.force_sd), axis=0))
+    size = min(len(applied), max(32, int(_SEGMENT_S * rate)))
+    frequency, density = welch(applied, fs=rate, nperseg=size, axis=0, detrend="constant")
+    signal = np.maximum(density - 2.0 * np.square(noise) / rate, 0.0)
+    # What scatters about the noise is no signal: it counts from twice the noise on.
+    signal[density < 4.0 * np.square(noise) / rate] = 0.0
+    signal[0] = 0.0
+    power = np.cumsum(signal, axis=0)
+    out = np.zeros(applied.shape[1])
+    for i in range(out.size):
+        if power[-1, i] > 0.0:
+            out[i] = frequency[int(np.searchsorted(power[:, i], _COVERED * power[-1, i]))]
+    return out

@@ -1,0 +1,108 @@
+"""Which trials a fit may see, which are left out together, and which count in the verdict."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.estimate.normal_equations import NormalEquations
+
+Array = NDArray[np.float64]
+
+HELD_OUT = -1
+"""Group of the trials that the session holds out."""
+MOST_GROUPS = 10
+"""With more trials than this, they are left out in so many groups: the cost of leaving each out
+alone grows with the square of their number."""
+
+
+@dataclass(frozen=True)
+class Folds:
+    """How the trials of a session are held out.
+
+    Attributes:
+        groups: number of the group of each trial; those of a group are left out together, those
+            in `HELD_OUT` are never fitted.
+        fitted: whether a fit may see each trial.
+        judged: whether each trial counts in the held-out error.
+    """
+
+    groups: tuple[int, ...]
+    fitted: tuple[bool, ...]
+    judged: tuple[bool, ...]
+
+    @classmethod
+    def of_groups(cls, groups: Sequence[int], fitted: Sequence[bool]) -> Folds:
+        """Judge by the trials that the session holds out, else by all in turn."""
+        held = [group == HELD_OUT for group in groups]
+        return cls(tuple(groups), tuple(fitted), tuple(held) if any(held) else (True,) * len(held))
+
+    @classmethod
+    def of_trials(
+        cls, names: Sequence[str], held_out: Collection[str], fitted: Collection[str]
+    ) -> Folds:
+        """Leave each trial out alone, or in `MOST_GROUPS` groups where there are more."""
+        groups = [
+            HELD_OUT if name in held_out else number % MOST_GROUPS
+            for number, name in enumerate(names)
+        ]
+        return cls.of_groups(groups, [name in fitted for name in names])
+
+    @property
+    def fitted_trials(self) -> list[int]:
+        """Numbers of the trials that a fit sees."""
+        return [k for k, fits in enumerate(self.fitted) if fits]
+
+    @property
+    def nothing_held_out(self) -> bool:
+        """Whether there is one group only, so that the error is that of the fit."""
+        return len(set(self.groups)) == 1
+
+    def among_fitted(self) -> Folds:
+        """The same without regard to the trials that the session holds out."""
+        return replace(self, judged=tuple(group != HELD_OUT for group in self.groups))
+
+    def with_all_fitted(self) -> Folds:
+        """The same with every trial fitted that the session does not hold out."""
+        return replace(self, fitted=tuple(group != HELD_OUT for group in self.groups))
+
+    def solve(
+        self,
+        sums: NormalEquations,
+        weight: Array,
+        lower: Array,
+        upper: Array,
+    ) -> tuple[Array, ...]:
+        """Coefficients (P,) for each trial, fitted to the other groups.
+
+        Where there is but one group, or no other trial to fit, nothing is left out: zeros, the
+        coefficients of the fit to all.
+
+        Args:
+            sums: of all trials, linearised at the fit to the fitted ones.
+            weight: of each axis, (n_q,); lower, upper: bounds of the coefficients, (P,).
+        """
+        found: dict[int, Array] = {}
+        for group in sorted(set(self.groups)):
+            others = [k for k in self.fitted_trials if self.groups[k] != group]
+            if others and not self.nothing_held_out:
+                found[group] = sums.subset(others).solve(weight, lower, upper)
+            else:
+                found[group] = np.zeros(lower.size)
+        return tuple(found[group] for group in self.groups)
+
+    def error(self, sums: NormalEquations, values: Sequence[Array]) -> Array:
+        """Root mean square by axis over the judged trials, (n_q,).
+
+        Args:
+            sums: of all trials; values: coefficients for each trial, each (P,).
+        """
+        squares, count = np.zeros(sums.yy.shape[1]), np.zeros(sums.yy.shape[1])
+        for k, judged in enumerate(self.judged):
+            if judged:
+                squares += sums.subset([k]).squares(values[k])[0]
+                count += sums.count[k]
+        return np.asarray(np.sqrt(squares / np.maximum(count, 1.0)))

@@ -1,0 +1,104 @@
+"""The filters that every trial goes through, measured or replayed: one way from readings to motion.
+
+Positions are differentiated axis by axis as ``filter/filter.json`` says; the inputs themselves are
+not filtered, their time derivatives are band-limited.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.estimate import butterworth, kalman_smoother, savitzky_golay
+from bampipe.estimate.differentiation import Derivatives, Flags
+from bampipe.physics.device import LAST_ORDER
+from bampipe.results.filter import FilterResult
+from bampipe.trials.motion import Motion, Recording, input_derivatives
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class AxisFilter:
+    """How the positions of one axis are differentiated.
+
+    Attributes:
+        bandwidth_hz: half-power frequency, Hz.
+        noise_sd: standard deviation of the white noise of a reading, rad or m.
+        order: of the integrated white noise of the Kalman smoother; 0 for other methods.
+    """
+
+    bandwidth_hz: float
+    noise_sd: float
+    order: int = 0
+
+
+@dataclass(frozen=True)
+class Kinematics:
+    """The filters of a session.
+
+    Attributes:
+        method: ``kalman``, ``butterworth`` or ``savitzky_golay``.
+        rate_hz: sampling rate.
+        axes: by coordinate, in order.
+        input_cutoff_hz: half-amplitude frequency of the time derivatives of inputs, Hz.
+    """
+
+    method: str
+    rate_hz: float
+    axes: Mapping[str, AxisFilter]
+    input_cutoff_hz: float
+
+    @classmethod
+    def from_result(cls, found: FilterResult, coordinates: Sequence[str]) -> Kinematics:
+        """The filters that ``filter/filter.json`` describes, in the order of a model's axes."""
+        axes = {}
+        for name in coordinates:
+            axis = found.axes[name]
+            axes[name] = AxisFilter(axis.bandwidth_hz, axis.measurement_noise_sd, axis.order or 0)
+        return cls(found.method, found.sample_rate_hz, axes, found.force.derivative_cutoff_hz)
+
+    def differentiate(self, axis: str, position: Array, seen: Flags | None = None) -> Derivatives:
+        """Return the motion behind the readings of one axis.
+
+        Args:
+            axis: its name; position: (T,) readings on the uniform grid.
+            seen: (T,) false where a reading is a guess across a gap; the Kalman smoother alone
+                leaves those out.
+        """
+        chosen = self.axes[axis]
+        if self.method == "kalman":
+            ratio = kalman_smoother.ratio_for(chosen.bandwidth_hz, chosen.order, self.rate_hz)
+            model = kalman_smoother.MotionModel(chosen.order, chosen.noise_sd, ratio, self.rate_hz)
+            return kalman_smoother.smooth(position, model, seen)
+        smooth = butterworth.smooth if self.method == "butterworth" else savitzky_golay.smooth
+        return smooth(position, self.rate_hz, chosen.bandwidth_hz, chosen.noise_sd)
+
+    def input_rates(self, values: Array) -> list[Array]:
+        """Return the time derivatives (T,) of an input (T,), lowest order first."""
+        return butterworth.rates(values, self.rate_hz, self.input_cutoff_hz, LAST_ORDER)
+
+    def observe(self, recording: Recording, smooth_inputs: Sequence[str]) -> Motion:
+        """Filter a recording the way every recording, measured or replayed, is filtered.
+
+        Args:
+            recording: the readings.
+            smooth_inputs: the channels that have time derivatives.
+        """
+        moved = [self.differentiate(axis, recording.q[:, i]) for i, axis in enumerate(self.axes)]
+        channels = dict(recording.channels)
+        for name in smooth_inputs:
+            rates = self.input_rates(recording.channels[name])
+            channels |= dict(zip(input_derivatives(name), rates, strict=True))
+        return Motion(
+            recording.trial_id,
+            np.arange(len(recording.q)) / self.rate_hz,
+            np.column_stack([m.position for m in moved]),
+            np.column_stack([m.velocity for m in moved]),
+            np.column_stack([m.acceleration for m in moved]),
+            np.column_stack([m.velocity_sd for m in moved]),
+            channels,
+        )

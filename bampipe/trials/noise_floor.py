@@ -1,0 +1,124 @@
+"""The noise floor: the held-out error of a model that is the whole truth; and whether it is met.
+
+This is the one place where a floor is found and where an error is held against it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.estimate.low_pass import Band
+from bampipe.physics import System
+from bampipe.results.record import Standing
+from bampipe.trials.folds import Folds
+from bampipe.trials.kinematics import Kinematics
+from bampipe.trials.motion import Motion
+from bampipe.trials.replay import replay_motions
+from bampipe.trials.residuals import Evidence, gather_evidence
+from bampipe.trials.sensors import Sensors
+
+Array = NDArray[np.float64]
+
+FLOOR_SEED = 0
+"""First number, after the user's, of the seeds of replays of the model as it is: the same replays
+serve as noise floor in every stage."""
+ENOUGH_SAMPLES, MOST_REPLAYS = 250_000, 6
+"""Replays are repeated until they hold so many samples, but no oftener than this: the floor of a
+session of forty thousand samples is then known to about 1 %, and longer ones need fewer."""
+
+AT_FLOOR = 1.2
+"""Error over floor up to which a model leaves no more than its sensors do."""
+IMPLAUSIBLE = 0.7
+"""Error over floor below which the floor is wrong: sensors noisier than the data, or a replay that
+does not resemble the machine."""
+
+
+def standing(error: float, floor: float | None, floor_sd: float = 0.0) -> Standing:
+    """Hold a held-out error against its noise floor.
+
+    Args:
+        error: held-out error of one axis; floor: its noise floor, None where there is none.
+        floor_sd: scatter of the floor over replays.
+    """
+    if floor is None or not np.isfinite(floor) or not np.isfinite(error) or floor <= 0.0:
+        return "floor_missing"
+    if error < IMPLAUSIBLE * floor - 3.0 * floor_sd:
+        return "floor_implausible"
+    return "at_floor" if error <= AT_FLOOR * floor + 3.0 * floor_sd else "above_floor"
+
+
+@dataclass(frozen=True)
+class NoiseFloor:
+    """Held-out error of replays.
+
+    Attributes:
+        mean, sd: over replays, by axis, (n_q,), N.m or N; ``sd`` is that of one replay.
+        replays: how many.
+    """
+
+    mean: Array
+    sd: Array
+    replays: int
+
+    @classmethod
+    def of_errors(cls, errors: Sequence[Array]) -> NoiseFloor:
+        """Mean and scatter of the errors (n_q,) of replays."""
+        found = np.array(errors)
+        sd = found.std(axis=0, ddof=1) if len(found) > 1 else np.zeros(found.shape[1])
+        return cls(found.mean(axis=0), sd, len(found))
+
+
+def floor_replays(motions: Sequence[Motion]) -> int:
+    """How many replays of these trials give the floor."""
+    total = sum(motion.t.size for motion in motions)
+    return int(np.clip(-(-ENOUGH_SAMPLES // max(total, 1)), 1, MOST_REPLAYS))
+
+
+def replay_evidence(
+    system: System,
+    p: Array,
+    motions: Sequence[Motion],
+    sensors: Sensors,
+    kinematics: Kinematics,
+    band: Band,
+    folds: Folds,
+    seed: Sequence[int],
+) -> Evidence:
+    """Replay all trials by a model at ``p`` and fit it to them as it was to the measurement."""
+    replays = replay_motions(system, p, motions, sensors, kinematics, seed)
+    return gather_evidence(system, replays, band, p, folds)
+
+
+def find_noise_floor(
+    evidence: Evidence,
+    sensors: Sensors,
+    kinematics: Kinematics,
+    seed: int,
+    count: int,
+    progress: Callable[[int], None] = lambda done: None,
+) -> NoiseFloor:
+    """Return the held-out error that the fitted model leaves when it is the truth.
+
+    Every trial is replayed by the model under the measured force and an arm that keeps the motion
+    near the measured one; the replay goes through the same sensors, filters and fits.
+
+    Args:
+        evidence: the model, fitted; sensors, kinematics: of the session.
+        seed: the user's; count: of replays; progress: called with how many are done.
+
+    Raises:
+        Runaway: the simulated motion grows without bounds.
+    """
+    errors = []
+    for k in range(count):
+        found = replay_evidence(
+            evidence.system, evidence.p, evidence.motions, sensors, kinematics,
+            evidence.band, evidence.folds, (seed, FLOOR_SEED, k),
+        )  # fmt: skip
+        errors.append(found.held_out_rmse)
+        progress(k + 1)
+    return NoiseFloor.of_errors(errors)

@@ -1,0 +1,223 @@
+"""Trials of a run folder as motions: which there are, and which of them a fit may see."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from bampipe.data.run_folder import MOVING, RunFolder
+from bampipe.data.store import read_parquet, trial_ids
+from bampipe.errors import InputError
+from bampipe.estimate.low_pass import Band
+from bampipe.physics import System
+from bampipe.physics.device import Device
+from bampipe.physics.soundness import require_sound
+from bampipe.results.filter import FilterResult
+from bampipe.results.ingest import IngestResult
+from bampipe.trials.cache import TrialCache
+from bampipe.trials.kinematics import Kinematics
+from bampipe.trials.motion import Motion, input_derivatives, n_samples
+from bampipe.trials.sensors import Sensors
+
+Array = NDArray[np.float64]
+
+KINEMATICS = "filter/kinematics.parquet"
+
+
+def read_sensors(run: RunFolder, system: System) -> Sensors:
+    """Return the sensors that ingest settled, in the order of the model."""
+    return Sensors.from_result(
+        run.read(IngestResult), system.coordinates, system.model.device.forces
+    )
+
+
+def read_kinematics(run: RunFolder, system: System) -> Kinematics:
+    """Return the filters that the trials went through, in the order of the model."""
+    return Kinematics.from_result(run.read(FilterResult), system.coordinates)
+
+
+def read_band(run: RunFolder, system: System) -> Band:
+    """Return the band in which residuals are compared, in the order of the model."""
+    found = run.read(FilterResult)
+    cutoffs = tuple(found.axes[axis].band.cutoff_hz for axis in system.coordinates)
+    return Band(found.sample_rate_hz, cutoffs)
+
+
+def held_out_trials(run: RunFolder) -> frozenset[str]:
+    """Return the trials that the session holds out: never fitted, only for judging."""
+    trials = read_parquet(run.require("ingest/trials.parquet", "ingest"))
+    if "hold_out" not in trials:
+        return frozenset()
+    return frozenset(trials.loc[trials["hold_out"].astype(bool), "trial_id"].astype(str))
+
+
+def free_trials(run: RunFolder, *, fitted: bool = False, braked: bool = False) -> tuple[str, ...]:
+    """Return the free trials that were differentiated, in the order of the session.
+
+    Args:
+        run: the run folder.
+        fitted: without those that the session holds out.
+        braked: those in a viscous field too, after the others: a lag of the brakes, say, shows
+            in no other.
+
+    Raises:
+        InputError: there is none.
+    """
+    trials = read_parquet(run.require("ingest/trials.parquet", "ingest"))
+    kinds = MOVING if braked else MOVING[:1]
+    usable = trials[trials["kind"].isin(kinds) & (trials["status"] != "set_aside")]
+    usable = usable.sort_values("kind", key=lambda kind: kind != MOVING[0], kind="stable")
+    if fitted:
+        usable = usable[~usable["trial_id"].isin(held_out_trials(run))]
+    moving = trial_ids(run.require(KINEMATICS, "filter"))
+    found = tuple(str(name) for name in usable["trial_id"] if str(name) in moving)
+    if not set(found) & set(trials.loc[trials["kind"] == MOVING[0], "trial_id"].astype(str)):
+        raise InputError(
+            "no free trial to identify from",
+            where=str(run.root),
+            remedy="look at ingest/trials.parquet for the reasons",
+        )
+    return found
+
+
+def read_motion(
+    run: RunFolder, trial_id: str, system: System, *, every_input: bool = False
+) -> Motion:
+    """Read one trial of ``filter/kinematics.parquet``.
+
+    Args:
+        run: the run folder; trial_id: which trial.
+        system: the model, whose inputs and their first time derivatives are read.
+        every_input: every input of its device too, with all time derivatives: what an effect
+            that is not in the model may need.
+
+    Raises:
+        InputError: the file or a column that the model needs is missing.
+    """
+    path = run.require(KINEMATICS, "filter")
+    return read_motion_of(path, trial_id, system, every_input=every_input)
+
+
+def read_motion_of(
+    path: Path, trial_id: str, system: System, *, every_input: bool = False
+) -> Motion:
+    """Read one trial of a table of kinematics; arguments and errors as `read_motion`."""
+    frame = read_parquet(path, trial=trial_id)
+    axes, device = system.coordinates, system.model.device
+    t = frame["t"].to_numpy(dtype=float)
+    brakes = {name: f"brake_{axis}" for axis, name in device.brakes.items()}
+    needed = [name for name in system.inputs if name != "t"]
+    wanted = list(needed)
+    if every_input:
+        smooth = (*device.forces, *device.channels)
+        needed += [name for name in (*smooth, *brakes) if name not in needed]
+        wanted = [*needed, *(rate for name in smooth for rate in input_derivatives(name))]
+    else:
+        wanted += [input_derivatives(name)[0] for name in needed if _is_smooth(device, name)]
+    channels: dict[str, Array] = {}
+    for name in dict.fromkeys(wanted):
+        column = brakes.get(name, name)
+        if column in frame:
+            channels[name] = frame[column].to_numpy(dtype=float, copy=True)
+        elif name in brakes:  # a brake without a logged command was off
+            channels[name] = np.zeros(t.size)
+        elif name in needed:
+            raise _no_column(column, str(path))
+    return Motion(
+        trial_id=trial_id,
+        t=t - t[0],
+        q=_columns(frame, [f"q_{axis}" for axis in axes], str(path)),
+        qd=_columns(frame, [f"qd_{axis}" for axis in axes], str(path)),
+        qdd=_columns(frame, [f"qdd_{axis}" for axis in axes], str(path)),
+        qd_sd=_columns(frame, [f"qd_sd_{axis}" for axis in axes], str(path)),
+        channels=channels,
+    )
+
+
+def read_motions(
+    run: RunFolder,
+    system: System,
+    *,
+    fitted: bool = False,
+    braked: bool = False,
+    every_input: bool = False,
+    late_s: float = 0.0,
+) -> Sequence[Motion]:
+    """Return the free trials, each read from ``filter/kinematics.parquet`` when it is wanted.
+
+    Args:
+        run: the run folder.
+        system: the model.
+        fitted, braked: as in :func:`free_trials`; every_input: as in :func:`read_motion`.
+        late_s: time by which inputs were sampled after positions, taken off.
+
+    Raises:
+        InputError: there is none; on reading one, as :func:`read_motion`.
+    """
+    names = free_trials(run, fitted=fitted, braked=braked)
+
+    def fetch(number: int) -> Motion:
+        motion = read_motion(run, names[number], system, every_input=every_input)
+        return motion.with_input_timing(late_s)
+
+    return TrialCache(fetch, len(names), n_samples)
+
+
+def require_sound_motions(system: System, motions: Sequence[Motion]) -> None:
+    """Refuse trials on which the equations of motion cannot be solved.
+
+    Raises:
+        InputError: the mass matrix is singular at a pose of a trial, or a force no number there.
+    """
+    for motion in motions:
+        require_sound(
+            system, motion.q, motion.qd, motion.qdd, motion.inputs(system.inputs), system.prior,
+            motion.t, f"trial {motion.trial_id}",
+        )  # fmt: skip
+
+
+def input_columns(
+    frame: pd.DataFrame, names: Sequence[str], brakes: dict[str, str], t: Array, where: str
+) -> Array:
+    """Return inputs of a model as columns (T, n_u) of raw samples.
+
+    Args:
+        frame: columns force_<c>, brake_<axis>, ...; a brake without a column was off.
+        names: inputs of the model; brakes: input that is the brake command, by axis.
+        t: (T,) time, s; where: file, for messages.
+
+    Raises:
+        InputError: an input has no column.
+    """
+    column = {name: f"brake_{axis}" for axis, name in brakes.items()}
+    values = np.zeros((len(frame), len(names)))
+    for number, name in enumerate(names):
+        if name == "t":
+            values[:, number] = t - t[0]
+        elif name not in column or column[name] in frame:
+            values[:, number] = _columns(frame, [column.get(name, name)], where)[:, 0]
+    return values
+
+
+def _is_smooth(device: Device, name: str) -> bool:
+    return name in device.forces or name in device.channels
+
+
+def _columns(frame: pd.DataFrame, names: Sequence[str], where: str) -> Array:
+    for name in names:
+        if name not in frame:
+            raise _no_column(name, where)
+    return frame[list(names)].to_numpy(dtype=float, copy=True)  # one column alone is read-only
+
+
+def _no_column(name: str, where: str) -> InputError:
+    return InputError(
+        f"no column {name!r}, which the model needs",
+        where=where,
+        remedy="name the channel in session.toml if it was logged; if not, the effect that "
+        "uses it cannot be weighed with this session",
+    )

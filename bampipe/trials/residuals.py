@@ -1,0 +1,223 @@
+"""The residual of a model on trials: both sides of the equation filtered alike, by trial.
+
+Velocities from encoders are low-passed, forces are not. Comparing them raw misses effects near
+standstill and invents delays; so the residual as a whole, the sign of the velocity in it included,
+goes through one low-pass before anything is fitted, and is thinned to what that leaves independent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.estimate.least_squares import Problem, fit, stacked_residual
+from bampipe.estimate.low_pass import Band
+from bampipe.estimate.normal_equations import NormalEquations
+from bampipe.estimate.standstill import resting
+from bampipe.physics import System
+from bampipe.trials.folds import Folds
+from bampipe.trials.motion import Motion
+
+Array = NDArray[np.float64]
+
+
+def problem_of(
+    system: System,
+    motions: Sequence[Motion],
+    band: Band,
+    *,
+    held: Sequence[str] = (),
+    timing: bool = False,
+) -> Problem:
+    """Return the inverse dynamics of ``motions`` as a least-squares problem.
+
+    Its parameters are the model's, then the time by which the inputs were sampled after the
+    positions, s, within half a sample.
+
+    Args:
+        system: the model; motions: the trials; band: the low-pass of the residual.
+        held: parameters that are not estimated, beside those that the model fixes.
+        timing: whether that time is estimated; else it stays as given.
+    """
+    n = len(system.parameters)
+
+    def residual(trial: int, p: Array) -> Array:
+        motion = motions[trial]
+        u = motion.inputs(system.inputs)
+        if p[n] != 0.0:
+            u = u - p[n] * motion.input_rates(system.inputs)
+        z = system.memory(motion.q, motion.qd, motion.qdd, u, p[:n], motion.t)
+        q, qd, qdd = system.true_motion(motion.q, motion.qd, motion.qdd, u, p[:n])
+        return system.residual(q, qd, qdd, z, u, p[:n])
+
+    parameters = system.parameters
+    free = [i for i, item in enumerate(parameters) if not item.fixed and item.name not in held]
+    lower = [parameters[i].lower for i in free]
+    upper = [parameters[i].upper for i in free]
+    step = [
+        1.0
+        if system.linear[i]
+        else 1e-4 * max(abs(parameters[i].prior), parameters[i].sd, np.finfo(float).tiny)
+        for i in free
+    ]
+    if timing:
+        half = 0.5 / band.rate_hz
+        free, lower, upper, step = [*free, n], [*lower, -half], [*upper, half], [*step, half]
+    return Problem(
+        residual=residual,
+        n_trials=len(motions),
+        free=np.array(free, dtype=np.int64),
+        lower=np.array(lower),
+        upper=np.array(upper),
+        step=np.array(step),
+        linear=all(system.linear[i] for i in free if i < n),
+        band=band,
+        resting=[_standstill(motion, system, band) for motion in motions],
+    )
+
+
+def _standstill(motion: Motion, system: System, band: Band) -> NDArray[np.bool_]:
+    """Which samples stand still, (T, n_q)."""
+    u = motion.inputs(system.inputs)
+    brakes = [system.model.device.brakes.get(axis) for axis in system.coordinates]
+    braked = [
+        name in system.inputs and bool(u[:, system.inputs.index(name)].any()) for name in brakes
+    ]
+    return resting(motion.qd, motion.qd_sd, band.rate_hz, np.array(braked))
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Residuals of one model on the trials of one session, linearised at its least-squares fit.
+
+    Attributes:
+        system: the model.
+        p: parameters at which it is linearised, (n_p,).
+        motions: the trials.
+        band: the low-pass.
+        folds: which trials were fitted, and which are left out together.
+        residual: low-passed and thinned, by trial, each (K, n_q), N.m or N.
+        jacobian: derivative of ``residual`` by the free parameters, by trial, (K, n_q, n_free).
+        used: which samples count, by trial, (K, n_q), see `standstill`; the others are zero in
+            ``residual`` and ``jacobian``.
+        free: indices of the parameters that are estimated.
+        lower, upper: bounds of their change, (n_free,).
+    """
+
+    system: System
+    p: Array
+    motions: Sequence[Motion]
+    band: Band
+    folds: Folds
+    residual: tuple[Array, ...]
+    jacobian: tuple[Array, ...]
+    used: tuple[NDArray[np.bool_], ...]
+    free: tuple[int, ...]
+    lower: Array
+    upper: Array
+    _unfiltered: dict[int, tuple[Array, Array]] = field(
+        default_factory=dict, repr=False, compare=False
+    )
+
+    @cached_property
+    def sums(self) -> NormalEquations:
+        """Sums of products of the linearised residual."""
+        return NormalEquations.from_samples(self.jacobian, self.residual, self.used)
+
+    @cached_property
+    def weight(self) -> Array:
+        """Weight of the squares of each axis: one over the mean square where it was fitted."""
+        fitted = self.sums.subset(self.folds.fitted_trials)
+        mean = fitted.yy.sum(axis=0) / np.maximum(fitted.count.sum(axis=0), 1.0)
+        return np.asarray(1.0 / np.maximum(mean, 1e-24))
+
+    @cached_property
+    def independent(self) -> Array:
+        """Number of independent samples by axis, (n_q,)."""
+        return np.asarray(self.sums.count.sum(axis=0) * self.band.independent_share)
+
+    def rmse(self) -> Array:
+        """Root mean square of the residual by axis over all trials, (n_q,), N.m or N."""
+        count = np.maximum(self.sums.count.sum(axis=0), 1.0)
+        return np.asarray(np.sqrt(self.sums.yy.sum(axis=0) / count))
+
+    @cached_property
+    def held_out_steps(self) -> tuple[Array, ...]:
+        """Change of the free parameters when the trials of a group are left out, by trial."""
+        return self.folds.solve(self.sums, self.weight, self.lower, self.upper)
+
+    @property
+    def held_out_rmse(self) -> Array:
+        """Error on trials that the parameters have not seen, (n_q,), N.m or N.
+
+        The parameters are refitted without each group of trials by the normal equations at the
+        fit to all: exact for a model linear in its parameters, to first order for others.
+        """
+        return self.folds.error(self.sums, self.held_out_steps)
+
+    def held_out_residual(self, trial: int) -> Array:
+        """The residual of a trial with parameters that have not seen it, (K, n_q)."""
+        return np.asarray(self.residual[trial] + self.jacobian[trial] @ self.held_out_steps[trial])
+
+    def held_out_parameters(self, trial: int) -> Array:
+        """Those parameters, (n_p,)."""
+        p = self.p.copy()
+        p[list(self.free)] += self.held_out_steps[trial]
+        return p
+
+    def unfiltered(self, trial: int) -> tuple[Array, Array]:
+        """Residual (T, n_q) of a trial before the low-pass, and internal states (T, n_z)."""
+        if trial not in self._unfiltered:
+            motion, system = self.motions[trial], self.system
+            u = motion.inputs(system.inputs)
+            z = system.memory(motion.q, motion.qd, motion.qdd, u, self.p, motion.t)
+            true = system.true_motion(motion.q, motion.qd, motion.qdd, u, self.p)
+            self._unfiltered[trial] = system.residual(*true, z, u, self.p), z
+        return self._unfiltered[trial]
+
+
+def gather_evidence(
+    system: System,
+    motions: Sequence[Motion],
+    band: Band,
+    start: Array,
+    folds: Folds,
+    *,
+    most_iterations: int = 12,
+) -> Evidence:
+    """Fit a model to the fitted trials by least squares and linearise it there on all.
+
+    Args:
+        system: the model; motions: the trials; band: the low-pass.
+        start: parameters to start from, (n_p,); folds: which trials are fitted.
+        most_iterations: the most Gauss-Newton steps.
+
+    Raises:
+        ValueError: fewer samples than parameters.
+    """
+    problem = problem_of(system, motions, band)
+    fitted = folds.fitted_trials
+    found = fit(problem, np.append(start, 0.0), trials=fitted, most_iterations=most_iterations)
+    stacked = dict(zip(fitted, found.stacked, strict=True))
+    for trial in range(len(motions)):
+        if trial not in stacked:
+            stacked[trial] = stacked_residual(problem, trial, found.p)
+    value = found.p[problem.free]
+    order = range(len(motions))
+    return Evidence(
+        system,
+        found.p[:-1],
+        motions,
+        band,
+        folds,
+        tuple(stacked[k].residual for k in order),
+        tuple(stacked[k].slope for k in order),
+        tuple(stacked[k].used for k in order),
+        tuple(int(i) for i in problem.free),
+        problem.lower - value,
+        problem.upper - value,
+    )
