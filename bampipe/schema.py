@@ -259,12 +259,15 @@ def _faults(
         if e["type"] != "too_short" or len(e["input"]) < e["ctx"]["min_length"]
     ]
     # A key that is not known often is a missing one misspelt: it comes first.
-    unknown, keys = _UNKNOWN, {*_UNKNOWN, "missing"}
-    found.sort(key=lambda e: (e["type"] not in keys or len(e["loc"]) > 1, e["type"] not in unknown))
+    keys = (*_UNKNOWN, "missing")
+    found.sort(
+        key=lambda e: (e["type"] not in keys or len(e["loc"]) > 1, e["type"] not in _UNKNOWN)
+    )
     said = []
     for e in found:
-        path = [*inside, *(part for part in e["loc"] if not str(part).startswith("#"))]
-        path = path[:-2] if path and path[-1] == "[key]" else path
+        place = e["loc"][:-1] if e["type"] in keys else e["loc"]
+        place = place[:-2] if place[-1:] == ("[key]",) else place
+        path = [*inside, *(part for part in place if not str(part).startswith("#"))]
         if e["type"] == "faults":
             said += [_placed(f, [*path, f.where], where) for f in e["ctx"]["found"]]
         else:
@@ -283,8 +286,8 @@ def _in_words(error: Any, path: list[Any], schema: Mapping[str, Any], where: str
     kind, given, more = error["type"], error["input"], error.get("ctx", {})
     remedy = ""
     if kind in ("missing", *_UNKNOWN):
-        *path, key = path
-        known = _node(schema, error["loc"][:-1]).get("properties", {})
+        *above, key = error["loc"]
+        known = _node(schema, above).get("properties", {})
         if kind == "missing":
             what, remedy = f"'{key}' is missing", known.get(key, {}).get("description", "")
         else:
@@ -302,7 +305,7 @@ def _in_words(error: Any, path: list[Any], schema: Mapping[str, Any], where: str
             unit = "entry" if more["field_type"] == "Dictionary" else "in the list"
             expected = f"at least {more['min_length']} {unit}"
         else:
-            expected = _EXPECTED.get(kind, error["msg"]).format(**more)
+            expected = _EXPECTED[kind].format(**more) if kind in _EXPECTED else error["msg"]
         what = f"found {_shown(given)}, expected {expected}"
     return _placed(InputError(what, remedy=remedy), path, where)
 
