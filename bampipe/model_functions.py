@@ -14,9 +14,6 @@ COMMAND = MEASURE
 """c(y, r, s, out) -> None: commands of a controller and rates of its states, from readings,
 references and these states."""
 
-RESIDUAL = types.FunctionType(types.void(*[_vector] * 7))
-"""e(q, qd, qdd, z, u, p, out) -> None: applied minus required generalised force."""
-
 ROWS = 64
 """Most rows of one call of a function over rows; quantity i of row r is at [i*ROWS + r]."""
 

@@ -42,6 +42,7 @@ def heaviside(x, half):
 
 
 V = types.float64[::1]
+M = types.float64[:, ::1]
 '''
 
 # The same equations once more for all sigma points of a filter at once. Quantity i of row r is
@@ -59,9 +60,6 @@ V = types.float64[::1]
 
 
 MEMORY_LOOP = '''
-
-M = types.float64[:, ::1]
-
 
 @njit(types.void(M, M, M, V, V, V, types.int64, M), cache=True, error_model='numpy')
 def memory(q, qd, u, p, t, z0, steps, out):
@@ -206,11 +204,17 @@ def array_source(e: Equations, added: Sequence[Any]) -> str:
     return "".join(parts)
 
 
-def _compiled(name: str, arguments: str, body: list[str]) -> str:
-    count = len(arguments.split(","))
-    kinds = ", ".join(["V"] * count)
-    head = f"\n\n@njit(types.void({kinds}), cache=True, error_model='numpy', {_PASSED})"
+def _compiled(
+    name: str, arguments: str, body: Sequence[str], *, kinds: str = "", options: str = _PASSED
+) -> str:
+    """A compiled function; its arguments are vectors unless ``kinds`` says otherwise."""
+    kinds = kinds or ", ".join(["V"] * len(arguments.split(",")))
+    head = f"\n\n@njit(types.void({kinds}), cache=True, error_model='numpy', {options})"
     return f"{head}\ndef {name}({arguments}):\n    " + "\n    ".join(body or ["pass"]) + "\n"
+
+
+def _loop(head: str, body: Sequence[str]) -> list[str]:
+    return [head, *(f"    {line}" for line in body)]
 
 
 def _solve(mass: list[list[Any]]) -> list[str]:
@@ -296,18 +300,20 @@ def rows_source(e: Equations, rows: int) -> str:
         ("measure_rows", "x, u, p, y", _reading(e, place)),
     ):
         kinds = ", ".join(["types.int64", *["V"] * len(arguments.split(","))])
-        parts.append(
-            f"\n\n@njit(types.void({kinds}), cache=True, error_model='numpy', "
-            f"fastmath={{'contract'}}, {_PASSED})\ndef {name}(count, {arguments}):\n    "
-            "for r in range(count):\n        " + "\n        ".join(body) + "\n"
-        )
+        options = f"fastmath={{'contract'}}, {_PASSED}"
+        body = _loop("for r in range(count):", body)
+        parts.append(_compiled(name, f"count, {arguments}", body, kinds=kinds, options=options))
     return "".join(parts)
 
 
 def scalar_source(e: Equations) -> str:
     """Source of the compiled functions of one state."""
-    parts = [SCALAR_HEADER, _compiled("derivative", "x, u, p, w, dx", _motion(e))]
+    derivative = _compiled("derivative", "x, u, p, w, dx", _motion(e))
+    return SCALAR_HEADER + derivative + _compiled("measure", "x, u, p, y", _reading(e))
 
+
+def residual_source(e: Equations) -> str:
+    """Source of the compiled residual along a motion: ``residual(q, qd, qdd, z, u, p, out)``."""
     quiet = dict.fromkeys(e.w, 0)
     residual = [
         a + (o - h).subs(quiet) - sum(m * x for m, x in zip(row, e.qdd, strict=True))
@@ -315,14 +321,17 @@ def scalar_source(e: Equations) -> str:
     ]
     used = set().union(*(x.free_symbols for x in residual))
     lines, values = _block(residual)
-    groups = {"q": e.q, "qd": e.qd, "qdd": e.qdd, "z": e.z, "u": e.u, "p": e.p}
-    body = [line for group, symbols in groups.items() for line in _unpack(group, symbols, used)]
-    body += lines + [f"out[{i}] = {v}" for i, v in enumerate(values)]
-    parts.append(_compiled("residual", "q, qd, qdd, z, u, p, out", body))
-
-    parts.append(_compiled("measure", "x, u, p, y", _reading(e)))
-
-    return "".join(parts)
+    groups = {"q": e.q, "qd": e.qd, "qdd": e.qdd, "z": e.z, "u": e.u}
+    row = [
+        line
+        for group, symbols in groups.items()
+        for line in _unpack(group, symbols, used, "row, {}")
+    ]
+    row += lines + [f"out[row, {i}] = {v}" for i, v in enumerate(values)]
+    body = [*_unpack("p", e.p, used), *_loop("for row in range(len(q)):", row)]
+    return SCALAR_HEADER + _compiled(
+        "residual", "q, qd, qdd, z, u, p, out", body, kinds="M, M, M, M, M, V, M", options=""
+    )
 
 
 def memory_source(e: Equations) -> str:
@@ -333,7 +342,7 @@ def memory_source(e: Equations) -> str:
     for group, symbols in {"q": e.q, "qd": e.qd, "u": e.u, "p": e.p, "z": e.z}.items():
         body += _unpack(group, symbols, used)
     body += lines + [f"dz[{i}] = {v}" for i, v in enumerate(values)]
-    rate = _compiled("memory_rate", "q, qd, u, p, z, dz", body)
+    rate = _compiled("memory_rate", "q, qd, u, p, z, dz", body, options="")
     return SCALAR_HEADER + "import numpy as np\n" + rate + MEMORY_LOOP
 
 

@@ -97,6 +97,10 @@ class System:
     def _compiled(self) -> ModuleType:
         return self._code.module("compiled")
 
+    @cached_property
+    def _residual(self) -> Callable[..., None]:
+        return self._code.module("residual").residual
+
     @property
     def derivative(self) -> Callable[..., None]:
         """f(x, u, p, w, dx): numba-compiled state derivative (eq 14)."""
@@ -187,11 +191,9 @@ class System:
 
         Arguments as in `required`, but q, qd, qdd are already what `true_motion` returns.
         """
-        from bampipe.physics.loops import residual_rows
-
         arrays = [np.ascontiguousarray(x, dtype=np.float64) for x in (q, qd, qdd, z, u, p)]
         out = np.empty(arrays[0].shape)
-        residual_rows(self._compiled.residual, *arrays, out)
+        self._residual(*arrays, out)
         return out
 
     def contribution(self, q: Array, qd: Array, qdd: Array, z: Array, u: Array, p: Array) -> Array:
@@ -290,7 +292,13 @@ def compile_model(model: Model) -> System:
 def _generate(model: Model) -> tuple[dict[str, Any], dict[str, str]]:
     """What the generator says of a model, and the source of its modules."""
     from bampipe.model_functions import ROWS
-    from bampipe.physics.codegen import array_source, memory_source, rows_source, scalar_source
+    from bampipe.physics.codegen import (
+        array_source,
+        memory_source,
+        residual_source,
+        rows_source,
+        scalar_source,
+    )
     from bampipe.physics.derivation import derive
     from bampipe.physics.equations import contribution
 
@@ -315,6 +323,7 @@ def _generate(model: Model) -> tuple[dict[str, Any], dict[str, str]]:
     sources = {
         "columns": array_source(equations, added),
         "compiled": scalar_source(equations),
+        "residual": residual_source(equations),
         "rows": rows_source(equations, ROWS),
     }
     if equations.z:

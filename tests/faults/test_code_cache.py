@@ -286,7 +286,7 @@ def energy(system: System) -> float:
     return float(kinetic[0] + potential[0])
 
 
-@pytest.mark.parametrize("name", ["columns", "compiled", "rows", "meta"])
+@pytest.mark.parametrize("name", ["columns", "compiled", "residual", "rows", "meta"])
 @pytest.mark.parametrize("damage", ["truncated", "edited", "garbage", "gone"])
 def test_damaged_generated_code_is_generated_again(
     model: Model, tmp_path: Path, name: str, damage: str
