@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 import tempfile
 from pathlib import Path
 
@@ -251,3 +252,9 @@ def test_json_that_is_no_trial_is_refused_in_one_line(tmp_path, text, said):
     with pytest.raises(InputError) as caught:
         read_json(tmp_path, text)
     assert said in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_log_that_is_no_regular_file(tmp_path):
+    os.mkfifo(tmp_path / "a.csv")
+    with pytest.raises(InputError, match="not a regular file"):
+        read_trial(tmp_path / "a.csv", ("t", "x"), name="a.csv")

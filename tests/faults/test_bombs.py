@@ -134,6 +134,37 @@ def ros1(codec: str) -> Callable[[Path], None]:
     return write
 
 
+def messages(kind: str, *fields: str) -> Callable[[Path], None]:
+    """A message of 12 bytes that claims billions of items of a type with these fields."""
+
+    def write(path: Path) -> None:
+        pytest.importorskip("rosbags")
+        from rosbags.rosbag1 import Writer as Ros1Writer
+        from rosbags.rosbag2 import StoragePlugin
+        from rosbags.rosbag2 import Writer as Ros2Writer
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+        store = get_typestore(Stores.EMPTY)
+        inner = "\n".join(fields)
+        text = f"float64 x\nx/Item[{kind}] items\n{'=' * 80}\nMSG: x/Item\n{inner}"
+        store.register(get_types_from_msg(text, "x/msg/Log"))
+        writer: Any
+        if path.suffix == ".bag":
+            writer, made = Ros1Writer(path), path
+        else:
+            folder = path.with_suffix("")
+            plugin = StoragePlugin.MCAP
+            writer = Ros2Writer(folder, version=9, storage_plugin=plugin)
+            made = folder / path.name
+        with writer:
+            link = writer.add_connection("/state", "x/msg/Log", typestore=store)
+            start = b"" if path.suffix == ".bag" else b"\0\1\0\0"
+            writer.write(link, 1, start + struct.pack("<dI", 1.0, 2**31 - 1))
+        made.replace(path)
+
+    return write
+
+
 def view(path: Path) -> None:
     """A bag whose messages are made without end by a query."""
     with sqlite3.connect(path) as database:
@@ -186,6 +217,9 @@ BOMBS: dict[str, tuple[Callable[[Path], None], str, dict[str, Any], str]] = {
     "chunks.mcap": (mcap(4, 80 << 20), "state", {}, "chunks of the same time would unpack to"),
     "bz2.bag": (ros1("bz2"), "state", {}, "a chunk of 0.2 kB would unpack to more than 256 MB"),
     "lz4.bag": (ros1("lz4"), "state", {}, "kB would unpack to more than 256 MB"),
+    "list.bag": (messages(""), "state", {}, "not a sound bag"),
+    "array.bag": (messages("300000000"), "state", {}, "not a sound bag"),
+    "array.mcap": (messages("300000000", "float64 y"), "state", {}, "not a sound MCAP file"),
     "view.db3": (view, "state", {}, "not a sound bag"),
     "generated.db3": (generated, "state", {}, "not a sound bag"),
     "brackets.json": (brackets, "", {"largest_bytes": 1 << 30}, "a JSON text that unpacks to"),

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import json
 import sqlite3
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,6 +35,11 @@ from bampipe.errors import InputError
 
 RECORDED = "@time"
 STAMP = "header.stamp"
+_FILLER = "structure_needs_at_least_one_member"
+"""What rosbags puts into a type without fields; ROS 1 messages do not have it."""
+
+_MOST_ITEMS = 10_000
+"""Items of an array of messages or texts, nested ones counted in; robots have some dozen joints."""
 
 
 @dataclass(frozen=True)
@@ -227,8 +232,35 @@ def _ros_messages(path: Path, topics: Sequence[str], name: str) -> Iterator[tupl
         chosen = [c for c in reader.connections if not topics or c.topic in topics]
         if not chosen:
             raise InputError("holds no messages", where=name)
+        for connection in chosen:
+            _count_items(("NAME", connection.msgtype), reader.typestore.fielddefs)
         for connection, moment, raw in reader.messages(connections=chosen):
             yield connection.topic, moment, reader.deserialize(raw, connection.msgtype)
+
+
+def _count_items(kind: Any, types: Mapping[str, Any]) -> int:
+    """Items that every message of a type has, nested ones counted in.
+
+    Raises:
+        ValueError: a few bytes can make it endless: a list of types without fields, or a vast
+            array, whose items rosbags goes through one by one.
+    """
+    node, content = getattr(kind[0], "name", kind[0]), kind[1]
+    if node == "NAME":
+        fields = types[content][1]
+        return sum(_count_items(field, types) for label, field in fields if label != _FILLER)
+    if node == "BASE":
+        return 1
+    inner, count = content
+    items = _count_items(inner, types)
+    if node == "SEQUENCE" and items == 0:
+        raise ValueError("a list of a type without fields")
+    numbers = inner[0].name == "BASE" and inner[1][0] != "string"
+    if node == "SEQUENCE" or numbers:  # read at once
+        return 1
+    if count * max(items, 1) > _MOST_ITEMS:
+        raise ValueError("an array with too many items")
+    return int(count) * items
 
 
 def _check_tables(path: Path) -> None:
