@@ -1,4 +1,4 @@
-"""Fixtures of the whole test suite: toy stages, and folders to work in."""
+"""Fixtures of the whole test suite: toy stages, folders to work in, paths of shared modules."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from jsonschema import Draft202012Validator
 
 TOYS, ORACLES = (Path(__file__).parent / name for name in ("toys", "oracles"))
 sys.path[:0] = [str(TOYS), str(ORACLES)]
+# The simulators that share no code with bampipe serve tests and benchmarks alike.
+sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
 SCHEMAS = Path(__file__).parent.parent / "schemas"
 
 import install_toys  # noqa: E402

@@ -73,6 +73,8 @@ def record(
         rng = np.random.default_rng([seed, 1 + number])
         goal, rate = draw_moves(rng, steps, 0.12, 0.3 * c.pace, 0.1)
         kick = np.repeat(rng.choice([-60.0, 0.0, 0.0, 60.0], steps // 1500 + 1), 1500)[:steps]
+        # With edges of 20 ms, samples determine what happens between them.
+        kick = np.convolve(kick, np.hanning(200) / np.hanning(200).sum(), mode="same")
         at = sample_steps(rng, steps, 1.0 / (rate_hz * STEP), c)
         motion = move(specimen.machine, specimen.law, goal, rate, kick, at)
         t = at * STEP

@@ -160,5 +160,6 @@ def draw_waves(
     for w in 2 * np.pi * rng.uniform(0.06, highest_hz, 5):
         goal += np.sin(w * t + rng.uniform(0.0, 6.0)) / (0.3 + w / 3.0)
     goal *= reach * rng.uniform(0.7, 1.0) / np.abs(goal).max()
-    goal = (goal - goal[0]) * np.minimum(t / 1.5, 1.0) ** 2
+    rise = np.minimum(t / 1.5, 1.0)
+    goal = (goal - goal[0]) * rise**3 * (10.0 - 15.0 * rise + 6.0 * rise**2)
     return goal, np.gradient(goal, STEP)

@@ -1,0 +1,41 @@
+"""Estimates and their intervals, held against simulators that share no code with bampipe."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from independent_runs import record_run
+
+DAYS = {
+    "noise five times what is stated": {"noise_factor": 5.0},
+    "mains hum and coarse encoders": {"hum": 10.0, "coarse": 8.0},
+    "dropped samples and jitter": {"dropped": 0.02, "jitter": 0.1},
+    "true standstill": {"creep": False},
+}
+
+
+def deviations(run, truth):
+    """Estimate minus truth in standard deviations, by parameter of the bare device."""
+    table = run.parameters("base")
+    assert set(truth) == set(table.index)
+    return {name: (table.estimate[name] - truth[name]) / table.sd[name] for name in truth}
+
+
+@pytest.mark.parametrize("day", DAYS)
+def test_the_arm_is_identified_on_bad_days(tmp_path, day):
+    run, truth = record_run(tmp_path, "bam", 17, **DAYS[day])
+    off = deviations(run, truth)
+    assert max(map(abs, off.values())) < 4.0, off
+    assert np.sqrt(np.mean(np.square(list(off.values())))) < 2.0, off
+    estimates = run.parameters("base").estimate
+    for name, value in truth.items():
+        assert estimates[name] == pytest.approx(value, rel=0.03), name
+
+
+@pytest.mark.parametrize(("machine", "seed"), [("bam", 16), ("joint", 18), ("axis", 19)])
+def test_machines_that_lack_nothing_are_identified(tmp_path, machine, seed):
+    run, truth = record_run(tmp_path, machine, seed)
+    off = deviations(run, truth)
+    assert max(map(abs, off.values())) < 4.0, off
+    axes = run.validation("base")
+    assert (axes.held_out_rmse < 1.25 * axes.noise_floor).all()
