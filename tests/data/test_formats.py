@@ -326,6 +326,17 @@ def test_mcap_of_json(tmp_path):
     assert "not a sound MCAP file" in refused(path, ("/state:@time",))
 
 
+def test_an_mcap_file_whose_summary_is_not_where_it_says(tmp_path):
+    path = write_ros(tmp_path, "mcap")
+    content = bytearray(path.read_bytes())
+    start = int.from_bytes(content[-28:-20], "little")
+    content[-28:-20] = (start + 3).to_bytes(8, "little")
+    path.write_bytes(content)
+    assert "not a sound MCAP file" in refused(path, ("/joint_states:@time",))
+    with pytest.raises(InputError, match="not a sound MCAP file"):
+        columns_of(path)
+
+
 @pytest.mark.parametrize(
     ("ending", "module", "extra"),
     [

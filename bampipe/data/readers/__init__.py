@@ -11,7 +11,8 @@ taken (:mod:`.unpacking`).
 from __future__ import annotations
 
 import stat
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 
@@ -82,10 +83,8 @@ def read_trial(
     path, name = Path(path), name or str(path)
     reader = _READERS[_checked_extension(path, name)]
     wanted = Wanted(tuple(columns), datetimes or {}, dialect or Dialect(), largest_bytes)
-    try:
+    with _memory_named(name):
         trial: RawTrial = reader.read(path, wanted, name)
-    except MemoryError as error:
-        raise InputError("does not fit into memory", where=name) from error
     if len(trial.columns[columns[0]]) == 0:
         raise InputError("a header but no samples", where=name)
     return trial
@@ -100,8 +99,19 @@ def columns_of(path: Path, *, name: str = "") -> dict[str, str]:
         InputError: as :func:`read_trial`.
     """
     path, name = Path(path), name or str(path)
-    columns: dict[str, str] = _READERS[_checked_extension(path, name)].columns(path, name)
+    reader = _READERS[_checked_extension(path, name)]
+    with _memory_named(name):
+        columns: dict[str, str] = reader.columns(path, name)
     return columns
+
+
+@contextmanager
+def _memory_named(name: str) -> Iterator[None]:
+    """Turn a lack of memory into InputError."""
+    try:
+        yield
+    except MemoryError as error:
+        raise InputError("does not fit into memory", where=name) from error
 
 
 def _checked_extension(path: Path, name: str) -> str:

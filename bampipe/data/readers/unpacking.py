@@ -76,11 +76,14 @@ def check_mcap(path: Path, largest_bytes: int, name: str) -> None:
     """
     sizes: dict[int, int] = {}
     spans: list[tuple[int, int, int]] = []
+    starts = {0}
+    summary = 0
     with path.open("rb") as stream:
         end = stream.seek(0, 2)
         stream.seek(8)
         while stream.tell() < end - 8:
             start = stream.tell()
+            starts.add(start)
             kind, length = struct.unpack("<BQ", stream.read(9))
             if stream.tell() + length > end:
                 raise ValueError("a record ends after the file")
@@ -92,8 +95,13 @@ def check_mcap(path: Path, largest_bytes: int, name: str) -> None:
             elif kind == 0x08:
                 spans.append(struct.unpack("<QQQ", stream.read(24)))
                 stream.seek(length - 24, 1)
+            elif kind == 0x02:
+                (summary,) = struct.unpack("<Q", stream.read(8))
+                stream.seek(length - 8, 1)
             else:
                 stream.seek(length, 1)
+    if summary not in starts:
+        raise ValueError("the summary does not begin with a record")
     if not spans:
         check_unpacked(sum(sizes.values()), largest_bytes // 3, name, "a file without an index")
     held: list[tuple[int, int]] = []
