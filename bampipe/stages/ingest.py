@@ -178,6 +178,7 @@ def _match(session: Session, device: Device) -> None:
                 remedy=f"these are given: {', '.join(sorted(given)) or 'none'}",
             )
     wanted = {**dict.fromkeys(device.forces, device.force_unit), **device.channels}
+    wanted |= device.controller.channels if device.controller else {}
     for channel in session.channels:
         unit = wanted.get(channel.name, channel.unit)
         if not _alike(channel.unit, unit):

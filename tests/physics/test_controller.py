@@ -25,12 +25,8 @@ def test_the_servo_saturates_at_full_duty():
     law = compile_law(registry.device("servo_pendulum"))
     assert law is not None and law.inputs == ("goal", "gain", "supply", "t")
     out = np.empty(1)
-    for goal, duty in (
-        (0.02, 0.02 * 400 / 256 * 4096 / (2 * np.pi) / 885),
-        (1.0, 1.0),
-        (-1.0, -1.0),
-    ):
-        r = np.array([goal, 400.0, 7.4, 0.0])
+    for goal, duty in ((0.02, 0.02 * 1.15), (1.0, 1.0), (-1.0, -1.0)):
+        r = np.array([goal, 1.15, 7.4, 0.0])
         law.command(np.zeros(2), r, np.empty(0), out)
         assert out[0] == pytest.approx(duty, rel=1e-6)
 

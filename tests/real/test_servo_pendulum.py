@@ -21,6 +21,14 @@ from bampipe.trials.reading import free_trials, read_motion
 from bampipe.trials.residuals import problem_of
 
 HELD_OUT_GAIN = 200
+FULL_DUTY = 885.0
+"""Count at which the motor is always on: the manual's limit of the pulse width."""
+GAIN = 4096.0 / (2.0 * np.pi) / 256.0 / FULL_DUTY
+"""Duty for one radian and one count of the gain register.
+
+The encoder has 4096 steps a turn. 256 is the duty logged over gain times position error, alike in
+every log below saturation; the manual of the series says 128.
+"""
 HEAD = """
 schema = "bampipe.session/1"
 session_id = "{name}"
@@ -35,14 +43,14 @@ joint = {{ column = "position", unit = "rad", resolution = 1.5339807878853584e-3
 duty = {{ column = "load", unit = "", scale = {duty!r}, wrap_bits = 16, signed = true }}
 supply = {{ column = "input_volts", unit = "V" }}
 goal = {{ column = "goal_position", unit = "rad" }}
-gain = {{ column = "kp", unit = "" }}
+gain = {{ column = "kp", unit = "1/rad", scale = {gain!r} }}
 """
 BAND = Band(188.0, (8.0,))
 
 
 def write_session(folder: Path, logs: list[Path], name: str) -> Path:
     folder.mkdir()
-    text = HEAD.format(name=name, duty=1.0 / 885.0)
+    text = HEAD.format(name=name, duty=1.0 / FULL_DUTY, gain=GAIN)
     for log in logs:
         shutil.copy(log, folder / log.name)
         text += f'[[trials]]\nfile = "{log.name}"\nkind = "free"\n'
@@ -116,7 +124,7 @@ def free_run_error(run: Path, model: str) -> float:
     """Mean absolute error of the free run over the logs at the held-out gain, rad."""
     gains = read_parquet(run / "ingest/samples.parquet").groupby("trial_id").gain.first()
     trials = result(run, f"models/{model}/validate.json")["free_run"]["trials"]
-    chosen = [name for name in trials if gains[name] == HELD_OUT_GAIN]
+    chosen = [name for name in trials if gains[name] == pytest.approx(HELD_OUT_GAIN * GAIN)]
     assert len(chosen) == 3
     return float(np.mean([trials[name]["joint"]["mean_absolute"] for name in chosen]))
 

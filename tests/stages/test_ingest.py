@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -24,6 +25,7 @@ from bampipe.progress import silent
 from bampipe.run.settings import configure
 from bampipe.stages import ingest
 
+SAMPLES = Path(__file__).parents[2] / "sample_runs"
 NAMES = [f"open-0{number}" for number in range(1, 10)]
 
 
@@ -260,3 +262,11 @@ def test_memory_stays_below_three_times_the_largest_trial(tmp_path):
     status = read_parquet(tmp_path / "large-out/ingest/trials.parquet").status[0]
     assert status == "repaired"
     assert after - before < 3 * raw, f"{(after - before) / raw:.2f} times {raw >> 20} MB"
+
+
+def test_a_channel_of_the_controller_has_the_unit_of_the_device(tmp_path):
+    shutil.copytree(SAMPLES / "positioning_axis", tmp_path / "axis")
+    file = tmp_path / "axis/session.toml"
+    file.write_text(file.read_text().replace('"qg", unit = "m"', '"qg", unit = "N"'))
+    with pytest.raises(InputError, match=r"channels\.goal\.unit: a unit of N, but .* takes m"):
+        run_ingest(tmp_path / "axis", tmp_path / "out")
