@@ -11,6 +11,7 @@ from bampipe.api import loop
 from bampipe.declarations.model import ModelFile
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.ingest import IngestResult
+from bampipe.results.run import RunResult
 from bampipe.run import models, pipeline, record
 from bampipe.run.events import unheard
 
@@ -18,7 +19,7 @@ from bampipe.run.events import unheard
 def made(settings: dict[str, object]) -> dict[str, object]:
     """The record of a step that was given ``settings``."""
     empty: dict[str, object] = {"config": {}, "inputs": {}, "outputs": {}, "versions": {}}
-    return {**empty, "key": "k", "settings": settings, "declared_inputs": [], "code": "c",
+    return {**empty, "key": "0" * 64, "settings": settings, "declared_inputs": [], "code": "0" * 64,
             "summary": {}}  # fmt: skip
 
 
@@ -34,7 +35,7 @@ def test_a_child_is_identified_as_its_parent_was(tmp_path: Path) -> None:
         "validate:base": made({"model": "base", "seed": 3}),
         f"validate:{child}": made({"model": child, "seed": 4}),
     }
-    record.write(tmp_path, {"schema": record.SCHEMA, "stages": stages})
+    write_result(tmp_path, RunResult, schema=record.SCHEMA, stages=stages)
     given = loop.settings_of(tmp_path, "base")
     assert given == {"identify": {"method": "least-squares"}, "validate": {"seed": 3}}
     assert loop.settings_of(tmp_path, child) == {**given, "validate": {"seed": 4}}

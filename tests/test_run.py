@@ -660,4 +660,4 @@ def test_lock_is_free_after_a_crash(toy: Toy) -> None:
         toy.run()
     (toy.session / "numbers.txt").write_text("1")
     assert states(toy.run(wait=False)) == ["done"] * 4
-    assert record.read(toy.root)["failures"] == {}
+    assert record.read(toy.root).failures == {}

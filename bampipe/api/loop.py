@@ -73,13 +73,13 @@ def settings_of(root: Path, model: str) -> dict[str, dict[str, object]]:
     line = [model]
     while line[-1] in models.names(root) and models.read(root, line[-1]).parent:
         line.append(models.read(root, line[-1]).parent)
-    made = record.read(root)["stages"]
+    made = record.read(root).stages
     used: dict[str, dict[str, object]] = {}
     for name in line[::-1]:
         for stage in base.PER_MODEL:
-            given = made.get(f"{stage}:{name}", {}).get("settings")
-            if given is not None:
-                used[stage] = {key: value for key, value in given.items() if key != "model"}
+            step = made.get(f"{stage}:{name}")
+            if step is not None:
+                used[stage] = {k: value for k, value in step.settings.items() if k != "model"}
     return used
 
 
@@ -88,7 +88,8 @@ def current_model(root: Path) -> str:
 
     A model counts once it stands in the ladder: what a killed `extend` left unfinished does not.
     """
-    compared = record.read(root)["stages"].get("compare", {}).get("inputs", {})
+    steps = record.read(root).stages
+    compared = steps["compare"].inputs if "compare" in steps else {}
     known = [name for name in models.names(root) if f"models/{name}/validate.json" in compared]
     if not known:
         return models.BASE
@@ -151,7 +152,7 @@ def extend(options: Options, parent: str, effect: str) -> str:
     child = models.child_name(parent, name)
     if "/" in child or not is_normal(child):
         raise InputError(f"{name!r} is no name of an effect", remedy="see `bampipe effects`")
-    fresh = f"identify:{child}" not in record.read(root)["stages"]
+    fresh = f"identify:{child}" not in record.read(root).stages
     try:
         with options.lock():
             models.ensure_base(root, *options.pipeline.base_model)

@@ -6,7 +6,6 @@ control. `bampipe accept RUN` writes it; gates with ``against = "accepted"`` rea
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import quote
@@ -76,7 +75,7 @@ def accept(root: Path, model: str, folder: Path, force: bool = False) -> Path:
     names = (IdentifyResult.file(model), StiffnessResult.FILE, IngestResult.FILE)
     record.require_untouched(root, names)
     run.require(IdentifyResult.file(model), IdentifyResult.STAGE)
-    failed = [gate["gate"] for gate in record.read(root).get("gates", ()) if _failed(gate)]
+    failed = [gate.gate for gate in record.read(root).gates if gate.state == "failed"]
     if failed and not force:
         raise InputError(
             f"the gate {failed[0]!r} failed in this run",
@@ -109,7 +108,3 @@ def accept(root: Path, model: str, folder: Path, force: bool = False) -> Path:
     )
     write_json(path, content.model_dump(by_alias=True))
     return path
-
-
-def _failed(gate: Mapping[str, object]) -> bool:
-    return gate.get("state") == "failed"

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import bampipe
 from bampipe.errors import InputError, choose_from
@@ -12,21 +11,22 @@ from bampipe.files import read_toml
 
 if TYPE_CHECKING:
     from bampipe.declarations.pipeline import Pipeline
+    from bampipe.results.run import RunResult
 
 SCHEMA = "bampipe.pipeline/1"
 
 
-def recorded(content: Mapping[str, Any]) -> Pipeline:
+def recorded(run: RunResult) -> Pipeline:
     """Return the pipeline, without its gates, that ``run.json`` keeps; else the default one."""
     from bampipe.declarations.pipeline import Pipeline
     from bampipe.schema import read
 
-    kept = content.get("pipeline")
-    if not isinstance(kept, Mapping):
+    used = run.pipeline
+    if used is None:
         return load()
-    table = {key: kept.get(key) for key in ("name", "stages", "settings")}
-    table |= {"schema": SCHEMA, "model": {key: kept.get(key) for key in ("device", "effects")}}
-    return read(Pipeline, table, "run.json: pipeline")
+    model = {"device": used.device, "effects": used.effects}
+    table = {"name": used.name, "stages": used.stages, "settings": used.settings, "model": model}
+    return read(Pipeline, {"schema": SCHEMA, **table}, "run.json: pipeline")
 
 
 _PACKAGE = Path(bampipe.__file__).parent

@@ -6,7 +6,7 @@ import contextlib
 import os
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from bampipe.errors import InputError
 from bampipe.files import (
@@ -21,45 +21,39 @@ from bampipe.files import (
 from bampipe.run.events import Event, Listener, unheard
 from bampipe.run.lock import hold
 
+if TYPE_CHECKING:
+    from bampipe.results.run import RunResult, StepRecord
+
 SCHEMA = "bampipe.run/1"
 FILE = "run.json"
 PRIVATE = ".bampipe"
 SESSION = "session:"
 """What the names of a session's files begin with among the inputs of a step."""
 
-_TABLES = ("stages", "timings", "failures", "place", "gates")
-_FIELDS = {
-    "key": str,
-    "config": dict,
-    "settings": dict,
-    "declared_inputs": list,
-    "inputs": dict,
-    "outputs": dict,
-    "code": str,
-    "versions": dict,
-    "summary": dict,
-}
 
-
-def read(root: Path) -> dict[str, Any]:
-    """Return the contents of ``run.json`` in ``root``; of an empty run where there is none.
+def read(root: Path) -> RunResult:
+    """Return what ``run.json`` in ``root`` says; of an empty run where there is none.
 
     What is damaged counts as not there: its stages run again, and the file is rebuilt.
     """
-    found = _content(root)
-    if found is None:
-        return {"schema": SCHEMA, "stages": {}}
-    stages = found.get("stages")
-    kept = stages.items() if isinstance(stages, dict) else ()
-    sound: dict[str, Any] = {"stages": {name: made for name, made in kept if is_sound(made)}}
-    for name, kind in (("timings", dict), ("failures", str), ("place", str)):
-        if isinstance(found.get(name), dict):
-            sound[name] = {k: v for k, v in found[name].items() if isinstance(v, kind)}
-    gates = found.get("gates")
-    if isinstance(gates, list) and all(isinstance(gate, dict) for gate in gates):
-        sound["gates"] = gates
-    others = {name: value for name, value in found.items() if name not in _TABLES}
-    return {**others, **sound}
+    from bampipe.results.run import RunResult, Timing
+
+    found = _content(root) or {}
+    by_name: dict[str, Callable[[object], object]] = {
+        "stages": sound_step,
+        "timings": lambda value: _sound(Timing, value),
+        "failures": lambda value: _sound(str, value),
+    }
+    sound: dict[str, Any] = {"schema": SCHEMA, "stages": {}}
+    for name, field in RunResult.model_fields.items():
+        value = found.get(name)
+        if name in by_name:
+            entries = value.items() if isinstance(value, dict) else ()
+            checked = {key: by_name[name](entry) for key, entry in entries}
+            sound[name] = {key: entry for key, entry in checked.items() if entry is not None}
+        elif value is not None and (whole := _sound(field.annotation, value)) is not None:
+            sound[name] = whole
+    return RunResult(**sound)
 
 
 def is_damaged(root: Path) -> bool:
@@ -67,7 +61,7 @@ def is_damaged(root: Path) -> bool:
     if not (root / FILE).exists():
         return False
     found = _content(root)
-    return found is None or found.get("stages", {}).keys() != read(root)["stages"].keys()
+    return found is None or found.get("stages", {}).keys() != read(root).stages.keys()
 
 
 def _content(root: Path) -> dict[str, Any] | None:
@@ -80,19 +74,33 @@ def _content(root: Path) -> dict[str, Any] | None:
     return content if isinstance(content.get("stages"), dict) else None
 
 
-def is_sound(made: object) -> bool:
-    """Whether the record of a step has every field that the runner reads, of its type."""
-    if not isinstance(made, dict):
-        return False
-    if not all(isinstance(made.get(name), kind) for name, kind in _FIELDS.items()):
-        return False
-    hashes = {**made["inputs"], **made["outputs"]}
-    inputs = [name for name in made["inputs"] if not name.startswith(SESSION)]
-    return (
-        all(isinstance(digest, str) for digest in hashes.values())
-        and all(is_normal(name) for name in (*inputs, *made["declared_inputs"]))
-        and are_results(made["outputs"])
-    )
+def _sound(kind: Any, value: object) -> Any:
+    """Return ``value`` as a ``kind``; None where it is none."""
+    from pydantic import TypeAdapter, ValidationError
+
+    try:
+        return TypeAdapter(kind).validate_python(value)
+    except ValidationError:
+        return None
+
+
+def is_timing(value: object) -> bool:
+    """Whether ``value`` says when a step ran, and for how long."""
+    from bampipe.results.run import Timing
+
+    return _sound(Timing, value) is not None
+
+
+def sound_step(value: object) -> StepRecord | None:
+    """Return the record of a step; None where it is none, or names what leads out of the run."""
+    from bampipe.results.run import StepRecord
+
+    made: StepRecord | None = _sound(StepRecord, value)
+    if made is None:
+        return None
+    inputs = [name for name in made.inputs if not name.startswith(SESSION)]
+    normal = all(is_normal(name) for name in (*inputs, *made.declared_inputs))
+    return made if normal and are_results(made.outputs) else None
 
 
 def are_results(names: Iterable[object]) -> bool:
@@ -115,8 +123,8 @@ def require_untouched(root: Path, names: Iterable[str]) -> None:
     """
     written = {
         name: (step, known)
-        for step, made in read(root)["stages"].items()
-        for name, known in made["outputs"].items()
+        for step, made in read(root).stages.items()
+        for name, known in made.outputs.items()
     }
     for name in names:
         step, known = written.get(name, ("", ""))
@@ -157,9 +165,9 @@ def draft_of(path: Path) -> Path:
     return path.with_name(f".{path.name}.part")
 
 
-def write(root: Path, content: dict[str, Any]) -> None:
+def write(root: Path, content: RunResult) -> None:
     """Write ``run.json``, whole or not at all."""
-    replace_json(root / FILE, content)
+    replace_json(root / FILE, content.model_dump(mode="json"))
 
 
 @contextlib.contextmanager

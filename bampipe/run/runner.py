@@ -6,7 +6,6 @@ import json
 import shutil
 import time
 from datetime import UTC, datetime
-from typing import Any
 
 from bampipe import compile_ahead
 from bampipe.errors import InputError
@@ -28,6 +27,8 @@ class _Runner:
         self.root = request.root
 
     def execute(self, step: Step, reason: str) -> StepResult:
+        from bampipe.results.run import StepRecord, Timing
+
         name = self.root.name
         self.listen(Event(name, step.name, "start", 0.0, reason))
         compile_ahead.begin()
@@ -47,27 +48,24 @@ class _Runner:
         summary = module.execute(state.folder, out, config, progress)
         written = staging.written(out, outputs, step)
         settings = lasting(config)
-        previous = state.records.get(step.name, {}).get("outputs", {})
-        made: dict[str, Any] = {
-            "key": state.key(step, settings, inputs),
-            "config": settings,
-            "settings": state.settings(step),
-            "declared_inputs": list(declared),
-            "inputs": inputs,
-            "outputs": written,
-            "code": hashing.digest_code(step.stage),
-            "versions": dict(hashing.versions()),
-            "summary": _as_stored(summary, step),
-        }
+        previous = state.records[step.name].outputs if step.name in state.records else {}
+        made = StepRecord(
+            key=state.key(step, settings, inputs),
+            config=settings,
+            settings=state.settings(step),
+            declared_inputs=declared,
+            inputs=inputs,
+            outputs=written,
+            code=hashing.digest_code(step.stage),
+            versions=dict(hashing.versions()),
+            summary=_as_stored(summary, step),
+        )
         seconds = time.perf_counter() - clock
-        timing = {
-            "started_at": started.isoformat(timespec="seconds"),
-            "seconds": round(seconds, 3),
-        }
+        timing = Timing(started_at=started.isoformat(timespec="seconds"), seconds=round(seconds, 3))
         staging.seal(out, step, made, timing, sorted(previous.keys() - written.keys()))
         staging.commit(state, out)
         self.listen(Event(name, step.name, "done", 1.0))
-        return StepResult(step.name, "done", reason, seconds, made["summary"])
+        return StepResult(step.name, "done", reason, seconds, made.summary)
 
     def failed(self, step: Step, error: str) -> None:
         """Note that the step failed; what its last success left stays, and stays recorded."""
@@ -89,7 +87,7 @@ class _Runner:
             raise
         self.state.failures.pop(step.name, None)
         self.listen(Event(self.root.name, step.name, "unchanged", 1.0))
-        summary = self.state.records[step.name]["summary"]
+        summary = self.state.records[step.name].summary
         return StepResult(step.name, "unchanged", "", 0.0, summary)
 
     def run(self) -> Outcome:

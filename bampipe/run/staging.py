@@ -8,13 +8,16 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from bampipe.errors import InputError
 from bampipe.files import digest_file, is_inside, read_json_table
 from bampipe.run import record
 from bampipe.run.request import Step
 from bampipe.run.state import RunState
+
+if TYPE_CHECKING:
+    from bampipe.results.run import StepRecord, Timing
 
 COMMIT = ".commit.json"
 
@@ -67,9 +70,7 @@ def written(staging: Path, declared: tuple[str, ...], step: Step) -> dict[str, s
     return {name: digest_file(path) for name, path in files.items()}
 
 
-def seal(
-    staging: Path, step: Step, made: dict[str, Any], timing: dict[str, Any], remove: list[str]
-) -> None:
+def seal(staging: Path, step: Step, made: StepRecord, timing: Timing, remove: list[str]) -> None:
     """Write the commit file: from here on the step counts as done.
 
     Args:
@@ -79,23 +80,31 @@ def seal(
         timing: when it ran and how long.
         remove: outputs of its last run that it no longer has.
     """
-    entry = {"step": step.name, "record": made, "timing": timing, "remove": remove}
+    entry = {
+        "step": step.name,
+        "record": made.model_dump(mode="json"),
+        "timing": timing.model_dump(mode="json"),
+        "remove": remove,
+    }
     record.replace_json(staging / COMMIT, entry)
 
 
 def commit(state: RunState, staging: Path) -> None:
     """Move the outputs of a sealed step into the run folder; may be repeated."""
+    from bampipe.results.run import StepRecord, Timing
+
     entry = read_json_table(staging / COMMIT)
-    for relative in entry["record"]["outputs"]:
+    made = StepRecord.model_validate(entry["record"])
+    for relative in made.outputs:
         source, target = staging / relative, state.root / relative
         if source.is_file():
             target.parent.mkdir(parents=True, exist_ok=True)
             source.replace(target)
     for relative in entry["remove"]:
         (state.root / relative).unlink(missing_ok=True)
-    state.records[entry["step"]] = entry["record"]
+    state.records[entry["step"]] = made
     state.failures.pop(entry["step"], None)
-    state.timings[entry["step"]] = entry["timing"]
+    state.timings[entry["step"]] = Timing.model_validate(entry["timing"])
     state.save()
     shutil.rmtree(staging)
 
@@ -121,20 +130,19 @@ def _is_whole(root: Path, staging: Path) -> bool:
         entry = read_json_table(staging / COMMIT)
     except InputError:
         return False
-    step, made, remove = entry.get("step"), entry.get("record"), entry.get("remove")
+    step, remove = entry.get("step"), entry.get("remove")
+    made = record.sound_step(entry.get("record"))
     if not isinstance(step, str) or folder_name(step) != staging.name:
         return False
-    if not record.is_sound(made) or not isinstance(entry.get("timing"), dict):
+    if made is None or not record.is_timing(entry.get("timing")):
         return False
-    if not isinstance(made, dict) or not isinstance(remove, list):
+    if not isinstance(remove, list) or not record.are_results(remove):
         return False
-    if not record.are_results(remove):
-        return False
-    names = (*made["outputs"], *remove)
+    names = (*made.outputs, *remove)
     if not all(is_inside(root, name) and not (root / name).is_dir() for name in names):
         return False
     return all(
         is_inside(staging, name) and digest_file(staging / name) == digest
-        for name, digest in made["outputs"].items()
+        for name, digest in made.outputs.items()
         if (staging / name).is_file()
     )

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import copy
 import platform
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError
@@ -16,6 +15,9 @@ from bampipe.run.gates import Verdict
 from bampipe.run.request import Request, Step
 from bampipe.run.settings import configure, plain
 from bampipe.stages import base
+
+if TYPE_CHECKING:
+    from bampipe.results.run import RunResult
 
 NEUTRAL = ("session", "jobs")
 """Fields of a configuration that no result depends on: a place, and a number of processes."""
@@ -33,12 +35,10 @@ class RunState:
         self.root = request.root
         self.folder = RunFolder(request.root)
         self.damaged = record.is_damaged(request.root)
-        self.content = record.read(request.root)
-        self.written = copy.deepcopy(self.content)
-        self.records: dict[str, dict[str, Any]] = self.content.setdefault("stages", {})
-        self.timings: dict[str, Any] = self.content.setdefault("timings", {})
-        self.failures: dict[str, str] = self.content.setdefault("failures", {})
-        self.place: dict[str, Any] = self.content.setdefault("place", {})
+        self.written = record.read(request.root)
+        self.records = dict(self.written.stages)
+        self.timings = dict(self.written.timings)
+        self.failures = dict(self.written.failures)
         self.digests: dict[tuple[str, int, int, int], str] = {}
         self.memory = hashing.HashMemory(self.root / record.PRIVATE / "hashes.json")
         self.session = request.session
@@ -65,13 +65,13 @@ class RunState:
     def digest_record(self, step: Step) -> str:
         """Hash of what ``run.json`` says of the other steps, times and places left out."""
         return digest_content(
-            {name: made["key"] for name, made in self.records.items() if name != step.name}
+            {name: made.key for name, made in self.records.items() if name != step.name}
         )
 
     def session_folder(self) -> Path:
         if self.session is None:
-            place = self.place.get("session")
-            if not isinstance(place, str) or not Path(place).is_dir():
+            place = self.written.place.session
+            if place is None or not Path(place).is_dir():
                 raise InputError(
                     "the session of this run is not known or no longer there",
                     where=str(self.root),
@@ -125,7 +125,7 @@ class RunState:
 
     def check_untouched(self, name: str) -> None:
         for step, made in self.records.items():
-            written = made.get("outputs", {}).get(name)
+            written = made.outputs.get(name)
             if written is not None and self.digest(name) != written:
                 raise InputError(
                     f"{name} was changed since {step} wrote it",
@@ -152,11 +152,10 @@ class RunState:
         Where the same settings met the same code before, the record answers, and the module of
         the stage (which may import much) stays unloaded; the configuration is then None.
         """
-        made = self.records.get(step.name, {})
-        if made.get("settings") == self.settings(step) and made.get("code") == hashing.digest_code(
-            step.stage
-        ):
-            return made["config"], tuple(made["declared_inputs"]), None
+        made = self.records.get(step.name)
+        code = hashing.digest_code(step.stage)
+        if made is not None and made.settings == self.settings(step) and made.code == code:
+            return made.config, made.declared_inputs, None
         config = self.configure(step, self.settings(step))
         return lasting(config), base.load(step.stage).inputs(config), config
 
@@ -167,21 +166,21 @@ class RunState:
             return "run.json was damaged" if self.damaged else "never run"
         if self.request.force:
             return "forced"
-        for name, written in made["outputs"].items():
+        for name, written in made.outputs.items():
             if not self.folder.exists(name):
                 return f"{name} is gone"
             if self.digest(name) != written:
                 return f"{name} was changed since it was written"
         config, declared, _ = self.declared(step)
         inputs = self.inputs(step, declared)
-        if self.key(step, config, inputs) == made["key"]:
+        if self.key(step, config, inputs) == made.key:
             return ""
-        if config != made["config"]:
+        if config != made.config:
             return "settings changed"
-        for name in sorted(inputs.keys() | made["inputs"].keys()):
-            if inputs.get(name) != made["inputs"].get(name):
+        for name in sorted(inputs.keys() | made.inputs.keys()):
+            if inputs.get(name) != made.inputs.get(name):
                 return f"{name.removeprefix(record.SESSION)} changed"
-        if dict(hashing.versions()) != made["versions"]:
+        if dict(hashing.versions()) != made.versions:
             return "versions changed"
         return "the code of the stage changed"
 
@@ -201,28 +200,42 @@ class RunState:
 
     def save(self) -> None:
         """Write ``run.json``."""
-        self.content["schema"] = record.SCHEMA
-        self.content["run"] = self.root.name
-        self.content["versions"] = dict(hashing.versions())
-        self.place["machine"] = platform.platform()
-        if self.session is not None:
-            self.place["session"] = str(self.session.resolve())
-        record.write(self.root, self.content)
+        self._write(self._noted())
 
     def close(self, verdicts: Iterable[Verdict]) -> None:
         """Write ``run.json`` with the verdicts of the gates, unless it says the same already."""
-        noted = {**self.content, "failures": dict(self.failures)}
+        from bampipe.results.run import GateVerdict, PipelineUsed
+
+        noted = self._noted()
         if self.request.judged:
-            noted["pipeline"] = self.request.pipeline.content()
-            noted["gates"] = [verdict.content() for verdict in verdicts]
-        if self.session is not None:
-            noted["place"] = {**self.place, "session": str(self.session.resolve())}
+            used = PipelineUsed.model_validate(self.request.pipeline.content())
+            gates = tuple(GateVerdict.model_validate(verdict.content()) for verdict in verdicts)
+            noted = noted.model_copy(update={"pipeline": used, "gates": gates})
         if noted != self.written:
-            self.content.update(noted)
-            self.place = self.content["place"]
-            self.save()
+            self._write(noted)
         if self.memory.changed:
             record.replace_json(self.memory.path, self.memory.notes)
+
+    def _noted(self) -> RunResult:
+        """What is known by now; versions and machine as they were written."""
+        place = self.written.place
+        if self.session is not None:
+            place = place.model_copy(update={"session": str(self.session.resolve())})
+        return self.written.model_copy(
+            update={
+                "stages": dict(self.records),
+                "timings": dict(self.timings),
+                "failures": dict(self.failures),
+                "place": place,
+            }
+        )
+
+    def _write(self, noted: RunResult) -> None:
+        place = noted.place.model_copy(update={"machine": platform.platform()})
+        versions = dict(hashing.versions())
+        update = {"run": self.root.name, "versions": versions, "place": place}
+        self.written = noted.model_copy(update=update)
+        record.write(self.root, self.written)
 
 
 def _maker(name: str) -> str:

@@ -51,7 +51,7 @@ def status(root: Path, pipeline: Pipeline) -> list[StepStatus]:
     stale = False
     for stage in shown:
         for step in run.steps(stage):
-            timing = run.timings.get(step.name, {})
+            timing = run.timings.get(step.name)
             if step.name in run.failures:
                 state, reason = "failed", run.failures[step.name]
             elif step.name not in run.records:
@@ -70,8 +70,8 @@ def status(root: Path, pipeline: Pipeline) -> list[StepStatus]:
                     step.name,
                     state,
                     reason,
-                    timing.get("started_at", ""),
-                    timing.get("seconds"),
+                    timing.started_at if timing else "",
+                    timing.seconds if timing else None,
                 )
             )
     return found

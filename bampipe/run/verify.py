@@ -26,15 +26,15 @@ def verify(root: Path) -> list[tuple[str, str]]:
     content = record.read(root)
     found: dict[str, str] = {record.FILE: "damaged"} if record.is_damaged(root) else {}
     recorded: set[str] = {record.FILE}
-    for made in content["stages"].values():
-        for name, written in made.get("outputs", {}).items():
+    for made in content.stages.values():
+        for name, written in made.outputs.items():
             recorded.add(name)
             path = root / name
             if not path.is_file():
                 found[name] = "gone"
             elif digest_file(path) != written:
                 found[name] = "changed"
-        for name, written in made.get("inputs", {}).items():
+        for name, written in made.inputs.items():
             if name.startswith(record.SESSION):
                 continue
             recorded.add(name)
@@ -45,12 +45,12 @@ def verify(root: Path) -> list[tuple[str, str]]:
                 found[name] = "gone"
             elif digest_input(path) != written and path.suffix == ".toml":
                 found[name] = "changed"
-    place = content.get("place", {}).get("session")
+    place = content.place.session
     for stage in base.READS_SESSION:
-        noted = content["stages"].get(stage, {}).get("inputs", {})
-        if not noted:
+        if stage not in content.stages:
             continue
-        if not isinstance(place, str) or not Path(place).is_dir():
+        noted = content.stages[stage].inputs
+        if place is None or not Path(place).is_dir():
             found["session"] = "gone"
             continue
         now = hashing.digest_session(Path(place))

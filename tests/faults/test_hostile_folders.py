@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from conftest import Toy
+from made_results import write_result
 
 from bampipe.api import loop
 from bampipe.api.opened import open_run
@@ -19,6 +20,8 @@ from bampipe.declarations.model import ModelFile
 from bampipe.errors import InputError
 from bampipe.files import is_inside, is_normal, read_json, read_toml
 from bampipe.lab.collect import collect
+from bampipe.results.ingest import IngestResult
+from bampipe.results.run import RunResult
 from bampipe.run import models, record
 from bampipe.run.events import unheard
 from bampipe.run.publish import publish
@@ -130,10 +133,8 @@ def test_a_link_in_the_folder_of_the_lab_is_refused(toy: Toy, outside: Path) -> 
     lab.mkdir()
     (lab / ".lock").touch()
     (lab / "figures").symlink_to(outside)
-    (toy.root / "ingest").mkdir(exist_ok=True)
-    about = {"device": "bam", "axes": {}, "recorded_at": "2026-10-03T10:00:00Z"}
-    (toy.root / "ingest/session.json").write_text(json.dumps(about))
-    record.write(toy.root, {"schema": record.SCHEMA, "stages": {}})
+    write_result(toy.root, IngestResult, device="bam", axes={"yaw": {}})
+    record.write(toy.root, RunResult(schema=record.SCHEMA, stages={}))
     with pytest.raises(InputError, match="a link"):
         collect(toy.runs, lab)
     assert (outside / "mine.svg").read_text() == "mine"

@@ -200,7 +200,8 @@ def test_a_result_that_was_edited_leaves_its_run_out(tmp_path: Path) -> None:
     runs = make_lab(tmp_path, sessions=2)
     path = runs / "s01/models/base/identify.json"
     step = {
-        "key": "", "config": {}, "settings": {}, "declared_inputs": [], "inputs": {}, "code": "",
+        "key": "0" * 64, "config": {}, "settings": {}, "declared_inputs": [], "inputs": {},
+        "code": "0" * 64,
         "versions": {}, "summary": {}, "outputs": {"models/base/identify.json": digest_file(path)},
     }  # fmt: skip
     kept = {"schema": "bampipe.run/1", "stages": {"identify:base": step}}
