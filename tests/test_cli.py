@@ -392,7 +392,8 @@ def test_an_effect_is_not_added_twice(ingested: Path, command: Command) -> None:
     folder.mkdir(parents=True)
     text = 'schema = "bampipe.model/1"\nname = "base+stribeck.yaw"\nparent = "base"\n'
     (folder / "model.toml").write_text(text + 'device = "bam"\neffects = ["stribeck:yaw"]\n')
-    error = one_line_error(*command("extend", ingested, "stribeck:yaw"))
+    extended = ("--model", "base+stribeck.yaw")
+    error = one_line_error(*command("extend", ingested, "stribeck:yaw", *extended))
     assert "has stribeck:yaw already" in error
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import bampipe.stages
@@ -17,6 +18,7 @@ TABLES = {
 def install() -> None:
     """Replace the stages of bampipe by the toys."""
     folder = str(Path(__file__).parent)
+    sys.path.append(str(Path(__file__).parents[1]))  # for made_results
     if folder not in bampipe.stages.__path__:
         bampipe.stages.__path__.append(folder)
     for name, value in TABLES.items():

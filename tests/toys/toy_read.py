@@ -6,12 +6,14 @@ import json
 import os
 from pathlib import Path
 
+from made_results import write_result
 from pydantic.dataclasses import dataclass as checked_dataclass
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError
 from bampipe.files import write_json
 from bampipe.progress import Progress
+from bampipe.results.ingest import IngestResult
 from bampipe.schema import STRICT
 
 NAME = "toy_read"
@@ -45,13 +47,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         numbers = [int(word) + config.offset for word in text.split()]
     except ValueError as error:
         raise InputError(str(error), where="numbers.txt", remedy="write whole numbers") from error
-    session = {
-        "session_id": "toy", "device": "bam", "device_file": None, "recorded_at": None,
-        "sample_rate_hz": 1.0, "announced_rate_hz": None, "brakes": {}, "channels": {},
-        "axes": {"yaw": {"unit": "rad", "resolution": None}},
-        "force": {"columns": [], "unit": "N", "noise_sd": None},
-    }  # fmt: skip
-    write_json(out / "ingest/session.json", session)
+    write_result(out, IngestResult, device="bam", axes={"yaw": {}})
     write_json(out / "toy/numbers.json", {"numbers": numbers})
     return {"headline": f"{len(numbers)} numbers"}
 
