@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import read_parquet
-from bampipe.estimate import filterpy_oracle
+from bampipe.estimate import filterpy_engine
 from bampipe.estimate.unscented import FilterModel, FilterSettings, Trial, filter_trials
 from bampipe.files import read_json
 from bampipe.physics import Model, compile_model, registry
@@ -179,11 +179,11 @@ def in_python(derivative: Callable[..., None]) -> Callable[..., None]:
 def by_filterpy(problem: Problem, compiled: bool, repeats: int) -> Measured:
     """filterpy 2, the model compiled or in Python."""
     advance = (
-        filterpy_oracle.runge_kutta if compiled else in_python(problem.system.derivative.py_func)
+        filterpy_engine.runge_kutta if compiled else in_python(problem.system.derivative.py_func)
     )
 
     def run() -> Array:
-        return filterpy_oracle.filter_trials_by_filterpy(
+        return filterpy_engine.filter_trials_by_filterpy(
             problem.model, [problem.trial], problem.mean, problem.covariance, problem.settings,
             advance=advance,
         ).theta  # fmt: skip

@@ -65,11 +65,11 @@ def window_means(nis: Array, n_readings: int, samples: int) -> Array:
         samples: length of a window; windows less than half full are left out.
     """
     count = nis.size // samples
-    whole = nis[: count * samples].reshape(count, samples)
-    full = np.isfinite(whole).sum(axis=1)
-    sums = np.nansum(whole, axis=1)
-    kept = full >= 0.5 * samples
-    return np.asarray(sums[kept] / (full[kept] * n_readings))
+    windows = nis[: count * samples].reshape(count, samples)
+    full = np.isfinite(windows).sum(axis=1)
+    sums = np.nansum(windows, axis=1)
+    judged = full >= 0.5 * samples
+    return np.asarray(sums[judged] / (full[judged] * n_readings))
 
 
 class WindowTest:

@@ -108,13 +108,13 @@ def extend(values: Array, reach: int, fit: int) -> Array:
     steps = np.arange(fit, dtype=np.float64)
     offsets = np.arange(1, reach + 1, dtype=np.float64)
 
-    def beyond(end: Array) -> Array:
+    def extrapolate(end: Array) -> Array:
         """Return the samples before ``end[0]``, the nearest first."""
         curve = np.polynomial.Polynomial.fit(steps, end[:fit], degree)
-        start, bend = curve(0.0), curve.deriv(2)(0.0) if degree >= 2 else 0.0
-        return np.asarray(2.0 * start - end[1 : reach + 1] + bend * offsets**2)
+        start, curvature = curve(0.0), curve.deriv(2)(0.0) if degree >= 2 else 0.0
+        return np.asarray(2.0 * start - end[1 : reach + 1] + curvature * offsets**2)
 
-    return np.concatenate((beyond(values)[::-1], values, beyond(values[::-1])))
+    return np.concatenate((extrapolate(values)[::-1], values, extrapolate(values[::-1])))
 
 
 Linear = Callable[[Array], tuple[Array, Array, Array]]

@@ -64,12 +64,12 @@ def sandwich_covariance(
     scores = np.array([gain - matrix @ final for matrix, gain in gains])
     meat = scores.T @ scores * (len(gains) / (len(gains) - final.size))
     found = model @ meat @ model
-    own, seen = np.diag(model), np.diag(found)
-    silent = seen <= _SILENT * own
-    widen = np.sqrt(np.maximum(own / np.where(silent, own, seen), 1.0))
+    filter_variance, variance = np.diag(model), np.diag(found)
+    silent = variance <= _SILENT * filter_variance
+    widen = np.sqrt(np.maximum(filter_variance / np.where(silent, filter_variance, variance), 1.0))
     found = found * np.outer(widen, widen)
     found[silent] = found[:, silent] = 0.0
-    found[silent, silent] = own[silent]
+    found[silent, silent] = filter_variance[silent]
     return np.asarray(found), len(gains)
 
 

@@ -128,15 +128,15 @@ def reversals(smooth: Array) -> NDArray[np.intp]:
     valleys = find_peaks(-smooth, prominence=least)[0]
     turns = np.sort(np.concatenate((peaks, valleys)))
     # Two peaks in a row can only be shoulders of one: the higher is the turn.
-    kept: list[int] = []
+    turning: list[int] = []
     for turn in turns:
         top = turn in peaks
-        if kept and (kept[-1] in peaks) == top:
-            if (smooth[turn] > smooth[kept[-1]]) == top:
-                kept[-1] = int(turn)
+        if turning and (turning[-1] in peaks) == top:
+            if (smooth[turn] > smooth[turning[-1]]) == top:
+                turning[-1] = int(turn)
         else:
-            kept.append(int(turn))
-    return np.array(kept, dtype=np.intp)
+            turning.append(int(turn))
+    return np.array(turning, dtype=np.intp)
 
 
 def branches_of(torque: Array, deflection: Array, rate_hz: float) -> tuple[Branch, ...]:

@@ -68,7 +68,7 @@ def information(slope: Array, spectrum: Array) -> Array:
     return np.asarray((flat.conj().T @ flat).real)
 
 
-def bound(matrix: Array) -> Array:
+def cramer_rao_bound(matrix: Array) -> Array:
     """Cramér-Rao bound: inverse of the information, infinite for what it says nothing of.
 
     Args:
@@ -85,7 +85,7 @@ def bound(matrix: Array) -> Array:
     return np.asarray(inverse)
 
 
-def unseen(matrix: Array, prior_sd: Array) -> Array:
+def undetermined_covariance(matrix: Array, prior_sd: Array) -> Array:
     """What stays open of a prior where the information says nothing, (n, n) covariance.
 
     That is the prior, its parameters independent, given all combinations that the data fix.
@@ -143,10 +143,10 @@ def growth_without(parts: Sequence[Array]) -> Array:
         parts: by trial, (n, n) information.
     """
     total = np.sum(parts, axis=0)
-    with_all = np.sqrt(np.diag(bound(total)))
+    with_all = np.sqrt(np.diag(cramer_rao_bound(total)))
     rows = []
     for part in parts:
-        without = np.sqrt(np.diag(bound(total - part)))
+        without = np.sqrt(np.diag(cramer_rao_bound(total - part)))
         known = np.isfinite(with_all) & (with_all > 0.0)
         rows.append(np.where(known, without / np.where(known, with_all, 1.0) - 1.0, 0.0))
     return np.array(rows)

@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Test:
+class InnovationTest:
     """Outcome of one test.
 
     Attributes:
@@ -33,7 +33,7 @@ class Test:
     share: float
 
 
-def averaged(values: Array, length: int) -> Array:
+def average_stretches(values: Array, length: int) -> Array:
     """Means of consecutive stretches, (T // length, n), NaN where a value is missing.
 
     Args:
@@ -43,7 +43,7 @@ def averaged(values: Array, length: int) -> Array:
     return np.asarray(values[: count * length].reshape(count, length, -1).mean(axis=1))
 
 
-def whiteness(records: Sequence[Array], lags: int = 20) -> Test | None:
+def check_whiteness(records: Sequence[Array], lags: int = 20) -> InnovationTest | None:
     """Ljung and Box's test over records with gaps; None where there are too few values.
 
     Args:
@@ -68,12 +68,14 @@ def whiteness(records: Sequence[Array], lags: int = 20) -> Test | None:
     correlation = products / counts / variance
     statistic = float((size + 2.0) / size * np.sum(counts * correlation**2))
     share = float(np.sum(correlation**2 - 1.0 / counts))
-    return Test(statistic, lags, float(stats.chi2.sf(statistic, lags)), min(max(share, 0.0), 1.0))
+    return InnovationTest(
+        statistic, lags, float(stats.chi2.sf(statistic, lags)), min(max(share, 0.0), 1.0)
+    )
 
 
-def independence(
+def check_independence(
     records: Sequence[Array], inputs: Sequence[Array], lags: Sequence[int]
-) -> Test | None:
+) -> InnovationTest | None:
     """Regress innovations on present and past inputs; None where there is nothing to regress on.
 
     Inputs of a hand change slowly, so that a correlation at one lag is one at all: a regression
@@ -110,4 +112,6 @@ def independence(
     rest = len(y) - m - 1
     statistic = (explained / m) / max((total - explained) / rest, 1e-300)
     share = explained / total - m / len(y)
-    return Test(statistic, m, float(stats.f.sf(statistic, m, rest)), min(max(share, 0.0), 1.0))
+    return InnovationTest(
+        statistic, m, float(stats.f.sf(statistic, m, rest)), min(max(share, 0.0), 1.0)
+    )

@@ -30,7 +30,7 @@ _SETTLED = 1e-10
 
 _V = float64[::1]
 _M = float64[:, ::1]
-_SEEN = boolean[::1]
+_FLAGS = boolean[::1]
 
 
 def transition(order: int) -> tuple[Array, Array]:
@@ -125,9 +125,16 @@ def _allocate_pass(count: int, order: int) -> _Pass:
     )  # fmt: skip
 
 
-@njit(void(_V, _SEEN, _M, _M, _V, _M, _PASS, _M), cache=True)
+@njit(void(_V, _FLAGS, _M, _M, _V, _M, _PASS, _M), cache=True)
 def _filter(
-    y: Array, seen: Flags, step: Array, noise: Array, x: Array, p: Array, passed: _Pass, work: Array
+    y: Array,
+    present: Flags,
+    step: Array,
+    noise: Array,
+    x: Array,
+    p: Array,
+    passed: _Pass,
+    work: Array,
 ) -> None:
     """Run the filter from prior ``x``, ``p`` for the first sample and note what it passes.
 
@@ -137,7 +144,7 @@ def _filter(
     for t in range(y.shape[0]):
         if t > 0:
             _predict(x, p, step, noise, work)
-        if seen[t]:
+        if present[t]:
             innovations[t], spreads[t] = _update(x, p, y[t], gains[t])
         for i in range(x.shape[0]):
             states[t, i] = x[i]
@@ -145,9 +152,9 @@ def _filter(
                 covariances[t, i, j] = p[i, j]
 
 
-@njit(void(_SEEN, _M, _PASS, _M, _M, _M, _M), cache=True)
+@njit(void(_FLAGS, _M, _PASS, _M, _M, _M, _M), cache=True)
 def _smooth(
-    seen: Flags,
+    present: Flags,
     step: Array,
     passed: _Pass,
     variances: Array,
@@ -176,7 +183,7 @@ def _smooth(
                     total += weight[j, k] * p[k, i]
                 variance -= p[i, j] * total
             variances[t, i] = max(variance, 0.0)
-        if seen[t]:
+        if present[t]:
             # adjoint <- C' adjoint - H' v/S, weight <- C' weight C + H' H/S, with C = I - K H
             share = 0.0
             for j in range(n):
@@ -222,7 +229,7 @@ def _smooth(
 )
 def _evidence(
     y: Array,
-    seen: Flags,
+    present: Flags,
     step: Array,
     noise: Array,
     x: Array,
@@ -240,7 +247,7 @@ def _evidence(
     logs, squares, count = 0.0, 0.0, 0
     settled, spread = False, 1.0
     for t in range(y.shape[0]):
-        if settled and seen[t]:
+        if settled and present[t]:
             for i in range(n):
                 total = 0.0
                 for j in range(i, n):
@@ -252,7 +259,7 @@ def _evidence(
         else:
             if t > 0:
                 _predict(x, p, step, noise, work)
-            if not seen[t]:
+            if not present[t]:
                 settled = False
                 continue
             before = spread
@@ -276,7 +283,7 @@ def _prior(y: Array, order: int) -> tuple[Array, Array]:
     return start, np.diag(np.square(spread))
 
 
-def _informed_prior(y: Array, seen: Flags, step: Array, noise: Array) -> tuple[Array, Array]:
+def _informed_prior(y: Array, present: Flags, step: Array, noise: Array) -> tuple[Array, Array]:
     """Return a prior for the first state from the samples themselves, ten times too wide.
 
     The filter is run backwards in time (odd derivatives change sign). Against a prior that says
@@ -288,7 +295,7 @@ def _informed_prior(y: Array, seen: Flags, step: Array, noise: Array) -> tuple[A
     reverse = np.ascontiguousarray(y[::-1])
     start, spread = _prior(reverse, order)
     passed = _allocate_pass(count, order)
-    flags = np.ascontiguousarray(seen[::-1])
+    flags = np.ascontiguousarray(present[::-1])
     _filter(reverse, flags, step, noise, start, spread, passed, np.empty((order, order)))
     return passed.states[-1] * signs, 100.0 * passed.covariances[-1] * np.outer(signs, signs)
 
@@ -320,24 +327,24 @@ class MotionModel:
         return self.ratio * self.noise_sd**2 * self.rate_hz ** (2 * self.order - 1)
 
 
-def smooth(position: Array, model: MotionModel, seen: Flags | None = None) -> Derivatives:
+def smooth(position: Array, model: MotionModel, present: Flags | None = None) -> Derivatives:
     """Return the motion behind ``position`` (T,), given all its samples.
 
     Args:
         position: samples on the uniform grid of ``model.rate_hz``.
         model: motion and noise.
-        seen: shape (T,), false where there is no sample: ``position`` is then not used, and the
+        present: shape (T,), false where there is no sample: ``position`` is then not used, and the
             bands widen. The first sample must be there. All are, by default.
     """
     order, count = model.order, len(position)
-    seen = np.ones(count, dtype=bool) if seen is None else np.ascontiguousarray(seen)
+    present = np.ones(count, dtype=bool) if present is None else np.ascontiguousarray(present)
     step, noise = transition(order)
     y = (position - position[0]) / model.noise_sd
-    start, spread = _informed_prior(y, seen, step, model.ratio * noise)
+    start, spread = _informed_prior(y, present, step, model.ratio * noise)
     passed, variances = _allocate_pass(count, order), np.empty((count, order))
     work = np.empty((order, order))
-    _filter(y, seen, step, model.ratio * noise, start, spread, passed, work)
-    _smooth(seen, step, passed, variances, np.zeros((2, order)), np.zeros((order, order)), work)
+    _filter(y, present, step, model.ratio * noise, start, spread, passed, work)
+    _smooth(present, step, passed, variances, np.zeros((2, order)), np.zeros((order, order)), work)
     scale = model.noise_sd * model.rate_hz ** np.arange(3)
     x, sd = passed.states[:, :3] * scale, np.sqrt(variances[:, :3]) * scale
     return Derivatives(x[:, 0] + position[0], x[:, 1], x[:, 2], sd[:, 0], sd[:, 1], sd[:, 2])
@@ -386,7 +393,8 @@ def maximum_likelihood(
     quantum = resolution / np.sqrt(12.0)
     unit = quantum if quantum > 0.0 else float(np.std(np.diff(records[0][0]))) or 1.0
     scaled = [
-        ((position - position[0]) / unit, np.ascontiguousarray(seen)) for position, seen in records
+        ((position - position[0]) / unit, np.ascontiguousarray(present))
+        for position, present in records
     ]
     priors = [_prior(y, order) for y, _ in scaled]
 
@@ -394,9 +402,9 @@ def maximum_likelihood(
         """Return -log likelihood, measurement noise variance in units, and mean of v²/S."""
         logs = squares = 0.0
         count = 0
-        for (y, seen), (start, spread) in zip(scaled, priors, strict=True):
+        for (y, present), (start, spread) in zip(scaled, priors, strict=True):
             part = _evidence(
-                y, seen, step, np.exp(log_ratio) * noise, start.copy(), spread.copy(), 4 * order,
+                y, present, step, np.exp(log_ratio) * noise, start.copy(), spread.copy(), 4 * order,
                 np.empty((order, order)), np.empty(order),
             )  # fmt: skip
             logs, squares, count = logs + part[0], squares + part[1], count + part[2]

@@ -72,8 +72,8 @@ class _Linear:
     def projected(self) -> tuple[Array, Array]:
         """Error and slope by the parameters, less what an initial state explains."""
         basis, upper = np.linalg.qr(self.by_state)
-        kept = np.abs(np.diag(upper)) > 1e-12 * np.max(np.abs(upper))
-        basis = basis[:, kept]
+        determined = np.abs(np.diag(upper)) > 1e-12 * np.max(np.abs(upper))
+        basis = basis[:, determined]
         both = np.column_stack([self.error, self.by_parameter])
         both = both - basis @ (basis.T @ both)
         return both[:, 0], both[:, 1:]
@@ -177,9 +177,9 @@ class _Shot:
     def moved(self, value: Array, share: float) -> _Shot:
         p = self.p.copy()
         p[self.free] = value
-        whole = (value - self.value) / share
+        full_step = (value - self.value) / share
         states = [
-            x0 + share * _of_state(item, whole)
+            x0 + share * _of_state(item, full_step)
             for x0, item in zip(self.states, self.linear, strict=True)
         ]
         return replace(self, p=p, states=states, errors=_errors(self.segments, states, p))
@@ -203,10 +203,10 @@ def _linearise(
             (segment.simulate(moved, p) - base) / segment.x0_step[k] * weight
         ).reshape(-1)
     by_parameter = np.empty((base.size, free.size))
-    for k, place in enumerate(free):
+    for k, index in enumerate(free):
         moved = p.copy()
-        size = step[k] if p[place] + step[k] <= upper[k] else -step[k]
-        moved[place] += size
+        size = step[k] if p[index] + step[k] <= upper[k] else -step[k]
+        moved[index] += size
         by_parameter[:, k] = ((segment.simulate(x0, moved) - base) / size * weight).reshape(-1)
     return _Linear(((segment.q - base) * weight).reshape(-1), by_state, by_parameter)
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import read_parquet
 from bampipe.errors import InputError
-from bampipe.estimate.innovations import averaged
+from bampipe.estimate.innovations import average_stretches
 from bampipe.estimate.unscented import (
     FilteredTrial,
     FilterFailure,
@@ -333,7 +333,7 @@ def _kept(filtered: FilteredTrial, trial: Trial) -> Pass:
         counted=int(seen.sum()),
         log_likelihood=float(np.nansum(filtered.log_likelihood)),
         ratio=np.sqrt(np.nanmean(size**2, axis=0)),
-        stretches=averaged(size, stretch_of(trial)),
+        stretches=average_stretches(size, stretch_of(trial)),
     )
 
 
@@ -344,7 +344,7 @@ def stretch_of(trial: Trial) -> int:
 
 def _engine(choice: FilterChoice) -> Callable[..., FilterResult]:
     if choice.engine == "filterpy":
-        from bampipe.estimate.filterpy_oracle import filter_trials_by_filterpy
+        from bampipe.estimate.filterpy_engine import filter_trials_by_filterpy
 
         return filter_trials_by_filterpy
     return filter_trials

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from bampipe.estimate.identifiability import (
     Weak,
-    bound,
+    cramer_rao_bound,
     growth_without,
     information,
     residual_spectrum,
-    unseen,
+    undetermined_covariance,
     weak_directions,
 )
 from bampipe.estimate.least_squares import Problem, residual_and_slopes
@@ -81,7 +81,7 @@ def identifiability(
     n = len(names)
     total = np.sum(joint, axis=0)
     own = total[:n, :n]
-    covariance = bound(own)
+    covariance = cramer_rao_bound(own)
     sd = np.sqrt(np.diag(covariance))
     value = p[problem.free]
     kept = [i for i, name in enumerate(names) if name != TIMING]
@@ -129,7 +129,9 @@ def identifiability(
         "sentences": sentences,
     }
     bounds = tuple(_finite(sd[i]) for i in kept)
-    return Identifiability(bounds, unseen(own, assumed)[place], report, tuple(sentences))
+    return Identifiability(
+        bounds, undetermined_covariance(own, assumed)[place], report, tuple(sentences)
+    )
 
 
 def _of_trial(
@@ -224,7 +226,7 @@ def _number(
 ) -> dict[str, Any]:
     """Return what the trials say of one number of the device, were it estimated too."""
     rows = [*range(n), place]
-    covariance = bound(total[np.ix_(rows, rows)])
+    covariance = cramer_rao_bound(total[np.ix_(rows, rows)])
     partner, correlation = _partner(covariance, n)
     shift = -np.linalg.lstsq(total[:n, :n], total[:n, place], rcond=1e-12)[0]
     size = np.abs(value)

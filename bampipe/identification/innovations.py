@@ -7,7 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from bampipe.estimate.innovations import Test, averaged, independence, whiteness
+from bampipe.estimate.innovations import (
+    InnovationTest,
+    average_stretches,
+    check_independence,
+    check_whiteness,
+)
 from bampipe.estimate.unscented import Trial
 from bampipe.identification.filter_run import STRETCH_S, FilterRun, stretch_of
 from bampipe.physics import System
@@ -39,14 +44,14 @@ def innovation_tests(
     for place, trial in zip(found.order, found.trials, strict=True):
         given = trials[place]
         length = stretch_of(given)
-        clear = averaged(moving[place].astype(float), length) == 1.0
+        clear = average_stretches(moving[place].astype(float), length) == 1.0
         by_trial.append(np.where(clear, trial.stretches[:, :n], np.nan))
-        inputs.append(averaged(given.u[:, channels], length))
+        inputs.append(average_stretches(given.u[:, channels], length))
     content: dict[str, object] = {}
     for axis in range(n):
         records = [stretches[:, axis] for stretches in by_trial]
         lags = [round(lag / STRETCH_S) for lag in _LAGS_S]
-        own, driven = whiteness(records), independence(records, inputs, lags)
+        own, driven = check_whiteness(records), check_independence(records, inputs, lags)
         entry: dict[str, object] = {"sentence": _sentence(own, driven)}
         if own is not None:
             entry["whiteness"] = _entry(own) | {"white": not _fails(own, WHITE_SHARE)}
@@ -57,11 +62,11 @@ def innovation_tests(
     return content
 
 
-def _fails(test: Test, limit: float) -> bool:
+def _fails(test: InnovationTest, limit: float) -> bool:
     return test.p_value < _SIGNIFICANT and test.share > limit
 
 
-def _entry(test: Test) -> dict[str, object]:
+def _entry(test: InnovationTest) -> dict[str, object]:
     return {
         "statistic": test.statistic,
         "degrees": test.degrees,
@@ -70,7 +75,7 @@ def _entry(test: Test) -> dict[str, object]:
     }
 
 
-def _sentence(own: Test | None, driven: Test | None) -> str:
+def _sentence(own: InnovationTest | None, driven: InnovationTest | None) -> str:
     """Say both outcomes in words."""
     if own is None or driven is None:
         return "Too little motion to test the innovations."

@@ -150,9 +150,9 @@ def _block(results: Sequence[Any]) -> tuple[list[str], list[str]]:
     return lines, [printer.doprint(value) for value in reduced]
 
 
-def _unpack(group: str, symbols: Sequence[Any], used: set[Any], place: str = "{}") -> list[str]:
-    """Assignments of the symbols from their group; ``place`` formats the index."""
-    return [f"{s} = {group}[{place.format(i)}]" for i, s in enumerate(symbols) if s in used]
+def _unpack(group: str, symbols: Sequence[Any], used: set[Any], index: str = "{}") -> list[str]:
+    """Assignments of the symbols from their group; ``index`` formats the index."""
+    return [f"{s} = {group}[{index.format(i)}]" for i, s in enumerate(symbols) if s in used]
 
 
 def function_source(name: str, groups: Mapping[str, Sequence[Any]], results: Sequence[Any]) -> str:
@@ -241,7 +241,7 @@ def _solve(mass: list[list[Any]]) -> list[str]:
     return lines
 
 
-def _seen(e: Equations) -> list[Any]:
+def _encoder_readings(e: Equations) -> list[Any]:
     """What the encoders read of the true motion, positions then rates.
 
     Offsets are functions of the reading, q_true = reading + offset(reading), so the reading is
@@ -250,17 +250,17 @@ def _seen(e: Equations) -> list[Any]:
     truth, offset = [*e.q, *e.qd], [*e.offset, *e.offset_rate]
     moved = {s for s, o in zip(truth, offset, strict=True) if o != 0}
     steps = 6 if any(sp.sympify(o).free_symbols & moved for o in offset) else 1
-    seen = truth
+    readings = truth
     for _ in range(steps):
-        reading = dict(zip(truth, seen, strict=True))
-        seen = [
+        reading = dict(zip(truth, readings, strict=True))
+        readings = [
             t - sp.sympify(o).subs(reading, simultaneous=True)
             for t, o in zip(truth, offset, strict=True)
         ]
-    return seen
+    return readings
 
 
-def _motion(e: Equations, place: str = "{}") -> list[str]:
+def _motion(e: Equations, index: str = "{}") -> list[str]:
     """Body of the state derivative (eq 14): dx from x, u, p, w."""
     n = len(e.q)
     upper = [(i, j) for i in range(n) for j in range(i, n)]
@@ -268,9 +268,9 @@ def _motion(e: Equations, place: str = "{}") -> list[str]:
     results = [*[e.mass[i][j] for i, j in upper], *force, *e.rates]
     used = set().union(*(sp.sympify(x).free_symbols for x in results)) | set(e.qd)
     lines, values = _block(results)
-    body = _unpack("x", [*e.q, *e.qd, *e.z], used, place)
+    body = _unpack("x", [*e.q, *e.qd, *e.z], used, index)
     for group, symbols in {"u": e.u, "p": e.p, "w": e.w}.items():
-        body += _unpack(group, symbols, used, place)
+        body += _unpack(group, symbols, used, index)
     body += lines
     body += [
         f"m_{i}{j} = {v}" for (i, j), v in zip(upper, values, strict=False) if e.mass[i][j] != 0
@@ -278,26 +278,26 @@ def _motion(e: Equations, place: str = "{}") -> list[str]:
     body += [f"b_{i} = {values[len(upper) + i]}" for i in range(n)]
     body += _solve(e.mass)
     results = [*map(str, e.qd), *(f"b_{i}" for i in range(n)), *values[len(upper) + n :]]
-    return body + [f"dx[{place.format(i)}] = {v}" for i, v in enumerate(results)]
+    return body + [f"dx[{index.format(i)}] = {v}" for i, v in enumerate(results)]
 
 
-def _reading(e: Equations, place: str = "{}") -> list[str]:
+def _reading(e: Equations, index: str = "{}") -> list[str]:
     """Body of the measurement: y from x, u, p."""
-    seen = _seen(e)
-    used = set().union(*(x.free_symbols for x in seen))
-    lines, values = _block(seen)
-    body = _unpack("x", [*e.q, *e.qd], used, place)
-    body += _unpack("u", e.u, used, place) + _unpack("p", e.p, used, place)
-    return body + lines + [f"y[{place.format(i)}] = {v}" for i, v in enumerate(values)]
+    readings = _encoder_readings(e)
+    used = set().union(*(x.free_symbols for x in readings))
+    lines, values = _block(readings)
+    body = _unpack("x", [*e.q, *e.qd], used, index)
+    body += _unpack("u", e.u, used, index) + _unpack("p", e.p, used, index)
+    return body + lines + [f"y[{index.format(i)}] = {v}" for i, v in enumerate(values)]
 
 
 def rows_source(e: Equations, rows: int) -> str:
     """Source of derivative and measurement over up to ``rows`` rows at once."""
     parts = [ROWS_HEADER]
-    place = "{}*" + f"{rows} + r"
+    index = "{}*" + f"{rows} + r"
     for name, arguments, body in (
-        ("derivative_rows", "x, u, p, w, dx", _motion(e, place)),
-        ("measure_rows", "x, u, p, y", _reading(e, place)),
+        ("derivative_rows", "x, u, p, w, dx", _motion(e, index)),
+        ("measure_rows", "x, u, p, y", _reading(e, index)),
     ):
         kinds = ", ".join(["types.int64", *["V"] * len(arguments.split(","))])
         options = f"fastmath={{'contract'}}, {_PASSED}"
@@ -347,11 +347,11 @@ def memory_source(e: Equations) -> str:
 
 
 def law_source(
-    motion: Sequence[Any], given: Sequence[Any], kept: Sequence[Any], law: Sequence[Any]
+    motion: Sequence[Any], given: Sequence[Any], states: Sequence[Any], law: Sequence[Any]
 ) -> str:
     """Source of a compiled control law: ``command(y, r, s, out)``."""
     used = set().union(*(sp.sympify(e).free_symbols for e in law))
     lines, values = _block(law)
-    body = _unpack("y", motion, used) + _unpack("r", given, used) + _unpack("s", kept, used)
+    body = _unpack("y", motion, used) + _unpack("r", given, used) + _unpack("s", states, used)
     body += lines + [f"out[{i}] = {v}" for i, v in enumerate(values)]
     return SCALAR_HEADER + _compiled("command", "y, r, s, out", body)

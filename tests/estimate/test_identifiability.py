@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from bampipe.estimate.identifiability import (
-    bound,
+    cramer_rao_bound,
     growth_without,
     information,
     residual_spectrum,
-    unseen,
+    undetermined_covariance,
     weak_directions,
 )
 
@@ -49,7 +49,7 @@ def test_the_bound_is_met_by_weighted_least_squares_in_the_noise_of_an_encoder()
             np.linalg.solve(normal, (shaped.conj().T @ (weight[:, 0] * noise / root)).real)
         )
     scatter = np.std(estimates, axis=0)
-    np.testing.assert_allclose(scatter, np.sqrt(np.diag(bound(matrix))), rtol=0.12)
+    np.testing.assert_allclose(scatter, np.sqrt(np.diag(cramer_rao_bound(matrix))), rtol=0.12)
 
 
 def test_an_axis_that_nothing_drives_is_not_free_of_noise() -> None:
@@ -78,11 +78,11 @@ def test_what_data_say_nothing_of_has_no_bound() -> None:
     x = np.zeros((50, 3))
     x[:, 0], x[:, 1] = 1.0, np.linspace(-1, 1, 50)
     matrix = x.T @ x
-    sd = np.sqrt(np.diag(bound(matrix)))
+    sd = np.sqrt(np.diag(cramer_rao_bound(matrix)))
     assert np.isinf(sd[2])
     assert np.all(np.isfinite(sd[:2]))
     same = np.stack([x[:, 0], x[:, 0], x[:, 1]], axis=1)
-    sd = np.sqrt(np.diag(bound(same.T @ same)))
+    sd = np.sqrt(np.diag(cramer_rao_bound(same.T @ same)))
     assert np.isinf(sd[:2]).all()
     assert np.isfinite(sd[2])
 
@@ -100,10 +100,12 @@ def test_where_data_say_nothing_the_prior_stays_given_what_they_fix() -> None:
     matrix = np.zeros((4, 4))
     matrix[:2, :2] = 1e6  # the sum of the first two only
     matrix[2, 2] = 1e4
-    left = unseen(matrix, prior)
+    left = undetermined_covariance(matrix, prior)
     shared = 1.0 * 4.0 / (1.0 + 4.0)  # of a normal pair whose sum is known
     expected = np.zeros((4, 4))
     expected[:2, :2] = [[shared, -shared], [-shared, shared]]
     expected[3, 3] = 16.0
     np.testing.assert_allclose(left, expected, atol=1e-9)
-    np.testing.assert_array_equal(unseen(np.diag([1.0, 2.0]), np.ones(2)), np.zeros((2, 2)))
+    np.testing.assert_array_equal(
+        undetermined_covariance(np.diag([1.0, 2.0]), np.ones(2)), np.zeros((2, 2))
+    )

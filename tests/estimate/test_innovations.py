@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bampipe.estimate.innovations import averaged, independence, whiteness
+from bampipe.estimate.innovations import average_stretches, check_independence, check_whiteness
 
 
 def noise(seed: int, count: int = 600) -> np.ndarray:
@@ -26,7 +26,7 @@ def test_white_noise_passes_at_the_level_it_should_gaps_or_not() -> None:
     for seed in range(200):
         record = noise(seed)
         record[100:140] = np.nan
-        test = whiteness([record[:300], record[300:]])
+        test = check_whiteness([record[:300], record[300:]])
         assert test is not None
         rejected += test.p_value < 0.05
     assert 3 <= rejected <= 20
@@ -35,7 +35,7 @@ def test_white_noise_passes_at_the_level_it_should_gaps_or_not() -> None:
 def test_coloured_noise_is_found_and_its_share_told() -> None:
     white = noise(1, 4000)
     coloured = white[1:] + 0.5 * white[:-1]
-    test = whiteness([coloured])
+    test = check_whiteness([coloured])
     assert test is not None
     assert test.p_value < 1e-6
     assert abs(test.share - (0.5 / 1.25) ** 2) < 0.03
@@ -44,7 +44,7 @@ def test_coloured_noise_is_found_and_its_share_told() -> None:
 def test_inputs_that_have_nothing_to_do_with_it_pass_however_slow_they_are() -> None:
     rejected = 0
     for seed in range(200):
-        test = independence([noise(seed)], [hand(seed)], (0, 5, 10))
+        test = check_independence([noise(seed)], [hand(seed)], (0, 5, 10))
         assert test is not None
         rejected += test.p_value < 0.05
     assert 3 <= rejected <= 20
@@ -53,20 +53,20 @@ def test_inputs_that_have_nothing_to_do_with_it_pass_however_slow_they_are() -> 
 def test_an_input_that_leaks_in_is_found() -> None:
     given = hand(3, 2000)
     record = noise(3, 2000) + 0.3 * given[:, 1] / given[:, 1].std()
-    test = independence([record], [given], (0, 5))
+    test = check_independence([record], [given], (0, 5))
     assert test is not None
     assert test.p_value < 1e-6
     assert abs(test.share - 0.09 / 1.09) < 0.03
 
 
 def test_too_little_or_constant_input_gives_no_verdict() -> None:
-    assert whiteness([noise(1, 50)]) is None
-    assert independence([noise(1)], [np.ones((600, 2))], (0, 5)) is None
-    assert independence([noise(1, 5)], [np.ones((5, 2))], (0, 10)) is None
+    assert check_whiteness([noise(1, 50)]) is None
+    assert check_independence([noise(1)], [np.ones((600, 2))], (0, 5)) is None
+    assert check_independence([noise(1, 5)], [np.ones((5, 2))], (0, 10)) is None
 
 
 def test_averages_are_missing_where_a_value_is() -> None:
     values = np.stack([np.arange(11.0), np.arange(11.0) ** 2], axis=1)
     values[4, 0] = np.nan
-    np.testing.assert_array_equal(averaged(values, 3)[:, 0], [1.0, np.nan, 7.0])
-    np.testing.assert_allclose(averaged(values, 3)[:, 1], [5 / 3, 50 / 3, 149 / 3])
+    np.testing.assert_array_equal(average_stretches(values, 3)[:, 0], [1.0, np.nan, 7.0])
+    np.testing.assert_allclose(average_stretches(values, 3)[:, 1], [5 / 3, 50 / 3, 149 / 3])

@@ -11,7 +11,7 @@ from plain_filters import filter_by_covariance
 from slider import TRUTH, model, position_only, record, settings
 
 from bampipe.estimate.filter_uncertainty import climb, sandwich_covariance
-from bampipe.estimate.filterpy_oracle import filter_trials_by_filterpy
+from bampipe.estimate.filterpy_engine import filter_trials_by_filterpy
 from bampipe.estimate.sigma_points import SigmaPoints
 from bampipe.estimate.unscented import FilterFailure, Trial, constrain, filter_trials
 

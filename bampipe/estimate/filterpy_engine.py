@@ -1,4 +1,4 @@
-"""The filter of `unscented` by filterpy: slow, and the oracle of the compiled engine.
+"""The filter of `unscented` by filterpy: slow, an independent check on the compiled engine.
 
 filterpy knows no process noise that enters the equations of motion, so the noise is part of its
 state: carried as a state that each step forgets, with its variance put back by Q. Since 2.0
