@@ -31,7 +31,7 @@ LAWS = {
     "return_spring": {"spring": 60.0, "spring_rest": 0.05},
     "torque_ripple": {"cogging": 4.0, "cogging_wavenumber": 120.0, "cogging_phase": 0.6},
     "detent": {"detent": 12.0, "detent_at": 0.04, "detent_width": 0.005},
-    "one_sided_stop": {"stop": 600.0, "stop_at": 0.06},
+    "one_sided_stop": {"stop": 600.0, "stop_at": 0.02},
     "winding_cable": {"cable": 150.0, "cable_time": 1.0},
 }
 MOTOR = {"actuator_delay": 0.004, "actuator_lag": 0.005}

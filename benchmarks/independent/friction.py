@@ -2,6 +2,9 @@
 
 Dry friction is a set-valued law solved implicitly at every step: an axis whose push is below its
 dry friction stands still. Equations such as those of bampipe let it creep instead; ``creep`` does.
+
+numba keeps compiled callers by their own files: after a change of a kernel here, remove
+``__pycache__``.
 """
 
 from __future__ import annotations

@@ -1,0 +1,72 @@
+"""The independent simulators record what they promise, under names that bampipe knows."""
+
+import tomllib
+
+import independent
+import numpy as np
+import pandas as pd
+import pytest
+from independent import joint
+from independent.sensors import HARD, Conditions
+
+from bampipe.physics import Model, registry
+
+DEVICES = {"bam": "bam", "axis": "slider", "damper": "magnetic_damper"}
+BRIEF = Conditions(trials=1, seconds=0.8)
+
+
+def device_of(machine):
+    if machine == "joint":
+        return registry.device_from(tomllib.loads(joint.DEVICE), "joint.toml")
+    return registry.device(DEVICES[machine])
+
+
+def content(folder):
+    return {p.relative_to(folder): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+@pytest.mark.parametrize("machine", independent.MACHINES)
+def test_every_effect_changes_what_is_recorded(tmp_path, machine):
+    known = independent.MACHINES[machine]
+    free = Conditions(trials=1, seconds=6.0)
+    braked = Conditions(trials=1, seconds=1.5, viscous_trials=1)
+    bare = {}
+    for name, day in (("free", free), ("braked", braked)):
+        independent.record(machine, tmp_path / name, 3, conditions=day)
+        bare[name] = content(tmp_path / name)
+    for number, effect in enumerate((*known.EFFECTS, *known.UNKNOWN)):
+        name, day = ("braked", braked) if effect.startswith("brake") else ("free", free)
+        folder = tmp_path / str(number) / name
+        independent.record(machine, folder, 3, {effect: 1.0}, day)
+        tables = [pd.read_csv(file) for file in sorted(folder.rglob("*.csv"))]
+        assert all(np.isfinite(table.to_numpy()).all() for table in tables), effect
+        assert content(folder) != bare[name], effect
+
+
+@pytest.mark.parametrize("machine", independent.MACHINES)
+def test_effects_of_the_library_have_its_names(machine):
+    known, device = independent.MACHINES[machine], device_of(machine)
+    for effect in known.EFFECTS:
+        assert [item.name for item in Model(device, [effect]).effects] == [effect]
+    for effect in known.UNKNOWN:
+        assert effect.partition(":")[0] in known.OUTSIDE
+
+
+@pytest.mark.parametrize("machine", independent.MACHINES)
+def test_a_seed_gives_the_same_bytes_and_another_seed_others(tmp_path, machine):
+    folders = [tmp_path / name / "session" for name in ("one", "two", "other")]
+    for folder, seed in zip(folders, (5, 5, 6), strict=True):
+        independent.record(machine, folder, seed, conditions=BRIEF)
+    one, two, other = map(content, folders)
+    assert one == two
+    assert one != other
+    truths = [folder.with_name("session.truth.json").read_bytes() for folder in folders]
+    assert truths[0] == truths[1] != truths[2]
+
+
+@pytest.mark.parametrize("day", HARD)
+def test_conditions_change_the_recording_and_not_the_machine(tmp_path, day):
+    truth = independent.record("joint", tmp_path / "bare", 7)
+    hard = independent.record("joint", tmp_path / "hard", 7, conditions=HARD[day])
+    assert content(tmp_path / "bare") != content(tmp_path / "hard")
+    assert truth["parameters"] == hard["parameters"]
