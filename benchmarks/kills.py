@@ -2,9 +2,11 @@
 
 A run folder goes back and forth between two versions of a session, so that a mixture of old and
 new files would show. Each round changes the version, starts `bampipe run` (or `bampipe extend`),
-sends SIGKILL to it and its workers at a random moment after a randomly chosen stage has begun,
-checks that every recorded file is whole, runs again, and compares every file with those of a run
-that nobody disturbed; `bampipe verify` must have nothing to say.
+sends SIGKILL, SIGTERM or SIGINT to the command, or to one of its worker processes, at a random
+moment after a randomly chosen stage has begun. Then no process may be left, the lock must be free,
+the exit code that of the signal, and every recorded file whole; the same command runs again, and
+every file is compared with those of a run that nobody disturbed; `bampipe verify` must have
+nothing to say.
 
 Usage: python benchmarks/kills.py --kills 200 --seed 1
 """
@@ -27,6 +29,9 @@ from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
+import psutil
+
+from bampipe.run import record
 from bampipe.run.verify import verify
 from bampipe.stages import base
 
@@ -38,7 +43,7 @@ stages = {stages}
 tuning_samples = 2000
 [settings.diagnose]
 replicates = 4
-jobs = 1
+jobs = 2
 """
 EFFECT = "stribeck:carriage"
 CHILD = "base+stribeck.carriage"
@@ -63,6 +68,9 @@ def steps() -> dict[str, str]:
 
 EXTEND = "extend"
 LONGEST = 600.0
+SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
+ORPHAN_S = 5.0
+"""How long a worker may outlive its command: compiled code is not interrupted."""
 
 
 def start(folder: Path, *arguments: str) -> int:
@@ -75,6 +83,8 @@ def start(folder: Path, *arguments: str) -> int:
     if pid:
         return pid
     os.setsid()
+    # A shell has jobs in the background ignore SIGINT, and so would this one.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     os.chdir(folder)
     log = os.open("log.txt", os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     os.dup2(log, 1)
@@ -179,8 +189,15 @@ class Folder:
         finish(self.work, *self.command)
         return contents(self.root)
 
-    def kill(self, step: str, draw: random.Random) -> bool:
-        """Start a run and kill it during or just after ``step``; whether it was alive then."""
+    def kill(self, step: str, draw: random.Random, number: signal.Signals) -> str:
+        """Start a run and send it a signal during or just after ``step``.
+
+        Returns:
+            Who got it, "command" or "worker"; "" where the run had ended before.
+
+        Raises:
+            RuntimeError: a process or the lock was left, or the exit code is wrong.
+        """
         if step == EXTEND:
             shutil.rmtree(self.root / "models" / CHILD)
             pid = start(self.work, *self.extend)
@@ -191,10 +208,27 @@ class Folder:
             seconds = self.seconds[step]
             begun = self.root / ".bampipe" / "staging" / step.replace(":", "@")
         alive = moment_after(pid, begun, draw.uniform(0.0, 1.2 * seconds))
+        workers = psutil.Process(pid).children(recursive=True) if alive else []
+        to_worker = bool(workers) and draw.random() < 0.5
+        said = (self.work / "log.txt").stat().st_size
         with contextlib.suppress(ProcessLookupError):
-            os.killpg(pid, signal.SIGKILL)
-        os.waitpid(pid, 0)
-        return alive
+            os.kill(draw.choice(workers).pid if to_worker else pid, number)
+        code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+        left = psutil.wait_procs(workers, timeout=ORPHAN_S)[1]
+        if left:
+            raise RuntimeError(f"{number.name} to {pid}: {[one.pid for one in left]} are left")
+        # A worker may have been idle or done, and the command may have been about to leave.
+        expected = {0, 2} if to_worker else {0, -9 if number == signal.SIGKILL else 128 + number}
+        with (self.work / "log.txt").open() as log:
+            log.seek(said)
+            tail = log.read()
+        if code not in expected or "Traceback" in tail:
+            raise RuntimeError(f"{number.name}, to a worker: {to_worker}: left with {code}\n{tail}")
+        with record.lock(self.root, False):
+            pass
+        if not alive:
+            return ""
+        return "worker" if to_worker else "command"
 
 
 def make_versions(work: Path) -> None:
@@ -242,6 +276,7 @@ def main() -> None:
     options = parser.parse_args()
     draw = random.Random(options.seed)
     killed: Counter[str] = Counter()
+    sent: Counter[str] = Counter()
     missed = wrong = 0
     began = time.perf_counter()
     # Imported once, here: the kills then meet the work, not Python's start.
@@ -256,8 +291,11 @@ def main() -> None:
             step = targets[(killed.total() + missed) % len(targets)]
             folder = folders[kinds.get(step, "core")]
             folder.take(1 - folder.version)
-            alive = folder.kill(step, draw)
+            number = SIGNALS[killed.total() % len(SIGNALS)]
+            victim = folder.kill(step, draw, number)
+            alive = bool(victim)
             killed[step] += alive
+            sent[f"{number.name} to the {victim}"] += alive
             missed += not alive
             check_recorded(folder.root, f"models/{CHILD}/" if step == EXTEND else "//")
             if step == EXTEND:
@@ -270,11 +308,14 @@ def main() -> None:
                 names = sorted(expected.keys() | found.keys())
                 differing = [name for name in names if found.get(name) != expected.get(name)]
                 print(f"kill {killed.total()}, {step}: {differing[:5]} {touched[:5]}", flush=True)
-            if killed.total() % 20 == 0 and alive:
+            if killed.total() % 10 == 0 and alive:
                 print(f"{killed.total()} kills, {wrong} wrong", flush=True)
     print(f"{killed.total()} kills in {time.perf_counter() - began:.0f} s (seed {options.seed}):")
     for step in targets:
         print(f"  {step:40s} {killed[step]:4d}")
+    for kind in sorted(sent):
+        print(f"  {kind:40s} {sent[kind]:4d}")
+    print("no process and no lock was left")
     print(f"{missed} rounds in which the run had ended before the signal")
     print(f"{wrong} rounds after which a file differed or `bampipe verify` found one touched")
     sys.exit(int(wrong > 0))

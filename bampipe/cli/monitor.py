@@ -130,6 +130,9 @@ def follow(stream: Stream, watch: Monitor, output: _Output, wait: bool) -> None:
             if len(values):
                 watch.push(stream.names, values)
                 output.show(watch, stream)
+            watch.note_lines_without_sample(stream.lines_without_sample)
+            if watch.alarm and not len(values):
+                output.show(watch, stream)
             if stream.ended:
                 if not wait:
                     break
@@ -144,6 +147,7 @@ class _Output:
 
     def __init__(self, screen: bool, every: float) -> None:
         self._every, self._next, self._drawn = every, -float("inf"), 0.0
+        self._alarm = False
         self._screen: Any = None
         if screen:
             from rich.live import Live
@@ -168,7 +172,9 @@ class _Output:
             return
         content = watch.report()
         t = content["t"]
-        if not final and not (isinstance(t, float) and t >= self._next):
+        alarm = watch.alarm and not self._alarm
+        self._alarm = watch.alarm
+        if not final and not alarm and not (isinstance(t, float) and t >= self._next):
             return
         if isinstance(t, float):
             self._next = t + self._every
@@ -197,7 +203,10 @@ def _table(content: Mapping[str, Any], bad_lines: int) -> Any:
         )  # fmt: skip
     nis = content.get("nis", BLANK)
     ratio = nis.get("window")
-    if content["alarm"]:
+    if content["alarm"] and ratio is None:
+        axes = ", ".join(nis.get("useless", ()))
+        said = Text(f"ALARM: no data of use {axes}".strip(), style="bold red")
+    elif content["alarm"]:
         said = Text(f"ALARM: {nis['worst']} is not explained ({ratio:.2f})", style="bold red")
     elif ratio is None:
         said = Text("waiting for a whole window")

@@ -18,6 +18,8 @@ PORTION = 1 << 16
 """Bytes read at once: what memory is bounded by, with `LONGEST_LINE`."""
 LONGEST_LINE = 1 << 20
 DELIMITERS = ",;\t"
+LARGEST = 1e15
+"""No time, position or force in SI units is larger: what is, came of a fault."""
 MOST_COMPLAINTS = 3
 
 
@@ -125,6 +127,7 @@ class SampleStream:
     _layout: StreamLayout | None = None
     _rest: bytes = b""
     _line: int = 0
+    _last_good: int = 0
     _delimiter: str = ","
     _width: int = 0
     _indices: tuple[int, ...] = ()
@@ -134,6 +137,11 @@ class SampleStream:
     def names(self) -> tuple[str, ...]:
         """What the columns of `read` are; empty before the header has come."""
         return self._layout.names if self._layout else ()
+
+    @property
+    def lines_without_sample(self) -> int:
+        """How many lines have come since the last one that held a sample."""
+        return self._line - self._last_good
 
     def read(self, last: bool = False) -> Array:
         """Return the samples, (T, m), of what has come since; T may be 0.
@@ -176,6 +184,7 @@ class SampleStream:
                     self._layout = layout
                     self._width = len(found)
                     self._indices = tuple(found.index(name) for name in layout.columns)
+                    self._last_good = self._line
                     break
             else:
                 missing = [name for name in self.layouts[0].columns if name not in found]
@@ -194,7 +203,8 @@ class SampleStream:
             self._line += 1
             cells = line.split(delimiter)
             try:
-                if len(cells) != width:
+                # float() also reads 1_0 and the digits of other scripts, which no logger writes.
+                if len(cells) != width or "_" in line or not line.isascii():
                     raise ValueError
                 row = [float(cells[index]) for index in indices]
             except ValueError:
@@ -209,11 +219,15 @@ class SampleStream:
         if not rows:
             return np.empty((0, len(layout.names)))
         raw = np.array(rows)
-        finite = np.isfinite(raw)
-        raw[:, layout.may_lack] = np.where(
-            finite[:, layout.may_lack], raw[:, layout.may_lack], np.nan
-        )
-        good = (finite | layout.may_lack).all(axis=1)
+        lost = np.isnan(raw) & layout.may_lack
+        numeric = np.isfinite(raw) | lost
+        with np.errstate(over="ignore", invalid="ignore"):
+            values = np.where(lost, 0.0, raw) @ layout.gain + layout.offset
+            large = ~(np.abs(values) <= LARGEST)
+        # A missing position stays missing and spoils nothing else.
+        shared = slice(min(lost.shape[1], values.shape[1]))
+        values[:, shared][lost[:, shared]] = np.nan
+        good = numeric.all(axis=1) & ~large.any(axis=1)
         time = raw[:, 0] * layout.gain[0, 0]
         before = np.maximum.accumulate(
             np.concatenate([[self._last], np.where(good, time, -np.inf)])
@@ -222,12 +236,17 @@ class SampleStream:
         for row in np.flatnonzero(~good | late):
             if late[row]:
                 self._skip(numbers[row], layout.columns[0], "the time does not increase")
+            elif numeric[row].all():
+                name = layout.names[int(np.argmax(large[row]))]
+                self._skip(numbers[row], "", f"{name} is larger than {LARGEST:g}")
             else:
-                column = int(np.argmin(finite[row] | layout.may_lack))
+                column = int(np.argmin(numeric[row]))
                 self._skip(numbers[row], layout.columns[column], "no number")
         keep = good & ~late
         self._last = float(before[-1])
-        return _in_si(raw[keep], layout)
+        if keep.any():
+            self._last_good = numbers[int(np.flatnonzero(keep)[-1])]
+        return values[keep]
 
     def _carefully(self, cells: list[str], layout: StreamLayout) -> list[float] | None:
         """Read a line that is not plain numbers; None where it is bad."""
@@ -240,6 +259,8 @@ class SampleStream:
         ):
             text = cells[index].strip().strip("\"'")
             try:
+                if "_" in text or not text.isascii():
+                    raise ValueError
                 row.append(np.nan if may_lack and not text else float(text))
             except ValueError:
                 self._skip(self._line, column, f"{text[:40]!r} is no number")
@@ -254,11 +275,3 @@ class SampleStream:
         if self.bad_lines <= MOST_COMPLAINTS:
             more = "; further ones are only counted" if self.bad_lines == MOST_COMPLAINTS else ""
             self.complain(f"{where}: {what}: skipped{more}")
-
-
-def _in_si(raw: Array, layout: StreamLayout) -> Array:
-    """Apply gains; a missing position stays missing and spoils nothing else."""
-    lost = np.isnan(raw)
-    values = np.where(lost, 0.0, raw) @ layout.gain + layout.offset
-    values[:, 1:][lost[:, 1:]] = np.nan
-    return values

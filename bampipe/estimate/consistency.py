@@ -17,6 +17,9 @@ from scipy.special import gammaincinv
 
 Array = NDArray[np.float64]
 
+FEWEST_READINGS = 0.1
+"""Share of a window below which a reading is of no use; a slow sensor leaves cells empty too."""
+
 FEWEST_WINDOWS = 10
 """Good windows from which on their scatter is believed."""
 
@@ -67,7 +70,7 @@ def window_means(nis: Array, n_readings: int, samples: int) -> Array:
     count = nis.size // samples
     windows = nis[: count * samples].reshape(count, samples)
     full = np.isfinite(windows).sum(axis=1)
-    sums = np.nansum(windows, axis=1)
+    sums = np.sum(windows, axis=1, where=np.isfinite(windows))
     judged = full >= 0.5 * samples
     return np.asarray(sums[judged] / (full[judged] * n_readings))
 
@@ -76,8 +79,11 @@ class WindowTest:
     """Sums innovations up to windows, one after the other.
 
     Attributes:
-        ratio: mean NIS of a reading over the last whole window, NaN before the first.
+        ratio: mean NIS of a reading over the last whole window; NaN before the first, and
+            infinite where a reading was of no use.
         by_reading: (ny,) mean square of each innovation in its own standard deviation, there.
+        useless: (ny,) which readings were of no use there: absent, or beyond what the filter
+            could take, in all but a tenth of the window.
         windows: how many were judged.
     """
 
@@ -86,26 +92,35 @@ class WindowTest:
         self._samples = samples
         self.ratio = np.nan
         self.by_reading = np.full(n_readings, np.nan)
+        self.useless = np.zeros(n_readings, dtype=bool)
         self.windows = 0
         self._nis = np.zeros(0)
         self._squares = np.zeros((0, n_readings))
+        self._present = np.zeros((0, n_readings), dtype=bool)
 
-    def take(self, nis: Array, squares: Array) -> list[float]:
+    def take(self, nis: Array, squares: Array, present: NDArray[np.bool_]) -> list[float]:
         """Add samples; return the mean NIS of a reading of each window that is now whole.
 
         Args:
-            nis: (T,); squares: (T, ny) squared innovations in their own variance; NaN at gaps.
+            nis: (T,); squares: (T, ny) squared innovations in their own variance; not finite
+                where there was no reading, or none that the filter could use.
+            present: (T, ny) whether there was a reading that the filter could use.
         """
         self._nis = np.concatenate([self._nis, nis])
         self._squares = np.concatenate([self._squares, squares])
+        self._present = np.concatenate([self._present, present])
         found = []
         while self._nis.size >= self._samples:
             first, self._nis = self._nis[: self._samples], self._nis[self._samples :]
             parts, self._squares = self._squares[: self._samples], self._squares[self._samples :]
+            there, self._present = self._present[: self._samples], self._present[self._samples :]
             means = window_means(first, parts.shape[1], self._samples)
-            if means.size:
-                self.ratio = float(means[0])
-                self.by_reading = np.nanmean(parts, axis=0)
-                self.windows += 1
-                found.append(self.ratio)
+            finite = np.isfinite(parts)
+            self.useless = there.mean(axis=0) < FEWEST_READINGS
+            if not means.size and not self.useless.any():
+                continue
+            self.by_reading = np.sum(parts, axis=0, where=finite) / np.maximum(finite.sum(0), 1)
+            self.ratio = np.inf if self.useless.any() else float(means[0])
+            self.windows += 1
+            found.append(self.ratio)
         return found

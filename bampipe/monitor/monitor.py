@@ -32,8 +32,8 @@ class Monitor:
     """Takes samples, keeps the distribution of state and parameters, judges the innovations.
 
     Attributes:
-        alarm: whether the last whole window was inconsistent; alarms: how many were, by runs of
-            consecutive ones.
+        alarm: whether the last whole window was inconsistent, or held nothing of use; alarms: how
+            many were, by runs of consecutive ones.
         restarts: how often the motion was started anew after a gap or a lost motion.
         samples: how many were taken.
     """
@@ -59,6 +59,7 @@ class Monitor:
         self._waiting: list[tuple[Array, Array, Array]] = []
         self._threshold, self._t, self._axis = np.nan, np.nan, ""
         self._first_t = np.nan
+        self._useless = 0
         if start is not None:
             self._begin(start)
 
@@ -73,13 +74,22 @@ class Monitor:
             q = part[:, [names.index(f"q_{axis}") for axis in self.system.coordinates]]
             self.samples += len(part)
             if self.start is None:
-                self._waiting.append((t, u, q))
+                useful = np.isfinite(q).all(axis=1)
+                self._useless = 0 if useful.any() else self._useless + len(part)
+                self._judge(self._useless >= FIRST_LOOK)
+                self._waiting.append((t[useful], u[useful], q[useful]))
                 if sum(len(item[0]) for item in self._waiting) < FIRST_LOOK:
+                    self._t = float(t[-1])
                     continue
                 t, u, q = (np.concatenate(parts) for parts in zip(*self._waiting, strict=True))
                 self._waiting.clear()
                 self._begin(start_from_samples(self.system, t, u, q, self.options))
             self._take(t, u, q)
+
+    def note_lines_without_sample(self, lines: int) -> None:
+        """Raise the alarm where a whole window of lines has come and no sample in them."""
+        if lines >= (FIRST_LOOK if self.start is None else self.start.window):
+            self._judge(True)
 
     def report(self) -> dict[str, object]:
         """Return where things stand, as JSON can hold it; no state before the filter has begun."""
@@ -119,14 +129,19 @@ class Monitor:
             }
             for i, place in enumerate(model.free)
         }
-        judged = self._test.windows > 0
+        ratio, axes = self._test.ratio, self.system.coordinates
         content["nis"] = {
-            "window": self._test.ratio if judged else None,
+            "window": ratio if np.isfinite(ratio) else None,
             "threshold": self._threshold,
             "windows": self._test.windows,
             "worst": self._axis,
+            "useless": [axes[i] for i in np.flatnonzero(self._test.useless)],
         }
         return content
+
+    def _judge(self, inconsistent: bool) -> None:
+        self.alarms += inconsistent and not self.alarm
+        self.alarm = inconsistent
 
     def _begin(self, start: Start) -> None:
         self.start = start
@@ -159,6 +174,7 @@ class Monitor:
             raise RuntimeError("samples before the start")
         if self._filter is None:
             seen = np.flatnonzero(np.isfinite(q).all(axis=1))
+            self._add_unfiltered(np.isfinite(q[: seen[0] if seen.size else len(t)]))
             if not seen.size:
                 return
             t, u, q = t[seen[0] :], u[seen[0] :], q[seen[0] :]
@@ -170,14 +186,28 @@ class Monitor:
             found = self._filter.advance(t, u, q)
         except FilterFailure as failure:
             self._filter = None
+            self._add_unfiltered(np.zeros(q.shape, dtype=bool))
             self._again(f"near {t[min(failure.sample, t.size - 1)]:.3f} s {failure.reason}")
             return
-        squares = np.square(found.innovation / found.innovation_sd)
-        for mean in test.take(found.nis, squares):
-            inconsistent = mean > self._threshold
-            self.alarms += inconsistent and not self.alarm
-            self.alarm = bool(inconsistent)
-            self._axis = self.system.coordinates[int(np.argmax(test.by_reading))]
+        with np.errstate(over="ignore"):
+            squares = np.square(found.innovation / found.innovation_sd)
+        whole = np.isfinite(q).all(axis=1)
+        present = np.isfinite(q) & (np.isfinite(found.nis) | ~whole)[:, None]
+        self._take_innovations(test, found.nis, squares, present)
+
+    def _add_unfiltered(self, present: NDArray[np.bool_]) -> None:
+        """Count samples of which the filter made nothing; ``present`` as for the test."""
+        if self._test is not None:
+            nothing = np.full(present.shape, np.nan)
+            self._take_innovations(self._test, np.full(len(present), np.nan), nothing, present)
+
+    def _take_innovations(
+        self, test: WindowTest, nis: Array, squares: Array, present: NDArray[np.bool_]
+    ) -> None:
+        for mean in test.take(nis, squares, present):
+            self._judge(bool(mean > self._threshold))
+            worst = np.where(test.useless, np.inf, test.by_reading)
+            self._axis = self.system.coordinates[int(np.argmax(worst))]
 
     def _again(self, why: str) -> None:
         """Start the motion anew; the parameters go on from where they are, if they are known."""

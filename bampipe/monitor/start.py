@@ -37,6 +37,9 @@ Stream: TypeAlias = SampleStream
 
 _NO_STEP = 3e-6
 """Noise of an encoder that did not move in the first samples, rad or m."""
+
+LONGEST_WINDOW_S = 3600.0
+
 FIRST_LOOK = 500
 """Samples from which the noise is found where no run states it."""
 
@@ -60,9 +63,16 @@ class Options:
 
     def check(self) -> None:
         """Raise :class:`InputError` where an option makes no sense."""
-        for name in ("window_s", "false_alarms_per_hour", "memory_s", "gap_s"):
-            if not getattr(self, name) > 0.0:
-                raise InputError("must be positive", where=f"--{name.replace('_', '-')}")
+        given = {
+            "--window": self.window_s,
+            "--false-alarms": self.false_alarms_per_hour,
+            "--memory": self.memory_s,
+        }
+        for option, value in given.items():
+            if not value > 0.0:
+                raise InputError("must be positive", where=option)
+        if self.window_s > LONGEST_WINDOW_S:
+            raise InputError(f"must be at most {LONGEST_WINDOW_S:g} s", where="--window")
         if self.probability >= 0.5:
             raise InputError(
                 "more false alarms than windows", where="--false-alarms", remedy="ask for fewer"

@@ -66,6 +66,12 @@ def test_other_delimiters(delimiter):
         ("0.1,1,inf", "line 3, column force_x: no number"),
         ("0.0,1,1", "line 3, column t: the time does not increase"),
         ("nan,1,1", "line 3, column t: no number"),
+        ("0.1,inf,1", "line 3, column q_yaw: no number"),
+        ("0.1,1e308,1", "line 3: q_yaw is larger than 1e+15"),
+        ("0.1,1,-1e308", "line 3: force_x is larger than 1e+15"),
+        ("1e18,1,1", "line 3: t is larger than 1e+15"),
+        ("0.1,1_0,1", "line 3, column q_yaw: '1_0' is no number"),
+        ("0.1,\u0661,1", "line 3, column q_yaw: '\u0661' is no number"),
     ],
 )
 def test_a_bad_line_is_skipped_and_said(line, said):
@@ -80,7 +86,7 @@ def test_a_bad_line_is_skipped_and_said(line, said):
 
 
 def test_a_position_may_be_missing():
-    rows = Pipe().write("t,q_yaw,force_x\n0.0,,1\n0.1,nan,1\n0.2,inf,1\n")
+    rows = Pipe().write("t,q_yaw,force_x\n0.0,,1\n0.1,nan,1\n0.2,NaN,1\n")
     assert np.isnan(rows[:, 1]).all()
     np.testing.assert_array_equal(rows[:, [0, 2]], [[0.0, 1.0], [0.1, 1.0], [0.2, 1.0]])
 

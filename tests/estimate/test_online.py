@@ -58,7 +58,18 @@ def test_windows_half_empty_are_not_judged() -> None:
     np.testing.assert_allclose(window_means(nis, 2, 10), [1.0])
     test = WindowTest(2, 10)
     squares = np.stack([nis / 2.0, nis / 2.0], axis=1)
-    judged = [mean for k in range(25) for mean in test.take(nis[k : k + 1], squares[k : k + 1])]
+    there = np.isfinite(squares)
+    ones = [slice(k, k + 1) for k in range(25)]
+    judged = [mean for k in ones for mean in test.take(nis[k], squares[k], there[k])]
     assert judged == pytest.approx([1.0])
     assert test.windows == 1
     np.testing.assert_allclose(test.by_reading, 1.0)
+
+
+def test_a_window_without_readings_is_infinitely_wrong() -> None:
+    test = WindowTest(2, 10)
+    nis, squares = np.full(10, np.nan), np.full((10, 2), np.nan)
+    there = np.zeros((10, 2), dtype=bool)
+    there[:, 0] = True
+    assert test.take(nis, squares, there) == [np.inf]
+    assert test.useless.tolist() == [False, True]

@@ -761,3 +761,17 @@ def test_no_session_folder(tmp_path):
     config = ingest.Config(session=str(tmp_path / "nowhere"))
     with pytest.raises(InputError, match="nowhere: no such session folder"):
         ingest.execute(RunFolder(tmp_path), tmp_path, config, silent)
+
+
+@pytest.mark.parametrize(
+    ("offset", "factor", "said"),
+    [(1e18, 1.0, "are rounded to 128"), (0.0, 1e18, "which is more than a year")],
+)
+def test_time_stamps_beyond_all_clocks_are_refused(tmp_path, offset, factor, said):
+    def damage(made):
+        made.session["sample_rate_hz"] /= factor
+        for table in made.tables.values():
+            table["time_us"] = offset + factor * table["time_us"]
+
+    with pytest.raises(InputError, match=said):
+        run_ingest(Made(), tmp_path, damage)

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -242,3 +243,75 @@ def test_a_model_with_a_force_rate_is_refused() -> None:
     system = compile_model(Model(registry.device("bam"), ("force_delay",)))
     with pytest.raises(InputError, match="known only afterwards"):
         layouts(system, None)
+
+
+# Data of no use
+
+
+USELESS = {"nothing": "nan", "empty": "", "infinite": "inf", "overflow": "1e308", "words": "1_0"}
+
+
+@pytest.mark.parametrize("cell", USELESS.values(), ids=USELESS)
+@pytest.mark.parametrize("columns", [("q_yaw",), ("q_yaw", "q_pitch", "q_extension"), ("force_x",)])
+def test_useless_data_is_an_alarm(
+    run: RunFolder, begun: tuple, tmp_path: Path, cell: str, columns: tuple[str, ...]
+) -> None:
+    """Two seconds are as they should be, then a sensor dies."""
+    frame = samples(run, "t00").astype(object)
+    dead = frame["t"] > 2.0
+    for column in columns:
+        frame.loc[dead, column] = cell
+    found = followed(begun, as_csv(frame), tmp_path)
+    assert found["alarm"] and found["alarms"] == 1
+    assert found["restarts"] == 0
+    if found["bad_lines"]:
+        assert found["bad_lines"] == int(dead.sum())
+    else:
+        assert cell in ("nan", "") and columns[0] == "q_yaw"
+        assert found["nis"]["useless"] == [name.removeprefix("q_") for name in columns]
+        assert found["nis"]["window"] is None
+
+
+@pytest.mark.parametrize("cell", ["nan", "1e308"])
+def test_data_useless_from_the_start_is_an_alarm(
+    run: RunFolder, begun: tuple, tmp_path: Path, cell: str
+) -> None:
+    frame = samples(run, "t00").astype(object)
+    frame["q_yaw"] = cell
+    system, _ = begun
+    for start in (begun[1], None):
+        found = followed((system, start), as_csv(frame), tmp_path)
+        assert found["alarm"], cell
+
+
+def test_a_slow_sensor_is_no_useless_one(run: RunFolder, begun: tuple, tmp_path: Path) -> None:
+    frame = samples(run, "t00")
+    frame.loc[frame.index % 4 != 0, "q_yaw"] = np.nan
+    assert not followed(begun, as_csv(frame), tmp_path)["alarm"]
+
+
+def followed(begun: tuple, text: str, folder: Path) -> dict:
+    """What the monitor says in the end of a file that holds ``text``."""
+    from bampipe.cli.monitor import _Output, follow
+    from bampipe.monitor.start import open_stream
+
+    system, start = begun
+    path = folder / "log.csv"
+    path.write_text(text)
+    watch = Monitor(system, start, Options(), lambda _: None)
+    stream = open_stream(str(path), system, None, False, lambda _: None)
+    try:
+        follow(stream, watch, _Output(False, 1.0), wait=False)
+    finally:
+        os.close(stream.descriptor)
+    json.dumps(watch.report(), allow_nan=False)
+    return {**watch.report(), "bad_lines": stream.bad_lines}
+
+
+@pytest.mark.parametrize("value", ["0", "-1", "nan"])
+def test_an_option_is_called_by_its_name(
+    command: Callable[..., tuple[int, str, str]], value: str
+) -> None:
+    for option in ("--window", "--false-alarms", "--memory", "--every"):
+        code, _, said = command("monitor", "x.csv", "--device", "slider", option, value)
+        assert (code, said) == (2, f"bampipe: error: {option}: must be positive\n")

@@ -23,7 +23,7 @@ from bampipe.data.quality.clock import (
     drop_backward_stamps,
     keep_longest_stretch,
     note_clock,
-    refuse_short,
+    refuse_length,
     time_to_seconds,
 )
 from bampipe.data.quality.encoders import (
@@ -71,7 +71,7 @@ def clean(raw: RawTrial, session: Session, entry: TrialEntry, limits: Limits) ->
         integrate(table, encoder)
         interpolate_jumps(table, encoder)
     table.t -= table.t[0]
-    refuse_short(table)
+    refuse_length(table)
     note_clock(table)
     for encoder in session.encoders:
         check_velocity(table, encoder)

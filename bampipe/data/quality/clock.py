@@ -7,6 +7,12 @@ import numpy as np
 from bampipe.data.quality.table import Table, counted, in_rows, in_times
 from bampipe.data.session import SECONDS
 
+COARSEST_STAMP = 0.05
+"""Share of a step to which time stamps may be rounded: their scatter is a third of it."""
+
+LONGEST_TRIAL_S = 3.2e7
+"""A year: what is longer was not recorded in one go, and the unit of its clock is wrong."""
+
 
 def time_to_seconds(table: Table) -> None:
     """Time stamps in s, whatever unit they are really in; rows without one are dropped."""
@@ -27,6 +33,14 @@ def time_to_seconds(table: Table) -> None:
             "time runs backwards throughout" if falls else "time stands still",
             column=table.clock,
             remedy="is this the time column?",
+        )
+    room = float(np.spacing(np.median(np.abs(table.t))))
+    if room > COARSEST_STAMP * float(np.median(steps)):
+        raise table.fault(
+            f"time stamps near {np.median(table.t):.3g} are rounded to {room:.3g}, at a median step"
+            f" of {np.median(steps):.3g}",
+            column=table.clock,
+            remedy="log the time from the start of the recording",
         )
     # The first stamp goes first: stamps since 1970 in s have no room for fractions of 1 us.
     table.t = (table.t - table.t[0]) * table.session.tick
@@ -140,8 +154,8 @@ def keep_longest_stretch(table: Table) -> None:
     table.repairs.append(f"{words}: rows {first} to {last} kept, {in_rows(dropped)} dropped")
 
 
-def refuse_short(table: Table) -> None:
-    """A trial of a second or less tells nothing."""
+def refuse_length(table: Table) -> None:
+    """A trial of a second or less tells nothing, and none takes a year."""
     # Each sample stands for one step: 500 samples at 500 Hz are 1 s.
     step = float(np.median(np.diff(table.t))) if len(table) > 1 else 0.0
     duration = float(table.t[-1]) + step
@@ -149,6 +163,12 @@ def refuse_short(table: Table) -> None:
         raise table.fault(
             f"{counted(len(table), 'sample')} over {duration:.3g} s,"
             f" less than {table.limits.shortest_s:g} s"
+        )
+    if duration > LONGEST_TRIAL_S:
+        raise table.fault(
+            f"{counted(len(table), 'sample')} over {duration:.3g} s, which is more than a year",
+            column=table.clock,
+            remedy="check the unit of the time column and sample_rate_hz",
         )
 
 
