@@ -326,11 +326,18 @@ def test_mcap_of_json(tmp_path):
     assert "not a sound MCAP file" in refused(path, ("/state:@time",))
 
 
-def test_an_mcap_file_whose_summary_is_not_where_it_says(tmp_path):
+@pytest.mark.parametrize("lie", ["summary", "chunk"])
+def test_an_mcap_file_whose_summary_lies(tmp_path, lie):
     path = write_ros(tmp_path, "mcap")
     content = bytearray(path.read_bytes())
     start = int.from_bytes(content[-28:-20], "little")
-    content[-28:-20] = (start + 3).to_bytes(8, "little")
+    if lie == "summary":  # begins inside a record
+        content[-28:-20] = (start + 3).to_bytes(8, "little")
+    else:  # the first entry of the index gives the chunk more bytes than there are
+        while content[start] != 0x08:
+            start += 9 + int.from_bytes(content[start + 1 : start + 9], "little")
+        end = start + 9 + int.from_bytes(content[start + 1 : start + 9], "little")
+        content[end - 16 : end - 8] = (1 << 50).to_bytes(8, "little")
     path.write_bytes(content)
     assert "not a sound MCAP file" in refused(path, ("/joint_states:@time",))
     with pytest.raises(InputError, match="not a sound MCAP file"):

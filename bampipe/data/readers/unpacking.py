@@ -93,8 +93,11 @@ def check_mcap(path: Path, largest_bytes: int, name: str) -> None:
                 codec = record[32 : 32 + letters].decode("ascii", "replace")
                 sizes[start] = _chunk_size(record[40 + letters :], codec, name) if codec else 0
             elif kind == 0x08:
-                spans.append(struct.unpack("<QQQ", stream.read(24)))
-                stream.seek(length - 24, 1)
+                record = stream.read(length)
+                spans.append(struct.unpack_from("<QQQ", record))
+                (packed,) = struct.unpack_from("<Q", record, length - 16)
+                if packed > end:
+                    raise ValueError("the index names a chunk that is longer than the file")
             elif kind == 0x02:
                 (summary,) = struct.unpack("<Q", stream.read(8))
                 stream.seek(length - 8, 1)
