@@ -1,15 +1,273 @@
-"""Reading and checking ``session.toml``."""
+"""What a session file says: its channels, its trials, and where they lie; read and checked."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from pathlib import Path
-from typing import Any
+import datetime
+import math
+import re
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from functools import cached_property
+from pathlib import Path, PurePosixPath
+from typing import Annotated, Any, Literal
 
-from bampipe.data.session.records import FILE_NAME, Session
-from bampipe.errors import InputError
+from pydantic import AfterValidator, BeforeValidator, Field, PrivateAttr, StringConstraints
+
+from bampipe.data.readers.trial import Dialect
+from bampipe.data.session.channels import (
+    SECONDS,
+    Brake,
+    BrakeTable,
+    Channel,
+    ChannelName,
+    Clock,
+    Encoder,
+    Force,
+)
+from bampipe.data.session.places import inside, is_device_path, lexically_inside
+from bampipe.errors import InputError, did_you_mean
 from bampipe.files import read_toml
-from bampipe.schema import read
+from bampipe.schema import (
+    ByName,
+    Declaration,
+    NamedDeclaration,
+    NotNegative,
+    Positive,
+    Several,
+    Text,
+    checked_by,
+    fault,
+    read,
+)
+
+FILE_NAME = "session.toml"
+
+
+def _inside(path: str) -> str:
+    lexically_inside(path, where="")
+    return PurePosixPath(path).as_posix()
+
+
+def _device(text: str) -> str:
+    return _inside(text) if is_device_path(text) else text
+
+
+def _moment(value: Any) -> Any:
+    if isinstance(value, datetime.date):
+        return value.isoformat()
+    if isinstance(value, str):
+        try:
+            datetime.datetime.fromisoformat(value)
+        except ValueError:
+            said = f'found "{value}", expected a date and time like 2026-10-03T10:12:00Z'
+            raise fault(said) from None
+    return value
+
+
+class TrialEntry(NamedDeclaration):
+    """One ``[[trials]]`` entry."""
+
+    file: Annotated[Text, AfterValidator(checked_by(_inside))] = Field(
+        description="Path relative to the session folder"
+    )
+    kind: Literal["free", "locked", "viscous"]
+    locked_axis: ChannelName | None = Field(
+        default=None, description="The locked axis, of a locked trial"
+    )
+    viscous: Positive | None = Field(
+        default=None,
+        alias="viscous_n_s_per_m",
+        description="Commanded Cartesian damping, N.s/m, of a viscous trial",
+    )
+    start_s: NotNegative = Field(
+        default=0.0, description="Where in the record the trial starts, s after its first sample"
+    )
+    end_s: Positive = Field(
+        default=math.inf,
+        description="Where it ends, s after the first sample of the record; this moment excluded",
+    )
+    hold_out: bool = Field(default=False, description="Never fitted, only for judging models")
+    notes: str = Field(default="", description="Free text")
+
+    @property
+    def trial_id(self) -> str:
+        """The file's name without its extension, with its folders where that is not unique."""
+        return self.name
+
+    def overlaps(self, other: TrialEntry) -> bool:
+        """Whether the stretches of two trials of one record have samples in common."""
+        return self.start_s < other.end_s and other.start_s < self.end_s
+
+    def cross_faults(self) -> Iterator[InputError]:
+        for key, value, only in (
+            ("locked_axis", self.locked_axis, "locked"),
+            ("viscous_n_s_per_m", self.viscous, "viscous"),
+        ):
+            if value is None and self.kind == only:
+                yield InputError(f"'{key}' is missing", remedy=f'needed for a "{only}" trial')
+            if value is not None and self.kind != only:
+                yield InputError(
+                    f'given for a "{self.kind}" trial', where=key, remedy=f'only for "{only}"'
+                )
+        if not self.start_s < self.end_s:
+            yield InputError(
+                f"found {self.end_s:g}, expected more than start_s = {self.start_s:g}",
+                where="end_s",
+            )
+
+
+def _with_ids(trials: tuple[TrialEntry, ...]) -> tuple[TrialEntry, ...]:
+    """Give distinct names: the stem, else the whole path, else the path and a number."""
+    stems = Counter(PurePosixPath(file).stem for file in {trial.file for trial in trials})
+    seen: Counter[str] = Counter()
+    for trial in trials:
+        stem, flat = PurePosixPath(trial.file).stem, re.sub(r"[/.]", "_", trial.file)
+        name = stem if stems[stem] == 1 else flat
+        seen[name] += 1
+        trial._name = name if seen[name] == 1 else f"{name}_{seen[name]}"
+    return trials
+
+
+class Session(Declaration):
+    """session.toml: one recording session, its channels and its trials."""
+
+    schema_: Literal["bampipe.session/1"] = Field(
+        alias="schema", description='the version of this format, "bampipe.session/1"'
+    )
+    session_id: Annotated[
+        str, StringConstraints(pattern="^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=100)
+    ] = Field(
+        description="the name of the session and of its run folder, of letters, digits, '.', '_'"
+        " and '-'"
+    )
+    device: Annotated[Text, AfterValidator(checked_by(_device))] = Field(
+        description="A built-in device, or the path of a device file (.toml) in the session folder"
+    )
+    recorded_at: Annotated[str, BeforeValidator(_moment)] | None = Field(
+        default=None, description="Date and time of the recording, ISO 8601"
+    )
+    sample_rate: Positive = Field(
+        alias="sample_rate_hz", description="Nominal sample rate; the time column rules"
+    )
+    notes: str = Field(default="", description="Free text")
+    clock: Clock = Field(
+        default=Clock(column="time_us", unit="us"),
+        alias="time",
+        description="The time column, where it is not time_us in microseconds",
+    )
+    dialect: Dialect = Field(
+        default=Dialect(),
+        alias="csv",
+        description="Layout of text files, where it cannot be found in them",
+    )
+    encoders: Annotated[tuple[Encoder, ...], ByName(ChannelName, least=1)] = Field(
+        description="One entry an axis"
+    )
+    force: Force | None = None
+    brake_table: BrakeTable | None = Field(default=None, alias="brakes")
+    channels: Annotated[tuple[Channel, ...], ByName(ChannelName)] = Field(
+        default=(), description="Any other recorded input"
+    )
+    trials: Annotated[Several[TrialEntry], Field(min_length=1), AfterValidator(_with_ids)]
+    _root: Path = PrivateAttr(Path())
+
+    @property
+    def root(self) -> Path:
+        """The session folder."""
+        return self._root
+
+    @cached_property
+    def brakes(self) -> tuple[Brake, ...]:
+        """Which column brakes which axis."""
+        return self.brake_table.brakes(self.encoders) if self.brake_table else ()
+
+    @property
+    def tick(self) -> float:
+        """Length of one unit of the time column, s; of one sample where samples are counted."""
+        if self.clock.unit == "samples":
+            return 1.0 / self.sample_rate
+        return SECONDS.get(self.clock.unit, 1.0)
+
+    @cached_property
+    def columns(self) -> tuple[str, ...]:
+        """The columns that every trial file must have, the time column first."""
+        force = self.force.columns if self.force else ()
+        parts = (self.encoders, self.brakes, self.channels)
+        speeds = (e.velocity.column for e in self.encoders if e.velocity)
+        clock = tuple(c for c in (self.clock.column, self.clock.nanoseconds) if c)
+        return (*clock, *(c.column for part in parts for c in part), *speeds, *force)
+
+    @property
+    def raw_units(self) -> dict[str, str]:
+        """Unit of each column as the session file has it, where it is no count and no voltage."""
+        found = {e.column: e.raw_unit for e in self.encoders if not e.counts}
+        found |= {e.velocity.column: e.velocity.unit for e in self.encoders if e.velocity}
+        if self.force is not None:
+            found |= dict.fromkeys(self.force.columns, self.force.raw_unit)
+        found |= {c.column: c.raw_unit for c in self.channels if c.raw_unit}
+        return found
+
+    @property
+    def device_file(self) -> Path | None:
+        """Path of the lab's own device file, None for a built-in device.
+
+        Raises:
+            InputError: there is no such file, or it is outside the session folder.
+        """
+        if not is_device_path(self.device):
+            return None
+        return inside(self.root, self.device, where=f"{self.root / FILE_NAME}: device")
+
+    def cross_faults(self) -> Iterator[InputError]:
+        for channel in self.channels:
+            name = channel.name
+            if name in ("trial_id", "t") or name.startswith(("q_", "force_", "brake_")):
+                yield InputError(
+                    f"the name '{name}' is taken by ingest's own columns",
+                    where="channels",
+                    remedy="choose another name, or use [encoders], [force] or [brakes]",
+                )
+        try:
+            columns = self.columns
+        except InputError as error:
+            yield error
+            columns = ()
+        for column, times in Counter(columns).items():
+            if times > 1:
+                yield InputError(
+                    f"column '{column}' is used for {times} channels",
+                    remedy="each channel has its own column",
+                )
+        yield from self._faults_of_trials()
+
+    def _faults_of_trials(self) -> Iterator[InputError]:
+        axes = [encoder.axis for encoder in self.encoders]
+        for number, trial in enumerate(self.trials):
+            place = f"trials[{number}]"
+            if trial.locked_axis is not None and trial.locked_axis not in axes:
+                yield InputError(
+                    f"no axis '{trial.locked_axis}'{did_you_mean(trial.locked_axis, axes)}",
+                    where=f"{place}.locked_axis",
+                    remedy=f"the axes are {', '.join(axes)}",
+                )
+            for other in self.trials[:number]:
+                # The same file twice without stretches is left to ingest, which uses it once.
+                stretches = {(t.start_s, t.end_s) for t in (trial, other)}
+                twice = stretches == {(0.0, math.inf)}
+                if other.file == trial.file and other.overlaps(trial) and not twice:
+                    yield InputError(
+                        f"overlaps trial {other.trial_id} of the same file",
+                        where=place,
+                        remedy="give each stretch its own start_s and end_s: held-out samples"
+                        " must not be in another trial",
+                    )
+        free = [trial for trial in self.trials if trial.kind == "free"]
+        if any(trial.hold_out for trial in self.trials) and all(t.hold_out for t in free):
+            yield InputError(
+                "every free trial is held out: nothing is left to identify from",
+                where="trials",
+                remedy="leave hold_out away from some",
+            )
 
 
 def read_session(path: Path) -> Session:
