@@ -12,6 +12,7 @@ import json
 import os
 import re
 import stat
+import tempfile
 import tomllib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -224,6 +225,32 @@ def atomic_writer(path: Path, *, durable: bool = True) -> Iterator[BinaryIO]:
     except BaseException:
         _discard(partial)
         raise
+
+
+@contextmanager
+def temporary_space() -> Iterator[None]:
+    """A block that writes temporary files: what their disk refuses is said of that disk.
+
+    Raises:
+        InputError: there is no folder for temporary files, or its disk is full or the like.
+    """
+    try:
+        folder = tempfile.gettempdir()
+    except FileNotFoundError as error:
+        raise InputError(
+            "there is no folder for temporary files that can be written",
+            remedy="free some space, or set TMPDIR to a folder with room",
+        ) from error
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in STORAGE_FAULTS:
+            raise
+        raise InputError(
+            f"no temporary files can be written: {STORAGE_FAULTS[error.errno]}",
+            where=folder,
+            remedy="free some space there, or set TMPDIR to a folder with room",
+        ) from error
 
 
 def write_text(path: Path, text: str, *, durable: bool = True) -> None:

@@ -13,6 +13,7 @@ from pathlib import Path
 import typst
 
 from bampipe.errors import InputError
+from bampipe.files import temporary_space
 from bampipe.report.document import (
     Block,
     Bullets,
@@ -48,7 +49,7 @@ def pdf(document: Document, recorded: int) -> bytes:
             where="SOURCE_DATE_EPOCH",
             remedy="unset it, or give whole seconds since 1970",
         )
-    with tempfile.TemporaryDirectory(prefix="bampipe-report-") as folder:
+    with temporary_space(), tempfile.TemporaryDirectory(prefix="bampipe-report-") as folder:
         root = Path(folder)
         (root / "figures").mkdir()
         for section in document.sections:
@@ -59,9 +60,7 @@ def pdf(document: Document, recorded: int) -> bytes:
         source = root / _TEMPLATE.name
         shutil.copyfile(_TEMPLATE, source)
         compiler = typst.Compiler(source, root=root, ignore_system_fonts=True)
-        printed = root / "report.pdf"
-        compiler.compile(output=printed, format="pdf", timestamp=int(stamp))
-        return printed.read_bytes()
+        return bytes(compiler.compile(format="pdf", timestamp=int(stamp)))
 
 
 def content(document: Document) -> dict[str, object]:

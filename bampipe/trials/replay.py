@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from bampipe.estimate.butterworth import zero_phase
 from bampipe.estimate.simulation import simulate_tracking
+from bampipe.files import temporary_space
 from bampipe.physics import System
 from bampipe.physics.device import derivative
 from bampipe.trials.cache import MOST_SAMPLES, TrialCache
@@ -134,14 +135,16 @@ def store_motions(motions: Iterator[Motion]) -> Sequence[Motion]:
 
     What comes back is bit by bit the same, and takes the memory of a few trials only.
     """
-    folder = Path(tempfile.mkdtemp(prefix="bampipe-trials-"))
+    with temporary_space():
+        folder = Path(tempfile.mkdtemp(prefix="bampipe-trials-"))
     count = 0
     try:
         for count, motion in enumerate(motions, start=1):
             arrays = {f"channel {name}": values for name, values in motion.channels.items()}
             for name in _ARRAYS:
                 arrays[name] = getattr(motion, name)
-            np.savez(folder / f"{count - 1}.npz", trial_id=motion.trial_id, **arrays)
+            with temporary_space():
+                np.savez(folder / f"{count - 1}.npz", trial_id=motion.trial_id, **arrays)
     except BaseException:
         shutil.rmtree(folder)
         raise

@@ -9,7 +9,7 @@ import codecs
 import re
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
@@ -28,6 +28,7 @@ from bampipe.data.readers.trial import (
     joined,
 )
 from bampipe.errors import InputError
+from bampipe.files import temporary_space
 
 BLOCK = 1 << 20
 _UTF16 = (b"\xff\xfe", b"\xfe\xff")
@@ -123,9 +124,11 @@ def opened(path: Path, dialect: Dialect, name: str) -> Iterator[tuple[BinaryIO, 
         if encoding == "utf-8":
             yield stream, ()
             return
-        with tempfile.TemporaryFile() as copy:
-            _transcode(stream, copy, encoding, name)
-            copy.seek(0)
+        with ExitStack() as stack:
+            with temporary_space():
+                copy = stack.enter_context(tempfile.TemporaryFile())
+                _transcode(stream, copy, encoding, name)
+                copy.seek(0)
             yield copy, (_TAKEN_AS,) if encoding == _WESTERN and not dialect.encoding else ()
 
 
