@@ -34,9 +34,8 @@ from bampipe.progress import silent
 from bampipe.simulator import session as simulate
 from bampipe.stages import filter as filter_stage
 from bampipe.stages import identify, ingest
-from bampipe.trials.band import read_band
 from bampipe.trials.motion import Motion
-from bampipe.trials.reading import read_motions, read_sensors
+from bampipe.trials.reading import read_band, read_motions, read_sensors
 from bampipe.trials.residuals import problem_of
 
 Array = NDArray[np.float64]
@@ -89,7 +88,7 @@ def by_instruments(run: RunFolder, system: System) -> Found:
     begun = time.process_time()
     motions = list(read_motions(run, system, fitted=True))
     sensors = read_sensors(run, system)
-    band = read_band(read_json(run.path("filter/filter.json")), system.coordinates)
+    band = read_band(run, system)
     problem = problem_of(system, motions, band, timing=True)
     squares = fit(problem, np.append(system.prior, 0.0))
     choice = FilterChoice()

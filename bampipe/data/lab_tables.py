@@ -72,6 +72,7 @@ TABLES: dict[str, dict[str, pa.DataType]] = {
         "held_out_rmse": _NUMBER,
         "noise_floor": _NUMBER,
         "error_over_floor": _NUMBER,
+        "standing": _TEXT,
         "fit_percent": _NUMBER,
         "unit": _TEXT,
     },

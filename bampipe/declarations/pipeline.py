@@ -54,6 +54,10 @@ class Gate(Declaration):
         description="Judge the change since the accepted values instead, in percent, less two"
         " standard deviations",
     )
+    judged_by: NumberPath = Field(
+        default="", description="a dotted path of a word that says whether the value passes"
+    )
+    passes: Distinct[Text] = Field(default=(), description="Words of judged_by that pass")
     max: Number | None = Field(default=None, description="Largest value that passes")
     min: Number | None = Field(default=None, description="Smallest value that passes")
     level: Literal["fail", "warn"] = Field(
@@ -63,8 +67,10 @@ class Gate(Declaration):
     advice: str = Field(default="", description="What to do where the gate does not pass")
 
     def cross_faults(self) -> Iterator[InputError]:
-        if self.max is None and self.min is None:
-            yield InputError("neither 'max' nor 'min'", remedy="give the limit")
+        if self.max is None and self.min is None and not self.judged_by:
+            yield InputError("neither 'max' nor 'min'", remedy="give the limit, or 'judged_by'")
+        if bool(self.judged_by) != bool(self.passes):
+            yield InputError("'judged_by' and 'passes' go together", remedy="give both, or neither")
 
 
 class BaseModelTable(Declaration):

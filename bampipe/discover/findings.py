@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from bampipe.results.record import Standing
+from bampipe.results.standing import Standing
 from bampipe.trials.residuals import Evidence
 
 

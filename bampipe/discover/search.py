@@ -16,7 +16,8 @@ from bampipe.discover.rivals import choose
 from bampipe.discover.start import with_effect, without_effect
 from bampipe.estimate.simulation import Runaway
 from bampipe.physics.recipe import Recipe
-from bampipe.trials.noise_floor import AT_FLOOR, FLOOR_SEED
+from bampipe.results.standing import AT_FLOOR
+from bampipe.trials.noise_floor import FLOOR_SEED
 from bampipe.trials.residuals import Evidence
 
 Array = NDArray[np.float64]

@@ -11,7 +11,8 @@ from bampipe.discover.ranking import rank
 from bampipe.discover.search import Search
 from bampipe.discover.settings import Settings
 from bampipe.discover.shape import explainable_share
-from bampipe.trials.noise_floor import NoiseFloor, standing
+from bampipe.results.standing import standing
+from bampipe.trials.noise_floor import NoiseFloor
 
 
 def conclude(search: Search, s: Settings) -> Diagnosis:

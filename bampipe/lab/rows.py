@@ -117,6 +117,7 @@ def _model(
                 held_out_rmse=error.held_out_rmse,
                 noise_floor=floor,
                 error_over_floor=error.held_out_rmse / floor if floor else None,
+                standing=error.standing,
                 unit=error.unit,
                 rmse=error.rmse,
                 rmse_without_friction=error.rmse_without_friction,

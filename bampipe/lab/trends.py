@@ -30,9 +30,6 @@ EFFECT = "missing effect"
 BOTH = "device drifted, and missing effect"
 UNKNOWN = "not diagnosed"
 
-ABOVE_FLOOR = 1.5
-"""A held-out error so many noise floors high asks for a diagnosis (the gate of the pipelines)."""
-
 
 @dataclass(frozen=True)
 class Series:
@@ -83,6 +80,7 @@ class Judged:
         unexplained: axes on which something unknown is missing.
         diagnosed: whether a diagnosis was made.
         worst: largest held-out error of the base model over its floor, and its axis.
+        above_floor: whether validate found the base model above its floor on some axis.
         sentence: the verdict in words.
         remedy: a command that would say more, or "".
     """
@@ -96,6 +94,7 @@ class Judged:
     unexplained: tuple[str, ...] = ()
     diagnosed: bool = False
     worst: tuple[float, str] | None = None
+    above_floor: bool = False
     sentence: str = ""
     remedy: str = ""
 
@@ -148,6 +147,9 @@ def _judge(row: Row, tables: Mapping[str, Sequence[Row]], charts: Sequence[Serie
         if r["model"] == BASE and r["error_over_floor"] is not None
     ]
     judged.worst = max(ratios, default=None)
+    judged.above_floor = any(
+        r["standing"] == "above_floor" for r in mine["errors"] if r["model"] == BASE
+    )
     named = [effect for r in mine["verdicts"] for effect in r["effects"]]
     first = [r for r in mine["verdicts"] if r["model"] == BASE]
     judged.effects = tuple(dict.fromkeys(named if first else row["effects"]))
@@ -180,7 +182,7 @@ def _decide(judged: Judged, beyond: Sequence[Series], mine: Mapping[str, Sequenc
         if lacks:
             judged.verdict = EFFECT
             judged.sentence = f"lacks {what}; no parameter is beyond its limits"
-        elif not judged.diagnosed and judged.worst and judged.worst[0] > ABOVE_FLOOR:
+        elif not judged.diagnosed and judged.worst and judged.above_floor:
             judged.verdict = UNKNOWN
             judged.sentence = (
                 f"error on unseen trials {judged.worst[0]:.3g} times the floor on "

@@ -12,8 +12,8 @@ from matplotlib.axes import Axes
 from bampipe.report import page, style, typeset, wording
 from bampipe.report.build import Report
 from bampipe.report.document import Block, Callout, Document, Figure, Section, Table, Text
-from bampipe.report.verdicts import NEAR_FLOOR
 from bampipe.results.lab import ControlChart, SessionVerdict, TrendsResult
+from bampipe.results.standing import AT_FLOOR
 
 _COLUMNS = 3
 _MOST_PANELS = 12
@@ -264,7 +264,7 @@ def _errors(folder: Path, trends: TrendsResult) -> Section | None:
         base = here[here["model"] == "base"].set_index("session_id")["error_over_floor"]
         others = here[here["model"] != "base"].groupby("session_id")["error_over_floor"].min()
         place = {name: number for number, name in enumerate(sessions)}
-        panel.axhspan(0.0, NEAR_FLOOR, color=style.GREEN, alpha=0.12, lw=0)
+        panel.axhspan(0.0, AT_FLOOR, color=style.GREEN, alpha=0.12, lw=0)
         for values, colour, mark, name in (
             (base, style.BLUE, "o", "base model"),
             (others, style.VERMILLION, "D", "best extended model"),
@@ -288,7 +288,7 @@ def _errors(folder: Path, trends: TrendsResult) -> Section | None:
     caption = "Error on unseen trials over the noise floor, session by session."
     said = (
         "The noise floor is what sensors and filters leave if the model is exactly right. In the "
-        f"green band, below {NEAR_FLOOR:g}, a model leaves nothing that the session could show."
+        f"green band, below {AT_FLOOR:g}, a model leaves nothing that the session could show."
     )
     picture = Figure("errors", caption, style.svg(figure))
     return Section("Prediction", (Text(said), picture))

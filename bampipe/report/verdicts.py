@@ -8,10 +8,8 @@ from bampipe.report import wording
 from bampipe.report.document import Callout
 from bampipe.report.results import Results
 from bampipe.results.diagnose import DiagnoseResult
+from bampipe.results.standing import IN_WORDS as IN_WORDS_OF_STANDING
 from bampipe.results.validate import ValidateResult
-
-NEAR_FLOOR = 1.15
-"""A held-out error below this many noise floors counts as at the floor."""
 
 IN_WORDS = {
     "nothing_missing": "nothing missing",
@@ -20,7 +18,7 @@ IN_WORDS = {
 }
 
 
-def above_floor(results: Results, model: str) -> dict[str, float] | None:
+def error_over_floor(results: Results, model: str) -> dict[str, float] | None:
     """Return, by axis, held-out error over noise floor; None where it was not validated."""
     validated = results.read(ValidateResult, model)
     if validated is None:
@@ -40,17 +38,32 @@ def ordered(results: Results, by_axis: Collection[str]) -> tuple[str, ...]:
 
 def overall(results: Results) -> Callout:
     """Return the verdict on the session."""
+    validated = results.read(ValidateResult, results.model)
+    if validated is not None and validated.refused:
+        return Callout(
+            "attention",
+            "The published parameters are refused",
+            f"{'. '.join(validated.refused)}. `bampipe identify {results.root.name} --method "
+            "least-squares` takes another estimator.",
+        )
+    if validated is not None and (wrong := _wrong_floors(results, validated)):
+        return Callout(
+            "attention",
+            f"No verdict on {wording.listing(wrong)}: the noise floor is wrong",
+            f"The held-out error is {wording.listing(f'{a}: {w}' for a, w in wrong.items())}. "
+            "Look at the noise and resolution of the sensors, under Data.",
+        )
     diagnosis = results.read(DiagnoseResult)
     if diagnosis is not None:
         return _diagnosed(results, diagnosis)
-    ratios = above_floor(results, results.model)
-    if ratios is None:
+    if validated is None:
         done = "identified" if results.models else "read"
         return Callout(
             "note",
             f"The session has been {done}, not validated",
             f"`bampipe validate {results.root.name}` compares measured and predicted force.",
         )
+    ratios = error_over_floor(results, results.model)
     if not ratios:
         return Callout(
             "note",
@@ -58,7 +71,7 @@ def overall(results: Results) -> Callout:
             "The parameters have seen every trial, or no noise floor could be found, so nothing "
             "can be said about what the model would do on a new trial.",
         )
-    high = {axis: ratio for axis, ratio in ratios.items() if ratio > NEAR_FLOOR}
+    high = {a: r for a, r in ratios.items() if validated.axes[a].standing == "above_floor"}
     if not high:
         return Callout(
             "good",
@@ -72,6 +85,15 @@ def overall(results: Results) -> Callout:
         f"On trials that the parameters never saw, the error is {_ratios(high)}. "
         f"`bampipe diagnose {results.root.name}` says which effect is missing.",
     )
+
+
+def _wrong_floors(results: Results, validated: ValidateResult) -> dict[str, str]:
+    """Axes whose noise floor is implausible, in words."""
+    return {
+        axis: IN_WORDS_OF_STANDING[validated.axes[axis].standing]
+        for axis in ordered(results, validated.axes)
+        if validated.axes[axis].standing == "floor_implausible"
+    }
 
 
 def _ratios(ratios: dict[str, float]) -> str:

@@ -6,7 +6,8 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from bampipe.results.record import Names, Record, Result, Size, Standing
+from bampipe.results.record import Names, Record, Result, Size
+from bampipe.results.standing import Standing
 
 
 class FreeRunPosition(Record):

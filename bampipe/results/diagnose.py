@@ -6,7 +6,8 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from bampipe.results.record import Count, Names, Record, Result, Share, Size, Standing
+from bampipe.results.record import Count, Names, Record, Result, Share, Size
+from bampipe.results.standing import Standing
 
 Verdict = Literal["nothing_missing", "missing", "undecided", "unknown_effect"]
 UpToOne = Annotated[float, Field(le=1)]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Self
 
 from pydantic import (
     ConfigDict,
@@ -23,8 +23,6 @@ Positive = Annotated[float, Field(gt=0)]
 Share = Annotated[float, Field(ge=0, le=1)]
 Count = Annotated[int, Field(ge=0)]
 Names = tuple[str, ...]
-Standing = Literal["at_floor", "above_floor", "floor_implausible", "floor_missing"]
-"""How a held-out error stands against its noise floor: `trials.noise_floor.standing`."""
 
 
 class Record(Declaration):

@@ -6,7 +6,8 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import ConfigDict, Field
 
-from bampipe.results.record import Count, Names, Positive, Record, Result, Size, Standing
+from bampipe.results.record import Count, Names, Positive, Record, Result, Size
+from bampipe.results.standing import Standing
 
 
 class AxisError(Record):
@@ -38,6 +39,9 @@ class JudgedError(AxisError):
     )
     noise_floor_sd: Size = Field(description="Scatter of one replay")
     standing: Standing
+    estimate: Literal["accepted", "refused"] = Field(
+        description="Refused where published_rmse is more than 1.2 times held_out_rmse"
+    )
 
 
 class TrialError(Record):

@@ -86,6 +86,7 @@ def judge(gate: Gate, root: Path, model: str, baseline: Path) -> list[Verdict]:
     content = read_json_table(path)
     values = _pick(content, gate.value)
     divisors = _pick(content, gate.divide_by) if gate.divide_by else {}
+    words = _pick(content, gate.judged_by) if gate.judged_by else {}
     if not values:
         return [_missing(gate, "", f"{relative} has no {gate.value}")]
     if gate.against == accepted.ACCEPTED:
@@ -96,11 +97,24 @@ def judge(gate: Gate, root: Path, model: str, baseline: Path) -> list[Verdict]:
         if value is not None and gate.divide_by:
             divisor = _number(divisors.get(key))
             value = value / divisor if divisor else None
+        if gate.judged_by:
+            verdicts.append(_judged(gate, key, value, words.get(key)))
+            continue
         if value is None:
             verdicts.append(_missing(gate, key, f"{relative} has no number at {gate.value}"))
             continue
         verdicts.append(_hold(gate, key, value, ""))
     return verdicts
+
+
+def _judged(gate: Gate, key: str, value: float | None, word: object) -> Verdict:
+    """Return the verdict that a stage stored as a word; ``value`` is shown beside it."""
+    number = "no number" if value is None else f"{value:.4g}"
+    text = f"{number}, {str(word).replace('_', ' ')}"
+    if word in gate.passes:
+        return Verdict(gate.name, key, "passed", value, text)
+    state = "failed" if gate.level == "fail" else "warned"
+    return Verdict(gate.name, key, state, value, "; ".join(filter(None, [text, gate.advice])))
 
 
 def _hold(gate: Gate, key: str, value: float, said: str) -> Verdict:

@@ -20,12 +20,13 @@ from bampipe.identification.free_run import free_runs
 from bampipe.physics import System, compile_model
 from bampipe.progress import Progress
 from bampipe.results.identify import IdentifyResult
+from bampipe.results.standing import standing
 from bampipe.results.validate import ValidateResult
 from bampipe.schema import STRICT, Count
 from bampipe.trials.folds import HELD_OUT, Folds
 from bampipe.trials.measured import MeasuredTrials, read_measured_trials
 from bampipe.trials.motion import Motion
-from bampipe.trials.noise_floor import NoiseFloor, find_noise_floor, floor_replays, standing
+from bampipe.trials.noise_floor import NoiseFloor, find_noise_floor, floor_replays
 from bampipe.trials.reading import held_out_trials, require_sound_motions
 from bampipe.trials.residuals import Evidence, gather_evidence, problem_of
 
@@ -264,7 +265,8 @@ def _content(
         scatter = 0.0 if floor is None else float(floor.sd[i])
         entry["noise_floor"], entry["noise_floor_sd"] = level, scatter
         entry["standing"] = standing(error, level, scatter)
-        if published > REFUSED_BEYOND * error:
+        entry["estimate"] = "refused" if published > REFUSED_BEYOND * error else "accepted"
+        if entry["estimate"] == "refused":
             refused.append(
                 f"{axis}: the published parameters err by {published:.3g} {entry['unit']} on the"
                 f" trials where parameters refitted without them err by {error:.3g}"

@@ -1,6 +1,6 @@
-"""The noise floor: the held-out error of a model that is the whole truth; and whether it is met.
+"""The noise floor: the held-out error of a model that is the whole truth.
 
-This is the one place where a floor is found and where an error is held against it.
+This is the one place where a floor is found; `bampipe.results.standing` holds an error against it.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import System
-from bampipe.results.record import Standing
 from bampipe.trials.folds import Folds
 from bampipe.trials.kinematics import Kinematics
 from bampipe.trials.motion import Motion
@@ -29,26 +28,6 @@ serve as noise floor in every stage."""
 ENOUGH_SAMPLES, MOST_REPLAYS = 250_000, 6
 """Replays are repeated until they hold so many samples, but no oftener than this: the floor of a
 session of forty thousand samples is then known to about 1 %, and longer ones need fewer."""
-
-AT_FLOOR = 1.2
-"""Error over floor up to which a model leaves no more than its sensors do."""
-IMPLAUSIBLE = 0.7
-"""Error over floor below which the floor is wrong: sensors noisier than the data, or a replay that
-does not resemble the machine."""
-
-
-def standing(error: float, floor: float | None, floor_sd: float = 0.0) -> Standing:
-    """Hold a held-out error against its noise floor.
-
-    Args:
-        error: held-out error of one axis; floor: its noise floor, None where there is none.
-        floor_sd: scatter of the floor over replays.
-    """
-    if floor is None or not np.isfinite(floor) or not np.isfinite(error) or floor <= 0.0:
-        return "floor_missing"
-    if error < IMPLAUSIBLE * floor - 3.0 * floor_sd:
-        return "floor_implausible"
-    return "at_floor" if error <= AT_FLOOR * floor + 3.0 * floor_sd else "above_floor"
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,9 @@ from bampipe.trials.motion import Motion
 
 Array = NDArray[np.float64]
 
+_REFITS = 6
+"""Most Gauss-Newton steps of a refit that starts at the fit to all trials."""
+
 
 def problem_of(
     system: System,
@@ -90,6 +93,13 @@ def _standstill(motion: Motion, system: System, band: Band) -> NDArray[np.bool_]
     return resting(motion.qd, motion.qd_sd, band.rate_hz, np.array(braked))
 
 
+def residual_at(system: System, motion: Motion, p: Array) -> Array:
+    """Residual (T, n_q) of the inverse dynamics on a trial, before any low-pass, N.m or N."""
+    u = motion.inputs(system.inputs)
+    z = system.memory(motion.q, motion.qd, motion.qdd, u, p, motion.t)
+    return system.residual(*system.true_motion(motion.q, motion.qd, motion.qdd, u, p), z, u, p)
+
+
 @dataclass(frozen=True)
 class Evidence:
     """Residuals of one model on the trials of one session, linearised at its least-squares fit.
@@ -147,21 +157,49 @@ class Evidence:
 
     @cached_property
     def held_out_steps(self) -> tuple[Array, ...]:
-        """Change of the free parameters when the trials of a group are left out, by trial."""
-        return self.folds.solve(self.sums, self.weight, self.lower, self.upper)
+        """Change of the free parameters when the trials of a group are left out, by trial.
 
-    @property
+        By the normal equations at the fit to all where the model is linear in its parameters; by
+        refits from there where it is not: a Gauss-Newton step alone leads shapes astray.
+        """
+        if self.is_linear or self.folds.nothing_held_out:
+            return self.folds.solve(self.sums, self.weight, self.lower, self.upper)
+        problem = problem_of(self.system, self.motions, self.band)
+        start, free = np.append(self.p, 0.0), list(self.free)
+        steps: dict[int, Array] = {}
+        for group in sorted(set(self.folds.groups)):
+            others = [k for k in self.folds.fitted_trials if self.folds.groups[k] != group]
+            steps[group] = np.zeros(len(free))
+            if len(others) < len(self.folds.fitted_trials):
+                refit = fit(problem, start, trials=others, most_iterations=_REFITS)
+                steps[group] = refit.p[free] - self.p[free]
+        return tuple(steps[group] for group in self.folds.groups)
+
+    @cached_property
     def held_out_rmse(self) -> Array:
         """Error on trials that the parameters have not seen, (n_q,), N.m or N.
 
-        The parameters are refitted without each group of trials by the normal equations at the
-        fit to all: exact for a model linear in its parameters, to first order for others.
+        See `held_out_steps` for the parameters without each group of trials.
         """
-        return self.folds.error(self.sums, self.held_out_steps)
+        if self.is_linear:
+            return self.folds.error(self.sums, self.held_out_steps)
+        judged = [k for k, counts in enumerate(self.folds.judged) if counts]
+        squares = sum(np.sum(self.held_out_residual(k) ** 2, axis=0) for k in judged)
+        count = self.sums.count[judged].sum(axis=0)
+        return np.asarray(np.sqrt(squares / np.maximum(count, 1.0)))
+
+    @property
+    def is_linear(self) -> bool:
+        """Whether the residual is linear in all free parameters."""
+        return all(self.system.linear[i] for i in self.free)
 
     def held_out_residual(self, trial: int) -> Array:
         """The residual of a trial with parameters that have not seen it, (K, n_q)."""
-        return np.asarray(self.residual[trial] + self.jacobian[trial] @ self.held_out_steps[trial])
+        step = self.held_out_steps[trial]
+        if self.is_linear or not step.any():
+            return np.asarray(self.residual[trial] + self.jacobian[trial] @ step)
+        found = residual_at(self.system, self.motions[trial], self.held_out_parameters(trial))
+        return self.band.thin(found) * self.used[trial]
 
     def held_out_parameters(self, trial: int) -> Array:
         """Those parameters, (n_p,)."""

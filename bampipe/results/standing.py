@@ -1,0 +1,40 @@
+"""How a held-out error stands against its noise floor: the one judgement of "at the floor".
+
+Validate, diagnose and compare store it; reports, gates, the lab and the command line read it.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+Standing = Literal["at_floor", "above_floor", "floor_implausible", "floor_missing"]
+
+AT_FLOOR = 1.2
+"""Error over floor up to which a model leaves no more than its sensors do. No replay is perfect:
+where nothing is missing, errors stand up to this far above the floor (benchmarks/thresholds.py)."""
+IMPLAUSIBLE = 0.7
+"""Error over floor below which the floor is wrong: sensors noisier than the data, or a replay that
+does not resemble the machine."""
+
+IN_WORDS = {
+    "at_floor": "at the noise floor",
+    "above_floor": "above the noise floor",
+    "floor_implausible": "far below its noise floor, which is therefore wrong",
+    "floor_missing": "without a noise floor to be held against",
+}
+
+
+def standing(error: float, floor: float | None, floor_sd: float = 0.0) -> Standing:
+    """Hold a held-out error against its noise floor.
+
+    Args:
+        error: held-out error of one axis.
+        floor: its noise floor in the same unit, None where there is none.
+        floor_sd: scatter of the floor over replays; three of them are allowed for.
+    """
+    if floor is None or not math.isfinite(floor) or not math.isfinite(error) or floor <= 0.0:
+        return "floor_missing"
+    if error < IMPLAUSIBLE * floor - 3.0 * floor_sd:
+        return "floor_implausible"
+    return "at_floor" if error <= AT_FLOOR * floor + 3.0 * floor_sd else "above_floor"
