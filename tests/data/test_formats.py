@@ -290,6 +290,23 @@ def test_ros(tmp_path, kind):
     np.testing.assert_allclose(force[1:], T[1:] - 1e-3, atol=1e-9)
 
 
+def test_messages_in_lists_of_ros_messages(tmp_path):
+    pytest.importorskip("rosbags")
+    from rosbags.rosbag1 import Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC)
+    point, kind = store.types["geometry_msgs/msg/Point32"], "geometry_msgs/msg/Polygon"
+    with Writer(tmp_path / "a.bag") as writer:
+        link = writer.add_connection("/corners", kind, typestore=store)
+        for n in range(3):
+            corners = store.types[kind]([point(0.0, 0.0, 0.0), point(float(n), 0.0, 0.0)])
+            writer.write(link, n * 10**9, store.serialize_ros1(corners, kind))
+    assert "/corners:points[1].x" in columns_of(tmp_path / "a.bag")
+    trial = read_trial(tmp_path / "a.bag", ("/corners:@time", "/corners:points[1].x"))
+    np.testing.assert_array_equal(trial.columns["/corners:points[1].x"], [0.0, 1.0, 2.0])
+
+
 def test_ros_refused(tmp_path):
     path = write_ros(tmp_path, "ros1")
     state = "/joint_states:header.stamp"
