@@ -60,7 +60,9 @@ def pdf(document: Document, recorded: int) -> bytes:
         source = root / _TEMPLATE.name
         shutil.copyfile(_TEMPLATE, source)
         compiler = typst.Compiler(source, root=root, ignore_system_fonts=True)
-        return bytes(compiler.compile(format="pdf", timestamp=int(stamp)))
+        printed = compiler.compile(format="pdf", timestamp=int(stamp))
+        assert isinstance(printed, bytes)  # a list of pages comes for other formats
+        return printed
 
 
 def content(document: Document) -> dict[str, object]:
