@@ -265,9 +265,7 @@ def json_text(value: object) -> str:
     Raises:
         ValueError: a number is NaN or infinite: store None and say why.
     """
-    text = json.dumps(
-        value, sort_keys=True, indent=1, allow_nan=False, ensure_ascii=False, default=_listed
-    )
+    text = json.dumps(value, sort_keys=True, indent=1, allow_nan=False, ensure_ascii=False)
     return text + "\n"
 
 
@@ -363,11 +361,6 @@ def _refuse_deep(value: object, where: str, depth: int = DEEPEST) -> None:
 def _discard(partial: Path) -> None:
     if partial.exists():
         partial.unlink()
-
-
-def _listed(value: Any) -> object:
-    """An array or a number of numpy as JSON can hold it."""
-    return value.tolist()
 
 
 def _plain(value: object) -> object:

@@ -27,6 +27,8 @@ from hidden_effects import SINGLES
 from bampipe.data.run_folder import RunFolder
 from bampipe.files import write_text
 from bampipe.progress import silent
+from bampipe.results.identify import IdentifyResult
+from bampipe.results.validate import ValidateResult
 from bampipe.simulator import session as simulate
 from bampipe.stages import identify, validate
 
@@ -66,8 +68,8 @@ class Outcome:
 
 def _ratio(run: RunFolder, name: str) -> float:
     validate.execute(run, run.root, validate.Config(model=name, free_run=False), silent)
-    axes = run.read_json(f"models/{name}/validate.json")["axes"].values()
-    return max(float(e["held_out_rmse"]) / float(e["noise_floor"]) for e in axes)
+    axes = run.read(ValidateResult, name).axes.values()
+    return max(axis.held_out_rmse / axis.noise_floor for axis in axes if axis.noise_floor)
 
 
 def outcome(effect: str, seed: int) -> Outcome:
@@ -85,18 +87,18 @@ def outcome(effect: str, seed: int) -> Outcome:
             identify.execute(run, run.root, identify.Config(model=name), silent)
             seconds = time.process_time() - begun
             ratios.append(_ratio(run, name))
-        found = run.read_json("models/right/identify.json")
-    entries = found["parameters"]
+        found = run.read(IdentifyResult, "right")
+    entries = found.parameters
     head = effect.split(":")[0]
     own = [name for name in entries if name.startswith(f"{head}.")]
     names = [*own, *(name for name in entries if name not in own)]
     return Outcome(
         effect,
         seed,
-        str(found["method"]),
+        found.method,
         *ratios,
-        tuple((entries[n]["estimate"] - truth[n]) / entries[n]["sd"] for n in names),
-        tuple(entries[n]["sd"] / (entries[n]["bound_sd"] or np.inf) for n in names),
+        tuple((entries[n].estimate - truth[n]) / entries[n].sd for n in names),
+        tuple(entries[n].sd / (entries[n].bound_sd or np.inf) for n in names),
         len(own),
         seconds,
     )

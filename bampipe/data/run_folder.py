@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from bampipe.errors import InputError
-from bampipe.files import is_inside, read_json_table
+from bampipe.files import is_inside
 
 if TYPE_CHECKING:
     from bampipe.results.record import Result
@@ -64,17 +64,6 @@ class RunFolder:
             InputError: its stage has not run, or the file is not as bampipe writes it.
         """
         return kind.read(self.require(kind.file(model), kind.STAGE))
-
-    def read_json(self, relative: str) -> dict[str, Any]:
-        """Return the contents of the JSON file ``relative``.
-
-        Raises:
-            InputError: the file is missing, or is no table in JSON.
-        """
-        path = self.path(relative)
-        if not path.exists():
-            raise InputError(f"{relative} is missing", where=str(self.root))
-        return read_json_table(path)
 
     def glob(self, pattern: str) -> tuple[str, ...]:
         """Return the files that match ``pattern``, relative to the run folder, sorted."""

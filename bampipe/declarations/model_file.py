@@ -12,6 +12,7 @@ from bampipe.files import read_toml
 from bampipe.physics import Model, System, registry
 from bampipe.physics.device import Device
 from bampipe.physics.recipe import Recipe
+from bampipe.results.identify import IdentifyResult
 
 
 def load_model(run: RunFolder, name: str) -> Model:
@@ -68,9 +69,7 @@ def identified(run: RunFolder, name: str, system: System) -> NDArray[np.float64]
     Raises:
         InputError: the model has not been identified, or was another one when it was.
     """
-    path = f"models/{name}/identify.json"
-    run.require(path, "identify")
-    found = run.read_json(path)["parameters"]
+    found = run.read(IdentifyResult, name).parameters
     p = system.prior
     for i, item in enumerate(system.parameters):
         if item.fixed:
@@ -78,8 +77,8 @@ def identified(run: RunFolder, name: str, system: System) -> NDArray[np.float64]
         if item.name not in found:
             raise InputError(
                 f"no parameter {item.name!r}",
-                where=str(run.path(path)),
+                where=str(run.path(IdentifyResult.file(name))),
                 remedy=f"bampipe identify {run.root} --model {name} --force",
             )
-        p[i] = float(found[item.name]["estimate"])
+        p[i] = found[item.name].estimate
     return p

@@ -22,6 +22,7 @@ from bampipe.estimate.simulation import simulate
 from bampipe.physics import System
 from bampipe.physics.control_law import ControlLaw, compile_law
 from bampipe.physics.device import INPUT_ORDERS, derivative
+from bampipe.results.ingest import IngestResult
 from bampipe.trials.motion import Motion
 
 Array = NDArray[np.float64]
@@ -108,7 +109,7 @@ def free_runs(
 
 def _lacks(run: RunFolder, system: System, law: ControlLaw) -> str:
     """Why this session and model have no closed loop to run; "" where they have."""
-    recorded = run.read_json("ingest/session.json").get("channels", {})
+    recorded = run.read(IngestResult).channels
     missing = [n for n in law.inputs if n != "t" and n not in recorded]
     if missing:
         return f"the session records no channel {missing[0]!r} for the controller"

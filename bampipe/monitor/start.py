@@ -27,6 +27,8 @@ from bampipe.estimate.unscented import (
 )
 from bampipe.identification.filter_run import filter_model, state_at
 from bampipe.physics import System, compile_model
+from bampipe.results.identify import IdentifyResult
+from bampipe.results.ingest import IngestResult
 from bampipe.trials.reading import free_trials, input_columns
 from bampipe.trials.sensors import RecordNoise, settle_encoder, settle_force
 
@@ -179,38 +181,36 @@ def start_from_run(run: RunFolder, name: str, options: Options) -> tuple[System,
         InputError: the model has not been identified by the filter.
     """
     system = compile_model(load_model(run, name))
-    path = f"models/{name}/identify.json"
-    run.require(path, "identify")
-    found = run.read_json(path)
-    if "noise" not in found:
+    found = run.read(IdentifyResult, name)
+    path = IdentifyResult.file(name)
+    if found.noise is None:
         raise InputError(
             "identified without the filter: its noise levels are not known",
             where=str(run.path(path)),
             remedy=f"bampipe identify {run.root} --set method=ukf",
         )
     values = system.prior
-    names = found["covariance"]["names"]
+    names = found.covariance.names
     for parameter in names:
-        values[system.index(parameter)] = found["parameters"][parameter]["estimate"]
-    session = run.read_json("ingest/session.json")
-    rate = float(session["sample_rate_hz"])
+        values[system.index(parameter)] = found.parameters[parameter].estimate
+    rate = run.read(IngestResult).sample_rate_hz
     trials = [_trial(run, trial, system) for trial in free_trials(run, fitted=True)]
     model = filter_model(system, trials, values, timing=False)
-    model.parameters[-1] = found["input_timing"]["estimate"]
-    sd = np.array([found["parameters"][parameter]["sd"] for parameter in names])
+    model.parameters[-1] = found.input_timing.estimate
+    sd = np.array([found.parameters[parameter].sd for parameter in names])
     value = values[model.free]
     theta, spread = model.to_estimated(value, np.maximum(sd, 1e-6 * np.abs(value)))
-    matrix = np.array(found["covariance"]["matrix"])
+    matrix = np.array(found.covariance.matrix)
     scale = np.sqrt(np.diag(matrix))
     scale[scale == 0.0] = 1.0
     correlation = matrix / np.outer(scale, scale)
     np.fill_diagonal(correlation, 1.0)
     covariance = correlation * np.outer(spread, spread)
-    reading = [found["noise"]["reading_sd"][axis] for axis in system.coordinates]
+    reading = [found.noise.reading_sd[axis] for axis in system.coordinates]
     settings = FilterSettings(
         observed=np.arange(len(reading)),
         reading_sd=np.array(reading),
-        noise_sd=np.array([found["noise"]["process_sd"][item] for item in system.noise]),
+        noise_sd=np.array([found.noise.process_sd[item] for item in system.noise]),
         walk_sd=spread / np.sqrt(options.memory_s),
         stride=max(trial.t.size for trial in trials),
     )

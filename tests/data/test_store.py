@@ -36,7 +36,7 @@ def test_json_has_no_number_that_is_not_finite(tmp_path):
 @pytest.mark.parametrize("content", [b"[" * 100_000, b"9" * 5000, b"\xff", b""])
 def test_json_that_is_no_json_is_named(tmp_path, content):
     (tmp_path / "x.json").write_bytes(content)
-    with pytest.raises(InputError, match=r"x\.json.*: not JSON"):
+    with pytest.raises(InputError, match=r"x\.json.*: (not JSON|nested too deeply)"):
         read_json(tmp_path / "x.json")
 
 

@@ -15,14 +15,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from identified_run import MODEL, RESOLUTION, TRUTH, simulated_run
+from made_results import write_result
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import read_parquet
 from bampipe.estimate.unscented import Trial, filter_trials
-from bampipe.files import read_json, write_json, write_text
+from bampipe.files import read_json, write_text
 from bampipe.monitor.monitor import Monitor
 from bampipe.monitor.start import Options, start_from_run
 from bampipe.physics import Model, compile_model, registry
+from bampipe.results.identify import IdentifyResult
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +50,7 @@ def known(found: RunFolder, truth: dict[str, float]) -> RunFolder:
             ),
         },
     }
-    write_json(found.root / "models/base/identify.json", content)
+    write_result(found.root, IdentifyResult, **content)
     return found
 
 

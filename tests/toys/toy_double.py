@@ -10,7 +10,7 @@ from pathlib import Path
 from pydantic.dataclasses import dataclass as checked_dataclass
 
 from bampipe.data.run_folder import RunFolder
-from bampipe.files import write_json
+from bampipe.files import read_json, write_json
 from bampipe.progress import Progress
 from bampipe.schema import STRICT
 from bampipe.stages.toy_read import log
@@ -55,7 +55,7 @@ def multiply_all(numbers: list[float], factor: float) -> list[float]:
 
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
     log(NAME)
-    numbers = run.read_json("toy/numbers.json")["numbers"]
+    numbers = read_json(run.path("toy/numbers.json"))["numbers"]
     doubled = multiply_all(numbers, config.factor)
     for index, value in enumerate(doubled):
         write_json(out / f"toy/parts/{index}.json", {"value": value})

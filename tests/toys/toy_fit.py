@@ -7,7 +7,7 @@ from pathlib import Path
 from pydantic.dataclasses import dataclass as checked_dataclass
 
 from bampipe.data.run_folder import RunFolder
-from bampipe.files import write_json
+from bampipe.files import read_json, write_json
 from bampipe.progress import Progress
 from bampipe.schema import STRICT
 from bampipe.stages.toy_read import log
@@ -37,7 +37,7 @@ def outputs(config: Config) -> tuple[str, ...]:
 
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
     log(f"{NAME}:{config.model}")
-    axes = run.read_json("toy/double.json")["axes"]
+    axes = read_json(run.path("toy/double.json"))["axes"]
     total = sum(axis["value"] for axis in axes.values())
     write_json(out / f"models/{config.model}/fit.json", {"total": total})
     return {"headline": f"total {total:g}"}

@@ -7,7 +7,7 @@ from pathlib import Path
 from pydantic.dataclasses import dataclass as checked_dataclass
 
 from bampipe.data.run_folder import RunFolder
-from bampipe.files import write_json
+from bampipe.files import read_json, write_json
 from bampipe.progress import Progress
 from bampipe.schema import STRICT
 from bampipe.stages.toy_read import log
@@ -31,6 +31,6 @@ def outputs(config: Config) -> tuple[str, ...]:
 
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
     log(NAME)
-    totals = {name: run.read_json(name)["total"] for name in run.glob("models/*/fit.json")}
+    totals = {name: read_json(run.path(name))["total"] for name in run.glob("models/*/fit.json")}
     write_json(out / "sum.json", totals)
     return {"totals": totals}
