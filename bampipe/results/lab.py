@@ -75,6 +75,7 @@ class SessionVerdict(Record):
     worst: tuple[float, str] | None = Field(
         description="Largest held-out error over its floor, and its axis; or null"
     )
+    above_floor: bool = Field(description="Whether the base model is above its floor on some axis")
     sentence: str
     remedy: str
 

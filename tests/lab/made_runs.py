@@ -14,6 +14,7 @@ from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.ingest import IngestResult
 from bampipe.results.stiffness import StiffnessResult
+from bampipe.results.standing import standing
 from bampipe.results.validate import ValidateResult
 
 AXES = ("yaw", "pitch")
@@ -115,6 +116,7 @@ class Made:
                 "rmse_without_friction": 2.0,
                 "held_out_rmse": 0.02 * ratio,
                 "noise_floor": 0.02,
+                "standing": standing(0.02 * ratio, 0.02),
                 "fit_percent": 99.0,
                 "unit": "N.m",
             }

@@ -19,6 +19,7 @@ from bampipe.results.filter import FilterResult
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.ingest import IngestResult
 from bampipe.results.run import RunResult
+from bampipe.results.standing import standing
 from bampipe.results.stiffness import StiffnessResult
 from bampipe.results.validate import ValidateResult
 
@@ -215,7 +216,8 @@ def write_validation(root: Path, model: str) -> None:
     axes = {
         axis: {
             "rmse": 0.98 * error, "rmse_without_friction": 3.1234, "held_out_rmse": error,
-            "noise_floor": FLOOR[axis], "fit_percent": 91.24, "unit": TORQUE_UNIT[axis],
+            "noise_floor": FLOOR[axis], "noise_floor_sd": 0.001, "fit_percent": 91.24,
+            "standing": standing(error, FLOOR[axis], 0.001), "unit": TORQUE_UNIT[axis],
         }
         for axis, error in held_out(model).items()
     }  # fmt: skip

@@ -31,6 +31,64 @@ JUDGED = JudgedError(
     standing="at_floor",
     estimate="accepted",
 )
+
+
+def made(**changes: Any) -> ValidateResult:
+    fields: dict[str, Any] = {
+        "model": "base",
+        "headline": "fit",
+        "cutoff_hz": {"yaw": 8.0},
+        "floor_replays": 1,
+        "refused": (),
+        "notes": (),
+        "axes": {"yaw": JUDGED},
+        "trials": {"t01": TrialError(held_out=True, yaw=ERROR)},
+        "forces": {"force_x": ForceError(rmse=0.1, unit="N")},
+    }
+    return ValidateResult(**(fields | changes))
+
+
+def changed(root: Path, change: Any) -> Path:
+    """A run folder whose validate.json was changed by ``change``."""
+    content = made().write(root)
+    change(content)
+    (root / ValidateResult.file("base")).write_text(json.dumps(content))
+    return root
+
+
+def test_a_result_reads_back_as_it_was_written(tmp_path: Path) -> None:
+    made().write(tmp_path)
+    found = RunFolder(tmp_path).read(ValidateResult, "base")
+    assert found == made()
+    assert found.trials["t01"].axes == {"yaw": ERROR}
+
+
+def test_a_field_without_a_default_is_written_even_if_null_and_others_only_if_held() -> None:
+    content = made().model_dump(mode="json")
+    assert content["axes"]["yaw"]["fit_percent"] is None
+    assert "free_run" not in content
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -1.0, "small", None])
+def test_a_number_that_is_none_is_refused_with_its_place(value: object) -> None:
+    with pytest.raises(ValidationError, match=r"axes\.yaw\.rmse"):
+        made(axes={"yaw": ERROR.model_dump() | {"rmse": value}})
+
+
+def test_a_field_that_is_not_declared_is_refused() -> None:
+    with pytest.raises(ValidationError, match="nois_floor"):
+        made(axes={"yaw": ERROR.model_dump() | {"nois_floor": 1.0}})
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda c: c.pop("model"), "'model' is missing"),
+        (lambda c: c["axes"]["yaw"].update(rmse="1.0"), 'axes.yaw.rmse: found "1.0", expected a n'),
+        (lambda c: c["axes"]["yaw"].update(rmse=None, unit=3), r"axes.yaw.rmse: .*\(and 1 more\)"),
+        (lambda c: c["trials"]["t01"].update(yaw=1), "trials.t01.yaw: "),
+    ],
+)
 def test_what_is_wrong_with_a_file_is_said_in_one_line(
     tmp_path: Path, change: Any, message: str
 ) -> None:
