@@ -313,7 +313,7 @@ class Scorer:
             kept = e.band.kept(len(motion.t))
             u = motion.inputs(system.inputs)
             z = system.memory(motion.q, motion.qd, motion.qdd, u, p, motion.t)
-            at = [x[kept] for x in (motion.q, motion.qd, motion.qdd, z)]
+            at = motion.q[kept], motion.qd[kept], motion.qdd[kept], z[kept]
             plain = system.input_map(at[0], u[kept], p)
             here, slope = system.contribution(*at, u[kept], p), plain.copy()
             for j, force in enumerate(system.model.device.forces):
@@ -359,7 +359,7 @@ class Scorer:
                 changes.append(thin[:, 0])
         return columns, changes
 
-    def _thin(self, rows: list[Array], used: Array, axes: Sequence[int]) -> Array:
+    def _thin(self, rows: list[Array], used: NDArray[np.bool_], axes: Sequence[int]) -> Array:
         """Low-pass each (T, n_q) of ``rows``; only ``axes`` can differ from zero."""
         out = np.zeros((len(used), len(rows), used.shape[1]))
         for r, values in enumerate(rows):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -184,7 +183,7 @@ def worst_windows(evidence: Evidence, count: int = 10, width_s: float = 0.5) -> 
     return [window for _, window in found[:count]]
 
 
-def _doing(motion: Motion, rows: Sequence[int] | Array, axis: int, unit: str) -> str:
+def _doing(motion: Motion, rows: NDArray[np.int64], axis: int, unit: str) -> str:
     q, qd = motion.q[rows, axis], motion.qd[rows, axis]
     moved = "reversing" if np.any(qd > 0) and np.any(qd < 0) else (
         "moving up" if qd.mean() > 0 else "moving down"

@@ -37,7 +37,7 @@ def with_effect(recipe: Recipe, evidence: Evidence, score: Score) -> Array:
     start = np.array([known[q.name] for q in system.parameters])
     lower = np.array([q.lower for q in system.parameters])
     upper = np.array([q.upper for q in system.parameters])
-    return np.clip(start, lower, upper)
+    return np.asarray(np.clip(start, lower, upper))
 
 
 def without_effect(recipe: Recipe, evidence: Evidence) -> Array:

@@ -35,7 +35,10 @@ class NormalEquations:
 
     @classmethod
     def from_samples(
-        cls, slopes: Sequence[Array], residuals: Sequence[Array], used: Sequence[Array]
+        cls,
+        slopes: Sequence[Array],
+        residuals: Sequence[Array],
+        used: Sequence[NDArray[np.bool_]],
     ) -> NormalEquations:
         """Sum over the samples of each trial.
 

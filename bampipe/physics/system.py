@@ -152,7 +152,9 @@ class System:
             found[part] = y.reshape(-1, ROWS)[:, :count].T
         return found
 
-    def true_motion(self, q: Array, qd: Array, qdd: Array, u: Array, p: Array) -> tuple[Array, ...]:
+    def true_motion(
+        self, q: Array, qd: Array, qdd: Array, u: Array, p: Array
+    ) -> tuple[Array, Array, Array]:
         """Motion of the mechanism from what the encoders read; each (T, n_q)."""
         n = len(self.coordinates)
         columns = self._arrays.true_motion(q.T, qd.T, qdd.T, u.T, p)

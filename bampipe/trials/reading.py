@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -181,7 +181,7 @@ def require_sound_motions(system: System, motions: Sequence[Motion]) -> None:
 
 
 def input_columns(
-    frame: pd.DataFrame, names: Sequence[str], brakes: dict[str, str], t: Array, where: str
+    frame: pd.DataFrame, names: Sequence[str], brakes: Mapping[str, str], t: Array, where: str
 ) -> Array:
     """Return inputs of a model as columns (T, n_u) of raw samples.
 
@@ -211,7 +211,7 @@ def _columns(frame: pd.DataFrame, names: Sequence[str], where: str) -> Array:
     for name in names:
         if name not in frame:
             raise _no_column(name, where)
-    return frame[list(names)].to_numpy(dtype=float, copy=True)  # one column alone is read-only
+    return np.array(frame[list(names)], dtype=float)  # a copy: one column alone is read-only
 
 
 def _no_column(name: str, where: str) -> InputError:

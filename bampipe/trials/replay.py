@@ -13,6 +13,7 @@ import weakref
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -140,7 +141,7 @@ def store_motions(motions: Iterator[Motion]) -> Sequence[Motion]:
     count = 0
     try:
         for count, motion in enumerate(motions, start=1):
-            arrays = {f"channel {name}": values for name, values in motion.channels.items()}
+            arrays: dict[str, Any] = {f"channel {name}": x for name, x in motion.channels.items()}
             for name in _ARRAYS:
                 arrays[name] = getattr(motion, name)
             with temporary_space():
