@@ -116,7 +116,7 @@ def _one_process_at_a_time(cache: Any) -> Iterator[None]:
         os.close(handle)
 
 
-class _Locator(caching._CacheLocator):  # type: ignore[misc]
+class _Locator(caching._CacheLocator):
     """A folder for each content of the sources; generated code names those that it calls."""
 
     def __init__(self, function: Callable[..., Any], path: str) -> None:
@@ -141,11 +141,11 @@ class _Locator(caching._CacheLocator):  # type: ignore[misc]
         return str(self._line)
 
 
-class _Code(caching.CompileResultCacheImpl):  # type: ignore[misc]
+class _Code(caching.CompileResultCacheImpl):
     _locator_classes = (_Locator,)
 
 
-class _CheckedFiles(caching.IndexDataCacheFile):  # type: ignore[misc]
+class _CheckedFiles(caching.IndexDataCacheFile):
     """numba's index and code, each with its hash behind it, where pickle does not look."""
 
     @contextmanager
@@ -174,7 +174,7 @@ def _digest(path: str, content: bytes) -> bytes:
     return hashlib.sha256(os.path.basename(path).encode() + content).digest()
 
 
-class _CheckedCache(caching.FunctionCache):  # type: ignore[misc]
+class _CheckedCache(caching.FunctionCache):
     """numba's cache of one function, on files that are checked."""
 
     _impl_class = _Code

@@ -127,7 +127,8 @@ def driven(t: np.ndarray, q: np.ndarray, column: np.ndarray, angle: bool = False
         # Friction apart, this is what a link that hangs on the axis shows most.
         if swinging_rest < 0.8 * _fit(balanced, target)[1] and swinging_rest < 1.05 * rest:
             found, gravity = swinging_fit, (float(swinging_fit[3]), float(swinging_fit[4]))
-    return Driven(share, *(float(value) for value in found[:3]), gravity)
+    inertia, viscous, coulomb = (float(value) for value in found[:3])
+    return Driven(share, inertia, viscous, coulomb, gravity)
 
 
 def _fit(design: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, float]:

@@ -12,7 +12,7 @@ from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
 from types import TracebackType
-from typing import BinaryIO, Self
+from typing import BinaryIO, Self, TypeAlias
 
 import numpy as np
 import pandas as pd
@@ -23,7 +23,7 @@ import pyarrow.parquet as pq
 from bampipe.errors import InputError
 from bampipe.files import atomic_writer
 
-Frame = pd.DataFrame | Mapping[str, np.ndarray | pa.Array]
+Frame: TypeAlias = pd.DataFrame | Mapping[str, np.ndarray | pa.Array]
 
 
 class ParquetAppender:

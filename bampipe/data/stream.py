@@ -233,20 +233,20 @@ class SampleStream:
             np.concatenate([[self._last], np.where(good, time, -np.inf)])
         )
         late = good & ~(time > before[:-1])
-        for row in np.flatnonzero(~good | late):
-            if late[row]:
-                self._skip(numbers[row], layout.columns[0], "the time does not increase")
-            elif numeric[row].all():
-                name = layout.names[int(np.argmax(large[row]))]
-                self._skip(numbers[row], "", f"{name} is larger than {LARGEST:g}")
+        for at in np.flatnonzero(~good | late):
+            if late[at]:
+                self._skip(numbers[at], layout.columns[0], "the time does not increase")
+            elif numeric[at].all():
+                name = layout.names[int(np.argmax(large[at]))]
+                self._skip(numbers[at], "", f"{name} is larger than {LARGEST:g}")
             else:
-                column = int(np.argmin(numeric[row]))
-                self._skip(numbers[row], layout.columns[column], "no number")
+                column = int(np.argmin(numeric[at]))
+                self._skip(numbers[at], layout.columns[column], "no number")
         keep = good & ~late
         self._last = float(before[-1])
         if keep.any():
             self._last_good = numbers[int(np.flatnonzero(keep)[-1])]
-        return values[keep]
+        return np.asarray(values[keep])
 
     def _carefully(self, cells: list[str], layout: StreamLayout) -> list[float] | None:
         """Read a line that is not plain numbers; None where it is bad."""

@@ -146,7 +146,7 @@ def allocate(n: int, nx: int, nu: int, ny: int, nw: int, p: Array) -> Workspace:
 
 
 @njit(
-    types.UniTuple(int64, 2)(  # type: ignore[no-untyped-call]
+    types.UniTuple(int64, 2)(
         DERIVATIVE_ROWS,
         MEASURE_ROWS,
         ESTIMATED,

@@ -106,7 +106,7 @@ def estimate_by_filter(
     settings = untuned(system, noise, choice)
     settings = replace(settings, walk_sd=np.append(settings.walk_sd, late))
     moving = [calm(m, system, trial.t) for m, trial in zip(motions, trials, strict=True)]
-    clear = [every.all(axis=1) for every in moving]
+    clear = [np.asarray(every.all(axis=1)) for every in moving]
     settings = tuned(settings, model, trials, clear, settled, known, noise, choice)
     settings = replace(settings, stride=stride)
     prior_sd = np.append([item.sd for item in free], late_sd)

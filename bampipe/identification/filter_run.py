@@ -300,8 +300,8 @@ def run_filter(
                 theta, covariance = one.theta, one.covariance
                 passes.append(_kept(one.trials[0], trial))
                 told(done, place)
-        except FilterFailure as error:
-            failure = (place, error)
+        except FilterFailure as lost_motion:
+            failure = (place, lost_motion)
             continue
         found = FilterRun(search, tuple(passes), theta, covariance, level, order, restarts)
         if max(each.nis for each in passes) / len(passes[0].ratio) < _LARGEST_NIS:

@@ -147,11 +147,11 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
             if isinstance(trial, str):
                 skipped[trial_id] = trial
                 continue
-            frame, bands = _differentiate(trial, kinematics)
+            frame, errors = _differentiate(trial, kinematics)
             file.append(frame)
             interpolated[trial_id] = float(np.mean(trial.grid.bridged))
             for axis in axes:
-                levels[axis].append(bands[axis])
+                levels[axis].append(errors[axis])
     progress(0.95, "the band of motion and force")
     bands = _bands(run, out, session, kinematics, [k for k in ids if k in interpolated], config)
     content = _report(config, kinematics, axes, choices, levels, interpolated, skipped, bands)

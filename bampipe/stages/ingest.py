@@ -360,7 +360,9 @@ def _description(
             noise_sd_stated=stated,
             noise_sd_measured={name: found.measured for name, found in forces.items()},
         ),
-        sensor_warnings=[c.warning for c in (*encoders.values(), *forces.values()) if c.warning],
+        sensor_warnings=tuple(
+            sensor.warning for sensor in (*encoders.values(), *forces.values()) if sensor.warning
+        ),
         brakes={f"brake_{brake.axis}": Channel(unit=brake.unit) for brake in session.brakes},
         channels={channel.name: Channel(unit=channel.unit) for channel in session.channels},
     )

@@ -203,11 +203,11 @@ def _axis(
         poses={
             name: dict(zip(system.coordinates, pose, strict=True)) for name, pose in poses.items()
         },
-        loop_width=np.mean([cycle.width_torque for _, cycle in cycles]),
+        loop_width=float(np.mean([cycle.width_torque for _, cycle in cycles])),
         loop_width_unit=system.torque_units[number],
-        loop_width_deflection=np.mean([cycle.width_deflection for _, cycle in cycles]),
+        loop_width_deflection=float(np.mean([cycle.width_deflection for _, cycle in cycles])),
         loop_width_deflection_unit=system.coordinate_units[number],
-        energy_per_cycle=np.mean([cycle.energy for _, cycle in cycles]),
+        energy_per_cycle=float(np.mean([cycle.energy for _, cycle in cycles])),
         energy_unit="J",
         yielded=all(trial.found.yielded for trial in trials),
         cycles=tuple(_cycle(trial, cycle) for trial, cycle in cycles),

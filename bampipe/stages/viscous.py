@@ -17,13 +17,13 @@ from scipy import stats
 from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import read_parquet, write_parquet
 from bampipe.declarations.model_file import load_model, model_inputs
-from bampipe.errors import InputError
 from bampipe.estimate.filter_uncertainty import sandwich_covariance
 from bampipe.estimate.unscented import Trial
 from bampipe.identification.filter_choice import FilterChoice
 from bampipe.identification.filter_run import (
     Attempt,
     FilterRun,
+    MotionLost,
     filter_model,
     run_filter,
     stride_of,
@@ -186,10 +186,10 @@ def _estimated(
     def told(done: int, place: int) -> None:
         progress(0.2 + 0.75 * done / (len(readings) + 1), motions[place].trial_id)
 
-    def lost(what: str, place: int) -> InputError:
+    def lost(what: str, place: int) -> MotionLost:
         remedy = "set the trial aside, or identify with an effect of the brakes"
         said = what.format(motions[place].trial_id)
-        return InputError(said, where=f"model {config.model}", remedy=remedy)
+        return MotionLost(said, where=f"model {config.model}", remedy=remedy)
 
     attempts: list[Attempt] = [(value, sd, 4.0**k) for k in range(_RESTARTS)]
     found = run_filter(model, readings, attempts, settings, config, told, lost, system.coordinates)

@@ -167,15 +167,16 @@ def to_signed(table: Table, channel: Channel) -> None:
     """Read the unsigned register of a signed number as what it stands for."""
     if not channel.wrap_bits:
         return
+    period = 2.0**channel.wrap_bits
     values = table.columns[channel.column]
-    beyond = (values < 0.0) | (values >= 2.0**channel.wrap_bits)
+    beyond = (values < 0.0) | (values >= period)
     table.refuse(
         beyond,
-        lambda at: f"found {values[at]:g}, expected 0 to {2**channel.wrap_bits - 1}",
+        lambda at: f"found {values[at]:g}, expected 0 to {period - 1.0:.0f}",
         column=channel.column,
         remedy="a column that is signed already needs no wrap_bits",
     )
-    values[values >= 2.0 ** (channel.wrap_bits - 1)] -= 2.0**channel.wrap_bits
+    values[values >= 0.5 * period] -= period
 
 
 def _refuse_wild(table: Table, values: np.ndarray, words: str, column: str) -> None:

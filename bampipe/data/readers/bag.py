@@ -193,7 +193,7 @@ def _interpolated(base: np.ndarray, times: np.ndarray, cells: list[float]) -> np
     since = (times[order] - base[0]) / moments.NANOSECONDS
     at = (base - base[0]) / moments.NANOSECONDS
     values = np.array(cells, dtype=np.float64)[order]
-    return np.interp(at, since, values, left=np.nan, right=np.nan)
+    return np.asarray(np.interp(at, since, values, left=np.nan, right=np.nan))
 
 
 def _messages(

@@ -85,7 +85,7 @@ def find_layout(head: bytes, columns: Sequence[str], dialect: Dialect, name: str
     lines = _lines(head, name)
     if not any(line.text.strip() for line in lines):
         raise InputError("the file holds no text", where=name)
-    delimiters = [dialect.delimiter] if dialect.delimiter else list(DELIMITERS)
+    delimiters: list[str] = [dialect.delimiter] if dialect.delimiter else list(DELIMITERS)
     index, delimiter, header = _header(lines, columns, dialect, delimiters, name)
     body = lines[index + 1 :]
     units = _units_in(header)
@@ -142,7 +142,7 @@ def _mark(head: bytes) -> int:
 
 def _lines(head: bytes, name: str) -> list[_Line]:
     """The whole lines of ``head``, and the last one where it is all there is."""
-    found = []
+    found: list[_Line] = []
     start = _mark(head)
     for number, match in enumerate(re.finditer(rb"[^\r\n]*(\r\n|\n|\r|\Z)", head[start:]), 1):
         end = start + match.end()
@@ -207,7 +207,7 @@ def _names(text: str, delimiter: str, below: list[_Line]) -> list[str]:
 
 def _guess(lines: list[_Line], delimiters: list[str]) -> list[tuple[int, str]]:
     """Where the samples start and what separates their columns; several where that is equal."""
-    ranked = []
+    ranked: list[tuple[float, int, int, str]] = []
     tried = [line for line in lines[-_TRIED:] if line.text.strip()]
     for delimiter in delimiters:
         rows = [cells(line.text, delimiter) for line in tried]

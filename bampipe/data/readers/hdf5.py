@@ -57,7 +57,8 @@ def read(path: Path, wanted: Wanted, name: str, what: str = "dataset") -> RawTri
     longest = _longest_text(path) if wanted.datetimes else 0
     try:
         with h5py.File(path, "r") as file:
-            values, units = {}, {}
+            values: dict[str, np.ndarray] = {}
+            units: dict[str, str] = {}
             for column in wanted.columns:
                 where = f"{name}, {what} '{column}'"
                 data, field, index = _found(file, column, wanted.columns, name, where)
@@ -93,7 +94,7 @@ def columns(path: Path, name: str) -> dict[str, str]:
     """
     import h5py  # heavy: only for these files
 
-    found = {}
+    found: dict[str, str] = {}
     try:
         with h5py.File(path, "r") as file:
             for label, data in _datasets(file):

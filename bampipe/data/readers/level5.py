@@ -226,7 +226,8 @@ class _Source:
         return word, data
 
     def _take(self, size: int, exactly: bool = True) -> bytes:
-        data = self._raw(size) if self._inflate is None else self._inflated(size)
+        inflate = self._inflate
+        data = self._raw(size) if inflate is None else self._inflated(size, inflate)
         if exactly and len(data) != size:
             raise ValueError("an element ends early")
         self.position += len(data)
@@ -239,7 +240,7 @@ class _Source:
         self._left -= len(data)
         return data
 
-    def _inflated(self, size: int) -> bytes:
+    def _inflated(self, size: int, inflate: zlib._Decompress) -> bytes:
         if self.position + size > self.most:
             raise TooLargeError(
                 f"its variables would unpack to more than {_LARGEST_INFLATED >> 20} MB"
@@ -248,8 +249,8 @@ class _Source:
         while size:
             if not self._ahead:
                 self._ahead = self._raw(_CHUNK)
-            part = self._inflate.decompress(self._ahead, size)
-            self._ahead = self._inflate.unconsumed_tail
+            part = inflate.decompress(self._ahead, size)
+            self._ahead = inflate.unconsumed_tail
             if not part and not self._ahead and not self._left:
                 break
             parts.append(part)

@@ -51,7 +51,7 @@ def nanoseconds(
             where=where,
             remedy="" if form else 'give its form: format = "%d.%m.%Y %H:%M:%S.%f" under [time]',
         )
-    return moments.dt.tz_localize(None).to_numpy(dtype="datetime64[ns]").astype(np.int64)
+    return np.asarray(moments.dt.tz_localize(None), dtype="datetime64[ns]").astype(np.int64)
 
 
 def seconds(moments: np.ndarray) -> np.ndarray:

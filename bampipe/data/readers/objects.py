@@ -144,5 +144,7 @@ def _list_of_samples(content: object, name: str) -> tuple[list[object], dict[str
             else "no list of samples, that is of objects with named values",
             where=name,
         )
-    constants = {k: v for k, v in content.items() if isinstance(v, int | float)}
+    constants: dict[str, object] = {
+        key: value for key, value in content.items() if isinstance(value, int | float)
+    }
     return next(iter(lists.values())), constants

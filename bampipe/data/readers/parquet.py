@@ -175,7 +175,8 @@ def _numbers(cells: pa.Array, form: str | None, where: str, first: int) -> np.nd
     if form is None:
         if pa.types.is_boolean(cells.type):
             cells = cells.cast(pa.uint8())
-        return cells.cast(pa.float64(), safe=False).to_numpy(zero_copy_only=False)
+        numbers = cells.cast(pa.float64(), safe=False)
+        return np.asarray(numbers.to_numpy(zero_copy_only=False))
     if pa.types.is_timestamp(cells.type) or pa.types.is_date(cells.type):
         stamps = cells.cast(pa.timestamp("ns", getattr(cells.type, "tz", None)), safe=False)
         return moments.nanoseconds(

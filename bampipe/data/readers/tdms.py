@@ -36,7 +36,7 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
     """
     library = _library(name)
     values: dict[str, np.ndarray] = {}
-    units = {}
+    units: dict[str, str] = {}
     try:
         # A stream: by its path, npTDMS would take an index file beside it for the truth.
         with path.open("rb") as stream, library.TdmsFile.open(stream) as file:

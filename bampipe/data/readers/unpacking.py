@@ -12,7 +12,7 @@ import struct
 import zlib
 from io import BytesIO
 from pathlib import Path
-from typing import BinaryIO
+from typing import IO, BinaryIO
 
 from bampipe.data.readers.extras import need
 from bampipe.errors import InputError
@@ -140,15 +140,17 @@ def _chunk_size(data: bytes, codec: str, name: str) -> int:
     return size
 
 
-def _unpacked(data: bytes, codec: str, name: str) -> BinaryIO:
+def _unpacked(data: bytes, codec: str, name: str) -> IO[bytes]:
     """What ``data`` unpacks to, as a stream."""
     if codec == "bz2":
         return bz2.BZ2File(BytesIO(data))
     if codec == "lz4":
-        return need("lz4.frame", "ros", name).LZ4FrameFile(BytesIO(data))
+        lz4: IO[bytes] = need("lz4.frame", "ros", name).LZ4FrameFile(BytesIO(data))
+        return lz4
     if codec == "zstd":
         decompressor = need("zstandard", "ros", name).ZstdDecompressor()
-        return decompressor.stream_reader(BytesIO(data), read_across_frames=True)
+        zstd: IO[bytes] = decompressor.stream_reader(BytesIO(data), read_across_frames=True)
+        return zstd
     raise InputError(f"chunks are compressed as {codec!r:.20}", where=name)
 
 

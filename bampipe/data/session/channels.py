@@ -140,9 +140,9 @@ class Encoder(NamedDeclaration):
         return self.name
 
     @property
-    def unit(self) -> str:
-        """Unit of the position, "rad" or "m"."""
-        return _unit(self.stated_unit).si.removesuffix("/s")
+    def unit(self) -> Literal["rad", "m"]:
+        """Unit of the position."""
+        return "rad" if _unit(self.stated_unit).si.startswith("rad") else "m"
 
     @property
     def integrate(self) -> bool:
