@@ -7,70 +7,48 @@ from typing import Annotated
 import typer
 
 from bampipe.cli import places, show
-from bampipe.cli.one_stage import (
-    advise,
-    assignments,
-    one_stage,
-    print_settings,
-    whole_pipeline,
-)
+from bampipe.cli.one_stage import advise, one_stage, print_settings, whole_pipeline
 from bampipe.cli.options import (
+    DEFAULTS,
     RUNS,
     Force,
     Json,
-    ListSettings,
     NoWait,
-    PipelineName,
     Quiet,
     Run,
     Runs,
-    Settings,
+    StageOptions,
+    with_stage_options,
 )
 from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError
 from bampipe.run import batch
 
 
+@with_stage_options
 def diagnose(
     run: Run = None,
     model: Annotated[
         str, typer.Option(help="Model to diagnose; the one extended last if omitted.")
     ] = "",
-    settings: Settings = None,
-    list_settings: ListSettings = False,
-    pipeline: PipelineName = "",
-    force: Force = False,
-    runs: Runs = RUNS,
-    no_wait: NoWait = False,
-    json: Json = False,
-    quiet: Quiet = False,
+    options: StageOptions = DEFAULTS,
 ) -> None:
     """Which effect is missing from a model, and why the tool believes so.
 
     Example: bampipe diagnose 2026-10-03_s01
     """
-    if list_settings:
+    if options.list_settings:
         print_settings("diagnose")
         return
     from bampipe.api.loop import current_model, next_effect
 
-    root = places.find_run(run, runs)
+    root = places.find_run(run, options.runs)
     chosen = model or current_model(root)
-    one_stage(
-        "diagnose",
-        root,
-        assignments(settings),
-        pipeline=pipeline,
-        model=chosen,
-        force=force,
-        no_wait=no_wait,
-        json=json,
-        quiet=quiet,
-    )
-    name = places.next_to(root, runs)
+    one_stage("diagnose", root, options, model=chosen)
+    name = places.next_to(root, options.runs)
     effect = next_effect(root, chosen)
     command = f"bampipe extend {name} {effect}" if effect else f"bampipe report {name}"
-    advise(quiet, json, command)
+    advise(options.quiet, options.json, command)
 
 
 def extend(

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from bampipe.cli import places, show
+from bampipe.cli.options import StageOptions
 from bampipe.run import batch, record
 from bampipe.run import pipeline as pipelines
 from bampipe.run.request import Outcome, Request
@@ -57,32 +58,38 @@ def whole_pipeline(root: Path, name: str) -> Pipeline:
 def one_stage(
     stage: str,
     root: Path,
-    settings: Mapping[str, object],
+    options: StageOptions,
     *,
     session: Path | None = None,
-    pipeline: str = "",
     model: str = "",
-    force: bool = False,
-    no_wait: bool = False,
-    json: bool = False,
-    quiet: bool = False,
+    more: Mapping[str, object] | None = None,
 ) -> Outcome:
-    """Run one stage on what the earlier ones left, and print what it found."""
+    """Run one stage on what the earlier ones left, and print what it found.
+
+    Args:
+        stage: its name.
+        root: the run folder.
+        options: of the command.
+        session: the session folder, of a stage that reads it.
+        model: the only model to run; all that the pipeline names, if empty.
+        more: settings from options of this stage alone.
+    """
     batch.limit_threads(1)
+    settings = assignments(options.settings) | dict(more or {})
     request = Request(
         root=root,
-        pipeline=whole_pipeline(root, pipeline),
+        pipeline=whole_pipeline(root, options.pipeline),
         session=session,
         settings={stage: settings} if settings else {},
         first=stage,
         last=stage,
-        force=force,
+        force=options.force,
         model=model,
-        wait=not no_wait,
+        wait=not options.no_wait,
     )
-    with show.Watcher(quiet or json) as watcher:
+    with show.Watcher(options.quiet or options.json) as watcher:
         outcome = run_session(request, watcher)
-    if json:
+    if options.json:
         one = len(outcome.steps) == 1
         results = {step.step: step.summary for step in outcome.steps}
         show.as_json(outcome.steps[0].summary if one else results)
@@ -95,22 +102,21 @@ def one_stage(
 
 
 def plain_stage(
-    stage: str,
-    run: str | None,
-    list_settings: bool,
-    settings: Mapping[str, object],
-    runs: Path,
-    **options: Any,
+    stage: str, run: str | None, options: StageOptions, model: str = "", **more: str
 ) -> None:
-    """Run ``stage`` on the run that ``run`` means, or list its settings."""
-    if list_settings:
+    """Run ``stage`` on the run that ``run`` means, or list its settings.
+
+    ``more``: as of `one_stage`; what is empty was not given.
+    """
+    if options.list_settings:
         print_settings(stage)
         return
-    root = places.find_run(run, runs)
-    one_stage(stage, root, settings, **options)
-    name = places.next_to(root, runs)
+    root = places.find_run(run, options.runs)
+    given = {name: value for name, value in more.items() if value}
+    one_stage(stage, root, options, model=model, more=given)
+    name = places.next_to(root, options.runs)
     if stage == "report":
         command = f"open {root / 'report' / 'report.pdf'}"
     else:
         command = f"bampipe {AFTER[stage]} {name}"
-    advise(options["quiet"], options["json"], command)
+    advise(options.quiet, options.json, command)
