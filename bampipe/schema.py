@@ -185,6 +185,14 @@ class _Generator(GenerateJsonSchema):
             del content["default"]
         return content
 
+    def nullable_schema(self, schema: Any) -> dict[str, Any]:
+        content = self.generate_inner(schema["schema"])
+        kind = content.get("type")
+        if not isinstance(kind, str):
+            return super().nullable_schema(schema)
+        choices = {"enum": [*content["enum"], None]} if "enum" in content else {}
+        return content | choices | {"type": [kind, "null"]}
+
     def field_title_should_be_set(self, schema: Any) -> bool:
         return False
 
