@@ -26,8 +26,8 @@ from bampipe.estimate.least_squares import Problem, Stacked, fit, stacked_residu
 from bampipe.estimate.unscented import Trial
 from bampipe.files import read_json, write_text
 from bampipe.identification.filter_choice import FilterChoice
-from bampipe.identification.filter_run import trial_of
-from bampipe.identification.output_estimate import segments_of
+from bampipe.identification.filter_run import load_filter_trial
+from bampipe.identification.output_estimate import cut_segments
 from bampipe.identification.sensor_noise import sensor_noise
 from bampipe.physics import Model, System, compile_model, registry
 from bampipe.progress import silent
@@ -94,7 +94,7 @@ def by_instruments(run: RunFolder, system: System) -> Found:
     choice = FilterChoice()
     near = squares.p[: len(system.parameters)]
     noise = sensor_noise(sensors, system, motions, near, choice)
-    trials = [trial_of(run, motion, system, near, noise, 1, choice) for motion in motions]
+    trials = [load_filter_trial(run, motion, system, near, noise, 1, choice) for motion in motions]
     simulated = [
         _simulated(system, motion, trial, squares.p)
         for motion, trial in zip(motions, trials, strict=True)
@@ -163,7 +163,7 @@ def _simulated(system: System, motion: Motion, trial: Trial, p: Array) -> Motion
     """The motion of the fitted model, segment by segment, on the grid of the measured one."""
     n = len(system.coordinates)
     dt = float(np.median(np.diff(trial.t)))
-    segments = segments_of(system, motion, trial, p[:-1])
+    segments = cut_segments(system, motion, trial, p[:-1])
     q = np.concatenate([segment.simulate(segment.x0, p) for segment in segments])
     t = dt * np.arange(len(q))
     q = np.stack([np.interp(motion.t, t, column) for column in q.T], axis=1)
@@ -193,8 +193,8 @@ def main() -> None:
     for seed in range(chosen.seed, chosen.seed + chosen.sessions):
         with tempfile.TemporaryDirectory() as folder:
             config = simulate.Config(seed=seed, trials=chosen.trials, duration=chosen.duration)
-            run, told = prepare(Path(folder), config)
-            truth = np.array([told[name] for name in names])
+            run, report_progress = prepare(Path(folder), config)
+            truth = np.array([report_progress[name] for name in names])
             results = {label: by_stage(run, names, dict(s)) for label, s in BY_STAGE.items()}
             results["instrumental variables"] = by_instruments(run, system)
         for label, one in results.items():

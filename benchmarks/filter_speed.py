@@ -204,7 +204,7 @@ def by_c(problem: Problem, folder: Path, options: list[str], repeats: int) -> Me
     body = body_of_derivative(system)
     names = sorted({m[1] for line in body if (m := re.match(r"(\w+) *[-+]?= ", line))})
     sizes = {
-        "NX": len(system.states), "NU": len(system.inputs), "NP": len(system.parameters),
+        "NX": len(system.tabulate_states), "NU": len(system.inputs), "NP": len(system.parameters),
         "NW": len(system.noise), "NY": settings.observed.size,
         "LOGARITHMIC": int(np.flatnonzero(problem.model.logarithmic)[0]),
     }  # fmt: skip

@@ -11,7 +11,7 @@ import pytest
 
 from bampipe.data import store
 from bampipe.errors import InputError
-from bampipe.identification.filter_run import stride_of
+from bampipe.identification.filter_run import choose_stride
 from bampipe.trials.cache import TrialCache
 from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion
@@ -84,7 +84,7 @@ def test_the_trials_of_a_table_with_and_without_a_row_group_each(tmp_path: Path)
 
 def test_what_the_filter_stores_is_bounded_in_a_trial_and_in_all() -> None:
     def stride(*sizes: int) -> int:
-        return stride_of([SimpleNamespace(t=np.empty(size)) for size in sizes])  # type: ignore[misc]
+        return choose_stride([SimpleNamespace(t=np.empty(size)) for size in sizes])  # type: ignore[misc]
 
     assert stride(8000, 8000, 8000) == 1
     assert stride(20_001) == 2

@@ -47,10 +47,10 @@ def timing_entry(p: Array, variance: float) -> dict[str, object]:
     return {"estimate": float(p[-1]), "sd": float(np.sqrt(variance)), "unit": "s"}
 
 
-def content(
+def collect_result(
     system: System,
     estimate: Estimate,
-    can_say: Identifiability,
+    identifiability: Identifiability,
     motions: Sequence[Motion],
     model: str,
     method: str,
@@ -67,21 +67,21 @@ def content(
             "sd": float(sd[i]),
             "unit": system.parameters[place].unit,
             "at_bound": bool(estimate.at_bound[i]),
-            "bound_sd": can_say.bound_sd[i],
+            "bound_sd": identifiability.bound_sd[i],
             **estimate.details[i],
         }
-    told = ", ".join(
+    headline = ", ".join(
         f"{name} {entry['estimate']:.4g} ± {entry['sd']:.2g} {entry['unit']}"
         for name, entry in parameters.items()
     )
     return {
         "model": model,
-        "headline": told,
+        "headline": headline,
         "method": method,
         "engine": engine,
         "parameters": parameters,
         "covariance": {"names": names, "matrix": estimate.covariance.tolist()},
         "trials": [motion.trial_id for motion in motions],
-        "identifiability": can_say.report,
+        "identifiability": identifiability.report,
         **estimate.report,
     }

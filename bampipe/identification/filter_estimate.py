@@ -26,16 +26,22 @@ from bampipe.identification.filter_run import (
     Attempt,
     FilterRun,
     MotionLost,
-    calm,
-    filter_model,
+    build_filter_model,
+    choose_stride,
+    clear_of_reversal_mask,
+    load_filter_trial,
     run_filter,
-    stride_of,
-    trial_of,
 )
-from bampipe.identification.filter_tables import convergence, mean_nis, state_3sigma, states, trace
+from bampipe.identification.filter_tables import (
+    convergence,
+    state_3sigma,
+    tabulate_nis,
+    tabulate_states,
+    tabulate_trace,
+)
 from bampipe.identification.innovations import innovation_tests
-from bampipe.identification.sensor_noise import Noise, noise_report, tuned, untuned
-from bampipe.identification.squares_estimate import Squares, bias_details
+from bampipe.identification.least_squares_estimate import UnbiasedFit, bias_details
+from bampipe.identification.sensor_noise import Noise, noise_report, tune_noise, untuned_settings
 from bampipe.physics import System
 from bampipe.progress import Progress
 from bampipe.trials.cache import TrialCache
@@ -46,7 +52,7 @@ Array = NDArray[np.float64]
 _RESTARTS = 5
 """Further searches, each with four times the process noise of the one before."""
 _REGIONS = (30.0, 8.0)
-"""Standard deviations of least squares around its answer in which a model that bends with its
+"""Standard deviations of least squares around its answer in which a model nonlinear in its
 parameters is searched: a prior as wide as a range leads such a filter astray."""
 _LEAST_REGION = 3e-4
 """Least width of that, in standard deviations of the prior, times the number above."""
@@ -66,7 +72,7 @@ def estimate_by_filter(
     system: System,
     motions: Sequence[Motion],
     start: Array,
-    squares: Squares,
+    squares: UnbiasedFit,
     noise: Noise,
     choice: FilterChoice,
     model_name: str,
@@ -79,15 +85,15 @@ def estimate_by_filter(
         start: (n_p,) starting values.
         squares: least squares, which gives the region of the answer and checks it.
         noise: of the sensors; choice: of the filter; model_name: for messages.
-        progress: told how far it is.
+        progress: called with the share done.
 
     Raises:
         MotionLost: the filter does not follow the motion.
     """
-    stride = stride_of(motions)
+    stride = choose_stride(motions)
     near = squares.raw.p[: len(start)]
     trials = TrialCache(
-        lambda place: trial_of(run, motions[place], system, near, noise, stride, choice),
+        lambda place: load_filter_trial(run, motions[place], system, near, noise, stride, choice),
         len(motions),
         lambda trial: int(trial.t.size),
     )
@@ -95,19 +101,21 @@ def estimate_by_filter(
     free = [item for item in system.parameters if not item.fixed]
     kept = len(free)
     timing = problem.free.size > kept
-    model = filter_model(system, trials, start, timing)
+    model = build_filter_model(system, trials, start, timing)
     progress(0.15, "noise levels")
     late_sd = model.upper[kept:] / np.sqrt(3.0)
     late = np.zeros(late_sd.size)
-    bends = not problem.linear
+    nonlinear = not problem.linear
     answer = np.append(squares.p[problem.free[:kept]], late)
-    settled = answer if bends else np.append(squares.raw.p[problem.free[:kept]], late)
+    settled = answer if nonlinear else np.append(squares.raw.p[problem.free[:kept]], late)
     known = np.append(np.sqrt(np.diag(squares.raw.covariance))[:kept], late_sd)
-    settings = untuned(system, noise, choice)
+    settings = untuned_settings(system, noise, choice)
     settings = replace(settings, walk_sd=np.append(settings.walk_sd, late))
-    moving = [calm(m, system, trial.t) for m, trial in zip(motions, trials, strict=True)]
-    clear = [np.asarray(every.all(axis=1)) for every in moving]
-    settings = tuned(settings, model, trials, clear, settled, known, noise, choice)
+    clear_by_axis = [
+        clear_of_reversal_mask(m, system, trial.t) for m, trial in zip(motions, trials, strict=True)
+    ]
+    clear = [np.asarray(every.all(axis=1)) for every in clear_by_axis]
+    settings = tune_noise(settings, model, trials, clear, settled, known, noise, choice)
     settings = replace(settings, stride=stride)
     prior_sd = np.append([item.sd for item in free], late_sd)
     first = np.append(start[problem.free[:kept]], late)
@@ -116,7 +124,7 @@ def estimate_by_filter(
     # more and more process noise, as a model that lacks much needs.
     attempts: list[Attempt] = [(first, spread, 1.0)]
     attempts += [(settled, prior_sd, 4.0**k) for k in range(_RESTARTS)]
-    if bends:
+    if nonlinear:
         around = [
             np.minimum(size * np.hypot(known, _LEAST_REGION * prior_sd), spread)
             for size in _REGIONS
@@ -128,30 +136,30 @@ def estimate_by_filter(
 
         Where the model is linear they have one answer at most, and no need to be asked.
         """
-        if not bends:
+        if not nonlinear:
             return True
         value, slope = model.to_physical(found.theta)
         sd = np.hypot(slope * np.sqrt(np.diag(found.covariance)), known)
         return bool(np.all(np.abs(value - answer)[:kept] < _AGREE * sd[:kept]))
 
-    def told(done: int, place: int) -> None:
+    def report_progress(done: int, place: int) -> None:
         progress(0.35 + 0.6 * done / (len(trials) + 1), motions[place].trial_id)
 
-    def lost(what: str, place: int) -> MotionLost:
+    def lost_error(what: str, place: int) -> MotionLost:
         remedy = "try --method least-squares, or set the trial aside if its sensors jumped there"
-        said = what.format(motions[place].trial_id)
-        return MotionLost(said, where=f"model {model_name}", remedy=remedy)
+        message = what.format(motions[place].trial_id)
+        return MotionLost(message, where=f"model {model_name}", remedy=remedy)
 
     def run_from(attempts: Sequence[Attempt], settings: FilterSettings) -> FilterRun:
         return run_filter(
-            model, trials, attempts, settings, choice, told, lost, system.coordinates,
-            agrees, 1 + len(_REGIONS),
+            model, trials, attempts, settings, choice, report_progress, lost_error,
+            system.coordinates, agrees, 1 + len(_REGIONS),
         )  # fmt: skip
 
     found = run_from(attempts, settings)
-    if bends:
-        finer = _fine_enough(found, model, trials[0])
-        found = _until_it_stays(found, model, finer, run_from)
+    if nonlinear:
+        finer = _choose_longest_step(found, model, trials[0])
+        found = _repeat_until_settled(found, model, finer, run_from)
     covariance, blocks = sandwich_covariance(
         found.trials,
         model.n_states,
@@ -178,8 +186,8 @@ def estimate_by_filter(
         for k, bias in enumerate(bias_details(squares, range(kept)))
     ]
     report: dict[str, object] = {
-        "nis": mean_nis(found, motions),
-        "innovations": innovation_tests(system, found, trials, moving),
+        "nis": tabulate_nis(found, motions),
+        "innovations": innovation_tests(system, found, trials, clear_by_axis),
         "noise": noise_report(system, found.settings, noise),
         "input_timing": timing_entry(p, scaled[-1, -1] if timing else 0.0),
         "blocks": blocks,
@@ -195,15 +203,15 @@ def estimate_by_filter(
         at_bound=at_bound[:kept],
         details=details,
         report=report,
-        states=states(system, motions, found, p[:-1], choice.trace_rows),
-        trace=trace(names, model, motions, found, choice.trace_rows),
+        states=tabulate_states(system, motions, found, p[:-1], choice.trace_rows),
+        trace=tabulate_trace(names, model, motions, found, choice.trace_rows),
     )
 
 
-def _fine_enough(found: FilterRun, model: FilterModel, trial: Trial) -> FilterSettings:
+def _choose_longest_step(found: FilterRun, model: FilterModel, trial: Trial) -> FilterSettings:
     """Return the settings with a step that makes a trial as likely as finer ones do.
 
-    Friction that falls within millimetres a second has bent before a step is over.
+    Friction that falls within millimetres a second has changed before a step is over.
     """
 
     def log_likelihood(step: float) -> float:
@@ -221,7 +229,7 @@ def _fine_enough(found: FilterRun, model: FilterModel, trial: Trial) -> FilterSe
     return replace(found.settings, longest_step=step)
 
 
-def _until_it_stays(
+def _repeat_until_settled(
     found: FilterRun,
     model: FilterModel,
     settings: FilterSettings,
@@ -230,7 +238,7 @@ def _until_it_stays(
     """Filter again around the answer, as long as that moves it and makes the readings likelier.
 
     One pass takes the model as straight across all that it did not know when it began; where the
-    model bends, that leaves its mark on the answer. A start this wide of an answer adds a
+    model is nonlinear, that leaves its mark on the answer. A start this wide of an answer adds a
     hundredth to what is known of it.
     """
     for _ in range(_REPEATS):
@@ -250,13 +258,14 @@ def _until_it_stays(
     return found
 
 
-def _systematic(p: Array, covariance: Array, squares: Squares, count: int) -> Array:
+def _systematic(p: Array, covariance: Array, squares: UnbiasedFit, count: int) -> Array:
     """Return how far filter and least squares disagree beyond their standard deviations, (count,).
 
     Both see the same data and err alike by noise, but not by what the model lacks: where the
     model is right, their difference stays below the sum of their variances and adds nothing.
-    Where the model bends, least squares know less than the filter and scatter on their own: they
-    are asked what they would be if the filter's answer were true, and count if that is not so.
+    Where the model is nonlinear, least squares know less than the filter and scatter on their own:
+    they are asked what they would be if the filter's answer were true, and count if that is not
+    so.
 
     Args:
         p: (n_p + 1,) the filter's answer; covariance: (nt, nt) of it.

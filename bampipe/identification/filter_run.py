@@ -42,9 +42,9 @@ STRETCH_S = 0.05
 noise, and what a model lacks acts at the pace of a hand."""
 _SHIFT_KNOWN = 0.1
 """Share of the way between encoder and mechanism to which that way is known at the start."""
-_CALM = 5.0
+_REVERSAL_WIDTHS = 5.0
 """Widths of the smoothed sign of the velocity within which an axis counts as reversing."""
-_MARGIN_S = 0.02
+_REVERSAL_MARGIN_S = 0.02
 """Time around that, s, which counts too."""
 
 
@@ -84,7 +84,7 @@ class FilterRun:
         trials: the main passes over all trials in ``order``.
         theta: (nt,) parameters after them, on the scale of estimation; covariance: (nt, nt).
         settings: noise levels of the main pass.
-        order: places of ``trials`` in the session.
+        order: indices of ``trials`` in the session.
         restarts: attempts that failed before.
         repeats: how often it was begun again around its own answer.
     """
@@ -114,13 +114,13 @@ class FilterRun:
         return sum(each.log_likelihood for each in self.trials)
 
 
-def stride_of(motions: Sequence[Motion]) -> int:
+def choose_stride(motions: Sequence[Motion]) -> int:
     """Return every how many samples the filter stores its distribution."""
     sizes = [motion.t.size for motion in motions]
     return max(-(-max(sizes) // _STORED), -(-sum(sizes) // _STORED_IN_ALL))
 
 
-def trial_of(
+def load_filter_trial(
     run: RunFolder,
     motion: Motion,
     system: System,
@@ -129,7 +129,7 @@ def trial_of(
     stride: int,
     choice: FilterChoice,
 ) -> Trial:
-    """Return the raw samples of one trial as the filter wants them.
+    """Return the raw samples of one trial as the filter reads them.
 
     The state is that of the mechanism, which is not where its encoders are once a model has
     something between the two.
@@ -162,13 +162,13 @@ def trial_of(
     first = int(np.flatnonzero(np.isfinite(y).all(axis=1))[0])
     speed = np.maximum(motion.qd_sd[0], np.sqrt(np.mean(motion.qd**2, axis=0)) * 0.1)
     read = (y[first, :n], motion.qd[0], motion.qdd[0])
-    x, x_sd = state_at(system, p, read, u[first], noise.reading_sd[:n], speed)
+    x, x_sd = infer_initial_state(system, p, read, u[first], noise.reading_sd[:n], speed)
     # The last stored distribution must be that of the last sample.
     last = first + (t.size - 1 - first) // stride * stride + 1
     return Trial(t[first:last], u[first:last], y[first:last], x, x_sd)
 
 
-def state_at(
+def infer_initial_state(
     system: System,
     p: Array,
     read: tuple[Array, Array, Array],
@@ -194,10 +194,10 @@ def state_at(
     )
 
 
-def calm(motion: Motion, system: System, t: Array) -> NDArray[np.bool_]:
+def clear_of_reversal_mask(motion: Motion, system: System, t: Array) -> NDArray[np.bool_]:
     """Tell where each axis moves well clear of standstill and reversal, (T, n_q).
 
-    Within a few widths of the smoothed sign, friction bends faster than the spread of the state,
+    Within a few widths of the smoothed sign, friction changes faster than the spread of the state,
     and no Gaussian describes what an encoder reads of an axis that stands still: there the filter
     makes no claim that its innovations could be tested against.
 
@@ -206,16 +206,16 @@ def calm(motion: Motion, system: System, t: Array) -> NDArray[np.bool_]:
         t: (T,) times at which it is wanted, s since the start of the trial.
     """
     width = np.array([c.sign_width for c in system.model.device.coordinates])
-    slow = np.abs(motion.qd) < _CALM * width
+    slow = np.abs(motion.qd) < _REVERSAL_WIDTHS * width
     rate = (len(motion.t) - 1) / float(motion.t[-1] - motion.t[0])
-    reach = int(np.ceil(_MARGIN_S * rate))
+    reach = int(np.ceil(_REVERSAL_MARGIN_S * rate))
     window = np.ones(2 * reach + 1)
     near = np.stack([np.convolve(column, window, "same") for column in slow.T], axis=1)
     place = np.clip(np.searchsorted(motion.t, t), 0, len(motion.t) - 1)
     return np.asarray(near[place] < 0.5)
 
 
-def filter_model(
+def build_filter_model(
     system: System, trials: Sequence[Trial], start: Array, timing: bool
 ) -> FilterModel:
     """Return the model as the filter wants it.
@@ -252,8 +252,8 @@ def run_filter(
     attempts: Sequence[Attempt],
     settings: FilterSettings,
     choice: FilterChoice,
-    told: Callable[[int, int], None],
-    lost: Callable[[str, int], MotionLost],
+    report_progress: Callable[[int, int], None],
+    lost_error: Callable[[str, int], MotionLost],
     axes: Sequence[str],
     agrees: Callable[[FilterRun], bool] = lambda found: True,
     rivals: int = 1,
@@ -262,15 +262,15 @@ def run_filter(
 
     A filter that trusts its model far from the truth does not find back. The first trial is
     filtered with much process noise, which adds next to no information, and filtered again at
-    the end in its own right. Where parameters bend the model, a filter can follow the motion and
-    still sit in the wrong place: then the likeliest of several attempts counts.
+    the end in its own right. Where the model is nonlinear in its parameters, a filter can
+    follow the motion with wrong parameters: then the likeliest of several attempts counts.
 
     Args:
         model, trials, settings: as `filter_trials` takes them.
         attempts: where to start, one after the other.
         choice: which engine.
-        told: called with the number of trials done and the place of the next.
-        lost: makes the error from what happened and the place of the trial.
+        report_progress: called with the number of trials done and the index of the next.
+        lost_error: makes the error from what happened and the index of the trial.
         axes: names of the readings, for messages.
         agrees: whether an attempt that follows the motion is where other evidence has it.
         rivals: with so many that follow and do not agree, the likeliest of them counts.
@@ -286,7 +286,7 @@ def run_filter(
     for restarts, (value, sd, factor) in enumerate(attempts):
         mean, spread = model.to_estimated(value, sd)
         level = replace(settings, noise_sd=factor * settings.noise_sd)
-        told(0, 0)
+        report_progress(0, 0)
         place = 0
         try:
             search = engine(
@@ -298,8 +298,8 @@ def run_filter(
                 trial = trials[place]
                 one = engine(model, [trial], theta, covariance, level)
                 theta, covariance = one.theta, one.covariance
-                passes.append(_kept(one.trials[0], trial))
-                told(done, place)
+                passes.append(_summarise_pass(one.trials[0], trial))
+                report_progress(done, place)
         except FilterFailure as lost_motion:
             failure = (place, lost_motion)
             continue
@@ -313,31 +313,33 @@ def run_filter(
     if following:
         return max(following, key=lambda each: each.log_likelihood)
     if found is not None:
-        raise _not_followed(found, lost, axes)
+        raise _not_followed_error(found, lost_error, axes)
     if failure is None:
         raise RuntimeError("no attempt was made")
     place, error = failure
     t = trials[place].t[min(error.sample, trials[place].t.size - 1)]
-    raise lost(f"the filter lost the motion of trial {{}} at {t:.2f} s: {error.reason}", place)
+    raise lost_error(
+        f"the filter lost the motion of trial {{}} at {t:.2f} s: {error.reason}", place
+    )
 
 
-def _kept(filtered: FilteredTrial, trial: Trial) -> Pass:
+def _summarise_pass(filtered: FilteredTrial, trial: Trial) -> Pass:
     """What later steps need of a filtered trial."""
     size = np.asarray(filtered.innovation / filtered.innovation_sd)
-    seen = ~np.isnan(filtered.nis)
+    present = ~np.isnan(filtered.nis)
     return Pass(
         t=filtered.t,
         mean=filtered.mean,
         covariance=filtered.covariance,
-        nis=float(filtered.nis[seen].mean()) if seen.any() else np.inf,
-        counted=int(seen.sum()),
+        nis=float(filtered.nis[present].mean()) if present.any() else np.inf,
+        counted=int(present.sum()),
         log_likelihood=float(np.nansum(filtered.log_likelihood)),
         ratio=np.sqrt(np.nanmean(size**2, axis=0)),
-        stretches=average_stretches(size, stretch_of(trial)),
+        stretches=average_stretches(size, samples_per_stretch(trial)),
     )
 
 
-def stretch_of(trial: Trial) -> int:
+def samples_per_stretch(trial: Trial) -> int:
     """Return the number of samples in ``STRETCH_S``."""
     return max(1, round(STRETCH_S / float(np.median(np.diff(trial.t)))))
 
@@ -350,14 +352,14 @@ def _engine(choice: FilterChoice) -> Callable[..., FilterResult]:
     return filter_trials
 
 
-def _not_followed(
-    found: FilterRun, lost: Callable[[str, int], MotionLost], axes: Sequence[str]
+def _not_followed_error(
+    found: FilterRun, lost_error: Callable[[str, int], MotionLost], axes: Sequence[str]
 ) -> MotionLost:
     """Say in physical words which trial and axis the filter does not follow."""
     worst = int(np.argmax([trial.nis for trial in found.trials]))
     ratio = found.trials[worst].ratio
     axis = (*axes, *axes)[int(np.argmax(ratio))]
-    return lost(
+    return lost_error(
         f"the filter does not follow trial {{}}: its prediction of {axis} one sample ahead errs "
         f"{ratio.max():.0f} times more than noise explains",
         found.order[worst],

@@ -16,7 +16,7 @@ from bampipe.trials.motion import Motion
 Array = NDArray[np.float64]
 
 
-def mean_nis(found: FilterRun, motions: Sequence[Motion]) -> dict[str, object]:
+def tabulate_nis(found: FilterRun, motions: Sequence[Motion]) -> dict[str, object]:
     """Return the normalised innovation squared: near 1 where the noise levels are right."""
     size = found.settings.observed.size
     by_trial = {
@@ -78,7 +78,7 @@ def _thinned(count: int, rows: int) -> NDArray[np.int64]:
     return np.arange(count - 1, -1, -step)[::-1]
 
 
-def states(
+def tabulate_states(
     system: System, motions: Sequence[Motion], found: FilterRun, p: Array, rows: int
 ) -> pd.DataFrame:
     """Return the filtered motion of every trial, in the order of the session.
@@ -138,7 +138,7 @@ def as_filtered(system: System, motion: Motion, p: Array) -> pd.DataFrame:
     return with_torques(system, motion, motion.t, columns, p)
 
 
-def trace(
+def tabulate_trace(
     names: Sequence[str],
     model: FilterModel,
     motions: Sequence[Motion],

@@ -57,7 +57,7 @@ class Identifiability:
     sentences: tuple[str, ...]
 
 
-def identifiability(
+def assess_identifiability(
     system: System,
     motions: Sequence[Motion],
     problem: Problem,
@@ -251,9 +251,9 @@ def _together(members: Sequence[str], combinations: Sequence[str]) -> str:
 
 def _moving(weak: Weak, names: Sequence[str], value: Array, covariance: Array) -> str:
     """Say which parameters move together, and for a pair how well sum and difference are known."""
-    told = _listed([f"`{names[i]}`" for i in weak.members])
+    members = _listed([f"`{names[i]}`" for i in weak.members])
     pair = list(weak.members)
-    start = f"{told} move together here"
+    start = f"{members} move together here"
     if (
         len(pair) != 2
         or np.any(value[pair] == 0.0)
@@ -301,20 +301,20 @@ def _idle(trials: Mapping[str, Mapping[str, Any]]) -> list[str]:
 
 def _leaning(numbers: Sequence[Mapping[str, Any]]) -> list[str]:
     """Say which numbers of the device file the estimates rest on, and which they resemble."""
-    told = []
+    sentences = []
     for number in numbers:
         moved = {
             name: size for name, size in number["moves_percent"].items() if abs(size) >= _MOVES
         }
         if moved:
             shown = _listed([f"`{name}` by {size:+.1f} %" for name, size in moved.items()])
-            told.append(f"An error of 1 % in {number['name']} would move {shown}.")
+            sentences.append(f"An error of 1 % in {number['name']} would move {shown}.")
         if number["partner"] is not None and abs(number["correlation"]) > _CLOSE:
-            told.append(
+            sentences.append(
                 f"Were {number['name']} estimated too, it and `{number['partner']}` would move "
                 f"together (correlation {number['correlation']:+.2f})."
             )
-    return told
+    return sentences
 
 
 def _listed(items: Sequence[str]) -> str:

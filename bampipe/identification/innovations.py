@@ -14,7 +14,7 @@ from bampipe.estimate.innovations import (
     check_whiteness,
 )
 from bampipe.estimate.unscented import Trial
-from bampipe.identification.filter_run import STRETCH_S, FilterRun, stretch_of
+from bampipe.identification.filter_run import STRETCH_S, FilterRun, samples_per_stretch
 from bampipe.physics import System
 
 _LAGS_S = (0.0, 0.25, 0.5)
@@ -43,7 +43,7 @@ def innovation_tests(
     by_trial, inputs = [], []
     for place, trial in zip(found.order, found.trials, strict=True):
         given = trials[place]
-        length = stretch_of(given)
+        length = samples_per_stretch(given)
         clear = average_stretches(moving[place].astype(float), length) == 1.0
         by_trial.append(np.where(clear, trial.stretches[:, :n], np.nan))
         inputs.append(average_stretches(given.u[:, channels], length))

@@ -14,7 +14,7 @@ from bampipe.estimate.simulation import simulate
 from bampipe.estimate.unscented import Trial
 from bampipe.identification.estimates import Estimate, timing_entry
 from bampipe.identification.filter_tables import as_filtered
-from bampipe.identification.squares_estimate import Squares
+from bampipe.identification.least_squares_estimate import UnbiasedFit
 from bampipe.physics import System
 from bampipe.progress import Progress
 from bampipe.trials.motion import Motion
@@ -29,7 +29,7 @@ _POSITION_STEP, _RATE_STEP, _PARAMETER_STEP, _TIMING_STEP = 1e-5, 1e-4, 1e-4, 1e
 """Differences for slopes: rad or m, per s, in prior standard deviations, s."""
 
 
-def segments_of(system: System, motion: Motion, trial: Trial, p: Array) -> list[Segment]:
+def cut_segments(system: System, motion: Motion, trial: Trial, p: Array) -> list[Segment]:
     """Cut a trial into segments; those with a missing reading are left out.
 
     Args:
@@ -75,22 +75,22 @@ def segments_of(system: System, motion: Motion, trial: Trial, p: Array) -> list[
     return found
 
 
-def estimate_by_output(
+def estimate_by_output_error(
     system: System,
     motions: Sequence[Motion],
     trials: Sequence[Trial],
-    squares: Squares,
+    squares: UnbiasedFit,
     progress: Progress,
 ) -> Estimate:
     """Return the output-error estimate, from least squares on; its trace is the fit so far.
 
     Args:
         system: the model; motions, trials: filtered and raw; squares: where to start.
-        progress: told how many trials are done.
+        progress: called with the share done.
     """
     problem = squares.problem
     segments = [
-        segments_of(system, motion, trial, squares.p[:-1])
+        cut_segments(system, motion, trial, squares.p[:-1])
         for motion, trial in zip(motions, trials, strict=True)
     ]
     sd = np.array([*(item.sd for item in system.parameters), 0.0])

@@ -1,4 +1,4 @@
-"""Noise of a session's sensors, and the levels that the filter is best told (NIS, likelihood)."""
+"""Noise of a session's sensors, and the levels that suit the filter best (NIS, likelihood)."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def _force_in_positions(system: System, motions: Sequence[Motion], p: Array, noi
     return np.asarray(np.sqrt(square / count))
 
 
-def untuned(system: System, noise: Noise, choice: FilterChoice) -> FilterSettings:
+def untuned_settings(system: System, noise: Noise, choice: FilterChoice) -> FilterSettings:
     """Return the settings of the filter with the noise of the sensors as it is stated."""
     n = len(system.coordinates)
     free = [item for item in system.parameters if not item.fixed]
@@ -111,7 +111,7 @@ def untuned(system: System, noise: Noise, choice: FilterChoice) -> FilterSetting
     )
 
 
-def tuned(
+def tune_noise(
     settings: FilterSettings,
     model: FilterModel,
     trials: Sequence[Trial],

@@ -49,7 +49,7 @@ class Monitor:
 
         Args:
             system: the model; start: None to begin from the first `FIRST_LOOK` samples.
-            options: of the alarm; complain: told of the first few new starts of the motion.
+            options: of the alarm; complain: called for the first few new starts of the motion.
         """
         self.system, self.options, self._complain = system, options, complain
         self.alarm, self.alarms, self.restarts, self.samples = False, 0, 0, 0

@@ -25,7 +25,7 @@ from bampipe.estimate.unscented import (
     Trial,
     filter_trials,
 )
-from bampipe.identification.filter_run import filter_model, state_at
+from bampipe.identification.filter_run import build_filter_model, infer_initial_state
 from bampipe.physics import System, compile_model
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.ingest import IngestResult
@@ -48,7 +48,7 @@ FIRST_LOOK = 500
 
 @dataclass(frozen=True)
 class Options:
-    """What a monitor can be told.
+    """Settings of a monitor.
 
     Attributes:
         window_s: length of the windows that the alarm judges, s.
@@ -110,7 +110,9 @@ class Start:
         p = self.model.parameters.copy()
         p[self.model.free] = self.model.to_physical(self.theta)[0]
         none = np.zeros(q.size)
-        return state_at(system, p[:-1], (q, none, none), u, self.settings.reading_sd, self.speed_sd)
+        return infer_initial_state(
+            system, p[:-1], (q, none, none), u, self.settings.reading_sd, self.speed_sd
+        )
 
 
 def layouts(system: System, session: Session | None) -> tuple[StreamLayout, ...]:
@@ -154,7 +156,7 @@ def open_stream(
 
     Args:
         samples: path, or ``-``; system: the model; session: folder whose raw columns may come.
-        strict: raise at a bad line; complain: told of the first ones that are skipped.
+        strict: raise at a bad line; complain: called for the first ones that are skipped.
 
     Raises:
         InputError: there is no such file, or the session file is wrong.
@@ -195,7 +197,7 @@ def start_from_run(run: RunFolder, name: str, options: Options) -> tuple[System,
         values[system.index(parameter)] = found.parameters[parameter].estimate
     rate = run.read(IngestResult).sample_rate_hz
     trials = [_trial(run, trial, system) for trial in free_trials(run, fitted=True)]
-    model = filter_model(system, trials, values, timing=False)
+    model = build_filter_model(system, trials, values, timing=False)
     model.parameters[-1] = found.input_timing.estimate
     sd = np.array([found.parameters[parameter].sd for parameter in names])
     value = values[model.free]
@@ -246,7 +248,7 @@ def start_from_samples(system: System, t: Array, u: Array, q: Array, options: Op
         system: the model; t: (T,); u: (T, nu); q: (T, n_q): the first `FIRST_LOOK` samples.
     """
     trial = Trial(t, u, q, np.zeros(0), np.zeros(0))
-    model = filter_model(system, [trial], system.prior, timing=False)
+    model = build_filter_model(system, [trial], system.prior, timing=False)
     free = [item for item in system.parameters if not item.fixed]
     theta, spread = model.to_estimated(
         np.array([item.prior for item in free]), np.array([item.sd for item in free])

@@ -99,7 +99,7 @@ def input_column(system: System, name: str) -> int:
 def draw_plant(config: Config) -> tuple[Plant, dict[str, float]]:
     """Draw the plant; also the strength of each effect by canonical name."""
     device = registry.device(config.device)
-    extra = [_own_effect(Path(path)) for path in config.effect_files]
+    extra = [_read_effect(Path(path)) for path in config.effect_files]
     strengths = dict(_strength(text, config.strength) for text in config.effects)
     if len(strengths) < len(config.effects):
         raise InputError("an effect is named twice")
@@ -133,7 +133,7 @@ def _is_delay(item: BoundEffect) -> bool:
     return item.effect.name == "force_delay"
 
 
-def _own_effect(path: Path) -> Effect:
+def _read_effect(path: Path) -> Effect:
     return registry.effect_from(read_toml(path), str(path))
 
 

@@ -19,9 +19,9 @@ from bampipe.files import write_json, write_text
 from bampipe.physics.device import Device
 from bampipe.progress import Progress, silent
 from bampipe.results.truth import TruthResult
-from bampipe.simulator.hand import locked_trial, moving_trial
-from bampipe.simulator.logger import read_out, session_toml
 from bampipe.simulator.plant import Config, draw_plant
+from bampipe.simulator.recording import format_session_file, record_trial
+from bampipe.simulator.true_trials import simulate_locked_trial, simulate_moving_trial
 
 __all__ = ["Config", "simulate_session"]
 
@@ -57,17 +57,17 @@ def simulate_session(out: Path, config: Config, progress: Progress = silent) -> 
     for number, trial in enumerate(trials):
         rng = np.random.default_rng([config.seed, 1 + number])
         if trial["kind"] == "locked":
-            true = locked_trial(plant, config, rng, trial["locked_axis"])
+            true = simulate_locked_trial(plant, config, rng, trial["locked_axis"])
         else:
-            true = moving_trial(plant, config, rng, trial["kind"] == "viscous")
-        frame = read_out(plant, config, rng, true, trial["kind"] == "locked")
+            true = simulate_moving_trial(plant, config, rng, trial["kind"] == "viscous")
+        frame = record_trial(plant, config, rng, true, trial["kind"] == "locked")
         path = out / trial["file"]
         if config.file_format == "csv":
             write_text(path, frame.to_csv(index=False, lineterminator="\n"))
         else:
             store.write_parquet(path, frame)
         progress((number + 1) / len(trials), trial["file"])
-    write_text(out / "session.toml", session_toml(out.name, plant.device, config, trials))
+    write_text(out / "session.toml", format_session_file(out.name, plant.device, config, trials))
     truth = out.with_name(out.name + ".truth.json")
     found = TruthResult(
         schema="bampipe.truth/1",

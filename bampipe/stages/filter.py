@@ -98,7 +98,7 @@ class _Trial:
     frame: pd.DataFrame
 
     @property
-    def seen(self) -> Flags:
+    def observed(self) -> Flags:
         return np.logical_not(self.grid.bridged)
 
 
@@ -203,7 +203,7 @@ def _tuning_records(
         for axis in axes:
             position = trial.grid.resample(trial.frame[f"q_{axis}"].to_numpy(dtype=np.float64))
             # Copies: a view would keep the whole trial.
-            records[axis].append((position[:share].copy(), trial.seen[:share].copy()))
+            records[axis].append((position[:share].copy(), trial.observed[:share].copy()))
     return records
 
 
@@ -268,7 +268,7 @@ def _differentiate(
     bands: dict[str, tuple[float, float, float]] = {}
     motions = {
         axis: kinematics.differentiate(
-            axis, grid.resample(frame[f"q_{axis}"].to_numpy(dtype=np.float64)), trial.seen
+            axis, grid.resample(frame[f"q_{axis}"].to_numpy(dtype=np.float64)), trial.observed
         )
         for axis in kinematics.axes
     }

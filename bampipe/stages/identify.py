@@ -16,18 +16,18 @@ from bampipe.declarations.model_file import load_model, model_inputs, read_recip
 from bampipe.discover.start import search_start
 from bampipe.errors import InputError
 from bampipe.estimate.least_squares import fit
-from bampipe.identification.estimates import content
+from bampipe.identification.estimates import collect_result
 from bampipe.identification.filter_choice import FilterChoice
 from bampipe.identification.filter_estimate import estimate_by_filter
-from bampipe.identification.filter_run import MotionLost, trial_of
-from bampipe.identification.identifiability import identifiability
-from bampipe.identification.output_estimate import estimate_by_output
-from bampipe.identification.sensor_noise import sensor_noise
-from bampipe.identification.squares_estimate import (
-    Squares,
-    estimate_by_squares,
-    unbiased,
+from bampipe.identification.filter_run import MotionLost, load_filter_trial
+from bampipe.identification.identifiability import assess_identifiability
+from bampipe.identification.least_squares_estimate import (
+    UnbiasedFit,
+    estimate_by_least_squares,
+    remove_bias,
 )
+from bampipe.identification.output_estimate import estimate_by_output_error
+from bampipe.identification.sensor_noise import sensor_noise
 from bampipe.physics import System, compile_model
 from bampipe.progress import Progress
 from bampipe.results.identify import IdentifyResult
@@ -50,7 +50,7 @@ Array = NDArray[np.float64]
 
 @checked_dataclass(frozen=True, config=STRICT)
 class Config(FilterChoice):
-    """What the stage can be told.
+    """Settings of the stage.
 
     Attributes:
         model: which model version.
@@ -120,9 +120,9 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         raise InputError(
             f"the free trials are too short to identify from ({error})", where=str(run.root)
         ) from error
-    squares = Squares(raw, raw.p, None, problem)
+    squares = UnbiasedFit(raw, raw.p, None, problem)
     if config.remove_bias:
-        squares = unbiased(sensors, kinematics, system, motions, problem, raw)
+        squares = remove_bias(sensors, kinematics, system, motions, problem, raw)
     noise = sensor_noise(sensors, system, motions, raw.p[: len(start)], config)
     method, notes = config.method, []
     if method in ("auto", "ukf"):
@@ -134,29 +134,31 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         except MotionLost as error:
             if method == "ukf":
                 raise
-            estimate, method = estimate_by_squares(system, motions, squares), "least-squares"
+            estimate, method = estimate_by_least_squares(system, motions, squares), "least-squares"
             notes.append(f"Estimated by least squares, since {error.what}.")
     elif method == "output-error":
         progress(0.3, "output error")
         near = raw.p[: len(start)]
-        trials = [trial_of(run, motion, system, near, noise, 1, config) for motion in motions]
-        estimate = estimate_by_output(system, motions, trials, squares, progress)
+        trials = [
+            load_filter_trial(run, motion, system, near, noise, 1, config) for motion in motions
+        ]
+        estimate = estimate_by_output_error(system, motions, trials, squares, progress)
     else:
-        estimate = estimate_by_squares(system, motions, squares)
+        estimate = estimate_by_least_squares(system, motions, squares)
     if system.undriven and method == "least-squares":
         notes.append(
             f"No force acts on {', '.join(system.undriven)}: least squares makes what stands in"
             " such an equation too small, more so the more the model lacks."
         )
-    progress(0.97, "what the trials can say")
-    can_say = identifiability(
+    progress(0.97, "identifiability of the parameters")
+    identifiability = assess_identifiability(
         system, motions, estimate.problem, estimate.p, noise, estimate.at_bound
     )
     # What the trials say nothing of is as uncertain as it was before, whatever the fit believes.
-    estimate = replace(estimate, covariance=estimate.covariance + can_say.unseen)
+    estimate = replace(estimate, covariance=estimate.covariance + identifiability.unseen)
     engine = config.engine if method == "ukf" else "compiled"
-    found = content(system, estimate, can_say, motions, config.model, method, engine)
-    found["notes"] = [*notes, *can_say.sentences]
+    found = collect_result(system, estimate, identifiability, motions, config.model, method, engine)
+    found["notes"] = [*notes, *identifiability.sentences]
     write_parquet(out / f"models/{config.model}/states.parquet", estimate.states)
     write_parquet(out / f"models/{config.model}/trace.parquet", estimate.trace)
     return IdentifyResult.model_validate(found).write(out)

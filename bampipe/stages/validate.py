@@ -33,7 +33,7 @@ from bampipe.trials.residuals import Evidence, gather_evidence, problem_of
 NAME = "validate"
 SUMMARY = "Predicted against measured torque and force, on trials that the fit has not seen"
 
-REFUSED_BEYOND = 1.2
+REFUSAL_RATIO = 1.2
 """Error of the published parameters over that of parameters refitted without each trial, beyond
 which they do not describe the trials they come from, and are refused."""
 
@@ -265,7 +265,7 @@ def _content(
         scatter = 0.0 if floor is None else float(floor.sd[i])
         entry["noise_floor"], entry["noise_floor_sd"] = level, scatter
         entry["standing"] = standing(error, level, scatter)
-        entry["estimate"] = "refused" if published > REFUSED_BEYOND * error else "accepted"
+        entry["estimate"] = "refused" if published > REFUSAL_RATIO * error else "accepted"
         if entry["estimate"] == "refused":
             refused.append(
                 f"{axis}: the published parameters err by {published:.3g} {entry['unit']} on the"

@@ -24,13 +24,13 @@ from bampipe.identification.filter_run import (
     Attempt,
     FilterRun,
     MotionLost,
-    filter_model,
+    build_filter_model,
+    choose_stride,
+    load_filter_trial,
     run_filter,
-    stride_of,
-    trial_of,
 )
-from bampipe.identification.filter_tables import trace
-from bampipe.identification.sensor_noise import sensor_noise, untuned
+from bampipe.identification.filter_tables import tabulate_trace
+from bampipe.identification.sensor_noise import sensor_noise, untuned_settings
 from bampipe.physics import Model, System, compile_model
 from bampipe.physics.viscous_field import NAME as FIELD
 from bampipe.physics.viscous_field import viscous_field
@@ -52,7 +52,7 @@ _RESTARTS = 4
 
 @checked_dataclass(frozen=True, config=STRICT)
 class Config(FilterChoice):
-    """What the stage can be told.
+    """Settings of the stage.
 
     Attributes:
         model: which model version.
@@ -105,9 +105,11 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         return empty.write(out)
     identified = run.read(IdentifyResult, config.model)
     bare = load_model(run, config.model)
-    own = [item.effect for item in bare.effects]
+    effects = [item.effect for item in bare.effects]
     names = [item.name for item in bare.effects]
-    system = compile_model(Model(bare.device, [*names, FIELD], [*own, viscous_field(bare.device)]))
+    system = compile_model(
+        Model(bare.device, [*names, FIELD], [*effects, viscous_field(bare.device)])
+    )
     progress(0.1, "reading the trials")
     motions = [_unbraked(read_motion(run, str(t), system), system) for t in trials["trial_id"]]
     commanded = trials["viscous_n_s_per_m"].to_numpy(dtype=float)
@@ -160,21 +162,21 @@ def _estimated(
         ]
     )
     noise = sensor_noise(read_sensors(run, system), system, motions, start, config)
-    settings = untuned(system, noise, config)
+    settings = untuned_settings(system, noise, config)
     if identified.noise is not None and config.force_noise == 0.0:
         found_sd = [identified.noise.process_sd[name] for name in system.noise]
         settings = replace(settings, noise_sd=np.array(found_sd))
-    stride = stride_of(motions)
+    stride = choose_stride(motions)
     settings = replace(settings, stride=stride)
     readings = []
     for motion in motions:
-        trial = trial_of(run, motion, system, start, noise, stride, config)
+        trial = load_filter_trial(run, motion, system, start, noise, stride, config)
         u = trial.u.copy()
         u[:, _brakes(system)] = 0.0
         readings.append(Trial(trial.t, u, trial.y, trial.x, trial.x_sd))
     free = [item for item in system.parameters if not item.fixed]
     timing = identified.input_timing.estimate
-    model = filter_model(system, readings, start, timing=False)
+    model = build_filter_model(system, readings, start, timing=False)
     model = replace(model, parameters=np.append(start, timing))
     command = float(np.nanmean(commanded)) if np.isfinite(commanded).any() else None
     value = np.array(
@@ -183,28 +185,30 @@ def _estimated(
     sd = np.array([known[item.name].sd if item.name in known else item.sd for item in free])
     sd = np.maximum(sd, 1e-9 * np.maximum(np.abs(value), 1e-6))
 
-    def told(done: int, place: int) -> None:
+    def report_progress(done: int, place: int) -> None:
         progress(0.2 + 0.75 * done / (len(readings) + 1), motions[place].trial_id)
 
-    def lost(what: str, place: int) -> MotionLost:
+    def lost_error(what: str, place: int) -> MotionLost:
         remedy = "set the trial aside, or identify with an effect of the brakes"
-        said = what.format(motions[place].trial_id)
-        return MotionLost(said, where=f"model {config.model}", remedy=remedy)
+        message = what.format(motions[place].trial_id)
+        return MotionLost(message, where=f"model {config.model}", remedy=remedy)
 
     attempts: list[Attempt] = [(value, sd, 4.0**k) for k in range(_RESTARTS)]
-    found = run_filter(model, readings, attempts, settings, config, told, lost, system.coordinates)
+    found = run_filter(
+        model, readings, attempts, settings, config, report_progress, lost_error, system.coordinates
+    )
     estimate, slope = model.to_physical(found.theta)
     names = [item.name for item in free]
     field = [i for i, name in enumerate(names) if name.startswith(f"{FIELD}.")]
     field_sd, blocks = _block_sd(found, model.n_states, field, config.block_s)
     spread = slope[field] * field_sd
-    felt_own = _own_damping(system, motions, start)
+    friction = _device_damping(system, motions, start)
     directions = {}
     for k, component in enumerate(system.model.device.components):
         directions[component] = _direction(
-            estimate[field[k]], spread[k], felt_own[k], command, blocks
+            estimate[field[k]], spread[k], friction[k], command, blocks
         )
-    frame = trace(names, model, motions, found, config.trace_rows)
+    frame = tabulate_trace(names, model, motions, found, config.trace_rows)
     kept = [c for c in frame if c in ("t_total", "trial_id") or str(c).startswith(f"{FIELD}.")]
     frame = frame[kept].rename(columns=lambda c: str(c).removeprefix(f"{FIELD}."))
     result = ViscousResult(
@@ -231,10 +235,10 @@ def _block_sd(
     them: each is put on the scale of its own uncertainty, or the inverses would lose it.
     """
     scale = np.sqrt(np.diag(found.covariance))
-    whole = np.concatenate([np.ones(n_states), scale])
-    both = np.outer(whole, whole)
+    all_scales = np.concatenate([np.ones(n_states), scale])
+    both = np.outer(all_scales, all_scales)
     trials = [
-        replace(trial, mean=trial.mean / whole, covariance=trial.covariance / both)
+        replace(trial, mean=trial.mean / all_scales, covariance=trial.covariance / both)
         for trial in found.trials
     ]
     covariance, blocks = sandwich_covariance(
@@ -247,13 +251,13 @@ def _block_sd(
     return scale[field] * np.sqrt(np.diag(covariance)[field]), blocks
 
 
-def _own_damping(system: System, motions: Sequence[Motion], p: Array) -> Array:
+def _device_damping(system: System, motions: Sequence[Motion], p: Array) -> Array:
     """Return the device's own viscous friction as felt along each direction, mean, (n_f,), N.s/m.
 
     q' = B^-T v, so that joint damping D is felt as B^-1 D B^-T.
     """
-    own = {item.name: value for item, value in zip(system.parameters, p, strict=True)}
-    joint = np.diag([own.get(f"viscous.{axis}", 0.0) for axis in system.coordinates])
+    parameters = {item.name: value for item, value in zip(system.parameters, p, strict=True)}
+    joint = np.diag([parameters.get(f"viscous.{axis}", 0.0) for axis in system.coordinates])
     total, count = 0.0, 0
     for motion in motions:
         rows = slice(None, None, max(1, len(motion.t) // 500))
@@ -265,11 +269,17 @@ def _own_damping(system: System, motions: Sequence[Motion], p: Array) -> Array:
 
 
 def _direction(
-    estimate: float, sd: float, own: float, command: float | None, blocks: int
+    estimate: float, sd: float, friction: float, command: float | None, blocks: int
 ) -> Damping:
     """Return what is stored of one direction; the test is two-sided, Student's t over blocks."""
-    felt = estimate + own
-    found = {"estimate": estimate, "sd": sd, "own_friction": own, "felt": felt, "unit": "N.s/m"}
+    felt = estimate + friction
+    found = {
+        "estimate": estimate,
+        "sd": sd,
+        "own_friction": friction,
+        "felt": felt,
+        "unit": "N.s/m",
+    }
     if command is None:
         return Damping.model_validate(found)
     ratios = [abs(value - command) / sd if sd > 0.0 else np.inf for value in (estimate, felt)]

@@ -13,8 +13,8 @@ from bampipe.files import write_json, write_text
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.ingest import IngestResult
-from bampipe.results.stiffness import StiffnessResult
 from bampipe.results.standing import standing
+from bampipe.results.stiffness import StiffnessResult
 from bampipe.results.validate import ValidateResult
 
 AXES = ("yaw", "pitch")

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from bampipe.errors import InputError
 from bampipe.physics.device import INPUT_ORDERS, Coordinate, Device, derivative
 from bampipe.physics.system import System
-from bampipe.simulator.hand import TrueTrial
 from bampipe.simulator.plant import Config, Plant, input_column
+from bampipe.simulator.true_trials import TrueTrial
 
 Array = NDArray[np.float64]
 
@@ -29,20 +29,20 @@ ZERO_V = np.array([0.021, -0.034, 0.012])
 _TOO_HIGH = range(3, len(INPUT_ORDERS))
 
 
-def read_out(
+def record_trial(
     plant: Plant, config: Config, rng: np.random.Generator, true: TrueTrial, locked: bool
 ) -> pd.DataFrame:
-    """What the logger writes: whole counts, volts, brake commands."""
+    """Return what the logger writes: whole counts, volts, brake commands."""
     device = plant.device
     force = _sensed_force(plant, true) + config.force_noise * rng.normal(size=true.force.shape)
     # A locked trial winds up the transmission itself: the encoder sees the deflection as given.
     q = _sensed_position(plant, true, np.zeros_like(true.force) if locked else true.force)
     columns: dict[str, Any] = {"time_us": np.round(true.t * 1e6).astype(np.int64)}
     for i, c in enumerate(device.coordinates):
-        name, per_unit, zero = _encoder(c)
+        name, per_unit, zero = _encoder_settings(c)
         columns[name] = np.round(q[:, i] * per_unit + zero).astype(np.int64)
     if device.force_unit == "N":
-        calibration, zero_v = _calibration(len(device.forces))
+        calibration, zero_v = _force_calibration(len(device.forces))
         volts = np.linalg.solve(calibration, force.T).T + zero_v
         columns |= {f"{f}_v": np.round(volts[:, j], 6) for j, f in enumerate(device.forces)}
     else:
@@ -51,7 +51,7 @@ def read_out(
     return pd.DataFrame(columns)
 
 
-def _inputs(system: System, true: TrueTrial, force: Array) -> Array:
+def _sensor_inputs(system: System, true: TrueTrial, force: Array) -> Array:
     """Columns of u for the sensor models."""
     u = np.zeros((len(true.t), len(system.inputs)))
     for j, f in enumerate(system.model.device.forces):
@@ -69,7 +69,7 @@ def _sensed_position(plant: Plant, true: TrueTrial, force: Array) -> Array:
     if plant.position is None:
         return true.q
     system = plant.position
-    u, p = _inputs(system, true, force), plant.p(system)
+    u, p = _sensor_inputs(system, true, force), plant.p(system)
     q = true.q
     for _ in range(100):
         step = true.q - system.true_motion(q, true.qd, np.zeros_like(q), u, p)[0]
@@ -102,7 +102,7 @@ def _sensed_force(plant: Plant, true: TrueTrial) -> Array:
         applied = system.applied(true.q, true.qd, still, no_states, u, p)
         return np.asarray(np.einsum("tfq,tq->tf", inverse, applied), dtype=np.float64)
 
-    zero = _inputs(system, true, np.zeros_like(late))
+    zero = _sensor_inputs(system, true, np.zeros_like(late))
     constant = corrected(zero)
     if any(input_column(system, derivative(f, k)) >= 0 for f in names for k in _TOO_HIGH):
         raise InputError("an input effect with a third derivative cannot be simulated")
@@ -117,7 +117,7 @@ def _sensed_force(plant: Plant, true: TrueTrial) -> Array:
     side = late - constant
     if not response[1:].any():
         reading = np.linalg.solve(response[0], side[:, :, None])[:, :, 0]
-        if not np.allclose(corrected(_inputs(system, true, reading)), late, atol=1e-6):
+        if not np.allclose(corrected(_sensor_inputs(system, true, reading)), late, atol=1e-6):
             raise InputError("an input effect is not linear in the force: cannot be simulated")
         return np.asarray(reading)
     h = true.t[1] - true.t[0]
@@ -131,20 +131,20 @@ def _sensed_force(plant: Plant, true: TrueTrial) -> Array:
     return reading
 
 
-def _encoder(c: Coordinate) -> tuple[str, float, int]:
+def _encoder_settings(c: Coordinate) -> tuple[str, float, int]:
     return ENCODERS.get(c.name, (f"enc_{c.name}", 20000.0 if c.kind == "rotary" else 33333.0, 0))
 
 
-def _calibration(nf: int) -> tuple[Array, Array]:
+def _force_calibration(nf: int) -> tuple[Array, Array]:
     if nf > len(ZERO_V):
         return 12.0 * np.eye(nf), np.zeros(nf)
     return CALIBRATION[:nf, :nf], ZERO_V[:nf]
 
 
-def session_toml(
+def format_session_file(
     session_id: str, device: Device, config: Config, trials: list[dict[str, str]]
 ) -> str:
-    """The session file over the trials that `read_out` made."""
+    """Return the session file over the trials that `record_trial` made."""
     lines = [
         'schema = "bampipe.session/1"',
         f"session_id = {json.dumps(session_id)}",
@@ -154,12 +154,12 @@ def session_toml(
         "[encoders]",
     ]
     for c in device.coordinates:
-        name, per_unit, zero = _encoder(c)
+        name, per_unit, zero = _encoder_settings(c)
         entry = f'column = "{name}", counts_per_unit = {per_unit!r}, zero_counts = {zero}'
         lines.append(f'{c.name} = {{ {entry}, unit = "{c.unit}" }}')
     lines += ["", "[force]"]
     if device.force_unit == "N":
-        calibration, zero_v = _calibration(len(device.forces))
+        calibration, zero_v = _force_calibration(len(device.forces))
         lines += [
             f"columns = {json.dumps([f'{f}_v' for f in device.forces])}",
             'unit = "V"',

@@ -23,7 +23,7 @@ from bampipe.trials.sensors import Sensors
 Array = NDArray[np.float64]
 
 _CORRECTIONS = 5
-"""Most replays of a model that bends with its parameters, until its fit is the measured one's."""
+"""Most replays of a nonlinear model, until its fit is the measured one's."""
 _SAME = 1.0
 """Standard deviations within which the two fits are the same."""
 _SLOPE = (0.3, 3.0)
@@ -31,7 +31,7 @@ _SLOPE = (0.3, 3.0)
 
 
 @dataclass(frozen=True)
-class Squares:
+class UnbiasedFit:
     """Least squares with its bias taken off.
 
     Attributes:
@@ -59,23 +59,24 @@ class Squares:
         return np.asarray(p[free] + bias - self.raw.p[free])
 
 
-def unbiased(
+def remove_bias(
     sensors: Sensors,
     kinematics: Kinematics,
     system: System,
     motions: Sequence[Motion],
     problem: Problem,
     raw: LeastSquares,
-) -> Squares:
+) -> UnbiasedFit:
     """Take off what the filters alone do to the fit.
 
     Filtering blurs changes of direction and shortens accelerations, so that the fit to a perfect
     machine is not its truth. How far off it is, is measured: the fitted model is replayed along
     the trials, read by the same encoders, sent through the same filters and fitted again
     (parametric bootstrap, Efron and Tibshirani 1993, chapter 10). The force sensor is without
-    noise there: its noise adds scatter, not bias. Where the model bends with its parameters and the
-    bias is large, it is not that at the answer: those parameters are looked for whose replay is
-    fitted as the measurement is (indirect inference, Gourieroux, Monfort and Renault 1993).
+    noise there: its noise adds scatter, not bias. Where the model is nonlinear in its parameters
+    and the bias is large, it is not that at the answer: those parameters are looked for whose
+    replay is fitted as the measurement is (indirect inference, Gourieroux, Monfort and Renault
+    1993).
 
     Args:
         sensors: that read the trials; kinematics: the filters they went through.
@@ -101,17 +102,17 @@ def unbiased(
         bias = bias_at(raw.p)
     except InputError:
         # A model that lacks much may not hold the motion; it has no bias to speak of.
-        return Squares(raw, raw.p, None, problem)
-    # A large bias of a model that bends changes on the way to the answer, by some bias^2 / p.
+        return UnbiasedFit(raw, raw.p, None, problem)
+    # A large bias of a nonlinear model changes on the way to the answer, by some bias^2 / p.
     sd = np.sqrt(np.diag(raw.covariance))
-    found = Squares(raw, moved(bias), bias, problem, bias_at)
+    found = UnbiasedFit(raw, moved(bias), bias, problem, bias_at)
     if not problem.linear and np.any((bias**2 > sd * np.abs(raw.p[free]))[free < count]):
         bias = _settled(found, bias, moved)
         found = replace(found, p=moved(bias), bias=bias)
     return found
 
 
-def _settled(squares: Squares, bias: Array, moved: Callable[[Array], Array]) -> Array:
+def _settled(squares: UnbiasedFit, bias: Array, moved: Callable[[Array], Array]) -> Array:
     """Return the bias (n_free,) at the parameters that it leads to, by secants, one by one.
 
     Args:
@@ -140,7 +141,9 @@ def _settled(squares: Squares, bias: Array, moved: Callable[[Array], Array]) -> 
     return best
 
 
-def estimate_by_squares(system: System, motions: Sequence[Motion], squares: Squares) -> Estimate:
+def estimate_by_least_squares(
+    system: System, motions: Sequence[Motion], squares: UnbiasedFit
+) -> Estimate:
     """Return the least-squares estimate; its trace is the fit to the trials so far."""
     problem, raw = squares.problem, squares.raw
     kept = [k for k, i in enumerate(problem.free) if i < len(system.parameters)]
@@ -178,7 +181,7 @@ def estimate_by_squares(system: System, motions: Sequence[Motion], squares: Squa
     )
 
 
-def bias_details(squares: Squares, kept: Sequence[int]) -> list[dict[str, float]]:
+def bias_details(squares: UnbiasedFit, kept: Sequence[int]) -> list[dict[str, float]]:
     """Return, for each of the parameters ``kept``, the bias that was taken off."""
     if squares.bias is None:
         return [{} for _ in kept]

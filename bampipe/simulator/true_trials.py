@@ -39,7 +39,7 @@ class TrueTrial:
     brake: Array
 
 
-def _wanted(
+def _draw_wanted_motion(
     device: Device, config: Config, rng: np.random.Generator, t: Array, share: float
 ) -> tuple[Array, Array]:
     """Position and rate that the hand wants: band-limited noise in each axis, from rest."""
@@ -48,28 +48,28 @@ def _wanted(
     rise = np.clip(t / 1.0, 0.0, 1.0)
     fade, fade_rate = rise**2 * (3 - 2 * rise), 6 * rise * (1 - rise)
     for i, c in enumerate(device.coordinates):
-        middle, half = _range(device, c)
+        middle, half = _middle_and_half_range(device, c)
         frequency = 2 * np.pi * rng.uniform(*BAND, size=40)
         # A hand reaches far slowly and only a little fast.
         size = rng.normal(size=40) / (1.0 + (frequency / (2 * np.pi * 0.6)) ** 2) ** 2
         phase = np.outer(t, frequency) + rng.uniform(0.0, 2 * np.pi, size=40)
         wave, rate = np.sin(phase) @ size, np.cos(phase) @ (size * frequency)
         reach = half * REACH[c.kind] * config.amplitude * share * rng.uniform(0.7, 1.0)
-        bend = np.sin(phase) @ (size * frequency**2)
-        scale = min(reach / np.abs(wave).max(), HASTE[c.kind] / np.abs(bend).max())
+        acceleration = np.sin(phase) @ (size * frequency**2)
+        scale = min(reach / np.abs(wave).max(), HASTE[c.kind] / np.abs(acceleration).max())
         q[:, i] = middle + scale * (wave[0] + fade * (wave - wave[0]))
         qd[:, i] = scale * (fade * rate + fade_rate * (wave - wave[0]))
     return q, qd
 
 
-def moving_trial(
+def simulate_moving_trial(
     plant: Plant, config: Config, rng: np.random.Generator, viscous: bool
 ) -> TrueTrial:
     """A free trial, or one in a viscous field."""
     system, device = plant.motion, plant.device
     dt = 1.0 / config.sample_rate
     t = np.arange(round(config.duration * config.sample_rate), dtype=np.float64) * np.float64(dt)
-    q_ref, qd_ref = _wanted(device, config, rng, t, 0.6 if viscous else 1.0)
+    q_ref, qd_ref = _draw_wanted_motion(device, config, rng, t, 0.6 if viscous else 1.0)
     arm = Impedance(natural_frequency=rng.uniform(7.0, 10.0), damping_ratio=1.0, bandwidth=50.0)
     u = np.zeros((len(t), len(system.inputs)))
     if "t" in system.inputs:
@@ -97,7 +97,9 @@ def moving_trial(
     return TrueTrial(t, x[:, :n], x[:, n : 2 * n], total[:, force], total[:, brake])
 
 
-def locked_trial(plant: Plant, config: Config, rng: np.random.Generator, axis: str) -> TrueTrial:
+def simulate_locked_trial(
+    plant: Plant, config: Config, rng: np.random.Generator, axis: str
+) -> TrueTrial:
     """An axis held by its brake while the handle is loaded: the transmission winds up.
 
     The load is stiffness times deflection plus friction that builds up over a tenth of the
@@ -117,13 +119,13 @@ def locked_trial(plant: Plant, config: Config, rng: np.random.Generator, axis: s
     for k, step in enumerate(np.diff(deflection)):
         aim = np.sign(step)
         share[k + 1] = aim + (share[k] - aim) * np.exp(-abs(step) / (0.1 * peak))
-    middle = [_range(device, c) for c in device.coordinates]
+    middle = [_middle_and_half_range(device, c) for c in device.coordinates]
     pose = np.array([m + 0.05 * half for m, half in middle])
     q = np.tile(pose, (len(t), 1))
     q[:, i] += deflection
     load = np.zeros((len(t), len(names)))
     load[:, i] = stiffness * deflection + friction * share
-    force = _forces(plant.motion.input_map(q), load)
+    force = _handle_forces(plant.motion.input_map(q), load)
     wander = rng.uniform(0.0, 2 * np.pi, size=force.shape[1])
     others = np.abs(force).max(axis=0) < 0.05 * np.abs(force).max()
     force += np.where(others, 1.2 * np.sin(2 * np.pi * 0.17 * t[:, None] + wander), 0.0)
@@ -132,13 +134,13 @@ def locked_trial(plant: Plant, config: Config, rng: np.random.Generator, axis: s
     return TrueTrial(t, q, np.zeros_like(q), force, brake)
 
 
-def _forces(input_map: Array, load: Array) -> Array:
+def _handle_forces(input_map: Array, load: Array) -> Array:
     """Handle forces (T, n_f) that give the generalised forces ``load`` (T, n_q)."""
     inverse = np.linalg.pinv(input_map)
     return np.asarray(np.einsum("tfq,tq->tf", inverse, load), dtype=np.float64)
 
 
-def _range(device: Device, c: Coordinate) -> tuple[float, float]:
+def _middle_and_half_range(device: Device, c: Coordinate) -> tuple[float, float]:
     """Middle and half width of an axis' range."""
     lower, upper = device.limits.get(c.name, (-1.0, 1.0) if c.kind == "rotary" else (-0.2, 0.2))
     return (lower + upper) / 2, (upper - lower) / 2
