@@ -323,6 +323,7 @@ def test_summary_prints_tables(capsys: pytest.CaptureFixture[str]) -> None:
 def test_summary_prints_the_ladder(capsys: pytest.CaptureFixture[str]) -> None:
     rung = {"held_out_rmse": {"yaw": 0.5}, "noise_floor": {"yaw": 0.25}, "unit": {"yaw": "N.m"}}
     axis = {"mean_absolute": 0.1, "rmse": 0.2, "relative_error_percent": 3.0, "unit": "rad"}
+    axis["velocity_relative_error_percent"] = 4.0
     free = {"free_run_mode": "open_loop", "free_run": {"yaw": axis}}
     ladder = [{"model": "base", **rung}, {"model": "base+x", "added": "x", **rung, **free}]
     show.summary(filled(CompareResult, {"ladder": ladder}))

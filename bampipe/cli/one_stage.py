@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -38,7 +39,8 @@ def print_settings(stage: str) -> None:
     module = base.load(stage)
     show.say(f"{stage}: {module.SUMMARY}")
     show.say("")
-    show.say((module.Config.__doc__ or "").strip())
+    for kind in module.Config.__mro__[:-1]:
+        show.say((inspect.getdoc(kind) or "").partition("Attributes:\n")[2].rstrip())
     show.say("")
     show.say(f"defaults: {module.Config()}")
 

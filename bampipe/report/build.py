@@ -29,6 +29,18 @@ class Report:
     figures: dict[str, str]
     sections: tuple[str, ...]
 
+    @classmethod
+    def of(cls, document: Document, recorded: int) -> Report:
+        """Return the files of ``document``; see `typeset.pdf` for ``recorded``."""
+        figures = {
+            block.name: block.svg
+            for section in document.sections
+            for block in section.blocks
+            if isinstance(block, Figure)
+        }
+        titles = tuple(section.title for section in document.sections)
+        return cls(typeset.pdf(document, recorded), page.page(document), figures, titles)
+
 
 def build(results: Results, progress: Callable[[float, str], None]) -> Report:
     """Return the report of ``results``.
@@ -53,16 +65,7 @@ def build(results: Results, progress: Callable[[float, str], None]) -> Report:
         f"Session {results.session.session_id}", _subtitle(results), tuple(sections)
     )
     progress(0.7, "typesetting")
-    printed = typeset.pdf(document, _recorded(results))
-    progress(0.95, "page")
-    figures = {
-        block.name: block.svg
-        for section in sections
-        for block in section.blocks
-        if isinstance(block, Figure)
-    }
-    titles = tuple(section.title for section in sections)
-    return Report(printed, page.page(document), figures, titles)
+    return Report.of(document, _recorded(results))
 
 
 def _warnings(results: Results) -> tuple[Block, ...]:

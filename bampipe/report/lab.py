@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 
-from bampipe.report import page, style, typeset, wording
+from bampipe.report import style, wording
 from bampipe.report.build import Report
 from bampipe.report.document import Block, Callout, Document, Figure, Section, Table, Text
 from bampipe.results.lab import ControlChart, SessionVerdict, TrendsResult
@@ -39,17 +39,9 @@ def build(folder: Path) -> Report:
             if section is not None
         ]
     document = Document("All sessions", _subtitle(trends), tuple(sections))
-    figures = {
-        block.name: block.svg
-        for section in sections
-        for block in section.blocks
-        if isinstance(block, Figure)
-    }
     moments = [datetime.fromisoformat(one.recorded) for one in _dated(trends)]
     stamp = max((int(moment.timestamp()) for moment in moments), default=0)
-    printed = typeset.pdf(document, max(0, stamp))
-    titles = tuple(section.title for section in sections)
-    return Report(printed, page.page(document), figures, titles)
+    return Report.of(document, max(0, stamp))
 
 
 def _dated(trends: TrendsResult) -> list[SessionVerdict]:

@@ -8,15 +8,7 @@ from pydantic import Field
 
 from bampipe.results.record import Names, Record, Result, Size
 from bampipe.results.standing import Standing
-
-
-class FreeRunPosition(Record):
-    """Position error of one axis of the model left to itself."""
-
-    mean_absolute: Size
-    rmse: Size
-    relative_error_percent: Size
-    unit: Literal["rad", "m"]
+from bampipe.results.validate import FreeRunError
 
 
 class Rung(Record):
@@ -31,7 +23,7 @@ class Rung(Record):
     standing: dict[str, Standing]
     unit: dict[str, str]
     free_run_mode: Literal["closed_loop", "open_loop"] | None = None
-    free_run: dict[str, FreeRunPosition] = Field(default={}, description="By axis")
+    free_run: dict[str, FreeRunError] = Field(default={}, description="By axis")
 
 
 class Value(Record):

@@ -12,7 +12,7 @@ from bampipe.data.run_folder import RunFolder
 from bampipe.declarations.model import ModelFile, read_model_file
 from bampipe.errors import InputError
 from bampipe.progress import Progress
-from bampipe.results.compare import CompareResult, FreeRunPosition, Moved, Rung, Value
+from bampipe.results.compare import CompareResult, Moved, Rung, Value
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.validate import ValidateResult
 from bampipe.schema import STRICT, Positive
@@ -76,7 +76,6 @@ def _rung(run: RunFolder, name: str, models: Mapping[str, ModelFile]) -> Rung:
     axes, free = validated.axes, validated.free_run
     parent, effects = models[name].parent, models[name].effects
     had = models[parent].effects if parent in models else ()
-    positions = free.axes if free else {}
     return Rung(
         model=name,
         parent=parent or None,
@@ -87,15 +86,7 @@ def _rung(run: RunFolder, name: str, models: Mapping[str, ModelFile]) -> Rung:
         standing={axis: entry.standing for axis, entry in axes.items()},
         unit={axis: entry.unit for axis, entry in axes.items()},
         free_run_mode=free.mode if free else None,
-        free_run={
-            axis: FreeRunPosition(
-                mean_absolute=entry.mean_absolute,
-                rmse=entry.rmse,
-                relative_error_percent=entry.relative_error_percent,
-                unit=entry.unit,
-            )
-            for axis, entry in positions.items()
-        },
+        free_run=free.axes if free else {},
     )
 
 

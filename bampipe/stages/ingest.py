@@ -42,25 +42,11 @@ RATE_TOLERANCE = 0.02
 
 @checked_dataclass(frozen=True, config=STRICT)
 class Config(Limits):
-    """What the stage can be told.
+    """What the stage can be told, beside the limits of a sound trial.
 
     Attributes:
         session: folder of the session.
         largest_trial_mb: a trial that takes more memory than this, MB, is set aside.
-        shortest_s: a trial shorter than this, s, is set aside.
-        gap_s: longest gap in the time stamps that is left to resampling, s.
-        sound_share: least share of a trial that its longest stretch between gaps must hold.
-        dropped_share: largest share of rows that may be dropped for their time stamps.
-        nan_run: longest run of missing samples that is interpolated.
-        nan_share: largest share of missing samples in a channel.
-        saturated_share: largest share of samples at the rail of a force channel.
-        frozen_share: largest share of the trial over which a force channel may stand still.
-        still_rad: a free trial moves more than this, rad, or ``still_m`` on some axis.
-        still_m: the same for linear axes, m.
-        locked_rad: a locked rotary axis moves less than this, rad.
-        locked_m: a locked linear axis moves less than this, m.
-        locked_steps: a locked axis deflects by at least this many encoder steps.
-        brake_on: a brake command above this, N.m or N, makes a trial not free.
     """
 
     session: str = ""

@@ -19,7 +19,7 @@ class Limits:
     """What still counts as a sound trial.
 
     Attributes:
-        shortest_s: least duration, s.
+        shortest_s: a trial shorter than this, s, is set aside.
         gap_s: longest gap in the time stamps that is left to resampling, s.
         sound_share: least share of the trial that the longest stretch between gaps must hold.
         dropped_share: largest share of rows that may be dropped for their time stamps.
@@ -27,10 +27,10 @@ class Limits:
         nan_share: largest share of missing samples in a channel.
         saturated_share: largest share of samples at the rail of a force channel.
         frozen_share: largest share of the trial over which a force channel may stand still.
-        still_rad, still_m: a free trial moves more than this on some axis.
-        locked_rad, locked_m: a locked axis moves less than this.
+        still_rad, still_m: a free trial moves more than this, rad or m, on some axis.
+        locked_rad, locked_m: a locked axis moves less than this, rad or m.
         locked_steps: a locked axis deflects by at least this many encoder steps.
-        brake_on: brake command above which a trial is not free, N.m or N.
+        brake_on: a brake command above this, N.m or N, makes a trial not free.
     """
 
     shortest_s: NotNegative = 1.0
