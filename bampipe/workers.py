@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 from bampipe.errors import InputError
 
 Task = TypeVar("Task")
-Result = TypeVar("Result")
+Returned = TypeVar("Returned")
 
 
 def end_with_parent() -> None:
@@ -74,7 +74,9 @@ class ProcessPool:
         self._results: dict[int, _Reply] = {}
         self._number = 0
 
-    def map(self, function: Callable[[Task], Result], tasks: Iterable[Task]) -> Iterator[Result]:
+    def map(
+        self, function: Callable[[Task], Returned], tasks: Iterable[Task]
+    ) -> Iterator[Returned]:
         """Start ``function`` on every task, and return the results in the order of the tasks.
 
         Raises:

@@ -281,7 +281,7 @@ def main() -> None:
     began = time.perf_counter()
     # Imported once, here: the kills then meet the work, not Python's start.
     for stage in base.STAGES:
-        base.load(stage)
+        base.load_stage(stage)
     kinds = steps()
     targets = (*kinds, EXTEND)
     with working_folder(options.keep) as work:

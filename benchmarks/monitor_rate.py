@@ -17,7 +17,7 @@ import numpy as np
 
 from bampipe.data.stream import SampleStream
 from bampipe.monitor.monitor import Monitor
-from bampipe.monitor.start import Options, layouts
+from bampipe.monitor.start import MonitorOptions, layouts
 from bampipe.physics import Model, compile_model, registry
 
 RATE = 5000.0
@@ -43,7 +43,7 @@ def main() -> None:
     names, values = record(10_000)
     source, sink = os.pipe()
     stream = SampleStream(source, "pipe", layouts(system, None), True, print)
-    watch = Monitor(system, None, Options(), lambda _: None)
+    watch = Monitor(system, None, MonitorOptions(), lambda _: None)
     os.write(sink, (",".join(names) + "\n").encode())
     stream.read()
     taken, seconds, before, reported = 0, 0.0, 0, 0.0

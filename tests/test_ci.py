@@ -19,7 +19,7 @@ from bampipe.results.identify import IdentifyResult
 from bampipe.results.ingest import IngestResult
 from bampipe.results.validate import ValidateResult
 from bampipe.run import accepted, gates, pipeline
-from bampipe.run.gates import Verdict
+from bampipe.run.gates import GateVerdict
 from bampipe.run.markdown import summary
 from bampipe.run.request import Outcome
 
@@ -52,7 +52,7 @@ def made(root: Path, sd: float = 0.01, **estimates: float) -> Path:
 
 
 def states(root: Path, folder: Path, gate: Gate = CHANGE) -> dict[str, str]:
-    return {v.key: v.state for v in gates.judge(gate, root, "base", folder)}
+    return {v.key: v.state for v in gates.judge_gates(gate, root, "base", folder)}
 
 
 def test_parameters_are_held_against_those_accepted(tmp_path: Path) -> None:
@@ -69,7 +69,9 @@ def test_parameters_are_held_against_those_accepted(tmp_path: Path) -> None:
         "mass": "absent",
     }
     # 10 % less two standard deviations of the difference, 2 sqrt(0.01^2 + 0.01^2) / 2.0
-    verdict = next(v for v in gates.judge(CHANGE, new, "base", folder) if v.key == "coulomb.yaw")
+    verdict = next(
+        v for v in gates.judge_gates(CHANGE, new, "base", folder) if v.key == "coulomb.yaw"
+    )
     assert verdict.value == pytest.approx(10.0 - 100 * 2 * 0.01 * 2**0.5 / 2.0)
     assert "2 to 2.2, +10 %" in verdict.message
 
@@ -85,7 +87,7 @@ def test_accepted_values_of_another_model_do_not_count(tmp_path: Path) -> None:
     root = made(tmp_path / "runs/old", mass=2.0)
     accepted.accept(root, "base", folder)
     (root / "models/base").rename(root / "models/base+x")
-    found = gates.judge(CHANGE, root, "base+x", folder)
+    found = gates.judge_gates(CHANGE, root, "base+x", folder)
     assert [v.state for v in found] == ["absent"]
     assert "of model 'base'" in found[0].message
 
@@ -118,7 +120,7 @@ def test_accept_refuses_what_failed(
 
 
 def test_the_summary_is_a_table_that_no_text_breaks(tmp_path: Path) -> None:
-    bad = Verdict("error | floor", "yaw", "failed", 2.0, "2 is above 1.15;\nsee <b>")
+    bad = GateVerdict("error | floor", "yaw", "failed", 2.0, "2 is above 1.15;\nsee <b>")
     root = made(tmp_path / "runs/s1", mass=2.0)
     axes = {"yaw": {"held_out_rmse": 0.2, "noise_floor": 0.1}}
     write_result(root, ValidateResult, axes=axes)

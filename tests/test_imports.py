@@ -388,7 +388,7 @@ def test_help_is_quick() -> None:
 
 @pytest.mark.parametrize("name", base.STAGES)
 def test_the_static_tables_agree_with_the_stages(name: str) -> None:
-    module = base.load(name)
+    module = base.load_stage(name)
     fields = set(module.Config.__dataclass_fields__)
     assert name == module.NAME
     assert ("model" in fields) == (name in base.PER_MODEL)
@@ -397,7 +397,7 @@ def test_the_static_tables_agree_with_the_stages(name: str) -> None:
 
 @pytest.mark.parametrize("name", base.STAGES)
 def test_every_setting_is_described(name: str) -> None:
-    config = base.load(name).Config
+    config = base.load_stage(name).Config
     text = "".join(cls.__doc__ or "" for cls in config.__mro__[:-1])
     for field in config.__dataclass_fields__:
         assert field in text, f"{name}: {field}"

@@ -47,9 +47,9 @@ def test_following_judges_the_model_that_it_starts_from(
     ran: list[tuple[str, ...]] = []
     content = {"axes": {"joint": {"verdict": "unknown_effect"}}}
     found = DiagnoseResult.model_validate(filled(DiagnoseResult, content))
-    monkeypatch.setattr(loop.Options, "run", lambda _, *steps: ran.append(steps))
+    monkeypatch.setattr(loop.LoopOptions, "run", lambda _, *steps: ran.append(steps))
     monkeypatch.setattr(loop, "_diagnosis", lambda *_: found)
-    options = loop.Options(tmp_path, pipeline.load(), False, True, unheard)
+    options = loop.LoopOptions(tmp_path, pipeline.load(), False, True, unheard)
     told: list[str] = []
     assert loop.follow(options, "base", told.append) == "base"
     assert told == ["base, joint: unknown effect"]

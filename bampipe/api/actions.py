@@ -155,9 +155,9 @@ def _whole(root: Path) -> Pipeline:
     return pipelines.recorded(record.read(root)).with_every_stage()
 
 
-def _options(run: Run) -> loop.Options:
+def _options(run: Run) -> loop.LoopOptions:
     batch.limit_threads(1)
-    return loop.Options(run.root, _whole(run.root), False, True, unheard)
+    return loop.LoopOptions(run.root, _whole(run.root), False, True, unheard)
 
 
 def run_stage(run: Run | Path_, stage: str, model: str = "", **settings: object) -> dict[str, Any]:
@@ -172,7 +172,7 @@ def run_stage(run: Run | Path_, stage: str, model: str = "", **settings: object)
     Raises:
         InputError: no such stage, model or setting, or an earlier stage has not run.
     """
-    base.check_name(stage)
+    base.check_stage_name(stage)
     steps = _ran(_opened(run).root, stage, model, settings)
     return steps[0] if len(steps) == 1 else {"steps": steps}
 

@@ -26,7 +26,7 @@ MOST_EFFECTS = 5
 
 
 @dataclass(frozen=True)
-class Options:
+class LoopOptions:
     """What every step of the loop needs.
 
     Attributes:
@@ -132,7 +132,7 @@ def _named(text: str) -> tuple[str, Path | None]:
     return f"{effect.name}:{target}" if target else effect.name, path
 
 
-def extend(options: Options, parent: str, effect: str) -> str:
+def extend(options: LoopOptions, parent: str, effect: str) -> str:
     """Make the child of ``parent`` that has ``effect`` too; identify, validate, compare.
 
     Args:
@@ -199,7 +199,7 @@ def _write_child(root: Path, parent: str, effect: str, file: Path | None) -> Non
     load_model(RunFolder(root), child)
 
 
-def follow(options: Options, model: str, tell: Callable[[str], None]) -> str:
+def follow(options: LoopOptions, model: str, tell: Callable[[str], None]) -> str:
     """Diagnose and extend until the diagnosis says stop, or an effect does not help after all.
 
     Args:

@@ -14,7 +14,7 @@ from bampipe.cli.fetch import fetch
 from bampipe.cli.init import init
 from bampipe.cli.lab import lab
 from bampipe.cli.monitor import monitor
-from bampipe.cli.options import Json
+from bampipe.cli.options import JsonOption
 from bampipe.cli.run import run
 from bampipe.cli.simulate import simulate
 from bampipe.errors import InputError
@@ -41,7 +41,7 @@ def effects(
     device: Annotated[
         str, typer.Option(help="Device the effect is shown or checked on; a name or a file.")
     ] = "bam",
-    json: Json = False,
+    json: JsonOption = False,
 ) -> None:
     """The effects a model can have; with a name, one of them in full; or an effect file checked.
 

@@ -7,9 +7,9 @@ import typer
 from bampipe.cli import places, show
 from bampipe.cli.options import (
     RUNS,
-    Json,
-    Run,
-    Runs,
+    JsonOption,
+    RunArgument,
+    RunsOption,
 )
 from bampipe.run import pipeline as pipelines
 from bampipe.run import record
@@ -17,7 +17,7 @@ from bampipe.run.status import status
 from bampipe.run.verify import verify
 
 
-def status_(run: Run = None, runs: Runs = RUNS, json: Json = False) -> None:
+def status_(run: RunArgument = None, runs: RunsOption = RUNS, json: JsonOption = False) -> None:
     """Which stages of a run are current, stale or failed.
 
     Example: bampipe status 2026-10-03_s01
@@ -34,7 +34,7 @@ def status_(run: Run = None, runs: Runs = RUNS, json: Json = False) -> None:
     )
 
 
-def verify_(run: Run = None, runs: Runs = RUNS, json: Json = False) -> None:
+def verify_(run: RunArgument = None, runs: RunsOption = RUNS, json: JsonOption = False) -> None:
     """Recompute every recorded hash; say what was touched since. Exit 1 if anything was.
 
     Example: bampipe verify 2026-10-03_s01

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import bampipe
-from bampipe.api.loop import Options, follow
+from bampipe.api.loop import LoopOptions, follow
 from bampipe.cli import places
 from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError
@@ -50,7 +50,7 @@ def demonstrate(runs: Path, force: bool, listen: Listener, tell: Callable[[str],
             f"sensor noise alone would leave {error.noise_floor:.3g} {error.unit}"
         )
     tell("2. Which effect is missing? The diagnosis, then the model extended, until nothing is.")
-    options = Options(root, chosen.with_every_stage(), force, True, listen)
+    options = LoopOptions(root, chosen.with_every_stage(), force, True, listen)
     last = follow(options, models.BASE, lambda line: tell(f"   {line}"))
     tell("3. The error on unseen trials, model by model.")
     for rung in RunFolder(root).read(CompareResult).ladder:

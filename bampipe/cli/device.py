@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from bampipe.cli import show
+from bampipe.cli.options import JsonOption
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -17,12 +18,11 @@ app = typer.Typer(
     "Example: bampipe device check rail.toml",
 )
 
-Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Faults only.")]
+FaultsOnlyOption = Annotated[bool, typer.Option("--quiet", "-q", help="Faults only.")]
 
 
 @app.command("list")
-def list_(json: Json = False) -> None:
+def list_(json: JsonOption = False) -> None:
     """The built-in devices.
 
     Example: bampipe device list
@@ -49,7 +49,7 @@ def list_(json: Json = False) -> None:
 @app.command("show")
 def show_(
     device: Annotated[str, typer.Argument(help="A built-in device, or a device file.")],
-    json: Json = False,
+    json: JsonOption = False,
 ) -> None:
     """A device in full: equations of motion, numbers, inputs, the effects it can have.
 
@@ -92,8 +92,8 @@ def show_(
 @app.command()
 def check(
     file: Annotated[str, typer.Argument(help="A device file, or the name of a built-in device.")],
-    json: Json = False,
-    quiet: Quiet = False,
+    json: JsonOption = False,
+    quiet: FaultsOnlyOption = False,
 ) -> None:
     """The equations of motion that follow from a device file, and what is wrong with it.
 

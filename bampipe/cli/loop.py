@@ -11,12 +11,12 @@ from bampipe.cli.one_stage import advise, one_stage, print_settings, whole_pipel
 from bampipe.cli.options import (
     DEFAULTS,
     RUNS,
-    Force,
-    Json,
-    NoWait,
-    Quiet,
-    Run,
-    Runs,
+    ForceOption,
+    JsonOption,
+    NoWaitOption,
+    QuietOption,
+    RunArgument,
+    RunsOption,
     StageOptions,
     with_stage_options,
 )
@@ -27,7 +27,7 @@ from bampipe.run import batch
 
 @with_stage_options
 def diagnose(
-    run: Run = None,
+    run: RunArgument = None,
     model: Annotated[
         str, typer.Option(help="Model to diagnose; the one extended last if omitted.")
     ] = "",
@@ -68,11 +68,11 @@ def extend(
     model: Annotated[
         str, typer.Option(help="Model to extend; the one extended last if omitted.")
     ] = "",
-    force: Force = False,
-    runs: Runs = RUNS,
-    no_wait: NoWait = False,
-    json: Json = False,
-    quiet: Quiet = False,
+    force: ForceOption = False,
+    runs: RunsOption = RUNS,
+    no_wait: NoWaitOption = False,
+    json: JsonOption = False,
+    quiet: QuietOption = False,
 ) -> None:
     """Add an effect to a model, identify and validate it again, print the ladder.
 
@@ -97,7 +97,7 @@ def extend(
     pipeline = whole_pipeline(root, "")
     parent = model or loop.current_model(root)
     with show.Watcher(quiet or json) as watcher:
-        options = loop.Options(root, pipeline, force, not no_wait, watcher)
+        options = loop.LoopOptions(root, pipeline, force, not no_wait, watcher)
         if auto:
             last = loop.follow(options, parent, lambda line: None if json else show.say(line))
         else:
@@ -112,9 +112,9 @@ def extend(
 
 
 def demo(
-    runs: Runs = RUNS,
-    force: Force = False,
-    quiet: Quiet = False,
+    runs: RunsOption = RUNS,
+    force: ForceOption = False,
+    quiet: QuietOption = False,
 ) -> None:
     """A shipped session with a hidden effect: the whole loop, in minutes.
 

@@ -71,9 +71,9 @@ def monitor(
 
     Example: logger | bampipe monitor - --run 2026-10-03_s01 --session sessions/2026-10-03_s01
     """
-    from bampipe.monitor.start import Options
+    from bampipe.monitor.start import MonitorOptions
 
-    options = Options(window_s, false_alarms, memory_s)
+    options = MonitorOptions(window_s, false_alarms, memory_s)
     options.check()
     if not every > 0.0:
         raise InputError("must be positive", where="--every")

@@ -36,7 +36,7 @@ def assignments(given: Sequence[str] | None) -> dict[str, object]:
 
 
 def print_settings(stage: str) -> None:
-    module = base.load(stage)
+    module = base.load_stage(stage)
     show.say(f"{stage}: {module.SUMMARY}")
     show.say("")
     for kind in module.Config.__mro__[:-1]:

@@ -11,33 +11,35 @@ from typing import Annotated, Any, get_type_hints
 
 import typer
 
-Session = Annotated[str, typer.Argument(help="Folder of a session: session.toml and its trials.")]
-Run = Annotated[
+SessionArgument = Annotated[
+    str, typer.Argument(help="Folder of a session: session.toml and its trials.")
+]
+RunArgument = Annotated[
     str | None,
     typer.Argument(
         metavar="[RUN]", help="Run folder, or its name under runs/; the most recent run if omitted."
     ),
 ]
-Runs = Annotated[
+RunsOption = Annotated[
     Path, typer.Option("--runs", envvar="BAMPIPE_RUNS", help="Folder that holds the run folders.")
 ]
-Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no advice.")]
-Force = Annotated[bool, typer.Option("--force", help="Run even if nothing changed.")]
-NoWait = Annotated[
+JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no advice.")]
+ForceOption = Annotated[bool, typer.Option("--force", help="Run even if nothing changed.")]
+NoWaitOption = Annotated[
     bool, typer.Option("--no-wait", help="Refuse, rather than wait, if the run folder is in use.")
 ]
-PipelineName = Annotated[
+PipelineOption = Annotated[
     str, typer.Option("--pipeline", help="Name of a pipeline, or a file of your own.")
 ]
-Settings = Annotated[
+SettingsOption = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="NAME=VALUE", help="A setting of the stage; may be repeated."),
 ]
-ListSettings = Annotated[
+ListSettingsOption = Annotated[
     bool, typer.Option("--settings", help="List the settings of this stage, and leave.")
 ]
-ModelName = Annotated[
+ModelOption = Annotated[
     str, typer.Option("--model", help="Only this model; else base and what was run of the others.")
 ]
 
@@ -48,14 +50,14 @@ RUNS = Path("runs")
 class StageOptions:
     """The options that every stage takes as a command."""
 
-    settings: Settings = None
-    list_settings: ListSettings = False
-    pipeline: PipelineName = ""
-    force: Force = False
-    runs: Runs = RUNS
-    no_wait: NoWait = False
-    json: Json = False
-    quiet: Quiet = False
+    settings: SettingsOption = None
+    list_settings: ListSettingsOption = False
+    pipeline: PipelineOption = ""
+    force: ForceOption = False
+    runs: RunsOption = RUNS
+    no_wait: NoWaitOption = False
+    json: JsonOption = False
+    quiet: QuietOption = False
 
 
 DEFAULTS = StageOptions()

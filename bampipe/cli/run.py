@@ -16,12 +16,12 @@ from bampipe.cli.one_stage import (
 )
 from bampipe.cli.options import (
     RUNS,
-    Force,
-    Json,
-    NoWait,
-    PipelineName,
-    Quiet,
-    Runs,
+    ForceOption,
+    JsonOption,
+    NoWaitOption,
+    PipelineOption,
+    QuietOption,
+    RunsOption,
 )
 from bampipe.errors import InputError
 from bampipe.run import batch, models
@@ -36,7 +36,7 @@ def run(
     sessions: Annotated[
         list[str], typer.Argument(metavar="SESSION...", help="Session folders, or patterns.")
     ],
-    pipeline: PipelineName = "default",
+    pipeline: PipelineOption = "default",
     jobs: Annotated[int, typer.Option("--jobs", "-j", min=1, help="Sessions at once.")] = 1,
     engine: Annotated[
         str, typer.Option(help="local, or dask: the workers of a Dask cluster.")
@@ -50,7 +50,7 @@ def run(
     last: Annotated[
         str, typer.Option("--until", metavar="STAGE", help="Stop after this stage.")
     ] = "",
-    force: Force = False,
+    force: ForceOption = False,
     model: Annotated[str, typer.Option(help="Run and judge this model only.")] = "",
     settings: Annotated[
         list[str] | None,
@@ -73,10 +73,10 @@ def run(
             metavar="URL", help="Also publish finished runs there: s3://bucket/runs, file://..."
         ),
     ] = "",
-    runs: Runs = RUNS,
-    no_wait: NoWait = False,
-    json: Json = False,
-    quiet: Quiet = False,
+    runs: RunsOption = RUNS,
+    no_wait: NoWaitOption = False,
+    json: JsonOption = False,
+    quiet: QuietOption = False,
 ) -> None:
     """From raw log to report: all stages of a pipeline, those that changed.
 
@@ -159,7 +159,7 @@ def _stage_settings(given: Sequence[str] | None) -> dict[str, dict[str, object]]
             raise InputError(
                 f"{name!r} does not say which stage", remedy=f"write --set STAGE.{name}=..."
             )
-        base.check_name(stage)
+        base.check_stage_name(stage)
         found.setdefault(stage, {})[setting] = value
     return found
 

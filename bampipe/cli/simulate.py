@@ -13,8 +13,8 @@ from bampipe.cli.one_stage import (
     assignments,
 )
 from bampipe.cli.options import (
-    Json,
-    Quiet,
+    JsonOption,
+    QuietOption,
 )
 from bampipe.errors import InputError
 from bampipe.run import batch
@@ -46,8 +46,8 @@ def simulate(
             "--set", metavar="NAME=VALUE", help="A parameter of the plant; may be repeated."
         ),
     ] = None,
-    json: Json = False,
-    quiet: Quiet = False,
+    json: JsonOption = False,
+    quiet: QuietOption = False,
 ) -> None:
     """Make a session from the model, with known effects hidden in it.
 

@@ -10,9 +10,9 @@ from bampipe.cli import places
 from bampipe.cli.one_stage import advise, one_stage, plain_stage, print_settings
 from bampipe.cli.options import (
     DEFAULTS,
-    ModelName,
-    Run,
-    Session,
+    ModelOption,
+    RunArgument,
+    SessionArgument,
     StageOptions,
     with_stage_options,
 )
@@ -20,7 +20,7 @@ from bampipe.run.session_name import session_id
 
 
 @with_stage_options
-def ingest(session: Session, options: StageOptions = DEFAULTS) -> None:
+def ingest(session: SessionArgument, options: StageOptions = DEFAULTS) -> None:
     """Read a session's raw logs: SI units, repairs, trials set aside with a reason.
 
     Example: bampipe ingest sessions/2026-10-03_s01
@@ -36,7 +36,7 @@ def ingest(session: Session, options: StageOptions = DEFAULTS) -> None:
 
 @with_stage_options
 def filter_(
-    run: Run = None,
+    run: RunArgument = None,
     method: Annotated[str, typer.Option(help="auto, kalman, butterworth or savitzky_golay.")] = "",
     options: StageOptions = DEFAULTS,
 ) -> None:
@@ -48,7 +48,7 @@ def filter_(
 
 
 @with_stage_options
-def stiffness(run: Run = None, options: StageOptions = DEFAULTS) -> None:
+def stiffness(run: RunArgument = None, options: StageOptions = DEFAULTS) -> None:
     """Stiffness of each axis from its hysteresis loops, and the bandwidth that follows.
 
     Example: bampipe stiffness 2026-10-03_s01
@@ -58,8 +58,8 @@ def stiffness(run: Run = None, options: StageOptions = DEFAULTS) -> None:
 
 @with_stage_options
 def identify(
-    run: Run = None,
-    model: ModelName = "",
+    run: RunArgument = None,
+    model: ModelOption = "",
     method: Annotated[str, typer.Option(help="auto, ukf, least-squares or output-error.")] = "",
     engine: Annotated[
         str,
@@ -75,7 +75,9 @@ def identify(
 
 
 @with_stage_options
-def viscous(run: Run = None, model: ModelName = "", options: StageOptions = DEFAULTS) -> None:
+def viscous(
+    run: RunArgument = None, model: ModelOption = "", options: StageOptions = DEFAULTS
+) -> None:
     """Damping at the handle that the brakes rendered in viscous trials, against the command.
 
     Example: bampipe viscous 2026-10-03_s01
@@ -84,7 +86,9 @@ def viscous(run: Run = None, model: ModelName = "", options: StageOptions = DEFA
 
 
 @with_stage_options
-def performance(run: Run = None, model: ModelName = "", options: StageOptions = DEFAULTS) -> None:
+def performance(
+    run: RunArgument = None, model: ModelOption = "", options: StageOptions = DEFAULTS
+) -> None:
     """Workspace, stiffness, friction, inertia and force at the handle.
 
     Example: bampipe performance 2026-10-03_s01
@@ -93,7 +97,9 @@ def performance(run: Run = None, model: ModelName = "", options: StageOptions = 
 
 
 @with_stage_options
-def validate(run: Run = None, model: ModelName = "", options: StageOptions = DEFAULTS) -> None:
+def validate(
+    run: RunArgument = None, model: ModelOption = "", options: StageOptions = DEFAULTS
+) -> None:
     """Predicted against measured force, on trials the parameters never saw.
 
     Example: bampipe validate 2026-10-03_s01
@@ -102,7 +108,7 @@ def validate(run: Run = None, model: ModelName = "", options: StageOptions = DEF
 
 
 @with_stage_options
-def compare(run: Run = None, options: StageOptions = DEFAULTS) -> None:
+def compare(run: RunArgument = None, options: StageOptions = DEFAULTS) -> None:
     """The ladder: held-out error of each model version against the noise floor.
 
     Example: bampipe compare 2026-10-03_s01
@@ -111,7 +117,7 @@ def compare(run: Run = None, options: StageOptions = DEFAULTS) -> None:
 
 
 @with_stage_options
-def report(run: Run = None, options: StageOptions = DEFAULTS) -> None:
+def report(run: RunArgument = None, options: StageOptions = DEFAULTS) -> None:
     """PDF and web page of everything found so far.
 
     Example: bampipe report 2026-10-03_s01

@@ -42,7 +42,7 @@ _UNIT_WORDS = {
 
 
 @dataclass(frozen=True)
-class Column:
+class SurveyedColumn:
     """One column that all logs of a folder have.
 
     Attributes:
@@ -89,11 +89,11 @@ class Survey:
     """
 
     files: tuple[str, ...]
-    columns: tuple[Column, ...]
+    columns: tuple[SurveyedColumn, ...]
     remarks: tuple[str, ...]
     passed: tuple[tuple[str, str], ...]
 
-    def of(self, *roles: str) -> list[Column]:
+    def of(self, *roles: str) -> list[SurveyedColumn]:
         """The columns with one of these roles."""
         return [column for column in self.columns if column.role in roles]
 
@@ -140,7 +140,7 @@ def survey(folder: Path) -> Survey:
 
 def _columns(
     path: Path, name: str, stated: dict[str, str], common: tuple[str, ...]
-) -> tuple[tuple[Column, ...], tuple[str, ...]]:
+) -> tuple[tuple[SurveyedColumn, ...], tuple[str, ...]]:
     wanted = [column for column in stated if column in common]
     datetimes = {column: "" for column in wanted if stated[column] == "datetime"}
     # A reader of several topics takes the first column for the time.
@@ -150,7 +150,9 @@ def _columns(
     for column in wanted:
         said = raw.units.get(column, stated[column])
         role = _role(column, said)
-        found.append(Column(column, said, role, _unit(column, said, role), raw.columns[column]))
+        found.append(
+            SurveyedColumn(column, said, role, _unit(column, said, role), raw.columns[column])
+        )
     return tuple(found), raw.remarks
 
 

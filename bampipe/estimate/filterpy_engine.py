@@ -18,7 +18,7 @@ from bampipe.estimate.unscented import (
     FilteredTrial,
     FilterFailure,
     FilterModel,
-    FilterResult,
+    FilterOutcome,
     FilterSettings,
     Trial,
     in_sequence,
@@ -34,7 +34,7 @@ def filter_trials_by_filterpy(
     covariance: Array,
     settings: FilterSettings,
     advance: Callable[..., None] = runge_kutta,
-) -> FilterResult:
+) -> FilterOutcome:
     """Filter trials in sequence, as `unscented.filter_trials` does; same arguments and result.
 
     Args:

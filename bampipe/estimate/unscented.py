@@ -214,7 +214,7 @@ class FilteredTrial(Stored):
 
 
 @dataclass(frozen=True)
-class FilterResult:
+class FilterOutcome:
     """What the filter found in all trials.
 
     Attributes:
@@ -234,7 +234,7 @@ def filter_trials(
     theta: Array,
     covariance: Array,
     settings: FilterSettings,
-) -> FilterResult:
+) -> FilterOutcome:
     """Filter trials in sequence: each starts with its own state, the parameters carry over.
 
     Args:
@@ -276,7 +276,7 @@ def in_sequence(
     trials: Sequence[Trial],
     theta: Array,
     covariance: Array,
-) -> FilterResult:
+) -> FilterOutcome:
     """Filter trials one after the other, the parameters carried over.
 
     Args:
@@ -289,7 +289,7 @@ def in_sequence(
     for index, trial in enumerate(trials):
         filtered, theta, covariance = filter_one(index, trial, theta, covariance)
         found.append(filtered)
-    return FilterResult(theta, covariance, tuple(found))
+    return FilterOutcome(theta, covariance, tuple(found))
 
 
 def run_kernel(

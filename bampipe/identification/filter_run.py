@@ -16,7 +16,7 @@ from bampipe.estimate.unscented import (
     FilteredTrial,
     FilterFailure,
     FilterModel,
-    FilterResult,
+    FilterOutcome,
     FilterSettings,
     Stored,
     Trial,
@@ -89,7 +89,7 @@ class FilterRun:
         repeats: how often it was begun again around its own answer.
     """
 
-    search: FilterResult
+    search: FilterOutcome
     trials: tuple[Pass, ...]
     theta: Array
     covariance: Array
@@ -344,7 +344,7 @@ def samples_per_stretch(trial: Trial) -> int:
     return max(1, round(STRETCH_S / float(np.median(np.diff(trial.t)))))
 
 
-def _engine(choice: FilterChoice) -> Callable[..., FilterResult]:
+def _engine(choice: FilterChoice) -> Callable[..., FilterOutcome]:
     if choice.engine == "filterpy":
         from bampipe.estimate.filterpy_engine import filter_trials_by_filterpy
 

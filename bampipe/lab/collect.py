@@ -73,7 +73,7 @@ def collect(runs: Path, folder: Path, *, report: bool = True, progress: Progress
         for name in lab_tables.TABLES
     }
     charts = trends.series(tables)
-    content = trends.content(charts, trends.judge(tables, charts))
+    content = trends.build_trends(charts, trends.judge_sessions(tables, charts))
     if is_foreign(folder):
         raise InputError(
             "holds other files", where=str(folder), remedy="choose another folder with --out"

@@ -123,17 +123,19 @@ def series(tables: Mapping[str, Sequence[Row]]) -> list[Series]:
     return charts
 
 
-def judge(tables: Mapping[str, Sequence[Row]], charts: Sequence[Series]) -> list[Judged]:
+def judge_sessions(tables: Mapping[str, Sequence[Row]], charts: Sequence[Series]) -> list[Judged]:
     """Return what is to be said of each session, in the order of recording.
 
     Args:
         tables: rows of the lab's tables.
         charts: what :func:`series` returns for them.
     """
-    return [_judge(row, tables, charts) for row in tables["sessions"]]
+    return [_judge_session(row, tables, charts) for row in tables["sessions"]]
 
 
-def _judge(row: Row, tables: Mapping[str, Sequence[Row]], charts: Sequence[Series]) -> Judged:
+def _judge_session(
+    row: Row, tables: Mapping[str, Sequence[Row]], charts: Sequence[Series]
+) -> Judged:
     session, device = str(row["session_id"]), str(row["device"])
     when = row["recorded_at"]
     judged = Judged(session, device, when.isoformat() if when is not None else "")
@@ -155,13 +157,13 @@ def _judge(row: Row, tables: Mapping[str, Sequence[Row]], charts: Sequence[Serie
     judged.effects = tuple(dict.fromkeys(named if first else row["effects"]))
     judged.unexplained = tuple(r["axis"] for r in first if r["verdict"] == "unknown_effect")
     judged.diagnosed = bool(first)
-    beyond = [c for c in charts if c.device == device and _is_beyond(c, session)]
+    beyond = [c for c in charts if c.device == device and _is_outside(c, session)]
     judged.moved = tuple(_moved(c, session) for c in beyond)
     _decide(judged, beyond, mine)
     return judged
 
 
-def _is_beyond(c: Series, session: str) -> bool:
+def _is_outside(c: Series, session: str) -> bool:
     return session in c.sessions and bool(c.chart.beyond[c.sessions.index(session)])
 
 
@@ -250,7 +252,7 @@ def _in_words(moved: MovedParameter) -> str:
     return f"{moved.parameter} {moved.percent:+.2g} %".replace("-", "−")
 
 
-def content(charts: Sequence[Series], judged: Sequence[Judged]) -> TrendsResult:
+def build_trends(charts: Sequence[Series], judged: Sequence[Judged]) -> TrendsResult:
     """Return charts and verdicts as ``trends.json`` holds them."""
     return TrendsResult(
         schema="bampipe.trends/1",

@@ -15,7 +15,7 @@ from bampipe.estimate.online import OnlineFilter
 from bampipe.estimate.unscented import FilterFailure
 from bampipe.monitor.start import (
     FIRST_LOOK,
-    Options,
+    MonitorOptions,
     Start,
     start_from_samples,
 )
@@ -42,7 +42,7 @@ class Monitor:
         self,
         system: System,
         start: Start | None,
-        options: Options,
+        options: MonitorOptions,
         complain: Callable[[str], None],
     ) -> None:
         """Wait for the first sample.

@@ -47,7 +47,7 @@ FIRST_LOOK = 500
 
 
 @dataclass(frozen=True)
-class Options:
+class MonitorOptions:
     """Settings of a monitor.
 
     Attributes:
@@ -173,7 +173,7 @@ def open_stream(
     return SampleStream(descriptor, samples, known, strict, complain)
 
 
-def start_from_run(run: RunFolder, name: str, options: Options) -> tuple[System, Start]:
+def start_from_run(run: RunFolder, name: str, options: MonitorOptions) -> tuple[System, Start]:
     """Take model, parameters and noise from an identified run.
 
     The alarm's threshold comes from the run's own free trials, filtered as the monitor will:
@@ -238,7 +238,9 @@ def start_from_run(run: RunFolder, name: str, options: Options) -> tuple[System,
     return system, replace(start, reference=Reference.of_windows(np.concatenate(means), window * n))
 
 
-def start_from_samples(system: System, t: Array, u: Array, q: Array, options: Options) -> Start:
+def start_from_samples(
+    system: System, t: Array, u: Array, q: Array, options: MonitorOptions
+) -> Start:
     """Take parameters from the device's priors and the noise from the first samples.
 
     The noise of every channel is settled as `ingest` settles it. The alarm's threshold is that of

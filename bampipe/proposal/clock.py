@@ -8,7 +8,7 @@ import numpy as np
 
 from bampipe.data import guesses
 from bampipe.data.session import SECONDS
-from bampipe.data.survey import Column, Survey, words
+from bampipe.data.survey import Survey, SurveyedColumn, words
 from bampipe.data.units import spelled
 from bampipe.proposal.notes import UNKNOWN, Notes, quoted
 
@@ -17,7 +17,7 @@ _LIKELY_RATE_HZ = 100.0
 
 
 @dataclass(frozen=True)
-class Clock:
+class ProposedClock:
     """The time of the first log, and how the session file says it.
 
     Attributes:
@@ -33,7 +33,7 @@ class Clock:
     rate: str
 
 
-def clock_of(found: Survey, notes: Notes) -> Clock:
+def clock_of(found: Survey, notes: Notes) -> ProposedClock:
     """Propose a clock: by stamps in one column or two, else by counting samples."""
     times = found.of("time")
     seconds = [c for c in times if _whole_seconds(c)]
@@ -44,7 +44,7 @@ def clock_of(found: Survey, notes: Notes) -> Clock:
     return _counted(found, notes) if column is None else _in_one_column(column, notes)
 
 
-def _in_one_column(column: Column, notes: Notes) -> Clock:
+def _in_one_column(column: SurveyedColumn, notes: Notes) -> ProposedClock:
     kind = guesses.time_unit(column.values, column.unit)
     t = (column.values - column.values[0]) * SECONDS.get(kind, 1.0)
     if not kind:
@@ -52,15 +52,15 @@ def _in_one_column(column: Column, notes: Notes) -> Clock:
         lines = (f"column = {quoted(column.name)}", f'unit = "{UNKNOWN}"{note}')
         rate = f'sample_rate_hz = "{UNKNOWN}"' + notes.ask("sample_rate_hz, the true rate")
         samples = np.arange(len(t)) / _LIKELY_RATE_HZ
-        return Clock(samples, (column.name,), _table(*lines), rate)
+        return ProposedClock(samples, (column.name,), _table(*lines), rate)
     rate_hz = guesses.sample_rate(t)
     said = kind == "datetime" or spelled(column.unit, tuple(SECONDS)) == kind
     note = "" if said else notes.guess(f"time in {kind}, by the rate that it gives")
     lines = (f"column = {quoted(column.name)}", f'unit = "{kind}"{note}')
-    return Clock(t, (column.name,), _table(*lines), _stamped_rate(rate_hz, notes))
+    return ProposedClock(t, (column.name,), _table(*lines), _stamped_rate(rate_hz, notes))
 
 
-def _in_two_columns(seconds: Column, rest: Column, notes: Notes) -> Clock:
+def _in_two_columns(seconds: SurveyedColumn, rest: SurveyedColumn, notes: Notes) -> ProposedClock:
     """Whole seconds and the nanoseconds on top of them, as ROS has them."""
     t = seconds.values - seconds.values[0] + 1e-9 * (rest.values - rest.values[0])
     rate_hz = guesses.sample_rate(t)
@@ -70,10 +70,12 @@ def _in_two_columns(seconds: Column, rest: Column, notes: Notes) -> Clock:
         'unit = "s"',
         f"nanoseconds = {quoted(rest.name)}{note}",
     )
-    return Clock(t, (seconds.name, rest.name), _table(*lines), _stamped_rate(rate_hz, notes))
+    return ProposedClock(
+        t, (seconds.name, rest.name), _table(*lines), _stamped_rate(rate_hz, notes)
+    )
 
 
-def _counted(found: Survey, notes: Notes) -> Clock:
+def _counted(found: Survey, notes: Notes) -> ProposedClock:
     """No column is a clock; a number beside the samples may give the rate."""
     samples = np.arange(len(found.columns[0].values))
     steps = [
@@ -85,10 +87,10 @@ def _counted(found: Survey, notes: Notes) -> Clock:
     if step_s > 0.0:
         note = notes.guess(f"counted; {name} sets the rate")
         rate = f"sample_rate_hz = {1.0 / step_s:g}"
-        return Clock(step_s * samples, (name,), _table(f'unit = "samples"{note}'), rate)
+        return ProposedClock(step_s * samples, (name,), _table(f'unit = "samples"{note}'), rate)
     note = notes.guess("no column increases like a time")
     rate = f'sample_rate_hz = "{UNKNOWN}"' + notes.ask("sample_rate_hz, the true rate")
-    return Clock(samples / _LIKELY_RATE_HZ, (), _table(f'unit = "samples"{note}'), rate)
+    return ProposedClock(samples / _LIKELY_RATE_HZ, (), _table(f'unit = "samples"{note}'), rate)
 
 
 def _table(*lines: str) -> tuple[str, ...]:
@@ -100,12 +102,12 @@ def _stamped_rate(rate_hz: float, notes: Notes) -> str:
     return f"sample_rate_hz = {rate_hz:g}{note}"
 
 
-def _whole_seconds(column: Column) -> bool:
+def _whole_seconds(column: SurveyedColumn) -> bool:
     named = not {"sec", "secs", "seconds"}.isdisjoint(words(column.name))
     return named and column.is_integer and bool(np.all(np.diff(column.values) >= 0))
 
 
-def _nanoseconds_on_top(column: Column) -> bool:
+def _nanoseconds_on_top(column: SurveyedColumn) -> bool:
     said = {"nanosec", "nsec", "nsecs", "nanosecs", "nanoseconds"}
     named = not said.isdisjoint(words(column.name))
     within = (column.values >= 0) & (column.values < 1e9)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from bampipe.data import guesses
-from bampipe.data.survey import Column, Survey, words
+from bampipe.data.survey import Survey, SurveyedColumn, words
 from bampipe.errors import InputError
 from bampipe.files import read_toml
 from bampipe.physics import registry
@@ -39,7 +39,7 @@ class ChosenDevice:
     name: str
     device: Device
     text: str = ""
-    columns: Mapping[str, Column] = field(default_factory=dict)
+    columns: Mapping[str, SurveyedColumn] = field(default_factory=dict)
 
 
 def find_device(folder: Path, found: Survey, wanted: str) -> ChosenDevice | None:
@@ -132,7 +132,7 @@ def new_device(folder: Path, match: Matcher, notes: Notes) -> ChosenDevice:
 
 
 def _rough_fit(
-    position: Column, driver: Column | None, role: str, linear: bool, t: np.ndarray
+    position: SurveyedColumn, driver: SurveyedColumn | None, role: str, linear: bool, t: np.ndarray
 ) -> guesses.Driven:
     """How the driver goes with the motion, both in SI; nothing found where nothing drives."""
     if driver is None:

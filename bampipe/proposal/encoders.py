@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from bampipe.data import guesses
-from bampipe.data.survey import Column, words
+from bampipe.data.survey import SurveyedColumn, words
 from bampipe.data.units import spelled
 from bampipe.physics.device import Coordinate, Device
 from bampipe.proposal.matching import Matcher
@@ -18,10 +18,10 @@ _SPEED_UNITS = ("rad/s", "deg/s", "rev/s", "rev/min", "m/s", "cm/s", "mm/s", "in
 
 def encoders_table(
     device: Device, match: Matcher, notes: Notes
-) -> tuple[list[str], dict[str, Column]]:
+) -> tuple[list[str], dict[str, SurveyedColumn]]:
     """Propose the column of every axis; its lines, and the columns found, by axis."""
     lines = ["[encoders]"]
-    axes: dict[str, Column] = {}
+    axes: dict[str, SurveyedColumn] = {}
     for axis in device.coordinates:
         column = measured_position(axis.name, len(device.coordinates), match, notes)
         if column is None:
@@ -35,7 +35,7 @@ def encoders_table(
     return [*lines, ""], axes
 
 
-def measured_position(axis: str, axes: int, match: Matcher, notes: Notes) -> Column | None:
+def measured_position(axis: str, axes: int, match: Matcher, notes: Notes) -> SurveyedColumn | None:
     """The column of the position of an axis; a guess is noted where it was one of several.
 
     Args:
@@ -50,7 +50,9 @@ def measured_position(axis: str, axes: int, match: Matcher, notes: Notes) -> Col
     return column
 
 
-def _encoder(axis: Coordinate, alone: bool, column: Column, match: Matcher, notes: Notes) -> str:
+def _encoder(
+    axis: Coordinate, alone: bool, column: SurveyedColumn, match: Matcher, notes: Notes
+) -> str:
     if is_velocity(column):
         return _integrated(axis, column, notes)
     if in_counts(column):
@@ -68,7 +70,7 @@ def _encoder(axis: Coordinate, alone: bool, column: Column, match: Matcher, note
     )
 
 
-def _integrated(axis: Coordinate, column: Column, notes: Notes) -> str:
+def _integrated(axis: Coordinate, column: SurveyedColumn, notes: Notes) -> str:
     known = column.conversion
     si = f"{axis.unit}/s"
     said = spelled(column.unit, _SPEED_UNITS) if known is not None and known.si == si else ""
@@ -77,7 +79,7 @@ def _integrated(axis: Coordinate, column: Column, notes: Notes) -> str:
     )
 
 
-def _counted(axis: Coordinate, column: Column, notes: Notes) -> str:
+def _counted(axis: Coordinate, column: SurveyedColumn, notes: Notes) -> str:
     middle = float(np.median(column.values))
     return (
         f"{{ column = {quoted(column.name)}, counts_per_unit = 0.0, zero_counts = {middle:.0f},"

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from bampipe.data import guesses
-from bampipe.data.survey import Column
+from bampipe.data.survey import SurveyedColumn
 from bampipe.data.units import spelled, unit
 from bampipe.physics.device import Device
 from bampipe.proposal.device import ChosenDevice
@@ -20,7 +20,7 @@ _FULL_DUTY = 1.05
 
 
 def input_tables(
-    chosen: ChosenDevice, axes: Mapping[str, Column], match: Matcher, notes: Notes
+    chosen: ChosenDevice, axes: Mapping[str, SurveyedColumn], match: Matcher, notes: Notes
 ) -> list[str]:
     """Propose the column of every input; the lines of those tables that have something to say."""
     device = chosen.device
@@ -38,7 +38,9 @@ def input_tables(
     return lines + _channels_table(wanted, given, match, notes)
 
 
-def _force_table(device: Device, columns: list[Column], why: str, notes: Notes) -> list[str]:
+def _force_table(
+    device: Device, columns: list[SurveyedColumn], why: str, notes: Notes
+) -> list[str]:
     names = ", ".join(quoted(column.name) for column in columns)
     components = ", ".join(f'"{name}"' for name in device.components)
     return [
@@ -50,7 +52,7 @@ def _force_table(device: Device, columns: list[Column], why: str, notes: Notes) 
     ]
 
 
-def _force_unit(device: Device, columns: list[Column], why: str, notes: Notes) -> list[str]:
+def _force_unit(device: Device, columns: list[SurveyedColumn], why: str, notes: Notes) -> list[str]:
     """The unit that all force columns share, and what makes forces of volts."""
     units = {spelled(bare(column.unit), _FORCE_UNITS) for column in columns}
     common = units.pop() if len(units) == 1 else None
@@ -104,7 +106,7 @@ def _channels_table(
     return [*lines, ""]
 
 
-def _channel(name: str, si: str, column: Column, why: str, notes: Notes) -> str:
+def _channel(name: str, si: str, column: SurveyedColumn, why: str, notes: Notes) -> str:
     """Column and unit of one input; its register or its scale, where the unit does not do."""
     bits = guesses.signed_register(column.values)
     register = f", wrap_bits = {bits}, signed = true" if bits else ""
@@ -128,7 +130,7 @@ def _channel(name: str, si: str, column: Column, why: str, notes: Notes) -> str:
     )
 
 
-def _unscaled(si: str, column: Column, bits: int) -> str:
+def _unscaled(si: str, column: SurveyedColumn, bits: int) -> str:
     """What to add of a column that may be in counts, with ``bits`` where it is a register."""
     if bits:
         return f", a signed register of {bits} bits: give its scale"

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bampipe.data import guesses
-from bampipe.data.survey import Column, Survey, words
+from bampipe.data.survey import Survey, SurveyedColumn, words
 from bampipe.proposal.positions import travelled
 
 DRIVERS = ("force", "current", "voltage")
@@ -19,7 +19,7 @@ _DRIVEN = 0.5
 """Share of a column that the motion must explain for it to pass as what drives it."""
 
 _INPUT_ROLE = {"N": "force", "N.m": "force", "A": "current", "V": "voltage", "": "voltage"}
-Match = tuple[Column | None, str]
+Match = tuple[SurveyedColumn | None, str]
 
 
 @dataclass
@@ -36,7 +36,7 @@ class Matcher:
     t: np.ndarray
     used: set[str]
 
-    def named(self, name: str, *roles: str) -> Column | None:
+    def named(self, name: str, *roles: str) -> SurveyedColumn | None:
         """The column that has the words of ``name``, of one of the roles."""
         wanted = set(words(name))
         for column in self.found.of(*roles):
@@ -44,7 +44,7 @@ class Matcher:
                 return column
         return None
 
-    def position(self, axis: str, axes: int) -> tuple[Column | None, list[str]]:
+    def position(self, axis: str, axes: int) -> tuple[SurveyedColumn | None, list[str]]:
         """The measured position of an axis; and all that it was chosen from, if several.
 
         Args:
@@ -68,7 +68,9 @@ class Matcher:
             best = other if alike and guesses.follows(best.values, other.values) else best
         return best, [c.name for c in found]
 
-    def inputs(self, wanted: Mapping[str, str], axes: tuple[Column, ...]) -> dict[str, Match]:
+    def inputs(
+        self, wanted: Mapping[str, str], axes: tuple[SurveyedColumn, ...]
+    ) -> dict[str, Match]:
         """The column of every input, and why it is thought so where that is not by its name.
 
         Args:
@@ -83,7 +85,7 @@ class Matcher:
             self.used |= {column.name} if column is not None else set()
         return given
 
-    def _input(self, name: str, si: str, axes: tuple[Column, ...]) -> Match:
+    def _input(self, name: str, si: str, axes: tuple[SurveyedColumn, ...]) -> Match:
         role = _INPUT_ROLE.get(si, "")
         free = [c for c in self.found.columns if c.name not in self.used]
         exact = next((c for c in free if c.name == name), None)
@@ -99,7 +101,7 @@ class Matcher:
                 return best, ", since the motion follows it"
         return None, ""
 
-    def driver(self, position: Column) -> tuple[Column | None, str]:
+    def driver(self, position: SurveyedColumn) -> tuple[SurveyedColumn | None, str]:
         """What drives an axis: by its motion, else by name; and what kind of input that is.
 
         The kind is that of the column, ``duty`` for a voltage given as a share of the supply.
@@ -111,7 +113,7 @@ class Matcher:
         duty = best.role == "voltage" and {"pwm", "duty"} & set(words(best.name))
         return best, "duty" if duty else best.role
 
-    def supply(self, driver: Column | None) -> Column | None:
+    def supply(self, driver: SurveyedColumn | None) -> SurveyedColumn | None:
         """The supply voltage beside a duty cycle: in volts or of no unit, and never negative."""
         for column in self.found.of("voltage"):
             known = column.conversion
@@ -120,7 +122,7 @@ class Matcher:
                 return column
         return None
 
-    def driving(self, position: Column) -> Column | None:
+    def driving(self, position: SurveyedColumn) -> SurveyedColumn | None:
         """The column that acceleration, velocity and friction of the motion explain best."""
         share = {}
         for column in self.found.columns:
@@ -143,7 +145,7 @@ class Matcher:
         return next(c for c in self.found.columns if c.name == best)
 
 
-def _compatible(column: Column, si: str) -> bool:
+def _compatible(column: SurveyedColumn, si: str) -> bool:
     """Whether nothing that the column says of its unit contradicts ``si``."""
     known = column.conversion
     return known is None or known.si == si

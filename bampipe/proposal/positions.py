@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from bampipe.data import guesses
-from bampipe.data.survey import Column, Survey, words
+from bampipe.data.survey import Survey, SurveyedColumn, words
 from bampipe.data.units import unit
 from bampipe.data.velocity import integral
 
@@ -13,12 +13,12 @@ _SLIDING = frozenset(["stroke", "displacement", "disp", "weg", "hub", "carriage"
 _FEWEST_COUNTS = 100
 
 
-def is_velocity(column: Column) -> bool:
+def is_velocity(column: SurveyedColumn) -> bool:
     """Whether a column that stands for the position is a velocity, to be integrated."""
     return column.role == "velocity" or column.name in ("v", "V")
 
 
-def in_counts(column: Column) -> bool:
+def in_counts(column: SurveyedColumn) -> bool:
     """Whether a position is in whole counts of no known unit."""
     return (
         column.conversion is None
@@ -27,7 +27,7 @@ def in_counts(column: Column) -> bool:
     )
 
 
-def slides(column: Column, found: Survey) -> bool:
+def slides(column: SurveyedColumn, found: Survey) -> bool:
     """Whether an axis slides rather than turns: by its unit, its name, or a force in newtons."""
     known = column.conversion
     if known is not None and known.si:
@@ -38,7 +38,7 @@ def slides(column: Column, found: Survey) -> bool:
     return any(force is not None and force.si == "N" for force in forces)
 
 
-def travelled(column: Column, t: np.ndarray) -> np.ndarray:
+def travelled(column: SurveyedColumn, t: np.ndarray) -> np.ndarray:
     """Position (T,) as the column has it; the integral over ``t`` (T,), s, of a velocity."""
     values: np.ndarray = np.nan_to_num(column.values)
     if not is_velocity(column):
@@ -46,7 +46,7 @@ def travelled(column: Column, t: np.ndarray) -> np.ndarray:
     return integral(t, values)
 
 
-def position_in_si(column: Column, t: np.ndarray, si: str) -> np.ndarray:
+def position_in_si(column: SurveyedColumn, t: np.ndarray, si: str) -> np.ndarray:
     """Position (T,) in ``si``, rad or m; an angle that wraps at a full turn is unwrapped."""
     values = travelled(column, t)
     if is_velocity(column):
@@ -55,7 +55,7 @@ def position_in_si(column: Column, t: np.ndarray, si: str) -> np.ndarray:
     return np.unwrap(values) if si == "rad" and not in_counts(column) else values
 
 
-def scale_to(si: str, column: Column) -> float:
+def scale_to(si: str, column: SurveyedColumn) -> float:
     """What brings the values of a column to ``si``, by its unit or by the likely one."""
     known = column.conversion
     if known is None or known.si != si:

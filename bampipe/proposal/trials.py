@@ -7,14 +7,14 @@ from itertools import pairwise
 from pathlib import Path
 
 from bampipe.data import guesses
-from bampipe.data.survey import Column, words
+from bampipe.data.survey import SurveyedColumn, words
 from bampipe.physics.device import Device
 from bampipe.proposal.matching import Matcher
 from bampipe.proposal.notes import Notes, quoted
 
 
 def trials_tables(
-    device: Device, axes: Mapping[str, Column], match: Matcher, notes: Notes
+    device: Device, axes: Mapping[str, SurveyedColumn], match: Matcher, notes: Notes
 ) -> list[str]:
     """Propose the trials and their kinds; a single long record is cut at rests of its first axis.
 

@@ -30,7 +30,7 @@ def spans(text: str) -> list[Span]:
 
 
 @dataclass(frozen=True)
-class Text:
+class Paragraph:
     """A paragraph."""
 
     text: str
@@ -102,7 +102,7 @@ class Figure:
     svg: str
 
 
-Block = Text | Subheading | Bullets | Callout | Table | Figure
+Block = Paragraph | Subheading | Bullets | Callout | Table | Figure
 
 
 @dataclass(frozen=True)

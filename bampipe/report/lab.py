@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 
 from bampipe.report import style, wording
 from bampipe.report.build import Report
-from bampipe.report.document import Block, Callout, Document, Figure, Section, Table, Text
+from bampipe.report.document import Block, Callout, Document, Figure, Paragraph, Section, Table
 from bampipe.results.lab import ControlChart, SessionVerdict, TrendsResult
 from bampipe.results.standing import AT_FLOOR
 
@@ -73,7 +73,7 @@ def _summary(trends: TrendsResult) -> Section:
         )
     if len(odd) > 6:
         more = wording.count(len(odd) - 6, "session")
-        blocks.append(Text(f"Besides these, {more} in the table below."))
+        blocks.append(Paragraph(f"Besides these, {more} in the table below."))
     rows = [
         (
             one.session,
@@ -126,7 +126,7 @@ def _charts(trends: TrendsResult) -> list[Section]:
         charts = [c for c in trends.series if c.device == device]
         title = "Parameters over time" + (f", {device}" if len(devices) > 1 else "")
         blocks: list[Block] = [
-            Text(
+            Paragraph(
                 "Each point is a session's estimate with two standard deviations. The line is the "
                 "median, the band the control limits: from the scatter between neighbouring "
                 "sessions and each session's own uncertainty, so wide that a session of an "
@@ -283,7 +283,7 @@ def _errors(folder: Path, trends: TrendsResult) -> Section | None:
         f"green band, below {AT_FLOOR:g}, a model leaves nothing that the session could show."
     )
     picture = Figure("errors", caption, style.svg(figure))
-    return Section("Prediction", (Text(said), picture))
+    return Section("Prediction", (Paragraph(said), picture))
 
 
 def _trials(folder: Path) -> Section | None:
@@ -297,7 +297,7 @@ def _trials(folder: Path) -> Section | None:
         f"{int((frame['status'] == 'repaired').sum())} repaired, "
         f"{int((frame['status'] == 'set_aside').sum())} set aside."
     )
-    blocks: list[Block] = [Text(said)]
+    blocks: list[Block] = [Paragraph(said)]
     if not odd.empty:
         rows = [
             (

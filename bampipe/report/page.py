@@ -14,9 +14,9 @@ from bampipe.report.document import (
     Callout,
     Document,
     Figure,
+    Paragraph,
     Subheading,
     Table,
-    Text,
     spans,
 )
 from bampipe.report.typeset import next_number, numbering
@@ -55,7 +55,7 @@ def _rich(text: str) -> str:
 
 def _block(block: Block, number: str) -> str:
     match block:
-        case Text(text):
+        case Paragraph(text):
             return f"<p>{_rich(text)}</p>"
         case Subheading(text):
             return f"<h3>{_rich(text)}</h3>"

@@ -214,7 +214,7 @@ class Results:
 
         return tuple(sorted(parameters, key=rank))
 
-    def of_model(self, name: str, model: str | None = None) -> str:
+    def model_file(self, name: str, model: str | None = None) -> str:
         """Return the relative path of a file of ``model`` (default: the one in detail)."""
         return f"models/{model or self.model}/{name}"
 
@@ -229,9 +229,9 @@ class Results:
         path = Path(__file__).parent / "templates" / f"paper-{self.session.device}.toml"
         return read_toml(path) if path.is_file() else None
 
-    def as_in(self, place: str) -> str:
-        """Return " (the paper's <place>)" where the device has a paper, else ""."""
-        return f" (the paper's {place})" if self.paper else ""
+    def in_paper(self, item: str) -> str:
+        """Return " (the paper's <item>)" where the device has a paper, else ""."""
+        return f" (the paper's {item})" if self.paper else ""
 
 
 def _differs(name: str, maker: StepRecord, digest: str) -> bool:

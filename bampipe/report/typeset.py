@@ -20,10 +20,10 @@ from bampipe.report.document import (
     Callout,
     Document,
     Figure,
+    Paragraph,
     Span,
     Subheading,
     Table,
-    Text,
     spans,
 )
 
@@ -94,7 +94,7 @@ def next_number(numbers: dict[type, Iterator[str]], block: Block) -> str:
 
 def _block(block: Block, number: str) -> dict[str, object]:
     match block:
-        case Text(text):
+        case Paragraph(text):
             return {"kind": "text", "text": spans(text)}
         case Subheading(text):
             return {"kind": "subheading", "text": spans(text)}

@@ -6,8 +6,9 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from bampipe.results.record import Count, Names, Record, Result, Share, Size
+from bampipe.results.record import Names, Record, Result, Share, Size
 from bampipe.results.standing import Standing
+from bampipe.schema import Count
 
 Verdict = Literal["nothing_missing", "missing", "undecided", "unknown_effect"]
 UpToOne = Annotated[float, Field(le=1)]

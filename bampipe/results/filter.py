@@ -6,7 +6,8 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from bampipe.results.record import Positive, Record, Result, Share, Size
+from bampipe.results.record import Record, Result, Share, Size
+from bampipe.schema import Positive
 
 
 class ResidualBand(Record):
@@ -18,7 +19,7 @@ class ResidualBand(Record):
     motion_hz: Positive = Field(description="Bandwidth of the filtered motion")
 
 
-class AxisFilter(Record):
+class AxisDifferentiation(Record):
     """How one axis was differentiated; standard deviations are medians over samples and trials."""
 
     unit: Literal["rad", "m"]
@@ -53,7 +54,7 @@ class FilterResult(Result):
     method: str
     method_reason: str
     sample_rate_hz: Positive
-    axes: dict[str, AxisFilter] = Field(min_length=1)
+    axes: dict[str, AxisDifferentiation] = Field(min_length=1)
     force: ForceFilter
     bridged_fraction: dict[str, Share] = Field(
         description="By trial: share of its grid that had no sample"

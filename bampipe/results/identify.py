@@ -6,10 +6,11 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from bampipe.results.record import Count, Names, Record, Result, Share, Size
+from bampipe.results.record import Names, Record, Result, Share, Size
+from bampipe.schema import Count
 
 
-class Estimate(Record):
+class ParameterEstimate(Record):
     """One parameter."""
 
     estimate: float
@@ -67,7 +68,7 @@ class Consistency(Record):
     by_trial: dict[str, Size]
 
 
-class InnovationTest(Record):
+class InnovationTestResult(Record):
     """A test of the innovations: Ljung-Box, or F."""
 
     statistic: float
@@ -76,19 +77,19 @@ class InnovationTest(Record):
     share: Share
 
 
-class Whiteness(InnovationTest):
+class Whiteness(InnovationTestResult):
     """Whether the innovations follow from their past."""
 
     white: bool
 
 
-class Independence(InnovationTest):
+class Independence(InnovationTestResult):
     """Whether the inputs predict the innovations."""
 
     independent: bool
 
 
-class Innovations(Record):
+class InnovationTests(Record):
     """Both tests of one axis."""
 
     sentence: str
@@ -183,7 +184,7 @@ class IdentifyResult(Result):
     method: Literal["ukf", "least-squares", "output-error"]
     engine: Literal["compiled", "filterpy"]
     trials: Names = Field(description="Free trials used")
-    parameters: dict[str, Estimate] = Field(
+    parameters: dict[str, ParameterEstimate] = Field(
         description="By name: viscous.<axis>, coulomb.<axis>, mass, <effect>[.<axis>].<parameter>"
     )
     covariance: Covariance
@@ -193,7 +194,7 @@ class IdentifyResult(Result):
     identifiability: IdentifiabilityReport | None = None
     notes: Names = Field(default=(), description="What to know before believing a number")
     nis: Consistency | None = None
-    innovations: dict[str, Innovations] | None = Field(default=None, description="By axis")
+    innovations: dict[str, InnovationTests] | None = Field(default=None, description="By axis")
     noise: NoiseLevels | None = None
     position_error: dict[str, Size] | None = Field(
         default=None,

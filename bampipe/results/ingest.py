@@ -6,7 +6,8 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from bampipe.results.record import Names, Positive, Record, Result, Size
+from bampipe.results.record import Names, Record, Result, Size
+from bampipe.schema import Positive
 
 
 class EncoderChannel(Record):
@@ -33,7 +34,7 @@ class ForceChannels(Record):
     )
 
 
-class Channel(Record):
+class RecordedChannel(Record):
     """A brake command, or another recorded channel."""
 
     unit: str
@@ -67,5 +68,5 @@ class IngestResult(Result):
     sensor_warnings: Names = Field(
         description="Where stated and measured noise or resolution disagree by more than twice"
     )
-    brakes: dict[str, Channel]
-    channels: dict[str, Channel]
+    brakes: dict[str, RecordedChannel]
+    channels: dict[str, RecordedChannel]

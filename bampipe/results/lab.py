@@ -6,7 +6,8 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from bampipe.results.record import Count, Names, Record, Result, Share, Size
+from bampipe.results.record import Names, Record, Result, Share, Size
+from bampipe.schema import Count
 
 
 class LabResult(Result):

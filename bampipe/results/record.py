@@ -19,9 +19,7 @@ from bampipe.files import read_json_table, write_json
 from bampipe.schema import Declaration, refusal
 
 Size = Annotated[float, Field(ge=0)]
-Positive = Annotated[float, Field(gt=0)]
 Share = Annotated[float, Field(ge=0, le=1)]
-Count = Annotated[int, Field(ge=0)]
 Names = tuple[str, ...]
 
 

@@ -6,7 +6,8 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from bampipe.results.record import Names, Positive, Record, Result, Size
+from bampipe.results.record import Names, Record, Result, Size
+from bampipe.schema import Positive
 
 
 class Bandwidth(Record):

@@ -6,8 +6,9 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import ConfigDict, Field
 
-from bampipe.results.record import Count, Names, Positive, Record, Result, Size
+from bampipe.results.record import Names, Record, Result, Size
 from bampipe.results.standing import Standing
+from bampipe.schema import Count, Positive
 
 
 class AxisError(Record):

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Verdict:
+class GateVerdict:
     """What came of one gate for one axis (or for the one number it guards).
 
     Attributes:
@@ -61,13 +61,13 @@ def _number(value: object) -> float | None:
     return float(value) if math.isfinite(value) else None
 
 
-def _missing(gate: Gate, key: str, what: str) -> Verdict:
+def _missing(gate: Gate, key: str, what: str) -> GateVerdict:
     if gate.optional:
-        return Verdict(gate.name, key, "absent", None, what)
-    return Verdict(gate.name, key, "failed" if gate.level == "fail" else "warned", None, what)
+        return GateVerdict(gate.name, key, "absent", None, what)
+    return GateVerdict(gate.name, key, "failed" if gate.level == "fail" else "warned", None, what)
 
 
-def judge(gate: Gate, root: Path, model: str, baseline: Path) -> list[Verdict]:
+def judge_gates(gate: Gate, root: Path, model: str, baseline: Path) -> list[GateVerdict]:
     """Return the verdicts of ``gate`` on the run folder ``root``.
 
     Args:
@@ -107,17 +107,17 @@ def judge(gate: Gate, root: Path, model: str, baseline: Path) -> list[Verdict]:
     return verdicts
 
 
-def _judged(gate: Gate, key: str, value: float | None, word: object) -> Verdict:
+def _judged(gate: Gate, key: str, value: float | None, word: object) -> GateVerdict:
     """Return the verdict that a stage stored as a word; ``value`` is shown beside it."""
     number = "no number" if value is None else f"{value:.4g}"
     text = f"{number}, {str(word).replace('_', ' ')}"
     if word in gate.passes:
-        return Verdict(gate.name, key, "passed", value, text)
+        return GateVerdict(gate.name, key, "passed", value, text)
     state = "failed" if gate.level == "fail" else "warned"
-    return Verdict(gate.name, key, state, value, "; ".join(filter(None, [text, gate.advice])))
+    return GateVerdict(gate.name, key, state, value, "; ".join(filter(None, [text, gate.advice])))
 
 
-def _hold(gate: Gate, key: str, value: float, said: str) -> Verdict:
+def _hold(gate: Gate, key: str, value: float, said: str) -> GateVerdict:
     """Return the verdict on ``value``; ``said`` follows the number in the message."""
     limits = []
     if gate.max is not None and value > gate.max:
@@ -125,15 +125,15 @@ def _hold(gate: Gate, key: str, value: float, said: str) -> Verdict:
     if gate.min is not None and value < gate.min:
         limits.append(f"{value:.4g}{said} is below {gate.min:g}")
     if not limits:
-        return Verdict(gate.name, key, "passed", value, f"{value:.4g}{said}")
+        return GateVerdict(gate.name, key, "passed", value, f"{value:.4g}{said}")
     state = "failed" if gate.level == "fail" else "warned"
     text = "; ".join([*limits, gate.advice] if gate.advice else limits)
-    return Verdict(gate.name, key, state, value, text)
+    return GateVerdict(gate.name, key, state, value, text)
 
 
 def _against_accepted(
     gate: Gate, root: Path, model: str, baseline: Path, content: Mapping[str, Any]
-) -> list[Verdict]:
+) -> list[GateVerdict]:
     """Hold the change since the accepted values, beyond its uncertainty, against the limit."""
     from bampipe.results.ingest import IngestResult
 

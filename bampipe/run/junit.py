@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from bampipe.errors import printable
-from bampipe.run.gates import Verdict
+from bampipe.run.gates import GateVerdict
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class Suite:
     """
 
     name: str
-    verdicts: tuple[Verdict, ...]
+    verdicts: tuple[GateVerdict, ...]
     error: str = ""
 
 

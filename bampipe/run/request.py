@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bampipe.errors import InputError
-from bampipe.run.gates import Verdict
+from bampipe.run.gates import GateVerdict
 from bampipe.stages import base
 
 if TYPE_CHECKING:
@@ -103,7 +103,7 @@ class Outcome:
     root: Path
     state: str
     steps: tuple[StepResult, ...] = ()
-    verdicts: tuple[Verdict, ...] = ()
+    verdicts: tuple[GateVerdict, ...] = ()
     error: str = ""
     traceback: str = ""
 
@@ -137,7 +137,7 @@ def selected(request: Request) -> tuple[str, ...]:
     stages = request.pipeline.stages
     for name in (request.first, request.last):
         if name:
-            base.check_name(name)
+            base.check_stage_name(name)
         if name and name not in stages:
             raise InputError(
                 f"pipeline {request.pipeline.name!r} has no stage {name!r}",

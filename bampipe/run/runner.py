@@ -11,7 +11,7 @@ from bampipe import compile_ahead
 from bampipe.errors import InputError
 from bampipe.run import accepted, hashing, models, record, staging
 from bampipe.run.events import Event, Listener, unheard
-from bampipe.run.gates import Verdict, judge
+from bampipe.run.gates import GateVerdict, judge_gates
 from bampipe.run.request import Outcome, Request, Step, StepResult, selected
 from bampipe.run.state import RunState, lasting
 from bampipe.stages import base
@@ -36,7 +36,7 @@ class _Runner:
         clock = time.perf_counter()
         state = self.state
         config = state.configure(step, state.settings(step))
-        module = base.load(step.stage)
+        module = base.load_stage(step.stage)
         declared = module.inputs(config)
         inputs = state.inputs(step, declared)
         outputs = module.outputs(config)
@@ -100,11 +100,11 @@ class _Runner:
                     models.read(self.root, self.request.model)
             for step in self.state.steps(stage):
                 results.append(self.step(step))
-        verdicts: list[Verdict] = []
+        verdicts: list[GateVerdict] = []
         if self.request.judged:
             baseline = self.request.accepted or accepted.beside(self.root.parent)
             for gate in pipeline.gates:
-                verdicts += judge(gate, self.root, self.request.judged, baseline)
+                verdicts += judge_gates(gate, self.root, self.request.judged, baseline)
         self.state.close(verdicts)
         return Outcome(self.root, "done", tuple(results), tuple(verdicts))
 

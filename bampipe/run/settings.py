@@ -26,7 +26,7 @@ def configure(stage: str, settings: Mapping[str, object], where: str = "") -> An
 
     from bampipe.schema import refusal
 
-    kind = base.load(stage).Config
+    kind = base.load_stage(stage).Config
     try:
         return kind(**settings)
     except ValidationError as error:

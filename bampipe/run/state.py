@@ -11,7 +11,7 @@ from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError
 from bampipe.files import digest_content, digest_file, digest_input
 from bampipe.run import hashing, models, record
-from bampipe.run.gates import Verdict
+from bampipe.run.gates import GateVerdict
 from bampipe.run.request import Request, Step
 from bampipe.run.settings import configure, plain
 from bampipe.stages import base
@@ -86,7 +86,7 @@ class RunState:
             where = ""
         if step.stage in base.READS_SESSION:
             settings = {**settings, "session": str(self.session_folder().resolve())}
-        fields = base.load(step.stage).Config.__dataclass_fields__
+        fields = base.load_stage(step.stage).Config.__dataclass_fields__
         if self.request.processes and "jobs" in fields:
             settings = {"jobs": self.request.processes, **settings}
         return configure(step.stage, settings, where)
@@ -157,7 +157,7 @@ class RunState:
         if made is not None and made.settings == self.settings(step) and made.code == code:
             return made.config, made.declared_inputs, None
         config = self.configure(step, self.settings(step))
-        return lasting(config), base.load(step.stage).inputs(config), config
+        return lasting(config), base.load_stage(step.stage).inputs(config), config
 
     def reason(self, step: Step) -> str:
         """Why the step must run; "" if it need not."""
@@ -202,7 +202,7 @@ class RunState:
         """Write ``run.json``."""
         self._write(self._noted())
 
-    def close(self, verdicts: Iterable[Verdict]) -> None:
+    def close(self, verdicts: Iterable[GateVerdict]) -> None:
         """Write ``run.json`` with the verdicts of the gates, unless it says the same already."""
         from bampipe.results.run import GateVerdict, PipelineUsed
 
@@ -245,7 +245,7 @@ def _maker(name: str) -> str:
         return head if head in base.STAGES else ""
     model = rest.partition("/")[0]
     for stage in base.PER_MODEL:
-        if name in base.load(stage).outputs(configure(stage, {"model": model})):
+        if name in base.load_stage(stage).outputs(configure(stage, {"model": model})):
             return stage
     return ""
 

@@ -1,4 +1,4 @@
-"""What the sensors and the logger of a simulated plant write: counts, volts, brake commands."""
+"""What the sensors and the logger of a simulated machine write: counts, volts, brake commands."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from bampipe.errors import InputError
 from bampipe.physics.device import INPUT_ORDERS, Coordinate, Device, derivative
 from bampipe.physics.system import System
-from bampipe.simulator.plant import Config, Plant, input_column
+from bampipe.simulator.specimen import Config, Specimen, input_column
 from bampipe.simulator.true_trials import TrueTrial
 
 Array = NDArray[np.float64]
@@ -30,13 +30,13 @@ _TOO_HIGH = range(3, len(INPUT_ORDERS))
 
 
 def record_trial(
-    plant: Plant, config: Config, rng: np.random.Generator, true: TrueTrial, locked: bool
+    specimen: Specimen, config: Config, rng: np.random.Generator, true: TrueTrial, locked: bool
 ) -> pd.DataFrame:
     """Return what the logger writes: whole counts, volts, brake commands."""
-    device = plant.device
-    force = _sensed_force(plant, true) + config.force_noise * rng.normal(size=true.force.shape)
+    device = specimen.device
+    force = _sensed_force(specimen, true) + config.force_noise * rng.normal(size=true.force.shape)
     # A locked trial winds up the transmission itself: the encoder sees the deflection as given.
-    q = _sensed_position(plant, true, np.zeros_like(true.force) if locked else true.force)
+    q = _sensed_position(specimen, true, np.zeros_like(true.force) if locked else true.force)
     columns: dict[str, Any] = {"time_us": np.round(true.t * 1e6).astype(np.int64)}
     for i, c in enumerate(device.coordinates):
         name, per_unit, zero = _encoder_settings(c)
@@ -64,12 +64,12 @@ def _sensor_inputs(system: System, true: TrueTrial, force: Array) -> Array:
     return u
 
 
-def _sensed_position(plant: Plant, true: TrueTrial, force: Array) -> Array:
+def _sensed_position(specimen: Specimen, true: TrueTrial, force: Array) -> Array:
     """The reading q_m that solves q_true = q_m + offset(q_m), by iteration; ``force`` loads it."""
-    if plant.position is None:
+    if specimen.position is None:
         return true.q
-    system = plant.position
-    u, p = _sensor_inputs(system, true, force), plant.p(system)
+    system = specimen.position
+    u, p = _sensor_inputs(system, true, force), specimen.p(system)
     q = true.q
     for _ in range(100):
         step = true.q - system.true_motion(q, true.qd, np.zeros_like(q), u, p)[0]
@@ -79,7 +79,7 @@ def _sensed_position(plant: Plant, true: TrueTrial, force: Array) -> Array:
     raise InputError("a position effect is too strong to be simulated", remedy="weaken it")
 
 
-def _sensed_force(plant: Plant, true: TrueTrial) -> Array:
+def _sensed_force(specimen: Specimen, true: TrueTrial) -> Array:
     """The reading of the force sensor, without noise.
 
     The effects say true = T(reading). T is affine in the reading and its two derivatives, so its
@@ -87,15 +87,15 @@ def _sensed_force(plant: Plant, true: TrueTrial) -> Array:
     sample by sample where derivatives take part (implicit differences, stable for any lag).
     """
     late = np.column_stack(
-        [np.interp(true.t - plant.delay, true.t, column) for column in true.force.T]
+        [np.interp(true.t - specimen.delay, true.t, column) for column in true.force.T]
     )
-    if plant.force is None:
+    if specimen.force is None:
         return late
-    system, nf = plant.force, late.shape[1]
+    system, nf = specimen.force, late.shape[1]
     if system.memory_names:
         raise InputError("an input effect with internal states cannot be simulated")
-    p, no_states = plant.p(system), np.zeros((len(late), 0))
-    still, names = np.zeros_like(true.q), plant.device.forces
+    p, no_states = specimen.p(system), np.zeros((len(late), 0))
+    still, names = np.zeros_like(true.q), specimen.device.forces
     inverse = np.linalg.pinv(system.input_map(true.q))
 
     def corrected(u: Array) -> Array:

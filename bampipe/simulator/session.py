@@ -1,6 +1,6 @@
 """A session in the raw-log format, recorded from the model itself, with effects hidden in it.
 
-The plant is the compiled model with the effects of kind torque and energy; the effects of kind
+The specimen is the compiled model with the effects of kind torque and energy; the effects of kind
 input and measurement act on what its sensors read. The truth goes into a file beside the session
 folder, never inside.
 """
@@ -19,8 +19,8 @@ from bampipe.files import write_json, write_text
 from bampipe.physics.device import Device
 from bampipe.progress import Progress, silent
 from bampipe.results.truth import TruthResult
-from bampipe.simulator.plant import Config, draw_plant
 from bampipe.simulator.recording import format_session_file, record_trial
+from bampipe.simulator.specimen import Config, draw_specimen
 from bampipe.simulator.true_trials import simulate_locked_trial, simulate_moving_trial
 
 __all__ = ["Config", "simulate_session"]
@@ -48,8 +48,8 @@ def simulate_session(out: Path, config: Config, progress: Progress = silent) -> 
         )
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError("exists and is not an empty folder", where=str(out))
-    plant, strengths = draw_plant(config)
-    trials = _plan(plant.device, config)
+    specimen, strengths = draw_specimen(config)
+    trials = _plan(specimen.device, config)
     try:
         (out / "trials").mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -57,25 +57,25 @@ def simulate_session(out: Path, config: Config, progress: Progress = silent) -> 
     for number, trial in enumerate(trials):
         rng = np.random.default_rng([config.seed, 1 + number])
         if trial["kind"] == "locked":
-            true = simulate_locked_trial(plant, config, rng, trial["locked_axis"])
+            true = simulate_locked_trial(specimen, config, rng, trial["locked_axis"])
         else:
-            true = simulate_moving_trial(plant, config, rng, trial["kind"] == "viscous")
-        frame = record_trial(plant, config, rng, true, trial["kind"] == "locked")
+            true = simulate_moving_trial(specimen, config, rng, trial["kind"] == "viscous")
+        frame = record_trial(specimen, config, rng, true, trial["kind"] == "locked")
         path = out / trial["file"]
         if config.file_format == "csv":
             write_text(path, frame.to_csv(index=False, lineterminator="\n"))
         else:
             store.write_parquet(path, frame)
         progress((number + 1) / len(trials), trial["file"])
-    write_text(out / "session.toml", format_session_file(out.name, plant.device, config, trials))
+    write_text(out / "session.toml", format_session_file(out.name, specimen.device, config, trials))
     truth = out.with_name(out.name + ".truth.json")
     found = TruthResult(
         schema="bampipe.truth/1",
-        device=plant.device.name,
+        device=specimen.device.name,
         effects=strengths,
         configuration=asdict(config),
-        parameters=dict(plant.values),
-        stiffness=dict(plant.stiffness) if config.locked_trials else {},
+        parameters=dict(specimen.values),
+        stiffness=dict(specimen.stiffness) if config.locked_trials else {},
     )
     write_json(truth, found.model_dump(mode="json"))
     return {

@@ -1,4 +1,4 @@
-"""What a person does to a simulated plant: free and locked trials, trials in a viscous field."""
+"""What a person does to a simulated machine: free and locked trials, trials in a viscous field."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from bampipe.estimate.simulation import Impedance, simulate_tracking
 from bampipe.physics.device import Coordinate, Device, derivative
-from bampipe.simulator.plant import Config, Plant, input_column
+from bampipe.simulator.specimen import Config, Specimen, input_column
 
 Array = NDArray[np.float64]
 
@@ -63,10 +63,10 @@ def _draw_wanted_motion(
 
 
 def simulate_moving_trial(
-    plant: Plant, config: Config, rng: np.random.Generator, viscous: bool
+    specimen: Specimen, config: Config, rng: np.random.Generator, viscous: bool
 ) -> TrueTrial:
     """A free trial, or one in a viscous field."""
-    system, device = plant.motion, plant.device
+    system, device = specimen.motion, specimen.device
     dt = 1.0 / config.sample_rate
     t = np.arange(round(config.duration * config.sample_rate), dtype=np.float64) * np.float64(dt)
     q_ref, qd_ref = _draw_wanted_motion(device, config, rng, t, 0.6 if viscous else 1.0)
@@ -80,7 +80,7 @@ def simulate_moving_trial(
     brakes = [system.inputs.index(device.brakes[c.name]) for c in device.coordinates] if (
         viscous or set(device.brakes) == {c.name for c in device.coordinates}
     ) else []  # fmt: skip
-    p = plant.p(system)
+    p = specimen.p(system)
     x0 = np.concatenate([q_ref[0], np.zeros(n), system.initial_memory(q_ref[0], u[0], p)])
     pose = q_ref
     # The field J^T K J needs the pose; its own motion settles after a few rounds.
@@ -98,22 +98,22 @@ def simulate_moving_trial(
 
 
 def simulate_locked_trial(
-    plant: Plant, config: Config, rng: np.random.Generator, axis: str
+    specimen: Specimen, config: Config, rng: np.random.Generator, axis: str
 ) -> TrueTrial:
     """An axis held by its brake while the handle is loaded: the transmission winds up.
 
     The load is stiffness times deflection plus friction that builds up over a tenth of the
     deflection (Dahl), which gives the loop of Fig. 3.
     """
-    device = plant.device
+    device = specimen.device
     names = [c.name for c in device.coordinates]
     i = names.index(axis)
     kind = device.coordinates[i].kind
-    stiffness = plant.stiffness[axis]
+    stiffness = specimen.stiffness[axis]
     t = np.arange(round(LOCKED_PERIOD * LOCKED_CYCLES * config.sample_rate)) / config.sample_rate
     peak = LOCKED_LOAD[kind] / stiffness
     deflection = peak * (1 - 0.03 * rng.uniform()) * np.sin(2 * np.pi * t / LOCKED_PERIOD)
-    friction = 1.5 * plant.values.get(f"coulomb.{axis}", 0.02 * LOCKED_LOAD[kind])
+    friction = 1.5 * specimen.values.get(f"coulomb.{axis}", 0.02 * LOCKED_LOAD[kind])
     share = np.empty(len(t))
     share[0] = 0.0
     for k, step in enumerate(np.diff(deflection)):
@@ -125,7 +125,7 @@ def simulate_locked_trial(
     q[:, i] += deflection
     load = np.zeros((len(t), len(names)))
     load[:, i] = stiffness * deflection + friction * share
-    force = _handle_forces(plant.motion.input_map(q), load)
+    force = _handle_forces(specimen.motion.input_map(q), load)
     wander = rng.uniform(0.0, 2 * np.pi, size=force.shape[1])
     others = np.abs(force).max(axis=0) < 0.05 * np.abs(force).max()
     force += np.where(others, 1.2 * np.sin(2 * np.pi * 0.17 * t[:, None] + wander), 0.0)

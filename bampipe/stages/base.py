@@ -80,18 +80,18 @@ PER_MODEL: tuple[str, ...] = (
 """Stages whose ``Config`` has a field ``model``: they run once for each model."""
 
 
-def check_name(name: str) -> None:
+def check_stage_name(name: str) -> None:
     """Raise InputError unless there is a stage ``name``."""
     if name in STAGES:
         return
     raise InputError(f"no stage {name!r}", remedy=choose_from(name, STAGES))
 
 
-def load(name: str) -> Stage:
+def load_stage(name: str) -> Stage:
     """Import and return the stage ``name``.
 
     Raises:
         InputError: there is no such stage.
     """
-    check_name(name)
+    check_stage_name(name)
     return cast(Stage, importlib.import_module(f"bampipe.stages.{name}"))

@@ -23,7 +23,7 @@ SUMMARY = "Held-out error of every model version, and which parameters moved"
 
 @checked_dataclass(frozen=True, config=STRICT)
 class Config:
-    """What the stage can be told.
+    """Settings of the stage.
 
     Attributes:
         sigmas: a parameter has moved when it changed by more than this many standard deviations

@@ -36,7 +36,7 @@ SUMMARY = "Find which physical effect the model lacks"
 
 @checked_dataclass(frozen=True, config=STRICT)
 class Config:
-    """What the stage can be told.
+    """Settings of the stage.
 
     Attributes:
         model: which model version to diagnose.

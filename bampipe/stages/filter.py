@@ -45,7 +45,7 @@ _TUNING_PART = 2000
 
 @checked_dataclass(frozen=True, config=STRICT)
 class Config:
-    """What the stage can be told.
+    """Settings of the stage.
 
     Attributes:
         method: ``kalman`` (fixed-interval smoother), ``butterworth`` (zero-phase filter and

@@ -18,7 +18,7 @@ import pyarrow as pa
 from pydantic import Field
 from pydantic.dataclasses import dataclass as checked_dataclass
 
-from bampipe.data.quality import CleanTrial, Limits, clean
+from bampipe.data.quality import CleaningLimits, CleanTrial, clean
 from bampipe.data.readers import read_trial
 from bampipe.data.run_folder import MOVING, RunFolder
 from bampipe.data.session import SECONDS, Session, TrialEntry, inside, read_session
@@ -29,7 +29,7 @@ from bampipe.physics import registry
 from bampipe.physics.device import Device
 from bampipe.physics.units import parse_unit
 from bampipe.progress import Progress
-from bampipe.results.ingest import Channel, EncoderChannel, ForceChannels, IngestResult
+from bampipe.results.ingest import EncoderChannel, ForceChannels, IngestResult, RecordedChannel
 from bampipe.schema import STRICT
 from bampipe.trials.sensors import RecordNoise, settle_encoder, settle_force
 
@@ -41,8 +41,8 @@ RATE_TOLERANCE = 0.02
 
 
 @checked_dataclass(frozen=True, config=STRICT)
-class Config(Limits):
-    """What the stage can be told, beside the limits of a sound trial.
+class Config(CleaningLimits):
+    """Settings of the stage, beside the limits of a sound trial.
 
     Attributes:
         session: folder of the session.
@@ -349,8 +349,10 @@ def _description(
         sensor_warnings=tuple(
             sensor.warning for sensor in (*encoders.values(), *forces.values()) if sensor.warning
         ),
-        brakes={f"brake_{brake.axis}": Channel(unit=brake.unit) for brake in session.brakes},
-        channels={channel.name: Channel(unit=channel.unit) for channel in session.channels},
+        brakes={
+            f"brake_{brake.axis}": RecordedChannel(unit=brake.unit) for brake in session.brakes
+        },
+        channels={channel.name: RecordedChannel(unit=channel.unit) for channel in session.channels},
     )
 
 

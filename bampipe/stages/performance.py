@@ -37,7 +37,7 @@ Array = NDArray[np.float64]
 
 @checked_dataclass(frozen=True, config=STRICT)
 class Config:
-    """What the stage can be told.
+    """Settings of the stage.
 
     Attributes:
         model: which model version.

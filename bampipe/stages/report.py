@@ -29,7 +29,7 @@ _PER_MODEL = (
 
 @checked_dataclass(frozen=True, config=STRICT)
 class Config:
-    """What the stage can be told.
+    """Settings of the stage.
 
     Attributes:
         detail_model: the model whose parameters and predictions are shown in detail; "" for the

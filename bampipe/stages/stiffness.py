@@ -37,7 +37,7 @@ Array = NDArray[np.float64]
 
 @checked_dataclass(frozen=True, config=STRICT)
 class Config:
-    """What the stage can be told.
+    """Settings of the stage.
 
     Attributes:
         largest_drift: a locked trial whose loops drift from the first to the last cycle by more

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bampipe.data.quality import Limits, clean
+from bampipe.data.quality import CleaningLimits, clean
 from bampipe.data.readers import RawTrial
 from bampipe.data.session import session_from
 from bampipe.errors import InputError
@@ -51,7 +51,7 @@ def columns(n=N, seed=0):
 
 def cleaned(table, kind=0, limits=None):
     raw = RawTrial({name: np.array(values, dtype=float) for name, values in table.items()}, 2)
-    return clean(raw, SESSION, SESSION.trials[kind], limits or Limits())
+    return clean(raw, SESSION, SESSION.trials[kind], limits or CleaningLimits())
 
 
 def test_a_sound_trial_comes_through_untouched():
@@ -76,7 +76,7 @@ def test_a_force_of_several_columns_is_their_weighted_sum():
     table["pulse"] = np.where(np.arange(N) % 200 < 100, 40.0, 0.0)
     raw = RawTrial({name: np.array(values, dtype=float) for name, values in table.items()}, 2)
     session = session_from({**TABLE, "force": force}, Path())
-    trial = clean(raw, session, session.trials[0], Limits())
+    trial = clean(raw, session, session.trials[0], CleaningLimits())
     wanted = 35.0 * (table["volts"] - 0.1) + table["pulse"]
     np.testing.assert_allclose(trial.columns["force_motor"], wanted)
 
@@ -139,7 +139,7 @@ def test_a_trial_is_a_stretch_of_a_record():
     table = {**TABLE, "trials": [{"file": "a.csv", "kind": "free", "start_s": 0.5, "end_s": 2.0}]}
     session = session_from(table, Path())
     whole = columns()
-    trial = clean(RawTrial(columns(), 2), session, session.trials[0], Limits())
+    trial = clean(RawTrial(columns(), 2), session, session.trials[0], CleaningLimits())
     assert len(trial.t) == 750 and trial.t[0] == 0.0 and trial.repairs == []
     np.testing.assert_allclose(trial.columns["q_turn"], whole["turn"][250:1000])
     assert trial.notes == ["from 0.5 to 2 s of the record"]
@@ -149,7 +149,7 @@ def test_a_stretch_after_the_end_of_the_record_is_refused():
     table = {**TABLE, "trials": [{"file": "a.csv", "kind": "free", "start_s": 3.0}]}
     session = session_from(table, Path())
     with pytest.raises(InputError, match=r"after the last sample, at 2\.998 s"):
-        clean(RawTrial(columns(), 2), session, session.trials[0], Limits())
+        clean(RawTrial(columns(), 2), session, session.trials[0], CleaningLimits())
 
 
 def test_an_unsigned_register_is_read_as_signed():
@@ -158,11 +158,11 @@ def test_an_unsigned_register_is_read_as_signed():
     signed = np.rint(300 * np.sin(np.arange(N) / 40.0))
     raw = columns() | {"pwm": np.where(signed < 0, signed + 65536, signed)}
     raw["pwm"][np.flatnonzero(np.diff(np.sign(signed)))[3]] = np.nan
-    trial = clean(RawTrial(raw, 2), session, session.trials[0], Limits())
+    trial = clean(RawTrial(raw, 2), session, session.trials[0], CleaningLimits())
     np.testing.assert_allclose(trial.columns["duty"], 0.5 * signed, atol=3.0)
     below = columns() | {"pwm": signed}
     with pytest.raises(InputError, match="expected 0 to 65535"):
-        clean(RawTrial(below, 2), session, session.trials[0], Limits())
+        clean(RawTrial(below, 2), session, session.trials[0], CleaningLimits())
 
 
 def test_limits_are_heeded():
@@ -170,7 +170,10 @@ def test_limits_are_heeded():
     table["force_x"][100:107] = np.nan
     with pytest.raises(InputError, match=r"a\.csv, row 102, column 'force_x': 7 samples in a row"):
         cleaned(table)
-    assert "7 missing samples interpolated" in cleaned(table, limits=Limits(nan_run=7)).repairs[0]
+    assert (
+        "7 missing samples interpolated"
+        in cleaned(table, limits=CleaningLimits(nan_run=7)).repairs[0]
+    )
 
 
 def test_interpolation_follows_the_time_stamps():

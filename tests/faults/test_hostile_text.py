@@ -14,12 +14,20 @@ from conftest import Toy
 
 from bampipe.cli import show
 from bampipe.errors import InputError, printable
-from bampipe.report.document import Bullets, Callout, Document, Section, Subheading, Table, Text
+from bampipe.report.document import (
+    Bullets,
+    Callout,
+    Document,
+    Paragraph,
+    Section,
+    Subheading,
+    Table,
+)
 from bampipe.report.page import page
 from bampipe.report.typeset import pdf
 from bampipe.run import junit
 from bampipe.run.events import Event
-from bampipe.run.gates import Verdict
+from bampipe.run.gates import GateVerdict
 from bampipe.run.markdown import summary
 from bampipe.run.request import Outcome
 
@@ -92,7 +100,7 @@ carriage = {{ column = "x", counts_per_unit = 1.0, unit = "m" }}
 
 @pytest.mark.parametrize("control", CONTROLS)
 def test_junit_is_xml_whatever_a_session_is_called(control: str) -> None:
-    verdict = Verdict(f"gate{control}", f"yaw{control}", "failed", 1.0, f"bad{control}{MARKUP}")
+    verdict = GateVerdict(f"gate{control}", f"yaw{control}", "failed", 1.0, f"bad{control}{MARKUP}")
     suites = [junit.Suite(f"s{control}", (verdict,)), junit.Suite(MARKUP, (), f"no{control}")]
     top = ElementTree.fromstring(junit.junit(suites))
     assert [suite.get("name") for suite in top] == [printable(f"s{control}"), MARKUP]
@@ -133,7 +141,7 @@ HOSTILE = (
 @pytest.mark.parametrize("text", HOSTILE)
 def test_the_report_takes_names_for_text(text: str) -> None:
     blocks = (
-        Text(text),
+        Paragraph(text),
         Subheading(text),
         Bullets((text,)),
         Callout("good", text, text),

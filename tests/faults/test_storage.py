@@ -206,7 +206,7 @@ def test_damaged_notes_on_hashes_change_nothing(toy: Toy, notes: str) -> None:
 def test_extending_respects_the_lock(toy: Toy) -> None:
     toy.run()
     events: list[Event] = []
-    options = loop.Options(toy.root, toy.request().pipeline, False, False, events.append)
+    options = loop.LoopOptions(toy.root, toy.request().pipeline, False, False, events.append)
     before = toy.files()
     with (
         record.lock(toy.root, False),

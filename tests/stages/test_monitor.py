@@ -22,7 +22,7 @@ from bampipe.data.store import read_parquet
 from bampipe.estimate.unscented import Trial, filter_trials
 from bampipe.files import read_json, write_text
 from bampipe.monitor.monitor import Monitor
-from bampipe.monitor.start import Options, start_from_run
+from bampipe.monitor.start import MonitorOptions, start_from_run
 from bampipe.physics import Model, compile_model, registry
 from bampipe.results.identify import IdentifyResult
 
@@ -56,7 +56,7 @@ def known(found: RunFolder, truth: dict[str, float]) -> RunFolder:
 
 @pytest.fixture(scope="module")
 def begun(run: RunFolder):
-    return start_from_run(run, "base", Options())
+    return start_from_run(run, "base", MonitorOptions())
 
 
 def samples(run: RunFolder, trial: str):
@@ -72,7 +72,7 @@ def test_same_estimates_as_the_batch_filter(run: RunFolder, begun: tuple) -> Non
     system, start = begun
     frame = samples(run, "t01")
     names, values = tuple(frame.columns), frame.to_numpy(dtype=float)
-    monitor = Monitor(system, start, Options(), pytest.fail)
+    monitor = Monitor(system, start, MonitorOptions(), pytest.fail)
     for first in range(0, len(values), 77):
         monitor.push(names, values[first : first + 77])
     n = len(system.coordinates)
@@ -94,7 +94,7 @@ def test_same_estimates_as_the_batch_filter(run: RunFolder, begun: tuple) -> Non
 
 def test_no_alarm_while_nothing_changes(run: RunFolder, begun: tuple) -> None:
     system, start = begun
-    monitor = Monitor(system, start, Options(), pytest.fail)
+    monitor = Monitor(system, start, MonitorOptions(), pytest.fail)
     frame = samples(run, "t00")
     monitor.push(tuple(frame.columns), frame.to_numpy(dtype=float))
     report = monitor.report()
@@ -111,9 +111,9 @@ def test_begins_where_the_mechanism_is_and_not_its_encoder(tmp_path: Path) -> No
     found = simulated_run(tmp_path, trials=1, effect="encoder_scale:yaw", hidden=hidden)
     wrong = MODEL.replace("[]", '["encoder_scale:yaw"]')
     write_text(found.path("models/base/model.toml"), wrong)
-    system, start = start_from_run(known(found, TRUTH | hidden), "base", Options())
+    system, start = start_from_run(known(found, TRUTH | hidden), "base", MonitorOptions())
     values = samples(found, "t00")
-    monitor = Monitor(system, start, Options(), pytest.fail)
+    monitor = Monitor(system, start, MonitorOptions(), pytest.fail)
     monitor.push(tuple(values.columns), values.to_numpy(dtype=float)[:5])
     read = float(values["q_yaw"].iloc[4])
     state = monitor.report()["state"]["yaw"]
@@ -123,7 +123,7 @@ def test_begins_where_the_mechanism_is_and_not_its_encoder(tmp_path: Path) -> No
 
 def test_alarm_when_a_sensor_changes(run: RunFolder, begun: tuple) -> None:
     system, start = begun
-    monitor = Monitor(system, start, Options(), lambda _: None)
+    monitor = Monitor(system, start, MonitorOptions(), lambda _: None)
     frame = samples(run, "t00")
     frame.loc[frame["t"] > 6.0, "force_x"] *= 1.2
     values = frame.to_numpy(dtype=float)
@@ -137,7 +137,7 @@ def test_alarm_when_a_sensor_changes(run: RunFolder, begun: tuple) -> None:
 def test_a_gap_starts_the_motion_and_not_the_parameters(run: RunFolder, begun: tuple) -> None:
     system, start = begun
     said: list[str] = []
-    monitor = Monitor(system, start, Options(), said.append)
+    monitor = Monitor(system, start, MonitorOptions(), said.append)
     frame = samples(run, "t00")
     values = frame.to_numpy(dtype=float)
     kept = (values[:, 0] < 4.0) | (values[:, 0] > 6.0)
@@ -155,7 +155,7 @@ def test_a_lost_motion_starts_anew(run: RunFolder, begun: tuple) -> None:
     """A force of 1e200 N: the filter fails, the monitor goes on."""
     system, start = begun
     said: list[str] = []
-    monitor = Monitor(system, start, Options(), said.append)
+    monitor = Monitor(system, start, MonitorOptions(), said.append)
     frame = samples(run, "t00")
     values = frame.to_numpy(dtype=float, copy=True)
     values[1000, frame.columns.get_loc("force_x")] = 1e200
@@ -175,7 +175,7 @@ def test_memory_and_speed_hold(run: RunFolder, begun: tuple) -> None:
     frame = samples(run, "t00")
     source, sink = os.pipe()
     stream = SampleStream(source, "pipe", layouts(system, None), True, pytest.fail)
-    monitor = Monitor(system, start, Options(), pytest.fail)
+    monitor = Monitor(system, start, MonitorOptions(), pytest.fail)
     text = as_csv(frame).encode()
     step, taken, begin = 1 << 14, 0, time.process_time()
     for first in range(0, len(text), step):
@@ -300,7 +300,7 @@ def followed(begun: tuple, text: str, folder: Path) -> dict:
     system, start = begun
     path = folder / "log.csv"
     path.write_text(text)
-    watch = Monitor(system, start, Options(), lambda _: None)
+    watch = Monitor(system, start, MonitorOptions(), lambda _: None)
     stream = open_stream(str(path), system, None, False, lambda _: None)
     try:
         follow(stream, watch, _Output(False, 1.0), wait=False)

@@ -34,14 +34,14 @@ from bampipe.data.quality.encoders import (
     unwrap,
 )
 from bampipe.data.quality.motion import refuse_wrong_brakes, refuse_wrong_motion
-from bampipe.data.quality.table import CleanTrial, Limits, Table
+from bampipe.data.quality.table import CleaningLimits, CleanTrial, TrialTable
 from bampipe.data.readers import RawTrial
 from bampipe.data.session import Session, TrialEntry
 
-__all__ = ["CleanTrial", "Limits", "clean"]
+__all__ = ["CleanTrial", "CleaningLimits", "clean"]
 
 
-def clean(raw: RawTrial, session: Session, entry: TrialEntry, limits: Limits) -> CleanTrial:
+def clean(raw: RawTrial, session: Session, entry: TrialEntry, limits: CleaningLimits) -> CleanTrial:
     """Check and repair one trial and bring it to SI units.
 
     The arrays of ``raw`` are used up.
@@ -55,7 +55,7 @@ def clean(raw: RawTrial, session: Session, entry: TrialEntry, limits: Limits) ->
     Raises:
         InputError: the trial must be set aside; says why, and where in the file.
     """
-    table = Table(raw, session, entry, limits)
+    table = TrialTable(raw, session, entry, limits)
     refuse_other_units(table, raw.units)
     time_to_seconds(table)
     drop_backward_stamps(table)

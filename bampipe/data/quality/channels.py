@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from bampipe.data.quality.table import Table, counted, in_rows, longest_run
+from bampipe.data.quality.table import TrialTable, counted, in_rows, longest_run
 from bampipe.data.session import SECONDS, Channel
 from bampipe.data.units import unit
 
@@ -14,7 +14,7 @@ LARGEST_VALUE = 1e6
 """No angle, force, torque or other input is as large as this in SI units."""
 
 
-def refuse_other_units(table: Table, stated: Mapping[str, str]) -> None:
+def refuse_other_units(table: TrialTable, stated: Mapping[str, str]) -> None:
     """Refuse a column whose unit in the file is not that of the session file."""
     clock = table.session.clock
     declared = {**table.session.raw_units}
@@ -32,7 +32,7 @@ def refuse_other_units(table: Table, stated: Mapping[str, str]) -> None:
             )
 
 
-def fill_missing(table: Table) -> None:
+def fill_missing(table: TrialTable) -> None:
     """Interpolate short runs of missing samples; drop them at the ends; refuse long ones."""
     channels = [name for name in table.columns if name != table.clock]
     some = np.zeros(len(table), dtype=bool)
@@ -61,7 +61,7 @@ def fill_missing(table: Table) -> None:
             )
 
 
-def _refuse_missing(table: Table, name: str, missing: np.ndarray) -> None:
+def _refuse_missing(table: TrialTable, name: str, missing: np.ndarray) -> None:
     count = int(missing.sum())
     if count == 0:
         return
@@ -83,7 +83,7 @@ def _refuse_missing(table: Table, name: str, missing: np.ndarray) -> None:
         )
 
 
-def refuse_frozen(table: Table, column: str) -> None:
+def refuse_frozen(table: TrialTable, column: str) -> None:
     """A force channel that stands still for long is a cable that came off."""
     values = table.columns[column]
     start, length = longest_run(np.diff(values) == 0)
@@ -99,7 +99,7 @@ def refuse_frozen(table: Table, column: str) -> None:
         )
 
 
-def refuse_saturated(table: Table, column: str) -> None:
+def refuse_saturated(table: TrialTable, column: str) -> None:
     """Refuse a channel that piles up at its extreme: in runs, and far above the next level."""
     values = table.columns[column]
     levels, counts = np.unique(values, return_counts=True)
@@ -123,7 +123,7 @@ def refuse_saturated(table: Table, column: str) -> None:
             )
 
 
-def to_si(table: Table) -> dict[str, np.ndarray]:
+def to_si(table: TrialTable) -> dict[str, np.ndarray]:
     """Columns (T,) in SI units by name: q_<axis>, force_<component>, brake_<axis>, channels."""
     session, raw = table.session, table.columns
     si: dict[str, np.ndarray] = {}
@@ -163,7 +163,7 @@ def to_si(table: Table) -> dict[str, np.ndarray]:
     return si
 
 
-def to_signed(table: Table, channel: Channel) -> None:
+def to_signed(table: TrialTable, channel: Channel) -> None:
     """Read the unsigned register of a signed number as what it stands for."""
     if not channel.wrap_bits:
         return
@@ -179,7 +179,7 @@ def to_signed(table: Table, channel: Channel) -> None:
     values[values >= 0.5 * period] -= period
 
 
-def _refuse_wild(table: Table, values: np.ndarray, words: str, column: str) -> None:
+def _refuse_wild(table: TrialTable, values: np.ndarray, words: str, column: str) -> None:
     table.refuse(
         ~(np.abs(values) < LARGEST_VALUE),
         lambda at: f"{words} = {values[at]:.3g}, which no such machine does",

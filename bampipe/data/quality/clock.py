@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bampipe.data.quality.table import Table, counted, in_rows, in_times
+from bampipe.data.quality.table import TrialTable, counted, in_rows, in_times
 from bampipe.data.session import SECONDS
 
 COARSEST_STAMP = 0.05
@@ -14,7 +14,7 @@ LONGEST_TRIAL_S = 3.2e7
 """A year: what is longer was not recorded in one go, and the unit of its clock is wrong."""
 
 
-def time_to_seconds(table: Table) -> None:
+def time_to_seconds(table: TrialTable) -> None:
     """Time stamps in s, whatever unit they are really in; rows without one are dropped."""
     missing = ~np.isfinite(table.t)
     count = int(missing.sum())
@@ -62,7 +62,7 @@ def time_to_seconds(table: Table) -> None:
         )
 
 
-def _unwrap_clock(table: Table) -> None:
+def _unwrap_clock(table: TrialTable) -> None:
     """Undo the roll-over of a clock that counts ticks in 32 bits."""
     drops = np.flatnonzero(np.diff(table.t) < -(2.0**32) * 0.9)
     if len(drops) and table.t.min() >= 0 and table.t.max() < 2.0**32:
@@ -72,7 +72,7 @@ def _unwrap_clock(table: Table) -> None:
         table.repairs.append(f"clock rolls over at 32 bits {in_times(len(drops))}: unrolled")
 
 
-def drop_backward_stamps(table: Table) -> None:
+def drop_backward_stamps(table: TrialTable) -> None:
     """Leave strictly increasing stamps where few rows are in the way; else refuse the trial."""
     t = table.t
     if np.all(np.diff(t) > 0):
@@ -109,7 +109,7 @@ def drop_backward_stamps(table: Table) -> None:
         table.repairs.append(f"{in_rows(counts[1])} with a time stamp out of order dropped")
 
 
-def cut_stretch(table: Table) -> None:
+def cut_stretch(table: TrialTable) -> None:
     """Keep the stretch of the record that the session file gives to this trial."""
     start, end = table.entry.start_s, table.entry.end_s
     if start == 0.0 and np.isinf(end):
@@ -126,7 +126,7 @@ def cut_stretch(table: Table) -> None:
     table.notes.append(f"from {start:g} to {until} s of the record")
 
 
-def keep_longest_stretch(table: Table) -> None:
+def keep_longest_stretch(table: TrialTable) -> None:
     """Cut at gaps in the time stamps and keep the longest stretch, if it is most of the trial."""
     steps = np.diff(table.t)
     if len(steps) == 0:
@@ -154,7 +154,7 @@ def keep_longest_stretch(table: Table) -> None:
     table.repairs.append(f"{words}: rows {first} to {last} kept, {in_rows(dropped)} dropped")
 
 
-def refuse_length(table: Table) -> None:
+def refuse_length(table: TrialTable) -> None:
     """A trial of a second or less tells nothing, and none takes a year."""
     # Each sample stands for one step: 500 samples at 500 Hz are 1 s.
     step = float(np.median(np.diff(table.t))) if len(table) > 1 else 0.0
@@ -172,7 +172,7 @@ def refuse_length(table: Table) -> None:
         )
 
 
-def note_clock(table: Table) -> None:
+def note_clock(table: TrialTable) -> None:
     """Say what resampling has to deal with: small gaps, jitter, another rate than announced."""
     steps = np.diff(table.t)
     median = float(np.median(steps))
@@ -195,6 +195,6 @@ def note_clock(table: Table) -> None:
         table.notes.append(f"sampled at {1 / median:.4g} Hz, announced {nominal:g} Hz")
 
 
-def _few(table: Table, total: int) -> int:
+def _few(table: TrialTable, total: int) -> int:
     """How many rows may be dropped for their time stamps."""
     return max(3, int(table.limits.dropped_share * total))

@@ -6,7 +6,7 @@ import numpy as np
 
 from bampipe.data import velocity
 from bampipe.data.quality.channels import fill_missing
-from bampipe.data.quality.table import Table, counted, in_times
+from bampipe.data.quality.table import TrialTable, counted, in_times
 from bampipe.data.session import Encoder
 
 FASTEST = {"rad": 20.0, "m": 4.0}
@@ -17,7 +17,7 @@ VELOCITY_RATIO = 1.5
 """A recorded velocity further than this factor from the change of position is in another unit."""
 
 
-def refuse_fractions(table: Table, encoder: Encoder) -> None:
+def refuse_fractions(table: TrialTable, encoder: Encoder) -> None:
     """Counts are whole numbers."""
     if not encoder.counts:
         return
@@ -31,7 +31,7 @@ def refuse_fractions(table: Table, encoder: Encoder) -> None:
     )
 
 
-def integrate(table: Table, encoder: Encoder) -> None:
+def integrate(table: TrialTable, encoder: Encoder) -> None:
     """Take the integral of a velocity, by trapezia from 0, for the position that was not recorded.
 
     What a constant error of the velocity adds grows with time, which only terms in the position
@@ -43,7 +43,7 @@ def integrate(table: Table, encoder: Encoder) -> None:
     table.notes.append(f"position is the integral of the velocity '{encoder.column}', from 0")
 
 
-def unwrap(table: Table, encoder: Encoder) -> None:
+def unwrap(table: TrialTable, encoder: Encoder) -> None:
     """Undo the wrap-around of a counter of 16, 24 or 32 bits, or of an angle at a full turn."""
     if encoder.integrate:
         return
@@ -72,7 +72,7 @@ def unwrap(table: Table, encoder: Encoder) -> None:
         return
 
 
-def interpolate_jumps(table: Table, encoder: Encoder) -> None:
+def interpolate_jumps(table: TrialTable, encoder: Encoder) -> None:
     """Interpolate isolated wild readings; refuse a lasting jump (lost counts, a reset).
 
     A step is wild when it is 20 times what all but one step in twenty stay below, and faster
@@ -126,7 +126,7 @@ def interpolate_jumps(table: Table, encoder: Encoder) -> None:
     fill_missing(table)
 
 
-def check_velocity(table: Table, encoder: Encoder) -> None:
+def check_velocity(table: TrialTable, encoder: Encoder) -> None:
     """Refuse an axis whose recorded velocity is in another unit, or of another sign."""
     if encoder.velocity is None:
         return

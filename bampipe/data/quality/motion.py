@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from bampipe.data.quality.table import Table, counted
+from bampipe.data.quality.table import TrialTable, counted
 
 
-def refuse_wrong_motion(table: Table, columns: dict[str, np.ndarray]) -> None:
+def refuse_wrong_motion(table: TrialTable, columns: dict[str, np.ndarray]) -> None:
     """A free trial moves; a locked axis winds up, but stays."""
     session, limits, entry = table.session, table.limits, table.entry
     travel = {e.axis: float(np.ptp(columns[f"q_{e.axis}"])) for e in session.encoders}
@@ -46,7 +46,7 @@ def refuse_wrong_motion(table: Table, columns: dict[str, np.ndarray]) -> None:
         )
 
 
-def refuse_wrong_brakes(table: Table, columns: dict[str, np.ndarray]) -> None:
+def refuse_wrong_brakes(table: TrialTable, columns: dict[str, np.ndarray]) -> None:
     """A free trial has its brakes off, a viscous one has them on, and recorded."""
     entry, brakes = table.entry, table.session.brakes
     highest = {b.axis: float(np.abs(columns[f"brake_{b.axis}"]).max()) for b in brakes}

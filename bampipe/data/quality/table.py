@@ -15,7 +15,7 @@ from bampipe.schema import STRICT, Count, NotNegative
 
 
 @checked_dataclass(frozen=True, config=STRICT)
-class Limits:
+class CleaningLimits:
     """What still counts as a sound trial.
 
     Attributes:
@@ -68,10 +68,12 @@ class CleanTrial:
     notes: list[str] = field(default_factory=list)
 
 
-class Table:
+class TrialTable:
     """The columns of a trial while they are being cleaned, each row with its number in the file."""
 
-    def __init__(self, raw: RawTrial, session: Session, entry: TrialEntry, limits: Limits) -> None:
+    def __init__(
+        self, raw: RawTrial, session: Session, entry: TrialEntry, limits: CleaningLimits
+    ) -> None:
         self.columns = raw.columns
         self.session = session
         self.entry = entry

@@ -37,7 +37,7 @@ class TooLargeError(Exception):
 
 
 @dataclass(frozen=True)
-class Variable:
+class MatVariable:
     """One variable of a file, or one field of a struct.
 
     Attributes:
@@ -69,7 +69,7 @@ def is_level5(head: bytes) -> bool:
     return len(head) >= _HEADER and head[126:128] in (b"IM", b"MI")
 
 
-def variables(path: Path) -> list[Variable]:
+def variables(path: Path) -> list[MatVariable]:
     """The variables of the file, in its order, each struct followed by what is in it.
 
     Raises:
@@ -89,7 +89,7 @@ def variables(path: Path) -> list[Variable]:
             if size > end - offset or kind not in (_MATRIX, _COMPRESSED):
                 raise ValueError("an element is not what it says")
             source = _Source(stream, offset, size, kind == _COMPRESSED, order)
-            variable = Variable("", (), False, offset, size, kind == _COMPRESSED)
+            variable = MatVariable("", (), False, offset, size, kind == _COMPRESSED)
             source.most = _LARGEST_INFLATED - inflated
             found += [item for item in _arrays(source, variable, "", 0) if item.name]
             inflated += source.position if variable.compressed else 0
@@ -97,7 +97,9 @@ def variables(path: Path) -> list[Variable]:
     return found
 
 
-def _arrays(source: _Source, variable: Variable, label: str, depth: int) -> Iterator[Variable]:
+def _arrays(
+    source: _Source, variable: MatVariable, label: str, depth: int
+) -> Iterator[MatVariable]:
     """The array that comes next, and where it is a struct, those in its fields.
 
     Args:
@@ -129,7 +131,7 @@ def _arrays(source: _Source, variable: Variable, label: str, depth: int) -> Iter
             source.skip(end - source.position)
 
 
-def values(path: Path, variable: Variable) -> np.ndarray:
+def values(path: Path, variable: MatVariable) -> np.ndarray:
     """The elements of one real variable, in column-major order, as (n,) float64.
 
     Raises:

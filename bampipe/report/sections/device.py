@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 
 from bampipe.report import wording
-from bampipe.report.document import Block, Section, Table, Text
+from bampipe.report.document import Block, Paragraph, Section, Table
 from bampipe.report.results import Results
 from bampipe.results.identify import Combined, DeviceNumber, IdentifyResult
 from bampipe.results.performance import DeviceConstant, PerformanceResult
@@ -25,7 +25,7 @@ def section(results: Results) -> Section | None:
         members = wording.listing(f"`{name}`" for name in group.members)
         sums = wording.listing(f"`{name}`" for name in group.combinations)
         blocks.append(
-            Text(
+            Paragraph(
                 f"{members} enter the equations only as {sums}. No motion, however rich, tells the "
                 "parts apart: they stand as the device file has them."
             )
@@ -50,7 +50,7 @@ def _constants(
             )
         )
     return Table(
-        f"Numbers that the device file takes from drawings{results.as_in('Table II')}",
+        f"Numbers that the device file takes from drawings{results.in_paper('Table II')}",
         ("Name", "What", "Value", "Unit", "Source"),
         tuple(rows),
         "llrll",

@@ -14,10 +14,10 @@ from bampipe.report.document import (
     Bullets,
     Callout,
     Figure,
+    Paragraph,
     Section,
     Subheading,
     Table,
-    Text,
 )
 from bampipe.report.results import Results
 from bampipe.results.diagnose import (
@@ -46,7 +46,7 @@ def section(results: Results) -> Section:
     if not found:
         command = f"`bampipe diagnose {results.root.name}`"
         text = f"Whether an effect is missing, and which, has not been asked: {command} does it."
-        return Section(TITLE, (Text(text),))
+        return Section(TITLE, (Paragraph(text),))
     blocks: list[Block] = []
     last, after = found[-1]
     for model, content in found:
@@ -68,7 +68,7 @@ def _model(
     if found.ranking and lacking:
         blocks.append(_ranking(results, found.ranking))
     command = found.next.startswith("bampipe ")
-    blocks.append(Text(f"Next: `{found.next}`" if command else f"Next: {found.next}."))
+    blocks.append(Paragraph(f"Next: `{found.next}`" if command else f"Next: {found.next}."))
     if found.suggested_trial is not None:
         words = wording.sentence(found.suggested_trial.sentence)
         blocks.append(Callout("note", "A trial that would tell more", words))

@@ -11,9 +11,9 @@ import numpy as np
 import pandas as pd
 
 from bampipe.report import style, verdicts, wording
-from bampipe.report.document import Block, Figure, Section, Table, Text
+from bampipe.report.document import Block, Figure, Paragraph, Section, Table
 from bampipe.report.results import Results
-from bampipe.results.identify import Estimate, IdentifyResult, StateBound
+from bampipe.results.identify import IdentifyResult, ParameterEstimate, StateBound
 
 TITLE = "Identification"
 _NORMAL_95 = 1.959964
@@ -26,14 +26,16 @@ def section(results: Results) -> Section:
     identified = results.read(IdentifyResult)
     if identified is None:
         command = f"`bampipe identify {results.root.name}`"
-        return Section(TITLE, (Text(f"No parameters have been identified: {command} does it."),))
+        return Section(
+            TITLE, (Paragraph(f"No parameters have been identified: {command} does it."),)
+        )
     blocks: list[Block] = [_parameters(results, identified)]
     checks = _checks(identified)
     if checks:
-        blocks.append(Text(checks))
+        blocks.append(Paragraph(checks))
     if identified.state_3sigma:
         blocks.append(_bounds(results, identified.state_3sigma))
-    trace = results.table(results.of_model("trace.parquet"))
+    trace = results.table(results.model_file("trace.parquet"))
     if trace is not None and len(trace):
         blocks.append(_convergence(results, identified, trace))
     motion = _motion(results)
@@ -74,7 +76,7 @@ def _parameters(results: Results, identified: IdentifyResult) -> Table:
         note += " * At the limit of its range: the data ask for a value beyond it."
     return Table(
         f"Parameters of model `{identified.model}`{_method(identified)}"
-        f"{results.as_in('Table VII')}",
+        f"{results.in_paper('Table VII')}",
         (
             "Parameter",
             "Name",
@@ -131,7 +133,7 @@ def _bounds(results: Results, bounds: Mapping[str, StateBound]) -> Table:
         for axis in verdicts.ordered(results, bounds)
     ]
     return Table(
-        f"Error of the filtered state, 3σ bounds{results.as_in('Table VI')}",
+        f"Error of the filtered state, 3σ bounds{results.in_paper('Table VI')}",
         ("Axis", "Position", "Velocity"),
         tuple(rows),
         "lrr",
@@ -146,7 +148,7 @@ def _scaled(value: float | None, unit: str) -> str:
 
 
 def _groups(
-    results: Results, parameters: Mapping[str, Estimate], trace: pd.DataFrame
+    results: Results, parameters: Mapping[str, ParameterEstimate], trace: pd.DataFrame
 ) -> list[tuple[str, str, list[str]]]:
     """Return title, unit and parameters of each panel: those of one kind and unit together."""
     groups: dict[tuple[str, str], list[str]] = {}
@@ -187,7 +189,7 @@ def _convergence(results: Results, identified: IdentifyResult, trace: pd.DataFra
         panels[last, column].tick_params(labelbottom=True)
         panels[last, column].set_xlabel("time in the filter (s)")
     caption = (
-        f"Convergence of the parameters{results.as_in('Fig. 7')}, with the filter's own 95 % "
+        f"Convergence of the parameters{results.in_paper('Fig. 7')}, with the filter's own 95 % "
         "bounds. Dotted verticals: a new trial starts."
     )
     if identified.repeats:
@@ -236,7 +238,7 @@ def _settled(panel: Any, trace: pd.DataFrame, names: list[str]) -> None:
 
 
 def _motion(results: Results) -> Figure | None:
-    path = results.of_model("states.parquet")
+    path = results.model_file("states.parquet")
     columns = results.columns(path)
     torques = [axis for axis in results.axes if f"torque_user_{axis}" in columns]
     axes = [axis for axis in results.axes if f"q_{axis}" in columns]
@@ -284,5 +286,5 @@ def _motion(results: Results) -> Figure | None:
     forces = f"generalised forces of the {results.pusher}"
     if any(f"torque_gravity_{axis}" in columns for axis in axes):
         forces += " and of the gravity compensator"
-    caption = f"Trial {trial}{results.as_in('Fig. 6')}: {forces} (top) and the motion (bottom)."
+    caption = f"Trial {trial}{results.in_paper('Fig. 6')}: {forces} (top) and the motion (bottom)."
     return Figure("torques-and-motion", caption, style.svg(figure))

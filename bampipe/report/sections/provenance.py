@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from bampipe.report.document import Block, Section, Subheading, Table, Text
+from bampipe.report.document import Block, Paragraph, Section, Subheading, Table
 from bampipe.report.results import Results
 from bampipe.results.run import RunResult, StepRecord
 
@@ -21,9 +21,9 @@ def section(results: Results) -> Section:
     run = results.read(RunResult)
     if run is None:
         text = "This run folder has no run.json: what was run on what is not recorded."
-        return Section(TITLE, (Text(text),), new_page=True)
+        return Section(TITLE, (Paragraph(text),), new_page=True)
     stages = {name: made for name, made in run.stages.items() if name != "report"}
-    blocks: list[Block] = [Text(_versions(stages))]
+    blocks: list[Block] = [Paragraph(_versions(stages))]
     inputs = _inputs(stages)
     if inputs is not None:
         blocks.append(inputs)

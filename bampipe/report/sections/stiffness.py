@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from bampipe.report import style, verdicts, wording
-from bampipe.report.document import Block, Bullets, Figure, Section, Table, Text
+from bampipe.report.document import Block, Bullets, Figure, Paragraph, Section, Table
 from bampipe.report.results import Results
 from bampipe.results.stiffness import AxisStiffness, StiffnessResult
 
@@ -23,10 +23,12 @@ def section(results: Results) -> Section | None:
         if not (results.trials["kind"] == "locked").any():
             return None
         command = f"`bampipe stiffness {results.root.name}`"
-        return Section(TITLE, (Text(f"The locked trials have not been used: {command} does it."),))
+        return Section(
+            TITLE, (Paragraph(f"The locked trials have not been used: {command} does it."),)
+        )
     axes, notes = found.axes, found.notes
     if not axes:
-        return Section(TITLE, (Text(" ".join(notes) or "There are no locked trials."),))
+        return Section(TITLE, (Paragraph(" ".join(notes) or "There are no locked trials."),))
     blocks: list[Block] = [_table(results, axes)]
     loops = results.table("stiffness/loops.parquet")
     if loops is not None and len(loops):
@@ -61,7 +63,7 @@ def _table(results: Results, axes: Mapping[str, AxisStiffness]) -> Table:
     if poses:
         note += f" Bandwidth √(K/M) at {'; '.join(poses)}."
     return Table(
-        f"Stiffness of the locked axes{results.as_in('Table I')}",
+        f"Stiffness of the locked axes{results.in_paper('Table I')}",
         (
             "Axis",
             "Stiffness",
@@ -101,8 +103,8 @@ def _loops(results: Results, axes: Mapping[str, AxisStiffness], loops: pd.DataFr
         _loop(results, panel, axis, axes[axis], loops[loops["axis"] == axis])
     style.legend_below(figure, panels[0][0])
     caption = (
-        f"Hysteresis loops of the locked axes{results.as_in('Fig. 3')}: generalised force of the "
-        "hand against deflection. The slope of the parts away from reversals (blue) is the "
+        f"Hysteresis loops of the locked axes{results.in_paper('Fig. 3')}: generalised force of "
+        "the hand against deflection. The slope of the parts away from reversals (blue) is the "
         "stiffness (dashed)."
     )
     return Figure("stiffness-loops", caption, style.svg(figure))

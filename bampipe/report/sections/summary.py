@@ -6,20 +6,20 @@ from collections.abc import Mapping
 from typing import Any
 
 from bampipe.report import verdicts, wording
-from bampipe.report.document import Block, Section, Table, Text
+from bampipe.report.document import Block, Paragraph, Section, Table
 from bampipe.report.results import Results
 from bampipe.results.compare import CompareResult
-from bampipe.results.identify import Estimate, IdentifyResult
+from bampipe.results.identify import IdentifyResult, ParameterEstimate
 from bampipe.results.stiffness import AxisStiffness, StiffnessResult
 from bampipe.results.validate import AxisError, ValidateResult
 
 
 def section(results: Results) -> Section:
     """Return the section."""
-    blocks: list[Block] = [verdicts.overall(results), Text(_done(results))]
+    blocks: list[Block] = [verdicts.overall(results), Paragraph(_done(results))]
     ladder = _ladder(results)
     if ladder:
-        blocks.append(Text(ladder))
+        blocks.append(Paragraph(ladder))
     numbers = _numbers(results)
     if numbers is not None:
         blocks.append(numbers)
@@ -131,7 +131,7 @@ def _row(title: str, axes: tuple[str, ...], cell: Any) -> tuple[str, ...]:
     return (title, *(cell(axis) for axis in axes))
 
 
-def _estimate(entry: Estimate | None) -> str:
+def _estimate(entry: ParameterEstimate | None) -> str:
     if entry is None:
         return "–"
     return f"{wording.with_sd(entry.estimate, entry.sd)} {wording.unit(entry.unit)}".rstrip()
@@ -156,7 +156,7 @@ def _stiffness(entry: AxisStiffness | None) -> str:
     return f"{wording.with_sd(factor * entry.stiffness, factor * entry.sd)} {unit}"
 
 
-def _others(results: Results, parameters: Mapping[str, Estimate]) -> str:
+def _others(results: Results, parameters: Mapping[str, ParameterEstimate]) -> str:
     named = results.in_order(parameters)
     others = [name for name in named if not name.startswith(("viscous.", "coulomb."))]
     if not others:

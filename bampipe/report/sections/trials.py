@@ -7,7 +7,7 @@ import math
 from typing import Any
 
 from bampipe.report import verdicts, wording
-from bampipe.report.document import Block, Section, Table, Text
+from bampipe.report.document import Block, Paragraph, Section, Table
 from bampipe.report.results import Results
 from bampipe.results.filter import FilterResult
 from bampipe.results.ingest import IngestResult
@@ -18,12 +18,12 @@ _STATES = {"ok": "sound", "repaired": "repaired", "set_aside": "**set aside**"}
 def section(results: Results) -> Section:
     """Return the section."""
     session = results.session
-    blocks: list[Block] = [Text(_sampling(session))]
+    blocks: list[Block] = [Paragraph(_sampling(session))]
     blocks.append(_trials(results))
     filtered = results.read(FilterResult)
     if filtered is None:
         blocks.append(
-            Text(
+            Paragraph(
                 "Velocities and accelerations have not been computed: "
                 f"`bampipe filter {results.root.name}` does it."
             )
@@ -124,10 +124,10 @@ def _filter(results: Results, filtered: FilterResult) -> list[Block]:
         "savitzky-golay": "a Savitzky-Golay filter",
     }
     text = f"Velocity and acceleration come from {names.get(method, method)}"
-    blocks: list[Block] = [Text(f"{text} ({filtered.method_reason}).")]
+    blocks: list[Block] = [Paragraph(f"{text} ({filtered.method_reason}).")]
     if filtered.skipped:
         skipped = "; ".join(f"{name}: {reason}" for name, reason in filtered.skipped.items())
-        blocks.append(Text(f"Not differentiated: {skipped}."))
+        blocks.append(Paragraph(f"Not differentiated: {skipped}."))
     if rows:
         blocks.append(
             Table(

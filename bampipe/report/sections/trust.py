@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from bampipe.report import verdicts, wording
-from bampipe.report.document import Block, Bullets, Section, Table, Text
+from bampipe.report.document import Block, Bullets, Paragraph, Section, Table
 from bampipe.report.results import Results
 from bampipe.results.identify import (
     IdentifiabilityReport,
     IdentifyResult,
-    Innovations,
+    InnovationTests,
     TrialGrowth,
 )
 
@@ -25,7 +25,7 @@ def section(results: Results) -> Section | None:
     known = identified.identifiability
     blocks: list[Block] = []
     if known:
-        blocks.append(Text(_words(known)))
+        blocks.append(Paragraph(_words(known)))
         if known.sentences:
             blocks.append(Bullets(known.sentences))
         blocks.append(_parameters(results, identified, known))
@@ -92,7 +92,7 @@ def _trials(trials: Mapping[str, TrialGrowth]) -> Table:
     )
 
 
-def _innovations(results: Results, tests: Mapping[str, Innovations]) -> Table:
+def _innovations(results: Results, tests: Mapping[str, InnovationTests]) -> Table:
     rows = []
     for axis in verdicts.ordered(results, tests):
         own, driven = tests[axis].whiteness, tests[axis].inputs

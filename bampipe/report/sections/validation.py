@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from bampipe.report import style, verdicts, wording
-from bampipe.report.document import Block, Bullets, Figure, Section, Table, Text
+from bampipe.report.document import Block, Bullets, Figure, Paragraph, Section, Table
 from bampipe.report.results import Results
 from bampipe.results.validate import ValidateResult
 
@@ -23,12 +23,12 @@ def section(results: Results) -> Section:
     if validated is None:
         command = f"`bampipe validate {results.root.name}`"
         text = f"Predicted and measured force have not been compared: {command} does it."
-        return Section(TITLE, (Text(text),))
+        return Section(TITLE, (Paragraph(text),))
     blocks: list[Block] = [_by_axis(results, validated)]
     if validated.trials:
         blocks.append(_by_trial(results, validated))
     if validated.forces:
-        blocks.append(Text(_at_the_handle(validated, results.pusher)))
+        blocks.append(Paragraph(_at_the_handle(validated, results.pusher)))
     if validated.notes:
         blocks.append(Bullets(validated.notes))
     residuals = _shown_trial(results)
@@ -109,7 +109,7 @@ def _at_the_handle(validated: ValidateResult, pusher: str) -> str:
 
 def _shown_trial(results: Results) -> pd.DataFrame | None:
     """Return the residuals of the first held-out trial, else of the first."""
-    path = results.of_model("residuals.parquet")
+    path = results.model_file("residuals.parquet")
     columns = results.columns(path)
     if not columns:
         return None
@@ -155,8 +155,8 @@ def _forces(results: Results, frame: pd.DataFrame) -> Figure:
     whose = f"the {results.pusher}'s"
     where = f"{whose} force" if at_handle else f"{whose} generalised force at each joint"
     caption = (
-        f"Trial {trial}{results.as_in('Fig. 9')}: {where}, measured and predicted by the inverse "
-        "dynamics, with and without its friction terms."
+        f"Trial {trial}{results.in_paper('Fig. 9')}: {where}, measured and predicted by the "
+        "inverse dynamics, with and without its friction terms."
     )
     return Figure("force-prediction", caption, style.svg(figure))
 
@@ -230,7 +230,7 @@ def _friction(results: Results, frame: pd.DataFrame, velocity: dict[str, np.ndar
     more_handles, more_names = panels[1, 0].get_legend_handles_labels()
     style.legend_of(figure, top_handles + more_handles, top_names + more_names)
     caption = (
-        f"The friction that a model without it leaves{results.as_in('Fig. 4')}. Top: measured "
+        f"The friction that a model without it leaves{results.in_paper('Fig. 4')}. Top: measured "
         "minus predicted generalised force against velocity; the arrow shows the start of one "
         "movement. Bottom: that movement; without friction the prediction overshoots zero."
     )

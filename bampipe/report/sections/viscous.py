@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import pandas as pd
 
 from bampipe.report import style, wording
-from bampipe.report.document import Block, Figure, Section, Table, Text
+from bampipe.report.document import Block, Figure, Paragraph, Section, Table
 from bampipe.report.results import Results
 from bampipe.results.viscous import Damping, ViscousResult
 
@@ -22,12 +22,14 @@ def section(results: Results) -> Section | None:
         if not (results.trials["kind"] == "viscous").any():
             return None
         command = f"`bampipe viscous {results.root.name}`"
-        return Section(TITLE, (Text(f"The viscous trials have not been used: {command} does it."),))
+        return Section(
+            TITLE, (Paragraph(f"The viscous trials have not been used: {command} does it."),)
+        )
     directions = found.directions
     if not directions:
         return None
-    blocks: list[Block] = [Text(_words(directions)), _table(directions)]
-    trace = results.table(results.of_model("viscous.parquet"))
+    blocks: list[Block] = [Paragraph(_words(directions)), _table(directions)]
+    trace = results.table(results.model_file("viscous.parquet"))
     if trace is not None and len(trace):
         blocks.append(_figure(results, directions, trace))
     return Section(TITLE, tuple(blocks))
@@ -106,7 +108,8 @@ def _figure(results: Results, directions: Mapping[str, Damping], trace: pd.DataF
     panels[0][0].set_ylabel(style.label("damping", wording.unit("N.s/m")))
     style.legend_below(figure, panels[0][0])
     caption = (
-        f"Damping of the viscous field as the filter finds it{results.as_in('Fig. 8')}, with 95 % "
-        "bounds and the command. Dotted verticals: a new trial starts; the first is filtered twice."
+        f"Damping of the viscous field as the filter finds it{results.in_paper('Fig. 8')}, with "
+        "95 % bounds and the command. Dotted verticals: a new trial starts; the first is filtered "
+        "twice."
     )
     return Figure("viscous-field", caption, style.svg(figure))

@@ -65,7 +65,7 @@ class Config:
 
 
 @dataclass(frozen=True)
-class Plant:
+class Specimen:
     """The mechanism and its sensors as they truly are.
 
     Attributes:
@@ -96,8 +96,8 @@ def input_column(system: System, name: str) -> int:
     return system.inputs.index(name) if name in system.inputs else -1
 
 
-def draw_plant(config: Config) -> tuple[Plant, dict[str, float]]:
-    """Draw the plant; also the strength of each effect by canonical name."""
+def draw_specimen(config: Config) -> tuple[Specimen, dict[str, float]]:
+    """Draw the specimen; also the strength of each effect by canonical name."""
     device = registry.device(config.device)
     extra = [_read_effect(Path(path)) for path in config.effect_files]
     strengths = dict(_strength(text, config.strength) for text in config.effects)
@@ -123,7 +123,7 @@ def draw_plant(config: Config) -> tuple[Plant, dict[str, float]]:
                  device.coordinates}  # fmt: skip
     motion = part("torque", "energy") or compile_model(Model(device))
     return (
-        Plant(device, motion, part("input"), part("measurement"), values, delay, stiffness),
+        Specimen(device, motion, part("input"), part("measurement"), values, delay, stiffness),
         strengths,
     )
 
