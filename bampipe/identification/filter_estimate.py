@@ -20,7 +20,7 @@ from bampipe.estimate.unscented import (
     constrain,
     filter_trials,
 )
-from bampipe.identification.estimates import Estimate, timing_entry
+from bampipe.identification.estimates import Estimate, input_timing
 from bampipe.identification.filter_choice import FilterChoice
 from bampipe.identification.filter_run import (
     Attempt,
@@ -41,7 +41,7 @@ from bampipe.identification.filter_tables import (
 )
 from bampipe.identification.innovations import innovation_tests
 from bampipe.identification.least_squares_estimate import UnbiasedFit, bias_details
-from bampipe.identification.sensor_noise import Noise, noise_report, tune_noise, untuned_settings
+from bampipe.identification.sensor_noise import Noise, noise_levels, tune_noise, untuned_settings
 from bampipe.physics import System
 from bampipe.progress import Progress
 from bampipe.trials.cache import TrialCache
@@ -178,18 +178,18 @@ def estimate_by_filter(
     names = [item.name for item in free]
     details = [
         {
-            "filter_sd": float(tight[k]),
-            "systematic_sd": float(systematic[k]),
-            "least_squares": float(squares.p[problem.free[k]]),
+            "filter_sd": tight[k],
+            "systematic_sd": systematic[k],
+            "least_squares": squares.p[problem.free[k]],
             **bias,
         }
-        for k, bias in enumerate(bias_details(squares, range(kept)))
+        for k, bias in enumerate(bias_details(squares)[:kept])
     ]
-    report: dict[str, object] = {
+    report = {
         "nis": tabulate_nis(found, motions),
         "innovations": innovation_tests(system, found, trials, clear_by_axis),
-        "noise": noise_report(system, found.settings, noise),
-        "input_timing": timing_entry(p, scaled[-1, -1] if timing else 0.0),
+        "noise": noise_levels(system, found.settings, noise),
+        "input_timing": input_timing(p, scaled[-1, -1] if timing else 0.0),
         "blocks": blocks,
         "restarts": found.restarts,
         "repeats": found.repeats,

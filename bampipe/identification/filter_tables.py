@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 from bampipe.estimate.unscented import FilterModel, Stored
 from bampipe.identification.filter_run import FilterRun
 from bampipe.physics import System
+from bampipe.results.identify import Consistency, Convergence, StateBound
 from bampipe.trials.motion import Motion
 
 Array = NDArray[np.float64]
 
 
-def tabulate_nis(found: FilterRun, motions: Sequence[Motion]) -> dict[str, object]:
+def tabulate_nis(found: FilterRun, motions: Sequence[Motion]) -> Consistency:
     """Return the normalised innovation squared: near 1 where the noise levels are right."""
     size = found.settings.observed.size
     by_trial = {
@@ -25,10 +26,10 @@ def tabulate_nis(found: FilterRun, motions: Sequence[Motion]) -> dict[str, objec
     }
     counts = [trial.counted for trial in found.trials]
     total = np.average([trial.nis for trial in found.trials], weights=counts)
-    return {"mean": float(total) / size, "by_trial": by_trial}
+    return Consistency(mean=total / size, by_trial=by_trial)
 
 
-def state_3sigma(system: System, trials: Sequence[Stored]) -> dict[str, dict[str, float]]:
+def state_3sigma(system: System, trials: Sequence[Stored]) -> dict[str, StateBound]:
     """Return three standard deviations of position and velocity, median over time (Table VI)."""
     n = len(system.coordinates)
     variance = np.concatenate(
@@ -36,14 +37,14 @@ def state_3sigma(system: System, trials: Sequence[Stored]) -> dict[str, dict[str
     )
     bound = 3.0 * np.sqrt(np.median(variance, axis=0))
     return {
-        axis: {"position": float(bound[i]), "velocity": float(bound[n + i])}
+        axis: StateBound(position=bound[i], velocity=bound[n + i])
         for i, axis in enumerate(system.coordinates)
     }
 
 
 def convergence(
     names: Sequence[str], model: FilterModel, found: FilterRun, covariance: Array
-) -> dict[str, object]:
+) -> Convergence:
     """Say from when on every estimate stays within 2 % or 3 sd of its final value."""
     nx = model.n_states
     value, slope = model.to_physical(np.concatenate([p.mean[:, nx:] for p in found.passes]))
@@ -56,11 +57,8 @@ def convergence(
         late = np.flatnonzero(outside[:, place])
         settled[name] = float(elapsed[late[-1]]) if late.size else 0.0
     total = float(elapsed[-1])
-    return {
-        "settled_s": settled,
-        "total_s": total,
-        "converged": max(settled.values(), default=0.0) < 0.9 * total,
-    }
+    converged = max(settled.values(), default=0.0) < 0.9 * total
+    return Convergence(settled_s=settled, total_s=total, converged=converged)
 
 
 def _elapsed(passes: Sequence[Stored]) -> list[Array]:

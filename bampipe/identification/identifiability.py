@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +20,14 @@ from bampipe.estimate.least_squares import Problem, residual_and_slopes
 from bampipe.identification.sensor_noise import Noise
 from bampipe.physics import System
 from bampipe.physics.structure import Number, Structure, structure
+from bampipe.results.identify import (
+    Combined,
+    DeviceNumber,
+    IdentifiabilityReport,
+    ParameterBound,
+    TrialGrowth,
+    WeakDirection,
+)
 from bampipe.trials.motion import Motion
 
 Array = NDArray[np.float64]
@@ -39,24 +45,6 @@ _SHIFT = 1e-6
 TIMING = "input_timing"
 
 
-@dataclass(frozen=True)
-class Identifiability:
-    """What the trials could say at best.
-
-    Attributes:
-        bound_sd: (n_free,) Cramér-Rao bound on the standard deviation of each parameter, None
-            where the trials say nothing of it.
-        unseen: (n_free, n_free) covariance that their priors leave where the trials say nothing.
-        report: for identify.json.
-        sentences: what a reader must know before believing a number.
-    """
-
-    bound_sd: tuple[float | None, ...]
-    unseen: Array
-    report: dict[str, object]
-    sentences: tuple[str, ...]
-
-
 def assess_identifiability(
     system: System,
     motions: Sequence[Motion],
@@ -64,8 +52,8 @@ def assess_identifiability(
     p: Array,
     noise: Noise,
     at_bound: NDArray[np.bool_],
-) -> Identifiability:
-    """Return what sensor noise alone leaves open about the parameters at ``p``.
+) -> tuple[IdentifiabilityReport, Array]:
+    """Say what sensor noise alone leaves open about the parameters at ``p``.
 
     Args:
         system: the model; motions: the trials; problem: their inverse dynamics, the timing of
@@ -73,6 +61,10 @@ def assess_identifiability(
         p: (n_p + 1,) estimates, the timing last.
         noise: of the sensors.
         at_bound: (n_parameters,) which estimates lie at the limit of their range.
+
+    Returns:
+        The report, and the covariance (n_parameters, n_parameters) that their priors leave where
+        the trials say nothing.
     """
     known = structure(system)
     n_p = len(system.parameters)
@@ -87,51 +79,44 @@ def assess_identifiability(
     kept = [i for i, name in enumerate(names) if name != TIMING]
     weak = [w for w in weak_directions(own) if set(w.members) & set(kept)]
     growth = growth_without([part[:n, :n] for part in joint])[:, kept]
-    numbers = [
+    numbers = tuple(
         _number(number, total, n, n + j, names, value, kept)
         for j, number in enumerate(known.numbers)
-    ]
+    )
     half = problem.upper[-1]  # of a sample: all that is assumed of the timing
     assumed = np.array([system.parameters[i].sd if i < n_p else half for i in problem.free])
     prior, place = assumed[kept], np.ix_(kept, kept)
     parameters = {names[i]: _entry(own, covariance, i, names) for i in kept}
     trials = {
-        motion.trial_id: {
-            "growth": float(min(row.max(initial=0.0), 1e9)),
-            "parameter": names[kept[int(np.argmax(row))]],
-        }
+        motion.trial_id: TrialGrowth(
+            growth=min(row.max(initial=0.0), 1e9), parameter=names[kept[int(np.argmax(row))]]
+        )
         for motion, row in zip(motions, growth, strict=True)
     }
-    sentences = [
-        *(_together(group.members, group.combinations) for group in known.together),
-        *(_moving(w, names, value, covariance) for w in weak),
-        *_unsaid([names[i] for i in kept], sd[kept], prior),
-        *_limits([names[i] for i in kept], at_bound),
-        *_idle(trials),
-        *_leaning(numbers),
-    ]
-    report: dict[str, object] = {
-        "parameters": parameters,
-        "weak_directions": [
-            {
-                "members": [names[i] for i in w.members],
-                "parts": list(w.parts),
-                "strength": w.strength,
-            }
+    report = IdentifiabilityReport(
+        parameters=parameters,
+        weak_directions=tuple(
+            WeakDirection(
+                members=tuple(names[i] for i in w.members), parts=w.parts, strength=w.strength
+            )
             for w in weak
-        ],
-        "numbers": numbers,
-        "together": [
-            {"members": list(g.members), "combinations": list(g.combinations)}
+        ),
+        numbers=numbers,
+        together=tuple(
+            Combined(members=tuple(g.members), combinations=tuple(g.combinations))
             for g in known.together
-        ],
-        "trials": trials,
-        "sentences": sentences,
-    }
-    bounds = tuple(_finite(sd[i]) for i in kept)
-    return Identifiability(
-        bounds, undetermined_covariance(own, assumed)[place], report, tuple(sentences)
+        ),
+        trials=trials,
+        sentences=(
+            *(_together(group.members, group.combinations) for group in known.together),
+            *(_moving(w, names, value, covariance) for w in weak),
+            *_unsaid([names[i] for i in kept], sd[kept], prior),
+            *_limits([names[i] for i in kept], at_bound),
+            *_idle(trials),
+            *_leaning(numbers),
+        ),
     )
+    return report, undetermined_covariance(own, assumed)[place]
 
 
 def _of_trial(
@@ -190,16 +175,15 @@ def _finite(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def _entry(own: Array, covariance: Array, i: int, names: Sequence[str]) -> dict[str, object]:
+def _entry(own: Array, covariance: Array, i: int, names: Sequence[str]) -> ParameterBound:
     """Return bound, bound were all others known, and the parameter that most looks alike."""
-    entry: dict[str, object] = {
-        "bound_sd": _finite(np.sqrt(covariance[i, i])),
-        "alone_sd": _finite(1.0 / np.sqrt(own[i, i])) if own[i, i] > 0.0 else None,
-    }
     partner, correlation = _partner(covariance, i)
-    if partner is not None:
-        entry |= {"partner": names[partner], "correlation": correlation}
-    return entry
+    return ParameterBound(
+        bound_sd=_finite(np.sqrt(covariance[i, i])),
+        alone_sd=_finite(1.0 / np.sqrt(own[i, i])) if own[i, i] > 0.0 else None,
+        partner=None if partner is None else names[partner],
+        correlation=None if partner is None else correlation,
+    )
 
 
 def _partner(covariance: Array, i: int) -> tuple[int | None, float]:
@@ -223,7 +207,7 @@ def _number(
     names: Sequence[str],
     value: Array,
     kept: Sequence[int],
-) -> dict[str, Any]:
+) -> DeviceNumber:
     """Return what the trials say of one number of the device, were it estimated too."""
     rows = [*range(n), place]
     covariance = cramer_rao_bound(total[np.ix_(rows, rows)])
@@ -231,15 +215,15 @@ def _number(
     shift = -np.linalg.lstsq(total[:n, :n], total[:n, place], rcond=1e-12)[0]
     size = np.abs(value)
     per_cent = {names[i]: float(shift[i] * number.value / value[i]) for i in kept if size[i] > 0.0}
-    return {
-        "name": number.name,
-        "value": number.value,
-        "unit": number.unit,
-        "bound_sd": _finite(np.sqrt(covariance[n, n])),
-        "partner": None if partner is None else names[partner],
-        "correlation": correlation,
-        "moves_percent": per_cent,
-    }
+    return DeviceNumber(
+        name=number.name,
+        value=number.value,
+        unit=number.unit,
+        bound_sd=_finite(np.sqrt(covariance[n, n])),
+        partner=None if partner is None else names[partner],
+        correlation=correlation,
+        moves_percent=per_cent,
+    )
 
 
 def _together(members: Sequence[str], combinations: Sequence[str]) -> str:
@@ -288,31 +272,29 @@ def _limits(names: Sequence[str], at_bound: NDArray[np.bool_]) -> list[str]:
     ]
 
 
-def _idle(trials: Mapping[str, Mapping[str, Any]]) -> list[str]:
+def _idle(trials: Mapping[str, TrialGrowth]) -> list[str]:
     if len(trials) < 2:
         return []
     return [
         f"Trial {name} adds next to nothing: without it no bound would grow by more than "
-        f"{100.0 * entry['growth']:.1g} %."
+        f"{100.0 * entry.growth:.1g} %."
         for name, entry in trials.items()
-        if entry["growth"] < _NOTHING
+        if entry.growth < _NOTHING
     ]
 
 
-def _leaning(numbers: Sequence[Mapping[str, Any]]) -> list[str]:
+def _leaning(numbers: Sequence[DeviceNumber]) -> list[str]:
     """Say which numbers of the device file the estimates rest on, and which they resemble."""
     sentences = []
     for number in numbers:
-        moved = {
-            name: size for name, size in number["moves_percent"].items() if abs(size) >= _MOVES
-        }
+        moved = {name: size for name, size in number.moves_percent.items() if abs(size) >= _MOVES}
         if moved:
             shown = _listed([f"`{name}` by {size:+.1f} %" for name, size in moved.items()])
-            sentences.append(f"An error of 1 % in {number['name']} would move {shown}.")
-        if number["partner"] is not None and abs(number["correlation"]) > _CLOSE:
+            sentences.append(f"An error of 1 % in {number.name} would move {shown}.")
+        if number.partner is not None and abs(number.correlation) > _CLOSE:
             sentences.append(
-                f"Were {number['name']} estimated too, it and `{number['partner']}` would move "
-                f"together (correlation {number['correlation']:+.2f})."
+                f"Were {number.name} estimated too, it and `{number.partner}` would move "
+                f"together (correlation {number.correlation:+.2f})."
             )
     return sentences
 

@@ -16,6 +16,7 @@ from bampipe.estimate.innovations import (
 from bampipe.estimate.unscented import Trial
 from bampipe.identification.filter_run import STRETCH_S, FilterRun, samples_per_stretch
 from bampipe.physics import System
+from bampipe.results.identify import Independence, InnovationTests, Whiteness
 
 _LAGS_S = (0.0, 0.25, 0.5)
 """Lags at which inputs are taken."""
@@ -31,8 +32,8 @@ def innovation_tests(
     found: FilterRun,
     trials: Sequence[Trial],
     moving: Sequence[NDArray[np.bool_]],
-) -> dict[str, object]:
-    """Return both tests for each position channel, and a sentence on each, for identify.json.
+) -> dict[str, InnovationTests]:
+    """Return both tests for each position channel, and a sentence on each.
 
     Args:
         system: the model; found: the filter's; trials: as it was given them.
@@ -47,32 +48,23 @@ def innovation_tests(
         clear = average_stretches(moving[place].astype(float), length) == 1.0
         by_trial.append(np.where(clear, trial.stretches[:, :n], np.nan))
         inputs.append(average_stretches(given.u[:, channels], length))
-    content: dict[str, object] = {}
+    tests = {}
     for axis in range(n):
         records = [stretches[:, axis] for stretches in by_trial]
         lags = [round(lag / STRETCH_S) for lag in _LAGS_S]
         own, driven = check_whiteness(records), check_independence(records, inputs, lags)
-        entry: dict[str, object] = {"sentence": _sentence(own, driven)}
-        if own is not None:
-            entry["whiteness"] = _entry(own) | {"white": not _fails(own, WHITE_SHARE)}
-        if driven is not None:
-            passed = not _fails(driven, INPUT_SHARE)
-            entry["inputs"] = _entry(driven) | {"independent": passed}
-        content[system.coordinates[axis]] = entry
-    return content
+        tests[system.coordinates[axis]] = InnovationTests(
+            sentence=_sentence(own, driven),
+            whiteness=Whiteness(**vars(own), white=not _fails(own, WHITE_SHARE)) if own else None,
+            inputs=Independence(**vars(driven), independent=not _fails(driven, INPUT_SHARE))
+            if driven
+            else None,
+        )
+    return tests
 
 
 def _fails(test: InnovationTest, limit: float) -> bool:
     return test.p_value < _SIGNIFICANT and test.share > limit
-
-
-def _entry(test: InnovationTest) -> dict[str, object]:
-    return {
-        "statistic": test.statistic,
-        "degrees": test.degrees,
-        "p_value": test.p_value,
-        "share": test.share,
-    }
 
 
 def _sentence(own: InnovationTest | None, driven: InnovationTest | None) -> str:

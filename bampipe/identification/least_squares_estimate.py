@@ -6,13 +6,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
 from bampipe.errors import InputError
 from bampipe.estimate.least_squares import LeastSquares, Problem, fit
-from bampipe.identification.estimates import Estimate, timing_entry
-from bampipe.identification.filter_tables import as_filtered
+from bampipe.identification.estimates import Estimate, estimate_of_fit, trace_row
 from bampipe.physics import System
 from bampipe.trials.kinematics import Kinematics
 from bampipe.trials.motion import Motion
@@ -146,43 +144,22 @@ def estimate_by_least_squares(
 ) -> Estimate:
     """Return the least-squares estimate; its trace is the fit to the trials so far."""
     problem, raw = squares.problem, squares.raw
-    kept = [k for k, i in enumerate(problem.free) if i < len(system.parameters)]
-    names = [system.parameters[problem.free[k]].name for k in kept]
-    shift = np.zeros(problem.free.size) if squares.bias is None else squares.bias
+    shift = 0.0 if squares.bias is None else squares.bias
     rows, clock = [], 0.0
     for number, motion in enumerate(motions):
         clock += float(motion.t[-1])
         so_far = fit(problem, raw.p, trials=range(number + 1))
-        row: dict[str, object] = {"t_total": clock, "trial_id": motion.trial_id}
-        for k, name in zip(kept, names, strict=True):
-            row[name] = so_far.p[problem.free[k]] - shift[k]
-            row[f"{name}_sd"] = float(np.sqrt(so_far.covariance[k, k]))
-        rows.append(row)
-    frames = [as_filtered(system, motion, squares.p[:-1]) for motion in motions]
-    sd = 3.0 * np.median(np.concatenate([motion.qd_sd for motion in motions]), axis=0)
-    timed = len(kept) < problem.free.size
-    report: dict[str, object] = {
-        "input_timing": timing_entry(squares.p, raw.covariance[-1, -1] if timed else 0.0),
-        "residual_sd": dict(zip(system.coordinates, map(float, raw.residual_sd), strict=True)),
-        "convergence": {"iterations": raw.iterations, "converged": raw.converged},
-        "state_3sigma": {
-            axis: {"velocity": float(sd[i])} for i, axis in enumerate(system.coordinates)
-        },
-    }
-    return Estimate(
-        p=squares.p,
-        problem=problem,
-        covariance=raw.covariance[np.ix_(kept, kept)],
-        at_bound=raw.at_bound[kept],
-        details=bias_details(squares, kept),
-        report=report,
-        states=pd.concat(frames, ignore_index=True),
-        trace=pd.DataFrame(rows),
+        row = trace_row(system, problem, so_far, shift)
+        rows.append({"t_total": clock, "trial_id": motion.trial_id, **row})
+    residual_sd = dict(zip(system.coordinates, raw.residual_sd, strict=True))
+    details = bias_details(squares)
+    return estimate_of_fit(
+        system, motions, problem, raw, squares.p, details, rows, residual_sd=residual_sd
     )
 
 
-def bias_details(squares: UnbiasedFit, kept: Sequence[int]) -> list[dict[str, float]]:
-    """Return, for each of the parameters ``kept``, the bias that was taken off."""
+def bias_details(squares: UnbiasedFit) -> list[dict[str, float]]:
+    """Return, for each free parameter, the bias that was taken off."""
     if squares.bias is None:
-        return [{} for _ in kept]
-    return [{"least_squares_bias": float(squares.bias[k])} for k in kept]
+        return [{} for _ in squares.problem.free]
+    return [{"least_squares_bias": bias} for bias in squares.bias]

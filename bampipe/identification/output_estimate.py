@@ -5,15 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
 from bampipe.errors import InputError
 from bampipe.estimate.output_error import OutputError, Segment, fit_output
 from bampipe.estimate.simulation import simulate
 from bampipe.estimate.unscented import Trial
-from bampipe.identification.estimates import Estimate, timing_entry
-from bampipe.identification.filter_tables import as_filtered
+from bampipe.identification.estimates import Estimate, estimate_of_fit, trace_row
 from bampipe.identification.least_squares_estimate import UnbiasedFit
 from bampipe.physics import System
 from bampipe.progress import Progress
@@ -101,37 +99,17 @@ def estimate_by_output_error(
         return fit_output(chosen, start, problem.free, problem.lower, problem.upper, step, most)
 
     found = fit(len(segments), squares.p, 15)
-    kept = [k for k, i in enumerate(problem.free) if i < len(system.parameters)]
-    rows, frames, clock = [], [], 0.0
+    rows, clock = [], 0.0
     for number, motion in enumerate(motions, start=1):
         progress(0.4 + 0.5 * number / len(motions), motion.trial_id)
         clock += float(motion.t[-1])
         if sum(len(trial) for trial in segments[:number]) <= problem.free.size:
             continue
         so_far = found if number == len(motions) else fit(number, found.p, 2)
-        row: dict[str, object] = {"t_total": clock, "trial_id": motion.trial_id}
-        for k in kept:
-            name = system.parameters[problem.free[k]].name
-            row[name] = so_far.p[problem.free[k]]
-            row[f"{name}_sd"] = float(np.sqrt(so_far.covariance[k, k]))
-        rows.append(row)
-        frames.append(as_filtered(system, motion, found.p[:-1]))
-    bound = 3.0 * np.median(np.concatenate([motion.qd_sd for motion in motions]), axis=0)
-    timed = len(kept) < problem.free.size
-    return Estimate(
-        p=found.p,
-        problem=problem,
-        covariance=found.covariance[np.ix_(kept, kept)],
-        at_bound=found.at_bound[kept],
-        details=[{"least_squares": float(squares.p[problem.free[k]])} for k in kept],
-        report={
-            "input_timing": timing_entry(found.p, found.covariance[-1, -1] if timed else 0.0),
-            "position_error": dict(zip(system.coordinates, map(float, found.rms), strict=True)),
-            "convergence": {"iterations": found.iterations, "converged": found.converged},
-            "state_3sigma": {
-                axis: {"velocity": float(bound[i])} for i, axis in enumerate(system.coordinates)
-            },
-        },
-        states=pd.concat(frames, ignore_index=True),
-        trace=pd.DataFrame(rows),
+        row = trace_row(system, problem, so_far)
+        rows.append({"t_total": clock, "trial_id": motion.trial_id, **row})
+    position_error = dict(zip(system.coordinates, found.rms, strict=True))
+    details = [{"least_squares": squares.p[place]} for place in problem.free]
+    return estimate_of_fit(
+        system, motions, problem, found, found.p, details, rows, position_error=position_error
     )

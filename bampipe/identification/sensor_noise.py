@@ -18,6 +18,7 @@ from bampipe.estimate.unscented import (
 )
 from bampipe.identification.filter_choice import FilterChoice
 from bampipe.physics import System
+from bampipe.results.identify import NoiseLevels
 from bampipe.trials.motion import Motion
 from bampipe.trials.sensors import Sensors
 
@@ -172,14 +173,11 @@ def tune_noise(
     return replace(with_levels(best), longest_step=settings.longest_step)
 
 
-def noise_report(
-    system: System, settings: FilterSettings, noise: Noise
-) -> dict[str, dict[str, float]]:
-    """Return the levels used and those of the sensors, by name, as identify.json has them."""
+def noise_levels(system: System, settings: FilterSettings, noise: Noise) -> NoiseLevels:
+    """Return the levels used and those of the sensors, by name."""
     names = [*system.coordinates, *(f"{axis}_rate" for axis in system.coordinates)]
-    reading = zip(names, settings.reading_sd, strict=False)
-    return {
-        "reading_sd": {name: float(sd) for name, sd in reading},
-        "process_sd": dict(zip(system.noise, (float(sd) for sd in settings.noise_sd), strict=True)),
-        "sensor_sd": dict(zip(system.noise, (float(sd) for sd in noise.process_sd), strict=True)),
-    }
+    return NoiseLevels(
+        reading_sd=dict(zip(names, settings.reading_sd, strict=False)),
+        process_sd=dict(zip(system.noise, settings.noise_sd, strict=True)),
+        sensor_sd=dict(zip(system.noise, noise.process_sd, strict=True)),
+    )

@@ -30,7 +30,6 @@ from bampipe.identification.output_estimate import estimate_by_output_error
 from bampipe.identification.sensor_noise import sensor_noise
 from bampipe.physics import System, compile_model
 from bampipe.progress import Progress
-from bampipe.results.identify import IdentifyResult
 from bampipe.schema import STRICT, Positive
 from bampipe.trials.measured import read_measured_trials
 from bampipe.trials.reading import (
@@ -124,44 +123,46 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     if config.remove_bias:
         squares = remove_bias(sensors, kinematics, system, motions, problem, raw)
     noise = sensor_noise(sensors, system, motions, raw.p[: len(start)], config)
-    method, notes = config.method, []
-    if method in ("auto", "ukf"):
+    method: Literal["ukf", "least-squares", "output-error"] = "ukf"
+    notes = []
+    if config.method in ("auto", "ukf"):
         try:
             estimate = estimate_by_filter(
                 run, system, motions, start, squares, noise, config, config.model, progress
             )
-            method = "ukf"
         except MotionLost as error:
-            if method == "ukf":
+            if config.method == "ukf":
                 raise
             estimate, method = estimate_by_least_squares(system, motions, squares), "least-squares"
             notes.append(f"Estimated by least squares, since {error.what}.")
-    elif method == "output-error":
+    elif config.method == "output-error":
         progress(0.3, "output error")
         near = raw.p[: len(start)]
         trials = [
             load_filter_trial(run, motion, system, near, noise, 1, config) for motion in motions
         ]
         estimate = estimate_by_output_error(system, motions, trials, squares, progress)
+        method = "output-error"
     else:
-        estimate = estimate_by_least_squares(system, motions, squares)
+        estimate, method = estimate_by_least_squares(system, motions, squares), "least-squares"
     if system.undriven and method == "least-squares":
         notes.append(
             f"No force acts on {', '.join(system.undriven)}: least squares makes what stands in"
             " such an equation too small, more so the more the model lacks."
         )
     progress(0.97, "identifiability of the parameters")
-    identifiability = assess_identifiability(
+    identifiability, unseen = assess_identifiability(
         system, motions, estimate.problem, estimate.p, noise, estimate.at_bound
     )
     # What the trials say nothing of is as uncertain as it was before, whatever the fit believes.
-    estimate = replace(estimate, covariance=estimate.covariance + identifiability.unseen)
+    estimate = replace(estimate, covariance=estimate.covariance + unseen)
     engine = config.engine if method == "ukf" else "compiled"
-    found = collect_result(system, estimate, identifiability, motions, config.model, method, engine)
-    found["notes"] = [*notes, *identifiability.sentences]
+    result = collect_result(
+        system, estimate, identifiability, motions, config.model, method, engine, notes
+    )
     write_parquet(out / f"models/{config.model}/states.parquet", estimate.states)
     write_parquet(out / f"models/{config.model}/trace.parquet", estimate.trace)
-    return IdentifyResult.model_validate(found).write(out)
+    return result.write(out)
 
 
 def _start(run: RunFolder, system: System, config: Config) -> Array:
