@@ -68,7 +68,7 @@ class Config:
 
     method: Literal["auto", "kalman", "butterworth", "savitzky_golay"] = "auto"
     cutoff_hz: NotNegative = 0.0
-    minimum_bandwidth_hz: NotNegative = 20.0
+    minimum_bandwidth_hz: NotNegative = 25.0
     force_cutoff_hz: Positive = 25.0
     band_hz: NotNegative = 0.0
     tuning_samples: Annotated[int, Field(ge=1000)] = 120_000
@@ -225,7 +225,8 @@ def _choose(
     best = fits[order].model
     noise_sd = best.noise_sd
     floor = float(np.median([butterworth.floor_frequency(x, rate, noise_sd) for x, _ in records]))
-    least, most = min(config.minimum_bandwidth_hz, 0.1 * rate), 0.2 * rate
+    most = 0.2 * rate
+    least = min(config.minimum_bandwidth_hz, most)
     kalman = config.method in ("auto", "kalman")
     found = best.bandwidth_hz if kalman else floor
     cutoff = config.cutoff_hz or float(np.clip(found, least, most))
