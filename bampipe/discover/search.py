@@ -16,8 +16,8 @@ from bampipe.discover.rivals import choose
 from bampipe.discover.start import with_effect, without_effect
 from bampipe.estimate.simulation import Runaway
 from bampipe.physics.recipe import Recipe
-from bampipe.results.standing import AT_FLOOR
-from bampipe.trials.noise_floor import FLOOR_SEED
+from bampipe.results.standing import AT_FLOOR, standing
+from bampipe.trials.noise_floor import FLOOR_SEED, NoiseFloor
 from bampipe.trials.residuals import Evidence
 
 Array = NDArray[np.float64]
@@ -90,13 +90,16 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
         fitted = bench.fit(wider, with_effect(wider, evidence, scores[best]))
         wider, fitted = _needed(bench, base, wider, fitted)
         try:
-            replayed = bench.replicas(wider, fitted.p, s.rival_replicates, (), (3,))
+            replays = bench.replicas(wider, fitted.p, s.rival_replicates, (), (3,))
+            sound = _keeps_the_floor(fitted, replays, replayed)
         except Runaway:
+            sound = False
+        if not sound:
             # It resembles what is missing in these trials, but no mechanism could have it.
             dropped.add(best)
             scores = {name: score for name, score in scores.items() if name != best}
             continue
-        recipe, evidence = wider, fitted
+        recipe, evidence, replayed = wider, fitted, replays
         groups[best] = alike
         help_ = level.excess(first[best]) if best in first else known.excess(scores[best])
         main[best] = int(np.argmax(help_))
@@ -111,6 +114,23 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
     return Search(
         base, initial, level, first, groups, main, evidence, tuple(final)
     )  # fmt: skip
+
+
+def _keeps_the_floor(
+    evidence: Evidence, replays: Sequence[Replicate], before: Sequence[Replicate]
+) -> bool:
+    """Whether an effect buys nothing by raising the noise floor.
+
+    The replays of a model with a wrong effect can be so wild that any error is below their floor:
+    such a floor is no better than none, unless it was like that without the effect.
+    """
+    error = Scorer(evidence).before.error
+    after, earlier = (NoiseFloor.of_errors([r.error for r in some]) for some in (replays, before))
+    return not any(
+        standing(float(error[i]), float(after.mean[i])) == "floor_implausible"
+        and after.mean[i] > 2.0 * earlier.mean[i]
+        for i in range(len(error))
+    )
 
 
 def _needed(

@@ -1,14 +1,12 @@
 """White noise and counting steps of a record whose signal is otherwise smooth.
 
-A difference of order k of white noise of standard deviation s has standard deviation
-s sqrt(binomial(2k, k)), while that of a smooth signal falls with every order. The least over
-several orders therefore bounds the noise from above, and is the noise wherever the signal is smooth
-over a few samples.
+A difference of order k, divided by the root of its squared weights, has the standard deviation of
+white noise, while that of a smooth signal falls with every order. The least over several orders
+therefore bounds the noise from above, and is the noise wherever the signal is smooth over a few
+samples.
 """
 
 from __future__ import annotations
-
-from math import comb
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,34 +23,43 @@ _FEWEST = 200
 """Samples below which noise is not measured."""
 
 
-def white_noise_sd(record: Array, rate_hz: float = 0.0) -> float:
+def white_noise_sd(record: Array, t: Array | None = None) -> float:
     """Standard deviation of the white noise on a record (T,) of a signal that is otherwise smooth.
 
     From the median absolute difference, which resists spikes and steps; NaN for records too short
     to tell.
 
     Args:
-        record: on a uniform grid.
-        rate_hz: sampling rate, to look for noise that is not white between neighbouring samples;
-            0 to leave that out.
+        record: samples.
+        t: (T,) their time stamps, s, which need not be uniform. Given, noise that is not white
+            between neighbouring samples is looked for too; a uniform record needs none.
     """
-    fine = _difference_noise(record)
-    every = int(rate_hz / _SLOWEST_HZ)
-    coarse = _difference_noise(record[::every]) if every > 1 else fine
+    fine = _difference_noise(record, t)
+    if t is None or t.size < 2:
+        return fine
+    every = int(1.0 / (_SLOWEST_HZ * float(np.median(np.diff(t)))))
+    coarse = _difference_noise(record[::every], t[::every]) if every > 1 else fine
     return coarse if coarse > _COLOURED * fine else fine
 
 
-def _difference_noise(record: Array) -> float:
+def _difference_noise(record: Array, t: Array | None) -> float:
     """Least over several orders of the noise that differences of a record show."""
     if record.size < _FEWEST:
         return float("nan")
+    stamps = np.arange(record.size, dtype=float) if t is None else t / float(np.median(np.diff(t)))
     found = []
     for order in _ORDERS:
-        size = np.abs(np.diff(record, n=order))
+        windows = np.lib.stride_tricks.sliding_window_view(stamps, order + 1)
+        # A divided difference takes every polynomial of lower degree out, whatever the spacing.
+        gaps = windows[:, :, None] - windows[:, None, :]
+        gaps[:, range(order + 1), range(order + 1)] = 1.0
+        weights = 1.0 / np.prod(gaps, axis=2)
+        values = np.lib.stride_tricks.sliding_window_view(record, order + 1)
+        size = np.abs(np.sum(weights * values, axis=1)) / np.sqrt(np.sum(weights**2, axis=1))
         typical = float(np.median(size)) / _NORMAL_MEDIAN
         if typical == 0.0:  # more than half the differences are zero: coarse steps
             typical = float(np.sqrt(np.mean(np.square(size))))
-        found.append(typical / np.sqrt(comb(2 * order, order)))
+        found.append(typical)
     return float(min(found))
 
 

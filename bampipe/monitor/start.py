@@ -256,11 +256,11 @@ def start_from_samples(
         np.array([item.prior for item in free]), np.array([item.sd for item in free])
     )
     reading = [
-        settle_encoder(axis, "", None, [RecordNoise.of(column)]).noise_sd or _NO_STEP
+        settle_encoder(axis, "", None, [RecordNoise.of(column, t)]).noise_sd or _NO_STEP
         for axis, column in zip(system.coordinates, q.T, strict=True)
     ]
     sensed = {
-        name: settle_force(name, "", None, [RecordNoise.of(u[:, column])]).noise_sd
+        name: settle_force(name, "", None, [RecordNoise.of(u[:, column], t)]).noise_sd
         for column, name in enumerate(system.inputs)
         if name in system.noise
     }

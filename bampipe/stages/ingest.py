@@ -265,9 +265,7 @@ def _measure_noise(noise: dict[str, list[RecordNoise]], trial: CleanTrial) -> No
     """Note what a trial says of the noise of its encoders (``q_<axis>``) and inputs."""
     for name, values in trial.columns.items():
         if not name.startswith("brake_"):
-            # Encoders count: thinned, their records would only be shorter.
-            rate = 0.0 if name.startswith("q_") else trial.sample_rate
-            noise[name].append(RecordNoise.of(np.asarray(values, dtype=float), rate))
+            noise[name].append(RecordNoise.of(np.asarray(values, dtype=float), trial.t))
 
 
 def _row(entry: TrialEntry, trial: CleanTrial | None, reason: str) -> dict[str, object]:

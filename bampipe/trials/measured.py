@@ -22,6 +22,10 @@ from bampipe.trials.reading import (
 from bampipe.trials.sensors import Sensors
 
 
+_TIMING_LIMIT = 0.98
+"""Share of half a sample from which on a timing is at its limit."""
+
+
 @dataclass(frozen=True)
 class MeasuredTrials:
     """What identify, validate and diagnose share: the trials, and how they came to be.
@@ -50,18 +54,23 @@ def read_measured_trials(
 
     Args:
         run: the run folder; system: the model.
-        every_input: as in `read_motion`; late_s: time by which inputs were sampled after
-            positions, taken off.
+        every_input: as in `read_motion`.
+        late_s: time by which inputs were sampled after positions, as identified. It is taken off,
+            unless it is at its limit of half a sample: then it stands for a delay or lag that the
+            model lacks, and taking off a part of that would hide what it is.
 
     Raises:
         InputError: there is no free trial, or a file or column is missing.
     """
     names = free_trials(run, braked=True)
+    band = read_band(run, system)
+    if abs(late_s) >= _TIMING_LIMIT * 0.5 / band.rate_hz:
+        late_s = 0.0
     fitted = free_trials(run, fitted=True, braked=system.braked)
     return MeasuredTrials(
         read_motions(run, system, braked=True, every_input=every_input, late_s=late_s),
         read_sensors(run, system),
         read_kinematics(run, system),
-        read_band(run, system),
+        band,
         Folds.of_trials(names, held_out_trials(run), fitted),
     )

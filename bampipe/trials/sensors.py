@@ -33,10 +33,11 @@ class RecordNoise:
     white_sd: float
 
     @classmethod
-    def of(cls, record: Array, rate_hz: float = 0.0) -> RecordNoise:
-        """Measure a record (T,); a ``rate_hz`` thins it first, see `white_noise_sd`."""
-        sound = record[np.isfinite(record)]
-        return cls(counting_step(sound), white_noise_sd(sound, rate_hz))
+    def of(cls, record: Array, t: Array | None = None) -> RecordNoise:
+        """Measure a record (T,) with time stamps ``t`` (T,); see `white_noise_sd`."""
+        sound = np.isfinite(record)
+        stamps = None if t is None else t[sound]
+        return cls(counting_step(record[sound]), white_noise_sd(record[sound], stamps))
 
 
 @dataclass(frozen=True)
