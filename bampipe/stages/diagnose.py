@@ -87,8 +87,8 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
             where=f"device {model.device.name!r}",
             remedy="judge its models by validate and compare",
         )
-    late = run.read(IdentifyResult, config.model).input_timing
-    trials = read_measured_trials(run, system, every_input=True, late_s=late.estimate)
+    timing = run.read(IdentifyResult, config.model).input_timing
+    trials = read_measured_trials(run, system, every_input=True, timing=timing)
     fitted = sum(group != HELD_OUT for group in trials.folds.groups)
     if fitted < 2:
         raise InputError(

@@ -106,8 +106,8 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     """Compare one identified model with all free trials, and those in a viscous field."""
     system = compile_model(load_model(run, config.model))
     p = identified(run, config.model, system)
-    late = run.read(IdentifyResult, config.model).input_timing
-    trials = read_measured_trials(run, system, late_s=late.estimate)
+    timing = run.read(IdentifyResult, config.model).input_timing
+    trials = read_measured_trials(run, system, timing=timing)
     if config.hold_out_by:
         trials = replace(trials, folds=_folds_by_channel(run, trials, config.hold_out_by))
     require_sound_motions(system, trials.motions)

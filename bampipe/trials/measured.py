@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from bampipe.data.run_folder import RunFolder
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import System
+from bampipe.results.identify import InputTiming
 from bampipe.trials.folds import Folds
 from bampipe.trials.kinematics import Kinematics
 from bampipe.trials.motion import Motion
@@ -20,10 +21,6 @@ from bampipe.trials.reading import (
     read_sensors,
 )
 from bampipe.trials.sensors import Sensors
-
-
-_TIMING_LIMIT = 0.98
-"""Share of half a sample from which on a timing is at its limit."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +42,7 @@ class MeasuredTrials:
 
 
 def read_measured_trials(
-    run: RunFolder, system: System, *, every_input: bool = False, late_s: float = 0.0
+    run: RunFolder, system: System, *, every_input: bool = False, timing: InputTiming | None = None
 ) -> MeasuredTrials:
     """Read the trials of a run folder for a model.
 
@@ -55,17 +52,18 @@ def read_measured_trials(
     Args:
         run: the run folder; system: the model.
         every_input: as in `read_motion`.
-        late_s: time by which inputs were sampled after positions, as identified. It is taken off,
-            unless it is at its limit of half a sample: then it stands for a delay or lag that the
-            model lacks, and taking off a part of that would hide what it is.
+        timing: time by which inputs were sampled after positions, as identified. It is taken off
+            where it is known to be less than half a sample, its limit. At the limit it stands for
+            a delay or lag that the model lacks, and taking off a part would hide what it is.
 
     Raises:
         InputError: there is no free trial, or a file or column is missing.
     """
     names = free_trials(run, braked=True)
     band = read_band(run, system)
-    if abs(late_s) >= _TIMING_LIMIT * 0.5 / band.rate_hz:
-        late_s = 0.0
+    late_s = 0.0
+    if timing is not None and abs(timing.estimate) + 2.0 * timing.sd < 0.5 / band.rate_hz:
+        late_s = timing.estimate
     fitted = free_trials(run, fitted=True, braked=system.braked)
     return MeasuredTrials(
         read_motions(run, system, braked=True, every_input=every_input, late_s=late_s),
