@@ -2,9 +2,11 @@
 
 import re
 import tomllib
+import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import pytest
+from test_imports import LAWS
 
 from bampipe.physics import Model, compile_model, registry
 from bampipe.physics.expression import FUNCTIONS
@@ -12,7 +14,7 @@ from bampipe.physics.readable import describe_equations
 from bampipe.physics.units import check_device, check_effect
 
 ROOT = Path(__file__).parent.parent
-DOCS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+DOCS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 
 def blocks(name, language="toml"):
@@ -55,3 +57,50 @@ def test_links_lead_to_files(path):
     for link in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", text):
         if "://" not in link:
             assert (path.parent / link).exists(), link
+
+
+def test_the_architecture_describes_every_room_and_no_other():
+    text = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
+    table = text.partition("## The rooms\n")[2].partition("\n## ")[0]
+    rows = re.findall(r"^\| `(\w+)` \|.*\| `([^`]*)`(?:, `([^`]*)`)?[^|]* \|$", table, re.M)
+    assert sorted(room for room, *_ in rows) == sorted(LAWS)
+    for room, *files in rows:
+        for file in filter(None, files):
+            assert (ROOT / "bampipe" / room / file).is_file(), (room, file)
+
+
+def test_the_drawing_of_the_rooms_is_the_law_of_imports():
+    """An arrow stands for every room that may be imported and that no other way leads to."""
+    below = {
+        room: {name.split(".")[1] for name in law if _is_room(name)} for room, law in LAWS.items()
+    }
+    expected = {
+        (room, other)
+        for room in below
+        for other in below[room]
+        if not any(other in _reach(below, between) for between in below[room] - {other})
+    }
+    items = list(ET.parse(ROOT / "docs/images/rooms.svg").iter())
+    assert {item.get("data-room") for item in items} - {None} == set(LAWS)
+    arrows = {(item.get("data-from"), item.get("data-to")) for item in items} - {(None, None)}
+    assert arrows == expected
+
+
+def _is_room(name):
+    return name.count(".") == 1 and name.split(".")[1] in LAWS
+
+
+def _reach(below, room):
+    return {room}.union(*(_reach(below, other) for other in below[room]))
+
+
+@pytest.mark.parametrize("name", ["CONTRIBUTING.md", "docs/architecture.md"])
+def test_files_that_a_newcomer_is_sent_to_exist(name):
+    text = re.sub(r"```.*?```", "", (ROOT / name).read_text(encoding="utf-8"), flags=re.S)
+    text = re.sub(r"^\| `\w+` \|.*$", "", text, flags=re.M)  # the rooms, checked above
+    paths = re.findall(r"`((?:[\w.]+/)+(?:\w+\.\w+)?)(?: [^`]*)?`", text)
+    assert len(paths) > 10
+    of_a_session = ("ingest/", "filter/", "models/", "report/report", "trials/t01", "dist/")
+    for path in paths:
+        if "NAME" not in path and not path.startswith(of_a_session):
+            assert any((home / path).exists() for home in (ROOT, ROOT / "bampipe")), path

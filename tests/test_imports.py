@@ -134,7 +134,6 @@ LAWS = {
         "bampipe.physics",
         "bampipe.estimate",
         "bampipe.data",
-        "bampipe.declarations",
     },
     "monitor": {
         "numpy",
@@ -254,7 +253,6 @@ LAWS = {
         "bampipe.discover",
         "bampipe.data",
         "bampipe.declarations",
-        "bampipe.identification",
         "bampipe.monitor",
         "bampipe.proposal",
         "bampipe.simulator",
