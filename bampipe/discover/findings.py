@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from bampipe.results.diagnose import Verdict
 from bampipe.results.standing import Standing
 from bampipe.trials.residuals import Evidence
 
@@ -43,7 +44,7 @@ class AxisFinding:
         explained: share of the excess mean square that the effects found or nearest remove.
     """
 
-    verdict: str
+    verdict: Verdict
     rmse_before: float
     rmse_after: float
     noise_floor: float

@@ -11,6 +11,7 @@ from bampipe.discover.ranking import rank
 from bampipe.discover.search import Search
 from bampipe.discover.settings import Settings
 from bampipe.discover.shape import explainable_share
+from bampipe.results.diagnose import Verdict
 from bampipe.results.standing import standing
 from bampipe.trials.noise_floor import NoiseFloor
 
@@ -37,7 +38,7 @@ def conclude(search: Search, s: Settings) -> Diagnosis:
         against_floor = standing(float(after[axis]), level, scatter)
         above = after[axis] / max(level, 1e-30)
         lacking = against_floor == "above_floor" and (above > s.surely or share > s.predictable)
-        verdict = "missing" if here else "nothing_missing"
+        verdict: Verdict = "missing" if here else "nothing_missing"
         explained = max(0.0, 1.0 - left / max(excess, 1e-30)) if here else 0.0
         if lacking and explained < (s.explained_far if above > s.far else s.explained):
             verdict = "unknown_effect"

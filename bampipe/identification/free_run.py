@@ -8,8 +8,9 @@ without a restoring force any error of the force is integrated for ever.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,11 +24,13 @@ from bampipe.physics import System
 from bampipe.physics.control_law import ControlLaw, compile_law
 from bampipe.physics.device import INPUT_ORDERS, derivative
 from bampipe.results.ingest import IngestResult
+from bampipe.results.validate import CommandError, FreeRun, FreeRunError
 from bampipe.trials.motion import Motion
 
 Array = NDArray[np.float64]
 
-CLOSED, OPEN = "closed_loop", "open_loop"
+CLOSED: Final = "closed_loop"
+OPEN: Final = "open_loop"
 _PUSHED = 0.1
 """How far the start is displaced to see whether it is forgotten, in spreads of the motion."""
 _FORGOTTEN = 0.5
@@ -51,7 +54,7 @@ def free_runs(
     motions: Sequence[Motion],
     parameters: Sequence[Array],
     judged: Sequence[bool],
-) -> dict[str, object]:
+) -> FreeRun:
     """Run the model freely over every trial and say how far it ends up from the measurement.
 
     Args:
@@ -62,17 +65,14 @@ def free_runs(
         judged: which trials count for the whole; all where none does.
 
     Returns:
-        ``mode`` (``closed_loop`` or ``open_loop``), ``axes.<axis>`` and
-        ``trials.<trial_id>.<axis>`` with ``mean_absolute`` and ``rmse`` of the position, rad or m,
-        and relative errors of position and velocity in per cent; in closed loop
-        ``forces.<channel>`` with the relative error of the command. ``{"reason": ...}`` where no
-        free run is possible or meaningful.
+        Errors in closed loop, else in open loop; only a ``reason`` where no free run is possible
+        or meaningful.
     """
     law = compile_law(system.model.device)
     reason = "the device file declares no [controller]"
     if law is not None:
         reason = _lacks(run, system, law)
-    mode = OPEN if law is None or reason else CLOSED
+    mode: Literal["closed_loop", "open_loop"] = OPEN if law is None or reason else CLOSED
     runs = []
     try:
         for motion, p in zip(motions, parameters, strict=True):
@@ -81,30 +81,26 @@ def free_runs(
             elif runs or _forgets(system, motion, p):
                 runs.append(_open(system, motion, p))
             else:
-                return {
-                    "reason": f"{reason}, and driven by its recorded inputs alone the mechanism "
-                    "does not forget where it started"
-                }
-    except InputError as error:
-        return {"reason": f"{mode.replace('_', ' ')}: {error}"}
-    content: dict[str, object] = {
-        "mode": mode,
-        "axes": _axes(system, [r for r, j in zip(runs, judged, strict=True) if j] or runs),
-        "trials": {r.trial_id: _axes(system, [r]) for r in runs},
-    }
-    if mode == CLOSED:
-        content["forces"] = {
-            name: {
-                "relative_error_percent": _percent(
-                    np.concatenate([r.command[:, j] - r.force[:, j] for r in runs]),
-                    np.concatenate([r.force[:, j] for r in runs]),
+                return FreeRun(
+                    reason=f"{reason}, and driven by its recorded inputs alone the mechanism does "
+                    "not forget where it started"
                 )
-            }
-            for j, name in enumerate(system.model.device.forces)
-        }
-    else:
-        content["reason"] = reason
-    return content
+    except InputError as error:
+        return FreeRun(reason=f"{mode.replace('_', ' ')}: {error}")
+    forces = {}
+    if mode == CLOSED:
+        for j, name in enumerate(system.model.device.forces):
+            commanded = np.concatenate([r.command[:, j] for r in runs])
+            given = np.concatenate([r.force[:, j] for r in runs])
+            percent = _percent(commanded - given, given)
+            forces[name] = CommandError(relative_error_percent=percent)
+    return FreeRun(
+        reason="" if mode == CLOSED else reason,
+        mode=mode,
+        axes=_axes(system, [r for r, j in zip(runs, judged, strict=True) if j] or runs),
+        trials={r.trial_id: _axes(system, [r]) for r in runs},
+        forces=forces,
+    )
 
 
 def _lacks(run: RunFolder, system: System, law: ControlLaw) -> str:
@@ -179,18 +175,18 @@ def _width(system: System) -> Array:
     return np.array([c.sign_width for c in system.model.device.coordinates])
 
 
-def _axes(system: System, runs: Sequence[_Run]) -> dict[str, Mapping[str, object]]:
+def _axes(system: System, runs: Sequence[_Run]) -> dict[str, FreeRunError]:
     n = len(system.coordinates)
     error = np.concatenate([r.simulated - r.measured for r in runs])
     measured = np.concatenate([r.measured for r in runs])
     return {
-        axis: {
-            "mean_absolute": float(np.mean(np.abs(error[:, i]))),
-            "rmse": float(np.sqrt(np.mean(error[:, i] ** 2))),
-            "relative_error_percent": _percent(error[:, i], measured[:, i]),
-            "velocity_relative_error_percent": _percent(error[:, n + i], measured[:, n + i]),
-            "unit": system.coordinate_units[i],
-        }
+        axis: FreeRunError(
+            mean_absolute=np.mean(np.abs(error[:, i])),
+            rmse=np.sqrt(np.mean(error[:, i] ** 2)),
+            relative_error_percent=_percent(error[:, i], measured[:, i]),
+            velocity_relative_error_percent=_percent(error[:, n + i], measured[:, n + i]),
+            unit=system.coordinate_units[i],
+        )
         for i, axis in enumerate(system.coordinates)
     }
 

@@ -25,7 +25,9 @@ from bampipe.schema import (
     read,
 )
 
-KINDS = MappingProxyType({"rotary": ("rad", "N.m", 1e-3), "linear": ("m", "N", 2.5e-4)})
+KINDS: Mapping[str, tuple[Literal["rad", "m"], str, float]] = MappingProxyType(
+    {"rotary": ("rad", "N.m", 1e-3), "linear": ("m", "N", 2.5e-4)}
+)
 """By kind of coordinate: its unit, that of its generalised force, usual width of a sign."""
 
 
@@ -53,7 +55,7 @@ class Coordinate(NamedDeclaration):
         return self.given_sign_width or KINDS[self.kind][2]
 
     @property
-    def unit(self) -> str:
+    def unit(self) -> Literal["rad", "m"]:
         """Of the coordinate."""
         return KINDS[self.kind][0]
 

@@ -46,7 +46,7 @@ class System:
         meta = code.facts
         axes = model.device.coordinates
         self.coordinates: tuple[str, ...] = tuple(c.name for c in axes)
-        self.coordinate_units: tuple[str, ...] = tuple(c.unit for c in axes)
+        self.coordinate_units = tuple(c.unit for c in axes)
         self.torque_units: tuple[str, ...] = tuple(c.torque_unit for c in axes)
         self.memory_names: tuple[str, ...] = tuple(meta["memory"])
         self.states: tuple[str, ...] = (

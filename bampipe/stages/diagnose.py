@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -24,7 +23,14 @@ from bampipe.errors import InputError
 from bampipe.physics import compile_model
 from bampipe.physics.recipe import Recipe
 from bampipe.progress import Progress
-from bampipe.results.diagnose import DiagnoseResult
+from bampipe.results.diagnose import (
+    AxisVerdict,
+    DiagnoseResult,
+    RankedEffect,
+    ResidualMap,
+    SuggestedTrial,
+    WorstWindow,
+)
 from bampipe.results.identify import IdentifyResult
 from bampipe.schema import STRICT, Count
 from bampipe.trials.folds import HELD_OUT
@@ -106,8 +112,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         seed=config.seed,
     )
     found = diagnose(trials, recipe, start, settings, progress)
-    result = _result(found, trials, recipe, config.model)
-    return _summary(DiagnoseResult.model_validate(result).write(out))
+    return _summary(_result(found, trials, recipe, config.model).write(out))
 
 
 def _summary(result: dict[str, Any]) -> dict[str, object]:
@@ -129,7 +134,7 @@ def _summary(result: dict[str, Any]) -> dict[str, object]:
     }
 
 
-def _result(found: Diagnosis, trials: MeasuredTrials, recipe: Recipe, model: str) -> dict[str, Any]:
+def _result(found: Diagnosis, trials: MeasuredTrials, recipe: Recipe, model: str) -> DiagnoseResult:
     names = found.evidence.system.coordinates
     units = found.evidence.system.torque_units
     shapes = {
@@ -137,64 +142,56 @@ def _result(found: Diagnosis, trials: MeasuredTrials, recipe: Recipe, model: str
         for i, axis in enumerate(names)
         if found.axes[i].verdict == "unknown_effect" or found.axes[i].remains
     }
-    axes = {}
-    for i, axis in enumerate(names):
-        a = found.axes[i]
-        axes[axis] = {
-            "verdict": a.verdict,
-            "explainable_share": a.explainable_share,
-            "explainable_after": a.explainable_after,
-            "explainable_chance": a.explainable_chance,
-            "rmse_before": a.rmse_before,
-            "rmse_after": a.rmse_after,
-            "noise_floor": a.noise_floor,
-            "noise_floor_sd": a.floor_sd,
-            "standing": a.standing,
-            "unit": units[i],
-            "effects": list(a.effects),
-            "remains": a.remains,
-            "nearest": list(a.nearest),
-            "explained_by_effects": a.explained,
-            "sentence": _sentence(axis, i, found, shapes.get(axis, "")),
-        }
-    ranking = [
-        {
-            "effect": r.effect,
-            "axis": names[r.axis],
-            "held_out_rmse_before": r.held_out_rmse_before,
-            "held_out_rmse_after": r.held_out_rmse_after,
-            "unit": units[r.axis],
-            "p_value": r.p_value,
-            "score": r.score,
-            "parameters": dict(r.values),
-            "indistinguishable_from": list(r.indistinguishable_from),
-        }
-        for r in found.ranking
-    ]
-    suggestion = _suggestion(found, trials, recipe)
-    return {
-        "model": model,
-        "axes": axes,
-        "ranking": ranking,
-        "selected": list(found.selected),
-        "groups": {name: list(group) for name, group in found.groups.items()},
-        "suggested_trial": suggestion,
-        "maps": _maps(found),
-        "worst_windows": [
-            {
-                "axis": w.axis,
-                "trial_id": w.trial_id,
-                "t_start": w.t_start,
-                "t_end": w.t_end,
-                "rmse": w.rmse,
-                "unit": units[names.index(w.axis)],
-                "doing": w.doing,
-            }
-            for w in worst_windows(found.initial)
-        ],
-        "sentence": " ".join(str(a["sentence"]) for a in axes.values()),
-        "next": _next(found, suggestion, model),
+    axes = {
+        axis: AxisVerdict(
+            verdict=a.verdict,
+            explainable_share=a.explainable_share,
+            explainable_after=a.explainable_after,
+            explainable_chance=a.explainable_chance,
+            rmse_before=a.rmse_before,
+            rmse_after=a.rmse_after,
+            noise_floor=a.noise_floor,
+            noise_floor_sd=a.floor_sd,
+            standing=a.standing,
+            unit=units[i],
+            effects=a.effects,
+            remains=a.remains,
+            nearest=a.nearest,
+            explained_by_effects=a.explained,
+            sentence=_sentence(axis, i, found, shapes.get(axis, "")),
+        )
+        for i, (axis, a) in enumerate(zip(names, found.axes, strict=True))
     }
+    ranking = tuple(
+        RankedEffect(
+            effect=r.effect,
+            axis=names[r.axis],
+            held_out_rmse_before=r.held_out_rmse_before,
+            held_out_rmse_after=r.held_out_rmse_after,
+            unit=units[r.axis],
+            p_value=r.p_value,
+            score=r.score,
+            parameters=dict(r.values),
+            indistinguishable_from=r.indistinguishable_from,
+        )
+        for r in found.ranking
+    )
+    suggestion = _suggestion(found, trials, recipe)
+    return DiagnoseResult(
+        model=model,
+        axes=axes,
+        ranking=ranking,
+        selected=found.selected,
+        groups=dict(found.groups),
+        suggested_trial=suggestion,
+        maps=_maps(found),
+        worst_windows=tuple(
+            WorstWindow(**vars(w), unit=units[names.index(w.axis)])
+            for w in worst_windows(found.initial)
+        ),
+        sentence=" ".join(a.sentence for a in axes.values()),
+        next=_next(found, model),
+    )
 
 
 def _sentence(axis: str, i: int, found: Diagnosis, shape: str) -> str:
@@ -233,28 +230,26 @@ def _sentence(axis: str, i: int, found: Diagnosis, shape: str) -> str:
     )
 
 
-def _maps(found: Diagnosis) -> dict[str, object]:
-    out: dict[str, object] = {}
+def _maps(found: Diagnosis) -> dict[str, dict[str, ResidualMap]]:
+    maps: dict[str, dict[str, ResidualMap]] = {}
     for i, axis in enumerate(found.initial.system.coordinates):
-        entries = {}
-        for variable in variables(found.initial, i):
-            m = residual_map(found.initial, i, variable)
-            entries[m.variable] = {
-                "unit": m.unit,
-                "center": m.center.tolist(),
-                "mean": m.mean.tolist(),
-                "low": m.low.tolist(),
-                "high": m.high.tolist(),
-                "count": [int(c) for c in m.count],
-                "variance_share": m.share,
-            }
-        out[axis] = entries
-    return out
+        drawn = [residual_map(found.initial, i, v) for v in variables(found.initial, i)]
+        maps[axis] = {
+            m.variable: ResidualMap(
+                unit=m.unit,
+                center=tuple(m.center),
+                mean=tuple(m.mean),
+                low=tuple(m.low),
+                high=tuple(m.high),
+                count=tuple(m.count),
+                variance_share=m.share,
+            )
+            for m in drawn
+        }
+    return maps
 
 
-def _suggestion(
-    found: Diagnosis, trials: MeasuredTrials, recipe: Recipe
-) -> dict[str, object] | None:
+def _suggestion(found: Diagnosis, trials: MeasuredTrials, recipe: Recipe) -> SuggestedTrial | None:
     for name in found.selected:
         group = found.groups.get(name, ())
         if not group:
@@ -266,25 +261,25 @@ def _suggestion(
         values = {n: np.array(list(ranked[n].values.values())) for n in (name, group[0])}
         floor = found.axes[axis].noise_floor
         advice = advise(trials, recipe, found.initial, axis, name, group[0], values, floor)
-        return {
-            "between": [name, group[0]],
-            "axis": found.initial.system.coordinates[axis],
-            "design": advice.design,
-            "separation": advice.separation,
-            "separation_now": advice.separation_now,
-            "sentence": (
+        return SuggestedTrial(
+            between=(name, group[0]),
+            axis=found.initial.system.coordinates[axis],
+            design=advice.design,
+            separation=advice.separation,
+            separation_now=advice.separation_now,
+            sentence=(
                 f"To tell {name} from {group[0]}, record {advice.design}: taking one for the "
                 f"other would there leave {advice.separation:.1f} noise floors, against "
                 f"{advice.separation_now:.1f} in these trials."
             ),
-        }
+        )
     return None
 
 
-def _next(found: Diagnosis, suggestion: object, model: str) -> str:
+def _next(found: Diagnosis, model: str) -> str:
     if found.selected:
         return f"bampipe extend RUN {found.selected[0]} --model {model}"
-    unknown: Sequence[str] = [
+    unknown = [
         axis
         for axis, a in zip(found.evidence.system.coordinates, found.axes, strict=True)
         if a.verdict == "unknown_effect"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -25,7 +25,7 @@ from bampipe.estimate.differentiation import (
 )
 from bampipe.physics import Model, compile_model
 from bampipe.progress import Progress
-from bampipe.results.filter import FilterResult
+from bampipe.results.filter import AxisDifferentiation, FilterResult, ForceFilter, ResidualBand
 from bampipe.results.ingest import EncoderChannel, IngestResult
 from bampipe.schema import STRICT, NotNegative, Positive
 from bampipe.trials.band import AxisBand, find_band
@@ -107,7 +107,7 @@ class _Choice:
     """How one axis is differentiated, and the words for it."""
 
     filter: AxisFilter
-    report: dict[str, object]
+    report: dict[str, Any]
 
 
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
@@ -154,8 +154,8 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
                 levels[axis].append(errors[axis])
     progress(0.95, "the band of motion and force")
     bands = _bands(run, out, session, kinematics, [k for k in ids if k in interpolated], config)
-    content = _report(config, kinematics, axes, choices, levels, interpolated, skipped, bands)
-    return FilterResult.model_validate(content).write(out)
+    result = _result(config, kinematics, axes, choices, levels, interpolated, skipped, bands)
+    return result.write(out)
 
 
 def _bands(
@@ -245,7 +245,7 @@ def _choose(
         why = "maximum likelihood of the encoder samples"
     else:
         why = "encoder spectrum meets the quantisation floor"
-    report: dict[str, object] = {
+    report: dict[str, Any] = {
         "bandwidth_hz": cutoff,
         "bandwidth_reason": why,
         "measurement_noise_sd": noise_sd,
@@ -309,7 +309,7 @@ def _inputs(
         yield from zip(input_derivatives(name), kinematics.input_rates(values), strict=True)
 
 
-def _report(
+def _result(
     config: Config,
     kinematics: Kinematics,
     axes: Mapping[str, EncoderChannel],
@@ -318,31 +318,30 @@ def _report(
     interpolated: dict[str, float],
     skipped: dict[str, str],
     bands: Mapping[str, AxisBand],
-) -> dict[str, object]:
+) -> FilterResult:
     """Return what filter.json holds."""
-    entries: dict[str, object] = {}
+    entries = {}
     for axis, choice in choices.items():
-        typical = np.median(np.array(levels[axis]), axis=0)
-        unit = axes[axis].unit
-        entries[axis] = choice.report | {
-            "unit": unit,
-            "position_sd": float(typical[0]),
-            "velocity_sd": float(typical[1]),
-            "acceleration_sd": float(typical[2]),
-            "band": vars(bands[axis]),
-        }
+        position, velocity, acceleration = np.median(np.array(levels[axis]), axis=0)
+        entries[axis] = AxisDifferentiation(
+            unit=axes[axis].unit,
+            position_sd=position,
+            velocity_sd=velocity,
+            acceleration_sd=acceleration,
+            band=ResidualBand(**vars(bands[axis])),
+            **choice.report,
+        )
     widest = ", ".join(f"{axis} {c.filter.bandwidth_hz:.1f} Hz" for axis, c in choices.items())
     residuals = ", ".join(f"{axis} {band.cutoff_hz:.1f} Hz" for axis, band in bands.items())
-    return {
-        "method": kinematics.method,
-        "method_reason": "chosen by the user" if config.method != "auto" else (
-            "default: bandwidth and order by maximum likelihood, gaps bridged with error bands"
-        ),
-        "sample_rate_hz": kinematics.rate_hz,
-        "axes": entries,
-        "force": {"derivative_cutoff_hz": kinematics.input_cutoff_hz},
-        "bridged_fraction": interpolated,
-        "skipped": skipped,
-        "headline": f"{kinematics.method}, {len(interpolated)} trials; bandwidth {widest}; "
+    default = "default: bandwidth and order by maximum likelihood, gaps bridged with error bands"
+    return FilterResult(
+        method=kinematics.method,
+        method_reason=default if config.method == "auto" else "chosen by the user",
+        sample_rate_hz=kinematics.rate_hz,
+        axes=entries,
+        force=ForceFilter(derivative_cutoff_hz=kinematics.input_cutoff_hz),
+        bridged_fraction=interpolated,
+        skipped=skipped,
+        headline=f"{kinematics.method}, {len(interpolated)} trials; bandwidth {widest}; "
         f"residuals compared below {residuals}",
-    }  # fmt: skip
+    )

@@ -166,11 +166,11 @@ def _match(session: Session, device: Device) -> None:
     wanted = {**dict.fromkeys(device.forces, device.force_unit), **device.channels}
     wanted |= device.controller.channels if device.controller else {}
     for channel in session.channels:
-        unit = wanted.get(channel.name, channel.unit)
-        if not _alike(channel.unit, unit):
+        expected = wanted.get(channel.name, channel.unit)
+        if not _alike(channel.unit, expected):
             raise InputError(
                 f"a unit of {channel.unit or 'a pure number'}, but device '{device.name}' takes"
-                f" {unit or 'a pure number'}",
+                f" {expected or 'a pure number'}",
                 where=f"{where}: channels.{channel.name}.unit",
             )
     if session.force and not session.force.volts and session.force.unit != device.force_unit:

@@ -21,7 +21,14 @@ from bampipe.physics import System, compile_model
 from bampipe.progress import Progress
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.standing import standing
-from bampipe.results.validate import ValidateResult
+from bampipe.results.validate import (
+    AxisError,
+    ForceError,
+    FreeRun,
+    JudgedError,
+    TrialError,
+    ValidateResult,
+)
 from bampipe.schema import STRICT, Count
 from bampipe.trials.folds import HELD_OUT, Folds
 from bampipe.trials.measured import MeasuredTrials, read_measured_trials
@@ -135,15 +142,13 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
             )
         except InputError as error:
             notes.append(f"No noise floor: simulating the fitted model failed ({error}).")
-    content = _content(system, trials, compared, floor, notes, config)
+    free: FreeRun | None = None
     if config.free_run:
         progress(0.8, "free runs")
         unseen = [evidence.held_out_parameters(k) for k in range(len(trials.motions))]
-        content["free_run"] = free_runs(
-            run, system, trials.motions, unseen, [c.judged for c in compared]
-        )
+        free = free_runs(run, system, trials.motions, unseen, [c.judged for c in compared])
     write_parquet(out / f"models/{config.model}/residuals.parquet", _table(system, compared))
-    return ValidateResult.model_validate(content).write(out)
+    return _result(system, trials, compared, floor, free, notes, config.model).write(out)
 
 
 def _compare(
@@ -214,11 +219,11 @@ def _rms(values: Sequence[Array], used: Sequence[NDArray[np.bool_]]) -> Array:
 
 def _percent(error: float, size: float) -> float:
     """Relative error: norm of the residual over norm of the measured torque, per cent."""
-    return float(100.0 * error / size) if size > 0.0 else 100.0
+    return 100.0 * error / size if size > 0.0 else 100.0
 
 
-def _entries(system: System, compared: Sequence[_Compared]) -> dict[str, dict[str, object]]:
-    """Return the numbers of each axis over some trials."""
+def _errors(system: System, compared: Sequence[_Compared]) -> dict[str, AxisError]:
+    """Return the errors of each axis over some trials."""
     used = [c.used for c in compared]
     rmse = _rms([c.residual for c in compared], used)
     without = _rms([c.residual_without_friction for c in compared], used)
@@ -231,71 +236,81 @@ def _entries(system: System, compared: Sequence[_Compared]) -> dict[str, dict[st
     mean = sum(np.sum(c.measured * c.used, axis=0) for c in unseen) / count
     spread = _rms([c.measured - mean for c in unseen], where)
     unseen_size = _rms([c.measured for c in unseen], where)
-    entries: dict[str, dict[str, object]] = {}
-    for i, axis in enumerate(system.coordinates):
-        # Of an axis that nothing drives, such as a pole on a cart, no force is there to explain.
-        fit = 100.0 * (1.0 - held_out[i] / spread[i]) if spread[i] > 0.0 else None
-        entries[axis] = {
-            "rmse": float(rmse[i]),
-            "rmse_without_friction": float(without[i]),
-            "held_out_rmse": float(held_out[i]),
-            "published_rmse": float(published[i]),
-            "relative_error_percent": _percent(rmse[i], size[i]),
-            "held_out_relative_error_percent": _percent(held_out[i], unseen_size[i]),
-            "fit_percent": None if fit is None else float(fit),
-            "unit": system.torque_units[i],
-        }
-    return entries
+    # Of an axis that nothing drives, such as a pole on a cart, no force is there to explain.
+    return {
+        axis: AxisError(
+            rmse=rmse[i],
+            rmse_without_friction=without[i],
+            held_out_rmse=held_out[i],
+            published_rmse=published[i],
+            relative_error_percent=_percent(rmse[i], size[i]),
+            held_out_relative_error_percent=_percent(held_out[i], unseen_size[i]),
+            fit_percent=100.0 * (1.0 - held_out[i] / spread[i]) if spread[i] > 0.0 else None,
+            unit=system.torque_units[i],
+        )
+        for i, axis in enumerate(system.coordinates)
+    }
 
 
-def _content(
+def _judged(found: AxisError, level: float | None, scatter: float) -> JudgedError:
+    """Hold the error of one axis against its noise floor ``level``, which scatters so much."""
+    refused = found.published_rmse > REFUSAL_RATIO * found.held_out_rmse
+    return JudgedError(
+        **vars(found),
+        noise_floor=level,
+        noise_floor_sd=scatter,
+        standing=standing(found.held_out_rmse, level, scatter),
+        estimate="refused" if refused else "accepted",
+    )
+
+
+def _result(
     system: System,
     trials: MeasuredTrials,
     compared: Sequence[_Compared],
     floor: NoiseFloor | None,
+    free_run: FreeRun | None,
     notes: Sequence[str],
-    config: Config,
-) -> dict[str, object]:
+    model: str,
+) -> ValidateResult:
     """Return what validate.json says."""
-    axes = _entries(system, compared)
-    refused = []
-    for i, (axis, entry) in enumerate(axes.items()):
-        error, published = float(entry["held_out_rmse"]), float(entry["published_rmse"])  # type: ignore[arg-type]
-        level = None if floor is None else float(floor.mean[i])
-        scatter = 0.0 if floor is None else float(floor.sd[i])
-        entry["noise_floor"], entry["noise_floor_sd"] = level, scatter
-        entry["standing"] = standing(error, level, scatter)
-        entry["estimate"] = "refused" if published > REFUSAL_RATIO * error else "accepted"
-        if entry["estimate"] == "refused":
-            refused.append(
-                f"{axis}: the published parameters err by {published:.3g} {entry['unit']} on the"
-                f" trials where parameters refitted without them err by {error:.3g}"
-            )
+    axes = {
+        axis: _judged(found, floor.mean[i] if floor else None, floor.sd[i] if floor else 0.0)
+        for i, (axis, found) in enumerate(_errors(system, compared).items())
+    }
+    refused = tuple(
+        f"{axis}: the published parameters err by {entry.published_rmse:.3g} {entry.unit} on the"
+        f" trials where parameters refitted without them err by {entry.held_out_rmse:.3g}"
+        for axis, entry in axes.items()
+        if entry.estimate == "refused"
+    )
     forces = {}
     for column, name in enumerate(system.model.device.forces):
         error_of = np.concatenate([c.force_residual[c.used.all(axis=1), column] for c in compared])
-        forces[name] = {
-            "rmse": float(np.sqrt(np.mean(error_of**2))) if error_of.size else 0.0,
-            "unit": system.model.device.force_unit,
-        }
+        rmse = np.sqrt(np.mean(error_of**2)) if error_of.size else 0.0
+        forces[name] = ForceError(rmse=rmse, unit=system.model.device.force_unit)
     best = ", ".join(
-        f"{axis} {entry['fit_percent']:.1f} %"
+        f"{axis} {entry.fit_percent:.1f} %"
         for axis, entry in axes.items()
-        if entry["fit_percent"] is not None
+        if entry.fit_percent is not None
     )
     on = "held-out trials" if any(c.judged for c in compared) else "the trials it was fitted to"
     refusal = f"estimate refused ({'; '.join(refused)}); " if refused else ""
-    return {
-        "model": config.model,
-        "axes": axes,
-        "trials": {c.trial_id: _entries(system, [c]) | {"held_out": c.judged} for c in compared},
-        "forces": forces,
-        "cutoff_hz": dict(zip(system.coordinates, trials.band.cutoff_hz, strict=True)),
-        "floor_replays": 0 if floor is None else floor.replays,
-        "refused": refused,
-        "notes": list(notes),
-        "headline": f"{refusal}fit on {on}: {best}",
-    }
+    return ValidateResult(
+        model=model,
+        axes=axes,
+        trials={
+            c.trial_id: TrialError.model_validate(_errors(system, [c]) | {"held_out": c.judged})
+            for c in compared
+        },
+        forces=forces,
+        free_run=free_run,
+        cutoff_hz=dict(zip(system.coordinates, trials.band.cutoff_hz, strict=True)),
+        floor_replays=0 if floor is None else floor.replays,
+        refused=refused,
+        notes=tuple(notes),
+        headline=f"{refusal}fit on {on}: {best}",
+    )
 
 
 def _table(system: System, compared: Sequence[_Compared]) -> pd.DataFrame:
