@@ -5,12 +5,7 @@ from __future__ import annotations
 import typer
 
 from bampipe.cli import places, show
-from bampipe.cli.options import (
-    RUNS,
-    JsonOption,
-    RunArgument,
-    RunsOption,
-)
+from bampipe.cli.options import RUNS, JsonOption, RunArgument, RunsOption
 from bampipe.run import pipeline as pipelines
 from bampipe.run import record
 from bampipe.run.status import status

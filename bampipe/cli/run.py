@@ -10,10 +10,7 @@ import typer
 
 from bampipe.cli import places, show
 from bampipe.cli.lab import refresh
-from bampipe.cli.one_stage import (
-    advise,
-    assignments,
-)
+from bampipe.cli.one_stage import advise, assignments
 from bampipe.cli.options import (
     RUNS,
     ForceOption,

@@ -8,14 +8,8 @@ from typing import Annotated
 import typer
 
 from bampipe.cli import show
-from bampipe.cli.one_stage import (
-    advise,
-    assignments,
-)
-from bampipe.cli.options import (
-    JsonOption,
-    QuietOption,
-)
+from bampipe.cli.one_stage import advise, assignments
+from bampipe.cli.options import JsonOption, QuietOption
 from bampipe.errors import InputError
 from bampipe.run import batch
 

@@ -5,12 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.signal import butter, periodogram, sosfiltfilt
 
-from bampipe.estimate.differentiation import (
-    Array,
-    Derivatives,
-    extend,
-    linear_noise_gains,
-)
+from bampipe.estimate.differentiation import Array, Derivatives, extend, linear_noise_gains
 
 
 def _design(cutoff_hz: float, rate_hz: float, order: int) -> Array:

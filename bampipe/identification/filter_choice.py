@@ -22,7 +22,8 @@ class FilterChoice:
             second; 0 takes them as constant, and only then are the intervals calibrated.
         reading_noise: standard deviation of a position reading in encoder steps; 0 takes it
             from the data.
-        force_noise: of a force sample, N, model error included; 0 takes it from the data.
+        force_noise: of a force sample, N, model error included; 0 takes it from the data, or
+            from the identification where the model has been identified.
         longest_step_s: longest Runge-Kutta step, s.
         block_s: length of the blocks that are taken as independent of each other, s.
         trace_rows: most rows a trial in tables of states and of parameters along the data.

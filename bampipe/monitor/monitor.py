@@ -13,12 +13,7 @@ from bampipe.data.stream import MOST_COMPLAINTS
 from bampipe.estimate.consistency import WindowTest
 from bampipe.estimate.online import OnlineFilter
 from bampipe.estimate.unscented import FilterFailure
-from bampipe.monitor.start import (
-    FIRST_LOOK,
-    MonitorOptions,
-    Start,
-    start_from_samples,
-)
+from bampipe.monitor.start import FIRST_LOOK, MonitorOptions, Start, start_from_samples
 from bampipe.physics import System
 
 Array = NDArray[np.float64]

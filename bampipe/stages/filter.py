@@ -17,12 +17,7 @@ from bampipe.data.store import ParquetAppender, read_parquet
 from bampipe.declarations.model_file import load_device
 from bampipe.errors import InputError
 from bampipe.estimate import butterworth, kalman_smoother
-from bampipe.estimate.differentiation import (
-    Array,
-    Flags,
-    UniformGrid,
-    uniform_grid,
-)
+from bampipe.estimate.differentiation import Array, Flags, UniformGrid, uniform_grid
 from bampipe.physics import Model, compile_model
 from bampipe.progress import Progress
 from bampipe.results.filter import AxisDifferentiation, FilterResult, ForceFilter, ResidualBand

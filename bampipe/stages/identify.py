@@ -56,20 +56,9 @@ class Config(FilterChoice):
         method: ``ukf``, the augmented unscented Kalman filter; ``least-squares`` on the inverse
             dynamics; ``output-error``, the motion simulated in pieces against the positions; or
             ``auto``: the filter, and least squares where it cannot follow the motion.
-        engine: ``compiled``, or ``filterpy``: slow, gives the same numbers.
-        measure: ``position``, or ``position_velocity`` as in the paper; filtered velocities are
-            not white, so intervals from them are too narrow.
         start_factor: multiplies every starting value: estimates must not depend on it.
-        random_walk: of the parameters, in prior standard deviations per square root of a
-            second; 0 takes them as constant, and only then are the intervals calibrated.
-        reading_noise: standard deviation of a position reading in encoder steps; 0 takes it
-            from the data.
-        force_noise: of a force sample, N, model error included; 0 takes it from the data.
-        longest_step_s: longest Runge-Kutta step, s.
         input_timing: whether the time by which inputs were sampled after positions is estimated.
         remove_bias: whether the bias that filters give least squares is measured and taken off.
-        block_s: length of the blocks that are taken as independent of each other, s.
-        trace_rows: most rows a trial in trace.parquet and states.parquet.
     """
 
     model: str = "base"

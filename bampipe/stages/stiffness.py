@@ -13,11 +13,11 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import ParquetAppender, read_parquet
+from bampipe.declarations.model_file import load_device
 from bampipe.errors import InputError
 from bampipe.estimate.differentiation import uniform_grid
 from bampipe.estimate.hysteresis import Branch, Cycle, Hysteresis, hysteresis
-from bampipe.files import read_toml
-from bampipe.physics import Model, System, compile_model, registry
+from bampipe.physics import Model, System, compile_model
 from bampipe.progress import Progress
 from bampipe.results.ingest import IngestResult
 from bampipe.results.stiffness import (
@@ -81,7 +81,7 @@ class _Loops:
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
     """Find the stiffness of every axis that has a locked trial."""
     session = run.read(IngestResult)
-    system = _system(run, session)
+    system = compile_model(Model(load_device(run, session.device)))
     samples = run.require("ingest/samples.parquet", "ingest")
     trials = read_parquet(run.require("ingest/trials.parquet", "ingest"))
     locked = trials[(trials["kind"] == "locked") & (trials["status"] != "set_aside")]
@@ -112,14 +112,6 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     _write_loops(out / "stiffness/loops.parquet", loops)
     headline = _headline(axes) if axes else notes[-1]
     return StiffnessResult(axes=axes, notes=tuple(notes), headline=headline).write(out)
-
-
-def _system(run: RunFolder, session: IngestResult) -> System:
-    """Return the bare device of the session, compiled."""
-    if run.exists("ingest/device.toml"):
-        path = run.path("ingest/device.toml")
-        return compile_model(Model(registry.device_from(read_toml(path), str(path))))
-    return compile_model(Model(registry.device(session.device)))
 
 
 def _loops_of(

@@ -56,15 +56,6 @@ class Config(FilterChoice):
 
     Attributes:
         model: which model version.
-        engine: ``compiled``, or ``filterpy``: slow, gives the same numbers.
-        measure: ``position``, or ``position_velocity`` as in the paper.
-        random_walk: of the parameters, in prior standard deviations per square root of a second.
-        reading_noise: standard deviation of a position reading in encoder steps; 0 takes it
-            from the identification.
-        force_noise: of a force sample, N; 0 takes it from the identification.
-        longest_step_s: longest Runge-Kutta step, s.
-        block_s: length of the blocks that are taken as independent of each other, s.
-        trace_rows: most rows a trial in viscous.parquet.
     """
 
     model: str = "base"

@@ -23,13 +23,7 @@ import numpy as np
 from bampipe.data.readers import moments
 from bampipe.data.readers.extras import need
 from bampipe.data.readers.nested import MISSING, as_number, find, leaves
-from bampipe.data.readers.trial import (
-    LARGEST_BYTES,
-    RawTrial,
-    Wanted,
-    check_columns,
-    check_size,
-)
+from bampipe.data.readers.trial import LARGEST_BYTES, RawTrial, Wanted, check_columns, check_size
 from bampipe.data.readers.unpacking import check_mcap, check_ros1
 from bampipe.errors import InputError
 

@@ -20,13 +20,7 @@ import pyarrow.csv as pa_csv
 from bampipe.data.readers import dialect as dialects
 from bampipe.data.readers import moments
 from bampipe.data.readers.dialect import HEAD, NULLS, TableLayout
-from bampipe.data.readers.trial import (
-    Dialect,
-    RawTrial,
-    Wanted,
-    check_size,
-    joined,
-)
+from bampipe.data.readers.trial import Dialect, RawTrial, Wanted, check_size, joined
 from bampipe.errors import InputError
 from bampipe.files import temporary_space
 
