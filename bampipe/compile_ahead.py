@@ -37,7 +37,7 @@ _running: list[subprocess.Popen[bytes]] = []
 
 
 @contextmanager
-def beside(processes: int) -> Iterator[None]:
+def compiling_ahead(processes: int) -> Iterator[None]:
     """Compile ahead during the block, where that is wanted.
 
     Args:

@@ -40,7 +40,7 @@ def started(monkeypatch: pytest.MonkeyPatch) -> Started:
 def test_the_first_missing_function_starts_them_and_the_end_of_the_run_ends_them(
     started: Started,
 ) -> None:
-    with compile_ahead.beside(2):
+    with compile_ahead.compiling_ahead(2):
         assert not started.codes, "nothing is missing yet"
         compile_ahead.report_missing()
         compile_ahead.report_missing()
@@ -55,13 +55,13 @@ def test_the_first_stage_starts_them_where_nothing_was_compiled_from_these_sourc
     started: Started, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("BAMPIPE_CACHE_DIR", str(tmp_path))
-    with compile_ahead.beside(2):
+    with compile_ahead.compiling_ahead(2):
         compile_ahead.begin()
         compile_ahead.begin()
     assert len(started.codes) == len(compile_ahead._PARTS)
     started.codes.clear()
     generated_code.make_compiled_folder(Path(compile_ahead.__file__).with_name("estimate"))
-    with compile_ahead.beside(2):
+    with compile_ahead.compiling_ahead(2):
         compile_ahead.begin()
         assert not started.codes
         compile_ahead.report_missing()
@@ -73,13 +73,13 @@ def test_without_a_folder_the_run_itself_says_so(
 ) -> None:
     monkeypatch.setenv("BAMPIPE_CACHE_DIR", str(tmp_path / "file"))
     (tmp_path / "file").touch()
-    with compile_ahead.beside(2):
+    with compile_ahead.compiling_ahead(2):
         compile_ahead.begin()
     assert not started.codes
 
 
 def test_one_core_is_left_to_the_run(started: Started) -> None:
-    with compile_ahead.beside(1):
+    with compile_ahead.compiling_ahead(1):
         compile_ahead.begin()
         compile_ahead.report_missing()
     assert not started.codes

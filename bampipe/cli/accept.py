@@ -1,4 +1,4 @@
-"""`bampipe accept`: keep a session's values as those that later ones are held against."""
+"""`bampipe accept`: accept a session's values as the reference for later ones."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ def accept(
     Example: bampipe accept 2026-10-03_s01
     """
     root = places.find_run(run, runs)
-    path = accepted.accept(root, model, folder or accepted.beside(root.parent), force)
+    path = accepted.accept(root, model, folder or accepted.accepted_folder(root.parent), force)
     show.say(f"{path}: the values of {root.name}, model {model}")
     if not quiet:
         show.say("")
-        show.say(f"next: put {path} under version control; later runs are held against it")
+        show.say(f"next: put {path} under version control; later runs are compared with it")

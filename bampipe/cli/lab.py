@@ -55,10 +55,10 @@ def lab(
 def gather(runs: Path, out: Path | None = None, quiet: bool = False) -> Lab:
     """Write the lab's folder for the runs in ``runs``."""
     from bampipe.lab.collect import collect
-    from bampipe.lab.place import beside
+    from bampipe.lab.place import lab_folder
     from bampipe.run.events import Event
 
-    folder = out or beside(runs)
+    folder = out or lab_folder(runs)
     with show.Watcher(quiet) as watcher:
 
         def progress(fraction: float, message: str) -> None:
@@ -75,9 +75,9 @@ def refresh(runs: Path, several: bool, quiet: bool) -> None:
         several: whether several sessions were run: that makes a lab.
         quiet: print nothing.
     """
-    from bampipe.lab.place import FILE, beside, is_current, is_foreign, run_folders
+    from bampipe.lab.place import FILE, is_current, is_foreign, lab_folder, run_folders
 
-    folder = beside(runs)
+    folder = lab_folder(runs)
     wanted = several or (folder / FILE).is_file()
     begun = any((root / "ingest" / "session.json").is_file() for root in run_folders(runs))
     if not wanted or not begun or is_current(runs, folder):

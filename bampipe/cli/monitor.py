@@ -164,7 +164,7 @@ class _Output:
             self._screen.stop()
 
     def show(self, watch: Monitor, stream: Stream, final: bool = False) -> None:
-        """Show where things stand if it is time to."""
+        """Show the current state if it is time to."""
         if self._screen:
             if final or time.monotonic() - self._drawn > SCREEN_S:
                 self._drawn = time.monotonic()
@@ -205,16 +205,16 @@ def _table(content: Mapping[str, Any], bad_lines: int) -> Any:
     ratio = nis.get("window")
     if content["alarm"] and ratio is None:
         axes = ", ".join(nis.get("useless", ()))
-        said = Text(f"ALARM: no data of use {axes}".strip(), style="bold red")
+        text = Text(f"ALARM: no usable data {axes}".strip(), style="bold red")
     elif content["alarm"]:
-        said = Text(f"ALARM: {nis['worst']} is not explained ({ratio:.2f})", style="bold red")
+        text = Text(f"ALARM: {nis['worst']} is not explained ({ratio:.2f})", style="bold red")
     elif ratio is None:
-        said = Text("waiting for a whole window")
+        text = Text("waiting for a complete window")
     else:
-        said = Text(f"consistent ({ratio:.2f}, alarm from {nis['threshold']:.2f})", style="green")
+        text = Text(f"consistent ({ratio:.2f}, alarm from {nis['threshold']:.2f})", style="green")
     clock = "–" if content["t"] is None else f"{content['t']:.2f} s"
     table.add_row("t", clock, f"{content['samples']} samples", "")
-    table.add_row("innovations", "", "", said)
+    table.add_row("innovations", "", "", text)
     table.add_row(
         "alarms", str(content["alarms"]), f"{bad_lines} bad lines",
         f"{content['restarts']} restarts",

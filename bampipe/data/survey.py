@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from bampipe.data.readers import EXTENSIONS, columns_of, read_trial
-from bampipe.data.units import Unit, unit
+from bampipe.data.units import RecordedUnit, unit
 from bampipe.errors import InputError
 
 MOST_FILES = 500
@@ -60,7 +60,7 @@ class SurveyedColumn:
     values: np.ndarray
 
     @property
-    def conversion(self) -> Unit | None:
+    def conversion(self) -> RecordedUnit | None:
         """How its unit becomes SI; None where it has none, or none that is known."""
         return unit(self.unit) if self.unit else None
 

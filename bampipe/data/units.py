@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
-class Unit:
+class RecordedUnit:
     """How a unit becomes SI: value in ``si`` = scale * value + offset."""
 
     si: str
@@ -19,46 +19,46 @@ class Unit:
 
 _TURN = 2 * math.pi
 _POUND = 4.4482216152605
-_BASE: dict[str, Unit] = {
-    "s": Unit("s"),
-    "min": Unit("s", 60.0),
-    "m": Unit("m"),
-    "rad": Unit("rad"),
-    "deg": Unit("rad", math.pi / 180),
-    "rev": Unit("rad", _TURN),
-    "rad/s": Unit("rad/s"),
-    "deg/s": Unit("rad/s", math.pi / 180),
-    "rev/s": Unit("rad/s", _TURN),
-    "rev/min": Unit("rad/s", _TURN / 60),
-    "m/s": Unit("m/s"),
-    "m/min": Unit("m/s", 1 / 60),
-    "m/s2": Unit("m/s2"),
-    "rad/s2": Unit("rad/s2"),
-    "deg/s2": Unit("rad/s2", math.pi / 180),
-    "N": Unit("N"),
-    "N.m": Unit("N.m"),
-    "N.cm": Unit("N.m", 1e-2),
-    "N.mm": Unit("N.m", 1e-3),
-    "kgf": Unit("N", 9.80665),
-    "lbf": Unit("N", _POUND),
-    "lbf.ft": Unit("N.m", _POUND * 0.3048),
-    "lbf.in": Unit("N.m", _POUND * 0.0254),
-    "in": Unit("m", 0.0254),
-    "ft": Unit("m", 0.3048),
-    "in/s": Unit("m/s", 0.0254),
-    "A": Unit("A"),
-    "V": Unit("V"),
-    "W": Unit("W"),
-    "Hz": Unit("Hz"),
-    "Pa": Unit("Pa"),
-    "bar": Unit("Pa", 1e5),
-    "T": Unit("T"),
-    "K": Unit("K"),
-    "degC": Unit("K", 1.0, 273.15),
-    "kg": Unit("kg"),
-    "g": Unit("kg", 1e-3),
-    "%": Unit("", 1e-2),
-    "": Unit(""),
+_BASE: dict[str, RecordedUnit] = {
+    "s": RecordedUnit("s"),
+    "min": RecordedUnit("s", 60.0),
+    "m": RecordedUnit("m"),
+    "rad": RecordedUnit("rad"),
+    "deg": RecordedUnit("rad", math.pi / 180),
+    "rev": RecordedUnit("rad", _TURN),
+    "rad/s": RecordedUnit("rad/s"),
+    "deg/s": RecordedUnit("rad/s", math.pi / 180),
+    "rev/s": RecordedUnit("rad/s", _TURN),
+    "rev/min": RecordedUnit("rad/s", _TURN / 60),
+    "m/s": RecordedUnit("m/s"),
+    "m/min": RecordedUnit("m/s", 1 / 60),
+    "m/s2": RecordedUnit("m/s2"),
+    "rad/s2": RecordedUnit("rad/s2"),
+    "deg/s2": RecordedUnit("rad/s2", math.pi / 180),
+    "N": RecordedUnit("N"),
+    "N.m": RecordedUnit("N.m"),
+    "N.cm": RecordedUnit("N.m", 1e-2),
+    "N.mm": RecordedUnit("N.m", 1e-3),
+    "kgf": RecordedUnit("N", 9.80665),
+    "lbf": RecordedUnit("N", _POUND),
+    "lbf.ft": RecordedUnit("N.m", _POUND * 0.3048),
+    "lbf.in": RecordedUnit("N.m", _POUND * 0.0254),
+    "in": RecordedUnit("m", 0.0254),
+    "ft": RecordedUnit("m", 0.3048),
+    "in/s": RecordedUnit("m/s", 0.0254),
+    "A": RecordedUnit("A"),
+    "V": RecordedUnit("V"),
+    "W": RecordedUnit("W"),
+    "Hz": RecordedUnit("Hz"),
+    "Pa": RecordedUnit("Pa"),
+    "bar": RecordedUnit("Pa", 1e5),
+    "T": RecordedUnit("T"),
+    "K": RecordedUnit("K"),
+    "degC": RecordedUnit("K", 1.0, 273.15),
+    "kg": RecordedUnit("kg"),
+    "g": RecordedUnit("kg", 1e-3),
+    "%": RecordedUnit("", 1e-2),
+    "": RecordedUnit(""),
 }
 _PREFIXES = {"n": 1e-9, "u": 1e-6, "m": 1e-3, "c": 1e-2, "k": 1e3, "M": 1e6}
 _PREFIXED = ("s", "m", "rad", "N", "N.m", "A", "V", "W", "Hz", "Pa", "m/s", "T", "m/s2")
@@ -83,7 +83,7 @@ def spelled(text: str, among: Sequence[str]) -> str:
     return next((other for other in among if unit(other) == known), "")
 
 
-def unit(text: str) -> Unit | None:
+def unit(text: str) -> RecordedUnit | None:
     """What ``text`` stands for, None where that is not known.
 
     ``Nm``, ``N*m``, ``N·m`` and ``N.m`` are the same, ``mA``, ``kN`` and the like are put together
@@ -99,5 +99,5 @@ def unit(text: str) -> Unit | None:
         prefix, rest = spelling[:1], spelling[1:]
         if prefix in _PREFIXES and rest in _PREFIXED:
             base = _BASE[rest]
-            return Unit(base.si, base.scale * _PREFIXES[prefix])
+            return RecordedUnit(base.si, base.scale * _PREFIXES[prefix])
     return None

@@ -34,7 +34,7 @@ _LEFTOVER = 0.01
 _LATEST_START = 0.6
 """Share of a branch after which the rest is taken as post-yield at the latest: the exponential
 is a poor likeness of a long transition with a sharp end, and the slope needs a range."""
-_LARGEST_BEND = 0.02
+_LARGEST_SLOPE_CHANGE = 0.02
 """Post-yield at all: the slopes of the first and second half of what is used differ by less."""
 
 
@@ -93,10 +93,10 @@ class Hysteresis:
         cycles: cycle by cycle.
         branches: all whole branches.
         transition: torque after a reversal from which the loop is taken as post-yield, N.m or N.
-        bend: by how much the slope still changes in what is taken as post-yield: stiffness of its
-            first half over that of its second, less one.
-        yielded: whether ``bend`` is small (2 %, or three of its standard errors): if not, the
-            load was too small to overcome the friction, and the stiffness is too high.
+        slope_change: by how much the slope still changes in what is taken as post-yield:
+            stiffness of its first half over that of its second, less one.
+        yielded: whether ``slope_change`` is small (2 %, or three of its standard errors): if not,
+            the load was too small to overcome the friction, and the stiffness is too high.
     """
 
     stiffness: float
@@ -105,7 +105,7 @@ class Hysteresis:
     cycles: tuple[Cycle, ...]
     branches: tuple[Branch, ...]
     transition: float
-    bend: float
+    slope_change: float
     yielded: bool
 
 
@@ -238,8 +238,8 @@ def _sum_of_squares(branches: Sequence[Branch], coefficients: Array, length: flo
     total = 0.0
     for number, b in enumerate(branches):
         line = coefficients[0] * b.torque + coefficients[2 + number]
-        bend = -b.direction * coefficients[1] * np.exp(-b.travel / length)
-        total += float(np.sum((b.deflection - line - bend) ** 2))
+        approach = -b.direction * coefficients[1] * np.exp(-b.travel / length)
+        total += float(np.sum((b.deflection - line - approach) ** 2))
     return total
 
 
@@ -284,7 +284,10 @@ def hysteresis(
     middle = 0.5 * (start + float(np.median([branch.travel[-1] for branch in branches])))
     early, early_error, _ = _regression(branches, noise, (start, middle))
     late, late_error, _ = _regression(branches, noise, (middle, np.inf))
-    bend, bend_error = late / early - 1.0, float(np.hypot(early_error, late_error)) / compliance
+    slope_change, slope_change_error = (
+        late / early - 1.0,
+        float(np.hypot(early_error, late_error)) / compliance,
+    )
     cycles = tuple(
         _cycle(torque, deflection, branches[k : k + 2], noise, window)
         for k in range(0, len(branches) - 1, 2)
@@ -299,8 +302,8 @@ def hysteresis(
         cycles=cycles,
         branches=branches,
         transition=start,
-        bend=bend,
-        yielded=abs(bend) < max(_LARGEST_BEND, 3.0 * bend_error),
+        slope_change=slope_change,
+        yielded=abs(slope_change) < max(_LARGEST_SLOPE_CHANGE, 3.0 * slope_change_error),
     )
 
 

@@ -19,7 +19,7 @@ from bampipe.estimate.identifiability import (
 from bampipe.estimate.least_squares import Problem, residual_and_slopes
 from bampipe.identification.sensor_noise import Noise
 from bampipe.physics import System
-from bampipe.physics.structure import Number, Structure, structure
+from bampipe.physics.structure import DeterminableNumber, Structure, structure
 from bampipe.results.identify import (
     Combined,
     DeviceNumber,
@@ -200,7 +200,7 @@ def _partner(covariance: Array, i: int) -> tuple[int | None, float]:
 
 
 def _number(
-    number: Number,
+    number: DeterminableNumber,
     total: Array,
     n: int,
     place: int,

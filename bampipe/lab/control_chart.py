@@ -52,7 +52,7 @@ class Chart:
         between_sd: scatter between sessions, tau; the uncertainty within them is taken out.
         lower: lower limit for each session, (n,); NaN where there are too few sessions.
         upper: upper limit for each session, (n,).
-        beyond: whether each session lies outside its limits, (n,).
+        outside_limits: whether each session lies outside its limits, (n,).
         run: first and last session of the longest run on one side of the centre, if it is a
             shift; else None.
         slope: median slope a session (Theil and Sen), unit of the estimates.
@@ -63,7 +63,7 @@ class Chart:
     between_sd: float
     lower: Array
     upper: Array
-    beyond: NDArray[np.bool_]
+    outside_limits: NDArray[np.bool_]
     run: tuple[int, int] | None
     slope: float
     slope_p: float
@@ -98,9 +98,11 @@ def chart(estimates: Sequence[float] | Array, sds: Sequence[float] | Array) -> C
     sigma = float(np.median(np.abs(np.diff(x)))) / MEDIAN_RANGE
     between = float(np.sqrt(max(0.0, sigma**2 - float(np.median(s**2)))))
     half = factor(n) * np.sqrt(between**2 + s**2)
-    beyond = np.abs(x - centre) > half
+    outside_limits = np.abs(x - centre) > half
     slope, chance = _trend(x)
-    return Chart(centre, between, centre - half, centre + half, beyond, _run(x), slope, chance)
+    return Chart(
+        centre, between, centre - half, centre + half, outside_limits, _run(x), slope, chance
+    )
 
 
 def _run(x: Array) -> tuple[int, int] | None:

@@ -11,7 +11,7 @@ FILE = "lab.json"
 LOCK = ".lock"
 
 
-def beside(runs: Path) -> Path:
+def lab_folder(runs: Path) -> Path:
     """Return the lab's folder for a folder of runs: ``lab`` next to it."""
     return runs.resolve().parent / "lab" if runs.name in ("", "..") else runs.parent / "lab"
 

@@ -22,7 +22,7 @@ from bampipe.results.lab import (
 )
 from bampipe.run.models import BASE
 
-Row = Mapping[str, Any]
+TableRow = Mapping[str, Any]
 
 IN_CONTROL = "in control"
 DEVICE = "device drifted"
@@ -68,7 +68,7 @@ def _ratio(between: float, sd: float, old: float) -> float:
 
 @dataclass
 class Judged:
-    """What is said of one session.
+    """The verdict on one session.
 
     Attributes:
         session: its id.
@@ -99,7 +99,7 @@ class Judged:
     remedy: str = ""
 
 
-def series(tables: Mapping[str, Sequence[Row]]) -> list[Series]:
+def series(tables: Mapping[str, Sequence[TableRow]]) -> list[Series]:
     """Return the charts of every parameter of the base models, and of every stiffness.
 
     Args:
@@ -123,8 +123,10 @@ def series(tables: Mapping[str, Sequence[Row]]) -> list[Series]:
     return charts
 
 
-def judge_sessions(tables: Mapping[str, Sequence[Row]], charts: Sequence[Series]) -> list[Judged]:
-    """Return what is to be said of each session, in the order of recording.
+def judge_sessions(
+    tables: Mapping[str, Sequence[TableRow]], charts: Sequence[Series]
+) -> list[Judged]:
+    """Return the verdict on each session, in the order of recording.
 
     Args:
         tables: rows of the lab's tables.
@@ -134,7 +136,7 @@ def judge_sessions(tables: Mapping[str, Sequence[Row]], charts: Sequence[Series]
 
 
 def _judge_session(
-    row: Row, tables: Mapping[str, Sequence[Row]], charts: Sequence[Series]
+    row: TableRow, tables: Mapping[str, Sequence[TableRow]], charts: Sequence[Series]
 ) -> Judged:
     session, device = str(row["session_id"]), str(row["device"])
     when = row["recorded_at"]
@@ -157,14 +159,14 @@ def _judge_session(
     judged.effects = tuple(dict.fromkeys(named if first else row["effects"]))
     judged.unexplained = tuple(r["axis"] for r in first if r["verdict"] == "unknown_effect")
     judged.diagnosed = bool(first)
-    beyond = [c for c in charts if c.device == device and _is_outside(c, session)]
-    judged.moved = tuple(_moved(c, session) for c in beyond)
-    _decide(judged, beyond, mine)
+    outside = [c for c in charts if c.device == device and _is_outside(c, session)]
+    judged.moved = tuple(_moved(c, session) for c in outside)
+    _decide(judged, outside, mine)
     return judged
 
 
 def _is_outside(c: Series, session: str) -> bool:
-    return session in c.sessions and bool(c.chart.beyond[c.sessions.index(session)])
+    return session in c.sessions and bool(c.chart.outside_limits[c.sessions.index(session)])
 
 
 def _moved(c: Series, session: str) -> MovedParameter:
@@ -175,12 +177,14 @@ def _moved(c: Series, session: str) -> MovedParameter:
     )
 
 
-def _decide(judged: Judged, beyond: Sequence[Series], mine: Mapping[str, Sequence[Row]]) -> None:
+def _decide(
+    judged: Judged, outside: Sequence[Series], mine: Mapping[str, Sequence[TableRow]]
+) -> None:
     """Set verdict, sentence and remedy."""
     lacks = [*judged.effects, *(f"something unknown on {axis}" for axis in judged.unexplained)]
     what = " and ".join(lacks)
     moved = ", ".join(_in_words(entry) for entry in judged.moved)
-    if not beyond:
+    if not outside:
         if lacks:
             judged.verdict = EFFECT
             judged.sentence = f"lacks {what}; no parameter is beyond its limits"
@@ -199,7 +203,7 @@ def _decide(judged: Judged, beyond: Sequence[Series], mine: Mapping[str, Sequenc
             judged.sentence = f"{moved}; whether an effect is missing has not been asked"
             judged.remedy = f"bampipe diagnose {judged.session} --model {BASE}"
         return
-    back, still = _with_the_effect(judged, beyond, mine)
+    back, still = _with_the_effect(judged, outside, mine)
     if still:
         judged.verdict = BOTH
         judged.sentence = (
@@ -219,7 +223,7 @@ def _decide(judged: Judged, beyond: Sequence[Series], mine: Mapping[str, Sequenc
 
 
 def _with_the_effect(
-    judged: Judged, beyond: Sequence[Series], mine: Mapping[str, Sequence[Row]]
+    judged: Judged, outside: Sequence[Series], mine: Mapping[str, Sequence[TableRow]]
 ) -> tuple[list[str], list[str]]:
     """Return which parameters the missing effect brings back, and which it cannot account for.
 
@@ -236,7 +240,7 @@ def _with_the_effect(
     }
     back: list[str] = []
     still: list[str] = []
-    for c in beyond:
+    for c in outside:
         row = child.get(c.name)
         if row is not None and row["estimate"] is not None:
             inside = c.within(judged.session, float(row["estimate"]), float(row["sd"] or 0.0))
@@ -282,7 +286,7 @@ def _chart(c: Series) -> ControlChart:
                 sd=c.sds[i],
                 lower=k.lower[i] if known else None,
                 upper=k.upper[i] if known else None,
-                beyond=k.beyond[i],
+                outside_limits=k.outside_limits[i],
             )
             for i, session in enumerate(c.sessions)
         ),

@@ -87,7 +87,7 @@ class Monitor:
             self._judge(True)
 
     def report(self) -> dict[str, object]:
-        """Return where things stand, as JSON can hold it; no state before the filter has begun."""
+        """Return the current state, as JSON can hold it; no state before the filter has begun."""
         content: dict[str, object] = {
             "t": None if np.isnan(self._t) else self._t,
             "samples": self.samples,

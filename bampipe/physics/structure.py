@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Together:
+class Combination:
     """Numbers that enter only through combinations of each other.
 
     Attributes:
@@ -42,7 +42,7 @@ class Together:
 
 
 @dataclass(frozen=True)
-class Number:
+class DeterminableNumber:
     """A constant, or a sum of constants, that data could determine.
 
     Attributes:
@@ -65,8 +65,8 @@ class Structure:
             sums of those that do not.
     """
 
-    together: tuple[Together, ...]
-    numbers: tuple[Number, ...]
+    together: tuple[Combination, ...]
+    numbers: tuple[DeterminableNumber, ...]
     _slopes: Any
 
     def slopes(self, q: Array, qd: Array, qdd: Array, z: Array, u: Array, p: Array) -> Array:
@@ -99,12 +99,14 @@ def structure(system: System) -> Structure:
         return facts, {"slopes": source}
 
     code = generated_code.load(f"{system.model.key}_structure", generate)
-    together = tuple(Together(tuple(m), tuple(c)) for m, c in code.facts["together"])
-    found = tuple(Number(*entry) for entry in code.facts["numbers"])
+    together = tuple(Combination(tuple(m), tuple(c)) for m, c in code.facts["together"])
+    found = tuple(DeterminableNumber(*entry) for entry in code.facts["numbers"])
     return Structure(together, found, code.module("slopes").slopes)
 
 
-def _split(model: Model, e: Equations) -> tuple[list[Together], list[Number], list[str]]:
+def _split(
+    model: Model, e: Equations
+) -> tuple[list[Combination], list[DeterminableNumber], list[str]]:
     """Return groups, numbers that data could determine, and the constant that stands for each."""
     constants = {constant_symbol(c): c for c in model.device.constants}
     names = constants | dict(zip(e.p, (p.name for p in model.parameters), strict=True))
@@ -125,7 +127,7 @@ def _split(model: Model, e: Equations) -> tuple[list[Together], list[Number], li
         known |= new
     at = {symbol: model.device.constants[name].value for symbol, name in constants.items()}
     numbers = [
-        Number(name, at[symbol], model.device.constants[name].unit)
+        DeterminableNumber(name, at[symbol], model.device.constants[name].unit)
         for symbol, name in constants.items()
         if symbol in known
     ]
@@ -134,12 +136,14 @@ def _split(model: Model, e: Equations) -> tuple[list[Together], list[Number], li
     for members in _connected([f.free_symbols for f in left]):
         own = [f for f in left if f.free_symbols <= members]
         ordered = tuple(name for symbol, name in names.items() if symbol in members)
-        groups.append(Together(ordered, tuple(notation(f, names) for f in own)))
+        groups.append(Combination(ordered, tuple(notation(f, names) for f in own)))
         for sum_ in own:
             pivot = _pivot(sum_, own, constants)
             if pivot is not None:
                 unit = model.device.constants[constants[pivot]].unit
-                numbers.append(Number(notation(sum_, names), float(sum_.subs(at)), unit))
+                numbers.append(
+                    DeterminableNumber(notation(sum_, names), float(sum_.subs(at)), unit)
+                )
                 pivots.append(constants[pivot])
     return groups, numbers, pivots
 

@@ -170,13 +170,16 @@ def _panel(panel: Axes, chart: ControlChart) -> None:
             edges, np.repeat(low, 2), np.repeat(high, 2), color=style.SKY, alpha=0.22, lw=0
         )
         shown += [low, high]
-    beyond = np.array([point.beyond for point in points])
-    for chosen, colour, mark in ((~beyond, style.BLUE, "o"), (beyond, style.VERMILLION, "D")):
+    outside = np.array([point.outside_limits for point in points])
+    for chosen, colour, mark in (
+        (~outside, style.BLUE, "o"),
+        (outside, style.VERMILLION, "D"),
+    ):
         panel.errorbar(
             x[chosen], y[chosen], error[chosen], fmt=mark, ms=3.2, color=colour, elinewidth=0.8
         )
     middle = float(np.median(y))
-    for place in np.flatnonzero(beyond):
+    for place in np.flatnonzero(outside):
         above = y[place] > middle
         left = place > len(x) / 2
         panel.annotate(
@@ -211,8 +214,8 @@ def _chart_table(charts: list[ControlChart]) -> Table:
         if slope is not None and centre:
             trend = f"{wording.significant(100.0 * slope / abs(centre), 2)} %"
             trend += f" (p {wording.probability(chance)})"
-        outside = [point.session for point in chart.points if point.beyond]
-        signs = [f"beyond: {', '.join(outside)}"] if outside else []
+        outside = [point.session for point in chart.points if point.outside_limits]
+        signs = [f"outside its limits: {', '.join(outside)}"] if outside else []
         if chart.drifts:
             signs.append("trend")
         if chart.run:
@@ -278,12 +281,12 @@ def _errors(folder: Path, trends: TrendsResult) -> Section | None:
         panel.set_axis_off()
     style.legend_below(figure, panels[0][0])
     caption = "Error on unseen trials over the noise floor, session by session."
-    said = (
+    text = (
         "The noise floor is what sensors and filters leave if the model is exactly right. In the "
         f"green band, below {AT_FLOOR:g}, a model leaves nothing that the session could show."
     )
     picture = Figure("errors", caption, style.svg(figure))
-    return Section("Prediction", (Paragraph(said), picture))
+    return Section("Prediction", (Paragraph(text), picture))
 
 
 def _trials(folder: Path) -> Section | None:
@@ -292,12 +295,12 @@ def _trials(folder: Path) -> Section | None:
         return None
     odd = frame[frame["status"] != "ok"]
     sessions = wording.count(frame["session_id"].nunique(), "session")
-    said = (
+    text = (
         f"{wording.count(len(frame), 'trial')} in {sessions}: "
         f"{int((frame['status'] == 'repaired').sum())} repaired, "
         f"{int((frame['status'] == 'set_aside').sum())} set aside."
     )
-    blocks: list[Block] = [Paragraph(said)]
+    blocks: list[Block] = [Paragraph(text)]
     if not odd.empty:
         rows = [
             (

@@ -8,10 +8,10 @@ from bampipe.report import wording
 from bampipe.report.document import Callout
 from bampipe.report.results import Results
 from bampipe.results.diagnose import DiagnoseResult
-from bampipe.results.standing import IN_WORDS as IN_WORDS_OF_STANDING
+from bampipe.results.standing import STANDINGS_IN_WORDS
 from bampipe.results.validate import ValidateResult
 
-IN_WORDS = {
+VERDICTS_IN_WORDS = {
     "nothing_missing": "nothing missing",
     "missing": "an effect is missing",
     "unknown_effect": "an effect that no library entry explains",
@@ -90,7 +90,7 @@ def overall(results: Results) -> Callout:
 def _wrong_floors(results: Results, validated: ValidateResult) -> dict[str, str]:
     """Axes whose noise floor is implausible, in words."""
     return {
-        axis: IN_WORDS_OF_STANDING[validated.axes[axis].standing]
+        axis: STANDINGS_IN_WORDS[validated.axes[axis].standing]
         for axis in ordered(results, validated.axes)
         if validated.axes[axis].standing == "floor_implausible"
     }
@@ -105,7 +105,7 @@ def _diagnosed(results: Results, diagnosis: DiagnoseResult) -> Callout:
     axes = diagnosis.axes
     found = {axis: axes[axis].verdict for axis in ordered(results, axes)}
     by_verdict = {
-        verdict: [axis for axis in found if found[axis] == verdict] for verdict in IN_WORDS
+        verdict: [axis for axis in found if found[axis] == verdict] for verdict in VERDICTS_IN_WORDS
     }
     effects = results.effects(results.model)
     with_effects = f" with {wording.listing(f'`{name}`' for name in effects)}" if effects else ""

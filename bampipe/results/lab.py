@@ -30,7 +30,7 @@ class ChartPoint(Record):
     sd: Size
     lower: float | None = Field(description="Control limit")
     upper: float | None
-    beyond: bool
+    outside_limits: bool
 
 
 class ControlChart(Record):

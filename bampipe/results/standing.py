@@ -17,7 +17,7 @@ IMPLAUSIBLE = 0.7
 """Error over floor below which the floor is wrong: sensors noisier than the data, or a replay that
 does not resemble the machine."""
 
-IN_WORDS = {
+STANDINGS_IN_WORDS = {
     "at_floor": "at the noise floor",
     "above_floor": "above the noise floor",
     "floor_implausible": "far below its noise floor, which is therefore wrong",

@@ -39,7 +39,7 @@ class LockedTrial(Record):
     transition: float = Field(
         description="Torque after a reversal from which the loop is post-yield"
     )
-    bend: float = Field(
+    slope_change: float = Field(
         description="Stiffness of the first half of the post-yield part over the second, less 1"
     )
     drift: float = Field(

@@ -22,7 +22,7 @@ ACCEPTED = "accepted"
 """Name of the folder, and what a gate's ``against`` says."""
 
 
-def beside(runs: Path) -> Path:
+def accepted_folder(runs: Path) -> Path:
     """Return the folder of accepted values for a folder of runs."""
     return runs.parent / ACCEPTED
 

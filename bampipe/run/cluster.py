@@ -83,8 +83,8 @@ def run_on_cluster(requests: Sequence[Request], scheduler: str, listen: Listener
     if lost and not outcomes:
         raise InputError(lost, where=scheduler, remedy="finished steps are kept: run it again")
     for number, request in enumerate(requests):
-        said = f"{lost}; finished steps are kept: run it again"
-        outcomes.setdefault(number, Outcome(request.root, "refused", error=said))
+        message = f"{lost}; finished steps are kept: run it again"
+        outcomes.setdefault(number, Outcome(request.root, "refused", error=message))
     return [outcomes[number] for number in range(len(requests))]
 
 

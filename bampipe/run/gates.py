@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class GateVerdict:
+class GateOutcome:
     """What came of one gate for one axis (or for the one number it guards).
 
     Attributes:
@@ -61,13 +61,13 @@ def _number(value: object) -> float | None:
     return float(value) if math.isfinite(value) else None
 
 
-def _missing(gate: Gate, key: str, what: str) -> GateVerdict:
+def _missing(gate: Gate, key: str, what: str) -> GateOutcome:
     if gate.optional:
-        return GateVerdict(gate.name, key, "absent", None, what)
-    return GateVerdict(gate.name, key, "failed" if gate.level == "fail" else "warned", None, what)
+        return GateOutcome(gate.name, key, "absent", None, what)
+    return GateOutcome(gate.name, key, "failed" if gate.level == "fail" else "warned", None, what)
 
 
-def judge_gates(gate: Gate, root: Path, model: str, baseline: Path) -> list[GateVerdict]:
+def judge_gates(gate: Gate, root: Path, model: str, baseline: Path) -> list[GateOutcome]:
     """Return the verdicts of ``gate`` on the run folder ``root``.
 
     Args:
@@ -107,61 +107,60 @@ def judge_gates(gate: Gate, root: Path, model: str, baseline: Path) -> list[Gate
     return verdicts
 
 
-def _judged(gate: Gate, key: str, value: float | None, word: object) -> GateVerdict:
+def _judged(gate: Gate, key: str, value: float | None, word: object) -> GateOutcome:
     """Return the verdict that a stage stored as a word; ``value`` is shown beside it."""
     number = "no number" if value is None else f"{value:.4g}"
     text = f"{number}, {str(word).replace('_', ' ')}"
     if word in gate.passes:
-        return GateVerdict(gate.name, key, "passed", value, text)
+        return GateOutcome(gate.name, key, "passed", value, text)
     state = "failed" if gate.level == "fail" else "warned"
-    return GateVerdict(gate.name, key, state, value, "; ".join(filter(None, [text, gate.advice])))
+    return GateOutcome(gate.name, key, state, value, "; ".join(filter(None, [text, gate.advice])))
 
 
-def _hold(gate: Gate, key: str, value: float, said: str) -> GateVerdict:
-    """Return the verdict on ``value``; ``said`` follows the number in the message."""
+def _hold(gate: Gate, key: str, value: float, suffix: str) -> GateOutcome:
+    """Return the verdict on ``value``; ``suffix`` follows the number in the message."""
     limits = []
     if gate.max is not None and value > gate.max:
-        limits.append(f"{value:.4g}{said} is above {gate.max:g}")
+        limits.append(f"{value:.4g}{suffix} is above {gate.max:g}")
     if gate.min is not None and value < gate.min:
-        limits.append(f"{value:.4g}{said} is below {gate.min:g}")
+        limits.append(f"{value:.4g}{suffix} is below {gate.min:g}")
     if not limits:
-        return GateVerdict(gate.name, key, "passed", value, f"{value:.4g}{said}")
+        return GateOutcome(gate.name, key, "passed", value, f"{value:.4g}{suffix}")
     state = "failed" if gate.level == "fail" else "warned"
     text = "; ".join([*limits, gate.advice] if gate.advice else limits)
-    return GateVerdict(gate.name, key, state, value, text)
+    return GateOutcome(gate.name, key, state, value, text)
 
 
 def _against_accepted(
     gate: Gate, root: Path, model: str, baseline: Path, content: Mapping[str, Any]
-) -> list[GateVerdict]:
+) -> list[GateOutcome]:
     """Hold the change since the accepted values, beyond its uncertainty, against the limit."""
     from bampipe.results.ingest import IngestResult
 
-    kept = accepted.read(baseline, RunFolder(root).read(IngestResult).device)
-    if kept is None:
+    reference = accepted.read(baseline, RunFolder(root).read(IngestResult).device)
+    if reference is None:
         return [_missing(gate, "", f"nothing accepted yet in {baseline}: run `bampipe accept`")]
-    if kept.model != model:
-        what = f"the accepted values are those of model {kept.model!r}, not of {model!r}"
+    if reference.model != model:
+        what = f"the accepted values are those of model {reference.model!r}, not of {model!r}"
         return [_missing(gate, "", what)]
-    old = kept.results.get(gate.result, {})
+    old = reference.results.get(gate.result, {})
     parent, _, last = gate.value.rpartition(".")
     now, before = _pick(content, gate.value), _pick(old, gate.value)
     sds, old_sds = (_pick(of, f"{parent}.sd") for of in (content, old))
     verdicts = []
     for key in [*now, *(key for key in before if key not in now)]:
-        value, kept_value = _number(now.get(key)), _number(before.get(key))
-        if value is None or kept_value is None:
+        value, accepted_value = _number(now.get(key)), _number(before.get(key))
+        if value is None or accepted_value is None:
             where = "this run" if value is None else "the accepted values"
             verdicts.append(_missing(gate, key, f"no {last} in {where}"))
             continue
         sd = math.hypot(_number(sds.get(key)) or 0.0, _number(old_sds.get(key)) or 0.0)
-        beyond = max(0.0, abs(value - kept_value) - 2.0 * sd)
-        if kept_value == 0.0:
+        excess = max(0.0, abs(value - accepted_value) - 2.0 * sd)
+        if accepted_value == 0.0:
             verdicts.append(_missing(gate, key, "the accepted value is 0: no change in percent"))
             continue
-        change = 100.0 * (value - kept_value) / abs(kept_value)
-        said = (
-            f" % beyond two standard deviations ({kept_value:.4g} to {value:.4g}, {change:+.3g} %)"
-        )
-        verdicts.append(_hold(gate, key, 100.0 * beyond / abs(kept_value), said))
+        change = 100.0 * (value - accepted_value) / abs(accepted_value)
+        numbers = f"{accepted_value:.4g} to {value:.4g}, {change:+.3g} %"
+        suffix = f" % beyond two standard deviations ({numbers})"
+        verdicts.append(_hold(gate, key, 100.0 * excess / abs(accepted_value), suffix))
     return verdicts

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from bampipe.errors import printable
-from bampipe.run.gates import GateVerdict
+from bampipe.run.gates import GateOutcome
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class Suite:
     """
 
     name: str
-    verdicts: tuple[GateVerdict, ...]
+    verdicts: tuple[GateOutcome, ...]
     error: str = ""
 
 

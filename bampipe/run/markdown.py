@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError, printable
-from bampipe.run.gates import GateVerdict
+from bampipe.run.gates import GateOutcome
 from bampipe.run.models import BASE
 from bampipe.run.request import Outcome
 
@@ -72,7 +72,7 @@ def _session(outcome: Outcome, model: str) -> tuple[str, ...]:
     )
 
 
-def _count(verdicts: Iterable[GateVerdict], state: str) -> int:
+def _count(verdicts: Iterable[GateOutcome], state: str) -> int:
     return sum(verdict.state == state for verdict in verdicts)
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bampipe.errors import InputError
-from bampipe.run.gates import GateVerdict
+from bampipe.run.gates import GateOutcome
 from bampipe.stages import base
 
 if TYPE_CHECKING:
@@ -103,7 +103,7 @@ class Outcome:
     root: Path
     state: str
     steps: tuple[StepResult, ...] = ()
-    verdicts: tuple[GateVerdict, ...] = ()
+    verdicts: tuple[GateOutcome, ...] = ()
     error: str = ""
     traceback: str = ""
 

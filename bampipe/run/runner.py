@@ -11,7 +11,7 @@ from bampipe import compile_ahead
 from bampipe.errors import InputError
 from bampipe.run import accepted, hashing, models, record, staging
 from bampipe.run.events import Event, Listener, unheard
-from bampipe.run.gates import GateVerdict, judge_gates
+from bampipe.run.gates import GateOutcome, judge_gates
 from bampipe.run.request import Outcome, Request, Step, StepResult, selected
 from bampipe.run.state import RunState, lasting
 from bampipe.stages import base
@@ -100,9 +100,9 @@ class _Runner:
                     models.read(self.root, self.request.model)
             for step in self.state.steps(stage):
                 results.append(self.step(step))
-        verdicts: list[GateVerdict] = []
+        verdicts: list[GateOutcome] = []
         if self.request.judged:
-            baseline = self.request.accepted or accepted.beside(self.root.parent)
+            baseline = self.request.accepted or accepted.accepted_folder(self.root.parent)
             for gate in pipeline.gates:
                 verdicts += judge_gates(gate, self.root, self.request.judged, baseline)
         self.state.close(verdicts)
@@ -137,7 +137,7 @@ def run_session(request: Request, listen: Listener = unheard) -> Outcome:
         runner = _Runner(request, listen)
         staging.recover(runner.state)
         try:
-            with compile_ahead.beside(request.processes):
+            with compile_ahead.compiling_ahead(request.processes):
                 return runner.run()
         except InputError:
             if fresh and not runner.state.records:

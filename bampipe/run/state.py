@@ -11,7 +11,7 @@ from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError
 from bampipe.files import digest_content, digest_file, digest_input
 from bampipe.run import hashing, models, record
-from bampipe.run.gates import GateVerdict
+from bampipe.run.gates import GateOutcome
 from bampipe.run.request import Request, Step
 from bampipe.run.settings import configure, plain
 from bampipe.stages import base
@@ -202,7 +202,7 @@ class RunState:
         """Write ``run.json``."""
         self._write(self._noted())
 
-    def close(self, verdicts: Iterable[GateVerdict]) -> None:
+    def close(self, verdicts: Iterable[GateOutcome]) -> None:
         """Write ``run.json`` with the verdicts of the gates, unless it says the same already."""
         from bampipe.results.run import GateVerdict, PipelineUsed
 

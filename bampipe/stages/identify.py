@@ -100,8 +100,8 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     problem = problem_of(system, motions, band, timing=timing)
     progress(0.1, "least squares")
     start = _start(run, system, config)
-    own = problem.free[problem.free < len(start)]
-    start[own] *= config.start_factor
+    model_parameters = problem.free[problem.free < len(start)]
+    start[model_parameters] *= config.start_factor
     try:
         raw = fit(problem, np.append(start, 0.0), block_s=config.block_s)
     except ValueError as error:

@@ -37,7 +37,7 @@ NAME = "ingest"
 SUMMARY = "Read a session's raw logs, check and repair the trials, bring them to SI units"
 
 RATE_TOLERANCE = 0.02
-"""The announced sample rate stands where the time stamps agree with it this well."""
+"""The announced sample rate is used where the time stamps agree with it this well."""
 
 
 @checked_dataclass(frozen=True, config=STRICT)
@@ -245,11 +245,11 @@ def _trial(session: Session, entry: TrialEntry, config: Config, reason: str) -> 
         raw = replace(raw, columns=columns)
     if not clock.column:
         count = len(raw.columns[session.columns[0]])
-        said = f"no time stamps: samples counted at {session.sample_rate:g} Hz"
+        note = f"no time stamps: samples counted at {session.sample_rate:g} Hz"
         raw = replace(
             raw,
             columns={clock.column: np.arange(count, dtype=float), **raw.columns},
-            remarks=(*raw.remarks, said),
+            remarks=(*raw.remarks, note),
         )
     return clean(raw, session, entry, config)
 

@@ -170,8 +170,8 @@ def _axis(
         if not trial.found.yielded:
             notes.append(
                 f"{trial.trial_id}: the slope of the loops still changes by "
-                f"{100.0 * trial.found.bend:.1f} % where they should be straight: load the axis "
-                "further; the stiffness is too high."
+                f"{100.0 * trial.found.slope_change:.1f} % where they should be straight: load "
+                "the axis further; the stiffness is too high."
             )
         drift = _drift(trial)
         if abs(drift) > config.largest_drift:
@@ -208,7 +208,7 @@ def _axis(
                 stiffness=trial.found.stiffness,
                 standard_error=trial.found.standard_error,
                 transition=trial.found.transition,
-                bend=trial.found.bend,
+                slope_change=trial.found.slope_change,
                 drift=_drift(trial),
             )
             for trial in trials

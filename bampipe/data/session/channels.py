@@ -50,7 +50,7 @@ Column = Annotated[Text, Field(description="A column (or MATLAB variable) of the
 Columns = Annotated[Distinct[Column], Field(min_length=1)]
 
 
-def _unit(text: str) -> units.Unit:
+def _unit(text: str) -> units.RecordedUnit:
     """A unit that its declaration allows only where it is known."""
     found = units.unit(text)
     assert found is not None
@@ -389,8 +389,8 @@ class Channel(NamedDeclaration):
     signed: bool = False
 
     @property
-    def _raw(self) -> units.Unit:
-        return units.unit(self.stated_unit) or units.Unit(self.stated_unit)
+    def _raw(self) -> units.RecordedUnit:
+        return units.unit(self.stated_unit) or units.RecordedUnit(self.stated_unit)
 
     @property
     def unit(self) -> str:

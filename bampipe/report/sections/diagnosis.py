@@ -89,7 +89,7 @@ def _verdicts(names: tuple[str, ...], axes: Mapping[str, AxisVerdict]) -> Table:
         rows.append(
             (
                 axis,
-                verdicts.IN_WORDS.get(entry.verdict, wording.words(entry.verdict)),
+                verdicts.VERDICTS_IN_WORDS.get(entry.verdict, wording.words(entry.verdict)),
                 wording.percent(entry.explainable_share),
                 wording.percent(entry.explainable_chance),
                 wording.significant(entry.rmse_before),
@@ -137,7 +137,7 @@ def _ranking(results: Results, ranking: Sequence[RankedEffect]) -> Table:
         note += f" {wording.count(more, 'candidate')} further down not shown."
     return Table(
         "Candidate effects, best first: error on held-out trials without and with each",
-        ("Effect", "Axis", "Without", "With", "Unit", "p", "Not told apart from"),
+        ("Effect", "Axis", "Without", "With", "Unit", "p", "Indistinguishable from"),
         tuple(rows),
         "llrrlrl",
         (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0),

@@ -51,7 +51,7 @@ def _done(results: Results) -> str:
         )
     if results.read(ValidateResult) is not None:
         parts.append(
-            "The force that the model predicts was held against the measured one on trials not "
+            "The force that the model predicts was compared with the measured one on trials not "
             "used for identification."
         )
     return " ".join(parts)

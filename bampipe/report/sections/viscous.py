@@ -36,10 +36,10 @@ def section(results: Results) -> Section | None:
 
 
 def _words(directions: Mapping[str, Damping]) -> str:
-    """Say along which directions the brakes rendered what they were told."""
+    """Say along which directions the brakes rendered what was commanded."""
     tested = [name for name, entry in directions.items() if entry.differs is not None]
     if not tested:
-        return "What was commanded is not recorded, so the estimates are held against nothing."
+        return "What was commanded is not recorded, so the estimates cannot be compared with it."
     wrong = [name for name in tested if directions[name].differs]
     right = [name for name in tested if name not in wrong]
     parts = []
@@ -77,7 +77,7 @@ def _table(directions: Mapping[str, Damping]) -> Table:
         "lrrrrr",
         note="± one standard deviation over blocks of time. p: chance of so large a difference "
         "from the command if there were none (two-sided, Student's t). Friction and inertia as "
-        "identified; the brakes' commands are not told to the filter, only what they did.",
+        "identified; the filter does not know the brakes' commands, only what they did.",
     )
 
 
