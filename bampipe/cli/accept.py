@@ -30,7 +30,7 @@ def accept(
     ] = Path("runs"),
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No advice.")] = False,
 ) -> None:
-    """Keep a session's parameters as the device's accepted ones, for the gates of later runs.
+    """Accept a session's parameters as the device's reference for the gates of later runs.
 
     Example: bampipe accept 2026-10-03_s01
     """

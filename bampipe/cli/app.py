@@ -43,7 +43,7 @@ def effects(
     ] = "bam",
     json: JsonOption = False,
 ) -> None:
-    """The effects a model can have; with a name, one of them in full; or an effect file checked.
+    """List the effects a model can have; with a name, show one in full; or check an effect file.
 
     Example: bampipe effects
 
@@ -67,7 +67,7 @@ def effects(
 
 
 def version() -> None:
-    """The version of bampipe.
+    """Print the version of bampipe.
 
     Example: bampipe version
     """

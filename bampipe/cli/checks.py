@@ -13,7 +13,7 @@ from bampipe.run.verify import verify
 
 
 def status_(run: RunArgument = None, runs: RunsOption = RUNS, json: JsonOption = False) -> None:
-    """Which stages of a run are current, stale or failed.
+    """Show which stages of a run are current, stale or failed.
 
     Example: bampipe status 2026-10-03_s01
     """
@@ -30,7 +30,7 @@ def status_(run: RunArgument = None, runs: RunsOption = RUNS, json: JsonOption =
 
 
 def verify_(run: RunArgument = None, runs: RunsOption = RUNS, json: JsonOption = False) -> None:
-    """Recompute every recorded hash; say what was touched since. Exit 1 if anything was.
+    """Recompute every recorded hash and name the files changed since; exit code 1 if any was.
 
     Example: bampipe verify 2026-10-03_s01
     """

@@ -23,7 +23,7 @@ FaultsOnlyOption = Annotated[bool, typer.Option("--quiet", "-q", help="Faults on
 
 @app.command("list")
 def list_(json: JsonOption = False) -> None:
-    """The built-in devices.
+    """List the built-in devices.
 
     Example: bampipe device list
     """
@@ -51,7 +51,7 @@ def show_(
     device: Annotated[str, typer.Argument(help="A built-in device, or a device file.")],
     json: JsonOption = False,
 ) -> None:
-    """A device in full: equations of motion, numbers, inputs, the effects it can have.
+    """Show a device in full: equations of motion, numbers, inputs, the effects it can have.
 
     Example: bampipe device show slider
     """
@@ -95,7 +95,7 @@ def check(
     json: JsonOption = False,
     quiet: FaultsOnlyOption = False,
 ) -> None:
-    """The equations of motion that follow from a device file, and what is wrong with it.
+    """Check a device file: its equations of motion, and what is wrong with it.
 
     Names, units, expressions and the derivation are checked. Exit 2 with one line a fault.
 

@@ -31,9 +31,9 @@ def lab(
     json: Annotated[bool, typer.Option("--json", help="Print the trends as JSON.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no advice.")] = False,
 ) -> None:
-    """All sessions side by side: one data set, control charts, and which session drifted and why.
+    """Compare all sessions: one data set, control charts, and which session drifted and why.
 
-    Collects what has been run, and runs nothing.
+    Collects what has been run, and runs nothing itself.
 
     Example: bampipe lab
 

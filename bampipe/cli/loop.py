@@ -33,7 +33,7 @@ def diagnose(
     ] = "",
     options: StageOptions = DEFAULTS,
 ) -> None:
-    """Which effect is missing from a model, and why the tool believes so.
+    """Find which effect a model lacks, axis by axis, with the evidence.
 
     Example: bampipe diagnose 2026-10-03_s01
     """
@@ -116,7 +116,7 @@ def demo(
     force: ForceOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """A shipped session with a hidden effect: the whole loop, in minutes.
+    """Run the loop on a shipped session with a hidden effect, in minutes.
 
     Example: bampipe demo
     """

@@ -62,7 +62,7 @@ def monitor(
         Path, typer.Option("--runs", envvar="BAMPIPE_RUNS", help="Folder of the run folders.")
     ] = Path("runs"),
 ) -> None:
-    """State, parameters with bounds and an alarm, from samples as they come.
+    """Follow a log as it grows: state, parameters with bounds, and an alarm.
 
     Columns by name as in ingest/samples.parquet (t, q_yaw, force_x, brake_yaw, ...; SI), or with
     --session those of its raw logs. Bad lines are skipped and counted. Stop with Ctrl-C.

@@ -37,10 +37,10 @@ SettingsOption = Annotated[
     typer.Option("--set", metavar="NAME=VALUE", help="A setting of the stage; may be repeated."),
 ]
 ListSettingsOption = Annotated[
-    bool, typer.Option("--settings", help="List the settings of this stage, and leave.")
+    bool, typer.Option("--settings", help="List the settings of this stage, and exit.")
 ]
 ModelOption = Annotated[
-    str, typer.Option("--model", help="Only this model; else base and what was run of the others.")
+    str, typer.Option("--model", help="Only this model; else base, and the others that were run.")
 ]
 
 RUNS = Path("runs")

@@ -75,7 +75,7 @@ def run(
     json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """From raw log to report: all stages of a pipeline, those that changed.
+    """Run a pipeline from raw log to report; only stages that changed run again.
 
     Example: bampipe run sessions/2026-10-03_s01
 

@@ -43,7 +43,7 @@ def simulate(
     json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Make a session from the model, with known effects hidden in it.
+    """Simulate a session with known effects hidden in it.
 
     The truth goes into a file beside the session folder.
 

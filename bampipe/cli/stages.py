@@ -21,7 +21,7 @@ from bampipe.run.session_name import session_id
 
 @with_stage_options
 def ingest(session: SessionArgument, options: StageOptions = DEFAULTS) -> None:
-    """Read a session's raw logs: SI units, repairs, trials set aside with a reason.
+    """Read a session's raw logs: convert to SI units, repair, set bad trials aside.
 
     Example: bampipe ingest sessions/2026-10-03_s01
     """
@@ -40,7 +40,7 @@ def filter_(
     method: Annotated[str, typer.Option(help="auto, kalman, butterworth or savitzky_golay.")] = "",
     options: StageOptions = DEFAULTS,
 ) -> None:
-    """Velocity and acceleration from the encoders, with error bands.
+    """Compute velocity and acceleration from the encoders, with error bands.
 
     Example: bampipe filter 2026-10-03_s01 --method butterworth
     """
@@ -49,7 +49,7 @@ def filter_(
 
 @with_stage_options
 def stiffness(run: RunArgument = None, options: StageOptions = DEFAULTS) -> None:
-    """Stiffness of each axis from its hysteresis loops, and the bandwidth that follows.
+    """Compute the stiffness of each axis from its hysteresis loops, and its bandwidth.
 
     Example: bampipe stiffness 2026-10-03_s01
     """
@@ -78,7 +78,7 @@ def identify(
 def viscous(
     run: RunArgument = None, model: ModelOption = "", options: StageOptions = DEFAULTS
 ) -> None:
-    """Damping at the handle that the brakes rendered in viscous trials, against the command.
+    """Estimate the damping that the brakes rendered in viscous trials, against the command.
 
     Example: bampipe viscous 2026-10-03_s01
     """
@@ -89,7 +89,7 @@ def viscous(
 def performance(
     run: RunArgument = None, model: ModelOption = "", options: StageOptions = DEFAULTS
 ) -> None:
-    """Workspace, stiffness, friction, inertia and force at the handle.
+    """Compute workspace, stiffness, friction, inertia and force at the handle.
 
     Example: bampipe performance 2026-10-03_s01
     """
@@ -100,7 +100,7 @@ def performance(
 def validate(
     run: RunArgument = None, model: ModelOption = "", options: StageOptions = DEFAULTS
 ) -> None:
-    """Predicted against measured force, on trials the parameters never saw.
+    """Compare predicted with measured force, on trials the parameters never saw.
 
     Example: bampipe validate 2026-10-03_s01
     """
@@ -109,7 +109,7 @@ def validate(
 
 @with_stage_options
 def compare(run: RunArgument = None, options: StageOptions = DEFAULTS) -> None:
-    """The ladder: held-out error of each model version against the noise floor.
+    """Print the ladder: held-out error of each model version against the noise floor.
 
     Example: bampipe compare 2026-10-03_s01
     """
@@ -118,7 +118,7 @@ def compare(run: RunArgument = None, options: StageOptions = DEFAULTS) -> None:
 
 @with_stage_options
 def report(run: RunArgument = None, options: StageOptions = DEFAULTS) -> None:
-    """PDF and web page of everything found so far.
+    """Write PDF and web page of everything found so far.
 
     Example: bampipe report 2026-10-03_s01
     """
