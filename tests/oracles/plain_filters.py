@@ -19,7 +19,7 @@ from bampipe.estimate.unscented import (
     FilteredTrial,
     FilterFailure,
     FilterModel,
-    FilterResult,
+    FilterOutcome,
     FilterSettings,
     Trial,
     in_sequence,
@@ -35,7 +35,7 @@ def filter_by_covariance(
     theta: np.ndarray,
     covariance: np.ndarray,
     settings: FilterSettings,
-) -> FilterResult:
+) -> FilterOutcome:
     """The compiled filter in its covariance form; as `unscented.filter_trials`."""
     return _filter(_predict_by_covariance, model, trials, theta, covariance, settings)
 
@@ -46,7 +46,7 @@ def filter_augmented(
     theta: np.ndarray,
     covariance: np.ndarray,
     settings: FilterSettings,
-) -> FilterResult:
+) -> FilterOutcome:
     """The filter with all noise in the state; as `unscented.filter_trials`."""
     return _filter(_predict_augmented, model, trials, theta, covariance, settings)
 
@@ -144,7 +144,7 @@ def _filter(
     theta: np.ndarray,
     covariance: np.ndarray,
     settings: FilterSettings,
-) -> FilterResult:
+) -> FilterOutcome:
     nx, (lower, upper) = model.n_states, model.range
 
     def filter_one(
