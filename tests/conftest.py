@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 from jsonschema import Draft202012Validator
+from numba.core import dispatcher
 
 TOYS, ORACLES = (Path(__file__).parent / name for name in ("toys", "oracles"))
 sys.path[:0] = [str(TOYS), str(ORACLES)]
@@ -26,6 +27,25 @@ from bampipe.run.events import Event  # noqa: E402
 from bampipe.run.request import Outcome, Request  # noqa: E402
 from bampipe.run.runner import run_session  # noqa: E402
 from bampipe.stages import base  # noqa: E402
+
+
+def leave_compiling_unmeasured() -> None:
+    """Stop coverage while numba compiles, where it would trace every line of numba for nothing."""
+    compile_types = dispatcher._FunctionCompiler.compile
+
+    def compile_untraced(*arguments: Any) -> Any:
+        trace = sys.gettrace()
+        sys.settrace(None)
+        try:
+            return compile_types(*arguments)
+        finally:
+            sys.settrace(trace)
+
+    dispatcher._FunctionCompiler.compile = compile_untraced
+
+
+if "coverage" in sys.modules:
+    leave_compiling_unmeasured()
 
 
 class Toy:
