@@ -164,14 +164,7 @@ class Run:
         return {path.stem: Picture(path) for path in paths}
 
     def _known(self, model: str) -> str:
-        chosen = model or self.model
-        if model and chosen not in self.models:
-            raise InputError(
-                f"no results for model {model!r}",
-                where=str(self.root),
-                remedy=f"choose from {', '.join(self.models) or 'none: identify first'}",
-            )
-        return chosen
+        return self._results.require_model(model) if model else self.model
 
     def _read(self, kind: type[R], model: str = "") -> R:
         name = self._known(model) if "{model}" in kind.FILE else ""

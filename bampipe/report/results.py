@@ -193,14 +193,22 @@ class Results:
             InputError: the model asked for has no results.
         """
         if self.detail_model:
-            if self.detail_model not in self.models:
-                raise InputError(
-                    f"no results for model {self.detail_model!r}",
-                    where=str(self.root),
-                    remedy=f"choose from {', '.join(self.models) or 'none: identify first'}",
-                )
-            return self.detail_model
+            return self.require_model(self.detail_model)
         return self.models[-1] if self.models else "base"
+
+    def require_model(self, name: str) -> str:
+        """Return ``name``.
+
+        Raises:
+            InputError: that model has no results.
+        """
+        if name in self.models:
+            return name
+        raise InputError(
+            f"no results for model {name!r}",
+            where=str(self.root),
+            remedy=f"choose from {', '.join(self.models) or 'none: identify first'}",
+        )
 
     def in_order(self, parameters: Iterable[str]) -> tuple[str, ...]:
         """Return names of parameters: those of every axis first, axis by axis, effects last."""

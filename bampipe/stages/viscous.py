@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -264,15 +265,11 @@ def _direction(
 ) -> Damping:
     """Return what is stored of one direction; the test is two-sided, Student's t over blocks."""
     felt = estimate + friction
-    found = {
-        "estimate": estimate,
-        "sd": sd,
-        "own_friction": friction,
-        "felt": felt,
-        "unit": "N.s/m",
-    }
+    found = partial(
+        Damping, estimate=estimate, sd=sd, own_friction=friction, felt=felt, unit="N.s/m"
+    )
     if command is None:
-        return Damping.model_validate(found)
+        return found()
     ratios = [abs(value - command) / sd if sd > 0.0 else np.inf for value in (estimate, felt)]
     p, felt_p = (float(2.0 * stats.t.sf(ratio, max(blocks - 1, 1))) for ratio in ratios)
     what = (
@@ -280,12 +277,11 @@ def _direction(
         if p < _SIGNIFICANT
         else f"no difference from {command:.4g} commanded shown"
     )
-    tested = {
-        "commanded": command,
-        "p_value": p,
-        "differs": p < _SIGNIFICANT,
-        "felt_p_value": felt_p,
-        "felt_differs": felt_p < _SIGNIFICANT,
-        "verdict": f"{what}, p = {p:.2g}",
-    }
-    return Damping.model_validate(found | tested)
+    return found(
+        commanded=command,
+        p_value=p,
+        differs=p < _SIGNIFICANT,
+        felt_p_value=felt_p,
+        felt_differs=felt_p < _SIGNIFICANT,
+        verdict=f"{what}, p = {p:.2g}",
+    )
