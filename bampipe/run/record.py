@@ -129,11 +129,13 @@ def require_untouched(root: Path, names: Iterable[str]) -> None:
     for name in names:
         step, known = written.get(name, ("", ""))
         if step and (root / name).is_file() and digest_file(root / name) != known:
-            raise InputError(
-                f"{name} was changed since {step} wrote it",
-                where=str(root),
-                remedy=f"run `bampipe {step.partition(':')[0]}` again to rebuild it",
-            )
+            raise touched(root, name, step)
+
+
+def touched(root: Path, name: str, step: str) -> InputError:
+    """Return the refusal of the result ``name`` that is not as ``step`` wrote it."""
+    remedy = f"run `bampipe {step.partition(':')[0]}` again to rebuild it"
+    return InputError(f"{name} was changed since {step} wrote it", where=str(root), remedy=remedy)
 
 
 def replace_json(path: Path, content: dict[str, Any]) -> None:

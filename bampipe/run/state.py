@@ -127,11 +127,7 @@ class RunState:
         for step, made in self.records.items():
             written = made.outputs.get(name)
             if written is not None and self.digest(name) != written:
-                raise InputError(
-                    f"{name} was changed since {step} wrote it",
-                    where=str(self.root),
-                    remedy=f"run `bampipe {step.partition(':')[0]}` again to rebuild it",
-                )
+                raise record.touched(self.root, name, step)
 
     def key(self, step: Step, config: Mapping[str, object], inputs: Mapping[str, str]) -> str:
         return digest_content(
