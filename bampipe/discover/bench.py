@@ -105,6 +105,7 @@ class Bench:
             asked,
             len(self.names),
             float(Scorer(evidence).independent.mean()),
+            self.settings.replay_error,
         )
 
     def gaining(self, scores: Mapping[str, Score], scorer: Scorer) -> list[str]:

@@ -14,6 +14,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from bampipe.discover.settings import Settings
 from bampipe.estimate.normal_equations import NormalEquations
 from bampipe.physics import Model, System, compile_model
 from bampipe.physics.device import Device
@@ -30,7 +31,6 @@ _GRID = 7
 _REFINE = 3
 _SIMILAR = 0.7
 _DENSEST = 48
-_WORTH = 4.0
 _SHARES = (1.0, 0.9, 0.8, 0.65, 0.5, 0.35, 0.2, 0.1, 0.05)
 """Shares of the least-squares strength tried where an effect weakens what the force does."""
 _DIVERGED = 1e30
@@ -162,7 +162,7 @@ class Scorer:
         """
         ranges = [_search_range(item.own[i]) for i in item.searched]
         at = [_middle(low, high) for low, high, _ in ranges]
-        hopeless = self._cost_before(item) - _WORTH
+        hopeless = self._cost_before(item) - Settings().worth_searching
         for _ in range(min(len(ranges), 2)):
             for k, interval in enumerate(ranges):
                 found = self._scan(item, at, k, interval)

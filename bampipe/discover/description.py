@@ -7,16 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bampipe.discover.settings import Settings
 from bampipe.discover.shape import BINS, Map, Variable, residual_map, variables
 from bampipe.trials.residuals import Evidence
 
 Array = NDArray[np.float64]
 
-_CARRIES = 0.2
-"""Least share of the residual's variance that a variable carries to be named its cause."""
-
-_RIPPLE = 0.5
-"""Least share of what a variable carries that a sine must carry to be called a ripple."""
+_LIMITS = Settings()
 
 
 @dataclass(frozen=True)
@@ -35,14 +32,14 @@ def describe(evidence: Evidence, axis: int) -> str:
     best = int(np.argmax([m.share for m in maps]))
     most, variable = maps[best], known[best]
     unit = evidence.system.torque_units[axis]
-    if most.share < _CARRIES or most.variable == "time":
+    if most.share < _LIMITS.variable_share or most.variable == "time":
         vibration = _vibration(evidence, axis)
-        if vibration is not None and vibration.share > max(most.share, _CARRIES):
+        if vibration is not None and vibration.share > max(most.share, _LIMITS.variable_share):
             return (
                 f"a vibration of {vibration.amplitude:.2g} {unit} at {vibration.frequency:.3g} Hz "
                 "in time, whatever the arm does"
             )
-    if most.share < _CARRIES:
+    if most.share < _LIMITS.variable_share:
         return (
             "scattered over all motions; it follows nothing that the arm does "
             f"({most.variable} carries {100 * most.share:.0f} %)"
@@ -50,7 +47,7 @@ def describe(evidence: Evidence, axis: int) -> str:
     carries = f"{most.variable} carries {100 * most.share:.0f} % of the residual's variance"
     turning = _by_direction(evidence, axis, variable)
     ripple = _ripple(evidence, axis, variable)
-    if ripple is not None and ripple.share > _RIPPLE * most.share:
+    if ripple is not None and ripple.share > _LIMITS.ripple_share * most.share:
         period = 1.0 / ripple.frequency
         return (
             f"a ripple of {ripple.amplitude:.2g} {unit} along {most.variable} that repeats every "
@@ -143,8 +140,8 @@ def _by_direction(evidence: Evidence, axis: int, variable: Variable) -> str:
     if len(means) < 4:
         return "seen in one direction of motion only"
     likeness = float(np.corrcoef(np.array(means).T)[0, 1])
-    if likeness > 0.6:
+    if likeness > _LIMITS.direction_likeness:
         return "the same in both directions of motion, as of a spring"
-    if likeness < -0.6:
+    if likeness < -_LIMITS.direction_likeness:
         return "opposite in the two directions of motion, as of friction"
     return "different in the two directions of motion"

@@ -29,7 +29,8 @@ class AxisFinding:
     """Verdict on one axis.
 
     Attributes:
-        verdict: ``nothing_missing``, ``missing`` or ``unknown_effect``.
+        verdict: ``nothing_missing``, ``missing``, ``unknown_effect``, or ``undecided`` where
+            the noise floor is wrong.
         rmse_before, rmse_after: held-out error without and with the effects found, N.m or N.
         noise_floor: what the final model leaves when it is the whole truth, N.m or N.
         floor_sd: its scatter over replays.

@@ -12,8 +12,6 @@ from bampipe.discover.candidates import Score
 from bampipe.discover.chance import Replicate
 
 Array = NDArray[np.float64]
-REPLAY_ERROR = 0.01
-"""How far the log error of a replay may be off because no replay is perfect."""
 
 
 class Level:
@@ -28,8 +26,11 @@ class Level:
         asked: Sequence[str],
         tests: int,
         independent: float,
+        replay_error: float,
     ) -> None:
-        self._replay, self._tests, self._independent = replay, tests, independent
+        self._replay, self._tests = replay, tests
+        # No replay is perfect: its log error is off by this, as a log likelihood.
+        self._error = replay_error * independent
         self._gains: dict[str, Array] = {}
         self.replicates = self._learn(asked)
 
@@ -57,9 +58,7 @@ class Level:
             return 1.0
         count = len(self.replicates)
         totals = self._gains[score.name].sum(axis=1)
-        spread = np.hypot(
-            totals.std(ddof=1) * np.sqrt(1.0 + 1.0 / count), REPLAY_ERROR * self._independent
-        )
+        spread = np.hypot(totals.std(ddof=1) * np.sqrt(1.0 + 1.0 / count), self._error)
         z = (score.total - totals.mean()) / spread
         return float(min(1.0, self._tests * student.sf(z, count - 1)))
 

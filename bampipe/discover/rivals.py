@@ -11,6 +11,7 @@ from bampipe.discover.bench import Bench
 from bampipe.discover.candidates import Score
 from bampipe.discover.chance import Progress, Replicate
 from bampipe.discover.level import Level
+from bampipe.discover.settings import Settings
 from bampipe.discover.start import with_effect
 from bampipe.estimate.simulation import Runaway
 from bampipe.physics.recipe import Recipe
@@ -19,30 +20,31 @@ from bampipe.trials.residuals import Evidence
 
 def choose(
     bench: Bench,
-    able: Sequence[tuple[float, str]],
+    significant: Sequence[tuple[float, str]],
     level: Level,
     recipe: Recipe,
     evidence: Evidence,
     scores: Mapping[str, Score],
     progress: Progress,
 ) -> tuple[str, tuple[str, ...]]:
-    """The best of ``able``, and others that these trials cannot tell from it, two at most.
+    """The best of ``significant``, and others that these trials cannot tell from it, two at most.
 
     Args:
         bench: the session.
-        able: candidates that beat chance with their excess, best first.
+        significant: candidates that beat chance with their excess, best first.
         level: their chance level.
         recipe, evidence: the model that they would be added to, fitted.
         scores: theirs.
         progress: called with a fraction and a message.
     """
-    top, best = able[0]
+    s = bench.settings
+    top, best = significant[0]
     axis = int(np.argmax(level.excess(scores[best])))
     rivals = [
         name
-        for excess, name in able[:6]
-        if excess > 0.6 * top and int(np.argmax(level.excess(scores[name]))) == axis
-    ][:4]
+        for excess, name in significant
+        if excess > s.rival_share * top and int(np.argmax(level.excess(scores[name]))) == axis
+    ][: s.most_rivals]
     if len(rivals) == 1:
         return best, ()
     misfit = {}
@@ -62,10 +64,10 @@ def choose(
         except Runaway:
             misfit[name] = np.inf
             continue
-        misfit[name] = _misfit(rivals, scores, replicas, axis)
+        misfit[name] = _misfit(rivals, scores, replicas, axis, s)
     ordered = sorted(rivals, key=lambda n: misfit[n])
     winner = ordered[0]
-    limit = max(2.0, misfit[winner] + 1.0)
+    limit = max(s.rival_misfit, misfit[winner] + s.rival_margin)
     alike = tuple(n for n in ordered[1:] if misfit[n] < limit)
     if best in alike:
         alike = (winner, *[n for n in alike if n != best])
@@ -78,17 +80,20 @@ def _misfit(
     scores: Mapping[str, Score],
     replicas: Sequence[Replicate],
     axis: int,
+    s: Settings,
 ) -> float:
     """How unlike the measured pattern of scores is to the replayed one: mean squared z.
 
-    A tenth of the score is allowed for, because no replay is perfect.
+    Errors of the scores themselves are allowed for, because no replay is perfect.
     """
     total = 0.0
     for name in rivals:
-        seen = scores[name].gain[axis]
+        measured = scores[name].gain[axis]
         replayed = np.array(
             [r.scores[name].gain[axis] if name in r.scores else 0.0 for r in replicas]
         )
-        spread = np.sqrt(replayed.var(ddof=1) + (0.1 * replayed.mean()) ** 2 + 4.0)
-        total += ((seen - replayed.mean()) / spread) ** 2
+        spread = np.sqrt(
+            replayed.var(ddof=1) + (s.score_error * replayed.mean()) ** 2 + s.score_sd**2
+        )
+        total += ((measured - replayed.mean()) / spread) ** 2
     return float(total / len(rivals))

@@ -77,15 +77,15 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
     replayed = level.replicates
     while len(groups) + len(dropped) < s.most_effects:
         known = level
-        able = _able(bench, scores, known, evidence, replayed)
-        if able and groups:
+        significant = _significant(bench, scores, known, evidence, replayed)
+        if significant and groups:
             # What a model with the first effects leaves by chance may look like another one.
-            close = {name: scores[name] for _, name in able}
+            close = {name: scores[name] for _, name in significant}
             known = bench.level(recipe, evidence, list(close), (4, len(groups)))
-            able = _able(bench, close, known, evidence, replayed)
-        if not able:
+            significant = _significant(bench, close, known, evidence, replayed)
+        if not significant:
             break
-        best, alike = choose(bench, able, known, recipe, evidence, scores, progress)
+        best, alike = choose(bench, significant, known, recipe, evidence, scores, progress)
         wider = replace(base, effects=(*base.effects, *groups, best))
         fitted = bench.fit(wider, with_effect(wider, evidence, scores[best]))
         wider, fitted = _needed(bench, base, wider, fitted)
@@ -150,7 +150,7 @@ def _needed(
     return recipe, evidence
 
 
-def _able(
+def _significant(
     bench: Bench,
     scores: Mapping[str, Score],
     level: Level,
@@ -163,9 +163,9 @@ def _able(
     errors = np.array([r.error for r in replayed])
     ceiling = AT_FLOOR * errors.mean(axis=0) + 2.0 * errors.std(axis=0, ddof=1)
     worth = np.where(scorer.before.error > ceiling, s.worth, s.worth_at_floor)
-    able = []
+    found = []
     for name, score in scores.items():
         excess = level.excess(score)
         if np.any(excess / scorer.independent > worth) and level.p_value(score) < s.significance:
-            able.append((float(excess.sum()), name))
-    return sorted(able, reverse=True)
+            found.append((float(excess.sum()), name))
+    return sorted(found, reverse=True)

@@ -1,4 +1,9 @@
-"""How carefully the diagnosis looks, and what it takes for a finding."""
+"""How carefully the diagnosis looks, and what it takes for a finding.
+
+Every threshold that decides a verdict stands here; where an error is at its floor is decided in
+`bampipe.results.standing`. The figures they rest on are in docs/benchmarks.md: clean axes beside
+weak effects (benchmarks/thresholds.py), hidden effects (benchmarks/hidden_effects.py).
+"""
 
 from __future__ import annotations
 
@@ -26,6 +31,18 @@ class Settings:
         far: error over floor with the effects found beyond which they must remove more.
         explained_far: that share: an effect that only resembles the missing one, such as a spring
             in place of a stop, removes much and leaves many times the floor.
+        replay_error: how far the log error of a replay may be off because no replay is perfect.
+        worth_searching: least gain in log likelihood in the fit for a search of its shape to go on.
+        rival_share: share of the best candidate's gain beyond chance from which on another one is
+            a rival; most_rivals: at most so many are replayed.
+        rival_misfit: mean squared z up to which the pattern of scores looks like the measured
+            one; rival_margin: or up to so much more than that of the best.
+        score_error: relative error of a replayed score, and score_sd: its least scatter, in log
+            likelihood, both because no replay is perfect.
+        variable_share: least share of a residual's variance that a variable carries to be named.
+        ripple_share: least share of that which a sine carries to be called a ripple.
+        direction_likeness: correlation of the residual in both directions from which on it is
+            called the same, as of a spring, or opposite, as of friction.
         jobs: worker processes.
         seed: of all noise.
     """
@@ -41,5 +58,16 @@ class Settings:
     explained: float = 0.6
     far: float = 5.0
     explained_far: float = 0.75
+    replay_error: float = 0.01
+    worth_searching: float = 4.0
+    rival_share: float = 0.6
+    most_rivals: int = 4
+    rival_misfit: float = 2.0
+    rival_margin: float = 1.0
+    score_error: float = 0.1
+    score_sd: float = 2.0
+    variable_share: float = 0.2
+    ripple_share: float = 0.5
+    direction_likeness: float = 0.6
     jobs: int = 2
     seed: int = 0

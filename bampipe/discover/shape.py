@@ -127,6 +127,9 @@ def residual_map(evidence: Evidence, axis: int, variable: Variable, bins: int = 
         for b in range(count)
         if np.sum(which == b) >= _LEAST
     ]
+    if not rows:
+        none = np.zeros(0)
+        return Map(variable.name, variable.unit, none, none, none, none, none, 0.0)
     center, mean, sd, n = (np.array(c, dtype=float) for c in zip(*rows, strict=True))
     independent = n * evidence.band.independent_share[axis]
     half = 1.96 * sd / np.sqrt(np.maximum(independent, 2.0))

@@ -39,6 +39,8 @@ def conclude(search: Search, s: Settings) -> Diagnosis:
         above = after[axis] / max(level, 1e-30)
         lacking = against_floor == "above_floor" and (above > s.surely or share > s.predictable)
         verdict: Verdict = "missing" if here else "nothing_missing"
+        if against_floor in ("floor_implausible", "floor_missing"):
+            verdict = "undecided"
         explained = max(0.0, 1.0 - left / max(excess, 1e-30)) if here else 0.0
         if lacking and explained < (s.explained_far if above > s.far else s.explained):
             verdict = "unknown_effect"
@@ -54,7 +56,7 @@ def conclude(search: Search, s: Settings) -> Diagnosis:
                 given,
                 share,
                 by_chance,
-                here if verdict == "missing" else (),
+                here if verdict in ("missing", "undecided") else (),
                 lacking and verdict == "missing",
                 here if verdict == "unknown_effect" else (),
                 explained,

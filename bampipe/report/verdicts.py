@@ -14,6 +14,7 @@ from bampipe.results.validate import ValidateResult
 VERDICTS_IN_WORDS = {
     "nothing_missing": "nothing missing",
     "missing": "an effect is missing",
+    "undecided": "undecided",
     "unknown_effect": "an effect that no library entry explains",
 }
 
@@ -121,5 +122,8 @@ def _diagnosed(results: Results, diagnosis: DiagnoseResult) -> Callout:
             f"Something that no known effect explains acts on {where}",
             sentence,
         )
+    if by_verdict["undecided"]:
+        where = wording.listing(by_verdict["undecided"])
+        return Callout("attention", f"No verdict on {where}: the noise floor is wrong", sentence)
     title = f"The model{with_effects} explains this session: nothing is missing"
     return Callout("good", title, sentence)

@@ -12,7 +12,8 @@ Standing = Literal["at_floor", "above_floor", "floor_implausible", "floor_missin
 
 AT_FLOOR = 1.2
 """Error over floor up to which a model leaves no more than its sensors do. No replay is perfect:
-where nothing is missing, errors stand up to this far above the floor (benchmarks/thresholds.py)."""
+clean axes stand at up to 1.08 floors, at up to 1.16 where friction truly stops the arm; the weakest
+effects that are found start at 1.18 (benchmarks/thresholds.py, docs/benchmarks.md)."""
 IMPLAUSIBLE = 0.7
 """Error over floor below which the floor is wrong: sensors noisier than the data, or a replay that
 does not resemble the machine."""

@@ -32,6 +32,7 @@ from bampipe.results.diagnose import (
     WorstWindow,
 )
 from bampipe.results.identify import IdentifyResult
+from bampipe.results.standing import IN_WORDS
 from bampipe.schema import STRICT, Count
 from bampipe.trials.folds import HELD_OUT
 from bampipe.trials.measured import MeasuredTrials, read_measured_trials
@@ -196,6 +197,13 @@ def _result(found: Diagnosis, trials: MeasuredTrials, recipe: Recipe, model: str
 
 def _sentence(axis: str, i: int, found: Diagnosis, shape: str) -> str:
     a, unit = found.axes[i], found.evidence.system.torque_units[i]
+    if a.standing in ("floor_implausible", "floor_missing"):
+        weighed = f" Weighed: {' and '.join(a.effects)}." if a.effects else ""
+        return (
+            f"{axis.capitalize()}: no verdict can be trusted, for its held-out error of "
+            f"{a.rmse_after:.3g} {unit} is {IN_WORDS[a.standing]} ({a.noise_floor:.3g} {unit})."
+            f"{weighed}"
+        )
     floor = max(a.noise_floor, 1e-30)
     ratio = a.rmse_after / floor
     error = a.rmse_before if a.nearest else a.rmse_after
