@@ -32,7 +32,7 @@ from bampipe.results.diagnose import (
     WorstWindow,
 )
 from bampipe.results.identify import IdentifyResult
-from bampipe.results.standing import IN_WORDS
+from bampipe.results.standing import STANDINGS_IN_WORDS
 from bampipe.schema import STRICT, Count
 from bampipe.trials.folds import HELD_OUT
 from bampipe.trials.measured import MeasuredTrials, read_measured_trials
@@ -201,7 +201,7 @@ def _sentence(axis: str, i: int, found: Diagnosis, shape: str) -> str:
         weighed = f" Weighed: {' and '.join(a.effects)}." if a.effects else ""
         return (
             f"{axis.capitalize()}: no verdict can be trusted, for its held-out error of "
-            f"{a.rmse_after:.3g} {unit} is {IN_WORDS[a.standing]} ({a.noise_floor:.3g} {unit})."
+            f"{a.rmse_after:.3g} {unit} is {STANDINGS_IN_WORDS[a.standing]} ({a.noise_floor:.3g} {unit})."
             f"{weighed}"
         )
     floor = max(a.noise_floor, 1e-30)
