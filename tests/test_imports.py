@@ -356,7 +356,7 @@ def test_only_the_filterpy_engine_knows_filterpy_and_only_when_asked() -> None:
 
 @pytest.mark.parametrize("layer", ["run", "cli"])
 def test_nothing_heavy_is_imported_before_a_command_needs_it(layer: str) -> None:
-    others = ("stages/base.py", "files.py", "errors.py", "lab/place.py")
+    others = ("stages/base.py", "files.py", "errors.py", "lab/folders.py")
     for path in [*sources(layer), *(PACKAGE / name for name in others)]:
         tops = {name.partition(".")[0] for name in imported(path, lazily=False)}
         assert tops.isdisjoint({*HEAVY, "rich"}), path

@@ -150,14 +150,14 @@ def _opened(run: Run | Path_) -> Run:
     return run if isinstance(run, Run) else open_run(run)
 
 
-def _whole(root: Path) -> Pipeline:
+def _full_pipeline(root: Path) -> Pipeline:
     """The pipeline of a run, with every stage in it."""
     return pipelines.recorded(record.read(root)).with_every_stage()
 
 
 def _options(run: Run) -> loop.LoopOptions:
     batch.limit_threads(1)
-    return loop.LoopOptions(run.root, _whole(run.root), False, True, unheard)
+    return loop.LoopOptions(run.root, _full_pipeline(run.root), False, True, unheard)
 
 
 def run_stage(run: Run | Path_, stage: str, model: str = "", **settings: object) -> dict[str, Any]:
@@ -192,7 +192,7 @@ def _ran(
     outcome = runner.run_session(
         Request(
             root=root,
-            pipeline=_whole(root),
+            pipeline=_full_pipeline(root),
             settings=_settings({stage: settings}),
             first=stage,
             last=stage,

@@ -113,7 +113,7 @@ def next_effect(root: Path, model: str) -> str:
     return next(iter(_diagnosis(root, model).selected), "")
 
 
-def _own_file(text: str) -> tuple[Path, str] | None:
+def _split_effect_file(text: str) -> tuple[Path, str] | None:
     """Split ``file.toml[:target]``; None if ``text`` names no file."""
     name, _, target = text.partition(":")
     return (Path(name), target) if name.endswith(".toml") else None
@@ -121,10 +121,10 @@ def _own_file(text: str) -> tuple[Path, str] | None:
 
 def _named(text: str) -> tuple[str, Path | None]:
     """Return the effect ``name[:target]`` and the file it comes from, if it is a lab's own."""
-    own = _own_file(text)
-    if own is None:
+    effect_file = _split_effect_file(text)
+    if effect_file is None:
         return text, None
-    path, target = own
+    path, target = effect_file
     from bampipe.declarations.files import read_effect
     from bampipe.physics import registry
 
@@ -187,10 +187,12 @@ def _write_child(root: Path, parent: str, effect: str, file: Path | None) -> Non
     if effect in before.effects:
         raise InputError(f"model {parent!r} has {effect} already", where=str(root))
     child = models.child_name(parent, effect)
-    own = {path.name: path for path in (root / "models" / parent / "effects").glob("*.toml")}
+    effect_files = {
+        path.name: path for path in (root / "models" / parent / "effects").glob("*.toml")
+    }
     if file is not None:
-        own[f"{effect.partition(':')[0]}.toml"] = file
-    for name, source in sorted(own.items()):
+        effect_files[f"{effect.partition(':')[0]}.toml"] = file
+    for name, source in sorted(effect_files.items()):
         text = source.read_text(encoding="utf-8")
         record.replace_text(root / "models" / child / "effects" / name, text)
     effects = (*before.effects, effect)

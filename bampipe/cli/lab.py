@@ -55,7 +55,7 @@ def lab(
 def gather(runs: Path, out: Path | None = None, quiet: bool = False) -> Lab:
     """Write the lab's folder for the runs in ``runs``."""
     from bampipe.lab.collect import collect
-    from bampipe.lab.place import lab_folder
+    from bampipe.lab.folders import lab_folder
     from bampipe.run.events import Event
 
     folder = out or lab_folder(runs)
@@ -75,7 +75,7 @@ def refresh(runs: Path, several: bool, quiet: bool) -> None:
         several: whether several sessions were run: that makes a lab.
         quiet: print nothing.
     """
-    from bampipe.lab.place import FILE, is_current, is_foreign, lab_folder, run_folders
+    from bampipe.lab.folders import FILE, is_current, is_foreign, lab_folder, run_folders
 
     folder = lab_folder(runs)
     wanted = several or (folder / FILE).is_file()

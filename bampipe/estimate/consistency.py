@@ -79,7 +79,7 @@ class WindowTest:
     """Sums innovations up to windows, one after the other.
 
     Attributes:
-        ratio: mean NIS of a reading over the last whole window; NaN before the first, and
+        ratio: mean NIS of a reading over the last complete window; NaN before the first, and
             infinite where a reading was of no use.
         by_reading: (ny,) mean square of each innovation in its own standard deviation, there.
         useless: (ny,) which readings were of no use there: absent, or beyond what the filter

@@ -88,16 +88,16 @@ def estimate_of_fit(
         p: (n_p + 1,) the estimate, without bias.
         details, report: as of `Estimate`; rows: of its trace.
     """
-    kept = [k for k, place in enumerate(problem.free) if place < len(system.parameters)]
-    timed = len(kept) < problem.free.size
+    model_indices = [k for k, place in enumerate(problem.free) if place < len(system.parameters)]
+    timed = len(model_indices) < problem.free.size
     sd = 3.0 * np.median(np.concatenate([motion.qd_sd for motion in motions]), axis=0)
     frames = [as_filtered(system, motion, p[:-1]) for motion in motions]
     return Estimate(
         p=p,
         problem=problem,
-        covariance=fit.covariance[np.ix_(kept, kept)],
-        at_bound=fit.at_bound[kept],
-        details=[details[k] for k in kept],
+        covariance=fit.covariance[np.ix_(model_indices, model_indices)],
+        at_bound=fit.at_bound[model_indices],
+        details=[details[k] for k in model_indices],
         report={
             "input_timing": input_timing(p, fit.covariance[-1, -1] if timed else 0.0),
             "convergence": Convergence(iterations=fit.iterations, converged=fit.converged),

@@ -99,16 +99,16 @@ def estimate_by_filter(
     )
     problem = squares.problem
     free = [item for item in system.parameters if not item.fixed]
-    kept = len(free)
-    timing = problem.free.size > kept
+    count = len(free)
+    timing = problem.free.size > count
     model = build_filter_model(system, trials, start, timing)
     progress(0.15, "noise levels")
-    late_sd = model.upper[kept:] / np.sqrt(3.0)
+    late_sd = model.upper[count:] / np.sqrt(3.0)
     late = np.zeros(late_sd.size)
     nonlinear = not problem.linear
-    answer = np.append(squares.p[problem.free[:kept]], late)
-    settled = answer if nonlinear else np.append(squares.raw.p[problem.free[:kept]], late)
-    known = np.append(np.sqrt(np.diag(squares.raw.covariance))[:kept], late_sd)
+    answer = np.append(squares.p[problem.free[:count]], late)
+    settled = answer if nonlinear else np.append(squares.raw.p[problem.free[:count]], late)
+    known = np.append(np.sqrt(np.diag(squares.raw.covariance))[:count], late_sd)
     settings = untuned_settings(system, noise, choice)
     settings = replace(settings, walk_sd=np.append(settings.walk_sd, late))
     clear_by_axis = [
@@ -118,8 +118,8 @@ def estimate_by_filter(
     settings = tune_noise(settings, model, trials, clear, settled, known, noise, choice)
     settings = replace(settings, stride=stride)
     prior_sd = np.append([item.sd for item in free], late_sd)
-    first = np.append(start[problem.free[:kept]], late)
-    spread = np.hypot(prior_sd, first - np.append(system.prior[problem.free[:kept]], late))
+    first = np.append(start[problem.free[:count]], late)
+    spread = np.hypot(prior_sd, first - np.append(system.prior[problem.free[:count]], late))
     # If the prior does not lead to the answer, the search starts from least squares, then with
     # more and more process noise, as a model that lacks much needs.
     attempts: list[Attempt] = [(first, spread, 1.0)]
@@ -140,7 +140,7 @@ def estimate_by_filter(
             return True
         value, slope = model.to_physical(found.theta)
         sd = np.hypot(slope * np.sqrt(np.diag(found.covariance)), known)
-        return bool(np.all(np.abs(value - answer)[:kept] < _AGREE * sd[:kept]))
+        return bool(np.all(np.abs(value - answer)[:count] < _AGREE * sd[:count]))
 
     def report_progress(done: int, place: int) -> None:
         progress(0.35 + 0.6 * done / (len(trials) + 1), motions[place].trial_id)
@@ -171,8 +171,8 @@ def estimate_by_filter(
     scaled = covariance * np.outer(slope, slope)
     p = np.append(start, 0.0)
     p[problem.free] = value
-    systematic = _systematic(p, scaled, squares, kept)
-    scaled[:kept, :kept] += np.diag(systematic**2)
+    systematic = _systematic(p, scaled, squares, count)
+    scaled[:count, :count] += np.diag(systematic**2)
     tight = slope * np.sqrt(np.diag(found.covariance))
     at_bound = (value - model.lower < tight) | (model.upper - value < tight)
     names = [item.name for item in free]
@@ -183,7 +183,7 @@ def estimate_by_filter(
             "least_squares": squares.p[problem.free[k]],
             **bias,
         }
-        for k, bias in enumerate(bias_details(squares)[:kept])
+        for k, bias in enumerate(bias_details(squares)[:count])
     ]
     report = {
         "nis": tabulate_nis(found, motions),
@@ -199,8 +199,8 @@ def estimate_by_filter(
     return Estimate(
         p=p,
         problem=problem,
-        covariance=scaled[:kept, :kept],
-        at_bound=at_bound[:kept],
+        covariance=scaled[:count, :count],
+        at_bound=at_bound[:count],
         details=details,
         report=report,
         states=tabulate_states(system, motions, found, p[:-1], choice.trace_rows),

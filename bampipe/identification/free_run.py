@@ -122,14 +122,14 @@ def _closed(run: RunFolder, system: System, motion: Motion, p: Array, law: Contr
         r[:, place] = motion.t if name == "t" else frame[name].to_numpy(dtype=float)
     u = motion.inputs(system.inputs)
     force = [system.inputs.index(name) for name in law.forces]
-    _, total, seen = simulate_controlled(
+    _, total, readings = simulate_controlled(
         system.derivative, system.measure, law.command, _start(system, motion, p), u, r,
         p[: len(system.parameters)], _interval(motion),
         width=_width(system), n_noise=len(system.noise), force=force, rate_hz=law.rate_hz,
         limits=law.limits,
     )  # fmt: skip
     measured = np.hstack([motion.q, motion.qd])
-    return _Run(motion.trial_id, measured, seen, u[:, force], total[:, force])
+    return _Run(motion.trial_id, measured, readings, u[:, force], total[:, force])
 
 
 def _open(system: System, motion: Motion, p: Array, push: Array | None = None) -> _Run:
@@ -141,11 +141,11 @@ def _open(system: System, motion: Motion, p: Array, push: Array | None = None) -
         system.derivative, start, u, p[: len(system.parameters)], _interval(motion),
         width=_width(system), n_noise=len(system.noise),
     )  # fmt: skip
-    seen = np.empty((len(x), 2 * n))
+    readings = np.empty((len(x), 2 * n))
     for i in range(len(x)):
-        system.measure(x[i], u[i], p, seen[i])
+        system.measure(x[i], u[i], p, readings[i])
     none = np.zeros((len(x), 0))
-    return _Run(motion.trial_id, np.hstack([motion.q, motion.qd]), seen, none, none)
+    return _Run(motion.trial_id, np.hstack([motion.q, motion.qd]), readings, none, none)
 
 
 def _forgets(system: System, motion: Motion, p: Array) -> bool:

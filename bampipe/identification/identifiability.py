@@ -76,20 +76,20 @@ def assess_identifiability(
     covariance = cramer_rao_bound(own)
     sd = np.sqrt(np.diag(covariance))
     value = p[problem.free]
-    kept = [i for i, name in enumerate(names) if name != TIMING]
-    weak = [w for w in weak_directions(own) if set(w.members) & set(kept)]
-    growth = growth_without([part[:n, :n] for part in joint])[:, kept]
+    estimated = [i for i, name in enumerate(names) if name != TIMING]
+    weak = [w for w in weak_directions(own) if set(w.members) & set(estimated)]
+    growth = growth_without([part[:n, :n] for part in joint])[:, estimated]
     numbers = tuple(
-        _number(number, total, n, n + j, names, value, kept)
+        _number(number, total, n, n + j, names, value, estimated)
         for j, number in enumerate(known.numbers)
     )
     half = problem.upper[-1]  # of a sample: all that is assumed of the timing
     assumed = np.array([system.parameters[i].sd if i < n_p else half for i in problem.free])
-    prior, place = assumed[kept], np.ix_(kept, kept)
-    parameters = {names[i]: _entry(own, covariance, i, names) for i in kept}
+    prior, place = assumed[estimated], np.ix_(estimated, estimated)
+    parameters = {names[i]: _entry(own, covariance, i, names) for i in estimated}
     trials = {
         motion.trial_id: TrialGrowth(
-            growth=min(row.max(initial=0.0), 1e9), parameter=names[kept[int(np.argmax(row))]]
+            growth=min(row.max(initial=0.0), 1e9), parameter=names[estimated[int(np.argmax(row))]]
         )
         for motion, row in zip(motions, growth, strict=True)
     }
@@ -110,8 +110,8 @@ def assess_identifiability(
         sentences=(
             *(_together(group.members, group.combinations) for group in known.together),
             *(_moving(w, names, value, covariance) for w in weak),
-            *_unsaid([names[i] for i in kept], sd[kept], prior),
-            *_limits([names[i] for i in kept], at_bound),
+            *_unsaid([names[i] for i in estimated], sd[estimated], prior),
+            *_limits([names[i] for i in estimated], at_bound),
             *_idle(trials),
             *_leaning(numbers),
         ),
@@ -206,7 +206,7 @@ def _number(
     place: int,
     names: Sequence[str],
     value: Array,
-    kept: Sequence[int],
+    estimated: Sequence[int],
 ) -> DeviceNumber:
     """Return what the trials say of one number of the device, were it estimated too."""
     rows = [*range(n), place]
@@ -214,7 +214,9 @@ def _number(
     partner, correlation = _partner(covariance, n)
     shift = -np.linalg.lstsq(total[:n, :n], total[:n, place], rcond=1e-12)[0]
     size = np.abs(value)
-    per_cent = {names[i]: float(shift[i] * number.value / value[i]) for i in kept if size[i] > 0.0}
+    per_cent = {
+        names[i]: float(shift[i] * number.value / value[i]) for i in estimated if size[i] > 0.0
+    }
     return DeviceNumber(
         name=number.name,
         value=number.value,

@@ -138,9 +138,12 @@ def tune_noise(
     """
     quick = replace(settings, longest_step=max(settings.longest_step, _TUNING_STEP_S))
     longest = max(range(len(trials)), key=lambda i: trials[i].t.size)
-    whole = trials[longest]
+    record = trials[longest]
     part = replace(
-        whole, t=whole.t[:_TUNING_SAMPLES], u=whole.u[:_TUNING_SAMPLES], y=whole.y[:_TUNING_SAMPLES]
+        record,
+        t=record.t[:_TUNING_SAMPLES],
+        u=record.u[:_TUNING_SAMPLES],
+        y=record.y[:_TUNING_SAMPLES],
     )
     counts = clear[longest][:_TUNING_SAMPLES]
     counts = counts if counts.any() else np.ones(part.t.size, dtype=bool)

@@ -12,7 +12,7 @@ from bampipe.data import lab_tables
 from bampipe.errors import InputError
 from bampipe.files import atomic_writer, refuse_links, write_text
 from bampipe.lab import rows, trends
-from bampipe.lab.place import LOCK, is_foreign, run_folders
+from bampipe.lab.folders import LOCK, is_foreign, run_folders
 from bampipe.progress import Progress, silent
 from bampipe.results.lab import LabResult, TrendsResult
 from bampipe.run.lock import hold

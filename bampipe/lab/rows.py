@@ -158,9 +158,9 @@ def _trials(run: RunFolder, rows: SessionRows, nis: Mapping[str, float]) -> None
 
 
 def _session(root: Path, rows: SessionRows, session: IngestResult, made: tuple[str, ...]) -> None:
-    kept = record.read(root)
+    run_record = record.read(root)
     states = [trial["status"] for trial in rows.tables.get("quality", ())]
-    verdicts = [gate.state for gate in kept.gates]
+    verdicts = [gate.state for gate in run_record.gates]
     had = set(models.read(root, models.BASE).effects) if models.BASE in made else set()
     added = [e for name in made for e in models.read(root, name).effects if e not in had]
     rows.add(
@@ -173,8 +173,8 @@ def _session(root: Path, rows: SessionRows, session: IngestResult, made: tuple[s
         effects=list(dict.fromkeys(added)),
         gates_failed=verdicts.count("failed"),
         gates_warned=verdicts.count("warned"),
-        failures=[f"{step}: {text}" for step, text in sorted(kept.failures.items())],
-        bampipe=kept.versions.get("bampipe"),
+        failures=[f"{step}: {text}" for step, text in sorted(run_record.failures.items())],
+        bampipe=run_record.versions.get("bampipe"),
     )
 
 

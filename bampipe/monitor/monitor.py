@@ -27,8 +27,8 @@ class Monitor:
     """Takes samples, keeps the distribution of state and parameters, judges the innovations.
 
     Attributes:
-        alarm: whether the last whole window was inconsistent, or held nothing of use; alarms: how
-            many were, by runs of consecutive ones.
+        alarm: whether the last complete window was inconsistent, or held nothing of use;
+            alarms: how many were, by runs of consecutive ones.
         restarts: how often the motion was started anew after a gap or a lost motion.
         samples: how many were taken.
     """
@@ -82,7 +82,7 @@ class Monitor:
             self._take(t, u, q)
 
     def note_lines_without_sample(self, lines: int) -> None:
-        """Raise the alarm where a whole window of lines has come and no sample in them."""
+        """Raise the alarm where a window of lines has come and no sample in them."""
         if lines >= (FIRST_LOOK if self.start is None else self.start.window):
             self._judge(True)
 
@@ -168,11 +168,13 @@ class Monitor:
         if start is None or test is None:
             raise RuntimeError("samples before the start")
         if self._filter is None:
-            seen = np.flatnonzero(np.isfinite(q).all(axis=1))
-            self._add_unfiltered(np.isfinite(q[: seen[0] if seen.size else len(t)]))
-            if not seen.size:
+            complete_rows = np.flatnonzero(np.isfinite(q).all(axis=1))
+            self._add_unfiltered(
+                np.isfinite(q[: complete_rows[0] if complete_rows.size else len(t)])
+            )
+            if not complete_rows.size:
                 return
-            t, u, q = t[seen[0] :], u[seen[0] :], q[seen[0] :]
+            t, u, q = t[complete_rows[0] :], u[complete_rows[0] :], q[complete_rows[0] :]
             x, x_sd = start.state(self.system, q[0], u[0])
             self._filter = OnlineFilter(
                 start.model, start.settings, x, x_sd, start.theta, start.covariance
@@ -186,8 +188,8 @@ class Monitor:
             return
         with np.errstate(over="ignore"):
             squares = np.square(found.innovation / found.innovation_sd)
-        whole = np.isfinite(q).all(axis=1)
-        present = np.isfinite(q) & (np.isfinite(found.nis) | ~whole)[:, None]
+        complete = np.isfinite(q).all(axis=1)
+        present = np.isfinite(q) & (np.isfinite(found.nis) | ~complete)[:, None]
         self._take_innovations(test, found.nis, squares, present)
 
     def _add_unfiltered(self, present: NDArray[np.bool_]) -> None:

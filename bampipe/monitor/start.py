@@ -227,14 +227,14 @@ def start_from_run(run: RunFolder, name: str, options: MonitorOptions) -> tuple[
     for trial in trials:
         begun = Trial(trial.t, trial.u, trial.y, *start.state(system, trial.y[0], trial.u[0]))
         try:
-            whole = filter_trials(model, [begun], theta, covariance, settings).trials[0]
+            filtered = filter_trials(model, [begun], theta, covariance, settings).trials[0]
         except FilterFailure as failure:
             raise InputError(
                 f"the identified model does not follow its own trials: {failure.reason}",
                 where=str(run.path(path)),
                 remedy=f"bampipe diagnose {run.root}",
             ) from failure
-        means.append(window_means(whole.nis[window:], n, window))
+        means.append(window_means(filtered.nis[window:], n, window))
     return system, replace(start, reference=Reference.of_windows(np.concatenate(means), window * n))
 
 
@@ -281,7 +281,7 @@ def start_from_samples(
 
 
 def _trial(run: RunFolder, trial_id: str, system: System) -> Trial:
-    """The raw samples of a trial from the first whole reading on; its state is left open."""
+    """The raw samples of a trial from the first complete reading on; its state is left open."""
     path = run.require("ingest/samples.parquet", "ingest")
     frame = read_parquet(path, trial=trial_id)
     t = frame["t"].to_numpy(dtype=float, copy=True)

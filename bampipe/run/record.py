@@ -51,13 +51,13 @@ def read(root: Path) -> RunResult:
             entries = value.items() if isinstance(value, dict) else ()
             checked = {key: by_name[name](entry) for key, entry in entries}
             sound[name] = {key: entry for key, entry in checked.items() if entry is not None}
-        elif value is not None and (whole := _sound(field.annotation, value)) is not None:
-            sound[name] = whole
+        elif value is not None and (checked := _sound(field.annotation, value)) is not None:
+            sound[name] = checked
     return RunResult(**sound)
 
 
 def is_damaged(root: Path) -> bool:
-    """Whether there is a ``run.json`` in ``root`` that is not whole."""
+    """Whether there is a ``run.json`` in ``root`` that is damaged."""
     if not (root / FILE).exists():
         return False
     found = _content(root)
@@ -139,12 +139,12 @@ def touched(root: Path, name: str, step: str) -> InputError:
 
 
 def replace_json(path: Path, content: dict[str, Any]) -> None:
-    """Write ``content`` to ``path``, whole or not at all."""
+    """Write ``content`` to ``path``, in one step: it appears complete or not at all."""
     replace_text(path, json_text(content))
 
 
 def replace_text(path: Path, text: str) -> None:
-    """Write ``text`` to ``path``, whole or not at all."""
+    """Write ``text`` to ``path``, in one step: it appears complete or not at all."""
     with _drafted(path) as draft:
         draft.write_text(text, encoding="utf-8")
 
@@ -168,7 +168,7 @@ def draft_of(path: Path) -> Path:
 
 
 def write(root: Path, content: RunResult) -> None:
-    """Write ``run.json``, whole or not at all."""
+    """Write ``run.json``, in one step: it appears complete or not at all."""
     replace_json(root / FILE, content.model_dump(mode="json"))
 
 

@@ -118,13 +118,13 @@ def recover(state: RunState) -> None:
     for staging in sorted(parent.glob("*")):
         if not staging.is_dir():
             staging.unlink()
-        elif (staging / COMMIT).is_file() and _is_whole(state.root, staging):
+        elif (staging / COMMIT).is_file() and _is_complete(state.root, staging):
             commit(state, staging)
         else:
             shutil.rmtree(staging)
 
 
-def _is_whole(root: Path, staging: Path) -> bool:
+def _is_complete(root: Path, staging: Path) -> bool:
     """Whether the commit file, and what it names and is still here, is as it was sealed."""
     try:
         entry = read_json_table(staging / COMMIT)

@@ -239,9 +239,9 @@ def _trial(session: Session, entry: TrialEntry, config: Config, reason: str) -> 
     )
     if clock.nanoseconds:
         columns = dict(raw.columns)
-        whole, more = columns[clock.column], columns.pop(clock.nanoseconds)
+        seconds, nanoseconds = columns[clock.column], columns.pop(clock.nanoseconds)
         # Seconds since 1970 leave no room for nanoseconds in a double: the first goes first.
-        columns[clock.column] = whole - np.fmin.reduce(whole) + SECONDS["ns"] * more
+        columns[clock.column] = seconds - np.fmin.reduce(seconds) + SECONDS["ns"] * nanoseconds
         raw = replace(raw, columns=columns)
     if not clock.column:
         count = len(raw.columns[session.columns[0]])

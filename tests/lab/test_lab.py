@@ -17,7 +17,7 @@ from bampipe.data import lab_tables
 from bampipe.errors import InputError
 from bampipe.files import digest_file
 from bampipe.lab.collect import collect
-from bampipe.lab.place import is_current
+from bampipe.lab.folders import is_current
 from bampipe.run.accepted import accept
 
 ROOT = Path(__file__).parent.parent.parent

@@ -28,17 +28,17 @@ def section(results: Results) -> Section:
 
 def _done(results: Results) -> str:
     trials = results.trials
-    kept = trials[trials["status"] != "set_aside"]
+    used = trials[trials["status"] != "set_aside"]
     kinds = [
-        wording.count(int((kept["kind"] == kind).sum()), f"{kind} trial")
+        wording.count(int((used["kind"] == kind).sum()), f"{kind} trial")
         for kind in ("free", "viscous", "locked")
-        if (kept["kind"] == kind).any()
+        if (used["kind"] == kind).any()
     ]
-    seconds = float(kept["duration_s"].sum())
+    seconds = float(used["duration_s"].sum())
     parts = [
         f"{wording.listing(kinds) or 'No trial'} ({wording.plain(seconds, 0)} s) could be used"
     ]
-    aside = len(trials) - len(kept)
+    aside = len(trials) - len(used)
     parts[0] += f"; {wording.count(aside, 'trial')} set aside." if aside else "."
     identified = results.read(IdentifyResult)
     if identified is not None:
