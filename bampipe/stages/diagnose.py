@@ -201,7 +201,8 @@ def _sentence(axis: str, i: int, found: Diagnosis, shape: str) -> str:
         weighed = f" Weighed: {' and '.join(a.effects)}." if a.effects else ""
         return (
             f"{axis.capitalize()}: no verdict can be trusted, for its held-out error of "
-            f"{a.rmse_after:.3g} {unit} is {STANDINGS_IN_WORDS[a.standing]} ({a.noise_floor:.3g} {unit})."
+            f"{a.rmse_after:.3g} {unit} is {STANDINGS_IN_WORDS[a.standing]} "
+            f"({a.noise_floor:.3g} {unit})."
             f"{weighed}"
         )
     floor = max(a.noise_floor, 1e-30)
