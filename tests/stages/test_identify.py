@@ -252,7 +252,7 @@ def test_friction_that_falls_within_a_step(tmp_path: Path) -> None:
 
 
 def test_least_squares_intervals_hold_once_its_bias_is_off(simulated: RunFolder) -> None:
-    """Filtered motions move its mass by more than its interval; the replay says by how much."""
+    """Filtered motions move what it fits; the replay says by how much."""
     content = identified(simulated, replace(FAST, method="least-squares"))
     z = []
     for name, value in TRUTH.items():
@@ -261,8 +261,9 @@ def test_least_squares_intervals_hold_once_its_bias_is_off(simulated: RunFolder)
         assert entry["bound_sd"] < 1.5 * entry["sd"]
     assert np.max(np.abs(z)) < 3.5
     assert np.sqrt(np.mean(np.square(z))) < 1.8
-    mass = content["parameters"]["mass"]
-    assert mass["least_squares_bias"] > mass["sd"]
+    # A wider filter biases less: some parameters are moved by about their interval, none is by ten.
+    bias = [abs(e["least_squares_bias"]) / e["sd"] for e in content["parameters"].values()]
+    assert 0.5 < max(bias) < 10.0
 
 
 def test_bounds_agree_with_the_filter_where_noise_is_what_the_sensors_say(
