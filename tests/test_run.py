@@ -506,7 +506,7 @@ def judged(tmp_path: Path, content: object, **changes: object) -> list[gates.Ver
     path = tmp_path / "models" / "base" / "v.json"
     path.parent.mkdir(parents=True)
     path.write_text(json.dumps(content))
-    return gates.judge(gate(**changes), tmp_path, "base", tmp_path / "accepted")
+    return gates.judge_gates(gate(**changes), tmp_path, "base", tmp_path / "accepted")
 
 
 def test_gate_judges_each_axis(tmp_path: Path) -> None:
@@ -532,9 +532,9 @@ def test_gate_without_a_number(tmp_path: Path, content: object, optional: bool) 
 
 
 def test_gate_without_a_result(tmp_path: Path) -> None:
-    assert [v.state for v in gates.judge(gate(), tmp_path, "base", tmp_path / "accepted")] == [
-        "failed"
-    ]
+    assert [
+        v.state for v in gates.judge_gates(gate(), tmp_path, "base", tmp_path / "accepted")
+    ] == ["failed"]
 
 
 def test_failed_gate_decides_the_exit_code(toy: Toy) -> None:

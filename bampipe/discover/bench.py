@@ -104,7 +104,8 @@ class Bench:
             lambda names: self.replicas(recipe, evidence.p, count, names, seed),
             asked,
             len(self.names),
-            float(Scorer(evidence).independent.mean()),
+            Scorer(evidence).before.error,
+            np.maximum(Scorer(evidence).independent, 1.0),
             self.settings.replay_error,
         )
 

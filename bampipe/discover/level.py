@@ -25,12 +25,14 @@ class Level:
         replay: Callable[[Sequence[str]], list[Replicate]],
         asked: Sequence[str],
         tests: int,
-        independent: float,
+        before: Array,
+        independent: Array,
         replay_error: float,
     ) -> None:
         self._replay, self._tests = replay, tests
+        self._before, self._independent = before, independent
         # No replay is perfect: its log error is off by this, as a log likelihood.
-        self._error = replay_error * independent
+        self._error = replay_error * float(independent.mean())
         self._gains: dict[str, Array] = {}
         self.replicates = self._learn(asked)
 
@@ -63,6 +65,17 @@ class Level:
         return float(min(1.0, self._tests * student.sf(z, count - 1)))
 
     def excess(self, score: Score) -> Array:
-        """Gain beyond the mean on replays, by axis; the gain itself where that is not known."""
+        """Gain beyond chance, by axis; the gain itself where chance is not known.
+
+        What chance takes off the mean square of a replay, it takes off the measured one: little
+        where much is missing, all of it where nothing is.
+        """
         gains = self._gains.get(score.name)
-        return np.asarray(score.gain if gains is None else score.gain - gains.mean(axis=0))
+        if gains is None:
+            return score.gain
+        n = self._independent
+        replayed = np.mean([r.error for r in self.replicates], axis=0)
+        by_chance = replayed**2 * (1.0 - np.exp(-2.0 * gains.mean(axis=0) / n))
+        after = self._before**2 * np.exp(-2.0 * score.gain / n) + by_chance
+        ratio = np.maximum(after, 1e-12 * self._before**2) / self._before**2
+        return np.asarray(-0.5 * n * np.log(ratio))

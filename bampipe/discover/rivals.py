@@ -67,6 +67,10 @@ def choose(
         misfit[name] = _misfit(rivals, scores, replicas, axis, s)
     ordered = sorted(rivals, key=lambda n: misfit[n])
     winner = ordered[0]
+    if misfit[winner] > s.rival_misfit + s.rival_margin:
+        # No rival's replays look like the measurement, as where more is missing than one effect:
+        # their patterns are no evidence for any of them.
+        return best, ()
     limit = max(s.rival_misfit, misfit[winner] + s.rival_margin)
     alike = tuple(n for n in ordered[1:] if misfit[n] < limit)
     if best in alike:

@@ -153,7 +153,9 @@ def explainable_share(evidence: Evidence, axis: int, seed: int = 0) -> float:
     y = [r[:, axis][use[k]] for k, r in enumerate(evidence.residual)]
     left = total = 0.0
     for k in range(len(x)):
-        others = [i for i in range(len(x)) if i != k]
+        others = [i for i in range(len(x)) if i != k and len(y[i])]
+        if not others or not len(y[k]):
+            continue  # an axis that rests through a trial says nothing there
         trees = ExtraTreesRegressor(
             n_estimators=16, min_samples_leaf=5, max_features=1.0, random_state=seed, n_jobs=1
         )

@@ -53,7 +53,6 @@ def time_limit(seconds: float) -> Iterator[None]:
             done.set()
             if raised:  # set, but the block ended before it was delivered
                 interrupt(None)
-        watcher.join()
 
 
 def _thread_clock() -> Callable[[], float]:

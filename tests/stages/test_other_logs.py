@@ -154,7 +154,9 @@ def test_a_velocity_for_want_of_a_position_is_integrated(tmp_path):
     )
     np.testing.assert_allclose(samples["q_joint"], Q - Q[0], atol=3e-4)
     assert "position is the integral of the velocity 'w'" in trial["repairs"]
-    assert about["axes"]["joint"] == {"unit": "rad", "resolution": None}
+    joint = about["axes"]["joint"]
+    assert joint["unit"] == "rad" and joint["resolution_stated"] is None
+    assert 0.0 < joint["resolution"] < 1e-6
     with pytest.raises(InputError, match="makes the column a velocity; leave it out"):
         ingested(
             tmp_path, text, time='column = "t"\nunit = "s"',
