@@ -15,7 +15,7 @@ class ResidualBand(Record):
 
     cutoff_hz: Positive
     reason: str
-    force_hz: Size = Field(description="The applied force has 99 % of its power below this")
+    force_hz: Size = Field(description="The applied force has 95 % of its power below this")
     motion_hz: Positive = Field(description="Bandwidth of the filtered motion")
 
 

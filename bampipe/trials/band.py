@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 
 LEAST_HZ = 8.0
 """No band is narrower: a change of direction, from which friction is read, is that wide."""
-_COVERED = 0.99
+_COVERED = 0.95
 """Share of the power of the applied force, above its noise, that the band covers."""
 _SEGMENT_S = 4.0
 _LONGEST = 5
@@ -50,7 +50,7 @@ def find_band(
 ) -> dict[str, AxisBand]:
     """Find where motion and force carry signal above noise, axis by axis.
 
-    The band ends where 99 % of the power of the applied force above its noise is covered, but not
+    The band ends where 95 % of the power of the applied force above its noise is covered, but not
     above the bandwidth of the filtered motion, and not below `LEAST_HZ`.
 
     Args:
@@ -73,10 +73,10 @@ def find_band(
         elif force_hz <= least:
             cutoff, reason = (
                 least,
-                f"the applied force has 99 % of its power below {force_hz:.2g} Hz",
+                f"the applied force has 95 % of its power below {force_hz:.2g} Hz",
             )
         elif force_hz <= most:
-            cutoff, reason = force_hz, "99 % of the power of the applied force above its noise"
+            cutoff, reason = force_hz, "95 % of the power of the applied force above its noise"
         else:
             cutoff = max(most, least)
             reason = f"the force goes on to {force_hz:.3g} Hz, the motion is known up to here"

@@ -62,8 +62,9 @@ LONG = {
 def test_a_device_that_takes_too_long_is_refused(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(derivation, "LONGEST_S", 1.0)
     declaration, words, definition = LONG[name]
+    if "takes too long" in words:  # where size is what is refused, a slow machine must not be first
+        monkeypatch.setattr(derivation, "LONGEST_S", 1.0)
     start = time.process_time()
     equations, (fault,) = device_faults(declaration, "joint.toml")
     assert time.process_time() - start < 10.0
