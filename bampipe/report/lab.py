@@ -195,7 +195,7 @@ def _panel(panel: Axes, chart: ControlChart) -> None:
 
 
 def _name_sessions(panel: Axes, names: list[str]) -> None:
-    """Name every so-manieth session below a panel, upright where names are long."""
+    """Name every n-th session below a panel, upright where names are long."""
     step = -(-len(names) // _MOST_NAMES)
     places = range(0, len(names), step)
     shown = [names[place] for place in places]

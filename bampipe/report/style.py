@@ -128,7 +128,7 @@ def label(quantity: str, unit: str) -> str:
 
 
 def pick(length: int, most: int) -> slice:
-    """Return every so-manieth sample, so that at most about ``most`` are drawn."""
+    """Return every n-th sample, so that at most about ``most`` are drawn."""
     return slice(0, length, max(1, -(-length // most)))
 
 

@@ -53,9 +53,7 @@ def problem_of(
         u = motion.inputs(system.inputs)
         if p[n] != 0.0:
             u = u - p[n] * motion.input_rates(system.inputs)
-        z = system.memory(motion.q, motion.qd, motion.qdd, u, p[:n], motion.t)
-        q, qd, qdd = system.true_motion(motion.q, motion.qd, motion.qdd, u, p[:n])
-        return system.residual(q, qd, qdd, z, u, p[:n])
+        return _residual_and_memory(system, motion, u, p[:n])[0]
 
     parameters = system.parameters
     free = [i for i, item in enumerate(parameters) if not item.fixed and item.name not in held]
@@ -93,11 +91,11 @@ def _standstill(motion: Motion, system: System, band: Band) -> NDArray[np.bool_]
     return resting(motion.qd, motion.qd_sd, band.rate_hz, np.array(braked))
 
 
-def residual_at(system: System, motion: Motion, p: Array) -> Array:
-    """Residual (T, n_q) of the inverse dynamics on a trial, before any low-pass, N.m or N."""
-    u = motion.inputs(system.inputs)
+def _residual_and_memory(system: System, motion: Motion, u: Array, p: Array) -> tuple[Array, Array]:
+    """Residual (T, n_q) of a trial under inputs ``u`` (T, n_u), unfiltered, and states (T, n_z)."""
     z = system.memory(motion.q, motion.qd, motion.qdd, u, p, motion.t)
-    return system.residual(*system.true_motion(motion.q, motion.qd, motion.qdd, u, p), z, u, p)
+    true = system.true_motion(motion.q, motion.qd, motion.qdd, u, p)
+    return system.residual(*true, z, u, p), z
 
 
 @dataclass(frozen=True)
@@ -144,11 +142,6 @@ class Evidence:
         fitted = self.sums.subset(self.folds.fitted_trials)
         mean = fitted.yy.sum(axis=0) / np.maximum(fitted.count.sum(axis=0), 1.0)
         return np.asarray(1.0 / np.maximum(mean, 1e-24))
-
-    @cached_property
-    def independent(self) -> Array:
-        """Number of independent samples by axis, (n_q,)."""
-        return np.asarray(self.sums.count.sum(axis=0) * self.band.independent_share)
 
     def rmse(self) -> Array:
         """Root mean square of the residual by axis over all trials, (n_q,), N.m or N."""
@@ -198,7 +191,7 @@ class Evidence:
         step = self.held_out_steps[trial]
         if self.is_linear or not step.any():
             return np.asarray(self.residual[trial] + self.jacobian[trial] @ step)
-        found = residual_at(self.system, self.motions[trial], self.held_out_parameters(trial))
+        found, _ = self._unfiltered_at(trial, self.held_out_parameters(trial))
         return self.band.thin(found) * self.used[trial]
 
     def held_out_parameters(self, trial: int) -> Array:
@@ -210,12 +203,12 @@ class Evidence:
     def unfiltered(self, trial: int) -> tuple[Array, Array]:
         """Residual (T, n_q) of a trial before the low-pass, and internal states (T, n_z)."""
         if trial not in self._unfiltered:
-            motion, system = self.motions[trial], self.system
-            u = motion.inputs(system.inputs)
-            z = system.memory(motion.q, motion.qd, motion.qdd, u, self.p, motion.t)
-            true = system.true_motion(motion.q, motion.qd, motion.qdd, u, self.p)
-            self._unfiltered[trial] = system.residual(*true, z, u, self.p), z
+            self._unfiltered[trial] = self._unfiltered_at(trial, self.p)
         return self._unfiltered[trial]
+
+    def _unfiltered_at(self, trial: int, p: Array) -> tuple[Array, Array]:
+        u = self.motions[trial].inputs(self.system.inputs)
+        return _residual_and_memory(self.system, self.motions[trial], u, p)
 
 
 def gather_evidence(
