@@ -8,10 +8,12 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
+import pandas as pd
 from pydantic import Field
 from pydantic.dataclasses import dataclass as checked_dataclass
 
 from bampipe.data.run_folder import RunFolder
+from bampipe.data.store import write_parquet
 from bampipe.declarations.model_file import identified, load_model, model_inputs, read_recipe
 from bampipe.discover.advice import advise
 from bampipe.discover.description import describe
@@ -75,11 +77,12 @@ def inputs(config: Config) -> tuple[str, ...]:
 
 def outputs(config: Config) -> tuple[str, ...]:
     """Return the paths the stage writes."""
-    return (f"models/{config.model}/diagnose.json",)
+    folder = f"models/{config.model}"
+    return (f"{folder}/diagnose.json", f"{folder}/map_variables.parquet")
 
 
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
-    """Diagnose one model and write ``models/<model>/diagnose.json``.
+    """Diagnose one model; write what it lacks, and what its residual was mapped against.
 
     Raises:
         InputError: fewer than two moving trials, a setting out of range, or an axis that no force
@@ -113,6 +116,8 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         seed=config.seed,
     )
     found = diagnose(trials, recipe, start, settings, progress)
+    samples = _map_variables(found)
+    write_parquet(out / f"models/{config.model}/map_variables.parquet", samples)
     return _summary(_result(found, trials, recipe, config.model).write(out))
 
 
@@ -256,6 +261,21 @@ def _maps(found: Diagnosis) -> dict[str, dict[str, ResidualMap]]:
             for m in drawn
         }
     return maps
+
+
+def _map_variables(found: Diagnosis) -> pd.DataFrame:
+    """Return map_variables.parquet: the variables of every axis' maps, sample by sample."""
+    evidence = found.initial
+    motions, band = evidence.motions, evidence.band
+    rows = [band.kept(len(motion.t)) for motion in motions]
+    columns: dict[str, object] = {
+        "trial_id": np.repeat([motion.trial_id for motion in motions], [len(k) for k in rows]),
+        "t": np.concatenate([motion.t[k] for motion, k in zip(motions, rows, strict=True)]),
+    }
+    for i, axis in enumerate(evidence.system.coordinates):
+        for variable in variables(evidence, i):
+            columns[f"{axis}.{variable.name}"] = np.concatenate(variable.values)
+    return pd.DataFrame(columns)
 
 
 def _suggestion(found: Diagnosis, trials: MeasuredTrials, recipe: Recipe) -> SuggestedTrial | None:

@@ -10,6 +10,7 @@ import re
 import shutil
 from pathlib import Path
 
+import pandas as pd
 import pytest
 from conftest import misfits
 from measured import ROOT, bampipe, estimates, result
@@ -100,6 +101,23 @@ def test_the_diagnosis_finds_friction_by_direction_unaided(stretches):
     half = best["parameters"]["asymmetric_coulomb.carriage.viscous_difference"]
     assert half == pytest.approx((166.7061 - 240.4236) / 2.0, rel=0.05)
     assert misfits(stretches) == []
+    check_that_maps_follow_from_samples(stretches, found["maps"]["carriage"])
+
+
+def check_that_maps_follow_from_samples(run, maps):
+    """The bins of each map, made again in another way from what is stored of every sample."""
+    samples = pd.read_parquet(run / "models/base/map_variables.parquet")
+    residuals = pd.read_parquet(run / "models/base/residuals.parquet")
+    assert samples[["trial_id", "t"]].equals(residuals[["trial_id", "t"]])
+    moving = samples[residuals["moving_carriage"]]
+    assert set(samples.columns) == {"trial_id", "t", *(f"carriage.{name}" for name in maps)}
+    for name, drawn in maps.items():
+        values = moving[f"carriage.{name}"]
+        few = values.nunique() <= 16
+        bins = values if few else pd.qcut(values, 16, duplicates="drop")
+        centres = values.groupby(bins, observed=True).mean()
+        assert len(drawn["center"]) == len(centres), name
+        assert drawn["center"] == pytest.approx(centres.to_numpy(), rel=0.02, abs=0.01), name
 
 
 def test_every_stretch_is_held_out_once(stretches):
