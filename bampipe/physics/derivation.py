@@ -6,18 +6,17 @@ Q_other from friction (eq 20), brakes (eq 18), compensators and the effects of k
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import sympy as sp
 
 from bampipe.errors import InputError
-from bampipe.physics.device import INPUT_ORDERS, LAST_ORDER, derivative
-from bampipe.physics.effect import EACH
+from bampipe.physics.device import LAST_ORDER, derivative
 from bampipe.physics.equations import Equations
 from bampipe.physics.lagrange import allow, check_inertia, lagrange
 from bampipe.physics.model import Model
 from bampipe.physics.roles import compensation, delays
+from bampipe.physics.signals import Signals, order_of_action
 from bampipe.physics.time_limit import OutOfTime, time_limit
 from bampipe.physics.vocabulary import Vocabulary, constant_symbol
 
@@ -58,38 +57,42 @@ def _derive(model: Model, named_constants: bool) -> Equations:
     forces = [d.channel[f] for f in device.forces]
     input_map = [[sp.diff(e, f) for f in forces] for e in raw_applied]
 
-    corrections = _corrections(d, raw_applied, side)
-    truth = {d.channel[f]: d.channel[f] + c for f, c in corrections.items() if c != 0}
-    applied = [e.subs(truth, simultaneous=True) for e in raw_applied]
+    signals = Signals(d, model.effects, raw_applied, side)
+    applied = [signals.put_in(e) for e in raw_applied]
 
     noise = [*device.forces, *device.process_noise]
     w = [sp.Symbol(f"w{i}", real=True) for i in range(len(noise))]
-    noisy = truth | {
-        d.channel[f]: d.channel[f] + corrections[f] + w[i] for i, f in enumerate(device.forces)
-    }
+    noisy = signals.acting | {f: signals.acting.get(f, f) + w[i] for i, f in enumerate(forces)}
     applied_noise = [e.subs(noisy, simultaneous=True) for e in raw_applied]
 
     kinetic = d.build(device.kinetic, d.base, "energy.kinetic")
     potential = d.build(device.potential, d.base, "energy.potential")
-    other = _device_torque(d, truth, w)
+    other = _device_torque(d, w)
 
     label = f"device {device.name!r}: energy.kinetic"
     energies = [(label, device.kinetic, kinetic, potential)]
     offset = [sp.S.Zero] * n
-    z, z_names, rates, initial = [], [], [], []
     # An offset is differentiated twice. It cannot follow the rates, so what a motor's back EMF
     # takes off is left out of its load; nor states, so a lagging force counts as logged; and a
     # delayed force is delayed to two orders less in it.
-    known = {f: e for f, e in truth.items() if not e.has(*d.z.values())}
-    offset_orders = range(LAST_ORDER - 1)
+    prompt = Signals(d, [e for e in model.effects if not e.effect.states], raw_applied, side)
     lost = [
         d.channel[derivative(f, k)] for f in device.forces for k in (LAST_ORDER - 1, LAST_ORDER)
     ]
     none = dict.fromkeys([*d.qd, *lost], 0)
-    still = [e.subs(known, simultaneous=True).subs(none) for e in raw_applied]
-    for item in model.effects:
-        loaded = still if item.effect.kind == "measurement" else applied
-        symbols = d.effect_symbols(item, loaded, side)
+    still = [prompt.put_in(e).subs(none) for e in raw_applied]
+    # Up to where the logged inputs are replaced by what acts of them, all is in terms of these.
+    delivered = list(raw_applied)
+    of_states: dict[Any, tuple[Any, Any]] = {
+        z: (r, signals.initial[z]) for z, r in signals.rates.items()
+    }
+    for item in order_of_action(model.effects):
+        if "dry" in item.effect.names:
+            d.dry = _dry_friction(d, other)
+        if any(name.startswith("weight_") for name in item.effect.names):
+            d.weight = [sp.diff(sum(v for *_, v in energies), q) for q in d.q]
+        measures = item.effect.kind == "measurement"
+        symbols = d.effect_symbols(item, still if measures else delivered, side)
         for key, tree in item.effect.expressions.items():
             place = key.partition(".")[2] or item.target
             if item.effect.kind == "input":
@@ -102,18 +105,24 @@ def _derive(model: Model, named_constants: bool) -> Equations:
                 energies.append((label, tree, sp.S.Zero, value))
             elif place not in axes:
                 raise InputError(f"effect {item.name!r}: {key}: device has no axis {place!r}")
-            elif item.effect.kind == "torque":
-                other[axes.index(place)] += value
+            elif measures:
+                behind = {q: q + o for q, o in zip(d.q, offset, strict=True) if o != 0}
+                offset[axes.index(place)] += value.subs(behind, simultaneous=True)
             else:
-                offset[axes.index(place)] += value
-        for state in item.effect.states:
-            z.append(d.z[item.prefix, state.name])
-            z_names.append(f"{item.prefix}.{state.name}")
-            rates.append(d.own(item, state.rate, symbols, f"states.{state.name}.rate"))
-            initial.append(d.own(item, state.initial, symbols, f"states.{state.name}.initial"))
+                other[axes.index(place)] += value
+                if item.effect.acting_link:
+                    delivered[axes.index(place)] += value
+        for state in item.effect.states if item.effect.kind != "input" else ():
+            rate = d.own(item, state.rate, symbols, f"states.{state.name}.rate")
+            first = d.own(item, state.initial, symbols, f"states.{state.name}.initial")
+            z = d.z[item.prefix, state.name]
+            of_states[z] = signals.put_in(rate), signals.put_in_initial(first)
+    other = [signals.put_in(e) for e in other]
+    z_names = [".".join(key) for key in d.z]
+    rates, initial = ([of_states[z][k] for z in d.z.values()] for k in (0, 1))
     others = [d.channel[c] for c in device.channels]
     free, u = [*d.p.values(), *constants], [*d.channel.values()]
-    force0 = [d.channel[derivative(f, k)] for f in device.forces for k in offset_orders]
+    force0 = [d.channel[derivative(f, k)] for f in device.forces for k in range(LAST_ORDER - 1)]
     force0 += [*others, d.channel["t"]]
     motion, memory = [*d.q, *d.qd], [*d.z.values()]
     gains = [entry for row in input_map for entry in row]
@@ -164,59 +173,45 @@ def _derive(model: Model, named_constants: bool) -> Equations:
         for a, o, h, row in zip(applied, other, bias, mass, strict=True)
     ]
     moved = [*offset, *offset_rate, *offset_acceleration]
-    linear = []
-    for p in model.parameters:
-        symbol = d.p[p.name]
-        curved = any(sp.diff(e, symbol, 2) != 0 for e in residual)
+    linear: list[bool] = []
+    products: list[tuple[int, int]] = []
+    for i, symbol in enumerate(d.p.values()):
+        slopes = [sp.diff(e, symbol) for e in residual]
+        curved = any(sp.diff(slope, symbol) != 0 for slope in slopes)
         linear.append(not curved and not any(e.has(symbol) for e in [*rates, *moved]))
+        for j, earlier in enumerate([*d.p.values()][:i]):
+            if any(sp.diff(slope, earlier) != 0 for slope in slopes):
+                products.append((j, i))
     return Equations(
-        q=d.q, qd=d.qd, qdd=d.qdd, z=z, z_names=z_names,
+        q=d.q, qd=d.qd, qdd=d.qdd, z=[*d.z.values()], z_names=z_names,
         u=[d.channel[c] for c in inputs], inputs=inputs,
         p=list(d.p.values()), w=w, noise=noise,
         mass=mass, bias=bias, other=other, applied=applied, applied_noise=applied_noise,
         input_map=input_map, rates=rates, initial=initial,
         offset=offset, offset_rate=offset_rate, offset_acceleration=offset_acceleration,
-        kinetic=kinetic, potential=potential, linear=linear,
+        kinetic=kinetic, potential=potential, linear=linear, products=products,
         compensation=compensation(d, potential), delays=delays(d, applied),
     )  # fmt: skip
 
 
-def _corrections(d: Vocabulary, raw_applied: list[Any], side: list[Any]) -> dict[str, Any]:
-    """What effects of kind ``input`` add to each force and channel that they act on."""
-    model, device = d.model, d.model.device
-    corrections = dict.fromkeys((*device.forces, *device.channels), sp.S.Zero)
-    for item in (e for e in model.effects if e.effect.kind == "input"):
-        for key, tree in item.effect.expressions.items():
-            symbols = d.effect_symbols(item, raw_applied, side)
-            force = key.partition(".")[2]
-            if not force:
-                force = item.target if item.effect.scope == "channel" else d.targeted(item)[0]
-            for name in device.forces if force == EACH else (force,):
-                if name not in corrections:
-                    raise InputError(f"effect {item.name!r}: device has no input {name!r}")
-                if force == EACH:
-                    orders = range(len(INPUT_ORDERS))
-                    symbols |= {derivative("f", k): d.channel[derivative(name, k)] for k in orders}
-                corrections[name] += d.own(item, tree, symbols, key) - d.channel[name]
-    return corrections
-
-
-def _device_torque(d: Vocabulary, truth: Mapping[Any, Any], w: list[Any]) -> list[Any]:
-    """Q_other of the device without effects: its own torques, friction, brakes, process noise.
-
-    Dry friction, what turns with the sign of the motion, is noted in ``d.dry``.
-    """
+def _device_torque(d: Vocabulary, w: list[Any]) -> list[Any]:
+    """Q_other of the device without effects: its own torques, friction, brakes, process noise."""
     device = d.model.device
-    other = [e.subs(truth, simultaneous=True) for e in d.table(device.torque, "torque")]
+    other = d.table(device.torque, "torque")
     for i, c in enumerate(device.coordinates):
         sign = d.sgn(d.qd[i])
         if c.name in device.friction:
             other[i] -= d.p[f"viscous.{c.name}"] * d.qd[i] + d.p[f"coulomb.{c.name}"] * sign
-        slid = sp.Dummy()
-        d.dry[i] = -sp.diff(sp.sympify(other[i]).subs(sign, slid), slid)
         if c.name in device.brakes:
             other[i] -= d.channel[device.brakes[c.name]] * sign
     for k, name in enumerate(device.process_noise):
         gains = d.table(device.process_noise[name].torque, f"process_noise.{name}")
         other = [e + g * w[len(device.forces) + k] for e, g in zip(other, gains, strict=True)]
     return other
+
+
+def _dry_friction(d: Vocabulary, other: list[Any]) -> list[Any]:
+    """What of ``other`` turns with the sign of the motion, by axis."""
+    slid = sp.Dummy()
+    signs = [d.sgn(rate) for rate in d.qd]
+    return [-sp.diff(e.subs(sign, slid), slid) for e, sign in zip(other, signs, strict=True)]

@@ -25,6 +25,9 @@ _EXPRESSIONS = {
     "energy": (("kinetic", "potential"), ("axis", "device")),
     "measurement": (("offset",), ("axis", "device")),
 }
+Link = Literal["timing", "zero", "scale", "delay", "lag", "saturation", "lever"]
+"""Links between what is logged and what acts, from the log on: when a sensor reads, its zero and
+its scale; delay, lag and saturation of what drives; the lever at which it acts."""
 EACH = "each"
 """Place of a device-wide input effect that stands for every force channel."""
 
@@ -124,6 +127,12 @@ class Effect(Declaration):
         default=False,
         description="Whether it is one of motors only: offered where the device says drive = true",
     )
+    link: Link | None = Field(
+        default=None,
+        description="Where it acts between what is logged and the mechanism: links act in this"
+        " order, each on what the one before it leaves. scale where left out, lever for a"
+        " measurement; a torque with a link is part of the drive, and of the load of what follows",
+    )
     devices: Distinct[Text] = Field(
         default=(), description="Devices that it makes sense for; all where left out"
     )
@@ -150,6 +159,12 @@ class Effect(Declaration):
                 found[key] = value
         return found
 
+    @property
+    def acting_link(self) -> Link | None:
+        """Its link; None for what acts on the mechanism itself."""
+        usual: dict[str, Link] = {"input": "scale", "measurement": "lever"}
+        return self.link or usual.get(self.kind)
+
     def cross_faults(self) -> Iterator[InputError]:
         main, scopes = _EXPRESSIONS[self.kind]
         if self.scope not in scopes:
@@ -164,6 +179,8 @@ class Effect(Declaration):
             elif value is not None and isinstance(value, Mapping) != placed:
                 form = "a table, one expression a place" if placed else "one expression"
                 yield InputError(f"{key!r} must be {form}")
+        if self.link and self.kind == "energy":
+            yield InputError("'link' has no meaning for kind 'energy'")
         if not self.expressions:
             yield InputError(f"an effect of kind {self.kind!r} needs {' or '.join(main)}")
         for state in self.states:
@@ -175,7 +192,7 @@ class Effect(Declaration):
         if (self.devices and device.name not in self.devices) or (self.drive and not device.drive):
             return ()
         if self.scope == "axis":
-            used = self._names()
+            used = self.names
             return tuple(
                 c.name
                 for c in device.coordinates
@@ -190,7 +207,8 @@ class Effect(Declaration):
             return tuple(a + b for a in device.components for b in device.components if a != b)
         return ("",) if self._fits(device) else ()
 
-    def _names(self) -> set[str]:
+    @cached_property
+    def names(self) -> set[str]:
         """Every name that its expressions use."""
         trees = [*self.expressions.values()]
         trees += [tree for state in self.states for tree in (state.rate, state.initial)]
@@ -206,14 +224,15 @@ class Effect(Declaration):
         known |= set(device.brakes.values()) | set(self.parameters) | {s.name for s in self.states}
         for c in device.coordinates:
             known |= {
-                f"{prefix}_{c.name}" for prefix in ("qd", "applied", "viscous", "coulomb", "load")
+                f"{prefix}_{c.name}"
+                for prefix in ("qd", "applied", "viscous", "coulomb", "load", "weight")
             }
         keys = {key.partition(".")[2] for key in self.expressions} - {""}
         places = {c.name for c in device.coordinates} | set(device.forces)
         if EACH in keys and device.forces:
             places |= {EACH}
             known |= {derivative("f", k) for k in range(len(INPUT_ORDERS))}
-        return keys <= places and self._names() <= known
+        return keys <= places and self.names <= known
 
 
 @dataclass(frozen=True)

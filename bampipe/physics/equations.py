@@ -26,6 +26,7 @@ class Equations:
         offset, offset_rate, offset_acceleration: q_true - q_measured and its derivatives.
         kinetic, potential: energies, as declared, definitions put in.
         linear: for each parameter, whether the residual is linear in it.
+        products: pairs of parameters, by number, of which the residual has a product.
         compensation: per coordinate, the part of Q_other that balances gravity there: see
             `roles.compensation`; zero where nothing does.
         delays: parameters that shift measured forces in time: see `roles.delays`.
@@ -55,6 +56,7 @@ class Equations:
     kinetic: Any
     potential: Any
     linear: list[bool]
+    products: list[tuple[int, int]]
     compensation: list[Any]
     delays: list[str]
 

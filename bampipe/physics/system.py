@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from types import ModuleType
 from typing import Any
@@ -30,7 +30,7 @@ class System:
         inputs: names of the columns of u.
         parameters: what p holds, in order.
         noise: names of the additive process noise w.
-        linear: per parameter, whether the residual is linear in it.
+        linear: per parameter, whether the residual is linear in it; of several, see `is_linear_in`.
         touched: axes whose equation the effects change, measurement effects aside.
         moves_sensors: whether an effect of kind ``measurement`` is present.
         driven: whether what the effects add to the residual depends on the measured force of
@@ -58,6 +58,7 @@ class System:
         self.noise: tuple[str, ...] = tuple(meta["noise"])
         self.parameters: tuple[Parameter, ...] = model.parameters
         self.linear: tuple[bool, ...] = tuple(meta["linear"])
+        self._products: list[list[int]] = meta["products"]
         self.touched: tuple[int, ...] = tuple(meta["touched"])
         self.moves_sensors: bool = meta["moves_sensors"]
         self.driven: bool = meta["driven"]
@@ -77,6 +78,12 @@ class System:
         poses = np.linspace(0.1, 1.3, 3 * n).reshape(3, n)
         acting = np.abs(self.input_map(poses, np.ones((3, len(self.inputs))))).sum(axis=(0, 2))
         return tuple(c for c, some in zip(self.coordinates, acting, strict=True) if some == 0.0)
+
+    def is_linear_in(self, parameters: Sequence[int]) -> bool:
+        """Whether the residual is linear in ``parameters``, by number, all together."""
+        chosen = set(parameters)
+        one_by_one = all(self.linear[i] for i in chosen)
+        return one_by_one and not any(chosen.issuperset(pair) for pair in self._products)
 
     def index(self, name: str) -> int:
         """Position of the parameter called ``name``.
@@ -314,6 +321,7 @@ def _generate(model: Model) -> tuple[dict[str, Any], dict[str, str]]:
         "inputs": equations.inputs,
         "noise": equations.noise,
         "linear": equations.linear,
+        "products": equations.products,
         "touched": [i for i, e in enumerate(added) if e != 0],
         "moves_sensors": any(e != 0 for e in equations.offset),
         "driven": any(e.has(*forces) for e in added)

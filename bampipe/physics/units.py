@@ -314,7 +314,8 @@ def _effect_symbols(item: BoundEffect, device: Device, check: _Check) -> dict[st
     second = _UNITS["s"]
     symbols = _device_symbols(device, _Check())
     for axis, unit, torque in _axes(device):
-        symbols |= dict.fromkeys((f"applied_{axis}", f"load_{axis}", f"coulomb_{axis}"), torque)
+        names = [f"{term}_{axis}" for term in ("applied", "load", "coulomb", "weight")]
+        symbols |= dict.fromkeys(names, torque)
         symbols[f"viscous_{axis}"] = torque * second / unit
         if axis == item.target and item.effect.scope == "axis":
             symbols |= {"q": unit, "qd": unit / second, "brake": torque, "side_load": None}

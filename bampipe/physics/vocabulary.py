@@ -33,7 +33,8 @@ class Vocabulary:
         channels: every input there may be; channel: their symbols.
         p, z: symbols of the parameters, and of effects' internal states.
         dry: by coordinate, the dry friction that turns with the motion; filled while torques are
-            put together, before any effect is.
+            put together, before the first effect that uses it.
+        weight: by coordinate, slope of the potential energy; filled like `dry`.
         base: what every expression of the device may use.
     """
 
@@ -58,6 +59,7 @@ class Vocabulary:
         self.special = {"sgn": self.sgn, "ddt": self.ddt}
         self.sizes: dict[str, int] = {}
         self.dry: list[Any] = [sp.S.Zero] * len(self.axes)
+        self.weight: list[Any] = [sp.S.Zero] * len(self.axes)
         self.base: Symbols = dict(zip(self.axes, self.q, strict=True))
         self.base |= {f"qd_{a}": s for a, s in zip(self.axes, self.qd, strict=True)}
         self.base |= {
@@ -161,6 +163,7 @@ class Vocabulary:
         symbols = dict(self.base)
         for i, a in enumerate(self.axes):
             symbols |= {f"applied_{a}": applied[i], f"load_{a}": sp.Abs(applied[i])}
+            symbols[f"weight_{a}"] = self.weight[i]
             for term in ("viscous", "coulomb"):
                 symbols[f"{term}_{a}"] = self.p.get(f"{term}.{a}", sp.S.Zero)
         if item.effect.scope == "axis":

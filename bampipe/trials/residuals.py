@@ -75,7 +75,7 @@ def problem_of(
         lower=np.array(lower),
         upper=np.array(upper),
         step=np.array(step),
-        linear=all(system.linear[i] for i in free if i < n),
+        linear=system.is_linear_in([i for i in free if i < n]),
         band=band,
         resting=[_standstill(motion, system, band) for motion in motions],
     )
@@ -183,8 +183,8 @@ class Evidence:
 
     @property
     def is_linear(self) -> bool:
-        """Whether the residual is linear in all free parameters."""
-        return all(self.system.linear[i] for i in self.free)
+        """Whether the residual is linear in all free parameters together."""
+        return self.system.is_linear_in(self.free)
 
     def held_out_residual(self, trial: int) -> Array:
         """The residual of a trial with parameters that have not seen it, (K, n_q)."""

@@ -219,7 +219,7 @@ def symbols_of(case):
             known[f"f_{order}".rstrip("_")] = slope
     for c in BAM.coordinates:
         torque = dimension(c.torque_unit)
-        known[f"brake_{c.name}"] = torque
+        known[f"brake_{c.name}"] = known[f"weight_{c.name}"] = torque
         if c.name == bound.target:
             known |= dict.fromkeys(("load", "applied", "brake", "side_load", "coulomb"), torque)
             known |= {"q": dimension(c.unit), "qd": dimension(f"{c.unit}/s")}

@@ -1,0 +1,113 @@
+"""What acts of each logged input, after the effects that stand between log and mechanism."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any, get_args
+
+import sympy as sp
+
+from bampipe.errors import InputError
+from bampipe.physics.device import INPUT_ORDERS, LAST_ORDER, derivative
+from bampipe.physics.effect import EACH, BoundEffect, Link
+from bampipe.physics.vocabulary import Vocabulary
+
+_ORDER = {link: number for number, link in enumerate(get_args(Link))}
+
+
+def order_of_action(effects: Iterable[BoundEffect]) -> list[BoundEffect]:
+    """Effects in the order in which they act, whatever the order in which they were added.
+
+    Link by link, then what acts on the mechanism itself, last what acts on all dry friction or on
+    all weights; among those alike, names decide.
+    """
+
+    def place(item: BoundEffect) -> tuple[int, bool, str]:
+        link = item.effect.acting_link
+        last = any(name == "dry" or name.startswith("weight_") for name in item.effect.names)
+        return (_ORDER[link] if link else len(_ORDER), last, item.name)
+
+    return sorted(effects, key=place)
+
+
+class Signals:
+    """The inputs that act, as expressions of the logged ones, and the internal states between.
+
+    Attributes:
+        acting: by the symbol of a logged force or channel, what acts of it, where that differs.
+        rates, initial: of the internal states of the effects between, by symbol.
+    """
+
+    def __init__(
+        self, d: Vocabulary, effects: Iterable[BoundEffect], applied: list[Any], side: list[Any]
+    ) -> None:
+        """Chain the effects of kind ``input`` among ``effects``.
+
+        Args:
+            d: the vocabulary of the model.
+            effects: its effects, or some of them.
+            applied, side: generalised force and side load, by axis, of the logged inputs.
+        """
+        self._d = d
+        self.acting: dict[Any, Any] = {}
+        self.rates: dict[Any, Any] = {}
+        self.initial: dict[Any, Any] = {}
+        for item in order_of_action(e for e in effects if e.effect.kind == "input"):
+            self._add(item, applied, side)
+
+    def _add(self, item: BoundEffect, applied: list[Any], side: list[Any]) -> None:
+        d, device = self._d, self._d.model.device
+        known, found = (*device.forces, *device.channels), {}
+        symbols = d.effect_symbols(item, applied, side)
+        for key, tree in item.effect.expressions.items():
+            place = key.partition(".")[2]
+            if not place:
+                place = item.target if item.effect.scope == "channel" else d.targeted(item)[0]
+            for name in device.forces if place == EACH else (place,):
+                if name not in known:
+                    raise InputError(f"effect {item.name!r}: device has no input {name!r}")
+                if place == EACH:
+                    for k in range(len(INPUT_ORDERS)):
+                        symbols[derivative("f", k)] = d.channel[derivative(name, k)]
+                found[d.channel[name]] = self.put_in(d.own(item, tree, symbols, key))
+        for state in item.effect.states:
+            z = d.z[item.prefix, state.name]
+            rate = d.own(item, state.rate, symbols, f"states.{state.name}.rate")
+            initial = d.own(item, state.initial, symbols, f"states.{state.name}.initial")
+            self.rates[z], self.initial[z] = self.put_in(rate), self.put_in_initial(initial)
+        self.acting |= found
+
+    def put_in(self, expr: Any) -> Any:
+        """``expr`` of logged inputs and their derivatives, with what acts of them in their place.
+
+        Raises:
+            InputError: it needs a derivative of what follows the rates, whose own is not known.
+        """
+        d = self._d
+        values = {symbol: value for symbol, value in self.acting.items() if expr.has(symbol)}
+        for force in d.model.device.forces:
+            used = [
+                k for k in range(1, LAST_ORDER + 1) if expr.has(d.channel[derivative(force, k)])
+            ]
+            value = self.acting.get(d.channel[force])
+            for k in range(1, max(used) + 1) if used and value is not None else ():
+                value = self._rate(value)
+                if value.has(*d.qdd):
+                    raise InputError(f"the time derivative {k} of {force!r} is not known")
+                values[d.channel[derivative(force, k)]] = value
+        return expr.subs(values, simultaneous=True) if values else expr
+
+    def put_in_initial(self, expr: Any) -> Any:
+        """The same of an initial value: states between log and mechanism are at theirs."""
+        return self.put_in(expr).subs(self.initial, simultaneous=True)
+
+    def _rate(self, expr: Any) -> Any:
+        """Time derivative along the motion; a series in the derivatives of a force ends there."""
+        d = self._d
+        rates = dict(zip([*d.q, *d.qd], [*d.qd, *d.qdd], strict=True)) | self.rates
+        for force in d.model.device.forces:
+            for k in range(LAST_ORDER):
+                low, high = derivative(force, k), derivative(force, k + 1)
+                rates[d.channel[low]] = d.channel[high]
+        rates[d.channel["t"]] = sp.S.One
+        return sp.Add(*(sp.diff(expr, symbol) * rate for symbol, rate in rates.items()))

@@ -1,0 +1,238 @@
+"""Effects that meet on one channel or axis act in their order, on what the one before leaves."""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+import sympy as sp
+from scipy.signal import lfilter
+
+from bampipe.physics import Model, compile_model, registry
+from bampipe.physics.derivation import derive
+
+RATE = 1000.0
+
+
+def pairs(machine, places):
+    """Pairs of effects of ``machine`` that meet at one of ``places``."""
+    device = registry.device(machine)
+    for place in places:
+        met = [
+            f"{name}:{target}" if target else name
+            for name in registry.effect_names()
+            for target in registry.effect(name).targets(device)
+            if target in ("", *place)
+        ]
+        yield from ((machine, a, b) for a, b in combinations(met, 2))
+
+
+# Of the arm, what meets on one reading and one encoder; of the others, everything.
+PAIRS = [
+    *pairs("magnetic_damper", [("piston", "current", "load_cell")]),
+    *pairs("slider", [("carriage", "motor")]),
+    *(p for p in pairs("bam", [("x", "xy")]) if "force" in p[1] and "force" in p[2]),
+    ("bam", "base_tilt", "handle_payload"),
+    ("bam", "encoder_scale:yaw", "transmission_compliance:yaw"),
+    ("bam", "backlash:yaw", "encoder_scale:yaw"),
+]
+
+
+def numbers(equations, model):
+    """Every function of the model at one made-up state, effects at their typical size."""
+    rng = np.random.default_rng(3)
+    at = {s: float(rng.uniform(0.3, 0.8)) for s in (*equations.q, *equations.qd, *equations.qdd)}
+    at |= {s: float(rng.uniform(0.5, 1.5)) for s in sorted(equations.u, key=str)}
+    at |= dict.fromkeys(equations.w, 0.0)
+    for symbol, p in zip(equations.p, model.parameters, strict=True):
+        at[symbol] = p.prior if p.typical is None else p.typical
+    states = {n: rng.uniform(0.2, 0.4) for n in sorted(equations.z_names)}
+    at |= {z: states[n] for z, n in zip(equations.z, equations.z_names, strict=True)}
+    groups = [equations.applied, equations.other, equations.bias, equations.offset,
+              equations.offset_acceleration]  # fmt: skip
+    values = [sp.sympify(e).subs(at) for group in groups for e in group]
+    rates = dict(zip(equations.z_names, equations.rates, strict=True))
+    return [float(v) for v in [*values, *(rates[n].subs(at) for n in sorted(rates))]]
+
+
+@pytest.mark.parametrize(("machine", "first", "second"), PAIRS)
+def test_order_of_adding_does_not_matter(machine, first, second):
+    device = registry.device(machine)
+    found = []
+    for names in ((first, second), (second, first)):
+        model = Model(device, names)
+        found.append(numbers(derive(model), model))
+    assert np.isfinite(found[0]).all()
+    np.testing.assert_allclose(found[0], found[1], rtol=1e-9, atol=1e-12)
+
+
+def motion(system, **channels):
+    """Two seconds of a made-up smooth motion of one coordinate, with given channels."""
+    t = np.arange(round(2 * RATE)) / RATE
+    w = 2 * np.pi * 1.3
+    q, qd, qdd = (0.02 * w**k * np.sin(w * t + k * np.pi / 2)[:, None] for k in range(3))
+    known = {"t": t, **channels}
+    u = np.column_stack([known.get(name, np.zeros(t.size)) for name in system.inputs])
+    return t, q, qd, qdd, u
+
+
+def forces(system, p, at):
+    """Applied and required force, (T,) each, along ``at`` with parameters by name."""
+    t, q, qd, qdd, u = at
+    values = np.array([p.get(x.name, 0.0) for x in system.parameters])
+    z = system.memory(q, qd, qdd, u, values, t)
+    true = q, qd, qdd
+    return (f(*true, z, u, values)[:, 0] for f in (system.applied, system.required))
+
+
+def lagged(x, time_constant):
+    """What follows ``x`` with a first-order lag, linear between samples."""
+    a = np.exp(-1.0 / RATE / time_constant)
+    ramp = 1.0 - (1.0 - a) * time_constant * RATE
+    return lfilter([ramp, 1.0 - a - ramp], [1.0, -a], x, zi=[x[0] * (1.0 - ramp)])[0]
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_the_coil_of_a_damper_saturates_with_the_current_that_has_come(order):
+    names = ["channel_lag:current", "channel_saturation:current"][::order]
+    system = compile_model(Model(registry.device("magnetic_damper"), names))
+    t = np.arange(round(2 * RATE)) / RATE
+    current = 1.0 + np.sin(2 * np.pi * 2.0 * t)
+    p = {
+        "channel_lag.current.time_constant": 0.04,
+        "channel_saturation.current.bend": 0.5,
+        "channel_saturation.current.sharpness": 2.0,
+        "viscous_gain": 400.0,
+        "coulomb_gain": 250.0,
+    }
+    at = motion(system, current=current)
+    _, needed = forces(system, p, at)
+    coil = lagged(current, 0.042)
+    field = coil / np.sqrt(1.0 + (0.5 * coil) ** 2)
+    speed = at[2][:, 0]
+    expected = field * (400.0 * speed + 250.0 * np.tanh(speed / 2e-3))
+    np.testing.assert_allclose(needed, expected, atol=0.02)
+
+
+def test_a_reading_is_corrected_before_it_lags_and_the_gears_carry_what_is_delivered():
+    effects = ["load_dependent_friction:carriage", "drive_sag:carriage", "actuator_lag:motor",
+               "force_gain:motor", "force_bias:motor"]  # fmt: skip
+    system = compile_model(Model(registry.device("slider"), effects))
+    t = np.arange(round(2 * RATE)) / RATE
+    asked = 200.0 * np.sin(2 * np.pi * 1.7 * t + 0.4)
+    p = {
+        "force_gain.motor.error": 0.1,
+        "force_bias.motor.bias": 12.0,
+        "actuator_lag.motor.time_constant": 0.03,
+        "drive_sag.carriage.sag": 0.002,
+        "load_dependent_friction.carriage.coefficient": 0.2,
+    }
+    at = motion(system, force_motor=asked / 0.9 + 12.0)
+    applied, needed = forces(system, p, at)
+    torque = lagged(asked, 0.031)
+    np.testing.assert_allclose(applied, torque, atol=0.01)
+    delivered = torque / (1.0 + 0.002 * np.abs(torque))
+    sign = np.tanh(at[2][:, 0] / 2.5e-4)
+    expected = torque - delivered + 0.2 * np.abs(delivered) * sign
+    np.testing.assert_allclose(needed, expected, atol=0.01)
+
+
+def test_delays_of_sensor_and_motor_add_up():
+    system = compile_model(Model(registry.device("slider"), ["actuator_delay", "force_delay"]))
+    t = np.arange(round(2 * RATE)) / RATE
+    w = 2 * np.pi * 3.0
+    names = ("", "_rate", "_curvature", "_third", "_fourth", "_fifth", "_sixth")
+    channels = {
+        f"force{n}_motor": w**k * np.sin(w * t + k * np.pi / 2) for k, n in enumerate(names)
+    }
+    p = {"actuator_delay.delay": 0.02, "force_delay.delay": 0.012}
+    applied, _ = forces(system, p, motion(system, **channels))
+    np.testing.assert_allclose(applied, np.sin(w * (t - 0.008)), atol=1e-6)
+
+
+def test_a_force_that_leaks_is_scaled_after_its_zero_is_taken_off():
+    effects = ["force_gain:x", "force_crosstalk:xy", "force_bias:x", "force_bias:y"]
+    system = compile_model(Model(registry.device("bam"), effects))
+    names = [x.name for x in system.parameters]
+    p = np.array([x.prior for x in system.parameters])
+    zero, gain = np.array([1.5, -2.0, 0.0]), np.array([[1.08, 0.05, 0], [0, 1, 0], [0, 0, 1]])
+    p[names.index("force_bias.x.bias")], p[names.index("force_bias.y.bias")] = zero[:2]
+    p[names.index("force_crosstalk.xy.leak")] = 0.05
+    p[names.index("force_gain.x.error")] = 1.0 - 1.0 / 1.08
+    true = np.random.default_rng(1).normal(size=(20, 3)) * 10.0
+    read = true @ gain.T + zero
+    column = {f"force_{c}": read[:, k] for k, c in enumerate("xyz")}
+    u = np.column_stack([column.get(name, np.zeros(20)) for name in system.inputs])
+    q = np.tile([0.1, 0.3, 1.0], (20, 1))
+    none = np.zeros((20, 0))
+    found = system.applied(q, 0 * q, 0 * q, none, u, p)
+    expected = true * [np.cos(0.3), 1.0, 1.0]
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+
+
+def test_a_payload_weighs_on_a_tilted_base_too():
+    device = registry.device("bam")
+    system = compile_model(Model(device, ["handle_payload", "base_tilt"]))
+    names = [x.name for x in system.parameters]
+    p = np.array([x.prior for x in system.parameters])
+    tilt_x, tilt_z, payload = 1e-3, -2e-3, 0.4
+    p[names.index("base_tilt.tilt_x")], p[names.index("base_tilt.tilt_z")] = tilt_x, tilt_z
+    p[names.index("handle_payload.payload")] = payload
+
+    def potential(q):
+        """Height of rod and payload along the vertical, from their places on the tilted base."""
+        yaw, pitch, extension = q
+        along = np.array([np.cos(pitch) * np.sin(yaw), np.sin(pitch), np.cos(pitch) * np.cos(yaw)])
+        up = np.array([tilt_z, 1.0, -tilt_x])
+        return 9.81 * (3.56 * (extension - 0.461) + payload * extension) * along @ up
+
+    q = np.array([0.4, 0.2, 1.2])
+    slope = [(potential(q + d) - potential(q - d)) / 2e-6 for d in 1e-6 * np.eye(3)]
+    u = np.zeros((1, len(system.inputs)))
+    still = np.zeros((1, 3))
+    held = system.required(q[None], still, still, np.zeros((1, 0)), u, p)[0]
+    bare = compile_model(Model(device))
+    balance = bare.compensation(q[None], still, np.zeros((1, 0)), u, p[: len(bare.parameters)])[0]
+    np.testing.assert_allclose(held + balance, slope, atol=2e-6)
+
+
+def test_an_encoder_is_corrected_before_what_lies_behind_it():
+    system = compile_model(
+        Model(
+            registry.device("bam"), ["transmission_compliance:extension", "encoder_scale:extension"]
+        )
+    )
+    names = [x.name for x in system.parameters]
+    p = np.array([x.prior for x in system.parameters])
+    p[names.index("encoder_scale.extension.error")] = 0.05
+    p[names.index("transmission_compliance.extension.compliance")] = 2e-4
+    u = np.zeros((1, len(system.inputs)))
+    u[0, system.inputs.index("force_z")] = 30.0
+    q = np.array([[0.1, 0.2, 1.0]])
+    true = system.true_motion(q, 0 * q, 0 * q, u, p)[0]
+    np.testing.assert_allclose(true[0], [0.1, 0.2, 1.05 + 2e-4 * 30.0], rtol=1e-12)
+
+
+def test_friction_by_load_builds_up_after_a_reversal_as_the_rest():
+    device = registry.device("magnetic_damper")
+    system = compile_model(Model(device, ["hysteresis:piston", "load_dependent_friction:piston"]))
+    p = {"coulomb.piston": 40.0, "coulomb_gain": 100.0, "hysteresis.piston.share": 1.0,
+         "load_dependent_friction.piston.coefficient": 0.3}  # fmt: skip
+    values = np.array([p.get(x.name, 0.0) for x in system.parameters])
+    u = np.array([[{"current": 0.5, "force_load_cell": 200.0}.get(n, 0.0) for n in system.inputs]])
+    one = np.array([[0.1]])
+    ends = [
+        system.required(0 * one, one, 0 * one, np.array([[z]]), u, values)[0, 0] for z in (0.0, 1.0)
+    ]
+    assert ends[1] - ends[0] == pytest.approx(40.0 + 50.0 + 60.0, rel=1e-6)
+
+
+def test_parameters_that_multiply_each_other_are_not_fitted_as_if_they_added_up():
+    model = Model(registry.device("bam"), ["base_tilt"])
+    system = compile_model(model)
+    names = [x.name for x in system.parameters]
+    mass, tilt = names.index("mass"), names.index("base_tilt.tilt_x")
+    assert system.linear[mass] and system.linear[tilt]
+    assert system.is_linear_in([mass]) and not system.is_linear_in([mass, tilt])
+    assert compile_model(Model(model.device)).is_linear_in(range(7))
