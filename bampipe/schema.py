@@ -208,27 +208,30 @@ def json_schema(kind: type) -> dict[str, Any]:
     return head | content
 
 
-def json_schema_text(kind: type[Declaration]) -> str:
-    """The JSON Schema of a file as it stands in ``schemas/``: what is flat or short is one line."""
+_SEVERAL = ("$defs", "properties")
+"""Keywords of a JSON Schema whose entries have names of the file: each begins a line."""
 
-    def lines(value: Any, indent: str, used: int) -> str:
+
+def json_schema_text(kind: type[Declaration]) -> str:
+    """The JSON Schema of a file as it stands in ``schemas/``: short entries share a line."""
+
+    def lines(value: Any, indent: str, keyword: str = "") -> str:
         short = json.dumps(value, ensure_ascii=False)
-        flat = "{" not in short[1:] and "[" not in short[1:]
-        if flat or len(indent) + used + len(short) < 160:
+        if not isinstance(value, dict | list) or len(indent) + len(short) < 140:
             return short
         inner = indent + " "
-        if isinstance(value, list):
-            parts = [lines(item, inner, 1) for item in value]
-        else:
-            labels = [f"{json.dumps(key)}: " for key in value]
-            parts = [
-                label + lines(item, inner, len(label) + 1)
-                for label, item in zip(labels, value.values(), strict=True)
-            ]
-        joined = f",\n{inner}".join(parts)
-        return f"{short[0]}\n{inner}{joined}\n{indent}{short[-1]}"
+        entries = value.items() if isinstance(value, dict) else (("", item) for item in value)
+        text = ""
+        for key, item in entries:
+            label = f"{json.dumps(key)}: " if isinstance(value, dict) else ""
+            part = label + lines(item, inner, "" if keyword in _SEVERAL else key)
+            line = text.rpartition("\n")[2]
+            full = len(line) + len(part.partition("\n")[0]) > 138
+            apart = keyword in _SEVERAL or "\n" in part or line.endswith((" }", " ]")) or full
+            text += (f",\n{inner}" if apart else ", ") * bool(text) + part
+        return f"{short[0]}\n{inner}{text}\n{indent}{short[-1]}"
 
-    return lines(json_schema(kind), "", 0) + "\n"
+    return lines(json_schema(kind), "") + "\n"
 
 
 def dotted(path: Iterable[str | int]) -> str:

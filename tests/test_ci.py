@@ -17,9 +17,9 @@ from bampipe.declarations.pipeline import Gate
 from bampipe.errors import InputError
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.ingest import IngestResult
+from bampipe.results.run import GateVerdict
 from bampipe.results.validate import ValidateResult
 from bampipe.run import accepted, gates, pipeline
-from bampipe.run.gates import GateOutcome
 from bampipe.run.markdown import summary
 from bampipe.run.request import Outcome
 
@@ -120,7 +120,13 @@ def test_accept_refuses_what_failed(
 
 
 def test_the_summary_is_a_table_that_no_text_breaks(tmp_path: Path) -> None:
-    bad = GateOutcome("error | floor", "yaw", "failed", 2.0, "2 is above 1.15;\nsee <b>")
+    bad = GateVerdict(
+        gate="error | floor",
+        key="yaw",
+        state="failed",
+        value=2.0,
+        message="2 is above 1.15;\nsee <b>",
+    )
     root = made(tmp_path / "runs/s1", mass=2.0)
     axes = {"yaw": {"held_out_rmse": 0.2, "noise_floor": 0.1}}
     write_result(root, ValidateResult, axes=axes)

@@ -264,10 +264,10 @@ def test_wrong_setting_keeps_the_result_current(toy: Toy) -> None:
 def test_stage_must_write_what_it_declares(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
     from bampipe.stages import toy_sum  # type: ignore[attr-defined]
 
-    monkeypatch.setattr(toy_sum, "outputs", lambda config: ("other.json",))
+    monkeypatch.setattr(toy_sum, "OUTPUTS", ("other.json",))
     with pytest.raises(RuntimeError, match=r"did not write other\.json"):
         toy.run()
-    monkeypatch.setattr(toy_sum, "outputs", lambda config: ())
+    monkeypatch.setattr(toy_sum, "OUTPUTS", ())
     with pytest.raises(RuntimeError, match=r"wrote sum\.json, which it does not declare"):
         toy.run()
 

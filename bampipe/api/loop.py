@@ -34,7 +34,7 @@ class LoopOptions:
         pipeline: whose settings count.
         force: run even if nothing changed.
         wait: wait while another process holds the run folder.
-        listen: told of every event.
+        listen: called with every event.
     """
 
     root: Path
@@ -207,7 +207,7 @@ def follow(options: LoopOptions, model: str, tell: Callable[[str], None]) -> str
     Args:
         options: run folder, settings, listener.
         model: name of the model to start from.
-        tell: told, in a line each, what was found and done.
+        tell: called with a line on each thing found and done.
 
     Returns:
         The name of the last model that is better than its parent.

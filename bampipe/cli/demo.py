@@ -26,8 +26,8 @@ def demonstrate(runs: Path, force: bool, listen: Listener, tell: Callable[[str],
     Args:
         runs: folder of run folders.
         force: run even if nothing changed.
-        listen: told of every event.
-        tell: told the story, line by line.
+        listen: called with every event.
+        tell: called with each line of the story.
 
     Raises:
         InputError: the session does not ship with this installation.

@@ -14,6 +14,9 @@ if TYPE_CHECKING:
 
 R = TypeVar("R", bound="Result")
 
+INGESTED = ("ingest/trials.parquet", "ingest/samples.parquet", "ingest/session.json")
+FILTERED = ("filter/kinematics.parquet", "filter/filter.json")
+"""What the stages ingest and filter leave for others."""
 MOVING = ("free", "viscous")
 """Kinds of trial in which the arm moves; only with commanded brakes do effects of brakes show."""
 

@@ -14,6 +14,11 @@ from bampipe.physics.device import Device
 from bampipe.physics.recipe import Recipe
 from bampipe.results.identify import IdentifyResult
 
+MODEL_INPUTS = ("models/{model}/model.toml", "models/{model}/effects/*.toml", "ingest/device.toml?")
+"""What `load_model` reads, as a stage declares it."""
+IDENTIFIED_MODEL = (*MODEL_INPUTS, "models/{model}/identify.json")
+"""What `load_model` and `identified` read."""
+
 
 def load_model(run: RunFolder, name: str) -> Model:
     """Return the model called ``name`` as ``models/<name>/model.toml`` declares it.
@@ -49,15 +54,6 @@ def read_recipe(run: RunFolder, name: str, model: Model) -> Recipe:
     """Return ``model``, called ``name`` in the run folder, as plain data for worker processes."""
     own = [read_toml(run.path(path)) for path in run.glob(f"models/{name}/effects/*.toml")]
     return Recipe(model.device.declaration, tuple(e.name for e in model.effects), tuple(own))
-
-
-def model_inputs(name: str) -> tuple[str, ...]:
-    """Return the paths that `load_model` reads, as a stage declares them."""
-    return (
-        f"models/{name}/model.toml",
-        f"models/{name}/effects/*.toml",
-        "ingest/device.toml?",
-    )
 
 
 def identified(run: RunFolder, name: str, system: System) -> NDArray[np.float64]:

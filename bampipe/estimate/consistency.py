@@ -29,7 +29,7 @@ class Reference:
     """Law of the mean NIS of a reading over a window: a gamma distribution.
 
     Attributes:
-        shape, scale: its mean is their product, 1 for a filter that is told the right noise.
+        shape, scale: its mean is their product, 1 for a filter that is given the right noise.
     """
 
     shape: float

@@ -1,6 +1,6 @@
 """How far to believe a filter: covariance from its own increments, noise from its likelihood.
 
-A filter's covariance is right only if its noise is white and of the size that it was told. What
+A filter's covariance is right only if its noise is white and of the size that it was given. What
 each stretch of time added to the estimate can be read back from the filter in information form;
 how much those stretches disagree, beside how much they should, is the sandwich covariance, which
 holds whatever the noise is, as long as stretches are independent of each other.

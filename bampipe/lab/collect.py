@@ -49,7 +49,7 @@ def collect(runs: Path, folder: Path, *, report: bool = True, progress: Progress
         runs: folder of run folders.
         folder: the lab's folder.
         report: whether to write report.pdf and report.html too.
-        progress: told the share done.
+        progress: called with the share done.
 
     Raises:
         InputError: there is no run in ``runs``, or a file cannot be written.

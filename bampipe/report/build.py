@@ -47,7 +47,7 @@ def build(results: Results, progress: Callable[[float, str], None]) -> Report:
 
     Args:
         results: the run folder's.
-        progress: told the share done and what is under way.
+        progress: called with the share done and what is under way.
 
     Raises:
         InputError: ingest has not run, or a result is damaged.

@@ -13,7 +13,7 @@ from bampipe.schema import Positive
 class ResidualBand(Record):
     """The band in which residuals of one axis are compared, by every later stage."""
 
-    cutoff_hz: Positive
+    cutoff_hz: Positive = Field(description="Of the low-pass")
     reason: str
     force_hz: Size = Field(description="The applied force has 95 % of its power below this")
     motion_hz: Positive = Field(description="Bandwidth of the filtered motion")

@@ -14,6 +14,9 @@ InputDigest = Annotated[
 ]
 
 
+GateState = Literal["passed", "failed", "warned", "absent"]
+
+
 class Place(Record):
     """Where it was made; no result depends on it."""
 
@@ -57,7 +60,7 @@ class GateVerdict(Record):
 
     gate: str
     key: str = Field(description='What * stood for, or ""')
-    state: Literal["passed", "failed", "warned", "absent"]
+    state: GateState
     value: float | None
     message: str
 

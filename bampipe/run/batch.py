@@ -65,7 +65,7 @@ def guarded(request: Request, listen: Listener) -> Outcome:
 
     Args:
         request: what to run.
-        listen: told of every event.
+        listen: called with every event.
     """
     try:
         return run_and_publish(request, listen)
@@ -124,7 +124,7 @@ def run_sessions(
     Args:
         requests: one for each session; no two may share a run folder.
         jobs: number of worker processes; 1 runs everything in this process.
-        listen: told of every event of every session.
+        listen: called with every event of every session.
 
     Returns:
         The outcomes, in the order of the requests.

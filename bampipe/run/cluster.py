@@ -42,7 +42,7 @@ def run_on_cluster(requests: Sequence[Request], scheduler: str, listen: Listener
         requests: one for each session; no two may share a run folder.
         scheduler: address of the scheduler, ``tcp://host:port``; "" starts a cluster of worker
             processes on this machine for the time of the run.
-        listen: told when a session is done.
+        listen: called when a session is done.
 
     Returns:
         The outcomes, in the order of the requests.

@@ -1,4 +1,4 @@
-"""What happens in a run, told to whoever shows it."""
+"""What happens in a run, for whoever shows it."""
 
 from __future__ import annotations
 

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,29 +13,7 @@ from bampipe.run import accepted
 
 if TYPE_CHECKING:
     from bampipe.declarations.pipeline import Gate
-
-
-@dataclass(frozen=True)
-class GateOutcome:
-    """What came of one gate for one axis (or for the one number it guards).
-
-    Attributes:
-        gate: name of the gate.
-        key: what ``*`` stood for, or "".
-        state: "passed", "failed", "warned" or "absent" (no such result, and none was demanded).
-        value: the number, None where there is none.
-        message: one line that says what was found.
-    """
-
-    gate: str
-    key: str
-    state: str
-    value: float | None
-    message: str
-
-    def content(self) -> dict[str, object]:
-        """Return the verdict as a table that JSON can hold."""
-        return asdict(self)
+    from bampipe.results.run import GateState, GateVerdict
 
 
 def _pick(content: object, dotted: str) -> dict[str, object]:
@@ -61,13 +38,25 @@ def _number(value: object) -> float | None:
     return float(value) if math.isfinite(value) else None
 
 
-def _missing(gate: Gate, key: str, what: str) -> GateOutcome:
-    if gate.optional:
-        return GateOutcome(gate.name, key, "absent", None, what)
-    return GateOutcome(gate.name, key, "failed" if gate.level == "fail" else "warned", None, what)
+def _found(
+    gate: Gate, key: str, passed: bool, value: float | None, parts: Sequence[str]
+) -> GateVerdict:
+    """Return what came of ``gate`` for ``key``: ``parts`` in one line, and advice if it fails."""
+    from bampipe.results.run import GateVerdict
+
+    state: GateState = "passed" if passed else "failed" if gate.level == "fail" else "warned"
+    parts = [*parts, gate.advice] if gate.advice and not passed else parts
+    return GateVerdict(gate=gate.name, key=key, state=state, value=value, message="; ".join(parts))
 
 
-def judge_gates(gate: Gate, root: Path, model: str, baseline: Path) -> list[GateOutcome]:
+def _missing(gate: Gate, key: str, what: str) -> GateVerdict:
+    from bampipe.results.run import GateVerdict
+
+    state: GateState = "absent" if gate.optional else "failed" if gate.level == "fail" else "warned"
+    return GateVerdict(gate=gate.name, key=key, state=state, value=None, message=what)
+
+
+def judge_gates(gate: Gate, root: Path, model: str, baseline: Path) -> list[GateVerdict]:
     """Return the verdicts of ``gate`` on the run folder ``root``.
 
     Args:
@@ -107,33 +96,26 @@ def judge_gates(gate: Gate, root: Path, model: str, baseline: Path) -> list[Gate
     return verdicts
 
 
-def _judged(gate: Gate, key: str, value: float | None, word: object) -> GateOutcome:
+def _judged(gate: Gate, key: str, value: float | None, word: object) -> GateVerdict:
     """Return the verdict that a stage stored as a word; ``value`` is shown beside it."""
     number = "no number" if value is None else f"{value:.4g}"
     text = f"{number}, {str(word).replace('_', ' ')}"
-    if word in gate.passes:
-        return GateOutcome(gate.name, key, "passed", value, text)
-    state = "failed" if gate.level == "fail" else "warned"
-    return GateOutcome(gate.name, key, state, value, "; ".join(filter(None, [text, gate.advice])))
+    return _found(gate, key, word in gate.passes, value, [text])
 
 
-def _hold(gate: Gate, key: str, value: float, suffix: str) -> GateOutcome:
+def _hold(gate: Gate, key: str, value: float, suffix: str) -> GateVerdict:
     """Return the verdict on ``value``; ``suffix`` follows the number in the message."""
     limits = []
     if gate.max is not None and value > gate.max:
         limits.append(f"{value:.4g}{suffix} is above {gate.max:g}")
     if gate.min is not None and value < gate.min:
         limits.append(f"{value:.4g}{suffix} is below {gate.min:g}")
-    if not limits:
-        return GateOutcome(gate.name, key, "passed", value, f"{value:.4g}{suffix}")
-    state = "failed" if gate.level == "fail" else "warned"
-    text = "; ".join([*limits, gate.advice] if gate.advice else limits)
-    return GateOutcome(gate.name, key, state, value, text)
+    return _found(gate, key, not limits, value, limits or [f"{value:.4g}{suffix}"])
 
 
 def _against_accepted(
     gate: Gate, root: Path, model: str, baseline: Path, content: Mapping[str, Any]
-) -> list[GateOutcome]:
+) -> list[GateVerdict]:
     """Hold the change since the accepted values, beyond its uncertainty, against the limit."""
     from bampipe.results.ingest import IngestResult
 

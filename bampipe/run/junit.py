@@ -5,9 +5,12 @@ from __future__ import annotations
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from bampipe.errors import printable
-from bampipe.run.gates import GateOutcome
+
+if TYPE_CHECKING:
+    from bampipe.results.run import GateVerdict
 
 
 @dataclass(frozen=True)
@@ -21,7 +24,7 @@ class Suite:
     """
 
     name: str
-    verdicts: tuple[GateOutcome, ...]
+    verdicts: tuple[GateVerdict, ...]
     error: str = ""
 
 

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError, printable
-from bampipe.run.gates import GateOutcome
 from bampipe.run.models import BASE
 from bampipe.run.request import Outcome
+
+if TYPE_CHECKING:
+    from bampipe.results.run import GateVerdict
 
 STATES = {0: "passed", 1: "**gate failed**", 2: "**bad input**", 3: "**crashed**"}
 MOST = 30
@@ -72,7 +75,7 @@ def _session(outcome: Outcome, model: str) -> tuple[str, ...]:
     )
 
 
-def _count(verdicts: Iterable[GateOutcome], state: str) -> int:
+def _count(verdicts: Iterable[GateVerdict], state: str) -> int:
     return sum(verdict.state == state for verdict in verdicts)
 
 

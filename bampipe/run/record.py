@@ -179,7 +179,7 @@ def lock(root: Path, wait: bool, listen: Listener = unheard) -> Iterator[None]:
     Args:
         root: the run folder; made if it is not there.
         wait: wait while another process holds it; else refuse.
-        listen: told before waiting, and where the last holder was killed.
+        listen: called before waiting, and where the last holder was killed.
 
     Raises:
         InputError: another process holds it and ``wait`` is false; it holds a link; or the disk

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bampipe.errors import InputError
-from bampipe.run.gates import GateOutcome
 from bampipe.stages import base
 
 if TYPE_CHECKING:
     from bampipe.declarations.pipeline import Pipeline
+    from bampipe.results.run import GateVerdict
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ class Outcome:
     root: Path
     state: str
     steps: tuple[StepResult, ...] = ()
-    verdicts: tuple[GateOutcome, ...] = ()
+    verdicts: tuple[GateVerdict, ...] = ()
     error: str = ""
     traceback: str = ""
 
@@ -124,7 +124,7 @@ class Outcome:
                 result.step: {"state": result.state, "summary": result.summary}
                 for result in self.steps
             },
-            "gates": [verdict.content() for verdict in self.verdicts],
+            "gates": [verdict.model_dump(mode="json") for verdict in self.verdicts],
         }
 
 

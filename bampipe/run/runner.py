@@ -6,15 +6,19 @@ import json
 import shutil
 import time
 from datetime import UTC, datetime
+from typing import TYPE_CHECKING
 
 from bampipe import compile_ahead
 from bampipe.errors import InputError
 from bampipe.run import accepted, hashing, models, record, staging
 from bampipe.run.events import Event, Listener, unheard
-from bampipe.run.gates import GateOutcome, judge_gates
+from bampipe.run.gates import judge_gates
 from bampipe.run.request import Outcome, Request, Step, StepResult, selected
 from bampipe.run.state import RunState, lasting
 from bampipe.stages import base
+
+if TYPE_CHECKING:
+    from bampipe.results.run import GateVerdict
 
 
 class _Runner:
@@ -37,9 +41,9 @@ class _Runner:
         state = self.state
         config = state.configure(step, state.settings(step))
         module = base.load_stage(step.stage)
-        declared = module.inputs(config)
+        declared = base.paths_of(step.model, module.INPUTS)
         inputs = state.inputs(step, declared)
-        outputs = module.outputs(config)
+        outputs = base.paths_of(step.model, module.OUTPUTS)
         out = staging.prepare(self.root, step, outputs)
 
         def progress(fraction: float, message: str) -> None:
@@ -100,7 +104,7 @@ class _Runner:
                     models.read(self.root, self.request.model)
             for step in self.state.steps(stage):
                 results.append(self.step(step))
-        verdicts: list[GateOutcome] = []
+        verdicts: list[GateVerdict] = []
         if self.request.judged:
             baseline = self.request.accepted or accepted.accepted_folder(self.root.parent)
             for gate in pipeline.gates:
@@ -123,7 +127,7 @@ def run_session(request: Request, listen: Listener = unheard) -> Outcome:
 
     Args:
         request: what to run, where.
-        listen: told of every event.
+        listen: called with every event.
 
     Returns:
         What came of it.

@@ -11,13 +11,12 @@ from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError
 from bampipe.files import digest_content, digest_file, digest_input
 from bampipe.run import hashing, models, record
-from bampipe.run.gates import GateOutcome
 from bampipe.run.request import Request, Step
 from bampipe.run.settings import configure, plain
 from bampipe.stages import base
 
 if TYPE_CHECKING:
-    from bampipe.results.run import RunResult
+    from bampipe.results.run import GateVerdict, RunResult
 
 NEUTRAL = ("session", "jobs")
 """Fields of a configuration that no result depends on: a place, and a number of processes."""
@@ -153,7 +152,8 @@ class RunState:
         if made is not None and made.settings == self.settings(step) and made.code == code:
             return made.config, made.declared_inputs, None
         config = self.configure(step, self.settings(step))
-        return lasting(config), base.load_stage(step.stage).inputs(config), config
+        declared = base.paths_of(step.model, base.load_stage(step.stage).INPUTS)
+        return lasting(config), declared, config
 
     def reason(self, step: Step) -> str:
         """Why the step must run; "" if it need not."""
@@ -198,15 +198,14 @@ class RunState:
         """Write ``run.json``."""
         self._write(self._noted())
 
-    def close(self, verdicts: Iterable[GateOutcome]) -> None:
+    def close(self, verdicts: Iterable[GateVerdict]) -> None:
         """Write ``run.json`` with the verdicts of the gates, unless it says the same already."""
-        from bampipe.results.run import GateVerdict, PipelineUsed
+        from bampipe.results.run import PipelineUsed
 
         noted = self._noted()
         if self.request.judged:
             used = PipelineUsed.model_validate(self.request.pipeline.content())
-            gates = tuple(GateVerdict.model_validate(verdict.content()) for verdict in verdicts)
-            noted = noted.model_copy(update={"pipeline": used, "gates": gates})
+            noted = noted.model_copy(update={"pipeline": used, "gates": tuple(verdicts)})
         if noted != self.written:
             self._write(noted)
         if self.memory.changed:
@@ -241,7 +240,7 @@ def _maker(name: str) -> str:
         return head if head in base.STAGES else ""
     model = rest.partition("/")[0]
     for stage in base.PER_MODEL:
-        if name in base.load_stage(stage).outputs(configure(stage, {"model": model})):
+        if name in base.paths_of(model, base.load_stage(stage).OUTPUTS):
             return stage
     return ""
 

@@ -2,9 +2,10 @@
 
 A stage is a module with
 
-- ``NAME`` and ``SUMMARY``: its command and one sentence on it;
+- ``SUMMARY``: one sentence on it;
+- ``INPUTS`` and ``OUTPUTS``: paths relative to the run folder, in which ``{model}`` stands for the
+  name of the model;
 - ``Config``: a frozen dataclass, every field typed, with a default, described in the docstring;
-- ``inputs(config)`` and ``outputs(config)``: tuples of paths relative to the run folder;
 - ``execute(run, out, config, progress)``: reads below ``run``, writes every output below
   ``out`` and returns a summary that JSON can hold.
 
@@ -14,7 +15,7 @@ files match it (``"models/*/validate.json"``, ``"report/figures/*.svg"``, ``"rep
 
 A stage whose ``Config`` has a field ``model`` runs once for each model. The runner writes
 ``models/<model>/model.toml`` before the first such stage, so those stages only read it
-(declare ``models/<model>/model.toml`` and ``models/<model>/effects/*.toml`` as inputs).
+(`declarations.model_file.MODEL_INPUTS`).
 A field ``jobs`` of a ``Config`` says how many processes to use and must not change the result.
 A stage whose ``Config`` has a field ``session`` reads that session folder, and the runner
 hashes the session file and the files it names.
@@ -37,15 +38,10 @@ from bampipe.progress import Progress
 class Stage(Protocol):
     """The module of a stage (see the module docstring)."""
 
-    NAME: str
     SUMMARY: str
+    INPUTS: tuple[str, ...]
+    OUTPUTS: tuple[str, ...]
     Config: type[Any]
-
-    def inputs(self, config: Any) -> tuple[str, ...]:
-        """Return the paths the stage reads."""
-
-    def outputs(self, config: Any) -> tuple[str, ...]:
-        """Return the paths the stage writes."""
 
     def execute(
         self, run: RunFolder, out: Path, config: Any, progress: Progress
@@ -95,3 +91,8 @@ def load_stage(name: str) -> Stage:
     """
     check_stage_name(name)
     return cast(Stage, importlib.import_module(f"bampipe.stages.{name}"))
+
+
+def paths_of(model: str, declared: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the paths that a stage has ``declared``, for ``model``."""
+    return tuple(path.replace("{model}", model) for path in declared)

@@ -17,8 +17,9 @@ from bampipe.results.identify import IdentifyResult
 from bampipe.results.validate import ValidateResult
 from bampipe.schema import STRICT, Positive
 
-NAME = "compare"
 SUMMARY = "Held-out error of every model version, and which parameters moved"
+INPUTS = ("models/*/model.toml", "models/*/identify.json", "models/*/validate.json")
+OUTPUTS = ("compare.json",)
 
 
 @checked_dataclass(frozen=True, config=STRICT)
@@ -31,16 +32,6 @@ class Config:
     """
 
     sigmas: Positive = 3.0
-
-
-def inputs(config: Config) -> tuple[str, ...]:
-    """Return the paths the stage reads."""
-    return ("models/*/model.toml", "models/*/identify.json", "models/*/validate.json")
-
-
-def outputs(config: Config) -> tuple[str, ...]:
-    """Return the paths the stage writes."""
-    return ("compare.json",)
 
 
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:

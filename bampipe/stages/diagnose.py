@@ -12,9 +12,9 @@ import pandas as pd
 from pydantic import Field
 from pydantic.dataclasses import dataclass as checked_dataclass
 
-from bampipe.data.run_folder import RunFolder
+from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
 from bampipe.data.store import write_parquet
-from bampipe.declarations.model_file import identified, load_model, model_inputs, read_recipe
+from bampipe.declarations.model_file import IDENTIFIED_MODEL, identified, load_model, read_recipe
 from bampipe.discover.advice import advise
 from bampipe.discover.description import describe
 from bampipe.discover.diagnosis import diagnose
@@ -39,8 +39,9 @@ from bampipe.schema import STRICT, Count
 from bampipe.trials.folds import HELD_OUT
 from bampipe.trials.measured import MeasuredTrials, read_measured_trials
 
-NAME = "diagnose"
 SUMMARY = "Find which physical effect the model lacks"
+INPUTS = (*INGESTED, *FILTERED, *IDENTIFIED_MODEL)
+OUTPUTS = ("models/{model}/diagnose.json", "models/{model}/map_variables.parquet")
 
 
 @checked_dataclass(frozen=True, config=STRICT)
@@ -60,25 +61,6 @@ class Config:
     significance: Annotated[float, Field(gt=0, lt=1)] = 0.01
     jobs: Count = 0
     seed: Count = 0
-
-
-def inputs(config: Config) -> tuple[str, ...]:
-    """Return the paths the stage reads."""
-    return (
-        "ingest/session.json",
-        "ingest/trials.parquet",
-        "ingest/samples.parquet",
-        "filter/kinematics.parquet",
-        "filter/filter.json",
-        f"models/{config.model}/identify.json",
-        *model_inputs(config.model),
-    )
-
-
-def outputs(config: Config) -> tuple[str, ...]:
-    """Return the paths the stage writes."""
-    folder = f"models/{config.model}"
-    return (f"{folder}/diagnose.json", f"{folder}/map_variables.parquet")
 
 
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:

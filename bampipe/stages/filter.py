@@ -12,7 +12,7 @@ import pandas as pd
 from pydantic import Field
 from pydantic.dataclasses import dataclass as checked_dataclass
 
-from bampipe.data.run_folder import MOVING, RunFolder
+from bampipe.data.run_folder import FILTERED, INGESTED, MOVING, RunFolder
 from bampipe.data.store import ParquetAppender, read_parquet
 from bampipe.declarations.model_file import load_device
 from bampipe.errors import InputError
@@ -23,15 +23,16 @@ from bampipe.progress import Progress
 from bampipe.results.filter import AxisDifferentiation, FilterResult, ForceFilter, ResidualBand
 from bampipe.results.ingest import EncoderChannel, IngestResult
 from bampipe.schema import STRICT, NotNegative, Positive
-from bampipe.trials.band import AxisBand, find_band
+from bampipe.trials.band import find_band
 from bampipe.trials.cache import TrialCache
 from bampipe.trials.kinematics import AxisFilter, Kinematics
 from bampipe.trials.motion import input_derivatives, n_samples
 from bampipe.trials.reading import read_motion_of
 from bampipe.trials.sensors import Sensors
 
-NAME = "filter"
 SUMMARY = "Velocity and acceleration from the encoders, with error bands"
+INPUTS = (*INGESTED, "ingest/device.toml?")
+OUTPUTS = FILTERED
 
 _SHORTEST = 32
 _TUNING_PART = 2000
@@ -67,21 +68,6 @@ class Config:
     force_cutoff_hz: Positive = 25.0
     band_hz: NotNegative = 0.0
     tuning_samples: Annotated[int, Field(ge=1000)] = 120_000
-
-
-def inputs(config: Config) -> tuple[str, ...]:
-    """Return the paths the stage reads."""
-    return (
-        "ingest/trials.parquet",
-        "ingest/samples.parquet",
-        "ingest/session.json",
-        "ingest/device.toml?",
-    )
-
-
-def outputs(config: Config) -> tuple[str, ...]:
-    """Return the paths the stage writes."""
-    return ("filter/kinematics.parquet", "filter/filter.json")
 
 
 @dataclass(frozen=True)
@@ -160,7 +146,7 @@ def _bands(
     kinematics: Kinematics,
     ids: Sequence[str],
     config: Config,
-) -> dict[str, AxisBand]:
+) -> dict[str, ResidualBand]:
     """Find the band in which residuals are compared, from the trials just written."""
     device = load_device(run, session.device)
     system = compile_model(Model(device))
@@ -312,7 +298,7 @@ def _result(
     levels: dict[str, list[tuple[float, float, float]]],
     interpolated: dict[str, float],
     skipped: dict[str, str],
-    bands: Mapping[str, AxisBand],
+    bands: Mapping[str, ResidualBand],
 ) -> FilterResult:
     """Return what filter.json holds."""
     entries = {}
@@ -323,7 +309,7 @@ def _result(
             position_sd=position,
             velocity_sd=velocity,
             acceleration_sd=acceleration,
-            band=ResidualBand(**vars(bands[axis])),
+            band=bands[axis],
             **choice.report,
         )
     widest = ", ".join(f"{axis} {c.filter.bandwidth_hz:.1f} Hz" for axis, c in choices.items())

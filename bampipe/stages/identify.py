@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic.dataclasses import dataclass as checked_dataclass
 
-from bampipe.data.run_folder import RunFolder
+from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
 from bampipe.data.store import write_parquet
-from bampipe.declarations.model_file import load_model, model_inputs, read_recipe
+from bampipe.declarations.model_file import MODEL_INPUTS, load_model, read_recipe
 from bampipe.discover.start import search_start
 from bampipe.errors import InputError
 from bampipe.estimate.least_squares import fit
@@ -41,8 +41,13 @@ from bampipe.trials.reading import (
 )
 from bampipe.trials.residuals import problem_of
 
-NAME = "identify"
 SUMMARY = "Parameters of the model with uncertainties, from the free trials"
+INPUTS = (*INGESTED, *FILTERED, *MODEL_INPUTS)
+OUTPUTS = (
+    "models/{model}/identify.json",
+    "models/{model}/states.parquet",
+    "models/{model}/trace.parquet",
+)
 
 Array = NDArray[np.float64]
 
@@ -66,24 +71,6 @@ class Config(FilterChoice):
     start_factor: Positive = 1.0
     input_timing: bool = True
     remove_bias: bool = True
-
-
-def inputs(config: Config) -> tuple[str, ...]:
-    """Return the paths the stage reads."""
-    return (
-        "ingest/trials.parquet",
-        "ingest/samples.parquet",
-        "ingest/session.json",
-        "filter/kinematics.parquet",
-        "filter/filter.json",
-        *model_inputs(config.model),
-    )
-
-
-def outputs(config: Config) -> tuple[str, ...]:
-    """Return the paths the stage writes."""
-    folder = f"models/{config.model}"
-    return (f"{folder}/identify.json", f"{folder}/states.parquet", f"{folder}/trace.parquet")
 
 
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:

@@ -20,7 +20,7 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 
 from bampipe.data.quality import CleaningLimits, CleanTrial, clean
 from bampipe.data.readers import read_trial
-from bampipe.data.run_folder import MOVING, RunFolder
+from bampipe.data.run_folder import INGESTED, MOVING, RunFolder
 from bampipe.data.session import SECONDS, Session, TrialEntry, inside, read_session
 from bampipe.data.store import ParquetAppender, write_parquet
 from bampipe.errors import InputError
@@ -33,8 +33,9 @@ from bampipe.results.ingest import EncoderChannel, ForceChannels, IngestResult, 
 from bampipe.schema import STRICT
 from bampipe.trials.sensors import RecordNoise, settle_encoder, settle_force
 
-NAME = "ingest"
 SUMMARY = "Read a session's raw logs, check and repair the trials, bring them to SI units"
+INPUTS: tuple[str, ...] = ()
+OUTPUTS = (*INGESTED, "ingest/device*.toml")
 
 RATE_TOLERANCE = 0.02
 """The announced sample rate is used where the time stamps agree with it this well."""
@@ -53,21 +54,6 @@ class Config(CleaningLimits):
     largest_trial_mb: Annotated[int, Field(ge=1)] = 4096
 
 
-def inputs(config: Config) -> tuple[str, ...]:
-    """Nothing in the run folder: the session is read."""
-    return ()
-
-
-def outputs(config: Config) -> tuple[str, ...]:
-    """Return the paths the stage writes; the device file only where the lab brings its own."""
-    return (
-        "ingest/session.json",
-        "ingest/trials.parquet",
-        "ingest/samples.parquet",
-        "ingest/device*.toml",
-    )
-
-
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
     """Write the sound trials of a session and what became of each.
 
@@ -80,7 +66,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     device = _device(session)
     _match(session, device)
     if device.drive:
-        # What a motor is told, unlike a sensor, may rest or stand at its limit for long.
+        # A command to a motor, unlike a sensor, may rest or stand at its limit for long.
         config = replace(config, frozen_share=1.0, saturated_share=1.0)
     (out / "ingest").mkdir(parents=True, exist_ok=True)
     rows: list[dict[str, object]] = []

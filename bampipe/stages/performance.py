@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from pydantic import Field
 from pydantic.dataclasses import dataclass as checked_dataclass
 
-from bampipe.data.run_folder import RunFolder
+from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
 from bampipe.data.store import read_parquet
-from bampipe.declarations.model_file import identified, load_model, model_inputs
+from bampipe.declarations.model_file import IDENTIFIED_MODEL, identified, load_model
 from bampipe.errors import InputError
 from bampipe.physics import System, compile_model
 from bampipe.progress import Progress
@@ -29,8 +29,9 @@ from bampipe.results.performance import (
 from bampipe.results.stiffness import StiffnessResult
 from bampipe.schema import STRICT
 
-NAME = "performance"
 SUMMARY = "Workspace, stiffness, friction, inertia and force at the handle"
+INPUTS = (*INGESTED, *FILTERED, "stiffness/stiffness.json?", *IDENTIFIED_MODEL)
+OUTPUTS = ("models/{model}/performance.json",)
 
 Array = NDArray[np.float64]
 
@@ -46,23 +47,6 @@ class Config:
 
     model: str = "base"
     points: Annotated[int, Field(ge=2)] = 15
-
-
-def inputs(config: Config) -> tuple[str, ...]:
-    """Return the paths the stage reads."""
-    return (
-        "ingest/session.json",
-        "ingest/samples.parquet",
-        "filter/kinematics.parquet",
-        "stiffness/stiffness.json?",
-        *model_inputs(config.model),
-        f"models/{config.model}/identify.json",
-    )
-
-
-def outputs(config: Config) -> tuple[str, ...]:
-    """Return the paths the stage writes."""
-    return (f"models/{config.model}/performance.json",)
 
 
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:

@@ -10,21 +10,22 @@ from bampipe.data.run_folder import RunFolder
 from bampipe.progress import Progress
 from bampipe.schema import STRICT
 
-NAME = "report"
 SUMMARY = "PDF and web page of everything found so far"
-
-_PER_MODEL = (
-    "model.toml",
-    "identify.json",
-    "trace.parquet",
-    "states.parquet",
-    "viscous.json",
-    "viscous.parquet",
-    "performance.json",
-    "validate.json",
-    "residuals.parquet",
-    "diagnose.json",
+INPUTS = (
+    "ingest/session.json",
+    "ingest/trials.parquet",
+    "ingest/samples.parquet?",
+    "filter/filter.json?",
+    "filter/kinematics.parquet?",
+    "stiffness/stiffness.json?",
+    "stiffness/loops.parquet?",
+    "models/*/model.toml",
+    "models/*/*.json",
+    "models/*/*.parquet",
+    "compare.json?",
+    "run.json?",  # the keys of the other stages
 )
+OUTPUTS = ("report/report.pdf", "report/report.html", "report/figures/*.svg")
 
 
 @checked_dataclass(frozen=True, config=STRICT)
@@ -37,27 +38,6 @@ class Config:
     """
 
     detail_model: str = ""
-
-
-def inputs(config: Config) -> tuple[str, ...]:
-    """Return the paths the stage reads; of ``run.json`` the keys of the other stages."""
-    return (
-        "ingest/session.json",
-        "ingest/trials.parquet",
-        "ingest/samples.parquet?",
-        "filter/filter.json?",
-        "filter/kinematics.parquet?",
-        "stiffness/stiffness.json?",
-        "stiffness/loops.parquet?",
-        *(f"models/*/{name}" for name in _PER_MODEL),
-        "compare.json?",
-        "run.json?",
-    )
-
-
-def outputs(config: Config) -> tuple[str, ...]:
-    """Return the paths the stage writes."""
-    return ("report/report.pdf", "report/report.html", "report/figures/*.svg")
 
 
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:

@@ -11,7 +11,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from pydantic.dataclasses import dataclass as checked_dataclass
 
-from bampipe.data.run_folder import RunFolder
+from bampipe.data.run_folder import INGESTED, RunFolder
 from bampipe.data.store import ParquetAppender, read_parquet
 from bampipe.declarations.model_file import load_device
 from bampipe.errors import InputError
@@ -29,8 +29,9 @@ from bampipe.results.stiffness import (
 )
 from bampipe.schema import STRICT, Positive
 
-NAME = "stiffness"
 SUMMARY = "Stiffness, loop width and bandwidth of the locked axes"
+INPUTS = (*INGESTED, "ingest/device.toml?")
+OUTPUTS = ("stiffness/stiffness.json", "stiffness/loops.parquet")
 
 Array = NDArray[np.float64]
 
@@ -45,21 +46,6 @@ class Config:
     """
 
     largest_drift: Positive = 0.05
-
-
-def inputs(config: Config) -> tuple[str, ...]:
-    """Return the paths the stage reads."""
-    return (
-        "ingest/trials.parquet",
-        "ingest/samples.parquet",
-        "ingest/session.json",
-        "ingest/device.toml?",
-    )
-
-
-def outputs(config: Config) -> tuple[str, ...]:
-    """Return the paths the stage writes."""
-    return ("stiffness/stiffness.json", "stiffness/loops.parquet")
 
 
 @dataclass(frozen=True)

@@ -11,11 +11,10 @@ import pandas as pd
 from numpy.typing import NDArray
 from pydantic.dataclasses import dataclass as checked_dataclass
 
-from bampipe.data.run_folder import RunFolder
+from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
 from bampipe.data.store import read_parquet, write_parquet
-from bampipe.declarations.model_file import identified, load_model, model_inputs
+from bampipe.declarations.model_file import IDENTIFIED_MODEL, identified, load_model
 from bampipe.errors import InputError
-from bampipe.estimate.least_squares import Problem
 from bampipe.identification.free_run import free_runs
 from bampipe.physics import System, compile_model
 from bampipe.progress import Progress
@@ -32,13 +31,13 @@ from bampipe.results.validate import (
 from bampipe.schema import STRICT, Count
 from bampipe.trials.folds import HELD_OUT, Folds
 from bampipe.trials.measured import MeasuredTrials, read_measured_trials
-from bampipe.trials.motion import Motion
 from bampipe.trials.noise_floor import NoiseFloor, find_noise_floor, floor_replays
 from bampipe.trials.reading import held_out_trials, require_sound_motions
-from bampipe.trials.residuals import Evidence, gather_evidence, problem_of
+from bampipe.trials.residuals import Evidence, gather_evidence
 
-NAME = "validate"
 SUMMARY = "Predicted against measured torque and force, on trials that the fit has not seen"
+INPUTS = (*INGESTED, *FILTERED, *IDENTIFIED_MODEL)
+OUTPUTS = ("models/{model}/validate.json", "models/{model}/residuals.parquet")
 
 REFUSAL_RATIO = 1.2
 """Error of the published parameters over that of parameters refitted without each trial, beyond
@@ -68,25 +67,6 @@ class Config:
     seed: Count = 0
     free_run: bool = True
     hold_out_by: str = ""
-
-
-def inputs(config: Config) -> tuple[str, ...]:
-    """Return the paths the stage reads."""
-    return (
-        "ingest/trials.parquet",
-        "ingest/session.json",
-        "ingest/samples.parquet",
-        "filter/kinematics.parquet",
-        "filter/filter.json",
-        *model_inputs(config.model),
-        f"models/{config.model}/identify.json",
-    )
-
-
-def outputs(config: Config) -> tuple[str, ...]:
-    """Return the paths the stage writes."""
-    folder = f"models/{config.model}"
-    return (f"{folder}/validate.json", f"{folder}/residuals.parquet")
 
 
 @dataclass(frozen=True)
@@ -120,11 +100,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     require_sound_motions(system, trials.motions)
     progress(0.1, "held-out fits")
     evidence = gather_evidence(system, trials.motions, trials.band, p, trials.folds)
-    problem = problem_of(system, trials.motions, trials.band)
-    compared = [
-        _compare(system, motion, problem, evidence, number, p)
-        for number, motion in enumerate(trials.motions)
-    ]
+    compared = [_compare(evidence, number, p) for number in range(len(trials.motions))]
     notes = []
     if trials.folds.nothing_held_out:
         notes.append("One trial, or one group: nothing is held out; the error is that of the fit.")
@@ -151,21 +127,20 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     return _result(system, trials, compared, floor, free, notes, config.model).write(out)
 
 
-def _compare(
-    system: System, motion: Motion, problem: Problem, evidence: Evidence, number: int, p: Array
-) -> _Compared:
+def _compare(evidence: Evidence, number: int, p: Array) -> _Compared:
     """Compare one trial with the model as published, held out, and without friction."""
+    system, motion = evidence.system, evidence.motions[number]
     frictionless = p.copy()
     for i, item in enumerate(system.parameters):
         if item.name.startswith(("viscous.", "coulomb.")):
             frictionless[i] = 0.0
-    band, folds = problem.band, evidence.folds
+    band, folds = evidence.band, evidence.folds
     u = motion.inputs(system.inputs)
     z = system.memory(motion.q, motion.qd, motion.qdd, u, p, motion.t)
     applied = system.applied(motion.q, motion.qd, motion.qdd, z, u, p)
     force = [system.inputs.index(name) for name in system.model.device.forces]
     rows = band.kept(len(motion.t))
-    residual = band.thin(problem.residual(number, np.append(p, 0.0)))
+    residual = band.thin(evidence.unfiltered_at(number, p)[0])
     push = np.linalg.pinv(system.input_map(motion.q[rows], u[rows], p))
     return _Compared(
         trial_id=motion.trial_id,
@@ -174,7 +149,7 @@ def _compare(
         measured=band.thin(applied),
         residual=residual,
         residual_held_out=evidence.held_out_residual(number),
-        residual_without_friction=band.thin(problem.residual(number, np.append(frictionless, 0.0))),
+        residual_without_friction=band.thin(evidence.unfiltered_at(number, frictionless)[0]),
         force=band.thin_input(u[:, force]),
         force_residual=np.einsum("tfq,tq->tf", push, residual),
         judged=folds.judged[number] and not folds.nothing_held_out,

@@ -15,9 +15,9 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass as checked_dataclass
 from scipy import stats
 
-from bampipe.data.run_folder import RunFolder
+from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
 from bampipe.data.store import read_parquet, write_parquet
-from bampipe.declarations.model_file import load_model, model_inputs
+from bampipe.declarations.model_file import IDENTIFIED_MODEL, load_model
 from bampipe.estimate.filter_uncertainty import sandwich_covariance
 from bampipe.estimate.unscented import Trial
 from bampipe.identification.filter_choice import FilterChoice
@@ -42,8 +42,9 @@ from bampipe.schema import STRICT, Positive
 from bampipe.trials.motion import Motion
 from bampipe.trials.reading import read_motion, read_sensors
 
-NAME = "viscous"
 SUMMARY = "Cartesian damping that the brakes rendered in the viscous trials, against the command"
+INPUTS = (*INGESTED, *FILTERED, *IDENTIFIED_MODEL)
+OUTPUTS = ("models/{model}/viscous.json", "models/{model}/viscous.parquet")
 
 Array = NDArray[np.float64]
 
@@ -62,24 +63,6 @@ class Config(FilterChoice):
     model: str = "base"
     longest_step_s: Positive = 2e-3
     trace_rows: Annotated[int, Field(gt=0)] = 1000
-
-
-def inputs(config: Config) -> tuple[str, ...]:
-    """Return the paths the stage reads."""
-    return (
-        "ingest/trials.parquet",
-        "ingest/samples.parquet",
-        "ingest/session.json",
-        "filter/kinematics.parquet",
-        *model_inputs(config.model),
-        f"models/{config.model}/identify.json",
-    )
-
-
-def outputs(config: Config) -> tuple[str, ...]:
-    """Return the paths the stage writes."""
-    folder = f"models/{config.model}"
-    return (f"{folder}/viscous.json", f"{folder}/viscous.parquet")
 
 
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:

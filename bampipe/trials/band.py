@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import welch
 
 from bampipe.physics import System
+from bampipe.results.filter import ResidualBand
 from bampipe.trials.kinematics import Kinematics
 from bampipe.trials.motion import Motion
 from bampipe.trials.sensors import Sensors
@@ -25,29 +25,13 @@ _LONGEST = 5
 """Trials from which the band is found, spread over the session."""
 
 
-@dataclass(frozen=True)
-class AxisBand:
-    """The band of one axis.
-
-    Attributes:
-        cutoff_hz: of the low-pass; reason: in words.
-        force_hz: frequency below which the applied force has its power; motion_hz: bandwidth of
-            the filtered motion.
-    """
-
-    cutoff_hz: float
-    reason: str
-    force_hz: float
-    motion_hz: float
-
-
 def find_band(
     system: System,
     motions: Sequence[Motion],
     sensors: Sensors,
     kinematics: Kinematics,
     chosen_hz: float = 0.0,
-) -> dict[str, AxisBand]:
+) -> dict[str, ResidualBand]:
     """Find where motion and force carry signal above noise, axis by axis.
 
     The band ends where 95 % of the power of the applied force above its noise is covered, but not
@@ -80,7 +64,9 @@ def find_band(
         else:
             cutoff = max(most, least)
             reason = f"the force goes on to {force_hz:.3g} Hz, the motion is known up to here"
-        found[axis] = AxisBand(cutoff, reason, force_hz, motion_hz)
+        found[axis] = ResidualBand(
+            cutoff_hz=cutoff, reason=reason, force_hz=force_hz, motion_hz=motion_hz
+        )
     return found
 
 

@@ -191,7 +191,7 @@ class Evidence:
         step = self.held_out_steps[trial]
         if self.is_linear or not step.any():
             return np.asarray(self.residual[trial] + self.jacobian[trial] @ step)
-        found, _ = self._unfiltered_at(trial, self.held_out_parameters(trial))
+        found, _ = self.unfiltered_at(trial, self.held_out_parameters(trial))
         return self.band.thin(found) * self.used[trial]
 
     def held_out_parameters(self, trial: int) -> Array:
@@ -203,10 +203,11 @@ class Evidence:
     def unfiltered(self, trial: int) -> tuple[Array, Array]:
         """Residual (T, n_q) of a trial before the low-pass, and internal states (T, n_z)."""
         if trial not in self._unfiltered:
-            self._unfiltered[trial] = self._unfiltered_at(trial, self.p)
+            self._unfiltered[trial] = self.unfiltered_at(trial, self.p)
         return self._unfiltered[trial]
 
-    def _unfiltered_at(self, trial: int, p: Array) -> tuple[Array, Array]:
+    def unfiltered_at(self, trial: int, p: Array) -> tuple[Array, Array]:
+        """The same with the parameters ``p``, (n_p,)."""
         u = self.motions[trial].inputs(self.system.inputs)
         return _residual_and_memory(self.system, self.motions[trial], u, p)
 

@@ -25,9 +25,9 @@ from bampipe.report.document import (
 )
 from bampipe.report.page import page
 from bampipe.report.typeset import pdf
+from bampipe.results.run import GateVerdict
 from bampipe.run import junit
 from bampipe.run.events import Event
-from bampipe.run.gates import GateOutcome
 from bampipe.run.markdown import summary
 from bampipe.run.request import Outcome
 
@@ -100,7 +100,13 @@ carriage = {{ column = "x", counts_per_unit = 1.0, unit = "m" }}
 
 @pytest.mark.parametrize("control", CONTROLS)
 def test_junit_is_xml_whatever_a_session_is_called(control: str) -> None:
-    verdict = GateOutcome(f"gate{control}", f"yaw{control}", "failed", 1.0, f"bad{control}{MARKUP}")
+    verdict = GateVerdict(
+        gate=f"gate{control}",
+        key=f"yaw{control}",
+        state="failed",
+        value=1.0,
+        message=f"bad{control}{MARKUP}",
+    )
     suites = [junit.Suite(f"s{control}", (verdict,)), junit.Suite(MARKUP, (), f"no{control}")]
     top = ElementTree.fromstring(junit.junit(suites))
     assert [suite.get("name") for suite in top] == [printable(f"s{control}"), MARKUP]

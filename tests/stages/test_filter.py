@@ -168,7 +168,7 @@ def test_same_bytes(run: RunFolder) -> None:
     hashes = []
     for _ in range(2):
         run_stage(run)
-        hashes.append([digest_file(run.path(name)) for name in stage.outputs(stage.Config())])
+        hashes.append([digest_file(run.path(name)) for name in stage.OUTPUTS])
     assert hashes[0] == hashes[1]
 
 

@@ -35,7 +35,7 @@ def test_writes_what_it_declares(run: RunFolder, tmp_path: Path) -> None:
     summary = report.execute(run, out, report.Config(), silent)
     written = {path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file()}
     assert written == {"report/report.pdf", "report/report.html"}
-    assert {"report/report.pdf", "report/report.html"} <= set(report.outputs(report.Config()))
+    assert {"report/report.pdf", "report/report.html"} <= set(report.OUTPUTS)
     assert summary["sections"] == [
         "Summary", "Data", "Identification", "Validation", "Diagnosis", "Provenance",
     ]  # fmt: skip
@@ -49,7 +49,7 @@ def test_device_without_paper_mentions_none(run: RunFolder, tmp_path: Path) -> N
 
 
 def test_required_inputs_are_those_of_ingest() -> None:
-    declared = report.inputs(report.Config())
+    declared = report.INPUTS
     required = {name for name in declared if "*" not in name and not name.endswith("?")}
     assert required == {"ingest/session.json", "ingest/trials.parquet"}
 

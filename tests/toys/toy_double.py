@@ -16,8 +16,9 @@ from bampipe.schema import STRICT
 from bampipe.stages.toy_read import log
 from bampipe.workers import process_pool
 
-NAME = "toy_double"
 SUMMARY = "Double the numbers"
+INPUTS = ("toy/numbers.json",)
+OUTPUTS = ("toy/double.json", "toy/parts/*.json")
 
 
 @checked_dataclass(frozen=True, config=STRICT)
@@ -26,14 +27,6 @@ class Config:
 
     factor: float = 2.0
     label: str = ""
-
-
-def inputs(config: Config) -> tuple[str, ...]:
-    return ("toy/numbers.json",)
-
-
-def outputs(config: Config) -> tuple[str, ...]:
-    return ("toy/double.json", "toy/parts/*.json")
 
 
 def multiply(factor: float, number: float) -> float:
@@ -54,7 +47,7 @@ def multiply_all(numbers: list[float], factor: float) -> list[float]:
 
 
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
-    log(NAME)
+    log("toy_double")
     numbers = read_json(run.path("toy/numbers.json"))["numbers"]
     doubled = multiply_all(numbers, config.factor)
     for index, value in enumerate(doubled):

@@ -12,8 +12,13 @@ from bampipe.progress import Progress
 from bampipe.schema import STRICT
 from bampipe.stages.toy_read import log
 
-NAME = "toy_fit"
 SUMMARY = "Fit the numbers"
+INPUTS = (
+    "toy/double.json",
+    "models/{model}/model.toml",
+    "models/{model}/effects/*.toml",
+)
+OUTPUTS = ("models/{model}/fit.json",)
 
 
 @checked_dataclass(frozen=True, config=STRICT)
@@ -23,20 +28,8 @@ class Config:
     model: str = "base"
 
 
-def inputs(config: Config) -> tuple[str, ...]:
-    return (
-        "toy/double.json",
-        f"models/{config.model}/model.toml",
-        f"models/{config.model}/effects/*.toml",
-    )
-
-
-def outputs(config: Config) -> tuple[str, ...]:
-    return (f"models/{config.model}/fit.json",)
-
-
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
-    log(f"{NAME}:{config.model}")
+    log(f"toy_fit:{config.model}")
     axes = read_json(run.path("toy/double.json"))["axes"]
     total = sum(axis["value"] for axis in axes.values())
     write_json(out / f"models/{config.model}/fit.json", {"total": total})

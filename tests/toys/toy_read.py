@@ -16,8 +16,9 @@ from bampipe.progress import Progress
 from bampipe.results.ingest import IngestResult
 from bampipe.schema import STRICT
 
-NAME = "toy_read"
 SUMMARY = "Read the numbers"
+INPUTS = ()
+OUTPUTS = ("ingest/session.json", "toy/numbers.json")
 
 
 @checked_dataclass(frozen=True, config=STRICT)
@@ -28,16 +29,8 @@ class Config:
     offset: int = 0
 
 
-def inputs(config: Config) -> tuple[str, ...]:
-    return ()
-
-
-def outputs(config: Config) -> tuple[str, ...]:
-    return ("ingest/session.json", "toy/numbers.json")
-
-
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
-    log(NAME)
+    log("toy_read")
     text = (Path(config.session) / "numbers.txt").read_text()
     if text == "crash":
         raise ZeroDivisionError("a fault of the stage")

@@ -12,8 +12,9 @@ from bampipe.progress import Progress
 from bampipe.schema import STRICT
 from bampipe.stages.toy_read import log
 
-NAME = "toy_sum"
 SUMMARY = "Sum up"
+INPUTS = ("models/*/fit.json", "toy/absent.json?")
+OUTPUTS = ("sum.json",)
 
 
 @checked_dataclass(frozen=True, config=STRICT)
@@ -21,16 +22,8 @@ class Config:
     """Nothing to set."""
 
 
-def inputs(config: Config) -> tuple[str, ...]:
-    return ("models/*/fit.json", "toy/absent.json?")
-
-
-def outputs(config: Config) -> tuple[str, ...]:
-    return ("sum.json",)
-
-
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
-    log(NAME)
+    log("toy_sum")
     totals = {name: read_json(run.path(name))["total"] for name in run.glob("models/*/fit.json")}
     write_json(out / "sum.json", totals)
     return {"totals": totals}
