@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bampipe.discover.candidates import candidate
-from bampipe.physics import System
+from bampipe.physics import System, compile_model
 from bampipe.physics.device import INPUT_ORDERS, derivative
 from bampipe.physics.recipe import Recipe
-from bampipe.physics.registry import device_from, effect_from
+from bampipe.physics.registry import device_from
 from bampipe.trials.measured import MeasuredTrials
 from bampipe.trials.motion import Motion
 from bampipe.trials.residuals import Evidence
@@ -124,7 +123,7 @@ def _confusion(
 def _torque(recipe: Recipe, evidence: Evidence, motion: Motion, name: str, own: Array) -> Array:
     """What one effect adds to the residual along a motion, (T, n_q)."""
     device = device_from(recipe.device)
-    system = candidate(device, name, [effect_from(e) for e in recipe.extra]).system
+    system = compile_model(replace(recipe, effects=(name,)).model())
     p = np.concatenate([evidence.p[: len(device.parameters)], own])
     u = motion.inputs(system.inputs)
     if system.moves_sensors:

@@ -22,6 +22,7 @@ from bampipe.physics.effect import Effect
 from bampipe.physics.parameter import Parameter
 from bampipe.physics.registry import effect as built_in
 from bampipe.physics.registry import effect_names
+from bampipe.physics.signals import follows
 from bampipe.trials.folds import Folds
 from bampipe.trials.residuals import Evidence
 
@@ -39,11 +40,13 @@ _DIVERGED = 1e30
 
 @dataclass(frozen=True)
 class Candidate:
-    """One effect at one target, on the bare device.
+    """One effect at one target.
 
     Attributes:
         name: canonical, ``stribeck:yaw``.
-        system: the device with this effect alone.
+        system: the device with this effect alone; with the other effects of the model before it
+            where it acts on what they leave.
+        joint: whether it is with them.
         own: its parameters.
         linear: positions in ``own`` of strengths in which the residual is linear.
         searched: positions in ``own`` of the parameters that are searched.
@@ -51,6 +54,7 @@ class Candidate:
 
     name: str
     system: System
+    joint: bool
     own: tuple[Parameter, ...]
     linear: tuple[int, ...]
     searched: tuple[int, ...]
@@ -96,14 +100,27 @@ def library(
     return tuple(name for name in names if name not in present)
 
 
-def candidate(device: Device, name: str, extra: Sequence[Effect] = ()) -> Candidate:
-    """The candidate called ``name``.
+def candidate_model(
+    device: Device, name: str, extra: Sequence[Effect] = (), present: Sequence[str] = ()
+) -> Model:
+    """The model in which an effect is a candidate for one that has the effects ``present``.
+
+    That is ``device`` with the effect alone, last with those present where they act on each other.
 
     Raises:
         InputError: there is no such effect or target.
     """
-    system = compile_model(Model(device, (name,), extra))
-    count = len(device.parameters)
+    full = Model(device, (*present, name), extra)
+    *earlier, item = full.effects
+    if any(follows(item, one, device) or follows(one, item, device) for one in earlier):
+        return full
+    return Model(device, (name,), extra)
+
+
+def candidate(model: Model) -> Candidate:
+    """The candidate that is the last effect of ``model``; see `candidate_model`."""
+    system, item = compile_model(model), model.effects[-1]
+    count = len(system.parameters) - len(item.parameters)
     own = system.parameters[count:]
     linear, searched = [], []
     for i, parameter in enumerate(own):
@@ -113,7 +130,8 @@ def candidate(device: Device, name: str, extra: Sequence[Effect] = ()) -> Candid
             linear.append(i)
         else:
             searched.append(i)
-    return Candidate(name, system, own, tuple(linear), tuple(searched))
+    joint = len(model.effects) > 1
+    return Candidate(item.name, system, joint, own, tuple(linear), tuple(searched))
 
 
 class Scorer:
@@ -307,7 +325,7 @@ class Scorer:
     def _sensitivity(self, item: Candidate, own: Array) -> Array:
         """Mean of log |d residual / d force| with the effect over without it, by axis, (n_q,)."""
         e, system = self.evidence, item.system
-        p = np.concatenate([e.p[: len(system.model.device.parameters)], own])
+        p = np.concatenate([e.p[: len(system.parameters) - len(own)], own])
         total = np.zeros(len(system.coordinates))
         for motion, used in zip(e.motions, e.used, strict=True):
             kept = e.band.kept(len(motion.t))
@@ -329,7 +347,7 @@ class Scorer:
     def _columns(self, item: Candidate, searched: Array) -> tuple[list[Array], list[Array]]:
         """Columns of the linear strengths (K, n_q, m) and change of the residual (K, n_q)."""
         e, system = self.evidence, item.system
-        count = len(system.model.device.parameters)
+        count = len(system.parameters) - len(item.own)
         p = np.concatenate([e.p[:count], [q.prior for q in item.own]])
         p[[count + i for i in item.searched]] = searched
         p[[count + i for i in item.linear]] = 0.0
@@ -338,18 +356,25 @@ class Scorer:
         for trial, (motion, used) in enumerate(zip(e.motions, e.used, strict=True)):
             u = motion.inputs(system.inputs)
             rows = []
-            if system.moves_sensors:
+            if item.joint:
+                plain, _ = e.unfiltered(trial)
+                at = motion.q, motion.qd, motion.qdd
+                z = system.memory(*at, u, p, motion.t)
+                for probe in _probes(p, count, item.linear):
+                    rows.append(
+                        system.applied(*at, z, u, probe) - system.required(*at, z, u, probe) - plain
+                    )
+            elif system.moves_sensors:
                 true = system.true_motion(motion.q, motion.qd, motion.qdd, u, p)
                 inputs = motion.inputs(e.system.inputs)
                 plain, memory = e.unfiltered(trial)
                 rows.append(e.system.residual(*true, memory, inputs, e.p) - plain)
             else:
                 z = system.memory(motion.q, motion.qd, motion.qdd, u, p, motion.t)
-                for i in item.linear or (None,):
-                    probe = p.copy()
-                    if i is not None:
-                        probe[count + i] = 1.0
-                    rows.append(system.contribution(motion.q, motion.qd, motion.qdd, z, u, probe))
+                rows = [
+                    system.contribution(motion.q, motion.qd, motion.qdd, z, u, probe)
+                    for probe in _probes(p, count, item.linear)
+                ]
             thin = self._thin(rows, used, axes)
             if item.linear:
                 columns.append(thin.transpose(0, 2, 1))
@@ -365,6 +390,14 @@ class Scorer:
         for r, values in enumerate(rows):
             out[:, r, axes] = self.evidence.band.thin(values[:, axes], axes) * used[:, axes]
         return out
+
+
+def _probes(p: Array, count: int, linear: Sequence[int]) -> list[Array]:
+    """``p`` with each of the ``linear`` strengths, numbered from ``count``, at one; or as it is."""
+    probes = [p.copy() for _ in linear or (None,)]
+    for probe, i in zip(probes, linear, strict=False):
+        probe[count + i] = 1.0
+    return probes
 
 
 def _search_range(parameter: Parameter) -> tuple[float, float, bool]:

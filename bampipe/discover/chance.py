@@ -8,15 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bampipe.discover.candidates import Candidate, Score, Scorer, candidate
+from bampipe.discover.candidates import Candidate, Score, Scorer, candidate, candidate_model
 from bampipe.discover.shape import explainable_share
-from bampipe.physics import Model, System, compile_model
+from bampipe.physics import System, compile_model
 from bampipe.physics.recipe import Recipe
 from bampipe.physics.registry import effect_from
 from bampipe.trials.measured import MeasuredTrials
@@ -88,14 +88,13 @@ def fit_trials(trials: MeasuredTrials, recipe: Recipe, start: Array) -> Evidence
 
 def candidates_of(recipe: Recipe, names: Sequence[str]) -> list[Candidate]:
     """Candidates by name, built once a process for each content of device and effects."""
-    bare = replace(recipe, effects=()).model()
-    extra = [effect_from(e) for e in recipe.extra]
+    device, extra = recipe.model().device, [effect_from(e) for e in recipe.extra]
     out = []
     for name in names:
-        key = Model(bare.device, (name,), extra).key
-        if key not in _candidates:
-            _candidates[key] = candidate(bare.device, name, extra)
-        out.append(_candidates[key])
+        model = candidate_model(device, name, extra, recipe.effects)
+        if model.key not in _candidates:
+            _candidates[model.key] = candidate(model)
+        out.append(_candidates[model.key])
     return out
 
 

@@ -8,7 +8,7 @@ from typing import Any, get_args
 import sympy as sp
 
 from bampipe.errors import InputError
-from bampipe.physics.device import INPUT_ORDERS, LAST_ORDER, derivative
+from bampipe.physics.device import INPUT_ORDERS, LAST_ORDER, Device, derivative
 from bampipe.physics.effect import EACH, BoundEffect, Link
 from bampipe.physics.vocabulary import Vocabulary
 
@@ -28,6 +28,26 @@ def order_of_action(effects: Iterable[BoundEffect]) -> list[BoundEffect]:
         return (_ORDER[link] if link else len(_ORDER), last, item.name)
 
     return sorted(effects, key=place)
+
+
+def follows(item: BoundEffect, earlier: BoundEffect, device: Device) -> bool:
+    """Whether what ``item`` does changes, beyond first order, with ``earlier`` in the model.
+
+    So it is behind a lag or a saturation of an input that it uses, behind what acts on the same
+    dry friction, and for two effects of positions.
+    """
+    if item.effect.kind == "measurement" or earlier.effect.kind == "measurement":
+        return item.effect.kind == earlier.effect.kind
+    if "dry" in item.effect.names:
+        return earlier.effect.kind in ("torque", "input")
+    if earlier.effect.acting_link not in ("lag", "saturation"):
+        return False
+    changed = {earlier.target} & set(device.channels) or set(device.forces)
+    if item.effect.kind == "input":
+        return item.target == earlier.target or not item.target
+    terms = {name.partition("_")[0] for name in item.effect.names}
+    by_load = bool(terms & {"applied", "load", "side"}) and changed <= set(device.forces)
+    return by_load or bool(item.effect.names & changed)
 
 
 class Signals:
