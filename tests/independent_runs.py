@@ -16,6 +16,7 @@ SHORT = {
     "bam": Conditions(creep=True, trials=3, seconds=8.0, rate_hz=250.0),
     "joint": Conditions(creep=True, trials=3, seconds=8.0),
     "axis": Conditions(creep=True, trials=3, seconds=5.0),
+    "damper": Conditions(trials=3, seconds=6.0),
 }
 PIPELINE = """schema = "bampipe.pipeline/1"
 name = "short"
