@@ -73,6 +73,38 @@ def sandwich_covariance(
     return np.asarray(found), len(gains)
 
 
+def leave_out(
+    trials: Sequence[Stored],
+    groups: Sequence[int],
+    n_states: int,
+    theta: Array,
+    covariance: Array,
+) -> dict[int, Array]:
+    """Return the filter's final parameters (nt,) without each group of trials, by group.
+
+    What a trial added in information form is taken off again: exact where the model is linear in
+    its parameters and the filter near its answer throughout.
+
+    Args:
+        trials: filtered, in order, parameters not walking; groups: of each of them.
+        n_states, theta, covariance: as of `sandwich_covariance`.
+    """
+    information = np.linalg.inv(covariance)
+    vector = information @ theta
+    gained: dict[int, tuple[Array, Array]] = {}
+    for trial, group in zip(trials, groups, strict=True):
+        after = np.linalg.inv(trial.covariance[-1][n_states:, n_states:])
+        end = after @ trial.mean[-1][n_states:]
+        matrix, moment = gained.get(group, (np.zeros_like(after), np.zeros_like(end)))
+        gained[group] = matrix + after - information, moment + end - vector
+        information, vector = after, end
+    final = trials[-1].mean[-1][n_states:]
+    return {
+        group: final + np.linalg.lstsq(information - matrix, matrix @ final - moment, rcond=None)[0]
+        for group, (matrix, moment) in gained.items()
+    }
+
+
 def _block_ends(t: Array, block_s: float) -> list[int]:
     """Rows at which blocks of at least ``block_s`` end; the last row always is one."""
     count = max(1, int((t[-1] - t[0]) / block_s))

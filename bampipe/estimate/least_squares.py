@@ -190,7 +190,9 @@ class _Linearised:
     @property
     def cost(self) -> float:
         """Negative log likelihood a sample where each axis has its own unknown scatter."""
-        return float(np.sum(np.log(np.maximum(_scatter(self.stacked), 1e-300))))
+        count = np.sum([np.sum(s.used, axis=0) for s in self.stacked], axis=0)
+        scatter = np.log(np.maximum(_scatter(self.stacked), 1e-300))
+        return float(np.sum(count * scatter) / max(np.mean(count), 1.0))
 
     def normal_equations(self) -> tuple[Array, Array]:
         weight = 1.0 / np.maximum(_scatter(self.stacked), 1e-300)

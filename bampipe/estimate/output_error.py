@@ -50,11 +50,15 @@ class OutputError:
         rms: (n_q,) position error that is left, rad or m.
         iterations: Gauss-Newton steps; converged: whether the last one gained nothing.
         at_bound: (n_free,) which parameters ended on a bound.
+        normal, moment: by segment, (n_free, n_free) and (n_free,), its part of the normal equations
+            at ``p``, initial states eliminated.
     """
 
     p: Array
     covariance: Array
     rms: Array
+    normal: Array
+    moment: Array
     iterations: int
     converged: bool
     at_bound: NDArray[np.bool_]
@@ -122,10 +126,14 @@ def fit_output(
         )
     first = _Shot(segments, free, upper, step, p, states, errors)
     found = descend(first, lower, upper, most_iterations, _TOLERANCE)
+    normal = np.array([slope.T @ slope for _, slope in found.last.projected])
+    moment = np.array([slope.T @ error for error, slope in found.last.projected])
     return OutputError(
         p=found.last.p,
-        covariance=_sandwich(found.last.projected),
+        covariance=_sandwich(normal, moment),
         rms=found.last.rms,
+        normal=normal,
+        moment=moment,
         iterations=found.iterations,
         converged=found.converged,
         at_bound=found.at_bound,
@@ -217,10 +225,9 @@ def _of_state(linear: _Linear, move: Array) -> Array:
     return np.asarray(np.linalg.lstsq(linear.by_state, rest, rcond=1e-12)[0])
 
 
-def _sandwich(parts: Sequence[tuple[Array, Array]]) -> Array:
-    bread = np.sum([slope.T @ slope for _, slope in parts], axis=0)
-    scores = np.array([slope.T @ error for error, slope in parts])
-    inverse = np.linalg.pinv(bread, hermitian=True)
-    count = len(parts)
+def _sandwich(normal: Array, scores: Array) -> Array:
+    """Covariance from the scatter of the scores of the segments."""
+    inverse = np.linalg.pinv(normal.sum(axis=0), hermitian=True)
+    count = len(scores)
     spread = scores.T @ scores * (count / max(count - scores.shape[1], 1))
     return np.asarray(inverse @ spread @ inverse)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -20,6 +20,8 @@ from bampipe.results.identify import (
     IdentifiabilityReport,
     IdentifyResult,
     InputTiming,
+    Method,
+    MethodTried,
     ParameterEstimate,
     StateBound,
 )
@@ -36,21 +38,46 @@ class Estimate:
         p: (n_p + 1,) all parameters, the timing of the inputs last.
         problem: the inverse dynamics, its free parameters those estimated, the timing last
             where it was.
+        method: that made it.
         covariance: (n, n) of the estimated parameters of the model.
         at_bound: (n,) which lie at the limit of their range.
+        held_out: by trial, (n_p + 1,) the parameters without the trials that it is left out with.
+        doubts: why it may not be believed, a clause each; none where nothing speaks against it.
         details: by parameter, further fields of its record.
         report: further fields of the result.
-        states, trace: tables.
+        tabulate: makes the tables of the states and of the parameters along the data.
     """
 
+    method: Method
     p: Array
     problem: Problem
     covariance: Array
     at_bound: NDArray[np.bool_]
+    held_out: Sequence[Array]
+    doubts: tuple[str, ...]
     details: Sequence[dict[str, float]]
     report: dict[str, Any]
-    states: pd.DataFrame
-    trace: pd.DataFrame
+    tabulate: Callable[[], tuple[pd.DataFrame, pd.DataFrame]]
+
+    @property
+    def evidence(self) -> dict[str, Any]:
+        """What a filter says of the model and the noise, whatever becomes of its parameters."""
+        return {key: self.report[key] for key in ("nis", "innovations", "noise")}
+
+    @property
+    def free(self) -> NDArray[np.int64]:
+        """(n,) places of the estimated parameters of the model."""
+        return self.problem.free[: len(self.covariance)]
+
+    @property
+    def value(self) -> Array:
+        """(n,) estimated parameters of the model."""
+        return np.asarray(self.p[self.free])
+
+    @property
+    def sd(self) -> Array:
+        """(n,) their standard deviations."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
 
 
 def input_timing(p: Array, variance: float) -> InputTiming:
@@ -72,32 +99,41 @@ def trace_row(
 
 
 def estimate_of_fit(
+    method: Method,
     system: System,
     motions: Sequence[Motion],
     problem: Problem,
     fit: LeastSquares | OutputError,
     p: Array,
+    held_out: Sequence[Array],
     details: Sequence[dict[str, float]],
-    rows: Sequence[Mapping[str, object]],
+    rows: Callable[[], Sequence[Mapping[str, object]]],
     **report: object,
 ) -> Estimate:
     """Return the estimate of a method that leaves the motion as the filter stage did.
 
     Args:
-        system: the model; motions: the trials; problem: what was fitted; fit: the outcome.
-        p: (n_p + 1,) the estimate, without bias.
-        details, report: as of `Estimate`; rows: of its trace.
+        method: its name; system: the model; motions: the trials; problem: what was fitted.
+        fit: the outcome; p: (n_p + 1,) the estimate, without bias.
+        held_out, details, report: as of `Estimate`; rows: makes those of its trace.
     """
-    model_indices = [k for k, place in enumerate(problem.free) if place < len(system.parameters)]
-    timed = len(model_indices) < problem.free.size
+    count = int(np.sum(problem.free < len(system.parameters)))
+    timed = count < problem.free.size
     sd = 3.0 * np.median(np.concatenate([motion.qd_sd for motion in motions]), axis=0)
-    frames = [as_filtered(system, motion, p[:-1]) for motion in motions]
+
+    def tabulate() -> tuple[pd.DataFrame, pd.DataFrame]:
+        frames = [as_filtered(system, motion, p[:-1]) for motion in motions]
+        return pd.concat(frames, ignore_index=True), pd.DataFrame(rows())
+
     return Estimate(
+        method=method,
         p=p,
         problem=problem,
-        covariance=fit.covariance[np.ix_(model_indices, model_indices)],
-        at_bound=fit.at_bound[model_indices],
-        details=[details[k] for k in model_indices],
+        covariance=fit.covariance[:count, :count],
+        at_bound=fit.at_bound[:count],
+        held_out=held_out,
+        doubts=() if fit.converged else ("its search has not converged",),
+        details=details[:count],
         report={
             "input_timing": input_timing(p, fit.covariance[-1, -1] if timed else 0.0),
             "convergence": Convergence(iterations=fit.iterations, converged=fit.converged),
@@ -106,8 +142,7 @@ def estimate_of_fit(
             },
             **report,
         },
-        states=pd.concat(frames, ignore_index=True),
-        trace=pd.DataFrame(rows),
+        tabulate=tabulate,
     )
 
 
@@ -117,14 +152,13 @@ def collect_result(
     identifiability: IdentifiabilityReport,
     motions: Sequence[Motion],
     model: str,
-    method: Literal["ukf", "least-squares", "output-error"],
     engine: Literal["compiled", "filterpy"],
+    methods: Mapping[Method, MethodTried],
     notes: Sequence[str],
 ) -> IdentifyResult:
     """Return what identify.json says."""
-    free = [i for i in estimate.problem.free if i < len(system.parameters)]
+    free, sd = estimate.free, estimate.sd
     names = tuple(system.parameters[i].name for i in free)
-    sd = np.sqrt(np.diag(estimate.covariance))
     parameters = {
         name: ParameterEstimate(
             estimate=estimate.p[place],
@@ -142,8 +176,9 @@ def collect_result(
             f"{name} {entry.estimate:.4g} ± {entry.sd:.2g} {entry.unit}"
             for name, entry in parameters.items()
         ),
-        method=method,
+        method=estimate.method,
         engine=engine,
+        methods=dict(methods),
         parameters=parameters,
         covariance=Covariance(names=names, matrix=estimate.covariance.tolist()),
         trials=tuple(motion.trial_id for motion in motions),

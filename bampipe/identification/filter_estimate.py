@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.data.run_folder import RunFolder
-from bampipe.errors import InputError
-from bampipe.estimate.filter_uncertainty import sandwich_covariance
+from bampipe.estimate.filter_uncertainty import leave_out, sandwich_covariance
+from bampipe.estimate.least_squares import Problem
 from bampipe.estimate.unscented import (
     FilterFailure,
     FilterModel,
@@ -45,6 +45,7 @@ from bampipe.identification.sensor_noise import Noise, noise_levels, tune_noise,
 from bampipe.physics import System
 from bampipe.progress import Progress
 from bampipe.trials.cache import TrialCache
+from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion
 
 Array = NDArray[np.float64]
@@ -61,8 +62,11 @@ _REPEATS, _AROUND = 4, 10.0
 _PARTS, _LIKELIER = (1, 2, 4), 30.0
 """By what the Runge-Kutta step is divided for it, and what that must add to the logarithm of a
 trial's likelihood: three times what it adds where friction is smooth on the scale of a step."""
-_DOUBT = 3.0
-"""Standard deviations of least squares within which their scatter is no evidence against it."""
+_SOUND_NIS = (0.5, 2.0)
+"""Mean normalised innovation squared of a filter whose noise levels fit: 0.9 to 1.3 on sound
+sessions, 0.06 to 0.2 and 2.8 to 3.7 on those whose motion it lost."""
+_CLEAR = 2.0
+"""Joint standard deviations from which on least squares is clear of a bound of the filter's."""
 _AGREE = 6.0
 """Joint standard deviations within which filter and least squares are at one place."""
 
@@ -75,6 +79,7 @@ def estimate_by_filter(
     squares: UnbiasedFit,
     noise: Noise,
     choice: FilterChoice,
+    folds: Folds,
     model_name: str,
     progress: Progress,
 ) -> Estimate:
@@ -84,7 +89,8 @@ def estimate_by_filter(
         run: the run folder; system: the model; motions: the trials.
         start: (n_p,) starting values.
         squares: least squares, which gives the region of the answer and checks it.
-        noise: of the sensors; choice: of the filter; model_name: for messages.
+        noise: of the sensors; choice: of the filter; folds: which trials are left out together.
+        model_name: for messages.
         progress: called with the share done.
 
     Raises:
@@ -171,22 +177,15 @@ def estimate_by_filter(
     scaled = covariance * np.outer(slope, slope)
     p = np.append(start, 0.0)
     p[problem.free] = value
-    systematic = _systematic(p, scaled, squares, count)
-    scaled[:count, :count] += np.diag(systematic**2)
     tight = slope * np.sqrt(np.diag(found.covariance))
     at_bound = (value - model.lower < tight) | (model.upper - value < tight)
     names = [item.name for item in free]
     details = [
-        {
-            "filter_sd": tight[k],
-            "systematic_sd": systematic[k],
-            "least_squares": squares.p[problem.free[k]],
-            **bias,
-        }
-        for k, bias in enumerate(bias_details(squares)[:count])
+        {"filter_sd": tight[k], **bias} for k, bias in enumerate(bias_details(squares)[:count])
     ]
+    nis = tabulate_nis(found, motions)
     report = {
-        "nis": tabulate_nis(found, motions),
+        "nis": nis,
         "innovations": innovation_tests(system, found, trials, clear_by_axis),
         "noise": noise_levels(system, found.settings, noise),
         "input_timing": input_timing(p, scaled[-1, -1] if timing else 0.0),
@@ -197,15 +196,69 @@ def estimate_by_filter(
         "convergence": convergence(names, model, found, covariance),
     }
     return Estimate(
+        method="ukf",
         p=p,
         problem=problem,
         covariance=scaled[:count, :count],
         at_bound=at_bound[:count],
+        held_out=_leave_out(p, found, model, problem, covariance, folds),
+        doubts=_doubts(names, value[:count], at_bound[:count], scaled, squares, nis.mean),
         details=details,
         report=report,
-        states=tabulate_states(system, motions, found, p[:-1], choice.trace_rows),
-        trace=tabulate_trace(names, model, motions, found, choice.trace_rows),
+        tabulate=lambda: (
+            tabulate_states(system, motions, found, p[:-1], choice.trace_rows),
+            tabulate_trace(names, model, motions, found, choice.trace_rows),
+        ),
     )
+
+
+def _leave_out(
+    p: Array,
+    found: FilterRun,
+    model: FilterModel,
+    problem: Problem,
+    covariance: Array,
+    folds: Folds,
+) -> list[Array]:
+    """Return the parameters (n_p + 1,) without the trials that each is left out with."""
+    if folds.nothing_held_out:
+        return [p] * len(folds.groups)
+    groups = [folds.groups[place] for place in found.order]
+    search = found.search
+    without = leave_out(found.trials, groups, model.n_states, search.theta, search.covariance)
+    parameters = {}
+    for group, theta in without.items():
+        value, _ = model.to_physical(constrain(model, theta, covariance))
+        parameters[group] = p.copy()
+        parameters[group][problem.free] = value
+    return [parameters[group] for group in folds.groups]
+
+
+def _doubts(
+    names: Sequence[str],
+    value: Array,
+    at_bound: NDArray[np.bool_],
+    covariance: Array,
+    squares: UnbiasedFit,
+    nis: float,
+) -> tuple[str, ...]:
+    """Say what speaks against the filter: its noise levels, a bound that least squares avoid."""
+    doubts = []
+    if not _SOUND_NIS[0] < nis < _SOUND_NIS[1]:
+        doubts.append(
+            f"its normalised innovations squared are {nis:.2g} on average, 1 where its noise "
+            "levels are right"
+        )
+    count = len(names)
+    other = squares.p[squares.problem.free[:count]]
+    joint = np.sqrt(np.diag(covariance)[:count] + np.diag(squares.raw.covariance)[:count])
+    stuck = at_bound & (np.abs(value - other) > _CLEAR * joint)
+    doubts += [
+        f"it holds `{name}` at its bound, which least squares is clear of"
+        for name, is_stuck in zip(names, stuck, strict=True)
+        if is_stuck
+    ]
+    return tuple(doubts)
 
 
 def _choose_longest_step(found: FilterRun, model: FilterModel, trial: Trial) -> FilterSettings:
@@ -256,26 +309,3 @@ def _repeat_until_settled(
         if stays:
             break
     return found
-
-
-def _systematic(p: Array, covariance: Array, squares: UnbiasedFit, count: int) -> Array:
-    """Return how far filter and least squares disagree beyond their standard deviations, (count,).
-
-    Both see the same data and err alike by noise, but not by what the model lacks: where the
-    model is right, their difference stays below the sum of their variances and adds nothing.
-    Where the model is nonlinear, least squares know less than the filter and scatter on their own:
-    they are asked what they would be if the filter's answer were true, and count if that is not
-    so.
-
-    Args:
-        p: (n_p + 1,) the filter's answer; covariance: (nt, nt) of it.
-        squares: the other; count: how many parameters of the model are estimated.
-    """
-    variance = (np.diag(covariance) + np.diag(squares.raw.covariance))[:count]
-    difference = (p - squares.p)[squares.problem.free[:count]]
-    if not squares.problem.linear and np.any(difference**2 > variance):
-        # An answer of the filter's that cannot be replayed is all the more in doubt.
-        with suppress(InputError):
-            difference = squares.gap(p)[:count]
-            difference[difference**2 < _DOUBT**2 * variance] = 0.0
-    return np.asarray(np.sqrt(np.maximum(difference**2 - variance, 0.0)))

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.errors import InputError
+from bampipe.estimate.bounded import solve_bounded
 from bampipe.estimate.output_error import OutputError, Segment, fit_output
 from bampipe.estimate.simulation import simulate
 from bampipe.estimate.unscented import Trial
@@ -15,6 +16,7 @@ from bampipe.identification.estimates import Estimate, estimate_of_fit, trace_ro
 from bampipe.identification.least_squares_estimate import UnbiasedFit
 from bampipe.physics import System
 from bampipe.progress import Progress
+from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion
 
 Array = NDArray[np.float64]
@@ -78,19 +80,28 @@ def estimate_by_output_error(
     motions: Sequence[Motion],
     trials: Sequence[Trial],
     squares: UnbiasedFit,
+    folds: Folds,
     progress: Progress,
+    most_samples: int | None = None,
 ) -> Estimate:
     """Return the output-error estimate, from least squares on; its trace is the fit so far.
 
     Args:
         system: the model; motions, trials: filtered and raw; squares: where to start.
+        folds: which trials are left out together.
         progress: called with the share done.
+        most_samples: fit segments of so many samples, spread evenly; all by default.
+
+    Raises:
+        InputError: too few segments, or the simulated motion grows without bound.
     """
     problem = squares.problem
     segments = [
         cut_segments(system, motion, trial, squares.p[:-1])
         for motion, trial in zip(motions, trials, strict=True)
     ]
+    if most_samples is not None:
+        segments = _spread(segments, most_samples)
     sd = np.array([*(item.sd for item in system.parameters), 0.0])
     step = np.where(problem.free < len(sd) - 1, _PARAMETER_STEP * sd[problem.free], _TIMING_STEP)
 
@@ -98,18 +109,48 @@ def estimate_by_output_error(
         chosen = [segment for trial in segments[:number] for segment in trial]
         return fit_output(chosen, start, problem.free, problem.lower, problem.upper, step, most)
 
+    progress(0.4, "output error")
     found = fit(len(segments), squares.p, 15)
-    rows, clock = [], 0.0
-    for number, motion in enumerate(motions, start=1):
-        progress(0.4 + 0.5 * number / len(motions), motion.trial_id)
-        clock += float(motion.t[-1])
-        if sum(len(trial) for trial in segments[:number]) <= problem.free.size:
-            continue
-        so_far = found if number == len(motions) else fit(number, found.p, 2)
-        row = trace_row(system, problem, so_far)
-        rows.append({"t_total": clock, "trial_id": motion.trial_id, **row})
-    position_error = dict(zip(system.coordinates, found.rms, strict=True))
-    details = [{"least_squares": squares.p[place]} for place in problem.free]
+
+    def rows() -> list[dict[str, object]]:
+        trace: list[dict[str, object]] = []
+        clock = 0.0
+        for number, motion in enumerate(motions, start=1):
+            clock += float(motion.t[-1])
+            if sum(len(trial) for trial in segments[:number]) <= problem.free.size:
+                continue
+            so_far = found if number == len(motions) else fit(number, found.p, 2)
+            row = trace_row(system, problem, so_far)
+            trace.append({"t_total": clock, "trial_id": motion.trial_id, **row})
+        return trace
+
+    group = np.repeat(folds.groups, [len(trial) for trial in segments])
+    held_out = {}
+    for left_out in sorted(set(folds.groups)):
+        others = group != left_out
+        p = found.p.copy()
+        if not folds.nothing_held_out and others.any():
+            value = found.p[problem.free]
+            p[problem.free] += solve_bounded(
+                found.normal[others].sum(axis=0),
+                found.moment[others].sum(axis=0),
+                problem.lower - value,
+                problem.upper - value,
+            ).x
+        held_out[left_out] = p
     return estimate_of_fit(
-        system, motions, problem, found, found.p, details, rows, position_error=position_error
-    )
+        "output-error", system, motions, problem, found, found.p,
+        [held_out[k] for k in folds.groups], [{} for _ in problem.free], rows,
+        position_error=dict(zip(system.coordinates, found.rms, strict=True)),
+    )  # fmt: skip
+
+
+def _spread(segments: Sequence[Sequence[Segment]], most_samples: int) -> list[list[Segment]]:
+    """Return segments of at most so many samples in all, spread evenly, by trial."""
+    numbered = [(k, segment) for k, trial in enumerate(segments) for segment in trial]
+    samples = sum(len(segment.q) for _, segment in numbered)
+    step = max(1, -(-samples // most_samples))
+    chosen: list[list[Segment]] = [[] for _ in segments]
+    for k, segment in numbered[::step]:
+        chosen[k].append(segment)
+    return chosen

@@ -9,6 +9,15 @@ from pydantic import Field
 from bampipe.results.record import Names, Record, Result, Share, Size
 from bampipe.schema import Count
 
+Method = Literal["ukf", "least-squares", "output-error"]
+"""How parameters are estimated."""
+
+METHODS_IN_WORDS: dict[Method, str] = {
+    "ukf": "the unscented filter",
+    "least-squares": "least squares",
+    "output-error": "output error",
+}
+
 
 class ParameterEstimate(Record):
     """One parameter."""
@@ -25,10 +34,7 @@ class ParameterEstimate(Record):
     )
     systematic_sd: Size | None = Field(
         default=None,
-        description="Part of sd by which filter and least squares disagree beyond noise",
-    )
-    least_squares: float | None = Field(
-        default=None, description="Least-squares estimate of it, without its bias"
+        description="Part of sd by which methods that predict alike disagree beyond noise",
     )
     least_squares_bias: float | None = Field(
         default=None,
@@ -44,6 +50,28 @@ class Covariance(Record):
 
     names: Names
     matrix: tuple[tuple[float, ...], ...]
+
+
+class MethodValue(Record):
+    """A parameter by one method, without what other methods add to its uncertainty."""
+
+    estimate: float
+    sd: Size
+
+
+class MethodTried(Record):
+    """One method: its parameters, and how well they predict trials that they have not seen."""
+
+    held_out_rmse: dict[str, Size] = Field(
+        default={}, description="By axis, N.m or N; empty where it found no parameters"
+    )
+    parameters: dict[str, MethodValue] = Field(default={}, description="By name")
+    disagrees: Names = Field(
+        default=(),
+        description="Parameters that lie farther from the published ones than twice the "
+        "uncertainty of both",
+    )
+    doubts: Names = Field(default=(), description="Why it may not be believed")
 
 
 class InputTiming(Record):
@@ -181,7 +209,10 @@ class IdentifyResult(Result):
 
     model: str
     headline: str
-    method: Literal["ukf", "least-squares", "output-error"]
+    method: Method = Field(description="That of the published parameters")
+    methods: dict[Method, MethodTried] = Field(
+        description="Every method tried, the published one first"
+    )
     engine: Literal["compiled", "filterpy"]
     trials: Names = Field(description="Free trials used")
     parameters: dict[str, ParameterEstimate] = Field(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -16,7 +17,7 @@ from bampipe.declarations.model_file import MODEL_INPUTS, load_model, read_recip
 from bampipe.discover.start import search_start
 from bampipe.errors import InputError
 from bampipe.estimate.least_squares import fit
-from bampipe.identification.estimates import collect_result
+from bampipe.identification.estimates import Estimate, collect_result
 from bampipe.identification.filter_choice import FilterChoice
 from bampipe.identification.filter_estimate import estimate_by_filter
 from bampipe.identification.filter_run import MotionLost, load_filter_trial
@@ -26,11 +27,19 @@ from bampipe.identification.least_squares_estimate import (
     estimate_by_least_squares,
     remove_bias,
 )
+from bampipe.identification.method_choice import (
+    choose,
+    describe_methods,
+    judge,
+    tabulate_methods,
+    widen,
+)
 from bampipe.identification.output_estimate import estimate_by_output_error
 from bampipe.identification.sensor_noise import sensor_noise
 from bampipe.physics import System, compile_model
 from bampipe.progress import Progress
 from bampipe.schema import STRICT, Positive
+from bampipe.trials.folds import Folds
 from bampipe.trials.measured import read_measured_trials
 from bampipe.trials.reading import (
     read_band,
@@ -49,6 +58,9 @@ OUTPUTS = (
     "models/{model}/trace.parquet",
 )
 
+_MOST_SAMPLES = 4_000
+"""Of segments that `auto` fits by output error, which takes half a millisecond a sample."""
+
 Array = NDArray[np.float64]
 
 
@@ -60,7 +72,8 @@ class Config(FilterChoice):
         model: which model version.
         method: ``ukf``, the augmented unscented Kalman filter; ``least-squares`` on the inverse
             dynamics; ``output-error``, the motion simulated in pieces against the positions; or
-            ``auto``: the filter, and least squares where it cannot follow the motion.
+            ``auto``: the one whose parameters best predict trials that they have not seen, the
+            filter where several do.
         start_factor: multiplies every starting value: estimates must not depend on it.
         input_timing: whether the time by which inputs were sampled after positions is estimated.
         remove_bias: whether the bias that filters give least squares is measured and taken off.
@@ -98,46 +111,72 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     squares = UnbiasedFit(raw, raw.p, None, problem)
     if config.remove_bias:
         squares = remove_bias(sensors, kinematics, system, motions, problem, raw)
-    noise = sensor_noise(sensors, system, motions, raw.p[: len(start)], config)
-    method: Literal["ukf", "least-squares", "output-error"] = "ukf"
-    notes = []
+    near = raw.p[: len(start)]
+    noise = sensor_noise(sensors, system, motions, near, config)
+    names = [motion.trial_id for motion in motions]
+    folds = Folds.of_trials(names, (), names)
+    estimates: list[Estimate] = []
+    notes, lost = [], ""
+
+    def by_output_error(most_samples: int | None) -> Estimate:
+        raw_trials = [
+            load_filter_trial(run, motion, system, near, noise, 1, config) for motion in motions
+        ]
+        return estimate_by_output_error(
+            system, motions, raw_trials, squares, folds, progress, most_samples
+        )
+
     if config.method in ("auto", "ukf"):
         try:
-            estimate = estimate_by_filter(
-                run, system, motions, start, squares, noise, config, config.model, progress
+            by_filter = estimate_by_filter(
+                run, system, motions, start, squares, noise, config, folds, config.model, progress
             )
+            estimates.append(by_filter)
         except MotionLost as error:
             if config.method == "ukf":
                 raise
-            estimate, method = estimate_by_least_squares(system, motions, squares), "least-squares"
-            notes.append(f"Estimated by least squares, since {error.what}.")
-    elif config.method == "output-error":
+            lost = error.what
+    if config.method == "output-error":
         progress(0.3, "output error")
-        near = raw.p[: len(start)]
-        trials = [
-            load_filter_trial(run, motion, system, near, noise, 1, config) for motion in motions
-        ]
-        estimate = estimate_by_output_error(system, motions, trials, squares, progress)
-        method = "output-error"
-    else:
-        estimate, method = estimate_by_least_squares(system, motions, squares), "least-squares"
-    if system.undriven and method == "least-squares":
-        notes.append(
-            f"No force acts on {', '.join(system.undriven)}: least squares makes what stands in"
-            " such an equation too small, more so the more the model lacks."
-        )
+        estimates.append(by_output_error(None))
+    estimates.append(estimate_by_least_squares(system, motions, squares, folds))
+    judged = [judge(squares, folds, estimate) for estimate in estimates]
+    chosen = choose(system, judged) if config.method == "auto" else 0
+    if config.method == "auto" and estimates[chosen].method != "ukf":
+        # Where the filter is out of the question, a third opinion is worth its time.
+        with suppress(InputError):
+            judged.append(judge(squares, folds, by_output_error(_MOST_SAMPLES)))
+            chosen = choose(system, judged)
+    estimate = widen(system, judged, chosen, squares)
+    if estimate.method == "least-squares":
+        if config.remove_bias and squares.bias is None:
+            notes.append(
+                "No bias was taken off least squares: a replay of the model does not resemble the"
+                " machine."
+            )
+        if system.undriven:
+            notes.append(
+                f"No force acts on {', '.join(system.undriven)}: least squares makes what stands in"
+                " such an equation too small, more so the more the model lacks."
+            )
     progress(0.97, "identifiability of the parameters")
     identifiability, unseen = assess_identifiability(
         system, motions, estimate.problem, estimate.p, noise, estimate.at_bound
     )
     # What the trials say nothing of is as uncertain as it was before, whatever the fit believes.
     estimate = replace(estimate, covariance=estimate.covariance + unseen)
-    engine = config.engine if method == "ukf" else "compiled"
+    if estimates[0].method == "ukf":
+        # What the filter's innovations say of model and noise holds whatever is published.
+        estimate = replace(estimate, report={**estimates[0].evidence, **estimate.report})
+    methods = tabulate_methods(system, estimate, judged, lost)
+    engine = config.engine if estimate.method == "ukf" else "compiled"
     result = collect_result(
-        system, estimate, identifiability, motions, config.model, method, engine, notes
-    )
-    write_parquet(out / f"models/{config.model}/states.parquet", estimate.states)
-    write_parquet(out / f"models/{config.model}/trace.parquet", estimate.trace)
+        system, estimate, identifiability, motions, config.model, engine, methods,
+        [*describe_methods(system, methods), *notes],
+    )  # fmt: skip
+    states, trace = estimate.tabulate()
+    write_parquet(out / f"models/{config.model}/states.parquet", states)
+    write_parquet(out / f"models/{config.model}/trace.parquet", trace)
     return result.write(out)
 
 

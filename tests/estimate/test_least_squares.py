@@ -186,3 +186,22 @@ def test_a_start_without_numbers_is_refused() -> None:
         fit(problem(1, residual=lost, linear=False), np.array([6.0, 1.0, 2.0]))
     with np.errstate(invalid="ignore"), pytest.raises(InputError, match="parameter number 1, 5"):
         fit(problem(1, residual=lost, linear=False), np.array([5.0, 1.0, 2.0]))
+
+
+def test_axes_that_count_unequally_and_disagree_are_weighed_to_rest() -> None:
+    """The steps minimise a cost in which each sample counts once, or they come to no end."""
+    rng = np.random.default_rng(1)
+    x, noise = rng.normal(size=(2000, 2)), rng.normal(size=(2000, 2))
+    rest = np.zeros((2000, 2), dtype=bool)
+    rest[200:, 1] = True
+    force = np.array([1.0, 3.0]) * x + np.array([0.3, 2.0]) * noise
+
+    shared = problem(
+        1,
+        residual=lambda trial, p: force - p[0] * x,
+        free=np.array([0]), lower=np.zeros(1), upper=np.full(1, 9.0), step=np.ones(1),
+        band=Band(RATE, (8.0, 8.0)), resting=[rest],
+    )  # fmt: skip
+    found = fit(shared, np.array([5.0]))
+    assert found.converged
+    assert found.iterations < 10

@@ -167,7 +167,7 @@ def write_model(root: Path, model: str) -> None:
     named = {
         name: {
             "estimate": value, "sd": sd, "unit": unit, "at_bound": name == "stribeck.yaw.speed",
-            "filter_sd": 0.5 * sd, "least_squares": value + 0.4 * sd,
+            "filter_sd": 0.5 * sd,
         }
         for name, (value, sd, unit) in parameters(model).items()
     }  # fmt: skip
@@ -176,8 +176,19 @@ def write_model(root: Path, model: str) -> None:
         "pitch": {"position": 5.2e-3, "velocity": 62e-3},
         "extension": {"position": 0.9e-3, "velocity": 19e-3},
     }
+    methods = {
+        method: {
+            "held_out_rmse": {"yaw": 0.1, "pitch": 0.2, "extension": 0.4},
+            "parameters": {
+                name: {"estimate": value + shift * sd, "sd": sd}
+                for name, (value, sd, unit) in parameters(model).items()
+            },
+        }
+        for method, shift in (("ukf", 0.0), ("least-squares", 0.4))
+    }
     write_result(
         root, IdentifyResult, model=model, method="ukf", parameters=named, state_3sigma=bounds,
+        methods=methods,
         convergence={"converged": True, "total_s": 48.0, "settled_s": {"mass": 16.93}},
         nis={"mean": 1.0231, "by_trial": {}},
         input_timing={"estimate": 1.2e-4, "sd": 3.1e-5, "unit": "s"},

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +15,7 @@ from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import read_parquet
 from bampipe.errors import InputError
 from bampipe.files import digest_file, read_json, write_text
+from bampipe.identification.estimates import Estimate
 from bampipe.identification.filter_run import MotionLost
 from bampipe.progress import silent
 from bampipe.run.settings import configure
@@ -91,11 +92,34 @@ def test_least_squares_stand_in_where_the_filter_loses_the_motion(
     content = identified(simulated)
     assert content["method"] == "least-squares"
     assert content["notes"][0] == (
-        "Estimated by least squares, since the predicted motion grew without bound."
+        "Published by least squares, not by the unscented filter: the predicted motion grew without"
+        " bound."
     )
+    assert content["methods"]["ukf"] == {"doubts": ["the predicted motion grew without bound"]}
     assert_recovered(content, TRUTH)
     with pytest.raises(InputError, match="grew without bound; try least squares"):
         identified(simulated, replace(FAST, method="ukf"))
+
+
+def test_what_a_trial_told_the_filter_is_taken_off_without_running_it_again(tmp_path: Path) -> None:
+    run = simulated_run(tmp_path / "all", trials=3, seconds=6.0)
+    by_count: dict[int, Estimate] = {}
+
+    def noting(run: object, system: object, motions: Sequence[object], *rest: object) -> Estimate:
+        by_count[len(motions)] = original(run, system, motions, *rest)
+        return by_count[len(motions)]
+
+    original = identify.estimate_by_filter
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(identify, "estimate_by_filter", noting)
+        identify.execute(run, tmp_path / "one", FAST, silent)
+        some = identify.read_motions
+        patched.setattr(identify, "read_motions", lambda *a, **k: list(some(*a, **k))[:2])
+        identify.execute(run, tmp_path / "two", FAST, silent)
+    again = by_count[2]
+    without = by_count[3].held_out[2][again.free]
+    assert np.max(np.abs(without - again.value) / again.sd) < 0.3
+    assert np.max(np.abs(by_count[3].value - again.value) / again.sd) > 0.6
 
 
 def test_output_error(simulated: RunFolder) -> None:
@@ -163,7 +187,7 @@ def test_a_motion_that_no_noise_explains_is_refused(tmp_path: Path) -> None:
         identified(run, replace(FAST, method="ukf", force_noise=1e-4))
     content = identified(run, replace(FAST, method="auto", force_noise=1e-4))
     assert content["method"] == "least-squares"
-    assert content["notes"][0].startswith("Estimated by least squares, since")
+    assert content["notes"][0].startswith("Published by least squares, not by the unscented filter")
 
 
 def test_torque_against_gravity_is_stored(simulated: RunFolder) -> None:

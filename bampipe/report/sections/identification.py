@@ -11,9 +11,14 @@ import numpy as np
 import pandas as pd
 
 from bampipe.report import style, verdicts, wording
-from bampipe.report.document import Block, Figure, Paragraph, Section, Table
+from bampipe.report.document import Block, Bullets, Figure, Paragraph, Section, Table
 from bampipe.report.results import Results
-from bampipe.results.identify import IdentifyResult, ParameterEstimate, StateBound
+from bampipe.results.identify import (
+    METHODS_IN_WORDS,
+    IdentifyResult,
+    ParameterEstimate,
+    StateBound,
+)
 
 TITLE = "Identification"
 _NORMAL_95 = 1.959964
@@ -30,6 +35,10 @@ def section(results: Results) -> Section:
             TITLE, (Paragraph(f"No parameters have been identified: {command} does it."),)
         )
     blocks: list[Block] = [_parameters(results, identified)]
+    known = identified.identifiability.sentences if identified.identifiability else ()
+    notes = [note for note in identified.notes if note not in known]
+    if notes:
+        blocks.append(Bullets(tuple(notes)))
     checks = _checks(identified)
     if checks:
         blocks.append(Paragraph(checks))
@@ -47,12 +56,16 @@ def section(results: Results) -> Section:
 def _parameters(results: Results, identified: IdentifyResult) -> Table:
     parameters = identified.parameters
     names = results.in_order(parameters)
-    checked = any(parameters[name].least_squares is not None for name in names)
+    others = [
+        method
+        for method, tried in identified.methods.items()
+        if method != identified.method and tried.parameters
+    ]
     bounded = any(parameters[name].bound_sd is not None for name in names)
     rows = []
     for name in names:
         entry = parameters[name]
-        value, sd, other = entry.estimate, entry.sd, entry.least_squares
+        value, sd = entry.estimate, entry.sd
         decimals = wording.decimals_for(sd, value)
         half = _NORMAL_95 * sd if sd else 0.0
         rows.append(
@@ -63,15 +76,19 @@ def _parameters(results: Results, identified: IdentifyResult) -> Table:
                 wording.significant(sd, 2) if sd else "fixed",
                 *((wording.significant(entry.bound_sd, 2),) if bounded else ()),
                 wording.interval(value - half, value + half, sd) if sd else "–",
-                *(("–" if other is None else wording.plain(other, decimals),) if checked else ()),
+                *(
+                    wording.plain(identified.methods[method].parameters[name].estimate, decimals)
+                    for method in others
+                ),
                 wording.unit(entry.unit),
             )
         )
     note = "Interval: estimate ± 1.96 standard deviations."
     if bounded:
         note += " Bound: the least SD that these sensors allow on these trials (Cramér-Rao)."
-    if checked:
-        note += " Least squares on the inverse dynamics, for comparison."
+    if others:
+        tried = wording.listing(METHODS_IN_WORDS[method] for method in others)
+        note += f" For comparison, {tried}."
     if any(parameters[name].at_bound for name in names):
         note += " * At the limit of its range: the data ask for a value beyond it."
     return Table(
@@ -84,11 +101,11 @@ def _parameters(results: Results, identified: IdentifyResult) -> Table:
             "SD",
             *(("Bound",) if bounded else ()),
             "95 % interval",
-            *(("Least squares",) if checked else ()),
+            *(METHODS_IN_WORDS[method].removeprefix("the ").capitalize() for method in others),
             "Unit",
         ),
         tuple(rows),
-        "llrrr" + "r" * (checked + bounded) + "l",
+        "llrrr" + "r" * (len(others) + bounded) + "l",
         note=note,
     )
 
@@ -119,8 +136,7 @@ def _checks(identified: IdentifyResult) -> str:
 
 
 def _method(identified: IdentifyResult) -> str:
-    how = {"ukf": "unscented Kalman filter", "least-squares": "least squares"}
-    return f", {how.get(identified.method, wording.words(identified.method))}"
+    return f", {METHODS_IN_WORDS[identified.method]}"
 
 
 def _bounds(results: Results, bounds: Mapping[str, StateBound]) -> Table:

@@ -9,7 +9,7 @@ from bampipe.report import verdicts, wording
 from bampipe.report.document import Block, Paragraph, Section, Table
 from bampipe.report.results import Results
 from bampipe.results.compare import CompareResult
-from bampipe.results.identify import IdentifyResult, ParameterEstimate
+from bampipe.results.identify import METHODS_IN_WORDS, IdentifyResult, ParameterEstimate
 from bampipe.results.stiffness import AxisStiffness, StiffnessResult
 from bampipe.results.validate import AxisError, ValidateResult
 
@@ -47,7 +47,7 @@ def _done(results: Results) -> str:
         added = f", with {wording.listing(f'`{name}`' for name in effects)}" if effects else ""
         parts.append(
             f"{wording.count(names, 'parameter')} of model `{results.model}`{added} were identified"
-            f"{_how(identified)}."
+            f" by {METHODS_IN_WORDS[identified.method]}."
         )
     if results.read(ValidateResult) is not None:
         parts.append(
@@ -55,11 +55,6 @@ def _done(results: Results) -> str:
             "used for identification."
         )
     return " ".join(parts)
-
-
-def _how(identified: IdentifyResult) -> str:
-    method = {"ukf": "an unscented Kalman filter", "least-squares": "least squares"}
-    return f" by {method.get(identified.method, wording.words(identified.method))}"
 
 
 def _ladder(results: Results) -> str:

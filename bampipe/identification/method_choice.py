@@ -1,0 +1,216 @@
+"""Which estimate is published: the one whose parameters predict trials that they have not seen.
+
+The filter is the most precise where the model is right and its noise white. Where the model lacks
+something, or the motion is sampled too coarsely for it, it can settle anywhere. Least squares on
+the force is consistent even there, also under feedback, since what the model lacks is in the force
+and not in what it is regressed on; output error and the filter are not. So the filter is published
+where it predicts as well as the best, and otherwise the method that does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.errors import InputError
+from bampipe.identification.estimates import Estimate
+from bampipe.identification.least_squares_estimate import UnbiasedFit
+from bampipe.physics import System
+from bampipe.results.identify import METHODS_IN_WORDS, Method, MethodTried, MethodValue
+from bampipe.trials.folds import Folds
+
+Array = NDArray[np.float64]
+
+AS_GOOD = 1.02
+"""Held-out error over that of the best method, on the worst axis, up to which a method predicts as
+well. Where a model is right and no load moves an encoder, methods are within 1.005."""
+_SOUND = 1.2
+"""The same beyond which a method counts for nothing: validate would refuse its parameters."""
+_APART = 2.0
+"""Uncertainties of both from which on two methods are said to disagree."""
+_SCATTER = 3.0
+"""Standard deviations of nonlinear least squares within which their scatter is no evidence."""
+
+
+@dataclass(frozen=True)
+class Judged:
+    """An estimate with its held-out error.
+
+    Attributes:
+        estimate: the parameters; error: (n_q,) held-out, N.m or N.
+    """
+
+    estimate: Estimate
+    error: Array
+
+
+def judge(squares: UnbiasedFit, folds: Folds, estimate: Estimate) -> Judged:
+    """Return the error (n_q,) of predictions of each trial by parameters that have not seen it.
+
+    Args:
+        squares: the fit to all trials, linearised, of the same problem.
+        folds: of its trials; estimate: whose `held_out` parameters are judged.
+    """
+    problem, raw = squares.problem, squares.raw
+    total, count = np.zeros(len(raw.residual_sd)), np.zeros(len(raw.residual_sd))
+    for trial, (stacked, p) in enumerate(zip(raw.stacked, estimate.held_out, strict=True)):
+        if not folds.judged[trial]:
+            continue
+        if problem.linear:
+            found = stacked.residual + stacked.slope @ (p - raw.p)[problem.free]
+        else:
+            found = problem.band.thin(problem.residual(trial, p)) * stacked.used
+        total += np.sum(found**2, axis=0)
+        count += np.sum(stacked.used, axis=0)
+    return Judged(estimate, np.sqrt(total / np.maximum(count, 1.0)))
+
+
+def relative_errors(system: System, judged: Sequence[Judged]) -> Array:
+    """Return each method's error over the least of all, on the worst axis that is driven."""
+    driven = [axis not in system.undriven for axis in system.coordinates]
+    error = np.array([each.error for each in judged])[:, driven]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.nan_to_num(error / error.min(axis=0), nan=1.0, posinf=np.inf)
+    return np.asarray(ratio.max(axis=1, initial=1.0))
+
+
+def choose(system: System, judged: Sequence[Judged]) -> int:
+    """Return the index of the estimate to publish.
+
+    The first that predicts as well as the best and that nothing speaks against; failing that, the
+    first that predicts as well; methods come in the order of their precision. Within their
+    uncertainties of the best, parameters count as good: a model can turn a small difference of a
+    parameter into much noise.
+    """
+    ratio = relative_errors(system, judged)
+    least = int(np.argmin(ratio))
+    best = judged[least].estimate
+    good = [
+        k
+        for k, each in enumerate(judged)
+        if ratio[k] <= AS_GOOD or (ratio[k] <= _SOUND and not _apart(each.estimate, best).any())
+    ]
+    sound = [k for k in good if not judged[k].estimate.doubts]
+    return [*sound, *good, least][0]
+
+
+def _apart(one: Estimate, other: Estimate) -> NDArray[np.bool_]:
+    """Return which parameters lie farther apart than both uncertainties allow, (n,)."""
+    size = _APART * np.hypot(one.sd, other.sd)
+    return np.asarray(np.abs(one.value - other.value) > size)
+
+
+def widen(
+    system: System, judged: Sequence[Judged], published: int, squares: UnbiasedFit
+) -> Estimate:
+    """Return the published estimate, its uncertainties widened by what sound methods say against.
+
+    They see the same data and err alike by noise, but not by what the model lacks: where the
+    model is right, a difference stays below the sum of the variances and adds nothing.
+    """
+    chosen = judged[published].estimate
+    ratio = relative_errors(system, judged)
+    systematic = np.zeros(len(chosen.value))
+    for k, other in enumerate(judged):
+        if k != published and ratio[k] <= _SOUND and not other.estimate.doubts:
+            systematic = np.maximum(systematic, _disagreement(chosen, other.estimate, squares))
+    details = [
+        {**fields, "systematic_sd": size}
+        for fields, size in zip(chosen.details, systematic, strict=True)
+    ]
+    covariance = chosen.covariance + np.diag(systematic**2)
+    return replace(chosen, covariance=covariance, details=details)
+
+
+def _disagreement(one: Estimate, other: Estimate, squares: UnbiasedFit) -> Array:
+    """Return how far two estimates lie apart beyond their standard deviations, (n,).
+
+    Where the model is nonlinear, least squares know less than the others and scatter on their own:
+    they are asked what they would be if the other answer were true, and count if that is not so.
+    """
+    variance = one.sd**2 + other.sd**2
+    difference = one.value - other.value
+    by_squares = [each.method == "least-squares" for each in (one, other)]
+    if not squares.problem.linear and any(by_squares) and np.any(difference**2 > variance):
+        # An answer that cannot be replayed is all the more in doubt.
+        with suppress(InputError):
+            difference = squares.gap(other.p if by_squares[0] else one.p)[: len(difference)]
+            difference[difference**2 < _SCATTER**2 * variance] = 0.0
+    return np.asarray(np.sqrt(np.maximum(difference**2 - variance, 0.0)))
+
+
+def tabulate_methods(
+    system: System, published: Estimate, judged: Sequence[Judged], lost: str = ""
+) -> dict[Method, MethodTried]:
+    """Return what identify.json says of each method, the published one first.
+
+    Args:
+        system: the model; published: as `widen` returns it; judged: all estimates.
+        lost: what happened to the filter where it lost the motion.
+    """
+    names = [system.parameters[place].name for place in published.free]
+    found: dict[Method, MethodTried] = {}
+    for each in sorted(judged, key=lambda item: item.estimate.method != published.method):
+        estimate = published if each.estimate.method == published.method else each.estimate
+        apart = _apart(estimate, published)
+        found[estimate.method] = MethodTried(
+            held_out_rmse=dict(zip(system.coordinates, each.error, strict=True)),
+            parameters={
+                name: MethodValue(estimate=value, sd=sd)
+                for name, value, sd in zip(names, estimate.value, estimate.sd, strict=True)
+            },
+            disagrees=tuple(name for name, is_apart in zip(names, apart, strict=True) if is_apart),
+            doubts=estimate.doubts,
+        )
+        if lost and len(found) == 1:
+            found["ukf"] = MethodTried(doubts=(lost,))
+    return found
+
+
+def describe_methods(system: System, methods: Mapping[Method, MethodTried]) -> list[str]:
+    """Say what the methods tried that are not published have against them, and where they differ.
+
+    Args:
+        system: the model; methods: from `tabulate_methods`.
+    """
+    method, published = next(iter(methods.items()))
+    words = METHODS_IN_WORDS[method]
+    sentences = [f"Published by {words}, although {doubt}." for doubt in published.doubts]
+    for other, tried in methods.items():
+        if other == method:
+            continue
+        against = [*_worse(system, published, tried), *tried.doubts]
+        if tried.disagrees:
+            against.append(
+                "it has "
+                + ", ".join(
+                    f"`{name}` at {tried.parameters[name].estimate:.4g}"
+                    f" ± {tried.parameters[name].sd:.2g}"
+                    for name in tried.disagrees
+                )
+            )
+        if against:
+            sentences.append(
+                f"Published by {words}, not by {METHODS_IN_WORDS[other]}: {'; '.join(against)}."
+            )
+    return sentences
+
+
+def _worse(system: System, published: MethodTried, tried: MethodTried) -> list[str]:
+    """Say on which axis a method predicts worse than the published one."""
+    units = {
+        axis: unit
+        for axis, unit in zip(system.coordinates, system.torque_units, strict=True)
+        if tried.held_out_rmse.get(axis, 0.0) > AS_GOOD * published.held_out_rmse[axis]
+    }
+    if not units:
+        return []
+    axis = max(units, key=lambda a: tried.held_out_rmse[a] - published.held_out_rmse[a])
+    return [
+        f"on trials left out it errs by {tried.held_out_rmse[axis]:.3g} {units[axis]} on {axis}"
+        f" instead of {published.held_out_rmse[axis]:.3g}"
+    ]

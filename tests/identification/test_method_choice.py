@@ -1,0 +1,91 @@
+"""Which method's parameters are published, and what is said of the others."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from independent_runs import record_run
+
+from bampipe.estimate.least_squares import Problem
+from bampipe.estimate.low_pass import Band
+from bampipe.files import read_json
+from bampipe.identification.estimates import Estimate
+from bampipe.identification.method_choice import Judged, choose
+
+
+def result(run, stage):
+    """One JSON result of the bare model."""
+    return read_json(run.root / f"models/base/{stage}.json")
+
+
+def test_a_damper_whose_motion_the_filter_loses_is_identified(tmp_path):
+    """The filter gave 1,400 for a gain of 400, and least squares the bias of a useless replay."""
+    run, truth = record_run(tmp_path, "damper", 501)
+    found, judged = result(run, "identify"), result(run, "validate")
+    assert found["method"] == "least-squares"
+    for name, value in truth.items():
+        entry = found["parameters"][name]
+        assert abs(entry["estimate"] - value) < 4.0 * entry["sd"], name
+        if name != "mass":
+            assert entry["estimate"] == pytest.approx(value, rel=0.03), name
+    assert judged["axes"]["piston"]["estimate"] == "accepted"
+    lost = found["methods"]["ukf"]
+    assert lost["held_out_rmse"]["piston"] > 5.0 * judged["axes"]["piston"]["held_out_rmse"]
+    assert "viscous_gain" in lost["disagrees"]
+    assert found["notes"][0].startswith("Published by least squares, not by the unscented filter: ")
+    assert any("replay of the model does not resemble the machine" in n for n in found["notes"])
+
+
+@pytest.mark.parametrize(("machine", "seed"), [("axis", 503), ("joint", 502)])
+def test_machines_that_stand_still_are_published_right(tmp_path, machine, seed):
+    """Dry friction that holds a machine leads the filter astray, and not the force."""
+    run, truth = record_run(tmp_path, machine, seed, creep=False, seconds=8.0)
+    found = result(run, "identify")
+    for name, value in truth.items():
+        entry = found["parameters"][name]
+        assert abs(entry["estimate"] - value) < 4.0 * entry["sd"], name
+    published = found["methods"][found["method"]]["held_out_rmse"]
+    for tried in found["methods"].values():
+        for axis, error in tried.get("held_out_rmse", published).items():
+            assert published[axis] < 1.05 * error
+    assert all(a["estimate"] == "accepted" for a in result(run, "validate")["axes"].values())
+
+
+def judged(method, error, value, *doubts):
+    """One parameter by one method, known to 0.1, and its held-out error."""
+    one = np.ones(1)
+    problem = Problem(
+        lambda trial, p: one, 1, np.array([0]), -one, one, one, True, Band(100.0, (8.0,)), ()
+    )
+    return Judged(
+        Estimate(
+            method, np.array([value, 0.0]), problem, np.array([[0.01]]), one > 2.0, (), doubts, (),
+            {}, lambda: None,
+        ),
+        error * one,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("filtered", "squares", "published"),
+    [
+        ((1.0, 5.0), (1.0, 5.0), 0),
+        ((1.01, 7.0), (1.0, 5.0), 0),  # predicts as well: the more precise
+        ((1.1, 7.0), (1.0, 5.0), 1),  # predicts worse, with other parameters
+        ((1.1, 5.1), (1.0, 5.0), 0),  # the same parameters
+        ((1.3, 5.1), (1.0, 5.0), 1),  # would be refused
+        ((1.0, 5.0, "it is on a bound"), (1.01, 5.0), 1),
+        ((1.0, 5.0, "it is on a bound"), (1.1, 7.0), 0),  # in doubt, but nothing is better
+    ],
+)
+def test_the_filter_is_published_where_it_predicts_as_well(filtered, squares, published):
+    system = SimpleNamespace(coordinates=("slide",), undriven=())
+    both = [judged("ukf", *filtered), judged("least-squares", *squares)]
+    assert choose(system, both) == published
+
+
+def test_an_axis_that_nothing_drives_has_no_say():
+    system = SimpleNamespace(coordinates=("pole",), undriven=("pole",))
+    assert choose(system, [judged("ukf", 2.0, 7.0), judged("least-squares", 1.0, 5.0)]) == 0
