@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 from bampipe.report import page, style, typeset
 from bampipe.report.document import Block, Callout, Document, Figure, Section
+from bampipe.report.explorer.page import explorer_page
 from bampipe.report.results import Results
 from bampipe.report.sections import SECTIONS
 
@@ -20,17 +21,19 @@ class Report:
     Attributes:
         pdf: the printed form.
         html: the page for a browser.
+        explorer: the page for exploring; "" for a report over several sessions.
         figures: SVG text by name.
         sections: titles, in order.
     """
 
     pdf: bytes
     html: str
+    explorer: str
     figures: dict[str, str]
     sections: tuple[str, ...]
 
     @classmethod
-    def of(cls, document: Document, recorded: int) -> Report:
+    def of(cls, document: Document, recorded: int, explorer: str = "") -> Report:
         """Return the files of ``document``; see `typeset.pdf` for ``recorded``."""
         figures = {
             block.name: block.svg
@@ -39,7 +42,7 @@ class Report:
             if isinstance(block, Figure)
         }
         titles = tuple(section.title for section in document.sections)
-        return cls(typeset.pdf(document, recorded), page.page(document), figures, titles)
+        return cls(typeset.pdf(document, recorded), page.page(document), explorer, figures, titles)
 
 
 def build(results: Results, progress: Callable[[float, str], None]) -> Report:
@@ -64,8 +67,10 @@ def build(results: Results, progress: Callable[[float, str], None]) -> Report:
     document = Document(
         f"Session {results.session.session_id}", _subtitle(results), tuple(sections)
     )
-    progress(0.7, "typesetting")
-    return Report.of(document, _recorded(results))
+    progress(0.7, "page for exploring")
+    explorer = explorer_page(results, document.subtitle)
+    progress(0.85, "typesetting")
+    return Report.of(document, _recorded(results), explorer)
 
 
 def _warnings(results: Results) -> tuple[Block, ...]:

@@ -1,4 +1,4 @@
-"""Stage report: the stored results as a PDF, a page for the browser, and figures."""
+"""Stage report: the stored results as a PDF, two pages for the browser, and figures."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from bampipe.data.run_folder import RunFolder
 from bampipe.progress import Progress
 from bampipe.schema import STRICT
 
-SUMMARY = "PDF and web page of everything found so far"
+SUMMARY = "PDF, web page and page for exploring of everything found so far"
 INPUTS = (
     "ingest/session.json",
     "ingest/trials.parquet",
@@ -25,7 +25,12 @@ INPUTS = (
     "compare.json?",
     "run.json?",  # the keys of the other stages
 )
-OUTPUTS = ("report/report.pdf", "report/report.html", "report/figures/*.svg")
+OUTPUTS = (
+    "report/report.pdf",
+    "report/report.html",
+    "report/explore.html",
+    "report/figures/*.svg",
+)
 
 
 @checked_dataclass(frozen=True, config=STRICT)
@@ -51,10 +56,11 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     (folder / "figures").mkdir(parents=True, exist_ok=True)
     (folder / "report.pdf").write_bytes(report.pdf)
     (folder / "report.html").write_text(report.html, encoding="utf-8")
+    (folder / "explore.html").write_text(report.explorer, encoding="utf-8")
     for name, svg in report.figures.items():
         (folder / "figures" / f"{name}.svg").write_text(svg, encoding="utf-8")
     return {
         "sections": list(report.sections),
         "figures": sorted(report.figures),
-        "headline": f"report/report.pdf and report/report.html, {len(report.figures)} figures",
+        "headline": f"report/report.pdf, report.html, explore.html; {len(report.figures)} figures",
     }

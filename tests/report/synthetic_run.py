@@ -67,9 +67,13 @@ def write_ingest(root: Path, trials: tuple[str, ...] = FREE) -> None:
     rows.append(_trial("t04_free", "free") | aside)
     rows.append(_trial("t05_locked_yaw", "locked") | {"locked_axis": "yaw"})
     write_parquet(root / "ingest/trials.parquet", pd.DataFrame(rows))
-    columns = {f"q_{axis}": [0.0] for axis in AXES}
-    samples = {"trial_id": [trials[0]], "t": [0.0], **columns}
-    write_parquet(root / "ingest/samples.parquet", pd.DataFrame(samples))
+
+    def samples(number: int) -> pd.DataFrame:
+        frame = motion(number)
+        columns = {f"q_{axis}": frame[f"q_{axis}"] for axis in AXES}
+        return pd.DataFrame({"t": frame["t"], **columns, "force_x": np.cos(frame["t"])})
+
+    write_parquet(root / "ingest/samples.parquet", _by_trial(samples))
     units = {"yaw": ("rad", 47e-6), "pitch": ("rad", 98e-6), "extension": ("m", 30e-6)}
     write_result(
         root,
@@ -186,9 +190,12 @@ def write_model(root: Path, model: str) -> None:
         }
         for method, shift in (("ukf", 0.0), ("least-squares", 0.4))
     }
+    sds = np.array([sd for _, sd, _ in parameters(model).values()])
+    together = 0.4 ** np.abs(np.subtract.outer(range(len(sds)), range(len(sds))))
+    covariance = {"names": list(named), "matrix": (together * np.outer(sds, sds)).tolist()}
     write_result(
         root, IdentifyResult, model=model, method="ukf", parameters=named, state_3sigma=bounds,
-        methods=methods,
+        methods=methods, covariance=covariance, blocks=24,
         convergence={"converged": True, "total_s": 48.0, "settled_s": {"mass": 16.93}},
         nis={"mean": 1.0231, "by_trial": {}},
         input_timing={"estimate": 1.2e-4, "sd": 3.1e-5, "unit": "s"},
@@ -290,6 +297,13 @@ def write_diagnosis(root: Path, model: str) -> None:
         _candidate("presliding:yaw", 0.2323, 0.0021, ["stribeck:yaw"]),
         _candidate("asymmetric_coulomb:yaw", 0.5589, 0.41, []),
     ]
+
+    def variables(number: int) -> pd.DataFrame:
+        frame = motion(number)
+        columns = {f"{axis}.velocity": frame[f"qd_{axis}"] for axis in AXES}
+        return pd.DataFrame({"t": frame["t"], **columns})
+
+    write_parquet(root / f"models/{model}/map_variables.parquet", _by_trial(variables))
     window = {
         "axis": "yaw", "trial_id": FREE[1], "t_start": 3.2, "t_end": 3.7, "rmse": 1.234,
         "doing": "reversing slowly with the arm extended",

@@ -34,8 +34,8 @@ def test_writes_what_it_declares(run: RunFolder, tmp_path: Path) -> None:
     out = tmp_path / "out"
     summary = report.execute(run, out, report.Config(), silent)
     written = {path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file()}
-    assert written == {"report/report.pdf", "report/report.html"}
-    assert {"report/report.pdf", "report/report.html"} <= set(report.OUTPUTS)
+    assert written == {"report/report.pdf", "report/report.html", "report/explore.html"}
+    assert written <= set(report.OUTPUTS)
     assert summary["sections"] == [
         "Summary", "Data", "Identification", "Validation", "Diagnosis", "Provenance",
     ]  # fmt: skip

@@ -1,0 +1,377 @@
+"""The page for exploring: what is packed into it, and what a browser makes of it."""
+
+from __future__ import annotations
+
+import base64
+import csv
+import io
+import shutil
+import zlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import pandas as pd
+import pytest
+import synthetic_run
+from hypothesis import given
+from hypothesis import strategies as st
+from made_results import write_result
+
+from bampipe.data.store import write_parquet
+from bampipe.report.explorer.packing import PackedColumn, Packer
+from bampipe.report.explorer.page import explorer_page
+from bampipe.report.results import Results
+from bampipe.results.ingest import IngestResult
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+
+
+def unfold(packer: Packer, block: int, width: int) -> np.ndarray:
+    """Undo what packing did to one block, by its description alone."""
+    raw = zlib.decompress(base64.b64decode(packer.blocks[block]))
+    planes = np.frombuffer(raw, np.uint8).reshape(width, -1).astype(np.int64)
+    folded = sum(plane << (8 * place) for place, plane in enumerate(planes))
+    return np.where(folded % 2, -(folded + 1) // 2, folded // 2)
+
+
+def unpack(packer: Packer, column: PackedColumn) -> np.ndarray:
+    codes = unfold(packer, column.block, 2)
+    for _ in range(column.order):
+        codes = np.cumsum(codes)
+    codes %= 2**16
+    return np.where(codes == 65535, np.nan, column.low + column.step * codes)
+
+
+@given(
+    st.lists(st.floats(-1e9, 1e9, width=32) | st.just(float("nan")), max_size=200),
+    st.integers(0, 3),
+)
+def test_a_column_comes_back_within_half_a_step(values: list[float], smooth: int) -> None:
+    column = np.array(values, dtype=float)
+    for _ in range(smooth):
+        column = np.cumsum(np.nan_to_num(column)) / 10.0
+    packer = Packer()
+    packed = packer.pack(column)
+    back = unpack(packer, packed)
+    assert np.array_equal(np.isnan(back), np.isnan(column))
+    span = np.ptp(column[np.isfinite(column)]) if np.isfinite(column).any() else 0.0
+    assert np.nanmax(np.abs(back - column), initial=0.0) <= span / 65534 / 2 * 1.001 + 1e-30
+
+
+def test_times_keep_microseconds_over_gaps_and_hours() -> None:
+    times = np.concatenate([np.arange(5000) / 997.0, 600.0 + np.arange(5000) / 311.0, [8000.5]])
+    packer = Packer()
+    back = np.cumsum(np.cumsum(unfold(packer, packer.pack_times(times), 8)))
+    assert np.abs(1e-6 * back - times).max() <= 0.5e-6 + 1e-9
+
+
+def test_equal_columns_are_packed_once() -> None:
+    packer = Packer()
+    first, second = packer.pack(np.arange(9.0)), packer.pack(5.0 + 2.0 * np.arange(9.0))
+    assert first.block == second.block and first.low != second.low
+    assert len(packer.blocks) == 1
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return synthetic_run.write_all(tmp_path_factory.mktemp("runs") / "s01")
+
+
+@pytest.fixture(scope="module")
+def page_file(run: Path) -> Path:
+    path = run.parent / "explore.html"
+    path.write_text(explorer_page(Results(run), "device bam"), encoding="utf-8")
+    return path
+
+
+def test_the_page_names_no_address_but_the_report(page_file: Path) -> None:
+    text = page_file.read_text()
+    assert 'href="report.html"' in text
+    assert "default-src 'none'" in text
+    assert "src=" not in text.replace("img-src", "").replace("script-src", "").replace(
+        "style-src", ""
+    ).replace("default-src", "")
+    assert "Copyright (c) 2022 Leon Sorokin" in text
+
+
+def test_text_from_files_cannot_break_the_page(run: Path, tmp_path: Path) -> None:
+    root = tmp_path / "s02"
+    shutil.copytree(run, root)
+    frame = pd.read_parquet(root / "ingest/trials.parquet")
+    frame["kind"] = "</script><script>alert(1)</script>"
+    frame.to_parquet(root / "ingest/trials.parquet")
+    assert "<script>alert" not in explorer_page(Results(root), "")
+
+
+def test_a_session_that_was_only_read_has_a_page(tmp_path: Path) -> None:
+    synthetic_run.write_ingest(tmp_path)
+    assert "position yaw" in explorer_page(Results(tmp_path), "")
+
+
+# In a browser.
+
+Opened = Callable[..., Any]
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    found = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if found is None:
+        pytest.skip("no browser: install Chromium to test the page for exploring")
+    with api.sync_playwright() as driver:
+        running = driver.chromium.launch(executable_path=found, args=["--no-sandbox"])
+        yield running
+        running.close()
+
+
+@pytest.fixture
+def opened(browser: Any) -> Iterator[Opened]:
+    """Open a page; afterwards it must have complained of nothing and asked for nothing."""
+    complaints: list[str] = []
+    contexts = []
+
+    def open_page(path: Path, width: int = 1280, scheme: str = "light") -> Any:
+        context = browser.new_context(
+            viewport={"width": width, "height": 900}, color_scheme=scheme, accept_downloads=True
+        )
+        contexts.append(context)
+        page = context.new_page()
+        page.on("console", lambda message: complaints.append(message.text))
+        page.on("pageerror", lambda error: complaints.append(str(error)))
+
+        def requested(request: Any) -> None:
+            if request.url != path.as_uri() and not request.url.startswith("blob:"):
+                complaints.append(f"asked for {request.url}")
+
+        page.on("request", requested)
+        page.goto(path.as_uri())
+        page.wait_for_selector("html[data-complete]")
+        return page
+
+    yield open_page
+    for context in contexts:
+        context.close()
+    assert complaints == []
+
+
+def figure(page: Any, title: str) -> Any:
+    return page.locator("figure.plot").filter(has_text=title).first
+
+
+def saved(page: Any, title: str, kind: str) -> str:
+    with page.expect_download() as download:
+        page.get_by_role("button", name=f"{title}: {kind}", exact=True).click()
+    return Path(download.value.path()).read_text(encoding="utf-8")
+
+
+def csv_of(page: Any, title: str) -> pd.DataFrame:
+    return pd.read_csv(io.StringIO(saved(page, title, "CSV")))
+
+
+def drag(page: Any, title: str, start: tuple[float, float], stop: tuple[float, float]) -> None:
+    """Drag from one place to another of a figure's plotting area, given in shares of it."""
+    area = figure(page, title).locator(".u-over")
+    area.scroll_into_view_if_needed()
+    box = area.bounding_box()
+    places = [(box["x"] + x * box["width"], box["y"] + y * box["height"]) for x, y in (start, stop)]
+    page.mouse.move(*places[0])
+    page.mouse.down()
+    page.mouse.move(*places[1], steps=5)
+    page.mouse.up()
+
+
+def test_traces_hold_every_sample_of_every_trial(
+    opened: Opened, page_file: Path, run: Path
+) -> None:
+    page = opened(page_file)
+    shown = csv_of(page, "torque yaw")
+    stored = pd.read_parquet(run / "models/base/residuals.parquet")
+    assert shown["trial"].tolist() == stored["trial_id"].tolist()
+    assert shown["t (s)"].to_numpy() == pytest.approx(stored["t"].to_numpy(), abs=1e-6)
+    for column, name in (("measured", "torque_measured_yaw"), ("base", "torque_predicted_yaw")):
+        values = stored[name].to_numpy()
+        step = np.ptp(values) / 65534
+        assert shown[f"{column} (N·m)"].to_numpy() == pytest.approx(values, abs=0.51 * step + 1e-6)
+    assert "version 1 (N·m)" in shown
+
+
+def test_one_zoom_moves_all_traces_and_reset_shows_all(opened: Opened, page_file: Path) -> None:
+    page = opened(page_file)
+    everything = len(csv_of(page, "velocity yaw"))
+    drag(page, "torque yaw", (0.1, 0.5), (0.2, 0.5))
+    parts = [csv_of(page, title) for title in ("torque yaw", "residual yaw", "velocity yaw")]
+    spans = [
+        (part["trial"].unique().tolist(), part["t (s)"].min(), part["t (s)"].max())
+        for part in parts
+    ]
+    assert spans[0] == spans[1] == spans[2]
+    assert 0 < len(parts[2]) < 0.15 * everything
+    page.get_by_role("button", name="Show all").click()
+    assert len(csv_of(page, "velocity yaw")) == everything
+
+
+def test_versions_are_shown_and_hidden(opened: Opened, page_file: Path) -> None:
+    page = opened(page_file)
+    assert "base" in figure(page, "residual yaw").locator(".key").inner_text()
+    page.get_by_label("base", exact=True).uncheck()
+    assert "base" not in figure(page, "residual yaw").locator(".key").inner_text()
+    assert "base (N·m)" not in csv_of(page, "torque yaw")
+
+
+def test_a_region_of_a_map_marks_its_samples_and_a_view_shows_in_maps(
+    opened: Opened, page_file: Path, run: Path
+) -> None:
+    page = opened(page_file)
+    drag(page, "residual yaw by velocity", (0.6, 0.05), (0.8, 0.95))
+    words = page.locator("#marked").inner_text()
+    count = int(words.split()[0])
+    marked = csv_of(page, "residual yaw by velocity")
+    stored = pd.read_parquet(run / "models/base/map_variables.parquet")["yaw.velocity"]
+    assert marked["velocity"].to_numpy() == pytest.approx(stored.to_numpy(), abs=1e-3)
+    chosen = marked[marked["marked"] == 1]
+    assert len(chosen) == count > 20
+    between = marked["velocity"].between(chosen["velocity"].min(), chosen["velocity"].max())
+    tall = marked["residual version 1"]
+    inside = between & tall.between(
+        chosen["residual version 1"].min(), chosen["residual version 1"].max()
+    )
+    assert inside.sum() == count
+    before = figure(page, "residual yaw ").first.locator("canvas").screenshot()
+    page.get_by_role("button", name="Take the mark off").click()
+    assert not page.locator("#marked").is_visible()
+    assert figure(page, "residual yaw ").first.locator("canvas").screenshot() != before
+    canvas = figure(page, "residual yaw by velocity").locator("canvas")
+    everything = canvas.screenshot()
+    drag(page, "torque yaw", (0.1, 0.5), (0.2, 0.5))
+    page.wait_for_timeout(400)
+    assert canvas.screenshot() != everything
+
+
+def test_a_worst_window_is_one_choice_away(opened: Opened, page_file: Path) -> None:
+    page = opened(page_file)
+    page.get_by_role("button", name="Next worst window").click()
+    part = csv_of(page, "torque yaw")
+    assert part["trial"].unique().tolist() == [synthetic_run.FREE[1]]
+    assert part["t (s)"].min() < 3.2 and part["t (s)"].max() > 3.7
+    assert np.ptp(part["t (s)"]) < 3.0
+
+
+def test_keys_move_view_and_cursor_and_the_reading_is_said(opened: Opened, page_file: Path) -> None:
+    page = opened(page_file)
+    page.locator(".canvas").first.focus()
+    page.keyboard.press("PageDown")
+    assert csv_of(page, "torque yaw")["trial"].unique().tolist() == [synthetic_run.FREE[0]]
+    page.locator(".canvas").first.focus()
+    page.keyboard.press("ArrowRight")
+    said = page.locator("#reading").inner_text()
+    assert said.startswith(f"{synthetic_run.FREE[0]}, 8.")
+    assert "torque yaw: measured" in said and "version 1" in said
+    page.keyboard.press("+")
+    page.keyboard.press("+")
+    assert np.ptp(csv_of(page, "torque yaw")["t (s)"]) < 4.1
+
+
+def test_another_axis_brings_its_traces_and_maps(opened: Opened, page_file: Path) -> None:
+    page = opened(page_file)
+    page.get_by_label("pitch", exact=True).check()
+    page.wait_for_selector("text=residual pitch by velocity")
+    assert figure(page, "torque pitch").count() == 1
+    assert figure(page, "torque yaw").count() == 0
+
+
+def test_tables_sort_and_search(opened: Opened, page_file: Path) -> None:
+    page = opened(page_file)
+    table = page.get_by_role("region", name="Candidate effects, base")
+    table.get_by_role("button", name="With", exact=True).click()
+    table.get_by_role("button", name="With", exact=True).click()
+    assert table.locator("tbody tr td").first.inner_text() == "asymmetric_coulomb:yaw"
+    trials = page.get_by_label("Search in Pairs of estimates, version 1")
+    trials.fill("stribeck mass")
+    rows = page.get_by_role("region", name="Pairs of estimates, version 1").locator("tbody tr")
+    visible = [row for row in rows.all() if row.is_visible()]
+    assert 0 < len(visible) < rows.count()
+    assert all("stribeck" in row.inner_text() and "mass" in row.inner_text() for row in visible)
+
+
+def test_every_figure_is_saved_as_svg_and_csv(opened: Opened, page_file: Path) -> None:
+    page = opened(page_file)
+    names = [
+        button.get_attribute("aria-label").removesuffix(": SVG")
+        for button in page.locator('button[aria-label$=": SVG"]').all()
+    ]
+    assert len(names) >= 10
+    for name in names:
+        page.wait_for_timeout(250)  # a browser saves ten files a second at most
+        drawing = ElementTree.fromstring(saved(page, name, "SVG"))
+        assert len(list(drawing.iter("{http://www.w3.org/2000/svg}path"))) > 3, name
+        rows = list(csv.reader(io.StringIO(saved(page, name, "CSV"))))
+        assert len(rows) > 1 and len({len(row) for row in rows}) == 1, name
+
+
+@pytest.mark.parametrize("width", [390, 1280, 2560])
+def test_the_page_fits_the_window_in_either_scheme(
+    opened: Opened, page_file: Path, width: int
+) -> None:
+    papers = set()
+    for scheme in ("light", "dark"):
+        page = opened(page_file, width, scheme)
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+        papers.add(page.evaluate("getComputedStyle(document.body).backgroundColor"))
+    assert len(papers) == 2
+
+
+def test_the_spectrum_shows_the_wave_of_the_residual(opened: Opened, page_file: Path) -> None:
+    page = opened(page_file)
+    found = csv_of(page, "power spectrum yaw")
+    peak = found.loc[found["residual, version 1"].idxmax(), "frequency (Hz)"]
+    assert peak == pytest.approx(7.0 / (2.0 * np.pi), abs=0.13)
+    lags = csv_of(page, "autocorrelation of the residual yaw")
+    half = lags.loc[(lags["lag (s)"] - np.pi / 7.0).abs().idxmin(), "version 1"]
+    assert half == pytest.approx(-1.0, abs=0.05)
+
+
+@pytest.mark.slow
+def test_eight_channels_of_a_million_samples(opened: Opened, tmp_path: Path) -> None:
+    """Everything else must wait for these: 13.4 MB, 1.5 s to ready, 82 ms a zoom."""
+    path = tmp_path / "large.html"
+    path.write_text(explorer_page(Results(_large_session(tmp_path / "large")), ""))
+    assert path.stat().st_size <= 13.4e6
+    ready, zooms = [], []
+    for _ in range(3):
+        page = opened(path)
+        ready.append(float(page.evaluate("document.documentElement.dataset.ready")))
+        assert page.locator("#plots figure").count() == 8
+        page.locator(".canvas").first.focus()
+        for key in "++++++----":
+            page.keyboard.press(key)
+        measured = "performance.getEntriesByType('measure').map((one) => one.duration)"
+        zooms.append(float(np.median(page.evaluate(measured))))
+    assert min(ready) <= 1500.0
+    assert min(zooms) <= 82.0
+
+
+def _large_session(root: Path) -> Path:
+    count, rng = 10**6, np.random.default_rng(0)
+    t = np.arange(count) / 1000.0
+    names = [*(f"q_{axis}" for axis in synthetic_run.AXES), *(f"force_{c}" for c in "xyzuv")]
+    columns: dict[str, object] = {"trial_id": "t01", "t": t}
+    for number, name in enumerate(names):
+        swing = 10.0 * np.sin(2.0 * np.pi * (0.2 + 0.1 * number) * t) + 3.0 * np.sin(10.7 * t)
+        columns[name] = swing + 0.02 * rng.standard_normal(count)
+    write_parquet(root / "ingest/samples.parquet", pd.DataFrame(columns))
+    synthetic_trial = {
+        "trial_id": "t01", "file": "t01.csv", "kind": "free", "locked_axis": None,
+        "viscous_n_s_per_m": None, "n_samples": count, "duration_s": 1000.0,
+        "sample_rate_hz": 1000.0, "status": "ok", "reason": "", "repairs": "",
+    }  # fmt: skip
+    write_parquet(root / "ingest/trials.parquet", pd.DataFrame([synthetic_trial]))
+    write_result(
+        root, IngestResult, session_id="large", device="bam", sample_rate_hz=1000.0,
+        axes={axis: {"unit": "rad", "resolution": 1e-5} for axis in synthetic_run.AXES},
+        force={"noise_sd": {}, "unit": "N", "columns": names[3:]},
+    )  # fmt: skip
+    return root
