@@ -17,6 +17,7 @@ from bampipe.results.lab import LabResult, TrendsResult
 from bampipe.results.performance import PerformanceResult
 from bampipe.results.run import RunResult
 from bampipe.results.stiffness import StiffnessResult
+from bampipe.results.terms import TermsResult
 from bampipe.results.truth import TruthResult
 from bampipe.results.validate import ValidateResult
 from bampipe.results.viscous import ViscousResult
@@ -42,6 +43,7 @@ FILES: dict[str, type[Declaration]] = {
     "trends": TrendsResult,
     "truth": TruthResult,
     "validate": ValidateResult,
+    "terms": TermsResult,
     "viscous": ViscousResult,
 }
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
 
 from bampipe.cli import show
 from bampipe.errors import InputError, choose_from
@@ -89,7 +89,7 @@ def show_one(text: str, device_name: str, json: bool) -> None:
         return
     show.say(f"{effect.name}: {effect.summary}")
     show.say("")
-    for line in _formulas(effect.declaration):
+    for line in effect.formulas:
         show.say(f"  {line}")
     show.say("")
     rows = list(_parameter_rows(effect))
@@ -104,6 +104,8 @@ def show_one(text: str, device_name: str, json: bool) -> None:
     names = [f"{effect.name}:{item}" if item else effect.name for item in targets]
     show.say(f"on {device_name}: {', '.join(names)}")
     show.say(f"looks like: {effect.looks_like}")
+    if effect.on_the_machine:
+        show.say(f"on the machine: {effect.on_the_machine}")
     show.say(f"source: {effect.source}")
     show.say("")
     title = f"{effect.name}:{chosen}" if chosen else effect.name
@@ -117,23 +119,6 @@ def show_one(text: str, device_name: str, json: bool) -> None:
     )
     for line in plot(found.abscissa.tolist(), found.residual.tolist()):
         show.say(line)
-
-
-def _formulas(declaration: Mapping[str, Any]) -> list[str]:
-    lines = []
-    for key in ("torque", "input", "kinetic", "potential", "offset"):
-        value = declaration.get(key)
-        if isinstance(value, str):
-            lines.append(f"{key} = {' '.join(value.split())}")
-        elif isinstance(value, Mapping):
-            lines += [
-                f"{key} of {place} = {' '.join(str(v).split())}" for place, v in value.items()
-            ]
-    for name, state in declaration.get("states", {}).items():
-        lines.append(f"d {name}/dt = {' '.join(str(state['rate']).split())}")
-        if "initial" in state:
-            lines.append(f"{name} at the start = {state['initial']}")
-    return lines
 
 
 def _parameter_rows(effect: Effect) -> Iterator[list[object]]:

@@ -137,6 +137,9 @@ class Effect(Declaration):
         default=(), description="Devices that it makes sense for; all where left out"
     )
     looks_like: Text = Field(description="How it shows in a residual")
+    on_the_machine: str = Field(
+        default="", description="What to do on the machine about it, in one sentence"
+    )
     source: Text = Field(description="Literature, with year")
     parameters: dict[Name, EffectParameter] = Field(min_length=1)
     states: Annotated[tuple[State, ...], ByName(Name)] = ()
@@ -158,6 +161,22 @@ class Effect(Declaration):
             elif value is not None:
                 found[key] = value
         return found
+
+    @property
+    def formulas(self) -> tuple[str, ...]:
+        """Its expressions as lines of text, states with their rates."""
+        lines = []
+        for key in ("torque", "input", "kinetic", "potential", "offset"):
+            value = self.declaration.get(key)
+            if isinstance(value, str):
+                lines.append(f"{key} = {' '.join(value.split())}")
+            elif isinstance(value, Mapping):
+                lines += [f"{key} of {at} = {' '.join(str(v).split())}" for at, v in value.items()]
+        for name, state in self.declaration.get("states", {}).items():
+            lines.append(f"d {name}/dt = {' '.join(str(state['rate']).split())}")
+            if "initial" in state:
+                lines.append(f"{name} at the start = {state['initial']}")
+        return tuple(lines)
 
     @property
     def acting_link(self) -> Link | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -46,15 +47,44 @@ def describe_equations(device: Device) -> str:
     Raises:
         InputError: an expression of the device is wrong.
     """
-    model = Model(device)
+    potential, equations = _equations(Model(device), {})
+    lines = [f"{device.name}: {device.summary}", "", "Coordinates"]
+    for c in device.coordinates:
+        lines.append(f"  {c.symbol} = {c.name}, {c.unit}; generalised force in {c.torque_unit}")
+    lines += ["", "Energies"]
+    lines += ["  kinetic   = q'ᵀ M q' / 2", f"  potential = {potential}"]
+    lines += ["", "M q'' + h = Q, where", *(f"  {line}" for line in equations)]
+    lines += ["", "Numbers", *_numbers(device)]
+    return "\n".join(lines) + "\n"
+
+
+def model_equations(model: Model, values: Mapping[str, float]) -> tuple[str, ...]:
+    """The equations of motion of a model with its effects, ``values`` of parameters put in.
+
+    Returns:
+        Lines for the entries of M, h and Q of M q'' + h = Q, and for the rates of internal states;
+        parameters without a value, and numbers of the device, stand by their names.
+
+    Raises:
+        InputError: an expression is wrong, or deriving takes too long.
+    """
+    return _equations(model, values)[1]
+
+
+def _equations(model: Model, values: Mapping[str, float]) -> tuple[str, tuple[str, ...]]:
+    """The potential energy, and the lines of the equations of motion."""
+    device = model.device
     e = derive(model, named_constants=True)
     marks = [c.symbol for c in device.coordinates]
     names: dict[Any, Any] = {}
     for group, suffix in ((e.q, ""), (e.qd, "'"), (e.qdd, "''")):
         names |= {s: sp.Symbol(m + suffix, real=True) for s, m in zip(group, marks, strict=True)}
+    labels = {p.name: _number(values[p.name]) if p.name in values else p.name
+              for p in model.parameters}  # fmt: skip
     for symbol, label in [
         *zip(e.u, e.inputs, strict=True),
-        *zip(e.p, (p.name for p in model.parameters), strict=True),
+        *zip(e.z, e.z_names, strict=True),
+        *zip(e.p, (labels[p.name] for p in model.parameters), strict=True),
     ]:
         names[symbol] = sp.Symbol(label, real=True)
     names |= {constant_symbol(c): sp.Symbol(c, real=True) for c in device.constants}
@@ -68,23 +98,25 @@ def describe_equations(device: Device) -> str:
                 lambda f, rate=rate: isinstance(f, sp.tanh) and f.args[0].free_symbols == {rate},
                 lambda f, rate=rate: sign(rate),
             )
-        return str(_Notation().doprint(plain.xreplace(names)))
+        written = str(_Notation().doprint(plain.xreplace(names)))
+        return re.sub(r"(?<=[\w)]) (?=\d)", " · ", written)  # else two numbers would read as one
 
-    lines = [f"{device.name}: {device.summary}", "", "Coordinates"]
-    for c in device.coordinates:
-        lines.append(f"  {c.symbol} = {c.name}, {c.unit}; generalised force in {c.torque_unit}")
-    lines += ["", "Energies"]
-    lines += ["  kinetic   = q'ᵀ M q' / 2", f"  potential = {text(e.potential)}"]
-    lines += ["", "M q'' + h = Q, where"]
+    lines = []
     for i, a in enumerate(marks):
         for j, b in enumerate(marks):
             if j >= i and e.mass[i][j] != 0:
-                lines.append(f"  M[{a},{b}] = {text(e.mass[i][j])}")
-    lines += [f"  h[{a}] = {text(h)}" for a, h in zip(marks, e.bias, strict=True)]
+                lines.append(f"M[{a},{b}] = {text(e.mass[i][j])}")
+    lines += [f"h[{a}] = {text(h)}" for a, h in zip(marks, e.bias, strict=True)]
     for a, applied, other in zip(marks, e.applied, e.other, strict=True):
-        lines.append(f"  Q[{a}] = {text(applied + other)}")
-    lines += ["", "Numbers", *_numbers(device)]
-    return "\n".join(lines) + "\n"
+        lines.append(f"Q[{a}] = {text(applied + other)}")
+    lines += [f"d {z}/dt = {text(rate)}" for z, rate in zip(e.z_names, e.rates, strict=True)]
+    return text(e.potential), tuple(lines)
+
+
+def _number(value: float) -> str:
+    """A number as it stands in a formula."""
+    text = f"{value:.4g}"
+    return f"({text})" if value < 0.0 or "e" in text else text
 
 
 def _numbers(device: Device) -> list[str]:

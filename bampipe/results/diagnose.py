@@ -8,6 +8,7 @@ from pydantic import Field
 
 from bampipe.results.record import Names, Record, Result, Share, Size
 from bampipe.results.standing import Standing
+from bampipe.results.terms import EffectText
 from bampipe.schema import Count
 
 Verdict = Literal["nothing_missing", "missing", "undecided", "unknown_effect"]
@@ -100,6 +101,9 @@ class DiagnoseResult(Result):
     next: str = Field(description="What to do now")
     axes: dict[str, AxisVerdict] = Field(min_length=1)
     ranking: tuple[RankedEffect, ...] = Field(description="Best first")
+    descriptions: dict[str, EffectText] = Field(
+        default={}, description="By name of an effect in the ranking: what its file says"
+    )
     selected: Names
     groups: dict[str, Names] = Field(
         description="By effect found: others that these trials cannot tell from it"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -22,7 +23,9 @@ from bampipe.discover.findings import Diagnosis
 from bampipe.discover.settings import Settings
 from bampipe.discover.shape import residual_map, variables, worst_windows
 from bampipe.errors import InputError
-from bampipe.physics import compile_model
+from bampipe.identification.terms import effect_text
+from bampipe.physics import compile_model, registry
+from bampipe.physics.effect import effect_from
 from bampipe.physics.recipe import Recipe
 from bampipe.progress import Progress
 from bampipe.results.diagnose import (
@@ -35,9 +38,13 @@ from bampipe.results.diagnose import (
 )
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.standing import STANDINGS_IN_WORDS
+from bampipe.results.terms import EffectText
 from bampipe.schema import STRICT, Count
 from bampipe.trials.folds import HELD_OUT
 from bampipe.trials.measured import MeasuredTrials, read_measured_trials
+
+_DESCRIBED = 12
+"""Effects of the ranking whose formulas are stored with it."""
 
 SUMMARY = "Find which physical effect the model lacks"
 INPUTS = (*INGESTED, *FILTERED, *IDENTIFIED_MODEL)
@@ -169,6 +176,7 @@ def _result(found: Diagnosis, trials: MeasuredTrials, recipe: Recipe, model: str
         model=model,
         axes=axes,
         ranking=ranking,
+        descriptions=_descriptions(ranking[:_DESCRIBED], recipe),
         selected=found.selected,
         groups=dict(found.groups),
         suggested_trial=suggestion,
@@ -180,6 +188,12 @@ def _result(found: Diagnosis, trials: MeasuredTrials, recipe: Recipe, model: str
         sentence=" ".join(a.sentence for a in axes.values()),
         next=_next(found, model),
     )
+
+
+def _descriptions(ranking: Sequence[RankedEffect], recipe: Recipe) -> dict[str, EffectText]:
+    own = {effect.name: effect for effect in map(effect_from, recipe.extra)}
+    names = {entry.effect.partition(":")[0] for entry in ranking}
+    return {name: effect_text(own.get(name) or registry.effect(name)) for name in sorted(names)}
 
 
 def _sentence(axis: str, i: int, found: Diagnosis, shape: str) -> str:

@@ -16,6 +16,7 @@ from bampipe.data.store import read_parquet, write_parquet
 from bampipe.declarations.model_file import IDENTIFIED_MODEL, identified, load_model
 from bampipe.errors import InputError
 from bampipe.identification.free_run import free_runs
+from bampipe.identification.terms import describe_terms
 from bampipe.physics import System, compile_model
 from bampipe.progress import Progress
 from bampipe.results.identify import IdentifyResult
@@ -37,7 +38,11 @@ from bampipe.trials.residuals import Evidence, gather_evidence
 
 SUMMARY = "Predicted against measured torque and force, on trials that the fit has not seen"
 INPUTS = (*INGESTED, *FILTERED, *IDENTIFIED_MODEL)
-OUTPUTS = ("models/{model}/validate.json", "models/{model}/residuals.parquet")
+OUTPUTS = (
+    "models/{model}/validate.json",
+    "models/{model}/residuals.parquet",
+    "models/{model}/terms.json",
+)
 
 REFUSAL_RATIO = 1.2
 """Error of the published parameters over that of parameters refitted without each trial, beyond
@@ -93,8 +98,8 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     """Compare one identified model with all free trials, and those in a viscous field."""
     system = compile_model(load_model(run, config.model))
     p = identified(run, config.model, system)
-    timing = run.read(IdentifyResult, config.model).input_timing
-    trials = read_measured_trials(run, system, timing=timing)
+    estimates = run.read(IdentifyResult, config.model)
+    trials = read_measured_trials(run, system, timing=estimates.input_timing)
     if config.hold_out_by:
         trials = replace(trials, folds=_folds_by_channel(run, trials, config.hold_out_by))
     require_sound_motions(system, trials.motions)
@@ -124,6 +129,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         unseen = [evidence.held_out_parameters(k) for k in range(len(trials.motions))]
         free = free_runs(run, system, trials.motions, unseen, [c.judged for c in compared])
     write_parquet(out / f"models/{config.model}/residuals.parquet", _table(system, compared))
+    describe_terms(evidence, p, estimates.covariance, config.model).write(out)
     return _result(system, trials, compared, floor, free, notes, config.model).write(out)
 
 

@@ -52,6 +52,37 @@ def test_a_sound_model_is_at_its_noise_floor(simulated: RunFolder) -> None:
     assert content["notes"] == []
 
 
+def test_each_term_takes_the_force_that_its_formula_says(simulated: RunFolder) -> None:
+    validated(simulated)
+    content = read_json(simulated.path("models/base/terms.json"))
+    assert schema_misfits(content, "terms") == []
+    found = read_json(simulated.path("models/base/identify.json"))
+    covariance, names = np.array(found["covariance"]["matrix"]), found["covariance"]["names"]
+    terms = {term["name"]: term for term in content["terms"]}
+    assert set(terms) == {f"friction:{axis}" for axis in content_axes(found)}
+    for name, term in terms.items():
+        axis = name.partition(":")[2]
+        [curve] = term["curves"]
+        assert (curve["axis"], curve["variable"]) == (axis, "velocity")
+        assert term["parameters"] == [f"viscous.{axis}", f"coulomb.{axis}"]
+        speed, mean = np.array(curve["center"]), np.array(curve["mean"])
+        fast = np.abs(speed) > 0.4 * np.abs(speed).max()  # slower, the low-pass rounds the step
+        slope, step = (found["parameters"][item]["estimate"] for item in term["parameters"])
+        assert mean[fast] == pytest.approx((slope * speed + step * np.sign(speed))[fast], rel=0.04)
+        rows = [names.index(item) for item in term["parameters"]]
+        column = np.column_stack([speed, np.sign(speed)])[fast]
+        variance = np.einsum("bi,ij,bj->b", column, covariance[np.ix_(rows, rows)], column)
+        half = (np.array(curve["high"]) - mean)[fast]
+        assert half == pytest.approx(1.96 * np.sqrt(variance), rel=0.1)
+    mass = found["parameters"]["mass"]["estimate"]
+    assert f"M[r,r] = {mass:.4g}" in content["equations"]
+    assert not any("viscous." in line or "mass " in line for line in content["equations"][:7])
+
+
+def content_axes(identified_json: dict) -> list[str]:
+    return [name[8:] for name in identified_json["parameters"] if name.startswith("viscous.")]
+
+
 @pytest.mark.parametrize(("name", "missing"), [("open-01", None), ("open-02", "yaw")])
 def test_shared_sessions_stand_out_where_something_is_missing(
     tmp_path: Path, name: str, missing: str | None

@@ -1,0 +1,191 @@
+"""What each term of an identified model contributes to the force, sample by sample and in bins."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.discover.shape import Variable, variables
+from bampipe.errors import InputError
+from bampipe.physics import System
+from bampipe.physics.effect import Effect
+from bampipe.physics.readable import model_equations
+from bampipe.results.identify import Covariance
+from bampipe.results.terms import EffectText, ModelTerm, TermCurve, TermsResult
+from bampipe.trials.residuals import Evidence
+
+Array = NDArray[np.float64]
+
+_BINS = 24
+_FEWEST = 8
+"""Samples of a bin."""
+_NORMAL_95 = 1.959964
+_LEAST_SHARE = 0.02
+"""Of the force of a term over the axis' own error, below which its curve says nothing."""
+_STEP = 1e-4
+"""Of a parameter's size, for its derivative."""
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Some parameters by number, of which ``strengths`` at 0 take the term out of the model."""
+
+    name: str
+    text: EffectText
+    parameters: tuple[int, ...]
+    strengths: tuple[int, ...]
+
+
+def effect_text(effect: Effect) -> EffectText:
+    """Return what the file of ``effect`` says of it."""
+    return EffectText(
+        summary=effect.summary,
+        formulas=effect.formulas,
+        looks_like=effect.looks_like,
+        on_the_machine=effect.on_the_machine,
+        source=effect.source,
+    )
+
+
+def describe_terms(evidence: Evidence, p: Array, covariance: Covariance, model: str) -> TermsResult:
+    """Return the equations of a model with its numbers, and the curve of each term.
+
+    A curve is the force that the term takes: the residual of the model without it minus that of the
+    model, both low-passed, in bins of the variable that explains most of its variance.
+
+    Args:
+        evidence: of the model on its trials; p: its parameters as published, (n_p,).
+        covariance: of the estimates; model: its name.
+    """
+    system = evidence.system
+    values = {item.name: float(value) for item, value in zip(system.parameters, p, strict=True)}
+    try:
+        equations = model_equations(system.model, values)
+    except InputError:  # they take too long to derive
+        equations = ()
+    known = {
+        axis: [v for v in variables(evidence, axis) if v.name not in ("trial", "time")]
+        for axis in range(len(system.coordinates))
+    }
+    return TermsResult(
+        model=model,
+        equations=equations,
+        terms=tuple(
+            ModelTerm(
+                name=part.name,
+                text=part.text,
+                parameters=tuple(system.parameters[i].name for i in part.parameters),
+                curves=tuple(_curves(evidence, p, covariance, part, known)),
+            )
+            for part in _parts(system)
+        ),
+    )
+
+
+def _parts(system: System) -> Iterator[_Part]:
+    """Yield the friction of each axis, then the effects."""
+    numbers = {item.name: i for i, item in enumerate(system.parameters)}
+    for axis in system.coordinates:
+        own = [numbers[n] for n in (f"viscous.{axis}", f"coulomb.{axis}") if n in numbers]
+        if own:
+            text = EffectText(
+                summary="Viscous and Coulomb friction",
+                formulas=("torque = -viscous*qd - coulomb*sgn(qd)",),
+                looks_like="residual against velocity: a step at zero and a slope",
+                on_the_machine="",
+                source="",
+            )
+            yield _Part(f"friction:{axis}", text, tuple(own), tuple(own))
+    for bound in system.model.effects:
+        own = [numbers[item.name] for item in bound.parameters]
+        strengths = [numbers[item.name] for item in bound.parameters if item.strength]
+        yield _Part(bound.name, effect_text(bound.effect), tuple(own), tuple(strengths))
+
+
+def _residual(evidence: Evidence, p: Array) -> Array:
+    """Return the residual over all trials, low-passed and thinned, (K, n_q)."""
+    trials = range(len(evidence.motions))
+    return np.concatenate([evidence.band.thin(evidence.unfiltered_at(k, p)[0]) for k in trials])
+
+
+def _curves(
+    evidence: Evidence,
+    p: Array,
+    covariance: Covariance,
+    part: _Part,
+    known: dict[int, list[Variable]],
+) -> Iterator[TermCurve]:
+    if not part.strengths:
+        return
+    system = evidence.system
+    without = p.copy()
+    without[list(part.strengths)] = 0.0
+    present, absent = _residual(evidence, p), _residual(evidence, without)
+    force = absent - present
+    names = [system.parameters[i].name for i in part.parameters]
+    free = [i for i, name in zip(part.parameters, names, strict=True) if name in covariance.names]
+    rows = [covariance.names.index(system.parameters[i].name) for i in free]
+    spread = np.array(covariance.matrix)[np.ix_(rows, rows)] if rows else np.zeros((0, 0))
+    slopes = []
+    for i in free:
+        moved = p.copy()
+        step = _STEP * max(abs(p[i]), system.parameters[i].sd, 1e-12)
+        moved[i] += step
+        slopes.append((present - _residual(evidence, moved)) / step)
+    error = evidence.rmse()
+    for axis, name in enumerate(system.coordinates):
+        use = np.concatenate([u[:, axis] for u in evidence.used]) > 0
+        own = force[use, axis]
+        if not own.size or np.sqrt(np.mean(own**2)) < _LEAST_SHARE * error[axis]:
+            continue
+        best: tuple[float, Variable, NDArray[np.int64]] | None = None
+        for variable in known[axis]:
+            which = _bin(np.concatenate(variable.values)[use])
+            share = _explained(own, which)
+            if best is None or share > best[0]:
+                best = share, variable, which
+        if best is None:
+            continue
+        share, variable, which = best
+        values = np.concatenate(variable.values)[use]
+        filled = [b for b in range(which.max() + 1) if np.sum(which == b) >= _FEWEST]
+        if len(filled) < 2:
+            continue
+        mean = _means(own, which, filled)
+        slope = np.array([_means(one[use, axis], which, filled) for one in slopes])
+        variance = np.einsum("ib,ij,jb->b", slope, spread, slope) if rows else 0.0 * mean
+        half = _NORMAL_95 * np.sqrt(np.maximum(variance, 0.0))
+        yield TermCurve(
+            axis=name,
+            unit=system.torque_units[axis],
+            variable=variable.name,
+            variable_unit=variable.unit,
+            center=tuple(_means(values, which, filled)),
+            mean=tuple(mean),
+            low=tuple(mean - half),
+            high=tuple(mean + half),
+            variance_share=share,
+        )
+
+
+def _bin(values: Array) -> NDArray[np.int64]:
+    """Return the number of the bin of each value; bins hold equal counts."""
+    edges = np.unique(np.quantile(values, np.linspace(0.0, 1.0, _BINS + 1)))
+    found = np.searchsorted(edges, values, side="right") - 1
+    return np.clip(found, 0, max(len(edges) - 2, 0)).astype(np.int64)
+
+
+def _means(values: Array, which: NDArray[np.int64], bins: Sequence[int]) -> Array:
+    return np.array([values[which == b].mean() for b in bins])
+
+
+def _explained(values: Array, which: NDArray[np.int64]) -> float:
+    """Return the share of the variance of ``values`` that the means of bins carry."""
+    count = np.bincount(which)
+    means = np.bincount(which, values) / np.maximum(count, 1)
+    total = float(np.sum((values - values.mean()) ** 2))
+    between = float(np.sum(count * (means - values.mean()) ** 2))
+    return min(1.0, between / total) if total > 0.0 else 0.0

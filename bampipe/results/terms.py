@@ -1,0 +1,55 @@
+"""``models/<model>/terms.json``: the equations of a model and what each term contributes."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from pydantic import Field
+
+from bampipe.results.record import Names, Record, Result, Share
+
+
+class EffectText(Record):
+    """What an effect file says of its effect."""
+
+    summary: str
+    formulas: Names
+    looks_like: str
+    on_the_machine: str = Field(description="What to do on the machine about it; may be empty")
+    source: str
+
+
+class TermCurve(Record):
+    """Force that a term takes on one axis, against the variable that it follows most."""
+
+    axis: str
+    unit: str = Field(description="Of the force")
+    variable: str
+    variable_unit: str
+    center: tuple[float, ...] = Field(description="By bin of the trials' samples")
+    mean: tuple[float, ...]
+    low: tuple[float, ...] = Field(description="95 % band by the parameters' covariance")
+    high: tuple[float, ...]
+    variance_share: Share = Field(description="Share of the term's variance that the bins carry")
+
+
+class ModelTerm(Record):
+    """Friction of an axis, or an effect."""
+
+    name: str
+    text: EffectText
+    parameters: Names
+    curves: tuple[TermCurve, ...]
+
+
+class TermsResult(Result):
+    """The equations of a model, and what each of its terms contributes."""
+
+    FILE: ClassVar[str] = "models/{model}/terms.json"
+    STAGE: ClassVar[str] = "validate"
+
+    model: str
+    equations: Names = Field(
+        description="Of M q'' + h = Q, line by line, identified numbers put in; may be empty"
+    )
+    terms: tuple[ModelTerm, ...]
