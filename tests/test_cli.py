@@ -398,13 +398,11 @@ def test_an_effect_is_not_added_twice(ingested: Path, command: Command) -> None:
     assert "has stribeck:yaw already" in error
 
 
-@pytest.mark.parametrize(
-    ("selected", "effect"), [(["presliding:pitch", "force_delay"], "presliding:pitch"), ([], "")]
-)
-def test_the_next_effect_is_the_first_that_the_diagnosis_selects(
-    tmp_path: Path, selected: list[str], effect: str
+@pytest.mark.parametrize("selected", [["presliding:pitch", "force_delay"], []])
+def test_the_next_effects_are_all_that_the_diagnosis_selects(
+    tmp_path: Path, selected: list[str]
 ) -> None:
-    from bampipe.api.loop import next_effect
+    from bampipe.api.loop import next_effects
 
     write_result(tmp_path, DiagnoseResult, axes={"yaw": {}}, selected=selected)
-    assert next_effect(tmp_path, "base") == effect
+    assert next_effects(tmp_path, "base") == tuple(selected)

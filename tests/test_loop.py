@@ -25,7 +25,7 @@ def made(settings: dict[str, object]) -> dict[str, object]:
 
 def test_a_child_is_identified_as_its_parent_was(tmp_path: Path) -> None:
     models.write(tmp_path, ModelFile(name="base", device="slider"))
-    child = models.child_name("base", "stribeck:carriage")
+    child = models.child_name("base", ("stribeck:carriage",))
     models.write(
         tmp_path,
         ModelFile(name=child, parent="base", device="slider", effects=("stribeck:carriage",)),

@@ -398,7 +398,7 @@ def test_children_are_refreshed_once_they_were_run(toy: Toy) -> None:
     toy.run()
     toy.ran()
     parent = models.read(toy.root, "base")
-    name = models.child_name("base", "stribeck:yaw")
+    name = models.child_name("base", ("stribeck:yaw",))
     assert name == "base+stribeck.yaw"
     models.write(
         toy.root,

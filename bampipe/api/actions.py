@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -111,12 +111,12 @@ def write_report(run: Run | Path_, **settings: object) -> Path:
     return _stage(run, "report", "", settings).root / "report" / "report.pdf"
 
 
-def extend(run: Run | Path_, effect: str, model: str = "") -> Run:
-    """Add an effect to a model, identify and validate it again, and compare.
+def extend(run: Run | Path_, effect: str | Sequence[str], model: str = "") -> Run:
+    """Add an effect to a model, or several, identify and validate it again, and compare.
 
     Args:
         run: a run, or its folder.
-        effect: ``name[:target]``, or ``file.toml[:target]`` for one of your own.
+        effect: ``name[:target]``, or ``file.toml[:target]`` for one of your own; or several.
         model: the parent; the one extended last where empty.
 
     Returns:
@@ -126,7 +126,8 @@ def extend(run: Run | Path_, effect: str, model: str = "") -> Run:
         InputError: no such effect or parent, or one that the device cannot have.
     """
     opened = _opened(run)
-    loop.extend(_options(opened), model or opened.model, effect)
+    effects = (effect,) if isinstance(effect, str) else tuple(effect)
+    loop.extend(_options(opened), model or opened.model, effects)
     return Run(opened.root)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from bampipe.declarations.pipeline import Pipeline
     from bampipe.results.diagnose import DiagnoseResult
 
-MOST_EFFECTS = 5
+MOST_ROUNDS = 4
 
 
 @dataclass(frozen=True)
@@ -103,14 +103,14 @@ def _diagnosis(root: Path, model: str) -> DiagnoseResult:
     return RunFolder(root).read(DiagnoseResult, model)
 
 
-def next_effect(root: Path, model: str) -> str:
-    """Return the effect that the diagnosis of ``model`` ranks first, "" if nothing is to be added.
+def next_effects(root: Path, model: str) -> tuple[str, ...]:
+    """Return the effects that the diagnosis of ``model`` found, none if nothing is to be added.
 
     Args:
         root: the run folder; the model must have been diagnosed.
         model: name of the model.
     """
-    return next(iter(_diagnosis(root, model).selected), "")
+    return _diagnosis(root, model).selected
 
 
 def _split_effect_file(text: str) -> tuple[Path, str] | None:
@@ -132,13 +132,13 @@ def _named(text: str) -> tuple[str, Path | None]:
     return f"{effect.name}:{target}" if target else effect.name, path
 
 
-def extend(options: LoopOptions, parent: str, effect: str) -> str:
-    """Make the child of ``parent`` that has ``effect`` too; identify, validate, compare.
+def extend(options: LoopOptions, parent: str, effects: Sequence[str]) -> str:
+    """Make the child of ``parent`` that has ``effects`` too; identify, validate, compare.
 
     Args:
         options: run folder, settings, listener.
         parent: name of a model of this run.
-        effect: ``name[:target]``, or ``file.toml[:target]`` for a lab's own.
+        effects: each ``name[:target]``, or ``file.toml[:target]`` for a lab's own.
 
     Returns:
         The name of the child.
@@ -148,61 +148,73 @@ def extend(options: LoopOptions, parent: str, effect: str) -> str:
             has already; nothing is left behind.
     """
     root = options.root
-    name, file = _named(effect)
-    child = models.child_name(parent, name)
-    if "/" in child or not is_normal(child):
-        raise InputError(f"{name!r} is no name of an effect", remedy="see `bampipe effects`")
+    named = dict(_named(effect) for effect in effects)
+    child = models.child_name(parent, tuple(named))
+    for name in named:
+        if "/" in name or not is_normal(child):
+            raise InputError(f"{name!r} is no name of an effect", remedy="see `bampipe effects`")
     fresh = f"identify:{child}" not in record.read(root).stages
     try:
         with options.lock():
             models.ensure_base(root, *options.pipeline.base_model)
-            _write_child(root, parent, name, file)
+            _write_child(root, parent, named)
         options.run("identify", "validate", parent)
         options.run("identify", "validate", child)
     except InputError:
-        if fresh and (root / "models" / child).exists():
-            with options.lock():
-                shutil.rmtree(root / "models" / child)
+        if fresh:
+            _remove(options, child)
         raise
     options.run("compare", "compare", "")
     return child
 
 
-def _write_child(root: Path, parent: str, effect: str, file: Path | None) -> None:
-    """Write the child of ``parent`` with ``effect`` too, its ``model.toml`` last: then it counts.
+def _remove(options: LoopOptions, model: str) -> None:
+    """Remove a model that came to nothing."""
+    folder = options.root / "models" / model
+    if folder.exists():
+        with options.lock():
+            shutil.rmtree(folder)
+
+
+def _write_child(root: Path, parent: str, named: Mapping[str, Path | None]) -> None:
+    """Write the child of ``parent`` with more effects, its ``model.toml`` last: then it counts.
 
     Args:
         root: the run folder, held.
         parent: name of a model.
-        effect: ``name[:target]``.
-        file: where the effect comes from, if it is a lab's own.
+        named: ``name[:target]`` of each effect, and where it comes from if it is a lab's own.
 
     Raises:
-        InputError: the parent has the effect already, or the device cannot have it.
+        InputError: the parent has an effect already, or the device cannot have it.
     """
     from bampipe.declarations.model import ModelFile
     from bampipe.declarations.model_file import load_model
 
     before = models.read(root, parent)
-    if effect in before.effects:
-        raise InputError(f"model {parent!r} has {effect} already", where=str(root))
-    child = models.child_name(parent, effect)
+    for effect in named:
+        if effect in before.effects:
+            raise InputError(f"model {parent!r} has {effect} already", where=str(root))
+    child = models.child_name(parent, tuple(named))
     effect_files = {
         path.name: path for path in (root / "models" / parent / "effects").glob("*.toml")
     }
-    if file is not None:
-        effect_files[f"{effect.partition(':')[0]}.toml"] = file
+    for effect, file in named.items():
+        if file is not None:
+            effect_files[f"{effect.partition(':')[0]}.toml"] = file
     for name, source in sorted(effect_files.items()):
         text = source.read_text(encoding="utf-8")
         record.replace_text(root / "models" / child / "effects" / name, text)
-    effects = (*before.effects, effect)
+    effects = (*before.effects, *named)
     model = ModelFile(name=child, parent=parent, device=before.device, effects=effects)
     models.write(root, model)
     load_model(RunFolder(root), child)
 
 
 def follow(options: LoopOptions, model: str, tell: Callable[[str], None]) -> str:
-    """Diagnose and extend until the diagnosis says stop, or an effect does not help after all.
+    """Diagnose, add all that was found at once, and confirm it by one more diagnosis.
+
+    An effect that the identified model gives no strength is left out again. What the confirmation
+    finds beyond the set is added likewise, until it finds nothing more.
 
     Args:
         options: run folder, settings, listener.
@@ -213,23 +225,57 @@ def follow(options: LoopOptions, model: str, tell: Callable[[str], None]) -> str
         The name of the last model that is better than its parent.
     """
     options.run("identify", "validate", model)  # what a child is held against, and the ladder shows
-    for _ in range(MOST_EFFECTS):
+    for _ in range(MOST_ROUNDS):
         options.run("diagnose", "diagnose", model)
-        effect = next_effect(options.root, model)
-        for axis, entry in sorted(_diagnosis(options.root, model).axes.items()):
+        diagnosis = _diagnosis(options.root, model)
+        for axis, entry in sorted(diagnosis.axes.items()):
             tell(f"{model}, {axis}: {entry.verdict.replace('_', ' ')}")
-        if not effect:
+        if not diagnosis.selected:
             break
-        tell(f"adding {effect}")
-        child = extend(options, model, effect)
-        if not _better(options.root, model, child):
-            tell(f"{effect} does not lower the held-out error after all: stopped at {model}")
+        child = _add(options, model, diagnosis.selected, tell)
+        if not child:
             break
         model = child
     else:
-        tell(f"stopped after {MOST_EFFECTS} effects")
+        tell(f"stopped after {MOST_ROUNDS} rounds")
     options.run("compare", "compare", "")
     return model
+
+
+def _add(
+    options: LoopOptions, model: str, effects: tuple[str, ...], tell: Callable[[str], None]
+) -> str:
+    """Extend ``model`` by those of ``effects`` that keep a strength; "" if that helps no axis."""
+    tell(f"adding {', '.join(effects)}")
+    child = extend(options, model, effects)
+    idle = _without_strength(options.root, child, effects)
+    if idle:
+        tell(f"{', '.join(idle)}: no strength beside the other parameters, left out")
+        effects = tuple(effect for effect in effects if effect not in idle)
+        _remove(options, child)
+        if not effects:
+            return ""
+        child = extend(options, model, effects)
+    if _better(options.root, model, child):
+        return child
+    tell(f"{', '.join(effects)}: the held-out error does not fall after all, stopped at {model}")
+    return ""
+
+
+def _without_strength(root: Path, model: str, effects: Sequence[str]) -> tuple[str, ...]:
+    """Those of ``effects`` whose every strength in ``model`` is zero within two of its sd."""
+    from bampipe.declarations.model_file import load_model
+    from bampipe.results.identify import IdentifyResult
+
+    run = RunFolder(root)
+    found = run.read(IdentifyResult, model).parameters
+    idle = []
+    for effect in load_model(run, model).effects:
+        strengths = [found[p.name] for p in effect.parameters if p.strength and p.name in found]
+        unsure = all(abs(p.estimate) < 2.0 * p.sd for p in strengths)
+        if effect.name in effects and strengths and unsure:
+            idle.append(effect.name)
+    return tuple(idle)
 
 
 def _better(root: Path, parent: str, child: str) -> bool:

@@ -40,14 +40,14 @@ def diagnose(
     if options.list_settings:
         print_settings("diagnose")
         return
-    from bampipe.api.loop import current_model, next_effect
+    from bampipe.api.loop import current_model, next_effects
 
     root = places.find_run(run, options.runs)
     chosen = model or current_model(root)
     one_stage("diagnose", root, options, model=chosen)
     name = places.next_to(root, options.runs)
-    effect = next_effect(root, chosen)
-    command = f"bampipe extend {name} {effect}" if effect else f"bampipe report {name}"
+    effects = " ".join(next_effects(root, chosen))
+    command = f"bampipe extend {name} {effects}" if effects else f"bampipe report {name}"
     advise(options.quiet, options.json, command)
 
 
@@ -56,14 +56,17 @@ def extend(
         str | None,
         typer.Argument(metavar="[RUN]", help="Run folder; the most recent run if omitted."),
     ] = None,
-    second: Annotated[
-        str | None,
+    others: Annotated[
+        list[str] | None,
         typer.Argument(
-            metavar="EFFECT", help="Effect to add, name[:target], or an effect file[:target]."
+            metavar="EFFECT...", help="Effects to add, name[:target], or effect files[:target]."
         ),
     ] = None,
     auto: Annotated[
-        bool, typer.Option("--auto", help="Follow the diagnosis until it says stop.")
+        bool,
+        typer.Option(
+            "--auto", help="Add what the diagnosis finds, and confirm, until it says stop."
+        ),
     ] = False,
     model: Annotated[
         str, typer.Option(help="Model to extend; the one extended last if omitted.")
@@ -74,7 +77,7 @@ def extend(
     json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Add an effect to a model, identify and validate it again, print the ladder.
+    """Add effects to a model, identify and validate it again, print the ladder.
 
     Example: bampipe extend 2026-10-03_s01 stribeck:yaw
 
@@ -86,13 +89,18 @@ def extend(
     from bampipe.results.compare import CompareResult
 
     batch.limit_threads(1)
-    if auto and second is not None:
-        raise InputError("--auto chooses the effects itself", remedy=f"leave out {second!r}")
-    alone = first is None or (second is None and places.is_run(first, runs))
-    if not auto and alone:
+    effects = others or []
+    if auto and effects:
+        raise InputError("--auto chooses the effects itself", remedy=f"leave out {effects[0]!r}")
+    if (
+        first is not None
+        and not auto
+        and not places.is_run(first, runs)
+        and (not effects or _is_effect(first))
+    ):
+        effects, first = [first, *effects], None
+    if not auto and not effects:
         raise InputError("no effect named", remedy="`bampipe effects` lists them; or use --auto")
-    if not auto and second is None:
-        first, second = None, first
     root = places.find_run(first, runs)
     pipeline = whole_pipeline(root, "")
     parent = model or loop.current_model(root)
@@ -101,7 +109,7 @@ def extend(
         if auto:
             last = loop.follow(options, parent, lambda line: None if json else show.say(line))
         else:
-            last = loop.extend(options, parent, second or "")
+            last = loop.extend(options, parent, effects)
     ladder = RunFolder(root).read(CompareResult).model_dump(mode="json")
     if json:
         show.as_json(ladder)
@@ -109,6 +117,14 @@ def extend(
     show.say(f"{root}: {last}")
     show.summary(ladder)
     advise(quiet, json, f"bampipe diagnose {places.next_to(root, runs)}")
+
+
+def _is_effect(argument: str) -> bool:
+    """Whether ``argument`` names an effect or an effect file, and not a run."""
+    from bampipe.physics.registry import effect_names
+
+    name = argument.partition(":")[0]
+    return name.endswith(".toml") or name in effect_names()
 
 
 def demo(

@@ -19,6 +19,9 @@ from bampipe.trials.residuals import Evidence
 Array = NDArray[np.float64]
 
 _DURATION_S = 16.0
+_BETTER = 1.5
+"""A trial is suggested if it tells two effects apart so many times better than those at hand: the
+designs are ideal, a hand is not."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +69,7 @@ def advise(
     second: str,
     values: Mapping[str, Array],
     floor: float,
-) -> Advice:
+) -> Advice | None:
     """The design under which confusing ``first`` with ``second`` would cost most.
 
     Args:
@@ -77,6 +80,9 @@ def advise(
         first, second: canonical names.
         values: fitted parameters of each effect, in the order of its file.
         floor: noise floor of the axis, N.m or N.
+
+    Returns:
+        None where no design would show more than the trials at hand, or less than the floor.
     """
     now = [_confusion(recipe, evidence, m, axis, first, second, values) for m in trials.motions]
     best: Advice | None = None
@@ -86,8 +92,8 @@ def advise(
         if best is None or cost > best.separation:
             words = design.words.format(axis=evidence.system.coordinates[axis])
             best = Advice(words, float(cost), float(np.mean(now) / floor))
-    assert best is not None
-    return best
+    tells = best is not None and best.separation > max(1.0, _BETTER * best.separation_now)
+    return best if tells else None
 
 
 def _confusion(

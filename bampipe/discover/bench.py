@@ -65,18 +65,19 @@ class Bench:
         seed: tuple[int, ...],
         share: bool = False,
         analysed: tuple[Recipe, Array] | None = None,
+        first: int = 0,
     ) -> list[Replicate]:
         """Replays of a model at ``p``; ``seed`` tells this set from all others.
 
-        Each is fitted by ``analysed``, a model and where its fit starts, or else by itself, and
-        ``names`` are scored against that fit.
+        They are numbered from ``first`` on. Each is fitted by ``analysed``, a model and where its
+        fit starts, or else by itself, and ``names`` are scored against that fit.
         """
         into, start = analysed or (recipe, p)
         tasks = [
             ReplicateTask(
                 recipe, p, into, start, (self.settings.seed, *seed, k), tuple(names), share
             )
-            for k in range(count)
+            for k in range(first, first + count)
         ]
         return list(self.pool(run_replicate, tasks))
 
@@ -99,14 +100,18 @@ class Bench:
         self, recipe: Recipe, evidence: Evidence, asked: Sequence[str], seed: tuple[int, ...]
     ) -> Level:
         """Chance level of candidates against a fitted model; ``asked`` are learned at once."""
-        count = self.settings.replicates
+
+        def replay(names: Sequence[str], first: int, count: int) -> list[Replicate]:
+            return self.replicas(recipe, evidence.p, count, names, seed, first=first)
+
+        scorer = Scorer(evidence)
         return Level(
-            lambda names: self.replicas(recipe, evidence.p, count, names, seed),
+            replay,
             asked,
             len(self.names),
-            Scorer(evidence).before.error,
-            np.maximum(Scorer(evidence).independent, 1.0),
-            self.settings.replay_error,
+            scorer.before.error,
+            np.maximum(scorer.independent, 1.0),
+            self.settings,
         )
 
     def gaining(self, scores: Mapping[str, Score], scorer: Scorer) -> list[str]:

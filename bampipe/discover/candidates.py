@@ -34,6 +34,11 @@ _SIMILAR = 0.7
 _DENSEST = 48
 _SHARES = (1.0, 0.9, 0.8, 0.65, 0.5, 0.35, 0.2, 0.1, 0.05)
 """Shares of the least-squares strength tried where an effect weakens what the force does."""
+_OWN_WEIGHT = 0.05
+"""Weight that a trial keeps when it is left out to score candidates. Where it alone holds what
+determines a parameter, as one wide motion among narrow ones does, leaving it out altogether would
+compare extrapolations; of what several trials determine it keeps a few hundredths of a degree of
+freedom."""
 _DIVERGED = 1e30
 """An internal state that is too stiff to be integrated at the sampling rate ends above this."""
 
@@ -85,6 +90,21 @@ class Score:
     def total(self) -> float:
         """Gain over all axes."""
         return float(self.gain.sum())
+
+
+@dataclass(frozen=True)
+class _Joint:
+    """The linear problem of a model with a candidate of given shape.
+
+    Attributes:
+        sums: its sums of products; slopes, residuals: by trial, (K, n_q, P) and (K, n_q).
+        columns: what the candidate adds, (n, m), for comparing shapes.
+    """
+
+    sums: NormalEquations
+    slopes: Sequence[Array]
+    residuals: Sequence[Array]
+    columns: Array
 
 
 def library(
@@ -157,7 +177,7 @@ class Scorer:
     def before(self) -> Score:
         """The model as it is."""
         e = self.evidence
-        steps = self.folds.solve(e.sums, e.weight, e.lower, e.upper)
+        steps = self.folds.solve(e.sums, e.weight, e.lower, e.upper, _OWN_WEIGHT)
         error = self.folds.error(e.sums, steps)
         return Score("", error, np.zeros(0), np.zeros(len(e.free)), np.zeros(len(error)))
 
@@ -192,6 +212,29 @@ class Scorer:
         best = self._at(item, np.array(at))
         # An error of exactly zero, on an axis that nothing drives, is no explanation.
         return best if best is not None and np.isfinite(best.gain).all() else None
+
+    def score_at(self, item: Candidate, values: Array) -> Score | None:
+        """Refit with ``item`` added, its searched parameters held at those of ``values``."""
+        found = self._at(item, values[list(item.searched)])
+        return found if found is not None and np.isfinite(found.gain).all() else None
+
+    def gain_by_sample(self, item: Candidate, score: Score) -> list[Array]:
+        """Gain in log likelihood that each sample contributes, by trial, each (K,).
+
+        That of the fit; zero in trials that the session holds out, for they choose no model.
+        """
+        problem = self._problem(item, score.values[list(item.searched)])
+        if problem is None:
+            return [np.zeros(len(r)) for r in self.evidence.residual]
+        values, weight = self._fit(item, problem.sums)
+        rows = zip(
+            self.folds.judged, self.evidence.residual, problem.residuals, problem.slopes,
+            strict=True,
+        )  # fmt: skip
+        return [
+            0.5 * (np.square(before) - np.square(r + x @ values)) @ weight * judged
+            for judged, before, r, x in rows
+        ]
 
     def _absent(self, item: Candidate) -> Score:
         """The score of an effect that these trials do not ask for: strength zero."""
@@ -247,7 +290,7 @@ class Scorer:
                 ends = [_middle(x, ends[0]), _middle(x, ends[1])]
         return float(x), float(best)
 
-    def _problem(self, item: Candidate, searched: Array) -> tuple[NormalEquations, Array] | None:
+    def _problem(self, item: Candidate, searched: Array) -> _Joint | None:
         columns, change = self._columns(item, searched)
         if all(not c.any() for c in columns) and all(not c.any() for c in change):
             return None
@@ -258,7 +301,8 @@ class Scorer:
         residuals = [r + c for r, c in zip(e.residual, change, strict=True)]
         shape = np.concatenate(columns if item.linear else change)
         flat = shape.reshape(-1, shape.shape[-1]) if item.linear else shape
-        return NormalEquations.from_samples(slopes, residuals, e.used), flat
+        sums = NormalEquations.from_samples(slopes, residuals, e.used)
+        return _Joint(sums, slopes, residuals, flat)
 
     def _bounds(self, item: Candidate) -> tuple[Array, Array]:
         """Bounds of the changes of the base parameters and of the linear strengths."""
@@ -273,9 +317,8 @@ class Scorer:
         problem = self._problem(item, searched)
         if problem is None:
             return None
-        sums, columns = problem
-        values, _ = self._fit(item, sums)
-        return self._cost(sums, values, self._folds(item)), columns
+        values, _ = self._fit(item, problem.sums)
+        return self._cost(problem.sums, values, self._folds(item)), problem.columns
 
     def _fit(self, item: Candidate, sums: NormalEquations) -> tuple[Array, Array]:
         """Coefficients of the joint fit, reweighted once by what each axis is left with."""
@@ -290,7 +333,7 @@ class Scorer:
         problem = self._problem(item, searched)
         if problem is None:
             return None
-        sums, _ = problem
+        sums = problem.sums
         values, weight = self._fit(item, sums)
         folds, (lower, upper) = self._folds(item), self._bounds(item)
         own = np.array([p.prior for p in item.own])
@@ -299,7 +342,8 @@ class Scorer:
         own[list(item.linear)] = values[start:]
 
         def error_within(lower: Array, upper: Array) -> Array:
-            return folds.error(sums, folds.solve(sums, weight, lower, upper))
+            steps = folds.solve(sums, weight, lower, upper, _OWN_WEIGHT)
+            return folds.error(sums, steps)
 
         if not item.system.driven:
             error = error_within(lower, upper)

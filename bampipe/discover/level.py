@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +10,7 @@ from scipy.stats import t as student
 
 from bampipe.discover.candidates import Score
 from bampipe.discover.chance import Replicate
+from bampipe.discover.settings import Settings
 
 Array = NDArray[np.float64]
 
@@ -18,48 +19,76 @@ class Level:
     """Mean and scatter of candidates' scores on replays of one model, found as needed.
 
     A candidate that gains nothing on the measured trials needs no chance level; most gain nothing.
+    Where a decision is close, more replays are made of those candidates.
     """
 
     def __init__(
         self,
-        replay: Callable[[Sequence[str]], list[Replicate]],
+        replay: Callable[[Sequence[str], int, int], list[Replicate]],
         asked: Sequence[str],
         tests: int,
         before: Array,
         independent: Array,
-        replay_error: float,
+        settings: Settings,
     ) -> None:
-        self._replay, self._tests = replay, tests
+        """Replay the model and learn the chance level of ``asked``.
+
+        Args:
+            replay: candidates to score, number of the first replay, count; returns the replays.
+            asked: candidates to learn at once.
+            tests: number of candidates in the library.
+            before: error of the model, by axis; independent: samples that count, by axis.
+            settings: how many replays, and what is significant.
+        """
+        self._replay, self._tests, self._settings = replay, tests, settings
         self._before, self._independent = before, independent
         # No replay is perfect: its log error is off by this, as a log likelihood.
-        self._error = replay_error * float(independent.mean())
+        self._error = settings.replay_error * float(independent.mean())
         self._gains: dict[str, Array] = {}
-        self.replicates = self._learn(asked)
+        self.replicates = self._learn(asked, 0, settings.replicates)
 
-    def _learn(self, names: Sequence[str]) -> list[Replicate]:
-        replicates = self._replay(names)
+    def _learn(self, names: Sequence[str], first: int, count: int) -> list[Replicate]:
+        replicates = self._replay(names, first, count)
         nothing = np.zeros(len(replicates[0].error))
         for name in names:
-            self._gains[name] = np.array(
+            gains = np.array(
                 [r.scores[name].gain if name in r.scores else nothing for r in replicates]
             )
+            known = self._gains.get(name)
+            self._gains[name] = gains if known is None else np.concatenate([known, gains])
         return replicates
 
-    def ask(self, names: Sequence[str]) -> None:
-        """Replay again for those of ``names`` whose chance level is not known yet."""
+    def ask(self, scores: Mapping[str, Score], names: Sequence[str]) -> None:
+        """Replay for those of ``names`` whose chance level is not known, again where it is close.
+
+        Close is a p-value within a factor of `Settings.close` of the significance on either side:
+        on both, or the second look would be another chance of a false alarm.
+        """
+        s = self._settings
         unknown = [name for name in names if name not in self._gains]
         if unknown:
-            self._learn(unknown)
+            self._learn(unknown, 0, s.replicates)
+        low, high = s.significance / s.close, s.significance * s.close
+        close = [
+            name
+            for name in names
+            if len(self._gains[name]) == s.replicates and low < self.p_value(scores[name]) < high
+        ]
+        if close and s.most_replicates > s.replicates:
+            self._learn(close, s.replicates, s.most_replicates - s.replicates)
 
     def p_value(self, score: Score) -> float:
         """Chance that any candidate scores this high with nothing missing (Bonferroni).
 
-        One for a candidate that was not worth a chance level.
+        One for a candidate that was not worth a chance level. What counts is how far chance reaches
+        upwards: a replay on which the candidate fails, as its shape may without one of three
+        trials, would only widen the scatter.
         """
         if score.name not in self._gains:
             return 1.0
-        count = len(self.replicates)
         totals = self._gains[score.name].sum(axis=1)
+        count, middle = len(totals), float(np.median(totals))
+        totals = np.maximum(totals, 2.0 * middle - totals.max())
         spread = np.hypot(totals.std(ddof=1) * np.sqrt(1.0 + 1.0 / count), self._error)
         z = (score.total - totals.mean()) / spread
         return float(min(1.0, self._tests * student.sf(z, count - 1)))
@@ -75,7 +104,7 @@ class Level:
             return score.gain
         n = self._independent
         replayed = np.mean([r.error for r in self.replicates], axis=0)
-        by_chance = replayed**2 * (1.0 - np.exp(-2.0 * gains.mean(axis=0) / n))
+        by_chance = replayed**2 * (1.0 - np.exp(-2.0 * np.median(gains, axis=0) / n))
         after = self._before**2 * np.exp(-2.0 * score.gain / n) + by_chance
         ratio = np.maximum(after, 1e-12 * self._before**2) / self._before**2
         return np.asarray(-0.5 * n * np.log(ratio))

@@ -3,19 +3,35 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from bampipe.discover.bench import Bench
-from bampipe.discover.candidates import Score
-from bampipe.discover.chance import Progress, Replicate
+from bampipe.discover.candidates import Score, Scorer
+from bampipe.discover.chance import Progress, Replicate, candidates_of
+from bampipe.discover.influence import Stretch, find_influence
 from bampipe.discover.level import Level
 from bampipe.discover.settings import Settings
 from bampipe.discover.start import with_effect
 from bampipe.estimate.simulation import Runaway
 from bampipe.physics.recipe import Recipe
 from bampipe.trials.residuals import Evidence
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Which of the candidates that beat chance is to be added.
+
+    Attributes:
+        winner: the best one; "" if every one of them rests on one second.
+        alike: others that these trials cannot tell from it, two at most.
+        transient: candidates that only one second speaks for, and that second.
+    """
+
+    winner: str
+    alike: tuple[str, ...]
+    transient: Mapping[str, Stretch]
 
 
 def choose(
@@ -26,8 +42,11 @@ def choose(
     evidence: Evidence,
     scores: Mapping[str, Score],
     progress: Progress,
-) -> tuple[str, tuple[str, ...]]:
-    """The best of ``significant``, and others that these trials cannot tell from it, two at most.
+) -> Choice:
+    """Choose among ``significant`` the best, and name others that these trials cannot tell from it.
+
+    Candidates that come close are compared without the second that speaks most for the first of
+    them, too: a start or a hit at a stop that happened once must not decide.
 
     Args:
         bench: the session.
@@ -40,13 +59,32 @@ def choose(
     s = bench.settings
     top, best = significant[0]
     axis = int(np.argmax(level.excess(scores[best])))
-    rivals = [
+    close = [
         name
         for excess, name in significant
         if excess > s.rival_share * top and int(np.argmax(level.excess(scores[name]))) == axis
-    ][: s.most_rivals]
+    ]
+    items = candidates_of(recipe, close)
+    influence = find_influence(evidence, items, [scores[name] for name in close])
+    rest = influence.without_second
+    independent = Scorer(evidence).independent
+
+    def stands(name: str) -> bool:
+        score = rest.get(name)
+        return (
+            score is not None
+            and level.p_value(score) < s.significance
+            and bool(np.any(score.gain / independent > 0.5 * s.worth))
+        )
+
+    firm = sorted((n for n in close if stands(n)), key=lambda n: -rest[n].total)
+    transient = {name: influence.second for name in close if name not in firm}
+    if not firm:
+        return Choice("", (), transient)
+    rivals = firm[: s.most_rivals]
+    best = rivals[0]
     if len(rivals) == 1:
-        return best, ()
+        return Choice(best, (), transient)
     misfit = {}
     for k, name in enumerate(rivals):
         progress(0.5, f"replaying {name} to tell it from {len(rivals) - 1} rival(s)")
@@ -70,13 +108,13 @@ def choose(
     if misfit[winner] > s.rival_misfit + s.rival_margin:
         # No rival's replays look like the measurement, as where more is missing than one effect:
         # their patterns are no evidence for any of them.
-        return best, ()
+        return Choice(best, (), transient)
     limit = max(s.rival_misfit, misfit[winner] + s.rival_margin)
     alike = tuple(n for n in ordered[1:] if misfit[n] < limit)
     if best in alike:
         alike = (winner, *[n for n in alike if n != best])
         winner = best
-    return winner, alike[:2]
+    return Choice(winner, alike[:2], transient)
 
 
 def _misfit(

@@ -1,9 +1,9 @@
-"""The search for what a model lacks: the best candidate that beats chance, again and again."""
+"""The search for what a model lacks: sets of effects that beat chance, grown, swapped, pruned."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,12 +11,16 @@ from numpy.typing import NDArray
 from bampipe.discover.bench import Bench
 from bampipe.discover.candidates import Score, Scorer
 from bampipe.discover.chance import Progress, Replicate
+from bampipe.discover.findings import Contender, Step
+from bampipe.discover.influence import Stretch, error_without_second
 from bampipe.discover.level import Level
+from bampipe.discover.polish import FittedSet, extend_set, is_superfluous, polish, reduce_set
 from bampipe.discover.rivals import choose
-from bampipe.discover.start import with_effect, without_effect
+from bampipe.discover.settings import Settings
 from bampipe.estimate.simulation import Runaway
 from bampipe.physics.recipe import Recipe
 from bampipe.results.standing import AT_FLOOR, standing
+from bampipe.trials.folds import HELD_OUT
 from bampipe.trials.noise_floor import FLOOR_SEED, NoiseFloor
 from bampipe.trials.residuals import Evidence
 
@@ -32,29 +36,43 @@ class Search:
         initial: its fit.
         level: chance level of candidates against it.
         first: scores against it.
-        groups: for each effect added, in order, the others that these trials cannot tell from it.
+        found: the model with every effect found, fitted.
+        groups: for each effect found, in order, the others that these trials cannot tell from it.
+        contests: for each, those who contend for its place, itself first.
         main: for each, the axis on which it helps most.
-        evidence: fit of the model with all of them.
-        final: replays of that model, with explainable shares.
+        likely: p-value and gain in log error by axis of candidates that would lower the error of
+            the final model, but do not beat chance.
+        transient: candidates that only one second speaks for, and that second.
+        steps: the sets tried, in order.
+        final: replays of the final model, with explainable shares.
     """
 
     recipe: Recipe
     initial: Evidence
     level: Level
     first: Mapping[str, Score]
+    found: FittedSet
     groups: Mapping[str, tuple[str, ...]]
+    contests: Mapping[str, tuple[Contender, ...]]
     main: Mapping[str, int]
-    evidence: Evidence
+    likely: Mapping[str, tuple[float, Array]]
+    transient: Mapping[str, Stretch]
+    steps: tuple[Step, ...]
     final: tuple[Replicate, ...]
 
     @property
     def selected(self) -> tuple[str, ...]:
-        """Effects added, in order."""
-        return tuple(self.groups)
+        """Effects found, in order."""
+        return self.found.added
+
+    @property
+    def evidence(self) -> Evidence:
+        """Fit of the model with all of them."""
+        return self.found.evidence
 
 
 def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Search:
-    """Add effects to a model until no candidate beats chance.
+    """Add effects to a model until no candidate beats chance, then put the set to the test.
 
     Args:
         bench: the session and the candidates.
@@ -70,50 +88,83 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
     first = bench.scores(base, initial.p, bench.names)
     progress(0.15, "replaying the model for chance levels")
     level = bench.level(base, initial, bench.gaining(first, Scorer(initial)), (FLOOR_SEED,))
-    recipe, evidence, scores = base, initial, first
+    current, scores = FittedSet(base, (), initial), dict(first)
     groups: dict[str, tuple[str, ...]] = {}
-    main: dict[str, int] = {}
     dropped: set[str] = set()
+    transient: dict[str, Stretch] = {}
+    steps = [_step(current)]
     replayed = level.replicates
-    while len(groups) + len(dropped) < s.most_effects:
+    while len(current.added) + len(dropped) < s.most_effects:
+        evidence = current.evidence
         known = level
-        significant = _significant(bench, scores, known, evidence, replayed)
-        if significant and groups:
+        significant, likely = _weigh(bench, scores, known, evidence, replayed)
+        if significant and current.added:
             # What a model with the first effects leaves by chance may look like another one.
             close = {name: scores[name] for _, name in significant}
-            known = bench.level(recipe, evidence, list(close), (4, len(groups)))
-            significant = _significant(bench, close, known, evidence, replayed)
+            seed = (4, len(current.added))
+            known = bench.level(current.recipe, evidence, list(close), seed)
+            significant, fewer = _weigh(bench, close, known, evidence, replayed)
+            likely |= fewer
         if not significant:
             break
-        best, alike = choose(bench, significant, known, recipe, evidence, scores, progress)
-        wider = replace(base, effects=(*base.effects, *groups, best))
-        fitted = bench.fit(wider, with_effect(wider, evidence, scores[best]))
-        wider, fitted = _needed(bench, base, wider, fitted)
+        chosen = choose(bench, significant, known, current.recipe, evidence, scores, progress)
+        transient |= chosen.transient
+        scores = {n: score for n, score in scores.items() if n not in chosen.transient}
+        if not chosen.winner:
+            continue
+        wider = extend_set(bench, current, scores[chosen.winner])
+        for earlier in wider.added[:-1]:
+            # What resembles the missing effect may come first: it takes a little of several others.
+            less = reduce_set(bench, wider, earlier)
+            if is_superfluous(wider, less, s):
+                wider = less
         try:
-            replays = bench.replicas(wider, fitted.p, s.rival_replicates, (), (3,))
-            sound = _keeps_the_floor(fitted, replays, replayed)
+            replays = bench.replicas(wider.recipe, wider.evidence.p, s.rival_replicates, (), (3,))
+            sound = _keeps_the_floor(wider.evidence, replays, replayed) and _carries_over(
+                current.evidence, wider.evidence, s
+            )
         except Runaway:
             sound = False
         if not sound:
             # It resembles what is missing in these trials, but no mechanism could have it.
-            dropped.add(best)
-            scores = {name: score for name, score in scores.items() if name != best}
+            dropped.add(chosen.winner)
+            scores = {name: score for name, score in scores.items() if name != chosen.winner}
             continue
-        recipe, evidence, replayed = wider, fitted, replays
-        groups[best] = alike
-        help_ = level.excess(first[best]) if best in first else known.excess(scores[best])
-        main[best] = int(np.argmax(help_))
-        progress(0.45 + 0.1 * len(groups), f"added {best}, looking for more")
-        dropped |= set(groups) - set(recipe.effects)
-        groups = {name: alike for name, alike in groups.items() if name not in dropped}
-        main = {name: axis for name, axis in main.items() if name not in dropped}
-        rest = [n for n in bench.names if n not in groups and n not in dropped]
-        scores = bench.scores(recipe, evidence.p, rest)
+        dropped |= {*current.added, chosen.winner} - {*wider.added}
+        current, replayed = wider, replays
+        groups[chosen.winner] = chosen.alike
+        steps.append(_step(current))
+        progress(0.45 + 0.05 * len(steps), f"added {chosen.winner}, looking for more")
+        rest = [n for n in bench.names if n not in current.added and n not in dropped]
+        rest = [n for n in rest if n not in transient]
+        scores = bench.scores(current.recipe, current.evidence.p, rest)
+    progress(0.8, "weighing each effect beside its rivals")
+    rivals = {name: _rivals(first, name, groups.get(name, ()), s) for name in current.added}
+    found, contests = polish(bench, current, rivals)
+    if found.added != current.added:
+        steps.append(_step(found))
     progress(0.85, "replaying the final model for its noise floor")
-    final = bench.floor_replicas(recipe, evidence.p)
+    final = bench.floor_replicas(found.recipe, found.evidence.p)
+    main = {name: contest[0].axis for name, contest in contests.items() if contest}
     return Search(
-        base, initial, level, first, groups, main, evidence, tuple(final)
+        base, initial, level, first, found,
+        {name: groups.get(name, ()) for name in found.added},
+        contests, main, likely, transient, tuple(steps), tuple(final),
     )  # fmt: skip
+
+
+def _step(known: FittedSet) -> Step:
+    return Step(known.added, tuple(float(e) for e in known.evidence.held_out_rmse))
+
+
+def _rivals(first: Mapping[str, Score], name: str, alike: Sequence[str], s: Settings) -> list[str]:
+    """Candidates that help the model as given on the axis where ``name`` does, best first."""
+    if name not in first:
+        return list(alike)
+    axis = int(np.argmax(first[name].gain))
+    others = [n for n in first if n != name and first[n].gain[axis] > 0.0]
+    others.sort(key=lambda n: -float(first[n].gain[axis]))
+    return [*alike, *(n for n in others[: s.most_rivals] if n not in alike)]
 
 
 def _keeps_the_floor(
@@ -133,39 +184,59 @@ def _keeps_the_floor(
     )
 
 
-def _needed(
-    bench: Bench, base: Recipe, recipe: Recipe, evidence: Evidence
-) -> tuple[Recipe, Evidence]:
-    """The model without those earlier effects that the latest one makes superfluous, and its fit.
+def _carries_over(before: Evidence, after: Evidence, s: Settings) -> bool:
+    """Whether some axis errs less on the trials that a session holds out, by what is worth it.
 
-    What resembles the missing effect may come first, because it takes a little of several others.
+    They choose no effect, but one that does nothing for them is none. The second that is worst for
+    both does not count.
     """
-    now = Scorer(evidence).before.error
-    for name in recipe.effects[len(base.effects) : -1]:
-        fewer = replace(recipe, effects=tuple(e for e in recipe.effects if e != name))
-        fitted = bench.fit(fewer, without_effect(fewer, evidence))
-        then = Scorer(fitted).before.error
-        if np.all(np.log(then / now) < bench.settings.worth):
-            recipe, evidence, now = fewer, fitted, then
-    return recipe, evidence
+    if HELD_OUT not in before.folds.groups:
+        return True
+    axes = range(len(before.held_out_rmse))
+    return any(
+        np.log(error_without_second(before, i)[1] / error_without_second(after, i)[1]) > s.worth
+        for i in axes
+    )
 
 
-def _significant(
+def _weigh(
     bench: Bench,
     scores: Mapping[str, Score],
     level: Level,
     evidence: Evidence,
     replayed: Sequence[Replicate],
-) -> list[tuple[float, str]]:
-    """Candidates that beat chance and are worth having, best first."""
+) -> tuple[list[tuple[float, str]], dict[str, tuple[float, Array]]]:
+    """Candidates that beat chance and are worth having, and those that are worth it but do not.
+
+    Returns:
+        The former with their excess, best first; the latter with p-value and gain in log error by
+        axis.
+    """
     scorer, s = Scorer(evidence), bench.settings
-    level.ask(bench.gaining(scores, scorer))
-    errors = np.array([r.error for r in replayed])
-    ceiling = AT_FLOOR * errors.mean(axis=0) + 2.0 * errors.std(axis=0, ddof=1)
-    worth = np.where(scorer.before.error > ceiling, s.worth, s.worth_at_floor)
-    found = []
+    level.ask(scores, bench.gaining(scores, scorer))
+
+    def ceiling(errors: Array) -> Array:
+        return np.asarray(AT_FLOOR * errors.mean(axis=0) + 2.0 * errors.std(axis=0, ddof=1))
+
+    # Trials that the session holds out may be above their floor where the fitted ones are not.
+    error, replays = scorer.before.error, np.array([r.error for r in replayed])
+    above = error > ceiling(replays)
+    if HELD_OUT in evidence.folds.groups:
+        above |= evidence.held_out_rmse > ceiling(np.array([r.held_out_rmse for r in replayed]))
+    worth = np.where(above, s.worth, s.worth_at_floor)
+    found, likely = [], {}
     for name, score in scores.items():
         excess = level.excess(score)
-        if np.any(excess / scorer.independent > worth) and level.p_value(score) < s.significance:
+        gain = excess / scorer.independent
+        removed = error**2 * (1.0 - np.exp(-2.0 * gain))
+        share = removed / np.maximum(
+            error**2 - replays.mean(axis=0) ** 2, np.maximum(removed, 1e-30)
+        )
+        if not np.any((gain > worth) & ((share > s.share) | ~above)):
+            continue
+        p_value = level.p_value(score)
+        if p_value < s.significance:
             found.append((float(excess.sum()), name))
-    return sorted(found, reverse=True)
+        elif p_value < s.likely:
+            likely[name] = (p_value, np.asarray(gain))
+    return sorted(found, reverse=True), likely

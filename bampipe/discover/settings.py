@@ -15,7 +15,8 @@ class Settings:
     """How carefully to look.
 
     Attributes:
-        replicates: replays of the model for the chance level.
+        replicates: replays of the model for the chance level; most_replicates: where a decision
+            is close, that is a p-value within a factor ``close`` of ``significance``.
         rival_replicates: replays of each rival when candidates come close.
         most_effects: the most effects tried, those dropped again among them.
         significance: chance of a false alarm in a session that is accepted.
@@ -23,14 +24,19 @@ class Settings:
         worth_at_floor: the same on an axis whose error is already at its noise floor: no replay
             is perfect, and changes of direction blurred by sampling invite
             spurious effects, up to a tenth of the error on a linear axis.
+        share: least share of what exceeds the floor on one axis, in the mean square, that an effect
+            must remove in its turn: on a measured machine something always remains, and many
+            effects take a little of it.
         predictable: least share of the residual of an axis above its floor that a flexible
             regressor must predict, beyond chance, for it to lack something.
         surely: error over floor beyond which it lacks something, predictable or not.
-        explained: least share of the excess mean square that the effects found must remove, else
-            the axis is reported as unknown.
-        far: error over floor with the effects found beyond which they must remove more.
-        explained_far: that share: an effect that only resembles the missing one, such as a spring
-            in place of a stop, removes much and leaves many times the floor.
+        explained: least share of the excess mean square that the effects found on an axis remove,
+            else they are likely and not found: what resembles the missing effect takes some.
+        resembles: below this share they are no more than resemblances, and the effect is unknown.
+        likely: p-value up to which a candidate that does not beat chance is named as likely.
+        decided: odds from which on an effect is found although others fit alike.
+        rival_score: share of an effect's score from which on another one is listed beside it.
+        swap: relative gain in score from which on another effect takes the place of one found.
         replay_error: how far the log error of a replay may be off because no replay is perfect.
         worth_searching: least gain in log likelihood in the fit for a search of its shape to go on.
         rival_share: share of the best candidate's gain beyond chance from which on another one is
@@ -48,16 +54,22 @@ class Settings:
     """
 
     replicates: int = 10
+    most_replicates: int = 30
+    close: float = 30.0
     rival_replicates: int = 4
-    most_effects: int = 4
+    most_effects: int = 8
     significance: float = 0.01
     worth: float = 0.03
     worth_at_floor: float = 0.16
+    share: float = 0.15
     predictable: float = 0.05
     surely: float = 2.0
-    explained: float = 0.6
-    far: float = 5.0
-    explained_far: float = 0.75
+    explained: float = 0.5
+    resembles: float = 0.35
+    likely: float = 0.5
+    decided: float = 0.9
+    rival_score: float = 0.9
+    swap: float = 0.05
     replay_error: float = 0.01
     worth_searching: float = 4.0
     rival_share: float = 0.6

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
+
 import numpy as np
 
 from bampipe.discover.candidates import Scorer
 from bampipe.discover.chance import candidates_of
-from bampipe.discover.findings import AxisFinding, Diagnosis
+from bampipe.discover.findings import AxisFinding, Contender, Diagnosis
+from bampipe.discover.influence import Stretch, error_without_second
 from bampipe.discover.ranking import rank
 from bampipe.discover.search import Search
 from bampipe.discover.settings import Settings
@@ -18,33 +22,50 @@ from bampipe.trials.noise_floor import NoiseFloor
 
 def conclude(search: Search, s: Settings) -> Diagnosis:
     """Say of each axis whether something is missing, and whether what was found explains it."""
-    before, after = search.initial.held_out_rmse, search.evidence.held_out_rmse
+    evidence = search.evidence
+    before, after = search.initial.held_out_rmse, evidence.held_out_rmse
     floor = NoiseFloor.of_errors([r.held_out_rmse for r in search.final])
     bare_floor = NoiseFloor.of_errors([r.held_out_rmse for r in search.level.replicates]).mean
     shares = np.array([r.share for r in search.final])
     reach = {n: _reach(search, n, s.worth) for n in search.selected}
+    odds = {n: _odds_of_group(search, n, s) for n in search.selected}
     findings = []
-    unknown = set()
+    weak = set()
     for axis in range(len(before)):
         level, scatter = float(floor.mean[axis]), float(floor.sd[axis])
         by_chance = float(shares[:, axis].max())
         given = _share_beyond_chance(explainable_share(search.initial, axis), by_chance)
         share = given
         if search.selected:
-            share = _share_beyond_chance(explainable_share(search.evidence, axis), by_chance)
+            share = _share_beyond_chance(explainable_share(evidence, axis), by_chance)
         here = tuple(n for n in search.selected if search.main[n] == axis or axis in reach[n])
         excess = before[axis] ** 2 - min(level, bare_floor[axis]) ** 2
         left = max(after[axis] ** 2 - level**2, 0.0)
+        explained = max(0.0, 1.0 - left / max(excess, 1e-30)) if here else 0.0
         against_floor = standing(float(after[axis]), level, scatter)
-        above = after[axis] / max(level, 1e-30)
-        lacking = against_floor == "above_floor" and (above > s.surely or share > s.predictable)
-        verdict: Verdict = "missing" if here else "nothing_missing"
+        worst, but_for_it = error_without_second(evidence, axis)
+        above = but_for_it / max(level, 1e-30)
+        lacking = standing(but_for_it, level, scatter) == "above_floor" and (
+            above > s.surely or share > s.predictable
+        )
+        verdict: Verdict
+        at: dict[str, float] = {}
         if against_floor in ("floor_implausible", "floor_missing"):
             verdict = "undecided"
-        explained = max(0.0, 1.0 - left / max(excess, 1e-30)) if here else 0.0
-        if lacking and explained < (s.explained_far if above > s.far else s.explained):
-            verdict = "unknown_effect"
-            unknown |= {n for n in here if search.main[n] == axis}
+        elif here:
+            verdict = "missing"
+            unsure = [n for n in here if max(odds[n].values()) < s.decided]
+            if unsure:
+                verdict, at = "undecided", odds[unsure[0]]
+            if lacking and explained < s.explained:
+                verdict = "undecided" if explained > s.resembles else "unknown_effect"
+                at = at or {n: 1.0 for n in here}
+                weak |= {n for n in here if search.main[n] == axis}
+        elif lacking:
+            at = _odds_of_likely(search, axis, s)
+            verdict = "undecided" if at else "unknown_effect"
+        else:
+            verdict = "nothing_missing"
         findings.append(
             AxisFinding(
                 verdict,
@@ -53,21 +74,79 @@ def conclude(search: Search, s: Settings) -> Diagnosis:
                 level,
                 scatter,
                 against_floor,
+                worst,
+                but_for_it,
                 given,
                 share,
                 by_chance,
-                here if verdict in ("missing", "undecided") else (),
-                lacking and verdict == "missing",
-                here if verdict == "unknown_effect" else (),
+                tuple(n for n in here if n not in weak),
+                lacking,
                 explained,
+                at,
             )
         )
-    kept = [n for n in search.selected if n not in unknown]
+    kept = [n for n in search.selected if n not in weak]
     ranking = rank(search, kept, before)
-    groups = {n: search.groups.get(n, ()) for n in kept}
+    groups = {n: search.groups[n] for n in kept}
+    contests = {n: _listed(search.contests.get(n, ()), odds[n], s) for n in kept}
     return Diagnosis(
-        tuple(findings), tuple(ranking), tuple(kept), groups, search.evidence, search.initial
-    )
+        tuple(findings), tuple(ranking), tuple(kept), groups, contests, search.steps,
+        _transient(search), evidence, search.initial,
+    )  # fmt: skip
+
+
+def _transient(search: Search) -> dict[str, tuple[int, Stretch]]:
+    """Candidates that only one second speaks for, with the axis where they help most."""
+    return {
+        name: (int(np.argmax(search.first[name].gain)), second)
+        for name, second in search.transient.items()
+        if name in search.first and name not in search.selected
+    }
+
+
+def _odds_of_group(search: Search, name: str, s: Settings) -> dict[str, float]:
+    """Odds of an effect found and of those that these trials cannot tell from it."""
+    alike = {name, *search.groups[name]}
+    scores = {c.effect: c.score for c in search.contests.get(name, ()) if c.effect in alike}
+    return _odds(scores or {name: 0.0}, s)
+
+
+def _odds(scores: Mapping[str, float], s: Settings) -> dict[str, float]:
+    """Odds by log likelihood, tempered by what the scores are good for: no replay is perfect."""
+    top = max(scores.values())
+    scale = np.hypot(s.score_sd, s.score_error * top)
+    weights = {name: float(np.exp((score - top) / scale)) for name, score in scores.items()}
+    total = sum(weights.values())
+    return {name: weight / total for name, weight in weights.items()}
+
+
+def _odds_of_likely(search: Search, axis: int, s: Settings) -> dict[str, float]:
+    """Odds of candidates that would lower the error of an axis but do not beat chance."""
+    count = Scorer(search.evidence).independent[axis]
+    here = {n: (p, gain[axis]) for n, (p, gain) in search.likely.items() if gain[axis] > s.worth}
+    if not here:
+        return {}
+    odds = _odds({n: float(gain * count) for n, (_, gain) in here.items()}, s)
+    found = {n: (1.0 - here[n][0]) * share for n, share in odds.items()}
+    return dict(sorted(found.items(), key=lambda pair: -pair[1]))
+
+
+def _listed(
+    contest: tuple[Contender, ...], odds: Mapping[str, float], s: Settings
+) -> tuple[Contender, ...]:
+    """The effect found, and the rivals that come close to it by any of the scores."""
+    if not contest:
+        return ()
+    mine = contest[0]
+
+    def is_close(c: Contender) -> bool:
+        pairs = [(c.score, mine.score), (c.score_without_second, mine.score_without_second)]
+        if c.score_without_trial is not None and mine.score_without_trial is not None:
+            pairs.append((c.score_without_trial, mine.score_without_trial))
+        return any(theirs >= s.rival_score * ours for theirs, ours in pairs)
+
+    shown = [c for c in contest if c.effect in odds or is_close(c)]
+    return tuple(replace(c, odds=odds.get(c.effect, 0.0)) for c in shown)
 
 
 def _reach(search: Search, name: str, worth: float) -> set[int]:

@@ -15,16 +15,31 @@ Verdict = Literal["nothing_missing", "missing", "undecided", "unknown_effect"]
 UpToOne = Annotated[float, Field(le=1)]
 
 
+class Stretch(Record):
+    """A stretch of a trial, s from its beginning."""
+
+    trial_id: str
+    t_start: float
+    t_end: float
+
+
 class AxisVerdict(Record):
     """What one axis lacks."""
 
     verdict: Verdict
-    effects: Names = Field(description="Found to be missing")
+    effects: Names = Field(description="Found to be missing; they are what `extend` adds")
+    likely: dict[str, Share] = Field(
+        description="Where undecided: effects that may be missing, by their odds"
+    )
     rmse_before: Size = Field(description="On held-out trials")
     rmse_after: Size = Field(description="With what was found")
     noise_floor: Size
     noise_floor_sd: Size
     standing: Standing = Field(description="rmse_after against noise_floor")
+    worst_second: Stretch = Field(description="Where the residual with what was found is largest")
+    rmse_without_worst_second: Size = Field(
+        description="rmse_after but for it; whether something remains is judged by this"
+    )
     unit: str
     explainable_share: UpToOne = Field(
         description="Share of the residual that any flexible function predicts on unseen data"
@@ -32,11 +47,8 @@ class AxisVerdict(Record):
     explainable_after: UpToOne
     explainable_chance: UpToOne = Field(description="Its chance level")
     remains: bool = Field(description="Whether something is left that the library does not explain")
-    nearest: Names = Field(
-        description="Of an unknown effect: what the library has that comes nearest"
-    )
     explained_by_effects: UpToOne = Field(
-        description="Share of the excess mean square that effects or nearest remove"
+        description="Share of the excess mean square that what was found or is likely removes"
     )
     sentence: str
 
@@ -53,6 +65,37 @@ class RankedEffect(Record):
     score: float
     parameters: dict[str, float]
     indistinguishable_from: Names
+
+
+class Contender(Record):
+    """An effect that contends for a place in the model, all others found being in it."""
+
+    effect: str
+    axis: str = Field(description="Where the effect found helps most")
+    held_out_rmse: Size = Field(description="There, with this effect in that place")
+    score: float = Field(description="Gain in log likelihood over all axes")
+    score_without_trial: float | None = Field(
+        description="Without the trial that speaks most for the effect found; null with two trials"
+    )
+    score_without_second: float = Field(
+        description="Without the second that speaks most for the effect found"
+    )
+    odds: Share = Field(description="That it is this one, of those that fit alike; 0 if it is not")
+
+
+class Step(Record):
+    """One step of the search over sets of effects."""
+
+    effects: Names = Field(description="In the model then")
+    held_out_rmse: dict[str, Size] = Field(description="By axis")
+
+
+class TransientCandidate(Record):
+    """A candidate that only one second speaks for: it is not named as missing."""
+
+    effect: str
+    axis: str
+    second: Stretch
 
 
 class SuggestedTrial(Record):
@@ -108,6 +151,11 @@ class DiagnoseResult(Result):
     groups: dict[str, Names] = Field(
         description="By effect found: others that these trials cannot tell from it"
     )
+    contests: dict[str, tuple[Contender, ...]] = Field(
+        description="By effect found: itself, then the rivals that come close to it"
+    )
+    steps: tuple[Step, ...] = Field(description="The sets of effects that the search went through")
+    transients: tuple[TransientCandidate, ...]
     suggested_trial: SuggestedTrial | None
     maps: dict[str, dict[str, ResidualMap]] = Field(description="By axis, then variable")
     worst_windows: tuple[WorstWindow, ...]

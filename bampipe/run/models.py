@@ -69,6 +69,6 @@ def ensure_base(root: Path, device: str, effects: tuple[str, ...]) -> None:
     write(root, ModelFile(name=BASE, device=device, effects=effects))
 
 
-def child_name(parent: str, effect: str) -> str:
-    """Return the name of the model that adds ``effect`` to ``parent``."""
-    return f"{parent}+{effect.replace(':', '.')}"
+def child_name(parent: str, effects: tuple[str, ...]) -> str:
+    """Return the name of the model that adds ``effects`` to ``parent``."""
+    return "+".join([parent, *(effect.replace(":", ".") for effect in effects)])

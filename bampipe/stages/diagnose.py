@@ -17,9 +17,10 @@ from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
 from bampipe.data.store import write_parquet
 from bampipe.declarations.model_file import IDENTIFIED_MODEL, identified, load_model, read_recipe
 from bampipe.discover.advice import advise
-from bampipe.discover.description import describe
 from bampipe.discover.diagnosis import diagnose
 from bampipe.discover.findings import Diagnosis
+from bampipe.discover.influence import Stretch as FoundStretch
+from bampipe.discover.sentences import axis_sentences
 from bampipe.discover.settings import Settings
 from bampipe.discover.shape import residual_map, variables, worst_windows
 from bampipe.errors import InputError
@@ -30,14 +31,17 @@ from bampipe.physics.recipe import Recipe
 from bampipe.progress import Progress
 from bampipe.results.diagnose import (
     AxisVerdict,
+    Contender,
     DiagnoseResult,
     RankedEffect,
     ResidualMap,
+    Step,
+    Stretch,
     SuggestedTrial,
+    TransientCandidate,
     WorstWindow,
 )
 from bampipe.results.identify import IdentifyResult
-from bampipe.results.standing import STANDINGS_IN_WORDS
 from bampipe.results.terms import EffectText
 from bampipe.schema import STRICT, Count
 from bampipe.trials.folds import HELD_OUT
@@ -132,11 +136,7 @@ def _summary(result: dict[str, Any]) -> dict[str, object]:
 def _result(found: Diagnosis, trials: MeasuredTrials, recipe: Recipe, model: str) -> DiagnoseResult:
     names = found.evidence.system.coordinates
     units = found.evidence.system.torque_units
-    shapes = {
-        axis: describe(found.initial if found.axes[i].nearest else found.evidence, i)
-        for i, axis in enumerate(names)
-        if found.axes[i].verdict == "unknown_effect" or found.axes[i].remains
-    }
+    sentences = axis_sentences(found)
     axes = {
         axis: AxisVerdict(
             verdict=a.verdict,
@@ -148,12 +148,14 @@ def _result(found: Diagnosis, trials: MeasuredTrials, recipe: Recipe, model: str
             noise_floor=a.noise_floor,
             noise_floor_sd=a.floor_sd,
             standing=a.standing,
+            worst_second=_stretch(a.worst_second),
+            rmse_without_worst_second=a.rmse_without_second,
             unit=units[i],
             effects=a.effects,
+            likely=dict(a.odds),
             remains=a.remains,
-            nearest=a.nearest,
             explained_by_effects=a.explained,
-            sentence=_sentence(axis, i, found, shapes.get(axis, "")),
+            sentence=sentences[axis],
         )
         for i, (axis, a) in enumerate(zip(names, found.axes, strict=True))
     }
@@ -171,7 +173,10 @@ def _result(found: Diagnosis, trials: MeasuredTrials, recipe: Recipe, model: str
         )
         for r in found.ranking
     )
-    suggestion = _suggestion(found, trials, recipe)
+    contests = {
+        effect: tuple(Contender(**vars(c) | {"axis": names[c.axis]}) for c in contest)
+        for effect, contest in found.contests.items()
+    }
     return DiagnoseResult(
         model=model,
         axes=axes,
@@ -179,13 +184,25 @@ def _result(found: Diagnosis, trials: MeasuredTrials, recipe: Recipe, model: str
         descriptions=_descriptions(ranking[:_DESCRIBED], recipe),
         selected=found.selected,
         groups=dict(found.groups),
-        suggested_trial=suggestion,
+        contests=contests,
+        steps=tuple(
+            Step(
+                effects=step.effects,
+                held_out_rmse=dict(zip(names, step.held_out_rmse, strict=True)),
+            )
+            for step in found.steps
+        ),
+        transients=tuple(
+            TransientCandidate(effect=effect, axis=names[axis], second=_stretch(second))
+            for effect, (axis, second) in found.transient.items()
+        ),
+        suggested_trial=_suggestion(found, trials, recipe),
         maps=_maps(found),
         worst_windows=tuple(
             WorstWindow(**vars(w), unit=units[names.index(w.axis)])
             for w in worst_windows(found.initial)
         ),
-        sentence=" ".join(a.sentence for a in axes.values()),
+        sentence=" ".join(sentences.values()),
         next=_next(found, model),
     )
 
@@ -196,48 +213,8 @@ def _descriptions(ranking: Sequence[RankedEffect], recipe: Recipe) -> dict[str, 
     return {name: effect_text(own.get(name) or registry.effect(name)) for name in sorted(names)}
 
 
-def _sentence(axis: str, i: int, found: Diagnosis, shape: str) -> str:
-    a, unit = found.axes[i], found.evidence.system.torque_units[i]
-    if a.standing in ("floor_implausible", "floor_missing"):
-        weighed = f" Weighed: {' and '.join(a.effects)}." if a.effects else ""
-        return (
-            f"{axis.capitalize()}: no verdict can be trusted, for its held-out error of "
-            f"{a.rmse_after:.3g} {unit} is {STANDINGS_IN_WORDS[a.standing]} "
-            f"({a.noise_floor:.3g} {unit})."
-            f"{weighed}"
-        )
-    floor = max(a.noise_floor, 1e-30)
-    ratio = a.rmse_after / floor
-    error = a.rmse_before if a.nearest else a.rmse_after
-    if a.verdict == "missing":
-        words = " and ".join(a.effects)
-        verb, it = ("is", "it") if len(a.effects) == 1 else ("are", "them")
-        alike = [g for n in a.effects for g in found.groups.get(n, ())]
-        also = f" (these trials cannot tell {it} from {', '.join(alike)})" if alike else ""
-        return (
-            f"{axis.capitalize()}: {words} {verb} missing{also}; adding {it} takes the held-out "
-            f"error from {a.rmse_before:.3g} to {a.rmse_after:.3g} {unit}, {ratio:.2f} times the "
-            f"noise floor."
-        ) + (
-            f" What is left no effect in the library explains; its shape: {shape}."
-            if a.remains
-            else ""
-        )
-    if a.verdict == "unknown_effect":
-        return (
-            f"{axis.capitalize()}: something is missing that no effect in the library explains "
-            f"(held-out error {error:.3g} {unit}, {error / floor:.1f} times the noise floor); its "
-            f"shape: {shape}."
-        ) + (
-            f" The nearest that the library has, {' and '.join(a.nearest)}, would remove "
-            f"{100 * a.explained:.0f} % of the excess mean square."
-            if a.nearest
-            else ""
-        )
-    return (
-        f"{axis.capitalize()}: nothing is missing that these trials could show (held-out error "
-        f"{a.rmse_after:.3g} {unit}, noise floor {a.noise_floor:.3g} {unit})."
-    )
+def _stretch(found: FoundStretch) -> Stretch:
+    return Stretch(trial_id=found.trial_id, t_start=found.t_start, t_end=found.t_end)
 
 
 def _maps(found: Diagnosis) -> dict[str, dict[str, ResidualMap]]:
@@ -275,25 +252,32 @@ def _map_variables(found: Diagnosis) -> pd.DataFrame:
 
 
 def _suggestion(found: Diagnosis, trials: MeasuredTrials, recipe: Recipe) -> SuggestedTrial | None:
-    for name in found.selected:
-        group = found.groups.get(name, ())
-        if not group:
+    """The trial that would tell apart two effects that these trials do not."""
+    pairs = [(name, group[0]) for name, group in found.groups.items() if group]
+    pairs += [
+        (first, second)
+        for a in found.axes
+        if len(a.odds) > 1 and not a.effects
+        for first, second in [list(a.odds)[:2]]
+    ]
+    ranked = {r.effect: r for r in found.ranking}
+    for first, second in pairs:
+        if first not in ranked or second not in ranked:
             continue
-        ranked = {r.effect: r for r in found.ranking}
-        if name not in ranked or group[0] not in ranked:
-            continue
-        axis = ranked[name].axis
-        values = {n: np.array(list(ranked[n].values.values())) for n in (name, group[0])}
+        axis = ranked[first].axis
+        values = {n: np.array(list(ranked[n].values.values())) for n in (first, second)}
         floor = found.axes[axis].noise_floor
-        advice = advise(trials, recipe, found.initial, axis, name, group[0], values, floor)
+        advice = advise(trials, recipe, found.initial, axis, first, second, values, floor)
+        if advice is None:
+            continue
         return SuggestedTrial(
-            between=(name, group[0]),
+            between=(first, second),
             axis=found.initial.system.coordinates[axis],
             design=advice.design,
             separation=advice.separation,
             separation_now=advice.separation_now,
             sentence=(
-                f"To tell {name} from {group[0]}, record {advice.design}: taking one for the "
+                f"To tell {first} from {second}, record {advice.design}: taking one for the "
                 f"other would there leave {advice.separation:.1f} noise floors, against "
                 f"{advice.separation_now:.1f} in these trials."
             ),
@@ -303,15 +287,18 @@ def _suggestion(found: Diagnosis, trials: MeasuredTrials, recipe: Recipe) -> Sug
 
 def _next(found: Diagnosis, model: str) -> str:
     if found.selected:
-        return f"bampipe extend RUN {found.selected[0]} --model {model}"
-    unknown = [
-        axis
-        for axis, a in zip(found.evidence.system.coordinates, found.axes, strict=True)
-        if a.verdict == "unknown_effect"
-    ]
+        return f"bampipe extend RUN {' '.join(found.selected)} --model {model}"
+    by_axis = dict(zip(found.evidence.system.coordinates, found.axes, strict=True))
+    unknown = [axis for axis, a in by_axis.items() if a.verdict == "unknown_effect"]
     if unknown:
         return (
             f"look at the residual maps of {', '.join(unknown)} with `bampipe report RUN`, write "
             "an effect file of that shape, and add it with `bampipe extend RUN FILE`"
+        )
+    undecided = [axis for axis, a in by_axis.items() if a.verdict == "undecided" and a.odds]
+    if undecided:
+        return (
+            f"record more trials like these that move {', '.join(undecided)}, or try the likeliest "
+            f"with `bampipe extend RUN {next(iter(by_axis[undecided[0]].odds))} --model {model}`"
         )
     return "nothing to add; `bampipe report RUN` writes it up"

@@ -75,6 +75,7 @@ class Folds:
         weight: Array,
         lower: Array,
         upper: Array,
+        own_weight: float = 0.0,
     ) -> tuple[Array, ...]:
         """Coefficients (P,) for each trial, fitted to the other groups.
 
@@ -84,12 +85,18 @@ class Folds:
         Args:
             sums: of all trials, linearised at the fit to the fitted ones.
             weight: of each axis, (n_q,); lower, upper: bounds of the coefficients, (P,).
+            own_weight: that a group keeps in its own fit; 0 leaves it out. A little of it keeps
+                coefficients that no other group determines from being extrapolated.
         """
         found: dict[int, Array] = {}
         for group in sorted(set(self.groups)):
             others = [k for k in self.fitted_trials if self.groups[k] != group]
             if others and not self.nothing_held_out:
-                found[group] = sums.subset(others).solve(weight, lower, upper)
+                own = [k for k in self.fitted_trials if self.groups[k] == group]
+                factor = np.isin(range(len(self.groups)), others) + own_weight * np.isin(
+                    range(len(self.groups)), own if group != HELD_OUT else []
+                )
+                found[group] = sums.scaled(factor).solve(weight, lower, upper)
             else:
                 found[group] = np.zeros(lower.size)
         return tuple(found[group] for group in self.groups)

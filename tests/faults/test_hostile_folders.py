@@ -388,7 +388,7 @@ def test_an_effect_whose_name_is_a_path_writes_nothing(toy: Toy, outside: Path) 
     before = everything(toy.folder)
     for name in ("../../../outside/x", "a/b:yaw", "x:../../y", "\0", ".."):
         with pytest.raises(InputError):
-            loop.extend(options, "base", name)
+            loop.extend(options, "base", (name,))
     changed = {k for k, v in everything(toy.folder).items() if before.get(k, 0) != v}
     assert changed <= {str(toy.root / ".bampipe/lock")}
 
@@ -396,6 +396,6 @@ def test_an_effect_whose_name_is_a_path_writes_nothing(toy: Toy, outside: Path) 
 def test_an_unfinished_model_is_not_the_one_to_extend(tmp_path: Path) -> None:
     models.write(tmp_path, ModelFile(name="base", device="slider"))
     effect = "stribeck:carriage"
-    child = models.child_name("base", effect)
+    child = models.child_name("base", (effect,))
     models.write(tmp_path, ModelFile(name=child, parent="base", device="slider", effects=(effect,)))
     assert loop.current_model(tmp_path) == "base"

@@ -212,7 +212,7 @@ def test_extending_respects_the_lock(toy: Toy) -> None:
         record.lock(toy.root, False),
         pytest.raises(InputError, match="another bampipe is at work"),
     ):
-        loop.extend(options, "base", "stribeck:yaw")
+        loop.extend(options, "base", ("stribeck:yaw",))
     assert toy.files() == before
 
 

@@ -1,0 +1,135 @@
+"""What hangs on one second or one trial: candidates scored again without it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.discover.candidates import Candidate, Score, Scorer
+from bampipe.trials.residuals import Evidence
+
+Array = NDArray[np.float64]
+
+SECOND_S = 1.0
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Samples of one trial that belong together.
+
+    Attributes:
+        trial: its number.
+        first, last: rows of the thinned residual, the last one excluded.
+        trial_id: its name; t_start, t_end: s from its beginning.
+    """
+
+    trial: int
+    first: int
+    last: int
+    trial_id: str
+    t_start: float
+    t_end: float
+
+
+def largest_second(evidence: Evidence, by_sample: Sequence[Array]) -> Stretch:
+    """The second in which ``by_sample``, by trial, each (K,), adds up to most."""
+    length = max(1, round(SECOND_S * evidence.band.rate_hz / evidence.band.step))
+    best, at = -np.inf, (0, 0)
+    for trial, values in enumerate(by_sample):
+        if not len(values):
+            continue
+        sums = np.convolve(values, np.ones(min(length, len(values))), mode="valid")
+        row = int(np.argmax(sums))
+        if sums[row] > best:
+            best, at = float(sums[row]), (trial, row)
+    trial, row = at
+    last = min(row + length, len(by_sample[trial]))
+    return _stretch(evidence, trial, row, last)
+
+
+def largest_trial(evidence: Evidence, by_sample: Sequence[Array]) -> Stretch:
+    """The trial in which ``by_sample``, by trial, each (K,), adds up to most."""
+    trial = int(np.argmax([values.sum() for values in by_sample]))
+    return _stretch(evidence, trial, 0, len(by_sample[trial]))
+
+
+def _stretch(evidence: Evidence, trial: int, first: int, last: int) -> Stretch:
+    motion = evidence.motions[trial]
+    t = motion.t[evidence.band.kept(len(motion.t))]
+    return Stretch(trial, first, last, motion.trial_id, float(t[first]), float(t[last - 1]))
+
+
+def without(evidence: Evidence, stretch: Stretch) -> Evidence:
+    """The evidence as if the samples of ``stretch`` had not been recorded; the fit stays."""
+
+    def cleared(parts: Sequence[NDArray[Any]]) -> tuple[NDArray[Any], ...]:
+        emptied = parts[stretch.trial].copy()
+        emptied[stretch.first : stretch.last] = 0
+        return (*parts[: stretch.trial], emptied, *parts[stretch.trial + 1 :])
+
+    return replace(
+        evidence,
+        residual=cleared(evidence.residual),
+        jacobian=cleared(evidence.jacobian),
+        used=cleared(evidence.used),
+    )
+
+
+def error_without_second(evidence: Evidence, axis: int) -> tuple[Stretch, float]:
+    """The second with the largest held-out residual of an axis, and the error but for it."""
+    judged = [k for k, counts in enumerate(evidence.folds.judged) if counts]
+    squares = [
+        np.square(evidence.held_out_residual(k)[:, axis])
+        if k in judged
+        else np.zeros(len(evidence.residual[k]))
+        for k in range(len(evidence.motions))
+    ]
+    worst = largest_second(evidence, squares)
+    rows = slice(worst.first, worst.last)
+    left = sum(float(x.sum()) for x in squares) - float(squares[worst.trial][rows].sum())
+    count = evidence.sums.count[judged, axis].sum() - evidence.used[worst.trial][rows, axis].sum()
+    return worst, float(np.sqrt(max(left, 0.0) / max(count, 1.0)))
+
+
+@dataclass(frozen=True)
+class Influence:
+    """Gains of candidates that are compared, as a whole and with less to go by.
+
+    Attributes:
+        second: the second that speaks most for the best of them; trial: the trial.
+        without_second, without_trial: scores without it, by candidate, the shapes held; those
+            without the trial are empty where fewer than three are fitted.
+    """
+
+    second: Stretch
+    trial: Stretch
+    without_second: dict[str, Score]
+    without_trial: dict[str, Score]
+
+
+def find_influence(
+    evidence: Evidence, items: Sequence[Candidate], scores: Sequence[Score]
+) -> Influence:
+    """Score candidates without the second and without the trial that speak most for the first.
+
+    Args:
+        evidence: of the model without any of them.
+        items: candidates, the best first; scores: theirs, in the same order.
+    """
+    gained = Scorer(evidence).gain_by_sample(items[0], scores[0])
+    second, trial = largest_second(evidence, gained), largest_trial(evidence, gained)
+
+    def again(stretch: Stretch) -> dict[str, Score]:
+        scorer = Scorer(without(evidence, stretch))
+        found = {
+            item.name: scorer.score_at(item, score.values)
+            for item, score in zip(items, scores, strict=True)
+        }
+        return {name: score for name, score in found.items() if score is not None}
+
+    enough = len(evidence.folds.fitted_trials) > 2
+    return Influence(second, trial, again(second), again(trial) if enough else {})

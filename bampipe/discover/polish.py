@@ -1,0 +1,140 @@
+"""The set of effects that a search found, put to the test in the presence of all the others.
+
+What came first may be superfluous once the rest is there, or another effect may do better in its
+place: effects are left out in turn, and weighed again beside their rivals.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.discover.bench import Bench
+from bampipe.discover.candidates import Score, Scorer
+from bampipe.discover.chance import candidates_of
+from bampipe.discover.findings import Contender
+from bampipe.discover.influence import find_influence
+from bampipe.discover.settings import Settings
+from bampipe.discover.start import with_effect, without_effect
+from bampipe.physics.recipe import Recipe
+from bampipe.trials.residuals import Evidence
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class FittedSet:
+    """A model with some effects, fitted.
+
+    Attributes:
+        recipe: the model; added: the effects that the model as given lacks, in order.
+        evidence: its fit.
+    """
+
+    recipe: Recipe
+    added: tuple[str, ...]
+    evidence: Evidence
+
+    @property
+    def error(self) -> Array:
+        """Cross-validated error among the fitted trials, by axis."""
+        return Scorer(self.evidence).before.error
+
+
+def extend_set(bench: Bench, known: FittedSet, score: Score) -> FittedSet:
+    """Fit the set with one effect more, from where it was scored."""
+    wider = replace(known.recipe, effects=(*known.recipe.effects, score.name))
+    fitted = bench.fit(wider, with_effect(wider, known.evidence, score))
+    return FittedSet(wider, (*known.added, score.name), fitted)
+
+
+def reduce_set(bench: Bench, known: FittedSet, name: str) -> FittedSet:
+    """Fit the set without one of its effects."""
+    fewer = replace(known.recipe, effects=tuple(e for e in known.recipe.effects if e != name))
+    fitted = bench.fit(fewer, without_effect(fewer, known.evidence))
+    return FittedSet(fewer, tuple(n for n in known.added if n != name), fitted)
+
+
+def is_superfluous(known: FittedSet, without: FittedSet, s: Settings) -> bool:
+    """Whether the error on every axis stays, but for what is not worth an effect."""
+    return bool(np.all(np.log(without.error / known.error) < s.worth))
+
+
+def polish(
+    bench: Bench, found: FittedSet, rivals: Mapping[str, Sequence[str]]
+) -> tuple[FittedSet, dict[str, tuple[Contender, ...]]]:
+    """Drop what is superfluous, swap what another effect does better, weigh each beside its rivals.
+
+    Args:
+        bench: the session.
+        found: the set, fitted.
+        rivals: by effect of the set, others that act where it does, most promising first.
+
+    Returns:
+        The set, and by effect those who contend for its place: itself first, then the rivals.
+    """
+    s = bench.settings
+    contests: dict[str, tuple[Contender, ...]] = {}
+    swapped: set[str] = set()
+    waiting = list(found.added)
+    while waiting:
+        name = waiting.pop(0)
+        fewer = reduce_set(bench, found, name)
+        if len(found.added) > 1 and is_superfluous(found, fewer, s):
+            found, contests = fewer, {}
+            waiting = list(found.added)
+            continue
+        others = [r for r in rivals.get(name, ()) if r not in found.added]
+        scores = bench.scores(fewer.recipe, fewer.evidence.p, [name, *others])
+        contest = weigh(fewer, name, scores)
+        best = contest[0] if contest else None
+        # Alone it has been told from its rivals by replays already.
+        if len(found.added) > 1 and best and best.effect != name and name not in swapped:
+            mine = next(c for c in contest if c.effect == name)
+            other = extend_set(bench, fewer, scores[best.effect])
+            if _beats(best, mine, s) and np.sum(np.log(other.error / found.error)) < 0.0:
+                swapped |= {name, best.effect}
+                found, contests = other, {}
+                waiting = list(found.added)
+                continue
+        contests[name] = tuple(sorted(contest, key=lambda c: c.effect != name))
+    return found, contests
+
+
+def weigh(fewer: FittedSet, name: str, scores: Mapping[str, Score]) -> list[Contender]:
+    """Score an effect and its rivals as a whole, without the worst trial, and without a second.
+
+    Args:
+        fewer: the model without the effect, fitted.
+        name: the effect; scores: of it and its rivals against that model.
+
+    Returns:
+        Best first by what they gain without the second that speaks most for ``name``.
+    """
+    if name not in scores:
+        return []
+    names = [name, *(n for n in scores if n != name)]
+    items = candidates_of(fewer.recipe, names)
+    influence = find_influence(fewer.evidence, items, [scores[n] for n in names])
+    axis = int(np.argmax(scores[name].gain))
+    contenders = [
+        Contender(
+            n,
+            axis,
+            float(scores[n].error[axis]),
+            scores[n].total,
+            influence.without_trial[n].total if n in influence.without_trial else None,
+            influence.without_second[n].total if n in influence.without_second else 0.0,
+        )
+        for n in names
+    ]
+    return sorted(contenders, key=lambda c: -c.score_without_second)
+
+
+def _beats(one: Contender, other: Contender, s: Settings) -> bool:
+    """Whether an effect is better than another by more than scores are good for, either way."""
+    pairs = [(one.score, other.score), (one.score_without_second, other.score_without_second)]
+    return all(a - b > max(s.score_sd, s.swap * abs(b)) for a, b in pairs)

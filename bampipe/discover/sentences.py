@@ -1,0 +1,134 @@
+"""What a diagnosis says of each axis: sentences made from its numbers, and from nothing else."""
+
+from __future__ import annotations
+
+from bampipe.discover.description import describe
+from bampipe.discover.findings import AxisFinding, Contender, Diagnosis
+from bampipe.discover.influence import Stretch
+from bampipe.results.standing import STANDINGS_IN_WORDS
+
+
+def axis_sentences(found: Diagnosis) -> dict[str, str]:
+    """One or more sentences for each axis, by its name."""
+    system = found.evidence.system
+    return {
+        axis: " ".join(_parts(axis, i, found, system.torque_units[i]))
+        for i, axis in enumerate(system.coordinates)
+    }
+
+
+def _parts(axis: str, i: int, found: Diagnosis, unit: str) -> list[str]:
+    a, name = found.axes[i], axis.capitalize()
+    if a.standing in ("floor_implausible", "floor_missing"):
+        parts = [
+            f"{name}: no verdict can be trusted, for its held-out error of {a.rmse_after:.3g} "
+            f"{unit} is {STANDINGS_IN_WORDS[a.standing]} ({a.noise_floor:.3g} {unit})."
+        ]
+        return parts + ([f"Weighed: {_and(a.effects)}."] if a.effects else [])
+    parts = [f"{name}: {_verdict(a, found, unit)}."]
+    parts += _rivals(a, found, unit)
+    parts += _transients(i, found)
+    if a.remains:
+        left = (
+            "What is left no effect in the library explains; its shape"
+            if a.effects
+            else "Its shape"
+        )
+        judged = found.evidence if a.effects else found.initial
+        parts.append(f"{left}: {describe(judged, i)}.")
+    elif a.standing == "above_floor":
+        parts.append(_excused(a, unit))
+    return parts
+
+
+def _verdict(a: AxisFinding, found: Diagnosis, unit: str) -> str:
+    ratio = a.rmse_after / max(a.noise_floor, 1e-30)
+    falls = (
+        f"takes the held-out error from {a.rmse_before:.3g} to {a.rmse_after:.3g} {unit}, "
+        f"{ratio:.2f} times the noise floor"
+    )
+    stands = f"held-out error {a.rmse_after:.3g} {unit}, {ratio:.1f} times the noise floor"
+    it = "it" if len(a.effects) == 1 else "them"
+    if a.verdict == "missing":
+        return f"{_and(a.effects)} {'is' if it == 'it' else 'are'} missing; adding {it} {falls}"
+    if a.verdict == "undecided" and a.effects:
+        sure = [n for n in a.effects if n not in a.odds]
+        also = f"{_and(sure)} {'is' if len(sure) == 1 else 'are'} missing, and " if sure else ""
+        return (
+            f"{also}these trials cannot tell {_odds(a, ' from ')}; adding {_and(a.effects)} {falls}"
+        )
+    if a.verdict == "undecided" and a.explained > 0.0:
+        return (
+            f"{_and(tuple(a.odds))} would take the held-out error from {a.rmse_before:.3g} to "
+            f"{a.rmse_after:.3g} {unit} only, {100 * a.explained:.0f} % of what exceeds the noise "
+            "floor in the mean square: likely, but not the effect that is missing"
+        )
+    if a.verdict == "undecided":
+        return f"{stands}; likely, but not beyond chance: {_odds(a, ', ')}"
+    if a.verdict == "unknown_effect":
+        error = a.rmse_before
+        near = (
+            f"; {_and(tuple(a.odds))} would take {100 * a.explained:.0f} % of what exceeds the "
+            f"noise floor in the mean square, and leave {a.rmse_after:.3g} {unit}"
+            if a.odds
+            else ""
+        )
+        return (
+            "something is missing that no effect in the library explains (held-out error "
+            f"{error:.3g} {unit}, {error / max(a.noise_floor, 1e-30):.1f} times the noise floor)"
+            + near
+        )
+    return (
+        f"nothing is missing that these trials could show (held-out error {a.rmse_after:.3g} "
+        f"{unit}, noise floor {a.noise_floor:.3g} {unit})"
+    )
+
+
+def _rivals(a: AxisFinding, found: Diagnosis, unit: str) -> list[str]:
+    """The effects that come close to one found on this axis, with what they would leave."""
+    said = []
+    for name in a.effects:
+        contest = found.contests.get(name, ())
+        rivals = [c for c in contest[1:] if c.effect not in a.odds]
+        if rivals:
+            mine = contest[0]
+            listed = _and([f"{c.effect} ({_left(c, unit)})" for c in rivals])
+            said.append(f"Close to {name} ({_left(mine, unit)}) comes {listed}.")
+    return said
+
+
+def _left(c: Contender, unit: str) -> str:
+    return f"leaves {c.held_out_rmse:.3g} {unit}"
+
+
+def _transients(i: int, found: Diagnosis) -> list[str]:
+    said = []
+    for name, (axis, second) in found.transient.items():
+        if axis == i:
+            said.append(
+                f"Only {_when(second)} speaks for {name}: it counts once another trial shows it."
+            )
+    return said
+
+
+def _excused(a: AxisFinding, unit: str) -> str:
+    """Why an error above its floor does not mean that something is missing."""
+    worst = a.rmse_after - a.rmse_without_second
+    if worst > 0.1 * a.rmse_after:
+        return (
+            f"Without {_when(a.worst_second)}, the worst second, the error is "
+            f"{a.rmse_without_second:.3g} {unit}."
+        )
+    return "What exceeds the noise floor follows nothing that the arm does."
+
+
+def _when(second: Stretch) -> str:
+    return f"{second.t_start:.1f} to {second.t_end:.1f} s of trial {second.trial_id}"
+
+
+def _odds(a: AxisFinding, between: str) -> str:
+    return between.join(f"{name} (odds {100 * share:.0f} %)" for name, share in a.odds.items())
+
+
+def _and(names: tuple[str, ...] | list[str]) -> str:
+    return ", ".join(names[:-1]) + " and " + names[-1] if len(names) > 1 else "".join(names)
