@@ -83,11 +83,16 @@ def _warnings(results: Results) -> tuple[Block, ...]:
 
 
 def _subtitle(results: Results) -> str:
-    parts = [f"device {results.session.device}"]
+    session = results.session
+    serial = f" {session.device_serial}" if session.device_serial else ""
+    parts = ["simulated"] if session.simulated else []
+    parts.append(f"device {session.device}{serial}")
     recorded = results.session.recorded_at
     if recorded:
         when = datetime.datetime.fromisoformat(recorded)
         parts.append(f"recorded {when:%Y-%m-%d %H:%M}{' UTC' if _is_utc(when) else ''}")
+    if session.operator:
+        parts.append(f"by {session.operator}")
     return ", ".join(parts)
 
 

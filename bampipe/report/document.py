@@ -51,6 +51,13 @@ class Bullets:
 
 
 @dataclass(frozen=True)
+class Formulas:
+    """Lines of formulas, each as it is."""
+
+    lines: tuple[str, ...]
+
+
+@dataclass(frozen=True)
 class Callout:
     """A verdict in a box.
 
@@ -102,7 +109,7 @@ class Figure:
     svg: str
 
 
-Block = Paragraph | Subheading | Bullets | Callout | Table | Figure
+Block = Paragraph | Subheading | Bullets | Formulas | Callout | Table | Figure
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from bampipe.report.document import (
     Callout,
     Document,
     Figure,
+    Formulas,
     Paragraph,
     Subheading,
     Table,
@@ -61,6 +62,9 @@ def _block(block: Block, number: str) -> str:
             return f"<h3>{_rich(text)}</h3>"
         case Bullets(items):
             return "<ul>" + "".join(f"<li>{_rich(item)}</li>" for item in items) + "</ul>"
+        case Formulas(lines):
+            rows = "".join(f"<div>{html.escape(line)}</div>" for line in lines)
+            return f'<div class="formulas">{rows}</div>'
         case Callout(tone, title, text):
             rest = f"<p>{_rich(text)}</p>" if text else ""
             return f'<div class="callout {tone}"><p class="verdict">{_rich(title)}</p>{rest}</div>'

@@ -20,6 +20,7 @@ from bampipe.report.document import (
     Callout,
     Document,
     Figure,
+    Formulas,
     Paragraph,
     Span,
     Subheading,
@@ -100,6 +101,8 @@ def _block(block: Block, number: str) -> dict[str, object]:
             return {"kind": "subheading", "text": spans(text)}
         case Bullets(items):
             return {"kind": "bullets", "items": [spans(item) for item in items]}
+        case Formulas(lines):
+            return {"kind": "formulas", "lines": list(lines)}
         case Callout(tone, title, text):
             return {
                 "kind": "callout",

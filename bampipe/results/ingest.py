@@ -61,6 +61,10 @@ class IngestResult(Result):
         default=(), description="Effects that the device file gives the base model"
     )
     recorded_at: str | None = Field(description="ISO 8601, or null")
+    operator: str = Field(default="", description="Who recorded it")
+    device_serial: str = ""
+    notes: str = ""
+    simulated: bool = Field(default=False, description="Whether a simulator made it")
     sample_rate_hz: Positive = Field(description="Median over the trials, from their clocks")
     announced_rate_hz: Positive | None = Field(description="What session.toml says, or null")
     axes: dict[str, EncoderChannel] = Field(min_length=1)

@@ -150,6 +150,7 @@ def format_session_file(
         f"session_id = {json.dumps(session_id)}",
         f"device = {json.dumps(config.device)}",
         f"sample_rate_hz = {config.sample_rate!r}",
+        "simulated = true",
         "",
         "[encoders]",
     ]

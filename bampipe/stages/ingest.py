@@ -311,6 +311,10 @@ def _description(
         driven=bool(device.drive),
         default_effects=device.default_effects,
         recorded_at=session.recorded_at,
+        operator=session.operator,
+        device_serial=session.device_serial,
+        notes=session.notes,
+        simulated=session.simulated,
         sample_rate_hz=rate,
         announced_rate_hz=session.sample_rate,
         axes={

@@ -21,6 +21,7 @@ from bampipe.results.ingest import IngestResult
 from bampipe.results.run import RunResult
 from bampipe.results.standing import standing
 from bampipe.results.stiffness import StiffnessResult
+from bampipe.results.terms import TermsResult
 from bampipe.results.validate import ValidateResult
 
 AXES = ("yaw", "pitch", "extension")
@@ -250,10 +251,12 @@ def write_validation(root: Path, model: str) -> None:
         notes=["A note of the validation."],
     )
 
+    size = 0.3 if model == "base" else 0.1
+
     def residuals(number: int) -> pd.DataFrame:
         frame = motion(number)
         columns: dict[str, object] = {"t": frame["t"], "held_out": number > 0}
-        wave = 0.3 * np.sin(7.0 * frame["t"])
+        wave = size * np.sin(7.0 * frame["t"])
         for axis in AXES:
             without = 2.0 * np.gradient(frame[f"qd_{axis}"], frame["t"])
             friction = 4.0 * frame[f"qd_{axis}"] + np.tanh(frame[f"qd_{axis}"] / 0.01)
@@ -264,6 +267,44 @@ def write_validation(root: Path, model: str) -> None:
         return pd.DataFrame(columns)
 
     write_parquet(root / f"models/{model}/residuals.parquet", _by_trial(residuals))
+    write_terms(root, model)
+
+
+def _text(summary: str, formula: str) -> dict[str, object]:
+    return {
+        "summary": summary, "formulas": [formula], "looks_like": "a step",
+        "source": "Stribeck 1902", "on_the_machine": "Grease the joint",
+    }  # fmt: skip
+
+
+def write_terms(root: Path, model: str) -> None:
+    """Write the equations and terms that validation leaves."""
+    speed = np.linspace(-0.8, 0.8, 9)
+
+    def curve(axis: str, mean: np.ndarray) -> dict[str, object]:
+        return {
+            "axis": axis, "unit": TORQUE_UNIT[axis], "variable": "velocity",
+            "variable_unit": "rad/s", "center": speed.tolist(), "mean": mean.tolist(),
+            "low": (mean - 0.1).tolist(), "high": (mean + 0.1).tolist(), "variance_share": 0.9,
+        }  # fmt: skip
+
+    terms = [
+        {
+            "name": "friction:yaw", "parameters": ["viscous.yaw", "coulomb.yaw"],
+            "text": _text("Viscous and Coulomb friction", "torque = -viscous*qd - coulomb*sgn(qd)"),
+            "curves": [curve("yaw", 4.0 * speed + np.sign(speed))],
+        }
+    ]  # fmt: skip
+    if model == CHILD:
+        terms.append(
+            {
+                "name": "stribeck:yaw", "parameters": list(ADDED),
+                "text": _text("Friction rises as the speed falls", "torque = -force*exp(-qd**2)"),
+                "curves": [curve("yaw", np.sign(speed) * np.exp(-((speed / 0.1) ** 2)))],
+            }
+        )  # fmt: skip
+    equations = ["M[θ,θ] = 3.552 (L - r)^2", "Q[θ] = -1.086 sgn(θ') - 4.171 θ'"]
+    write_result(root, TermsResult, model=model, equations=equations, terms=terms)
 
 
 def write_diagnosis(root: Path, model: str) -> None:
@@ -315,6 +356,13 @@ def write_diagnosis(root: Path, model: str) -> None:
         axes=axes,
         ranking=ranking if missing else [],
         selected=["stribeck:yaw"] if missing else [],
+        groups={"stribeck:yaw": ["presliding:yaw"]} if missing else {},
+        descriptions={
+            "presliding": _text("Friction builds up over a distance", "torque = -z"),
+            "asymmetric_coulomb": _text("Friction differs by direction", "torque = -abs(qd)"),
+        }
+        if missing
+        else {},
         suggested_trial={"sentence": "Move yaw back and forth at 0.02 rad/s for 20 s."}
         if missing
         else None,

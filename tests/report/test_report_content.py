@@ -130,6 +130,36 @@ def test_diagnosis_names_effect_group_and_trial(full: Report) -> None:
     assert "residual-maps-base-pitch" not in full.figures
 
 
+def test_each_effect_found_is_explained(full: Report) -> None:
+    words = text_of(
+        full.html[full.html.index(">Effects</h2>") - 200 :].replace("<h2", "<main><h2", 1)
+    )
+    assert "Friction rises as the speed falls. Found: force 1.021 ± 0.064 N·m; speed" in words
+    assert "torque = -force*exp(-qd**2)" in words
+    assert "On the machine. Grease the joint." in words
+    assert "These trials cannot tell it from presliding:yaw ." in words
+    assert "The worst window of yaw without stribeck:yaw (reversing slowly" in words
+    assert "the residual falls from 0.2" in words
+    assert {"friction", "effect-stribeck-yaw", "before-after-stribeck-yaw"} <= full.figures.keys()
+    assert "Friction builds up over a distance. torque = -z" in words
+
+
+def test_the_equations_have_the_numbers_in_them(full: Report) -> None:
+    assert "Q[θ] = -1.086 sgn(θ') - 4.171 θ'" in text_of(full.html)
+
+
+def test_a_simulated_session_says_so_and_who_recorded_what(full_run: Path, tmp_path: Path) -> None:
+    root = tmp_path / "s01"
+    shutil.copytree(full_run, root)
+    said = {"simulated": True, "operator": "A. Lee", "device_serial": "B-3", "notes": "warm room"}
+    path = root / "ingest/session.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **said}))
+    words = text_of(build(Results(root), quiet).html)
+    assert "simulated, device bam B-3, recorded 2026-10-03 10:12 UTC, by A. Lee" in words
+    assert "Notes: warm room." in words
+    assert "It replicates nothing that was measured" in words
+
+
 def test_ladder_shows_every_version_and_what_moved(full: Report) -> None:
     table = full.html[full.html.index("RMSE on the same held-out trials") :]
     assert row_of(table, "base")[2] == "0.562 (0.203)"

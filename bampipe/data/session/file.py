@@ -150,6 +150,11 @@ class Session(Declaration):
         alias="sample_rate_hz", description="Nominal sample rate; the time column rules"
     )
     notes: str = Field(default="", description="Free text")
+    operator: str = Field(default="", description="Who recorded it")
+    device_serial: str = Field(default="", description="Serial number of the device")
+    simulated: bool = Field(
+        default=False, description="Whether a simulator made it; the report then says so"
+    )
     clock: Clock = Field(
         default=Clock(column="time_us", unit="us"),
         alias="time",

@@ -5,8 +5,17 @@ from __future__ import annotations
 from typing import Any
 
 from bampipe.report import wording
-from bampipe.report.document import Block, Bullets, Section, Subheading, Table
+from bampipe.report.document import Block, Bullets, Callout, Section, Subheading, Table
 from bampipe.report.results import Results
+
+_SIMULATED = (
+    Callout(
+        "note",
+        "This session is simulated",
+        "Agreement with the paper shows that the pipeline finds what the simulator was given. It "
+        "replicates nothing that was measured.",
+    ),
+)
 
 
 def section(results: Results) -> Section | None:
@@ -16,12 +25,13 @@ def section(results: Results) -> Section | None:
         return None
     rows = tuple(_row(results, row) for row in paper["rows"])
     blocks: list[Block] = [
+        *(_SIMULATED if results.session.simulated else ()),
         Table(
             f"{paper['title']}: published values and those of this session",
             ("Quantity", "Place", "Paper", "This session", "Unit"),
             rows,
             "llrrl",
-        )
+        ),
     ]
     if "comparison" in paper:
         blocks.append(_comparison(results, paper["comparison"]))

@@ -19,6 +19,8 @@ def section(results: Results) -> Section:
     """Return the section."""
     session = results.session
     blocks: list[Block] = [Paragraph(_sampling(session))]
+    if session.notes:
+        blocks.append(Paragraph(f"Notes: {session.notes.rstrip('.')}."))
     blocks.append(_trials(results))
     filtered = results.read(FilterResult)
     if filtered is None:

@@ -1,0 +1,254 @@
+"""Effects: what each one found is, the curve identified, before and after, what to do, rivals."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+import pandas as pd
+
+from bampipe.report import style, wording
+from bampipe.report.document import (
+    Block,
+    Figure,
+    Formulas,
+    Paragraph,
+    Section,
+    Subheading,
+    Table,
+)
+from bampipe.report.results import Results
+from bampipe.results.compare import CompareResult
+from bampipe.results.diagnose import DiagnoseResult, RankedEffect, WorstWindow
+from bampipe.results.identify import IdentifyResult
+from bampipe.results.terms import ModelTerm, TermCurve, TermsResult
+
+TITLE = "Effects"
+_COLUMNS = 3
+_WEIGHED = 8
+
+
+def section(results: Results) -> Section | None:
+    """Return the section; None where no model was validated."""
+    terms = results.read(TermsResult)
+    if terms is None:
+        return None
+    friction = [term for term in terms.terms if term.name.startswith("friction:") and term.curves]
+    effects = [term for term in terms.terms if not term.name.startswith("friction:")]
+    blocks: list[Block] = []
+    if friction:
+        curves = [curve for term in friction for curve in term.curves[:1]]
+        caption = (
+            "Friction as identified: the force that it takes, low-passed as the trials are, with "
+            "its 95 % band, over the motion that it was learned from."
+        )
+        blocks.append(_curves("friction", curves, caption))
+    for term in effects:
+        blocks += _effect(results, term)
+    blocks += _weighed(results, {term.name for term in effects})
+    return Section(TITLE, tuple(blocks)) if blocks else None
+
+
+def _effect(results: Results, term: ModelTerm) -> list[Block]:
+    text = term.text
+    name = term.name.replace(":", "-")
+    blocks: list[Block] = [
+        Subheading(f"`{term.name}`"),
+        Paragraph(f"{text.summary}. {_found(results, term)}".rstrip()),
+        Formulas(text.formulas),
+    ]
+    if term.curves:
+        caption = (
+            f"What `{term.name}` contributes: the force that it takes, with its 95 % band, against "
+            f"{_variables(term.curves)}, which it follows most, over the trials that it was "
+            "learned from."
+        )
+        blocks.append(_curves(f"effect-{name}", term.curves, caption))
+    window = _window(results, term, f"before-after-{name}")
+    if window is not None:
+        blocks.append(window)
+    words = []
+    if text.on_the_machine:
+        words.append(f"**On the machine.** {text.on_the_machine}.")
+    words.append(f"**Rivals.** {_rivals(results, term.name)}")
+    if text.source:
+        words.append(f"**Source.** {text.source}.")
+    return [*blocks, *map(Paragraph, words)]
+
+
+def _found(results: Results, term: ModelTerm) -> str:
+    """Return its estimates in a sentence."""
+    identified = results.read(IdentifyResult)
+    known = identified.parameters if identified else {}
+    shown = []
+    for name in term.parameters:
+        if name in known:
+            entry = known[name]
+            value = wording.with_sd(entry.estimate, entry.sd)
+            unit = wording.unit(entry.unit)
+            short = wording.words(name.rpartition(".")[2])
+            shown.append(f"{short} {value} {unit}".rstrip())
+    return f"Found: {'; '.join(shown)}." if shown else ""
+
+
+def _variables(curves: Sequence[TermCurve]) -> str:
+    return wording.listing(dict.fromkeys(curve.variable for curve in curves))
+
+
+def _curves(name: str, curves: Sequence[TermCurve], caption: str) -> Figure:
+    """Draw each curve with its band in a panel."""
+    columns = min(_COLUMNS, len(curves))
+    rows = -(-len(curves) // columns)
+    width = min(style.WIDTH, 0.4 + 2.1 * columns)
+    figure, panels = style.panels(rows, columns, 1.85 * rows, width=width)
+    for panel, curve in zip(panels.flat, curves, strict=False):
+        x, unit = style.scaled(np.array(curve.center), curve.variable_unit)
+        panel.fill_between(x, curve.low, curve.high, color=style.BLUE, alpha=0.25, lw=0)
+        panel.plot(x, curve.mean, color=style.BLUE, marker=".", ms=3.0)
+        panel.axhline(0.0, color=style.INK, lw=0.5)
+        panel.set_title(curve.axis)
+        panel.set_xlabel(style.label(wording.words(curve.variable), unit))
+        panel.set_ylabel(style.label("force it takes", wording.unit(curve.unit)))
+    for panel in panels.flat[len(curves) :]:
+        panel.set_axis_off()
+    return Figure(name, caption, style.svg(figure))
+
+
+def _window(results: Results, term: ModelTerm, name: str) -> Figure | None:
+    """Draw the window that was worst before the effect was added, without and with it."""
+    compared = results.read(CompareResult)
+    rung = next(
+        (r for r in (compared.ladder if compared else ()) if _adds(r.added, term.name)), None
+    )
+    diagnosis = results.read(DiagnoseResult, rung.parent) if rung and rung.parent else None
+    axes = [curve.axis for curve in term.curves]
+    if rung is None or rung.parent is None or diagnosis is None or not axes:
+        return None
+    window = next((w for w in diagnosis.worst_windows if w.axis in axes), None)
+    if window is None:
+        return None
+    before, after = (_stretch(results, model, window) for model in (rung.parent, rung.model))
+    if before is None or after is None:
+        return None
+    axis = window.axis
+    figure, panels = style.panels(2, 1, 2.9, sharex=True, width=0.8 * style.WIDTH)
+    top, bottom = panels[:, 0]
+    top.plot(before["t"], before[f"torque_measured_{axis}"], color=style.FAINT, lw=2.6,
+             label="measured")  # fmt: skip
+    for frame, title, colour, look in (
+        (before, "without", style.VERMILLION, (0, (4, 1.5))),
+        (after, "with the effect", style.BLUE, "-"),
+    ):
+        top.plot(frame["t"], frame[f"torque_predicted_{axis}"], color=colour, ls=look, label=title)
+        bottom.plot(frame["t"], frame[f"residual_{axis}"], color=colour, ls=look)
+    bottom.axhline(0.0, color=style.INK, lw=0.5)
+    for panel in (top, bottom):
+        panel.axvspan(window.t_start, window.t_end, color=style.SKY, alpha=0.2, lw=0)
+    unit = wording.unit(results.force_unit(axis))
+    top.set_ylabel(style.label(axis, unit))
+    bottom.set_ylabel(style.label("residual", unit))
+    bottom.set_xlabel(f"time in {window.trial_id} (s)")
+    style.legend_below(figure, top)
+    errors = [_rms(frame, axis, window) for frame in (before, after)]
+    caption = (
+        f"The worst window of {axis} without `{term.name}` ({window.doing}): there the residual "
+        f"falls from {wording.significant(errors[0], 2)} to {wording.significant(errors[1], 2)} "
+        f"{unit} (RMSE)."
+        if errors[1] < errors[0]
+        else f"The worst window of {axis} without `{term.name}` ({window.doing}): there the "
+        f"effect does not lower the residual ({wording.significant(errors[0], 2)} and "
+        f"{wording.significant(errors[1], 2)} {unit} RMSE)."
+    )
+    return Figure(name, caption, style.svg(figure))
+
+
+def _adds(added: str | None, effect: str) -> bool:
+    return effect in (added or "").replace(",", " ").split()
+
+
+def _stretch(results: Results, model: str, window: WorstWindow) -> pd.DataFrame | None:
+    """Return the residuals of ``model`` in the window, with as much again to either side."""
+    frame = results.table(results.model_file("residuals.parquet", model), trial=window.trial_id)
+    if frame is None or frame.empty or f"residual_{window.axis}" not in frame:
+        return None
+    margin = 1.5 * (window.t_end - window.t_start)
+    part = frame[frame["t"].between(window.t_start - margin, window.t_end + margin)]
+    return part if len(part) > 3 else None
+
+
+def _rms(frame: pd.DataFrame, axis: str, window: WorstWindow) -> float:
+    inside = frame.loc[frame["t"].between(window.t_start, window.t_end), f"residual_{axis}"]
+    return float(np.sqrt(np.mean(inside.to_numpy() ** 2)))
+
+
+def _diagnoses(results: Results) -> Iterable[DiagnoseResult]:
+    """Yield the diagnoses of all versions, the latest first."""
+    for model in reversed(results.models):
+        found = results.read(DiagnoseResult, model)
+        if found is not None:
+            yield found
+
+
+def _rivals(results: Results, effect: str) -> str:
+    for diagnosis in _diagnoses(results):
+        entry = next((one for one in diagnosis.ranking if one.effect == effect), None)
+        if entry is None or effect not in diagnosis.selected:
+            continue
+        alike = diagnosis.groups.get(effect, ()) or entry.indistinguishable_from
+        if alike:
+            names = wording.listing(f"`{name}`" for name in alike)
+            return f"These trials cannot tell it from {names}."
+        others = [
+            one for one in diagnosis.ranking
+            if one.axis == entry.axis and one.effect != effect
+        ][:2]  # fmt: skip
+        unit = wording.unit(entry.unit)
+        nearest = wording.listing(
+            f"`{one.effect}` ({wording.significant(one.held_out_rmse_after)})" for one in others
+        )
+        after = wording.significant(entry.held_out_rmse_after)
+        if not others:
+            return "None fits these trials alike."
+        return (
+            f"None fits these trials alike: alone it takes the held-out error of {entry.axis} to "
+            f"{after} {unit}, the next best to {nearest}."
+        )
+    return "It was put in by hand: no diagnosis has weighed it against others."
+
+
+def _weighed(results: Results, added: set[str]) -> list[Block]:
+    """Return what the latest diagnosis weighed and did not add: best first."""
+    diagnosis = next((found for found in _diagnoses(results) if found.descriptions), None)
+    if diagnosis is None:
+        return []
+    shown = [
+        entry for entry in diagnosis.ranking
+        if entry.effect not in added and entry.effect.partition(":")[0] in diagnosis.descriptions
+    ][:_WEIGHED]  # fmt: skip
+    if not shown:
+        return []
+    rows = tuple(_weighed_row(diagnosis, entry) for entry in shown)
+    return [
+        Table(
+            f"Weighed on model `{diagnosis.model}`, best first",
+            ("Effect", "What it is, and its formula", "Without", "With", "Unit", "p"),
+            rows,
+            "llrrlr",
+            (0.9, 2.6, 0.0, 0.0, 0.0, 0.0),
+            "Held-out RMSE without and with it; p: chance of such a fall where the effect is "
+            "absent. A p near 1 says that these trials show nothing of it.",
+        )
+    ]
+
+
+def _weighed_row(diagnosis: DiagnoseResult, entry: RankedEffect) -> tuple[str, ...]:
+    text = diagnosis.descriptions[entry.effect.partition(":")[0]]
+    formulas = "; ".join(f"`{line}`" for line in text.formulas[:2])
+    return (
+        f"`{entry.effect}`",
+        f"{text.summary}. {formulas}",
+        wording.significant(entry.held_out_rmse_before),
+        wording.significant(entry.held_out_rmse_after),
+        wording.unit(entry.unit),
+        wording.probability(entry.p_value),
+    )
