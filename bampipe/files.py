@@ -59,7 +59,7 @@ def read_json(path: Path) -> Any:
     Raises:
         InputError: no such file, or not JSON (file and line are named).
     """
-    return parse_json(_read_bytes(path, LARGEST_JSON_BYTES), str(path))
+    return parse_json(read_bytes(path, LARGEST_JSON_BYTES), str(path))
 
 
 def read_json_table(path: Path) -> dict[str, Any]:
@@ -108,7 +108,7 @@ def read_toml(path: Path) -> dict[str, Any]:
     Raises:
         InputError: no such file, not UTF-8, or not TOML (file and line are named).
     """
-    data = _read_bytes(path, LARGEST_TOML_BYTES)
+    data = read_bytes(path, LARGEST_TOML_BYTES)
     if data.startswith((b"\xff\xfe", b"\xfe\xff")):
         raise InputError(
             "UTF-16 text, where TOML is UTF-8", where=str(path), remedy="save it as UTF-8"
@@ -274,6 +274,24 @@ def write_json(path: Path, value: object) -> None:
     write_text(path, json_text(value))
 
 
+def toml_text(table: Mapping[str, Any]) -> str:
+    """Return a table of text, numbers, booleans, lists and tables as TOML."""
+    lines: list[str] = []
+
+    def write(path: tuple[str, ...], content: Mapping[str, Any]) -> None:
+        tables = {key: value for key, value in content.items() if isinstance(value, Mapping)}
+        if path and (len(tables) < len(content) or not content):
+            lines.append("[" + ".".join(json.dumps(key) for key in path) + "]")
+        for key, value in content.items():
+            if key not in tables:
+                lines.append(f"{json.dumps(key)} = {json.dumps(value, ensure_ascii=False)}")
+        for key, value in tables.items():
+            write((*path, key), value)
+
+    write((), table)
+    return "\n".join(lines) + "\n"
+
+
 def digest_bytes(content: bytes) -> str:
     """Return the SHA-256 of ``content`` in hexadecimal."""
     return hashlib.sha256(content).hexdigest()
@@ -327,7 +345,12 @@ def cannot(verb: str, path: Path, error: OSError) -> InputError:
     )
 
 
-def _read_bytes(path: Path, limit: int) -> bytes:
+def read_bytes(path: Path, limit: int) -> bytes:
+    """The content of a regular file of at most ``limit`` bytes.
+
+    Raises:
+        InputError: no such file, a larger one, or one that cannot be read.
+    """
     path = Path(path)
     if require_regular(path).st_size > limit:
         raise InputError(f"larger than {limit // 1_000_000} MB", where=str(path))

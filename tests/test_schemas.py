@@ -13,6 +13,7 @@ import pytest
 from jsonschema import Draft202012Validator
 from pydantic import Field
 
+from bampipe.data.device_file import complete_device
 from bampipe.errors import InputError
 from bampipe.schema import (
     ByName,
@@ -44,7 +45,7 @@ def test_what_ships_fits_its_schema(path: Path) -> None:
     table = tomllib.loads(path.read_text(encoding="utf-8"))
     kind = SCRIPT["FILES"][table["schema"].removeprefix("bampipe.").removesuffix("/1")]
     Draft202012Validator(json_schema(kind)).validate(json.loads(json.dumps(table, default=str)))
-    read(kind, table, path.name)
+    read(kind, complete_device(table, path.parent, path.name), path.name)
 
 
 TWICE = ["fast", "fast"]

@@ -10,6 +10,7 @@ import typer
 import bampipe
 from bampipe.cli import checks, device, loop, show, stages
 from bampipe.cli.accept import accept
+from bampipe.cli.export import export
 from bampipe.cli.fetch import fetch
 from bampipe.cli.init import init
 from bampipe.cli.lab import lab
@@ -93,6 +94,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "demo": loop.demo,
     "lab": lab,
     "accept": accept,
+    "export": export,
     "fetch": fetch,
     "monitor": monitor,
     "status": checks.status_,

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from bampipe import schema
+from bampipe.data.device_file import read_device_file
 from bampipe.errors import InputError
 from bampipe.files import read_toml
 from bampipe.physics import Model, registry
@@ -31,7 +32,7 @@ def read_device(text: str) -> tuple[Mapping[str, Any], str]:
         InputError: there is neither.
     """
     if text.endswith(".toml") or Path(text).is_file():
-        return read_toml(Path(text)), text
+        return read_device_file(Path(text)), text
     return registry.device(text).declaration, f"devices/{text}.toml"
 
 

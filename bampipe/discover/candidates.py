@@ -97,13 +97,15 @@ class _Joint:
     """The linear problem of a model with a candidate of given shape.
 
     Attributes:
-        sums: its sums of products; slopes, residuals: by trial, (K, n_q, P) and (K, n_q).
-        columns: what the candidate adds, (n, m), for comparing shapes.
+        sums: its sums of products.
+        added, change: what the candidate adds to the columns and to the residual, by trial,
+            (K, n_q, m) and (K, n_q).
+        columns: what it adds, (n, m), for comparing shapes.
     """
 
     sums: NormalEquations
-    slopes: Sequence[Array]
-    residuals: Sequence[Array]
+    added: Sequence[Array]
+    change: Sequence[Array]
     columns: Array
 
 
@@ -227,13 +229,16 @@ class Scorer:
         if problem is None:
             return [np.zeros(len(r)) for r in self.evidence.residual]
         values, weight = self._fit(item, problem.sums)
+        e, count = self.evidence, len(self.evidence.free)
         rows = zip(
-            self.folds.judged, self.evidence.residual, problem.residuals, problem.slopes,
-            strict=True,
-        )  # fmt: skip
+            self.folds.judged, e.residual, e.jacobian, problem.change, problem.added, strict=True
+        )
         return [
-            0.5 * (np.square(before) - np.square(r + x @ values)) @ weight * judged
-            for judged, before, r, x in rows
+            0.5
+            * (np.square(r) - np.square(r + moved + x @ values[:count] + new @ values[count:]))
+            @ weight
+            * judged
+            for judged, r, x, moved, new in rows
         ]
 
     def _absent(self, item: Candidate) -> Score:
@@ -297,12 +302,10 @@ class Scorer:
         if not all((np.abs(c) < _DIVERGED).all() for c in (*columns, *change)):
             return None
         e = self.evidence
-        slopes = [np.concatenate([j, c], axis=2) for j, c in zip(e.jacobian, columns, strict=True)]
-        residuals = [r + c for r, c in zip(e.residual, change, strict=True)]
         shape = np.concatenate(columns if item.linear else change)
         flat = shape.reshape(-1, shape.shape[-1]) if item.linear else shape
-        sums = NormalEquations.from_samples(slopes, residuals, e.used)
-        return _Joint(sums, slopes, residuals, flat)
+        sums = e.sums.bordered(e.jacobian, columns, change, e.residual)
+        return _Joint(sums, columns, change, flat)
 
     def _bounds(self, item: Candidate) -> tuple[Array, Array]:
         """Bounds of the changes of the base parameters and of the linear strengths."""

@@ -17,12 +17,17 @@ from typing import Generic, Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import lsq_linear
 
 Array = NDArray[np.float64]
 
 _RANK_TOLERANCE = 1e-12
 """Of the largest eigenvalue, at unit diagonal: what lies below is rounding."""
+_DETERMINED = 1e-6
+"""Least squared pivot of a Cholesky factor, at unit diagonal, of what is surely determined."""
+_MOST_CHANGES = 20
+"""Of the set of coefficients at a bound, before the method that always ends is taken."""
 _SMALLEST_SHARE = 1e-3
 """Of a Gauss-Newton step, after which halving it ends."""
 
@@ -68,6 +73,9 @@ def solve_bounded(normal: Array, moment: Array, lower: Array, upper: Array) -> B
         normal: (n, n) slope^T slope; moment: (n,) slope^T measured, whatever the weights.
         lower, upper: (n,), infinite where there is no bound; equal where a coefficient is given.
     """
+    quick = _solve_definite(normal, moment, lower, upper)
+    if quick is not None:
+        return quick
     x = np.array(lower, dtype=float)
     open_ = np.flatnonzero(lower < upper)
     held = np.flatnonzero(~(lower < upper))
@@ -85,6 +93,44 @@ def solve_bounded(normal: Array, moment: Array, lower: Array, upper: Array) -> B
             free = np.where(found.active_mask < 0, low, np.where(found.active_mask > 0, high, free))
         x[open_] = free
     return BoundedSolution(x, np.asarray((x <= lower) | (x >= upper)))
+
+
+def _solve_definite(
+    normal: Array, moment: Array, lower: Array, upper: Array
+) -> BoundedSolution | None:
+    """`solve_bounded` where all is determined, by Cholesky factors of the unbounded part.
+
+    Coefficients beyond a bound are put there, and released where the slope leads back inside, until
+    neither happens: that is the solution. None where a direction is undetermined, or this does not
+    come to rest.
+    """
+    diagonal = np.diag(normal)
+    if not (diagonal > 0.0).all():
+        return None
+    scale = np.sqrt(diagonal)
+    matrix, target = normal / np.outer(scale, scale), moment / scale
+    low, high = lower * scale, upper * scale
+    held = ~(lower < upper)
+    x, fixed = np.where(held, low, 0.0), held.copy()
+    for _ in range(_MOST_CHANGES):
+        free = ~fixed
+        if free.any():
+            try:
+                factor = cho_factor(matrix[np.ix_(free, free)], lower=True)
+            except np.linalg.LinAlgError:
+                return None
+            if np.diag(factor[0]).min() ** 2 < _DETERMINED:
+                return None
+            x[free] = cho_solve(factor, target[free] - matrix[np.ix_(free, fixed)] @ x[fixed])
+        beyond = free & ((x < low) | (x > high))
+        slope = matrix @ x - target
+        back = fixed & ~held & (((x <= low) & (slope < 0.0)) | ((x >= high) & (slope > 0.0)))
+        if not beyond.any() and not back.any():
+            found = np.where(held | (x <= low), lower, np.where(x >= high, upper, x / scale))
+            return BoundedSolution(found, np.asarray((x <= low) | (x >= high)))
+        x[beyond] = np.clip(x[beyond], low[beyond], high[beyond])
+        fixed = (fixed | beyond) & ~back
+    return None
 
 
 class Iterate(Protocol):

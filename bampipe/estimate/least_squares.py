@@ -22,6 +22,11 @@ from bampipe.estimate.low_pass import Band
 from bampipe.estimate.standstill import moving
 
 Array = NDArray[np.float64]
+
+_A_PERIOD = 5
+"""Thinned samples in a period of the band; see `Band.step`."""
+_PERIODS = 10
+"""Periods of the band in the shortest block that is taken as independent of the next."""
 Residual = Callable[[int, Array], Array]
 """residual(trial, p) -> (T, n_q): unfiltered residual of one trial for parameters p (np,)."""
 
@@ -55,6 +60,8 @@ class Problem:
         linear: whether the residual is linear in all of them.
         band: the low-pass.
         resting: by trial, (T, n_q) whether an axis stands still; see `resting`.
+        precision: (n_free,) of what is known of the parameters beforehand, one over its variance,
+            zero where nothing is; known: (n_free,) that.
     """
 
     residual: Residual
@@ -66,6 +73,8 @@ class Problem:
     linear: bool
     band: Band
     resting: Sequence[NDArray[np.bool_]]
+    precision: Array
+    known: Array
 
 
 @dataclass(frozen=True)
@@ -192,12 +201,15 @@ class _Linearised:
         """Negative log likelihood a sample where each axis has its own unknown scatter."""
         count = np.sum([np.sum(s.used, axis=0) for s in self.stacked], axis=0)
         scatter = np.log(np.maximum(_scatter(self.stacked), 1e-300))
-        return float(np.sum(count * scatter) / max(np.mean(count), 1.0))
+        off = self.value - self.problem.known
+        prior = 0.5 * float(self.problem.precision @ off**2)
+        return (float(np.sum(count * scatter)) + prior) / max(float(np.mean(count)), 1.0)
 
     def normal_equations(self) -> tuple[Array, Array]:
         weight = 1.0 / np.maximum(_scatter(self.stacked), 1e-300)
         n_free = self.problem.free.size
-        normal, moment = np.zeros((n_free, n_free)), np.zeros(n_free)
+        precision = self.problem.precision
+        normal, moment = np.diag(precision), precision * (self.problem.known - self.value)
         for s in self.stacked:
             slope = (s.slope * weight[None, :, None]).reshape(-1, n_free)
             normal += slope.T @ slope
@@ -243,7 +255,11 @@ def _sandwich(problem: Problem, stacked: Sequence[Stacked], block_s: float) -> A
     n_free = problem.free.size
     band = problem.band
     samples = max(1, round(block_s * band.rate_hz / band.step))
-    bread, meat, blocks = np.zeros((n_free, n_free)), np.zeros((n_free, n_free)), 0
+    fitted = n_free - int(np.count_nonzero(problem.precision))
+    # Fewer blocks than parameters leave no scatter to see: shorter ones, of some periods at least.
+    most = sum(len(s.slope) for s in stacked) // (2 * max(fitted, 1))
+    samples = max(min(samples, most), min(samples, _PERIODS * _A_PERIOD))
+    bread, meat, blocks = np.diag(problem.precision), np.zeros((n_free, n_free)), 0
     for s in stacked:
         slope = s.slope * weight[None, :, None]
         bread += np.einsum("tqi,tqj->ij", slope, slope)
@@ -255,4 +271,5 @@ def _sandwich(problem: Problem, stacked: Sequence[Stacked], block_s: float) -> A
     held = problem.lower == problem.upper
     bread[held], bread[:, held], meat[held], meat[:, held] = 0.0, 0.0, 0.0, 0.0
     inverse = np.linalg.pinv(bread, hermitian=True)
-    return np.asarray(inverse @ meat @ inverse * (blocks / max(blocks - n_free, 1)))
+    meat = meat * (blocks / max(blocks - fitted, 1)) + np.diag(problem.precision)
+    return np.asarray(inverse @ meat @ inverse)

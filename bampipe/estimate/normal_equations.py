@@ -26,12 +26,17 @@ class NormalEquations:
         xy: -X'r, (K, n_q, P).
         yy: r'r, (K, n_q).
         count: samples that they are of, (K, n_q).
+        precision: of what is known of the coefficients beforehand, one over its variance, (P,);
+            zero where nothing is.
+        known: that, (P,), measured from the point where the residual was linearised.
     """
 
     xx: Array
     xy: Array
     yy: Array
     count: Array
+    precision: Array
+    known: Array
 
     @classmethod
     def from_samples(
@@ -39,6 +44,8 @@ class NormalEquations:
         slopes: Sequence[Array],
         residuals: Sequence[Array],
         used: Sequence[NDArray[np.bool_]],
+        precision: Array | None = None,
+        known: Array | None = None,
     ) -> NormalEquations:
         """Sum over the samples of each trial.
 
@@ -46,6 +53,7 @@ class NormalEquations:
             slopes: X by trial, each (T, n_q, P), zero where a sample is not used.
             residuals: r by trial, each (T, n_q), zero where a sample is not used.
             used: which samples count, by trial, each (T, n_q).
+            precision, known: of the first coefficients, (<= P,); nothing is known of others.
         """
         xx, xy, yy = [], [], []
         for slope, residual in zip(slopes, residuals, strict=True):
@@ -55,14 +63,66 @@ class NormalEquations:
             xy.append(-np.einsum("atp,at->ap", by_axis, right))
             yy.append(np.sum(right**2, axis=1))
         count = np.array([np.sum(u, axis=0, dtype=float) for u in used])
-        return cls(np.array(xx), np.array(xy), np.array(yy), count)
+        missing = slopes[0].shape[2] - (0 if precision is None else precision.size)
+        prior = [
+            np.append(np.zeros(0) if part is None else part, np.zeros(missing))
+            for part in (precision, known)
+        ]
+        return cls(np.array(xx), np.array(xy), np.array(yy), count, *prior)
+
+    def bordered(
+        self,
+        slopes: Sequence[Array],
+        columns: Sequence[Array],
+        change: Sequence[Array],
+        residuals: Sequence[Array],
+    ) -> NormalEquations:
+        """The sums with further columns, and with a residual that has changed.
+
+        Of the products only those with something new are taken: with many coefficients, as a
+        robot has, that is a hundredth of all.
+
+        Args:
+            slopes: X by trial, of which these sums are, each (T, n_q, P).
+            columns: what is added to it, each (T, n_q, m).
+            change: what is added to the residual, each (T, n_q).
+            residuals: r by trial, of which these sums are, each (T, n_q).
+        """
+        xx, xy, yy = [], [], []
+        for k, (slope, column, moved, residual) in enumerate(
+            zip(slopes, columns, change, residuals, strict=True)
+        ):
+            new = column.transpose(1, 2, 0)
+            cross = new @ slope.transpose(1, 0, 2)
+            own = new @ column.transpose(1, 0, 2)
+            xx.append(
+                np.concatenate(
+                    [
+                        np.concatenate([self.xx[k], cross.transpose(0, 2, 1)], axis=2),
+                        np.concatenate([cross, own], axis=2),
+                    ],
+                    axis=1,
+                )
+            )
+            shift = np.einsum("tap,ta->ap", slope, moved) if moved.any() else 0.0
+            right = (residual + moved).T
+            xy.append(
+                np.concatenate([self.xy[k] - shift, -(new @ right[:, :, None])[:, :, 0]], axis=1)
+            )
+            yy.append(np.sum(right**2, axis=1))
+        nothing = np.zeros(columns[0].shape[2])
+        return NormalEquations(
+            np.array(xx), np.array(xy), np.array(yy), self.count,
+            np.append(self.precision, nothing), np.append(self.known, nothing),
+        )  # fmt: skip
 
     def subset(self, trials: Sequence[int]) -> NormalEquations:
         """The sums of some trials."""
         chosen = list(trials)
         return NormalEquations(
-            self.xx[chosen], self.xy[chosen], self.yy[chosen], self.count[chosen]
-        )
+            self.xx[chosen], self.xy[chosen], self.yy[chosen], self.count[chosen],
+            self.precision, self.known,
+        )  # fmt: skip
 
     def scaled(self, factor: Array) -> NormalEquations:
         """The sums with every trial times its ``factor``, (K,)."""
@@ -72,6 +132,8 @@ class NormalEquations:
             self.xy * factor[:, None, None],
             self.yy * by_axis,
             self.count * by_axis,
+            self.precision,
+            self.known,
         )
 
     def solve(self, weight: Array, lower: Array, upper: Array) -> Array:
@@ -81,8 +143,8 @@ class NormalEquations:
             weight: of the squares of each axis, (n_q,).
             lower, upper: (P,); equal where a coefficient is given.
         """
-        normal = np.einsum("kapq,a->pq", self.xx, weight)
-        moment = np.einsum("kap,a->p", self.xy, weight)
+        normal = np.einsum("kapq,a->pq", self.xx, weight) + np.diag(self.precision)
+        moment = np.einsum("kap,a->p", self.xy, weight) + self.precision * self.known
         return solve_bounded(normal, moment, lower, upper).x
 
     def squares(self, values: Array) -> Array:

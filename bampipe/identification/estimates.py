@@ -15,6 +15,7 @@ from bampipe.estimate.output_error import OutputError
 from bampipe.identification.filter_tables import as_filtered
 from bampipe.physics import System
 from bampipe.results.identify import (
+    BaseEstimate,
     Convergence,
     Covariance,
     IdentifiabilityReport,
@@ -28,6 +29,9 @@ from bampipe.results.identify import (
 from bampipe.trials.motion import Motion
 
 Array = NDArray[np.float64]
+
+MOST_SHOWN = 24
+"""Parameters that a headline lists."""
 
 
 @dataclass(frozen=True)
@@ -155,6 +159,7 @@ def collect_result(
     engine: Literal["compiled", "filterpy"],
     methods: Mapping[Method, MethodTried],
     notes: Sequence[str],
+    base_parameters: tuple[BaseEstimate, ...] | None = None,
 ) -> IdentifyResult:
     """Return what identify.json says."""
     free, sd = estimate.free, estimate.sd
@@ -172,10 +177,7 @@ def collect_result(
     }
     return IdentifyResult(
         model=model,
-        headline=", ".join(
-            f"{name} {entry.estimate:.4g} ± {entry.sd:.2g} {entry.unit}"
-            for name, entry in parameters.items()
-        ),
+        headline=_headline(parameters),
         method=estimate.method,
         engine=engine,
         methods=dict(methods),
@@ -183,6 +185,18 @@ def collect_result(
         covariance=Covariance(names=names, matrix=estimate.covariance.tolist()),
         trials=tuple(motion.trial_id for motion in motions),
         identifiability=identifiability,
+        base_parameters=base_parameters,
         notes=(*notes, *identifiability.sentences),
         **estimate.report,
     )
+
+
+def _headline(parameters: Mapping[str, ParameterEstimate]) -> str:
+    """The parameters in one line; of a robot's many, the first."""
+    shown = [
+        f"{name} {entry.estimate:.4g} ± {entry.sd:.2g} {entry.unit}"
+        for name, entry in parameters.items()
+    ]
+    if len(shown) <= MOST_SHOWN:
+        return ", ".join(shown)
+    return f"{', '.join(shown[:MOST_SHOWN])} and {len(shown) - MOST_SHOWN} more"

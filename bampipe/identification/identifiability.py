@@ -72,12 +72,20 @@ def assess_identifiability(
     joint = [_of_trial(system, known, motions, problem, k, p, noise) for k in range(len(motions))]
     n = len(names)
     total = np.sum(joint, axis=0)
+    total[:n, :n] += np.diag(problem.precision)
     own = total[:n, :n]
     covariance = cramer_rao_bound(own)
     sd = np.sqrt(np.diag(covariance))
     value = p[problem.free]
     estimated = [i for i, name in enumerate(names) if name != TIMING]
-    weak = [w for w in weak_directions(own) if set(w.members) & set(estimated)]
+    # Of inertial numbers, which all hide each other, see `BaseEstimate`.
+    drawn = set(np.flatnonzero(problem.precision))
+    own_words = [i for i in estimated if i not in drawn]
+    weak = [
+        w
+        for w in weak_directions(own)
+        if set(w.members) & set(own_words) and not set(w.members) & drawn
+    ]
     growth = growth_without([part[:n, :n] for part in joint])[:, estimated]
     numbers = tuple(
         _number(number, total, n, n + j, names, value, estimated)
@@ -85,7 +93,7 @@ def assess_identifiability(
     )
     half = problem.upper[-1]  # of a sample: all that is assumed of the timing
     assumed = np.array([system.parameters[i].sd if i < n_p else half for i in problem.free])
-    prior, place = assumed[estimated], np.ix_(estimated, estimated)
+    place = np.ix_(estimated, estimated)
     parameters = {names[i]: _entry(own, covariance, i, names) for i in estimated}
     trials = {
         motion.trial_id: TrialGrowth(
@@ -110,7 +118,7 @@ def assess_identifiability(
         sentences=(
             *(_together(group.members, group.combinations) for group in known.together),
             *(_moving(w, names, value, covariance) for w in weak),
-            *_unsaid([names[i] for i in estimated], sd[estimated], prior),
+            *_unsaid([names[i] for i in own_words], sd[own_words], assumed[own_words]),
             *_limits([names[i] for i in estimated], at_bound),
             *_idle(trials),
             *_leaning(numbers),

@@ -188,8 +188,9 @@ def _leave_out(squares: UnbiasedFit, folds: Folds) -> list[Array]:
         lower, upper = np.maximum(lower, -_FARTHEST * sd), np.minimum(upper, _FARTHEST * sd)
     stacked = raw.stacked
     sums = NormalEquations.from_samples(
-        [s.slope for s in stacked], [s.residual for s in stacked], [s.used for s in stacked]
-    )
+        [s.slope for s in stacked], [s.residual for s in stacked], [s.used for s in stacked],
+        problem.precision, problem.known - raw.p[free],
+    )  # fmt: skip
     weight = 1.0 / np.maximum(raw.residual_sd, 1e-150) ** 2
     found = []
     for step in folds.solve(sums, weight, lower, upper):

@@ -7,6 +7,8 @@ state at a time. Both are printed from one set of equations, so they cannot disa
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import sympy as sp
@@ -142,12 +144,40 @@ class _Printer(PythonCodePrinter):  # type: ignore[misc]
         return repr(float(expr))
 
 
-def _block(results: Sequence[Any]) -> tuple[list[str], list[str]]:
-    """Assignments of common subexpressions, and one expression a result."""
+@dataclass(frozen=True)
+class _Block:
+    """Straight text that computes results.
+
+    Attributes:
+        used: every symbol that it reads.
+        lines: assignments of intermediates and common subexpressions.
+        values: one expression a result.
+    """
+
+    used: set[Any]
+    lines: list[str]
+    values: list[str]
+
+
+@lru_cache(maxsize=1 << 14)
+def _printed(value: Any) -> tuple[str, frozenset[Any]]:
+    """Text and symbols of an intermediate: several functions share it, and all candidates."""
+    return _Printer().doprint(value), frozenset(value.free_symbols)
+
+
+def _block(results: Sequence[Any], steps: Sequence[tuple[Any, Any]] = ()) -> _Block:
+    """The text of ``results``, with those of ``steps`` in front that they need."""
     printer = _Printer()
+    used: set[Any] = set().union(*(sp.sympify(e).free_symbols for e in results))
+    needed = []
+    for name, value in reversed(steps):
+        if name in used:
+            text, symbols = _printed(value)
+            needed.append(f"{name} = {text}")
+            used |= symbols
     shared, reduced = sp.cse(list(results), symbols=sp.numbered_symbols("c_"), order="none")
     lines = [f"{name} = {printer.doprint(value)}" for name, value in shared]
-    return lines, [printer.doprint(value) for value in reduced]
+    return _Block(used, [*reversed(needed), *lines], [printer.doprint(v) for v in reduced])
 
 
 def _unpack(group: str, symbols: Sequence[Any], used: set[Any], index: str = "{}") -> list[str]:
@@ -155,23 +185,47 @@ def _unpack(group: str, symbols: Sequence[Any], used: set[Any], index: str = "{}
     return [f"{s} = {group}[{index.format(i)}]" for i, s in enumerate(symbols) if s in used]
 
 
-def function_source(name: str, groups: Mapping[str, Sequence[Any]], results: Sequence[Any]) -> str:
+def function_source(
+    name: str,
+    groups: Mapping[str, Sequence[Any]],
+    results: Sequence[Any],
+    steps: Sequence[tuple[Any, Any]] = (),
+) -> str:
     """A function of groups of columns that returns one column a result."""
-    used = set().union(*(sp.sympify(e).free_symbols for e in results)) if results else set()
-    lines, values = _block(results)
-    body = [line for group, symbols in groups.items() for line in _unpack(group, symbols, used)]
-    body += [*lines, f"return ({''.join(v + ', ' for v in values)})"]
+    block = _block(results, steps)
+    body = [
+        line for group, symbols in groups.items() for line in _unpack(group, symbols, block.used)
+    ]
+    body += [*block.lines, f"return ({''.join(v + ', ' for v in block.values)})"]
     return f"\n\ndef {name}({', '.join(groups)}):\n    " + "\n    ".join(body) + "\n"
+
+
+def portable_expressions(
+    e: Equations, parameters: Mapping[Any, float]
+) -> tuple[list[str], list[str], list[Any]]:
+    """The force that a motion requires, as text with numbers for the parameters.
+
+    Args:
+        e: the equations of a model without internal states; parameters: value of each symbol.
+
+    Returns:
+        Assignments ``name = expression``, one expression an axis, and the inputs it still needs.
+    """
+    numbers = {symbol: sp.Float(value) for symbol, value in parameters.items()}
+    numbers |= dict.fromkeys(e.w, sp.S.Zero)
+    required = [
+        sp.sympify(f - o).xreplace(numbers) for f, o in zip(e.dynamics, e.other, strict=True)
+    ]
+    steps = [(name, value.xreplace(numbers)) for name, value in e.steps]
+    block = _block(required, steps)
+    return block.lines, block.values, [symbol for symbol in e.u if symbol in block.used]
 
 
 def array_source(e: Equations, added: Sequence[Any]) -> str:
     """Source of the functions over columns; ``added`` is what the effects add to the residual."""
     quiet = dict.fromkeys(e.w, 0)
     motion = {"q": e.q, "qd": e.qd, "qdd": e.qdd}
-    required = [
-        sum(m * a for m, a in zip(row, e.qdd, strict=True)) + h - o.subs(quiet)
-        for row, h, o in zip(e.mass, e.bias, e.other, strict=True)
-    ]
+    required = [f - o.subs(quiet) for f, o in zip(e.dynamics, e.other, strict=True)]
     true = [
         *[a + b for a, b in zip(e.q, e.offset, strict=True)],
         *[a + b for a, b in zip(e.qd, e.offset_rate, strict=True)],
@@ -179,7 +233,7 @@ def array_source(e: Equations, added: Sequence[Any]) -> str:
     ]
     parts = [
         ARRAY_HEADER,
-        function_source("required", {**motion, "z": e.z, "u": e.u, "p": e.p}, required),
+        function_source("required", {**motion, "z": e.z, "u": e.u, "p": e.p}, required, e.steps),
         function_source("applied", {**motion, "z": e.z, "u": e.u, "p": e.p}, e.applied),
         function_source(
             "contribution",
@@ -193,8 +247,12 @@ def array_source(e: Equations, added: Sequence[Any]) -> str:
             [entry for row in e.input_map for entry in row],
         ),
         function_source("initial_memory", {"q": e.q, "u": e.u, "p": e.p}, e.initial),
-        function_source("mass_matrix", {"q": e.q, "p": e.p}, [m for row in e.mass for m in row]),
-        function_source("energy", {"q": e.q, "qd": e.qd, "p": e.p}, [e.kinetic, e.potential]),
+        function_source(
+            "mass_matrix", {"q": e.q, "p": e.p}, [m for row in e.mass for m in row], e.steps
+        ),
+        function_source(
+            "energy", {"q": e.q, "qd": e.qd, "p": e.p}, [e.kinetic, e.potential], e.steps
+        ),
         function_source(
             "compensation",
             {"q": e.q, "qd": e.qd, "z": e.z, "u": e.u, "p": e.p},
@@ -266,12 +324,12 @@ def _motion(e: Equations, index: str = "{}") -> list[str]:
     upper = [(i, j) for i in range(n) for j in range(i, n)]
     force = [a + o - h for a, o, h in zip(e.applied_noise, e.other, e.bias, strict=True)]
     results = [*[e.mass[i][j] for i, j in upper], *force, *e.rates]
-    used = set().union(*(sp.sympify(x).free_symbols for x in results)) | set(e.qd)
-    lines, values = _block(results)
-    body = _unpack("x", [*e.q, *e.qd, *e.z], used, index)
+    block = _block([*results, *e.qd], e.steps)
+    values = block.values[: len(results)]
+    body = _unpack("x", [*e.q, *e.qd, *e.z], block.used, index)
     for group, symbols in {"u": e.u, "p": e.p, "w": e.w}.items():
-        body += _unpack(group, symbols, used, index)
-    body += lines
+        body += _unpack(group, symbols, block.used, index)
+    body += block.lines
     body += [
         f"m_{i}{j} = {v}" for (i, j), v in zip(upper, values, strict=False) if e.mass[i][j] != 0
     ]
@@ -284,11 +342,10 @@ def _motion(e: Equations, index: str = "{}") -> list[str]:
 def _reading(e: Equations, index: str = "{}") -> list[str]:
     """Body of the measurement: y from x, u, p."""
     readings = _encoder_readings(e)
-    used = set().union(*(x.free_symbols for x in readings))
-    lines, values = _block(readings)
-    body = _unpack("x", [*e.q, *e.qd], used, index)
-    body += _unpack("u", e.u, used, index) + _unpack("p", e.p, used, index)
-    return body + lines + [f"y[{index.format(i)}] = {v}" for i, v in enumerate(values)]
+    block = _block(readings)
+    body = _unpack("x", [*e.q, *e.qd], block.used, index)
+    body += _unpack("u", e.u, block.used, index) + _unpack("p", e.p, block.used, index)
+    return body + block.lines + [f"y[{index.format(i)}] = {v}" for i, v in enumerate(block.values)]
 
 
 def rows_source(e: Equations, rows: int) -> str:
@@ -316,19 +373,17 @@ def residual_source(e: Equations) -> str:
     """Source of the compiled residual along a motion: ``residual(q, qd, qdd, z, u, p, out)``."""
     quiet = dict.fromkeys(e.w, 0)
     residual = [
-        a + (o - h).subs(quiet) - sum(m * x for m, x in zip(row, e.qdd, strict=True))
-        for a, o, h, row in zip(e.applied, e.other, e.bias, e.mass, strict=True)
+        a + o.subs(quiet) - f for a, o, f in zip(e.applied, e.other, e.dynamics, strict=True)
     ]
-    used = set().union(*(x.free_symbols for x in residual))
-    lines, values = _block(residual)
+    block = _block(residual, e.steps)
     groups = {"q": e.q, "qd": e.qd, "qdd": e.qdd, "z": e.z, "u": e.u}
     row = [
         line
         for group, symbols in groups.items()
-        for line in _unpack(group, symbols, used, "row, {}")
+        for line in _unpack(group, symbols, block.used, "row, {}")
     ]
-    row += lines + [f"out[row, {i}] = {v}" for i, v in enumerate(values)]
-    body = [*_unpack("p", e.p, used), *_loop("for row in range(len(q)):", row)]
+    row += block.lines + [f"out[row, {i}] = {v}" for i, v in enumerate(block.values)]
+    body = [*_unpack("p", e.p, block.used), *_loop("for row in range(len(q)):", row)]
     return SCALAR_HEADER + _compiled(
         "residual", "q, qd, qdd, z, u, p, out", body, kinds="M, M, M, M, M, V, M", options=""
     )
@@ -336,12 +391,11 @@ def residual_source(e: Equations) -> str:
 
 def memory_source(e: Equations) -> str:
     """Source of the compiled internal states along a motion."""
-    used = set().union(*(sp.sympify(x).free_symbols for x in e.rates))
-    lines, values = _block(e.rates)
+    block = _block(e.rates)
     body = []
     for group, symbols in {"q": e.q, "qd": e.qd, "u": e.u, "p": e.p, "z": e.z}.items():
-        body += _unpack(group, symbols, used)
-    body += lines + [f"dz[{i}] = {v}" for i, v in enumerate(values)]
+        body += _unpack(group, symbols, block.used)
+    body += block.lines + [f"dz[{i}] = {v}" for i, v in enumerate(block.values)]
     rate = _compiled("memory_rate", "q, qd, u, p, z, dz", body, options="")
     return SCALAR_HEADER + "import numpy as np\n" + rate + MEMORY_LOOP
 
@@ -350,8 +404,11 @@ def law_source(
     motion: Sequence[Any], given: Sequence[Any], states: Sequence[Any], law: Sequence[Any]
 ) -> str:
     """Source of a compiled control law: ``command(y, r, s, out)``."""
-    used = set().union(*(sp.sympify(e).free_symbols for e in law))
-    lines, values = _block(law)
-    body = _unpack("y", motion, used) + _unpack("r", given, used) + _unpack("s", states, used)
-    body += lines + [f"out[{i}] = {v}" for i, v in enumerate(values)]
+    block = _block(law)
+    body = [
+        line
+        for group, symbols in {"y": motion, "r": given, "s": states}.items()
+        for line in _unpack(group, symbols, block.used)
+    ]
+    body += block.lines + [f"out[{i}] = {v}" for i, v in enumerate(block.values)]
     return SCALAR_HEADER + _compiled("command", "y, r, s, out", body)

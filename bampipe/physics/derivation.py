@@ -2,10 +2,13 @@
 
 M(q) qdd + h(q, qd) = Q_applied + Q_other, where Q_applied comes from the measured input (eq 19) and
 Q_other from friction (eq 20), brakes (eq 18), compensators and the effects of kind ``torque``.
+The bodies of a robot enter by Newton and Euler's equations instead: `newton_euler`.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import sympy as sp
@@ -15,6 +18,17 @@ from bampipe.physics.device import LAST_ORDER, derivative
 from bampipe.physics.equations import Equations
 from bampipe.physics.lagrange import allow, check_inertia, lagrange
 from bampipe.physics.model import Model
+from bampipe.physics.newton_euler import (
+    INERTIAL,
+    Algebra,
+    Link,
+    Text,
+    Vector,
+    joint_forces,
+    mass_matrix,
+    potential_energy,
+)
+from bampipe.physics.robot import gravity_vector
 from bampipe.physics.roles import compensation, delays
 from bampipe.physics.signals import Signals, order_of_action
 from bampipe.physics.time_limit import OutOfTime, time_limit
@@ -70,7 +84,7 @@ def _derive(model: Model, named_constants: bool) -> Equations:
     other = _device_torque(d, w)
 
     label = f"device {device.name!r}: energy.kinetic"
-    energies = [(label, device.kinetic, kinetic, potential)]
+    energies = [(label, device.kinetic, kinetic, potential)] if device.energy else []
     offset = [sp.S.Zero] * n
     # An offset is differentiated twice. It cannot follow the rates, so what a motor's back EMF
     # takes off is left out of its load; nor states, so a lagging force counts as logged; and a
@@ -94,7 +108,7 @@ def _derive(model: Model, named_constants: bool) -> Equations:
         measures = item.effect.kind == "measurement"
         symbols = d.effect_symbols(item, still if measures else delivered, side)
         for key, tree in item.effect.expressions.items():
-            place = key.partition(".")[2] or item.target
+            place = item.place(key)
             if item.effect.kind == "input":
                 continue
             value = d.own(item, tree, symbols, key)
@@ -127,7 +141,7 @@ def _derive(model: Model, named_constants: bool) -> Equations:
     motion, memory = [*d.q, *d.qd], [*d.z.values()]
     gains = [entry for row in input_map for entry in row]
     words = "motion, inputs, parameters and internal states"
-    _, _, kinetics, potentials = zip(*energies, strict=True)
+    kinetics, potentials = [e[2] for e in energies], [e[3] for e in energies]
     allow("the kinetic energy", [*kinetics], [*motion, *free], "positions, rates and parameters")
     allow("the potential energy", [*potentials], [*d.q, *free], "positions and parameters")
     allow(
@@ -148,12 +162,26 @@ def _derive(model: Model, named_constants: bool) -> Equations:
             terms.append(lagrange(a, b, tuple(d.q), tuple(d.qd)))
         except OutOfTime:
             raise d.too_long(tree, label) from None
-    mass = [[sum(t[0][i][j] for t in terms) for j in range(n)] for i in range(n)]
-    bias = [sum(t[1][i] for t in terms) for i in range(n)]
+    mass = [[sum((t[0][i][j] for t in terms), sp.S.Zero) for j in range(n)] for i in range(n)]
+    bias = [sum((t[1][i] for t in terms), sp.S.Zero) for i in range(n)]
     for row, term in zip(mass, bias, strict=True):
         allow("the equation of motion", [*row, term], [*motion, *free], "motion and parameters")
-    check_inertia(model, mass, [*d.q, *constants])
-    kinetic, potential = sum(kinetics), sum(potentials)
+    kinetic, potential = sum(kinetics, sp.S.Zero), sum(potentials, sp.S.Zero)
+    dynamics = [
+        h + sum(m * x for m, x in zip(row, d.qdd, strict=True))
+        for h, row in zip(bias, mass, strict=True)
+    ]
+    bodies = _bodies(d)
+    if bodies is None:
+        check_inertia(model, mass, [*d.q, *constants])
+    else:
+        mass = [
+            [m + b for m, b in zip(*rows, strict=True)]
+            for rows in zip(mass, bodies.mass, strict=True)
+        ]
+        bias = [h + b for h, b in zip(bias, bodies.bias, strict=True)]
+        dynamics = [h + b for h, b in zip(dynamics, bodies.dynamics, strict=True)]
+        kinetic, potential = kinetic + bodies.kinetic, potential + bodies.potential
 
     offset_rate = [d.ddt(e) for e in offset]
     offset_acceleration = [d.ddt(e) for e in offset_rate]
@@ -168,15 +196,12 @@ def _derive(model: Model, named_constants: bool) -> Equations:
     ]
     used = set().union(*(e.free_symbols for e in [*parts, *raw_applied]))
     inputs = [c for c in d.channels if d.channel[c] in used or c in device.forces]
-    residual = [
-        a + o - h - sum(m * x for m, x in zip(row, d.qdd, strict=True))
-        for a, o, h, row in zip(applied, other, bias, mass, strict=True)
-    ]
+    residual = [a + o - f for a, o, f in zip(applied, other, dynamics, strict=True)]
     moved = [*offset, *offset_rate, *offset_acceleration]
     linear: list[bool] = []
     products: list[tuple[int, int]] = []
     for i, symbol in enumerate(d.p.values()):
-        slopes = [sp.diff(e, symbol) for e in residual]
+        slopes = [slope for e in residual if (slope := sp.diff(e, symbol)) != 0]
         curved = any(sp.diff(slope, symbol) != 0 for slope in slopes)
         linear.append(not curved and not any(e.has(symbol) for e in [*rates, *moved]))
         for j, earlier in enumerate([*d.p.values()][:i]):
@@ -186,12 +211,60 @@ def _derive(model: Model, named_constants: bool) -> Equations:
         q=d.q, qd=d.qd, qdd=d.qdd, z=[*d.z.values()], z_names=z_names,
         u=[d.channel[c] for c in inputs], inputs=inputs,
         p=list(d.p.values()), w=w, noise=noise,
-        mass=mass, bias=bias, other=other, applied=applied, applied_noise=applied_noise,
+        steps=bodies.steps if bodies else [],
+        mass=mass, bias=bias, dynamics=dynamics, other=other,
+        applied=applied, applied_noise=applied_noise,
         input_map=input_map, rates=rates, initial=initial,
         offset=offset, offset_rate=offset_rate, offset_acceleration=offset_acceleration,
         kinetic=kinetic, potential=potential, linear=linear, products=products,
         compensation=compensation(d, potential), delays=delays(d, applied),
     )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Bodies:
+    """What the bodies of a robot put into the equations, by names in ``steps``."""
+
+    steps: list[tuple[Any, Any]]
+    mass: list[list[Any]]
+    bias: list[Any]
+    dynamics: list[Any]
+    kinetic: Any
+    potential: Any
+
+
+def _bodies(d: Vocabulary) -> _Bodies | None:
+    """Newton and Euler's equations of the bodies; None where the device is no robot."""
+    robot = d.model.device.robot
+    if robot is None:
+        return None
+    numbers = tuple(d.p[p.name] for p in robot.parameters)
+    motion = tuple(d.q), tuple(d.qd), tuple(d.qdd)
+    return _newton_euler(robot.links, gravity_vector(robot), numbers, motion)
+
+
+@cache
+def _newton_euler(
+    links: tuple[Link, ...],
+    gravity: Vector,
+    numbers: tuple[Any, ...],
+    motion: tuple[tuple[Any, ...], ...],
+) -> _Bodies:
+    """Every candidate effect of a robot has the same bodies: written once a process."""
+    q, qd, qdd = motion
+    text = Text()
+    algebra = Algebra.symbols(text)
+    inertial = [numbers[k : k + INERTIAL] for k in range(0, len(numbers), INERTIAL)]
+    mass = mass_matrix(algebra, links, inertial, q)
+    momentum = [sum(m * v for m, v in zip(row, qd, strict=True)) for row in mass]
+    return _Bodies(
+        text.steps,
+        mass,
+        joint_forces(algebra, links, inertial, q, qd, [0] * len(links), gravity),
+        joint_forces(algebra, links, inertial, q, qd, qdd, gravity),
+        sum(p * v for p, v in zip(momentum, qd, strict=True)) / 2,
+        potential_energy(algebra, links, inertial, q, gravity),
+    )
 
 
 def _device_torque(d: Vocabulary, w: list[Any]) -> list[Any]:

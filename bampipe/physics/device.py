@@ -14,6 +14,7 @@ from bampipe.errors import InputError, did_you_mean
 from bampipe.physics.controller import Controller
 from bampipe.physics.expression import MAX_NUMBER, Expression, Name
 from bampipe.physics.parameter import Parameter, PhysicalNumber
+from bampipe.physics.robot import Robot
 from bampipe.schema import (
     ByName,
     Declaration,
@@ -76,9 +77,13 @@ class Constant(Declaration):
 
 
 class Energy(Declaration):
-    """The energies of a device, J."""
+    """The energies of a device, J; beside those of its rigid bodies where it is a robot."""
 
-    kinetic: Expression = Field(description="Kinetic energy, J: quadratic in the rates")
+    kinetic: Expression = Field(
+        default="0",
+        validate_default=True,
+        description="Kinetic energy, J: quadratic in the rates",
+    )
     potential: Expression = Field(
         default="0",
         validate_default=True,
@@ -132,6 +137,10 @@ class Limits(Declaration):
             yield InputError("lower must be below upper")
 
 
+_NEEDED = ("coordinates", "inputs", "applied")
+"""Tables that every device has; those of a robot are filled in where its file is read."""
+
+
 class Device(Declaration):
     """A device: coordinates, energies, inputs and friction of one mechanism."""
 
@@ -140,7 +149,7 @@ class Device(Declaration):
     summary: str = Field(default="", description="What it is, in one sentence")
     source: str = Field(default="", description="Where its equations and numbers come from")
     coordinates: Annotated[tuple[Coordinate, ...], ByName(Name, least=1)] = Field(
-        description="One table a coordinate"
+        default=(), description="One table a coordinate; of a robot, its joints by default"
     )
     constants: dict[Name, Constant] = Field(
         default={}, description="Numbers from drawings and data sheets"
@@ -148,14 +157,23 @@ class Device(Declaration):
     definitions: dict[Name, Expression] = Field(
         default={}, description="Named expressions, in order; each may use those before it"
     )
-    energy: Energy
+    energy: Energy | None = Field(
+        default=None, description="Its energies; beside [robot], what is added to its bodies'"
+    )
+    robot: Robot | None = Field(
+        default=None, description="Rigid bodies on joints, in place of [energy]"
+    )
     torque: dict[Name, Expression] = Field(
         default={},
         description="Per coordinate: generalised force beside friction, brakes and the input",
     )
-    inputs: Inputs
+    inputs: Inputs = Field(
+        default=Inputs(), description="What drives it; a torque a joint or motor of a robot"
+    )
     applied: dict[Name, Expression] = Field(
-        min_length=1, description="Per coordinate: generalised force of the channels"
+        default={},
+        min_length=1,
+        description="Per coordinate: generalised force of the channels; by its motors of a robot",
     )
     side_load: dict[Name, Expression] = Field(
         default={}, description="Per coordinate: load across the motion"
@@ -187,13 +205,13 @@ class Device(Declaration):
 
     @property
     def kinetic(self) -> ast.expr:
-        """Kinetic energy, J."""
-        return self.energy.kinetic
+        """Kinetic energy, J; of a robot, what is added to that of its bodies."""
+        return self.energy.kinetic if self.energy else ast.Constant(0)
 
     @property
     def potential(self) -> ast.expr:
-        """Potential energy, J."""
-        return self.energy.potential
+        """Potential energy, J; of a robot, what is added to that of its bodies."""
+        return self.energy.potential if self.energy else ast.Constant(0)
 
     @property
     def forces(self) -> tuple[str, ...]:
@@ -222,13 +240,13 @@ class Device(Declaration):
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
-        """All its parameters: ``viscous.<axis>`` and ``coulomb.<axis>`` first."""
+        """All its parameters: ``viscous.<axis>`` and ``coulomb.<axis>`` first, bodies last."""
         terms = [
             parameter.renamed(f"{term}.{axis}")
             for axis, entry in self.friction.items()
             for term, parameter in entry
         ]
-        return (*terms, *self.other_parameters)
+        return (*terms, *self.other_parameters, *(self.robot.parameters if self.robot else ()))
 
     @property
     def limits(self) -> Mapping[str, tuple[float, float]]:
@@ -236,7 +254,14 @@ class Device(Declaration):
         return {axis: (entry.lower, entry.upper) for axis, entry in self.ranges.items()}
 
     def cross_faults(self) -> Iterator[InputError]:
+        missing = [key for key in _NEEDED if key not in self.model_fields_set]
+        for key in missing:
+            about = type(self).model_fields[key].description or ""
+            yield InputError(f"'{key}' is missing", remedy=about.partition(";")[0])
+        if missing:
+            return
         axes = [c.name for c in self.coordinates]
+        yield from self._faults_of_bodies()
         for label, table in (
             ("torque", self.torque),
             ("applied", self.applied),
@@ -276,6 +301,28 @@ class Device(Declaration):
                 if name in taken:
                     yield InputError(f"{name!r} is the name of {taken[name]} already", where=label)
                 taken[name] = f"one of {label}"
+
+    def _faults_of_bodies(self) -> Iterator[InputError]:
+        """Whether there is what moves: energies, or joints, one a coordinate."""
+        if self.robot is None:
+            if self.energy is None:
+                yield InputError("'energy' is missing", remedy="give [energy], or [robot]")
+            elif "kinetic" not in self.energy.model_fields_set:
+                yield InputError(
+                    "'kinetic' is missing",
+                    where="energy",
+                    remedy="Kinetic energy, J: quadratic in the rates",
+                )
+            return
+        kinds = {"revolute": "rotary", "prismatic": "linear"}
+        joints = [(joint.name, kinds[joint.kind]) for joint in self.robot.joints]
+        if joints != [(c.name, c.kind) for c in self.coordinates]:
+            yield InputError(
+                "the joints are not the coordinates",
+                where="robot.joints",
+                remedy="one coordinate a joint, of its name, in its order: rotary for revolute,"
+                " linear for prismatic",
+            )
 
     def coordinate(self, name: str) -> Coordinate:
         """The coordinate called ``name``.

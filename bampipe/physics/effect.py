@@ -20,14 +20,19 @@ from bampipe.schema import ByName, Declaration, Distinct, NamedDeclaration, Text
 
 # What an effect of each kind must give, where it may apply.
 _EXPRESSIONS = {
-    "torque": (("torque",), ("axis", "device")),
+    "torque": (("torque",), ("axis", "axis_pair", "device")),
     "input": (("input",), ("force_component", "force_pair", "channel", "device")),
-    "energy": (("kinetic", "potential"), ("axis", "device")),
+    "energy": (("kinetic", "potential"), ("axis", "axis_pair", "device")),
     "measurement": (("offset",), ("axis", "device")),
 }
 Link = Literal["timing", "zero", "scale", "delay", "lag", "saturation", "lever"]
 """Links between what is logged and what acts, from the log on: when a sensor reads, its zero and
 its scale; delay, lag and saturation of what drives; the lever at which it acts."""
+Scope = Literal["axis", "axis_pair", "force_component", "force_pair", "channel", "device"]
+_PLACED = ("axis_pair", "device")
+"""Scopes in which an expression is a table, one a place."""
+PAIR = ("a", "b")
+"""Places of an effect on a pair of axes."""
 EACH = "each"
 """Place of a device-wide input effect that stands for every force channel."""
 
@@ -96,9 +101,11 @@ class Effect(Declaration):
         Field(description="an identifier, such as magnetic_detent"),
     ]
     summary: Text = Field(description="What it is, in one sentence")
-    scope: Literal["axis", "force_component", "force_pair", "channel", "device"] = Field(
-        description="axis: one coordinate; force_component: one reading; force_pair: a reading"
-        " that leaks into another; channel: an input that is no force; device: the whole device"
+    scope: Scope = Field(
+        description="axis: one coordinate; axis_pair: two neighbouring joints of a robot, a nearer"
+        " to the base than b (q_a, qd_a, q_b, qd_b); force_component: one reading; force_pair: a"
+        " reading that leaks into another; channel: an input that is no force; device: the whole"
+        " device"
     )
     kind: Literal["torque", "input", "energy", "measurement"] = Field(
         description="torque: acts on the joints; input: maps the measured force to the true one;"
@@ -132,6 +139,10 @@ class Effect(Declaration):
         description="Where it acts between what is logged and the mechanism: links act in this"
         " order, each on what the one before it leaves. scale where left out, lever for a"
         " measurement; a torque with a link is part of the drive, and of the load of what follows",
+    )
+    robot: bool = Field(
+        default=False,
+        description="Whether it is one of robots only: offered where the device has joints",
     )
     devices: Distinct[Text] = Field(
         default=(), description="Devices that it makes sense for; all where left out"
@@ -192,12 +203,14 @@ class Effect(Declaration):
                 remedy=f"scope may be {' or '.join(scopes)}",
             )
         for key in (key for keys, _ in _EXPRESSIONS.values() for key in keys):
-            value, placed = getattr(self, key), self.scope == "device" and self.kind != "energy"
+            value, placed = getattr(self, key), self.scope in _PLACED and self.kind != "energy"
             if value is not None and key not in main:
                 yield InputError(f"{key!r} has no meaning for kind {self.kind!r}")
             elif value is not None and isinstance(value, Mapping) != placed:
                 form = "a table, one expression a place" if placed else "one expression"
                 yield InputError(f"{key!r} must be {form}")
+            elif self.scope == "axis_pair" and placed and value and not set(value) <= set(PAIR):
+                yield InputError(f"the places of {key!r} are {' and '.join(PAIR)}")
         if self.link and self.kind == "energy":
             yield InputError("'link' has no meaning for kind 'energy'")
         if not self.expressions:
@@ -210,20 +223,33 @@ class Effect(Declaration):
         """Names after the colon that make sense for ``device``; ``("",)`` for a device effect."""
         if (self.devices and device.name not in self.devices) or (self.drive and not device.drive):
             return ()
+        if self.robot and device.robot is None:
+            return ()
         if self.scope == "axis":
             used = self.names
             return tuple(
                 c.name
                 for c in device.coordinates
-                if ("brake" not in used or c.name in device.brakes)
+                if all(getattr(p, c.kind, p) is not None for p in self.parameters.values())
+                and ("brake" not in used or c.name in device.brakes)
                 and ("dry" not in used or device.has_dry_friction(c.name))
             )
+        if self.scope == "axis_pair":
+            return tuple(_neighbours(device))
         if self.scope == "channel":
             return tuple(device.channels)
         if self.scope == "force_component":
             return device.components
         if self.scope == "force_pair":
-            return tuple(a + b for a in device.components for b in device.components if a != b)
+            names = device.components
+            # The drives of a robot may share a gear with their neighbours, not with all others.
+            near = len(names) if device.robot is None else 1
+            return tuple(
+                a + b
+                for i, a in enumerate(names)
+                for j, b in enumerate(names)
+                if 0 < abs(i - j) <= near
+            )
         return ("",) if self._fits(device) else ()
 
     @cached_property
@@ -254,13 +280,30 @@ class Effect(Declaration):
         return keys <= places and self.names <= known
 
 
+def _neighbours(device: Device) -> dict[str, tuple[str, str]]:
+    """Pairs of neighbouring joints of one kind, by what follows the colon: ``wrist-hand``."""
+    if device.robot is None:
+        return {}
+    kinds = {c.name: c.kind for c in device.coordinates}
+    return {
+        f"{joint.after}-{joint.name}": (joint.after, joint.name)
+        for joint in device.robot.joints
+        if joint.after and kinds[joint.after] == kinds[joint.name]
+    }
+
+
 @dataclass(frozen=True)
 class BoundEffect:
-    """An effect at its target: what a model is made of."""
+    """An effect at its target: what a model is made of.
+
+    Attributes:
+        axes: the axis or the two that it acts on, where its scope says so.
+    """
 
     effect: Effect
     target: str
     parameters: tuple[Parameter, ...]
+    axes: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:
@@ -271,6 +314,13 @@ class BoundEffect:
     def prefix(self) -> str:
         """Prefix of its parameters' names: ``stribeck.yaw``."""
         return self.name.replace(":", ".")
+
+    def place(self, key: str) -> str:
+        """The axis, force or channel that the expression ``key`` acts on."""
+        place = key.partition(".")[2]
+        if self.effect.scope == "axis_pair" and place:
+            return self.axes[PAIR.index(place)]
+        return place or self.target
 
     def parameter(self, short: str) -> Parameter:
         """Its parameter called ``short``, such as ``force``."""
@@ -313,7 +363,10 @@ def bind(effect: Effect, target: str, device: Device) -> BoundEffect:
             else f"effect {effect.name!r} needs a target",
             remedy=f"choose from {choices}",
         )
-    kind = device.coordinate(target).kind if effect.scope == "axis" else ""
+    axes: tuple[str, ...] = (target,) if effect.scope == "axis" else ()
+    if effect.scope == "axis_pair":
+        axes = _neighbours(device)[target]
+    kind = device.coordinate(axes[-1]).kind if axes else ""
     prefix = f"{effect.name}.{target}" if target else effect.name
     bound = []
     for name, entry in effect.parameters.items():
@@ -326,7 +379,7 @@ def bind(effect: Effect, target: str, device: Device) -> BoundEffect:
         unit = unit_of(chosen.unit, effect, target, device)
         about = chosen.description or entry.description
         bound.append(chosen.renamed(f"{prefix}.{name}", unit=unit, description=about))
-    return BoundEffect(effect, target, tuple(bound))
+    return BoundEffect(effect, target, tuple(bound), axes)
 
 
 def unit_of(unit: str, effect: Effect, target: str, device: Device) -> str:

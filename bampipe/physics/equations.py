@@ -17,8 +17,11 @@ class Equations:
         z, z_names: internal states of effects.
         u, inputs: input symbols that the model uses, and their channel names.
         p, w, noise: parameters; additive process noise and its names.
+        steps: named intermediates of a robot's bodies, and what each stands for; each may use
+            those before it, and everything below may use them.
         mass: mass matrix, n by n.
         bias: h(q, qd): Coriolis, centrifugal and potential terms.
+        dynamics: mass times acceleration plus bias.
         other: Q_other, process noise included.
         applied: Q_applied; applied_noise: the same with noise on the measured force.
         input_map: d applied / d force of the device itself.
@@ -42,8 +45,10 @@ class Equations:
     p: list[Any]
     w: list[Any]
     noise: list[str]
+    steps: list[tuple[Any, Any]]
     mass: list[list[Any]]
     bias: list[Any]
+    dynamics: list[Any]
     other: list[Any]
     applied: list[Any]
     applied_noise: list[Any]

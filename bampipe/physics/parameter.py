@@ -41,6 +41,10 @@ class Parameter(NamedDeclaration):
     )
     strength: bool = Field(default=False, description="The effect is absent where this is 0")
     fixed: bool = Field(default=False, description="Held at its prior, never estimated")
+    weighed: bool = Field(
+        default=False,
+        description="Whether least squares weighs the prior beside the data, as a drawing's number",
+    )
     typical: PhysicalNumber | None = Field(
         default=None,
         description="Size at which the effect is clearly there; strength 1 of the simulator",

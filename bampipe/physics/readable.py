@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Container, Iterable, Mapping
 from typing import Any
 
 import sympy as sp
 from sympy.printing.str import StrPrinter
 
+from bampipe.physics.base_parameters import base_parameters
 from bampipe.physics.derivation import derive
 from bampipe.physics.device import Device
 from bampipe.physics.model import Model
+from bampipe.physics.robot import Robot
 from bampipe.physics.vocabulary import constant_symbol
 
 
@@ -47,6 +49,8 @@ def describe_equations(device: Device) -> str:
     Raises:
         InputError: an expression of the device is wrong.
     """
+    if device.robot is not None:
+        return _describe_robot(device, device.robot)
     potential, equations = _equations(Model(device), {})
     lines = [f"{device.name}: {device.summary}", "", "Coordinates"]
     for c in device.coordinates:
@@ -102,11 +106,16 @@ def _equations(model: Model, values: Mapping[str, float]) -> tuple[str, tuple[st
         return re.sub(r"(?<=[\w)]) (?=\d)", " · ", written)  # else two numbers would read as one
 
     lines = []
-    for i, a in enumerate(marks):
-        for j, b in enumerate(marks):
-            if j >= i and e.mass[i][j] != 0:
-                lines.append(f"M[{a},{b}] = {text(e.mass[i][j])}")
-    lines += [f"h[{a}] = {text(h)}" for a, h in zip(marks, e.bias, strict=True)]
+    if device.robot is not None:  # hundreds of lines, of which nobody would read one
+        lines.append(
+            "M, h: rigid bodies on joints, by Newton and Euler's equations, and the drives"
+        )
+    else:
+        for i, a in enumerate(marks):
+            for j, b in enumerate(marks):
+                if j >= i and e.mass[i][j] != 0:
+                    lines.append(f"M[{a},{b}] = {text(e.mass[i][j])}")
+        lines += [f"h[{a}] = {text(h)}" for a, h in zip(marks, e.bias, strict=True)]
     for a, applied, other in zip(marks, e.applied, e.other, strict=True):
         lines.append(f"Q[{a}] = {text(applied + other)}")
     lines += [f"d {z}/dt = {text(rate)}" for z, rate in zip(e.z_names, e.rates, strict=True)]
@@ -119,13 +128,70 @@ def _number(value: float) -> str:
     return f"({text})" if value < 0.0 or "e" in text else text
 
 
-def _numbers(device: Device) -> list[str]:
+_HEAD = (
+    "joint",
+    "kind",
+    "after",
+    "at, m",
+    "axis",
+    "range",
+    "mass, kg",
+    "centre, m",
+    "moments, kg.m2",
+)
+
+
+def _describe_robot(device: Device, robot: Robot) -> str:
+    """The chain as a table, one line a joint, then what is known of it before any data."""
+    rows = [_HEAD]
+    for joint in robot.joints:
+        unit = device.coordinate(joint.name).unit
+        low, high = device.limits.get(joint.name, (None, None))
+        rows.append(
+            (
+                joint.name,
+                joint.kind,
+                joint.after or robot.base or "base",
+                _triple(joint.position),
+                _triple(joint.axis),
+                "" if low is None else f"{low:.4g} to {high:.4g} {unit}",
+                f"{joint.mass:.4g}",
+                _triple(joint.center),
+                _triple(joint.principal_moments),
+            )
+        )
+    widths = [max(len(row[k]) for row in rows) for k in range(len(_HEAD))]
+    table = [
+        "  "
+        + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+        for row in rows
+    ]
+    free = sum(not p.fixed for p in robot.parameters)
+    lines = [f"{device.name}: {device.summary}".rstrip(": "), "", "Joints", *table, ""]
+    if device.source:
+        lines += [f"Source: {device.source}", ""]
+    lines += [
+        f"Of {len(robot.parameters)} inertial numbers {free} act on some joint, in"
+        f" {len(base_parameters(robot))} combinations."
+    ]
+    lines += [f"No body has this: {line}." for line in robot.impossible]
+    own = {p.name for p in robot.parameters}
+    lines += ["", "Numbers", *_numbers(device, own)]
+    return "\n".join(lines) + "\n"
+
+
+def _triple(values: Iterable[float]) -> str:
+    return " ".join(f"{value:.4g}" for value in values)
+
+
+def _numbers(device: Device, hidden: Container[str] = ()) -> list[str]:
     """One line a constant and a parameter: value, unit, where from."""
     rows: Mapping[str, tuple[str, str]] = {
         **{n: (f"{c.value:g} {c.unit}", c.source) for n, c in device.constants.items()},
         **{
             p.name: (f"{p.prior:g} ± {p.sd:g} {p.unit}", "prior, to be estimated")
             for p in device.parameters
+            if p.name not in hidden
         },
     }
     return [f"  {n} = {v.strip()}" + (f"  ({s})" if s else "") for n, (v, s) in rows.items()]

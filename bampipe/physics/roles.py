@@ -31,7 +31,7 @@ def compensation(d: Vocabulary, potential: Any) -> list[Any]:
     raw_applied, side = d.table(device.applied, "applied"), d.table(device.side_load, "side_load")
     for item in (e for e in d.model.effects if e.effect.kind == "torque"):
         for key, tree in item.effect.expressions.items():
-            place = d.axes.index(key.partition(".")[2] or item.target)
+            place = d.axes.index(item.place(key))
             if balanced[place] and expression.names(tree) & own:
                 found[place] += d.own(item, tree, d.effect_symbols(item, raw_applied, side), key)
     return found

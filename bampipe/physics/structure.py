@@ -113,7 +113,8 @@ def _split(
     motion = {*e.q, *e.qd, *e.z, *e.u}
     factors: list[Any] = []
     quiet = dict.fromkeys(e.w, 0)
-    for expr in (e.kinetic, e.potential):  # where no motion is, there is no force
+    # Where no motion is, there is no force. Of a robot's bodies, see `base_parameters`.
+    for expr in (e.kinetic, e.potential) if model.device.robot is None else ():
         factors += _factors(expr - expr.subs(dict.fromkeys(motion, 0)), motion, set(names))
     for expr in (*e.applied, *e.other, *e.rates, *e.offset):
         factors += _factors(sp.sympify(expr).subs(quiet), motion, set(names))
@@ -227,10 +228,10 @@ def _slope_source(model: Model, e: Equations, pivots: Sequence[str]) -> str:
     }
     quiet = dict.fromkeys(e.w, 0)
     slopes = []
-    for a, o, h, row in zip(e.applied, e.other, e.bias, e.mass, strict=True):
-        residual = a + o - h - sum(m * x for m, x in zip(row, e.qdd, strict=True))
+    for a, o, f in zip(e.applied, e.other, e.dynamics, strict=True):
+        residual = a + o - f
         for name in pivots:
             slope = sp.diff(residual, constant_symbol(name))
             slopes.append(sp.sympify(slope).subs(quiet).subs(numbers))
     groups = {"q": e.q, "qd": e.qd, "qdd": e.qdd, "z": e.z, "u": e.u, "p": e.p}
-    return function_source("slopes", groups, slopes)
+    return function_source("slopes", groups, slopes, e.steps)

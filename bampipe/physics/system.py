@@ -312,7 +312,8 @@ def _generate(model: Model) -> tuple[dict[str, Any], dict[str, str]]:
     from bampipe.physics.equations import contribution
 
     equations = derive(model)
-    added = contribution(equations, derive(Model(model.device)))
+    bare = derive(Model(model.device)) if model.effects else equations
+    added = contribution(equations, bare)
     channels = dict(zip(equations.inputs, equations.u, strict=True))
     forces = [channels[name] for name in model.device.forces]
     brakes = {channels[name] for name in model.device.brakes.values() if name in channels}

@@ -18,7 +18,7 @@ from fractions import Fraction
 
 from bampipe.errors import InputError, did_you_mean
 from bampipe.physics.device import INPUT_ORDERS, Device, derivative
-from bampipe.physics.effect import EACH, BoundEffect, Effect, bind, unit_of
+from bampipe.physics.effect import EACH, PAIR, BoundEffect, Effect, bind, unit_of
 
 BASE = ("kg", "m", "s", "A", "K")
 
@@ -324,6 +324,9 @@ def _effect_symbols(item: BoundEffect, device: Device, check: _Check) -> dict[st
             if axis in device.side_load:
                 side = device.side_load[axis]
                 symbols["side_load"] = check.expression(side, symbols, f"side_load.{axis}", None)
+        if axis in item.axes and item.effect.scope == "axis_pair":
+            letter = PAIR[item.axes.index(axis)]
+            symbols |= {f"q_{letter}": unit, f"qd_{letter}": unit / second}
     if item.effect.scope in ("force_component", "force_pair"):
         for letter in "fg"[: 1 + (item.effect.scope == "force_pair")]:
             for order, suffix in enumerate(("", "_rate", "_curvature")):
@@ -356,7 +359,7 @@ def check_effect(effect: Effect, device: Device, target: str = "") -> list[str]:
     check = _Check()
     item = bind(effect, target, device)
     symbols = _effect_symbols(item, device, check)
-    kind = device.coordinate(target).kind if effect.scope == "axis" else ""
+    kind = device.coordinate(item.axes[-1]).kind if item.axes else ""
     for state in effect.states:
         unit = unit_of(state.unit_on(kind), effect, target, device)
         symbols[state.name] = check.unit(unit, f"states.{state.name}.unit")
@@ -369,8 +372,8 @@ def check_effect(effect: Effect, device: Device, target: str = "") -> list[str]:
         "potential": lambda _: _UNITS["J"],
     }
     for key, tree in effect.expressions.items():
-        term, _, place = key.partition(".")
-        check.expression(tree, symbols, key, wanted[term](place or target))
+        term = key.partition(".")[0]
+        check.expression(tree, symbols, key, wanted[term](item.place(key)))
     for state in effect.states:
         own = symbols[state.name]
         rate = None if own is None else own / _UNITS["s"]

@@ -11,7 +11,7 @@ import sympy as sp
 from bampipe.errors import InputError
 from bampipe.physics import expression
 from bampipe.physics.device import INPUT_ORDERS, LAST_ORDER, derivative
-from bampipe.physics.effect import BoundEffect
+from bampipe.physics.effect import PAIR, BoundEffect
 from bampipe.physics.model import Model
 from bampipe.physics.time_limit import OutOfTime
 
@@ -114,11 +114,17 @@ class Vocabulary:
         return f"shorten it{above}: fewer nested functions, lower powers"
 
     def sgn(self, argument: Any) -> Any:
-        """Sign, smoothed over the axis' width where the argument is a coordinate's rate."""
+        """Sign, smoothed over the axes' widths where the argument is a rate or a sum of rates."""
+        width, rest = sp.S.Zero, sp.sympify(argument)
         for c, rate in zip(self.model.device.coordinates, self.qd, strict=True):
-            if argument == rate:
-                return sp.tanh(argument / sp.Float(c.sign_width))
-        return sp.sign(argument)
+            share = sp.diff(argument, rate)
+            if not share.is_number:
+                return sp.sign(argument)
+            width += abs(share) * sp.Float(c.sign_width)
+            rest -= share * rate
+        if width == 0 or sp.expand(rest) != 0:
+            return sp.sign(argument)
+        return sp.tanh(argument / width)
 
     def ddt(self, expr: Any) -> Any:
         """Total time derivative by the chain rule over motion and measured forces.
@@ -172,6 +178,10 @@ class Vocabulary:
             symbols |= {n: symbols[f"{n}_{a}"] for n in ("applied", "load", "viscous", "coulomb")}
             symbols["dry"] = self.dry[i]
             symbols["brake"] = self.channel.get(device.brakes.get(a, ""), sp.S.Zero)
+        elif item.effect.scope == "axis_pair":
+            for letter, axis in zip(PAIR, item.axes, strict=True):
+                i = self.axes.index(axis)
+                symbols |= {f"q_{letter}": self.q[i], f"qd_{letter}": self.qd[i]}
         elif item.effect.scope in ("force_component", "force_pair"):
             for letter, force in zip("fg", self.targeted(item), strict=False):
                 for k, suffix in enumerate(("", "_rate", "_curvature")):

@@ -14,11 +14,18 @@ from bampipe.data.survey import survey
 from bampipe.errors import InputError
 from bampipe.files import write_text
 from bampipe.proposal.clock import clock_of
-from bampipe.proposal.device import DEVICE, find_device, new_device
+from bampipe.proposal.device import (
+    DEVICE,
+    ChosenDevice,
+    find_device,
+    new_device,
+    robot_columns,
+)
 from bampipe.proposal.encoders import encoders_table
 from bampipe.proposal.inputs import input_tables
 from bampipe.proposal.matching import Matcher
 from bampipe.proposal.notes import Notes, quoted
+from bampipe.proposal.robot import check_against_drawing
 from bampipe.proposal.trials import trials_tables
 
 SESSION = "session.toml"
@@ -66,8 +73,17 @@ def propose(folder: Path, device: str = "") -> Proposal:
     match = Matcher(found, clock.t, set(clock.columns))
     if chosen is None:
         chosen = new_device(folder, match, notes)
+    elif chosen.device.robot is not None:
+        match.joints = robot_columns(chosen.device, found)
+        _check_robot(chosen, notes)
     encoders, axes = encoders_table(chosen.device, match, notes)
     inputs = input_tables(chosen, axes, match, notes)
+    if chosen.device.robot is not None:
+        joints = zip(chosen.device.coordinates, chosen.device.forces, strict=False)
+        drives = {c.name: match.joints[f] for c, f in joints if f in match.joints}
+        notes.check += check_against_drawing(
+            chosen.device, chosen.device.robot, axes, drives, match.t
+        )
     lines = [
         *_head(folder, chosen.name, clock.rate),
         *clock.lines,
@@ -95,6 +111,22 @@ def _head(folder: Path, device: str, rate: str) -> list[str]:
         rate,
         "",
     ]
+
+
+def _check_robot(chosen: ChosenDevice, notes: Notes) -> None:
+    """What a look at the columns does not show of a robot."""
+    robot = chosen.device.robot
+    assert robot is not None
+    notes.check.append(
+        f"positions and torques are those of the joints, {', '.join(j.name for j in robot.joints)}:"
+        " if they are of motors, give [robot.motors] and the reductions"
+    )
+    if chosen.device.force_unit == "A":
+        notes.check.append(
+            f"{chosen.name}: torque_constant 1.0 is not yours yet: all forces and inertias scale"
+            " with it"
+        )
+    notes.check += [f"no body has this: {line}" for line in robot.impossible]
 
 
 def _not_used(match: Matcher) -> list[str]:

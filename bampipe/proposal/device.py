@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -10,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from bampipe.data import guesses
+from bampipe.data.device_file import complete_device, read_device_file
 from bampipe.data.survey import Survey, SurveyedColumn, words
 from bampipe.errors import InputError
 from bampipe.files import read_toml
@@ -55,8 +57,55 @@ def find_device(folder: Path, found: Survey, wanted: str) -> ChosenDevice | None
     for path in sorted(folder.glob("*.toml")):
         content = read_toml(path)
         if content.get("schema") == "bampipe.device/1":
-            return ChosenDevice(path.name, registry.device_from(content, str(path)))
-    return _built_in(found)
+            device = registry.device_from(read_device_file(path), str(path))
+            return ChosenDevice(path.name, device)
+    return _robot(folder, found) or _built_in(found)
+
+
+def _robot(folder: Path, found: Survey) -> ChosenDevice | None:
+    """The robot of the only URDF in the folder, its drives logged as torque or as current.
+
+    Raises:
+        InputError: the URDF cannot be used.
+    """
+    urdfs = sorted(folder.glob("*.urdf"))
+    if len(urdfs) != 1:
+        return None
+    text = f'schema = "bampipe.device/1"\nname = "{urdfs[0].stem}"\n\n'
+    text += f'[robot]\nurdf = "{urdfs[0].name}"\n'
+    device = _complete(folder, text)
+    drives = [c for c in found.of("force") if not c.is_constant]
+    if not drives and found.of("current"):
+        text += "".join(
+            f"\n[robot.motors.{c.name}]\nturns = {{ {c.name} = 1.0 }}\ntorque_constant = 1.0\n"
+            for c in device.coordinates
+        )
+        device = _complete(folder, text)
+    return ChosenDevice(DEVICE, device, text, robot_columns(device, found))
+
+
+def _complete(folder: Path, text: str) -> Device:
+    return registry.device_from(complete_device(tomllib.loads(text), folder, DEVICE), DEVICE)
+
+
+def robot_columns(device: Device, found: Survey) -> dict[str, SurveyedColumn]:
+    """Columns of positions and drives that come in the order of a robot's joints.
+
+    A group of as many columns as there are joints, whose names differ by a number only; of several
+    such groups of a kind, the first.
+    """
+    joints = [c.name for c in device.coordinates]
+    columns: dict[str, SurveyedColumn] = {}
+    for roles, names in ((("position",), joints), (("force", "current"), list(device.forces))):
+        groups: dict[str, list[SurveyedColumn]] = {}
+        for column in found.of(*roles):
+            groups.setdefault(re.sub(r"\d+", "#", column.name), []).append(column)
+        for group in groups.values():
+            if len(group) == len(names):
+                ordered = sorted(group, key=lambda c: [int(n) for n in re.findall(r"\d+", c.name)])
+                columns |= dict(zip(names, ordered, strict=True))
+                break
+    return columns
 
 
 def _device_file(folder: Path, wanted: str) -> ChosenDevice:
@@ -70,7 +119,7 @@ def _device_file(folder: Path, wanted: str) -> ChosenDevice:
             where=wanted,
             remedy=f"copy it to {folder}",
         )
-    device = registry.device_from(read_toml(path), str(path))
+    device = registry.device_from(read_device_file(path), str(path))
     return ChosenDevice(full.relative_to(root).as_posix(), device)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -30,19 +30,23 @@ class Matcher:
         found: the columns.
         t: (T,) time stamps of the first log, s.
         used: names of the columns that have a meaning already; grows as tables are proposed.
+        joints: columns that belong to a robot's joints and drives by their order.
     """
 
     found: Survey
     t: np.ndarray
     used: set[str]
+    joints: Mapping[str, SurveyedColumn] = field(default_factory=dict)
 
     def named(self, name: str, *roles: str) -> SurveyedColumn | None:
         """The column that has the words of ``name``, of one of the roles."""
-        wanted = set(words(name))
+        wanted, numbers = set(words(name)), set(_numbers(name))
         for column in self.found.of(*roles):
-            if column.name == name or wanted <= set(words(column.name)):
+            alike = wanted <= set(words(column.name)) and numbers <= set(_numbers(column.name))
+            if column.name == name or alike:
                 return column
-        return None
+        ordered = self.joints.get(name)
+        return ordered if ordered is not None and ordered.role in roles else None
 
     def position(self, axis: str, axes: int) -> tuple[SurveyedColumn | None, list[str]]:
         """The measured position of an axis; and all that it was chosen from, if several.
@@ -143,6 +147,10 @@ class Matcher:
         if not best or share[best] < _DRIVEN:
             return None
         return next(c for c in self.found.columns if c.name == best)
+
+
+def _numbers(name: str) -> list[str]:
+    return [str(int(digits)) for digits in re.findall(r"\d+", name)]
 
 
 def _compatible(column: SurveyedColumn, si: str) -> bool:

@@ -201,6 +201,19 @@ class IdentifiabilityReport(Record):
     sentences: Names
 
 
+class BaseEstimate(Record):
+    """A combination of a robot's inertial numbers that motion shows, and no part of it alone."""
+
+    combination: str = Field(description="Of the names of parameters, with factors")
+    members: Names
+    estimate: float
+    sd: Size
+    drawn: float = Field(description="By the numbers of the drawing")
+    drawn_sd: Size
+    unit: str
+    shown: bool = Field(description="Whether the trials say more of it than the drawing")
+
+
 class IdentifyResult(Result):
     """Parameters of a model with uncertainties."""
 
@@ -223,6 +236,9 @@ class IdentifyResult(Result):
     state_3sigma: dict[str, StateBound] = Field(description="By axis")
     convergence: Convergence
     identifiability: IdentifiabilityReport | None = None
+    base_parameters: tuple[BaseEstimate, ...] | None = Field(
+        default=None, description="Of a robot, from the base to the tip"
+    )
     notes: Names = Field(default=(), description="What to know before believing a number")
     nis: Consistency | None = None
     innovations: dict[str, InnovationTests] | None = Field(default=None, description="By axis")

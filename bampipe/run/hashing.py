@@ -92,7 +92,8 @@ class HashMemory:
 def session_files(folder: Path) -> dict[str, Path]:
     """Return the files a session consists of, by the name the session file gives them.
 
-    These are ``session.toml``, the trial files and, where the device is a file, that file.
+    These are ``session.toml``, the trial files and, where the device is a file, that file and the
+    URDF that it names.
     Only files inside the session folder count, since ingest refuses others.
 
     Args:
@@ -111,12 +112,22 @@ def session_files(folder: Path) -> dict[str, Path]:
         else []
     )
     if isinstance(device, str) and device.endswith(".toml"):
-        names.append(device)
+        names += [device, *_urdf_of(folder, device)]
     for name in names:
         # The session file may say ./a.csv for a.csv.
         if isinstance(name, str) and is_inside(folder, PurePosixPath(name).as_posix()):
             files[name] = folder / name
     return files
+
+
+def _urdf_of(folder: Path, device: str) -> list[str]:
+    """The URDF that a device file of the session names, by its path in the session folder."""
+    try:
+        robot = read_toml(folder / device).get("robot")
+    except InputError:  # ingest says what is wrong with it
+        return []
+    urdf = robot.get("urdf") if isinstance(robot, dict) else None
+    return [str(PurePosixPath(device).parent / urdf)] if isinstance(urdf, str) else []
 
 
 def digest_session(folder: Path, memory: HashMemory | None = None) -> dict[str, str]:

@@ -17,6 +17,7 @@ from bampipe.declarations.model_file import MODEL_INPUTS, load_model, read_recip
 from bampipe.discover.start import search_start
 from bampipe.errors import InputError
 from bampipe.estimate.least_squares import fit
+from bampipe.identification.bodies import base_estimates, make_possible, summarise_bases
 from bampipe.identification.estimates import Estimate, collect_result
 from bampipe.identification.filter_choice import FilterChoice
 from bampipe.identification.filter_estimate import estimate_by_filter
@@ -61,6 +62,10 @@ OUTPUTS = (
 _MOST_SAMPLES = 4_000
 """Of segments that `auto` fits by output error, which takes half a millisecond a sample."""
 
+MOST_FILTERED = 30
+"""Parameters beyond which ``auto`` takes least squares: the filter's cost grows with the cube of
+their number, and what it adds, noise in positions, matters least where torques are rich."""
+
 Array = NDArray[np.float64]
 
 
@@ -73,7 +78,8 @@ class Config(FilterChoice):
         method: ``ukf``, the augmented unscented Kalman filter; ``least-squares`` on the inverse
             dynamics; ``output-error``, the motion simulated in pieces against the positions; or
             ``auto``: the one whose parameters best predict trials that they have not seen, the
-            filter where several do.
+            filter where several do; of more than `MOST_FILTERED` parameters, as of a robot, least
+            squares.
         start_factor: multiplies every starting value: estimates must not depend on it.
         input_timing: whether the time by which inputs were sampled after positions is estimated.
         remove_bias: whether the bias that filters give least squares is measured and taken off.
@@ -111,12 +117,16 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     squares = UnbiasedFit(raw, raw.p, None, problem)
     if config.remove_bias:
         squares = remove_bias(sensors, kinematics, system, motions, problem, raw)
+    squares, notes = make_possible(system, squares)
     near = raw.p[: len(start)]
     noise = sensor_noise(sensors, system, motions, near, config)
     names = [motion.trial_id for motion in motions]
     folds = Folds.of_trials(names, (), names)
     estimates: list[Estimate] = []
-    notes, lost = [], ""
+    lost = ""
+    method = config.method
+    if method == "auto" and len(model_parameters) > MOST_FILTERED:
+        method = "least-squares"
 
     def by_output_error(most_samples: int | None) -> Estimate:
         raw_trials = [
@@ -126,23 +136,23 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
             system, motions, raw_trials, squares, folds, progress, most_samples
         )
 
-    if config.method in ("auto", "ukf"):
+    if method in ("auto", "ukf"):
         try:
             by_filter = estimate_by_filter(
                 run, system, motions, start, squares, noise, config, folds, config.model, progress
             )
             estimates.append(by_filter)
         except MotionLost as error:
-            if config.method == "ukf":
+            if method == "ukf":
                 raise
             lost = error.what
-    if config.method == "output-error":
+    if method == "output-error":
         progress(0.3, "output error")
         estimates.append(by_output_error(None))
     estimates.append(estimate_by_least_squares(system, motions, squares, folds))
     judged = [judge(squares, folds, estimate) for estimate in estimates]
-    chosen = choose(system, judged) if config.method == "auto" else 0
-    if config.method == "auto" and estimates[chosen].method != "ukf":
+    chosen = choose(system, judged) if method == "auto" else 0
+    if method == "auto" and estimates[chosen].method != "ukf":
         # Where the filter is out of the question, a third opinion is worth its time.
         with suppress(InputError):
             judged.append(judge(squares, folds, by_output_error(_MOST_SAMPLES)))
@@ -170,10 +180,11 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         estimate = replace(estimate, report={**estimates[0].evidence, **estimate.report})
     methods = tabulate_methods(system, estimate, judged, lost)
     engine = config.engine if estimate.method == "ukf" else "compiled"
+    bases = base_estimates(system, estimate.p, estimate.covariance)
+    notes = [*describe_methods(system, methods), *notes, *summarise_bases(system, bases)]
     result = collect_result(
-        system, estimate, identifiability, motions, config.model, engine, methods,
-        [*describe_methods(system, methods), *notes],
-    )  # fmt: skip
+        system, estimate, identifiability, motions, config.model, engine, methods, notes, bases
+    )
     states, trace = estimate.tabulate()
     write_parquet(out / f"models/{config.model}/states.parquet", states)
     write_parquet(out / f"models/{config.model}/trace.parquet", trace)

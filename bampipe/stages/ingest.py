@@ -18,13 +18,14 @@ import pyarrow as pa
 from pydantic import Field
 from pydantic.dataclasses import dataclass as checked_dataclass
 
+from bampipe.data.device_file import read_device_file
 from bampipe.data.quality import CleaningLimits, CleanTrial, clean
 from bampipe.data.readers import read_trial
 from bampipe.data.run_folder import INGESTED, MOVING, RunFolder
 from bampipe.data.session import SECONDS, Session, TrialEntry, inside, read_session
 from bampipe.data.store import ParquetAppender, write_parquet
 from bampipe.errors import InputError
-from bampipe.files import digest_content, digest_file, read_toml
+from bampipe.files import digest_content, digest_file, toml_text
 from bampipe.physics import registry
 from bampipe.physics.device import Device
 from bampipe.physics.units import parse_unit
@@ -96,14 +97,18 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     description = _description(session, device, rate, noise)
     description.write(out)
     if session.device_file is not None:
-        (out / "ingest/device.toml").write_bytes(session.device_file.read_bytes())
+        file = out / "ingest/device.toml"
+        if device.robot is None:
+            file.write_bytes(session.device_file.read_bytes())
+        else:  # with all that its URDF says: the run folder stands on its own
+            file.write_text(toml_text(device.declaration), encoding="utf-8")
     return _summary(session, rows) | {"warnings": list(description.sensor_warnings)}
 
 
 def _device(session: Session) -> Device:
     path = session.device_file
     if path is not None:
-        return registry.device_from(read_toml(path), str(path))
+        return registry.device_from(read_device_file(path), str(path))
     try:
         return registry.device(session.device)
     except InputError as error:

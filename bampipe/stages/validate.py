@@ -33,7 +33,7 @@ from bampipe.schema import STRICT, Count
 from bampipe.trials.folds import HELD_OUT, Folds
 from bampipe.trials.measured import MeasuredTrials, read_measured_trials
 from bampipe.trials.noise_floor import NoiseFloor, find_noise_floor, floor_replays
-from bampipe.trials.reading import held_out_trials, require_sound_motions
+from bampipe.trials.reading import held_out_trials, read_motions, require_sound_motions
 from bampipe.trials.residuals import Evidence, gather_evidence
 
 SUMMARY = "Predicted against measured torque and force, on trials that the fit has not seen"
@@ -47,6 +47,9 @@ OUTPUTS = (
 REFUSAL_RATIO = 1.2
 """Error of the published parameters over that of parameters refitted without each trial, beyond
 which they do not describe the trials they come from, and are refused."""
+
+SILENT_PERCENT = 30.0
+"""Fit of a robot's joint below which its parameters say nothing of it."""
 
 Array = NDArray[np.float64]
 
@@ -100,6 +103,11 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     p = identified(run, config.model, system)
     estimates = run.read(IdentifyResult, config.model)
     trials = read_measured_trials(run, system, timing=estimates.input_timing)
+    if config.hold_out_by and trials.in_blocks:
+        raise InputError(
+            "there is one trial only, so nothing to hold out by a channel",
+            where="validate.hold_out_by",
+        )
     if config.hold_out_by:
         trials = replace(trials, folds=_folds_by_channel(run, trials, config.hold_out_by))
     require_sound_motions(system, trials.motions)
@@ -107,6 +115,11 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     evidence = gather_evidence(system, trials.motions, trials.band, p, trials.folds)
     compared = [_compare(evidence, number, p) for number in range(len(trials.motions))]
     notes = []
+    if trials.in_blocks:
+        notes.append(
+            f"One trial: it is left out in {len(compared)} blocks with gaps between them, by"
+            " parameters fitted to the others."
+        )
     if trials.folds.nothing_held_out:
         notes.append("One trial, or one group: nothing is held out; the error is that of the fit.")
     floor: NoiseFloor | None = None
@@ -124,13 +137,38 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         except InputError as error:
             notes.append(f"No noise floor: simulating the fitted model failed ({error}).")
     free: FreeRun | None = None
-    if config.free_run:
+    if config.free_run and not trials.in_blocks:
         progress(0.8, "free runs")
         unseen = [evidence.held_out_parameters(k) for k in range(len(trials.motions))]
         free = free_runs(run, system, trials.motions, unseen, [c.judged for c in compared])
+    elif config.free_run:
+        progress(0.8, "free runs")
+        whole = read_motions(run, system, braked=True)
+        free = free_runs(run, system, whole, [evidence.p], [False])
+    if system.model.device.robot is not None:
+        notes += _silent_joints(system, compared, floor)
     write_parquet(out / f"models/{config.model}/residuals.parquet", _table(system, compared))
     describe_terms(evidence, p, estimates.covariance, config.model).write(out)
     return _result(system, trials, compared, floor, free, notes, config.model).write(out)
+
+
+def _silent_joints(
+    system: System, compared: Sequence[_Compared], floor: NoiseFloor | None
+) -> list[str]:
+    """Say which joints of a robot these trials do not identify, and why as far as it shows."""
+    found = []
+    for i, (axis, entry) in enumerate(_errors(system, compared).items()):
+        if entry.fit_percent is None or entry.fit_percent >= SILENT_PERCENT:
+            continue
+        size = _rms([c.measured for c in compared], [c.used for c in compared])[i]
+        buried = floor is not None and entry.held_out_rmse < 2.0 * floor.mean[i]
+        why = "noise and friction bury it" if buried else "the model lacks what drives it"
+        share = max(entry.fit_percent, 0.0)
+        found.append(
+            f"{axis}: of its torque of {size:.2g} {entry.unit} RMS {share:.0f} % is explained:"
+            f" these trials do not identify this joint; {why}."
+        )
+    return found
 
 
 def _compare(evidence: Evidence, number: int, p: Array) -> _Compared:

@@ -65,8 +65,15 @@ def problem_of(
         else 1e-4 * max(abs(parameters[i].prior), parameters[i].sd, np.finfo(float).tiny)
         for i in free
     ]
+    weighed = [parameters[i].weighed for i in free]
+    known = [parameters[i].prior for i in free]
+    precision = [
+        1.0 / parameters[i].sd ** 2 if counts else 0.0
+        for i, counts in zip(free, weighed, strict=True)
+    ]
     if timing:
         half = 0.5 / band.rate_hz
+        precision, known = [*precision, 0.0], [*known, 0.0]
         free, lower, upper, step = [*free, n], [*lower, -half], [*upper, half], [*step, half]
     return Problem(
         residual=residual,
@@ -78,6 +85,8 @@ def problem_of(
         linear=system.is_linear_in([i for i in free if i < n]),
         band=band,
         resting=[_standstill(motion, system, band) for motion in motions],
+        precision=np.array(precision),
+        known=np.array(known),
     )
 
 
@@ -114,6 +123,8 @@ class Evidence:
             ``residual`` and ``jacobian``.
         free: indices of the parameters that are estimated.
         lower, upper: bounds of their change, (n_free,).
+        precision, known: what is known of their change beforehand, (n_free,); see
+            `NormalEquations`.
     """
 
     system: System
@@ -127,6 +138,8 @@ class Evidence:
     free: tuple[int, ...]
     lower: Array
     upper: Array
+    precision: Array
+    known: Array
     _unfiltered: dict[int, tuple[Array, Array]] = field(
         default_factory=dict, repr=False, compare=False
     )
@@ -134,7 +147,9 @@ class Evidence:
     @cached_property
     def sums(self) -> NormalEquations:
         """Sums of products of the linearised residual."""
-        return NormalEquations.from_samples(self.jacobian, self.residual, self.used)
+        return NormalEquations.from_samples(
+            self.jacobian, self.residual, self.used, self.precision, self.known
+        )
 
     @cached_property
     def weight(self) -> Array:
@@ -252,4 +267,6 @@ def gather_evidence(
         tuple(int(i) for i in problem.free),
         problem.lower - value,
         problem.upper - value,
+        problem.precision,
+        problem.known - value,
     )

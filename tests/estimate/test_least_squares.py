@@ -39,8 +39,9 @@ def problem(count: int = 3, truth: np.ndarray = TRUTH, **changes: object) -> Pro
         "linear": True,
         "band": Band(RATE, (8.0,)),
         "resting": [np.zeros((len(m[0]), 1), dtype=bool) for m in motions],
-    }
-    return Problem(**(standard | changes))  # type: ignore[arg-type]
+    } | changes
+    nothing = np.zeros(len(standard["free"]))  # type: ignore[arg-type]
+    return Problem(**({"precision": nothing, "known": nothing} | standard))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("factor", [0.2, 1.0, 5.0])

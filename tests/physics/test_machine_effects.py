@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
+from small_arm import ARM
 
 from bampipe.physics import Model, compile_model, registry
 from bampipe.physics.effect import unit_of
@@ -62,7 +63,29 @@ def typical(system, strength=1.0):
 @pytest.mark.parametrize("name", registry.effect_names())
 def test_every_effect_has_a_place_in_some_device(name):
     effect = registry.effect(name)
-    assert any(effect.targets(registry.device(d)) for d in registry.device_names())
+    devices = [registry.device_from(ARM), *map(registry.device, registry.device_names())]
+    assert any(effect.targets(device) for device in devices)
+
+
+@pytest.mark.parametrize(("word", "sign"), [("sum", 1.0), ("difference", -1.0)])
+def test_what_turns_with_two_joints_acts_on_both(word, sign):
+    """A drum on the sum (difference) of two joints: power and energy are those of its own turn."""
+    arm = registry.device_from(ARM)
+    names = [f"friction_of_{word}:one-two", f"inertia_of_{word}:one-two"]
+    bare, full = compile_model(Model(arm)), compile_model(Model(arm, names))
+    rng = np.random.default_rng(0)
+    q, qd, qdd = rng.normal(size=(3, 20, 3))
+    z, u = np.zeros((20, 0)), np.zeros((20, 3))
+    p = np.append(bare.prior, [0.3, 0.7, 0.2])  # viscous, Coulomb, inertia
+    force = full.required(q, qd, qdd, z, u, p) - bare.required(q, qd, qdd, z, u, bare.prior)
+    turn, change = qd[:, 1] + sign * qd[:, 0], qdd[:, 1] + sign * qdd[:, 0]
+    drum = 0.3 * turn + 0.7 * np.sign(turn) + 0.2 * change
+    np.testing.assert_allclose(force[:, 1], drum, atol=1e-3)
+    np.testing.assert_allclose(force[:, 0], sign * drum, atol=1e-3)
+    np.testing.assert_allclose(force[:, 2], 0.0, atol=1e-12)
+    for name in names:
+        effect, _, target = name.partition(":")
+        assert check_effect(registry.effect(effect), arm, target) == []
 
 
 @pytest.mark.parametrize(("machine", "case"), CASES)

@@ -158,13 +158,25 @@ def test_residuals_add_up_and_repeat(simulated: RunFolder, tmp_path: Path) -> No
     assert share < 0.2 * table["force_measured_z"].std()
 
 
-def test_one_trial_holds_nothing_out(tmp_path: Path) -> None:
-    run = identified(simulated_run(tmp_path / "one", trials=1))
+def test_one_short_trial_holds_nothing_out(tmp_path: Path) -> None:
+    run = identified(simulated_run(tmp_path / "one", trials=1, seconds=5.0))
     content = validated(run)
     assert "nothing is held out" in content["notes"][0]
     assert content["headline"].startswith("fit on the trials it was fitted to")
     assert not content["trials"]["t00"]["held_out"]
     assert not read_parquet(run.path("models/base/residuals.parquet"))["held_out"].any()
+
+
+def test_one_long_trial_is_left_out_in_blocks(tmp_path: Path) -> None:
+    run = identified(simulated_run(tmp_path / "one", trials=1, seconds=12.0))
+    content = validated(run)
+    assert content["notes"][0].startswith("One trial: it is left out in")
+    assert content["headline"].startswith("fit on held-out trials")
+    assert all(entry["held_out"] for entry in content["trials"].values())
+    table = read_parquet(run.path("models/base/residuals.parquet"))
+    assert table["held_out"].all()
+    assert (table["t"].diff().dropna() > 0.0).all()  # blocks do not overlap
+    assert 10.0 < table["t"].iloc[-1] < 12.0
 
 
 def test_mistakes_are_told(simulated: RunFolder, tmp_path: Path) -> None:

@@ -7,8 +7,10 @@ from collections.abc import Mapping
 import numpy as np
 
 from bampipe.data.quality.table import TrialTable, counted, in_rows, longest_run
-from bampipe.data.session import SECONDS, Channel
+from bampipe.data.session import SECONDS, Channel, Session
+from bampipe.data.session.channels import LARGEST_CONDITION
 from bampipe.data.units import unit
+from bampipe.errors import InputError
 
 LARGEST_VALUE = 1e6
 """No angle, force, torque or other input is as large as this in SI units."""
@@ -134,6 +136,7 @@ def to_si(table: TrialTable) -> dict[str, np.ndarray]:
         values *= encoder.scale
         si[f"q_{encoder.axis}"] = values
         source[f"q_{encoder.axis}"] = encoder.column
+    _part_readings(session, si)
     if session.force is not None:
         force = session.force
         for column, zero in zip(force.columns, force.zero, strict=True):
@@ -161,6 +164,25 @@ def to_si(table: TrialTable) -> dict[str, np.ndarray]:
     for name, values in si.items():
         _refuse_wild(table, values, f"gives {name}", source[name])
     return si
+
+
+def _part_readings(session: Session, si: dict[str, np.ndarray]) -> None:
+    """Take the positions of joints out of the readings of motors that several of them turn."""
+    if not any(encoder.also_reads for encoder in session.encoders):
+        return
+    place = {encoder.axis: i for i, encoder in enumerate(session.encoders)}
+    reads = np.eye(len(place))
+    for encoder in session.encoders:
+        for other, share in encoder.also_reads.items():
+            reads[place[encoder.axis], place[other]] = share
+    if not np.linalg.cond(reads) < LARGEST_CONDITION:
+        raise InputError(
+            "the readings do not give the positions: some motion shows in none of them",
+            where="session.toml: encoders.*.also_reads",
+        )
+    readings = np.stack([si[f"q_{axis}"] for axis in place])
+    for axis, values in zip(place, np.linalg.solve(reads, readings), strict=True):
+        si[f"q_{axis}"] = values
 
 
 def to_signed(table: TrialTable, channel: Channel) -> None:

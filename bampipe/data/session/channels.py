@@ -134,6 +134,12 @@ class Encoder(NamedDeclaration):
         description="Smallest step of a column that is not in counts, in its unit",
     )
 
+    also_reads: dict[ChannelName, Number] = Field(
+        default={},
+        description="Of an encoder on a motor that several joints turn: what it reads of other"
+        " axes beside its own, units of it for one of theirs",
+    )
+
     @property
     def axis(self) -> str:
         """Name of the axis."""

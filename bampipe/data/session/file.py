@@ -237,6 +237,15 @@ class Session(Declaration):
         except InputError as error:
             yield error
             columns = ()
+        axes = [encoder.axis for encoder in self.encoders]
+        for encoder in self.encoders:
+            for other in encoder.also_reads:
+                if other not in axes or other == encoder.axis:
+                    yield InputError(
+                        f"no other axis '{other}'{did_you_mean(other, axes)}",
+                        where=f"encoders.{encoder.axis}.also_reads",
+                        remedy=f"the axes are {', '.join(axes)}",
+                    )
         for column, times in Counter(columns).items():
             if times > 1:
                 yield InputError(

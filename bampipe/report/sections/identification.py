@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from bampipe.report.document import Block, Bullets, Figure, Paragraph, Section, 
 from bampipe.report.results import Results
 from bampipe.results.identify import (
     METHODS_IN_WORDS,
+    BaseEstimate,
     IdentifyResult,
     ParameterEstimate,
     StateBound,
@@ -35,6 +36,8 @@ def section(results: Results) -> Section:
             TITLE, (Paragraph(f"No parameters have been identified: {command} does it."),)
         )
     blocks: list[Block] = [_parameters(results, identified)]
+    if identified.base_parameters:
+        blocks.append(_base_parameters(identified.base_parameters))
     known = identified.identifiability.sentences if identified.identifiability else ()
     notes = [note for note in identified.notes if note not in known]
     if notes:
@@ -54,7 +57,7 @@ def section(results: Results) -> Section:
 
 
 def _parameters(results: Results, identified: IdentifyResult) -> Table:
-    parameters = identified.parameters
+    parameters = _without_inertial(identified)
     names = results.in_order(parameters)
     others = [
         method
@@ -107,6 +110,36 @@ def _parameters(results: Results, identified: IdentifyResult) -> Table:
         tuple(rows),
         "llrrr" + "r" * (len(others) + bounded) + "l",
         note=note,
+    )
+
+
+def _without_inertial(identified: IdentifyResult) -> Mapping[str, ParameterEstimate]:
+    """The parameters without a robot's inertial numbers: motion shows combinations of them only."""
+    inertial = {name for base in identified.base_parameters or () for name in base.members}
+    return {n: entry for n, entry in identified.parameters.items() if n not in inertial}
+
+
+def _base_parameters(bases: Sequence[BaseEstimate]) -> Table:
+    rows = []
+    for base in bases:
+        decimals = wording.decimals_for(base.sd, base.estimate)
+        rows.append(
+            (
+                base.combination,
+                wording.plain(base.estimate, decimals),
+                wording.significant(base.sd, 2),
+                f"{wording.significant(base.drawn, 4)} ± {wording.significant(base.drawn_sd, 2)}",
+                "yes" if base.shown else "no",
+                wording.unit(base.unit),
+            )
+        )
+    return Table(
+        "Combinations of inertial numbers that motion shows",
+        ("Combination", "Estimate", "SD", "Drawing", "Shown", "Unit"),
+        tuple(rows),
+        "lrrrll",
+        (3.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+        "Shown: whether the trials say more of it than the drawing does.",
     )
 
 
@@ -178,7 +211,7 @@ def _groups(
 
 
 def _convergence(results: Results, identified: IdentifyResult, trace: pd.DataFrame) -> Figure:
-    groups = _groups(results, identified.parameters, trace)
+    groups = _groups(results, _without_inertial(identified), trace)
     columns = 2 if len(groups) <= _TWO_COLUMNS else 3
     rows = math.ceil(len(groups) / columns)
     figure, panels = style.panels(rows, columns, 0.35 + 1.35 * rows, sharex=True)

@@ -1,0 +1,48 @@
+"""`bampipe export`: an identified model for other programs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from bampipe.cli import places, show
+from bampipe.cli.options import RUNS, RunArgument, RunsOption
+from bampipe.errors import InputError, did_you_mean
+from bampipe.run import models
+
+
+def export(
+    run: RunArgument = None,
+    form: Annotated[str, typer.Option("--as", help="json, urdf, python or c.")] = "json",
+    model: Annotated[str, typer.Option(help="The model that is written.")] = models.BASE,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="File to write; printed if omitted.")
+    ] = None,
+    runs: RunsOption = RUNS,
+) -> None:
+    """Write an identified model for other programs.
+
+    json: the device and its effects, every parameter with its uncertainty. urdf: the bodies and
+    the friction of a robot's joints. python, c: one self-contained function of inverse dynamics.
+
+    Example: bampipe export 2026-10-03_s01 --as c --out inverse_dynamics.c
+    """
+    from bampipe.data.run_folder import RunFolder
+    from bampipe.declarations.export import FORMS, export_model
+    from bampipe.files import write_text
+
+    chosen = next((known for known in FORMS if known == form), None)
+    if chosen is None:
+        raise InputError(
+            f"unknown form {form!r}{did_you_mean(form, FORMS)}",
+            remedy=f"--as {', '.join(FORMS)}",
+        )
+    root = places.find_run(run, runs)
+    text = export_model(RunFolder(root), model, chosen)
+    if out is None:
+        show.say(text.rstrip())
+        return
+    write_text(out, text)
+    show.say(f"{out}: model {model} of {root.name}")

@@ -1,0 +1,281 @@
+"""A device file as its table, complete: of a robot, the URDF is read and what follows filled in.
+
+A robot needs no more than ``[robot] urdf = "arm.urdf"``. Coordinates, inputs, friction and limits
+are those of its joints; what the file says itself stands.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from bampipe.data.urdf import Limits, read_chain
+from bampipe.errors import InputError
+from bampipe.files import read_toml
+
+_UNITS = {"revolute": ("rad", "N.m", "kg.m2"), "prismatic": ("m", "N", "kg")}
+_FRICTION_SHARE = 0.1
+"""Of the joint's largest effort: how much friction is thinkable before any data."""
+_EFFORT, _VELOCITY = 50.0, 3.0
+"""Largest effort and velocity of a joint for which the URDF states none."""
+_DATA_SHEET = 0.2
+"""Relative uncertainty of a rotor inertia that is given."""
+_ACCELERATING_S = 0.02
+"""Time in which a drive without load reaches full speed at full effort: how large a rotor may be.
+A joint whose drawn body has no inertia, as of many last links, moves by that of its drive."""
+
+
+def read_device_file(path: Path) -> dict[str, Any]:
+    """The table of a device file, a robot's joints, inputs and friction in it.
+
+    Raises:
+        InputError: no such file, not TOML, or a URDF that cannot be used.
+    """
+    return complete_device(read_toml(path), path.parent, str(path))
+
+
+def complete_device(table: dict[str, Any], folder: Path, where: str) -> dict[str, Any]:
+    """``table`` of a device file in ``folder``; as it is where it is no robot, or not well formed.
+
+    Raises:
+        InputError: a URDF that cannot be used.
+    """
+    robot = table.get("robot")
+    if not isinstance(robot, Mapping):
+        return table
+    robot = dict(robot)
+    limits: Mapping[str, Limits] = {}
+    source = ""
+    name = robot.get("urdf")
+    if isinstance(name, str) and "joints" not in robot:
+        file = Path(name)
+        if file.is_absolute() or ".." in file.parts:
+            raise InputError(
+                f"path '{name}' leaves the folder of the device file",
+                where=f"{where}: robot.urdf",
+                remedy="copy the URDF beside the device file",
+            )
+        payload = robot.get("payload")
+        chain = read_chain(
+            folder / file,
+            _text(robot.get("base")),
+            _text(robot.get("tip")),
+            payload if isinstance(payload, Mapping) else None,
+        )
+        robot |= {"joints": dict(chain.joints), "base": chain.base, "tip": chain.tip}
+        limits = chain.limits
+        source = "; ".join([f"{file.name}, {chain.base} to {chain.tip}", *chain.notes])
+    if isinstance(robot.get("dh"), Mapping) and "joints" not in robot:
+        robot["joints"] = _from_dh(robot["dh"])
+    joints = robot.get("joints")
+    if not isinstance(joints, Mapping) or not all(isinstance(j, Mapping) for j in joints.values()):
+        return table
+    kinds = {joint: str(entry.get("kind")) for joint, entry in joints.items()}
+    if not set(kinds.values()) <= set(_UNITS):
+        return table
+    motors = robot.get("motors", {})
+    if not _well_formed(motors, kinds):  # the check of its fields says what is wrong
+        motors = {}
+    filled = _filled(kinds, {joint: limits.get(joint, Limits()) for joint in joints}, motors)
+    if source and not table.get("source"):
+        filled["source"] = source
+    return {**filled, **table, "robot": robot}
+
+
+def _from_dh(rows: Mapping[str, Any]) -> dict[str, dict[str, Any]] | None:
+    """Joints of a table of Denavit and Hartenberg; None where a row is not well formed.
+
+    A row's frame lies behind its joint; joint and body are put where the motion is.
+    """
+    found: dict[str, dict[str, Any]] = {}
+    turn, offset, before = np.eye(3), np.zeros(3), ""
+    for name, row in rows.items():
+        if not isinstance(row, Mapping):
+            return None
+        try:
+            d, a, alpha, zero = (float(row.get(k, 0.0)) for k in ("d", "a", "alpha", "offset"))
+            center = np.array(row.get("center", (0.0,) * 3), dtype=float).reshape(3)
+            six = np.array(row.get("inertia", (0.0,) * 6), dtype=float).reshape(6)
+        except (TypeError, ValueError):
+            return None
+        twist = Rotation.from_euler("x", alpha).as_matrix()
+        behind = np.array([a, 0.0, d])
+        inertia = np.empty((3, 3))
+        inertia[np.triu_indices(3)] = six
+        inertia.T[np.triu_indices(3)] = six
+        placed = turn @ Rotation.from_euler("z", zero).as_matrix()
+        found[name] = {
+            "kind": row.get("kind", "revolute"),
+            "position": [float(v) for v in offset],
+            "rotation": [float(v) for v in Rotation.from_matrix(placed).as_euler("xyz")],
+            "axis": [0.0, 0.0, 1.0],
+            "mass": row.get("mass", 0.0),
+            "center": [float(v) for v in twist @ center + behind],
+            "inertia": [float(v) for v in (twist @ inertia @ twist.T)[np.triu_indices(3)]],
+        } | ({"after": before} if before else {})
+        turn, offset, before = twist, behind, name
+    return found
+
+
+def _well_formed(motors: object, joints: Mapping[str, str]) -> bool:
+    """Whether a table of motors can be filled in."""
+    if not isinstance(motors, Mapping):
+        return False
+    for motor in motors.values():
+        turns = motor.get("turns") if isinstance(motor, Mapping) else None
+        if not isinstance(turns, Mapping) or not turns or not set(turns) <= set(joints):
+            return False
+        numbers = [*turns.values(), *(v for k, v in motor.items() if k != "turns")]
+        if not all(isinstance(value, int | float) and value != 0 for value in numbers):
+            return False
+    return True
+
+
+def _filled(
+    kinds: Mapping[str, str], limits: Mapping[str, Limits], motors: Mapping[str, Mapping[str, Any]]
+) -> dict[str, Any]:
+    """What the device file of a robot holds where it does not say otherwise.
+
+    Args:
+        kinds: of the joints, by name; limits: of their drives.
+        motors: tables of ``[robot.motors]``; one a joint, at the joint, where there are none.
+    """
+    given = bool(motors)
+    motors = motors or {joint: {"turns": {joint: 1.0}} for joint in kinds}
+    slides = {joint for joint, kind in kinds.items() if kind == "prismatic"}
+    by_current = all("torque_constant" in motor for motor in motors.values())
+    channel = {name: f"{'current' if by_current else 'torque'}_{name}" for name in motors}
+    applied: dict[str, list[str]] = {joint: [] for joint in kinds}
+    losses: dict[str, list[str]] = {joint: [] for joint in kinds}
+    parameters: dict[str, dict[str, Any]] = {}
+    kinetic = []
+    for name, motor in motors.items():
+        ratios = {joint: _ratio(ratio, joint in slides) for joint, ratio in motor["turns"].items()}
+        speed = " + ".join(f"{ratio}*qd_{joint}" for joint, ratio in ratios.items())
+        torque = channel[name]
+        last = list(motor["turns"])[-1]
+        turns = abs(float(motor["turns"][last]))
+        if by_current:
+            torque += f"*torque_constant_{name}"
+            parameters[f"torque_constant_{name}"] = _constant(motor)
+        for joint, ratio in ratios.items():
+            applied[joint].append(f"{ratio}*{torque}")
+        # At the joint, inertia of a joint that slides is a mass.
+        direct = not given
+        unit = _UNITS[kinds[last]][2] if direct else "kg.m2"
+        rotor = f"rotor_inertia_{name}"
+        parameters[rotor] = _rotor_parameter(motor, name, limits[last], turns, unit)
+        kinetic.append(f"0.5*{rotor}*qd_{last}**2" if direct else f"0.5*{rotor}*({speed})**2")
+        if len(ratios) > 1:
+            effort, velocity = (value / turns for value in _scale(limits[last]))
+            velocity *= turns * turns
+            for term, size, unit in (
+                ("viscous", _FRICTION_SHARE * effort / velocity, "N.m.s/rad"),
+                ("coulomb", _FRICTION_SHARE * effort, "N.m"),
+            ):
+                parameters[f"{term}_{name}"] = {
+                    "unit": unit,
+                    "prior": 0.0,
+                    "sd": size,
+                    "lower": 0.0,
+                    "description": f"friction of motor {name}, at the motor",
+                }
+            for joint, ratio in ratios.items():
+                losses[joint].append(
+                    f"{ratio}*(viscous_{name}*({speed}) + coulomb_{name}*sgn({speed}))"
+                )
+    found: dict[str, Any] = {
+        "coordinates": {
+            joint: {"kind": "linear" if joint in slides else "rotary"} for joint in kinds
+        },
+        "inputs": {
+            "force": list(channel.values()),
+            "force_unit": "A" if by_current else "N.m",
+            "drive": True,
+        },
+        "applied": {joint: " + ".join(terms) or "0" for joint, terms in applied.items()},
+        "torque": {joint: " - ".join(["0", *terms]) for joint, terms in losses.items() if terms},
+        "friction": {joint: _friction(kinds[joint], limits[joint]) for joint in kinds},
+        "parameters": parameters,
+        "energy": {"kinetic": " + ".join(kinetic)},
+        "limits": {
+            joint: {"lower": limits[joint].lower, "upper": limits[joint].upper}
+            for joint in kinds
+            if limits[joint].lower < limits[joint].upper
+        },
+    }
+    if slides:
+        found["constants"] = {
+            "metre": {"value": 1.0, "unit": "m", "source": "a joint that slides feels a force"}
+        }
+    return found
+
+
+def _ratio(ratio: object, slides: bool) -> str:
+    return f"({float(ratio)!r}/metre)" if slides else f"({float(ratio)!r})"  # type: ignore[arg-type]
+
+
+def _constant(motor: Mapping[str, Any]) -> dict[str, Any]:
+    """The torque constant of a motor, estimated where its uncertainty is given."""
+    value, sd = float(motor["torque_constant"]), float(motor.get("torque_constant_sd", 0.0))
+    known = {"fixed": True} if sd == 0.0 else {"weighed": True}
+    return {
+        "unit": "N.m/A", "prior": value, "sd": sd, **known,
+        "description": "torque per ampere, at the motor",
+    }  # fmt: skip
+
+
+def _rotor_parameter(
+    motor: Mapping[str, Any], name: str, limits: Limits, turns: float, unit: str
+) -> dict[str, Any]:
+    """Inertia of a rotor: of the data sheet where it is given, else a guess."""
+    about = f"inertia of the rotor of {name}, seen from where its torque is"
+    if "rotor_inertia" in motor:
+        value = float(motor["rotor_inertia"])
+        return {
+            "unit": unit, "prior": value, "sd": _DATA_SHEET * value, "lower": 0.0,
+            "weighed": True, "description": about,
+        }  # fmt: skip
+    guess = _rotor(limits) / turns**2
+    return {
+        "unit": unit, "prior": guess, "sd": 5.0 * guess, "lower": 0.0, "description": about,
+    }  # fmt: skip
+
+
+def _friction(kind: str, limits: Limits) -> dict[str, Any]:
+    effort, velocity = _scale(limits)
+    length, torque, _ = _UNITS[kind]
+    size = _FRICTION_SHARE * effort
+    return {
+        "viscous": {
+            "unit": f"{torque}.s/{length}",
+            "prior": max(limits.damping, 0.0),
+            "sd": size / velocity,
+            "lower": 0.0,
+        },
+        "coulomb": {
+            "unit": torque,
+            "prior": max(limits.friction, 0.0),
+            "sd": size,
+            "lower": 0.0,
+        },
+    }
+
+
+def _rotor(limits: Limits) -> float:
+    """Inertia of a drive as seen from its joint, before any data."""
+    effort, velocity = _scale(limits)
+    return _ACCELERATING_S * effort / velocity
+
+
+def _scale(limits: Limits) -> tuple[float, float]:
+    """Largest effort and velocity of a joint."""
+    return limits.effort or _EFFORT, limits.velocity or _VELOCITY
+
+
+def _text(value: object) -> str:
+    return value if isinstance(value, str) else ""

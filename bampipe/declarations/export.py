@@ -1,0 +1,117 @@
+"""An identified model in forms that other programs read."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.data.run_folder import RunFolder
+from bampipe.data.urdf import Limits, urdf_text
+from bampipe.declarations.model_file import identified, load_model
+from bampipe.errors import InputError
+from bampipe.files import json_text
+from bampipe.physics import System, compile_model
+from bampipe.physics.newton_euler import INERTIAL
+from bampipe.physics.portable import portable_source
+from bampipe.results.identify import IdentifyResult
+
+Array = NDArray[np.float64]
+Form = Literal["json", "urdf", "python", "c"]
+FORMS: tuple[Form, ...] = get_args(Form)
+SUFFIXES: Mapping[Form, str] = {"json": ".json", "urdf": ".urdf", "python": ".py", "c": ".c"}
+
+
+def export_model(run: RunFolder, name: str, form: Form) -> str:
+    """Return the model called ``name`` of a run folder as text.
+
+    Args:
+        run: the run folder; name: of the model.
+        form: json, device, parameters and uncertainties; urdf, the bodies and joint friction of a
+            robot; python or c, a self-contained function of inverse dynamics.
+
+    Raises:
+        InputError: the model is not identified, or cannot be written in this form.
+    """
+    system = compile_model(load_model(run, name))
+    p = identified(run, name, system)
+    writers: dict[Form, Callable[[], str]] = {
+        "json": lambda: _json(run, name, system, p),
+        "urdf": lambda: _urdf(run, system, p),
+        "python": lambda: portable_source(system.model, p, "python"),
+        "c": lambda: portable_source(system.model, p, "c"),
+    }
+    return writers[form]()
+
+
+def _json(run: RunFolder, name: str, system: System, p: Array) -> str:
+    found = run.read(IdentifyResult, name)
+    sd = {key: entry.sd for key, entry in found.parameters.items()}
+    content: dict[str, Any] = {
+        "model": name,
+        "device": dict(system.model.device.declaration),
+        "effects": [dict(item.effect.declaration) for item in system.model.effects],
+        "bound": [item.name for item in system.model.effects],
+        "parameters": {
+            item.name: {"value": float(p[i]), "sd": sd.get(item.name), "unit": item.unit}
+            for i, item in enumerate(system.parameters)
+        },
+    }
+    if found.base_parameters is not None:
+        content["base_parameters"] = [vars(entry) for entry in found.base_parameters]
+    return json_text(content)
+
+
+def _urdf(run: RunFolder, system: System, p: Array) -> str:
+    device = system.model.device
+    robot = device.robot
+    if robot is None:
+        raise InputError(
+            f"device {device.name!r} is no robot: it has no bodies on joints",
+            where=str(run.root),
+            remedy=f"choose another form: {', '.join(f for f in FORMS if f != 'urdf')}",
+        )
+    value = {item.name: float(p[i]) for i, item in enumerate(system.parameters)}
+    joints, limits = {}, {}
+    for joint, declared in zip(
+        robot.joints, device.declaration["robot"]["joints"].values(), strict=True
+    ):
+        numbers = np.array(
+            [value[q.name] for q in robot.parameters if q.name.endswith(f".{joint.name}")]
+        )
+        assert numbers.size == INERTIAL
+        joints[joint.name] = {**_BARE, **declared, **_body(numbers)}
+        lower, upper = device.limits.get(joint.name, (0.0, 0.0))
+        limits[joint.name] = Limits(
+            lower,
+            upper,
+            damping=max(value.get(f"viscous.{joint.name}", 0.0), 0.0),
+            friction=max(value.get(f"coulomb.{joint.name}", 0.0), 0.0),
+        )
+    effects = ", ".join(item.name for item in system.model.effects)
+    comment = "identified by bampipe; drives' inertia is not in it"
+    if effects:
+        comment += f", nor {effects}"
+    return urdf_text(device.name, joints, limits, comment)
+
+
+_BARE: Mapping[str, Any] = {
+    "position": (0.0, 0.0, 0.0), "rotation": (0.0, 0.0, 0.0), "axis": (0.0, 0.0, 1.0),
+}  # fmt: skip
+
+
+def _body(numbers: Array) -> dict[str, Any]:
+    """Mass, centre and inertia about it, of the ten numbers about the joint."""
+    mass = float(numbers[0])
+    center = numbers[1:4] / mass if mass != 0.0 else np.zeros(3)
+    about = np.zeros((3, 3))
+    about[np.triu_indices(3)] = numbers[4:]
+    about = about + np.triu(about, 1).T
+    inertia = about - mass * ((center @ center) * np.eye(3) - np.outer(center, center))
+    return {
+        "mass": mass,
+        "center": [float(v) for v in center],
+        "inertia": [float(v) for v in inertia[np.triu_indices(3)]],
+    }

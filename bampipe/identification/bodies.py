@@ -1,0 +1,149 @@
+"""The inertial numbers of a robot: possible ones, and the combinations that the trials show."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.estimate.possible_bodies import is_possible, nearest_possible
+from bampipe.identification.least_squares_estimate import UnbiasedFit
+from bampipe.physics import System
+from bampipe.physics.base_parameters import base_parameters
+from bampipe.physics.newton_euler import INERTIAL
+from bampipe.physics.robot import Robot
+from bampipe.results.identify import BaseEstimate
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+_SHOWN = 0.5
+"""Share of the drawing's uncertainty below which the trials are said to show a combination."""
+
+
+def make_possible(system: System, squares: UnbiasedFit) -> tuple[UnbiasedFit, list[str]]:
+    """Return the fit with inertial numbers that some body can have, the nearest to its own.
+
+    Nearest is what explains the trials and the drawing least badly: the normal equations of the
+    fit weigh, and what is no inertial number follows.
+
+    Args:
+        system: the model; squares: its fit.
+
+    Returns:
+        The fit, the same where its numbers are possible; and what to tell of it.
+    """
+    robot = system.model.device.robot
+    if robot is None:
+        return squares, []
+    places = np.array([system.index(p.name) for p in robot.parameters])
+    value = squares.p[places].reshape(-1, INERTIAL)
+    names = [joint.name for joint in robot.joints]
+    wrong = [name for name, body in zip(names, value, strict=True) if not is_possible(body)]
+    if not wrong:
+        return squares, []
+    weight, follow = _weight(squares, robot, places)
+    drawn = np.array([joint.inertial for joint in robot.joints])
+    found = nearest_possible(value, weight, drawn)
+    p = squares.p.copy()
+    p[places] = found.ravel()
+    others, slope = follow
+    p[others] += slope @ (found - value).ravel()
+    free = squares.problem.free
+    inside = np.isin(free, others)
+    p[free[inside]] = np.clip(
+        p[free[inside]], squares.problem.lower[inside], squares.problem.upper[inside]
+    )
+    note = (
+        f"No body has the inertial numbers that fit {_listed(wrong)} best: the nearest possible"
+        " ones are given."
+    )
+    return replace(squares, p=p), [note]
+
+
+def _weight(
+    squares: UnbiasedFit, robot: Robot, places: Indices
+) -> tuple[Array, tuple[Indices, Array]]:
+    """Weight of a change of the inertial numbers, all others refitted, and how these follow.
+
+    Returns:
+        (10 b, 10 b); the places of the other free parameters, and their change (n, 10 b) for one
+        of each inertial number.
+    """
+    problem, raw = squares.problem, squares.raw
+    scale = 1.0 / np.maximum(raw.residual_sd, 1e-300)
+    normal = np.diag(problem.precision)
+    for s in raw.stacked:
+        slope = (s.slope * scale[None, :, None]).reshape(-1, problem.free.size)
+        normal += slope.T @ slope
+    column = {int(place): k for k, place in enumerate(problem.free)}
+    size = np.array([p.sd for p in robot.parameters])
+    weight = np.diag(1.0 / size**2)
+    own = [k for k, place in enumerate(places) if int(place) in column]
+    inner = [column[int(places[k])] for k in own]
+    free = [k for k in range(problem.free.size) if k not in inner and not raw.at_bound[k]]
+    slope = np.zeros((len(free), len(places)))
+    block = normal[np.ix_(inner, inner)]
+    if free:
+        cross = normal[np.ix_(free, inner)]
+        part = -np.linalg.lstsq(normal[np.ix_(free, free)], cross, rcond=1e-12)[0]
+        slope[:, own] = part
+        block = block + cross.T @ part
+    weight[np.ix_(own, own)] = 0.5 * (block + block.T)
+    return weight, (problem.free[free], slope)
+
+
+def base_estimates(system: System, p: Array, covariance: Array) -> tuple[BaseEstimate, ...] | None:
+    """Return the combinations that motion can show, with what the trials add to the drawing.
+
+    Args:
+        system: the model; p: (>= n_p,) its parameters.
+        covariance: of those estimated, in order.
+    """
+    robot = system.model.device.robot
+    if robot is None:
+        return None
+    free = [i for i, item in enumerate(system.parameters) if not item.fixed]
+    column = {system.parameters[i].name: k for k, i in enumerate(free)}
+    found = []
+    for base in base_parameters(robot):
+        members = [system.parameters[system.index(name)] for name in base.terms]
+        factors = np.array(list(base.terms.values()))
+        rows = [column[item.name] for item in members]
+        sd = float(np.sqrt(factors @ covariance[np.ix_(rows, rows)] @ factors))
+        drawn_sd = float(np.linalg.norm(factors * [item.sd for item in members]))
+        found.append(
+            BaseEstimate(
+                combination=base.words,
+                members=tuple(base.terms),
+                estimate=float(factors @ [p[system.index(item.name)] for item in members]),
+                sd=sd,
+                drawn=float(factors @ [item.prior for item in members]),
+                drawn_sd=drawn_sd,
+                unit=members[0].unit,
+                shown=sd < _SHOWN * drawn_sd,
+            )
+        )
+    return tuple(found)
+
+
+def summarise_bases(system: System, found: tuple[BaseEstimate, ...] | None) -> list[str]:
+    """Say how many combinations the trials show, and of which joints none."""
+    robot = system.model.device.robot
+    if robot is None or found is None:
+        return []
+    shown = [entry for entry in found if entry.shown]
+    seen = {name.rpartition(".")[2] for entry in shown for name in entry.members}
+    silent = [joint.name for joint in robot.joints if joint.name not in seen]
+    lines = [
+        f"Of the {len(found)} combinations of inertial numbers that motion can show, these trials"
+        f" show {len(shown)}; of the others the drawing stands."
+    ]
+    if silent:
+        lines.append(f"Of the bodies of {_listed(silent)} the trials say next to nothing.")
+    return lines
+
+
+def _listed(names: list[str]) -> str:
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"

@@ -1,0 +1,361 @@
+"""Recursive Newton-Euler equations of joints in a row or in a tree, written once.
+
+The same lines serve symbols and numbers: with sympy symbols and a `Text` that names every
+intermediate they become the text of generated code, with numpy arrays they are evaluated at once.
+All vectors of a link are in its own frame, at its joint; the inertia is about that point, so that
+every force is linear in the ten inertial numbers of a link (Atkeson, An and Hollerbach 1986).
+Gravity enters as an acceleration of the base (Luh, Walker and Paul 1980).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import sympy as sp
+from numpy.typing import NDArray
+
+Vector = tuple[Any, Any, Any]
+Array = NDArray[np.float64]
+
+ZERO: Vector = (0, 0, 0)
+INERTIAL = 10
+"""Inertial numbers of a link: mass, first moment x y z, inertia xx xy xz yy yz zz."""
+
+
+@dataclass(frozen=True)
+class Link:
+    """A joint and the body behind it, as numbers.
+
+    Attributes:
+        parent: index of the link before, -1 for the base.
+        slides: whether the joint is prismatic.
+        axis: unit vector of the joint, in the frame of this link.
+        position: of the joint in the frame of the link before, m.
+        rotation: matrix whose columns are this link's axes in the frame of the link before, at 0.
+    """
+
+    parent: int
+    slides: bool
+    axis: Vector
+    position: Vector
+    rotation: tuple[Vector, Vector, Vector]
+
+
+@dataclass
+class Text:
+    """Names of intermediates and what they stand for, in the order in which they are needed."""
+
+    steps: list[tuple[Any, Any]] = field(default_factory=list)
+    _known: dict[Any, Any] = field(default_factory=dict)
+
+    def name(self, value: Any) -> Any:
+        """Return a symbol for ``value``; numbers, symbols and their negatives stay."""
+        value = sp.sympify(value)
+        if value.is_number or value.is_Symbol or (-value).is_Symbol:
+            return value
+        if value not in self._known:
+            self._known[value] = sp.Symbol(f"r_{len(self.steps)}")
+            self.steps.append((self._known[value], value))
+        return self._known[value]
+
+
+@dataclass(frozen=True)
+class Algebra:
+    """What the equations are written in.
+
+    Attributes:
+        sin, cos: of a joint's position.
+        name: keeps an intermediate.
+    """
+
+    sin: Callable[[Any], Any]
+    cos: Callable[[Any], Any]
+    name: Callable[[Any], Any]
+
+    @classmethod
+    def symbols(cls, text: Text) -> Algebra:
+        """Symbols, every intermediate a name in ``text``."""
+        return cls(sp.sin, sp.cos, text.name)
+
+    @classmethod
+    def numbers(cls) -> Algebra:
+        """Numbers or columns of numbers."""
+        return cls(np.sin, np.cos, lambda value: value)
+
+
+@dataclass(frozen=True)
+class _Moving:
+    """A link in motion: its rotation into the frame before, and its motion in its own frame.
+
+    Attributes:
+        into_parent: vector of this frame into the frame before; from_parent: the reverse.
+        offset: from the joint before to this one, in the frame before.
+        acceleration: of the joint, gravity in it.
+        change: matrix W with W r the acceleration that rotation gives a point at r.
+        rate, rate_change: angular velocity and acceleration.
+    """
+
+    into_parent: Callable[[Vector], Vector]
+    from_parent: Callable[[Vector], Vector]
+    offset: Vector
+    acceleration: Vector
+    change: tuple[Vector, Vector, Vector]
+    rate: Vector
+    rate_change: Vector
+
+
+def joint_forces(
+    algebra: Algebra,
+    links: Sequence[Link],
+    inertial: Sequence[Sequence[Any]],
+    q: Sequence[Any],
+    qd: Sequence[Any],
+    qdd: Sequence[Any],
+    gravity: Vector,
+) -> list[Any]:
+    """Return the generalised force of each joint that a motion requires, N.m or N.
+
+    Args:
+        algebra: symbols or numbers.
+        links: parents before children.
+        inertial: by link, mass, first moment and inertia about the joint, ten numbers, SI.
+        q, qd, qdd: by joint, rad or m and derivatives.
+        gravity: m/s2 in the frame of the base.
+    """
+    a = algebra
+    moving = _motion(a, links, q, qd, qdd, gravity)
+    force, moment = [], []
+    for at, (mass, *rest) in zip(moving, inertial, strict=True):
+        first, inertia = (rest[0], rest[1], rest[2]), _symmetric(rest[3:])
+        force.append(_named(a, _sum(_scaled(mass, at.acceleration), _times(at.change, first))))
+        spin = _named(a, _times(inertia, at.rate))
+        moment.append(
+            _named(
+                a,
+                _sum(
+                    _times(inertia, at.rate_change),
+                    _cross(at.rate, spin),
+                    _cross(first, at.acceleration),
+                ),
+            )
+        )
+    found: list[Any] = [0] * len(links)
+    for i in reversed(range(len(links))):
+        found[i] = a.name(_dot(links[i].axis, force[i] if links[i].slides else moment[i]))
+        parent = links[i].parent
+        if parent >= 0:
+            onward = _named(a, moving[i].into_parent(force[i]))
+            force[parent] = _named(a, _sum(force[parent], onward))
+            turned = moving[i].into_parent(moment[i])
+            lever = _cross(moving[i].offset, onward)
+            moment[parent] = _named(a, _sum(moment[parent], turned, lever))
+    return found
+
+
+def columns(
+    algebra: Algebra,
+    links: Sequence[Link],
+    q: Sequence[Any],
+    qd: Sequence[Any],
+    qdd: Sequence[Any],
+    gravity: Vector,
+) -> list[list[list[Any]]]:
+    """Return what one of each inertial number adds to each joint's force: [joint][link][number].
+
+    Arguments as in `joint_forces`.
+    """
+    a = algebra
+    moving = _motion(a, links, q, qd, qdd, gravity)
+    found: list[list[list[Any]]] = [[[0] * INERTIAL for _ in links] for _ in links]
+    felt: list[dict[int, tuple[Vector, Vector]]] = []
+    for i, (link, at) in enumerate(zip(links, moving, strict=True)):
+        # What a moment and a force at this joint are to each joint before it, in this frame.
+        here: dict[int, tuple[Vector, Vector]] = {}
+        for j, (turn, push) in felt[link.parent].items() if link.parent >= 0 else ():
+            onward = _sum(push, _cross(turn, at.offset))
+            here[j] = _named(a, at.from_parent(turn)), _named(a, at.from_parent(onward))
+        here[i] = (ZERO, link.axis) if link.slides else (link.axis, ZERO)
+        felt.append(here)
+        by_number = _wrenches(a, at)
+        for j, (turn, push) in here.items():
+            found[j][i] = [
+                a.name(_dot(turn, moment) + _dot(push, force)) for force, moment in by_number
+            ]
+    return found
+
+
+def _wrenches(a: Algebra, at: _Moving) -> list[tuple[Vector, Vector]]:
+    """Force and moment at the joint by each inertial number of the link."""
+    x, y, z = at.rate
+    dx, dy, dz = at.rate_change
+    units: list[Vector] = [(1, 0, 0), (0, 1, 0), (0, 0, 1)]
+    found: list[tuple[Vector, Vector]] = [(at.acceleration, ZERO)]
+    found += [(_times(at.change, e), _cross(e, at.acceleration)) for e in units]
+    moments: list[Vector] = [
+        (dx, x * z, -x * y),
+        (dy - x * z, dx + y * z, x * x - y * y),
+        (dz + x * y, z * z - x * x, dx - y * z),
+        (-y * z, dy, x * y),
+        (y * y - z * z, dz - x * y, dy + x * z),
+        (y * z, -x * z, dz),
+    ]
+    return found + [(ZERO, _named(a, moment)) for moment in moments]
+
+
+def potential_energy(
+    algebra: Algebra,
+    links: Sequence[Link],
+    inertial: Sequence[Sequence[Any]],
+    q: Sequence[Any],
+    gravity: Vector,
+) -> Any:
+    """Return the potential energy of gravity, J; zero where all moments are at the base."""
+    still = [0] * len(links)
+    moving = _motion(algebra, links, q, still, still, gravity)
+    heights: list[Any] = []
+    total: Any = 0
+    for link, at, (mass, *rest) in zip(links, moving, inertial, strict=True):
+        below: Vector = (
+            moving[link.parent].acceleration if link.parent >= 0 else _scaled(-1, gravity)
+        )
+        height = heights[link.parent] if link.parent >= 0 else 0
+        heights.append(algebra.name(height + _dot(below, at.offset)))
+        total = total + mass * heights[-1] + _dot(at.acceleration, (rest[0], rest[1], rest[2]))
+    return algebra.name(total)
+
+
+def mass_matrix(
+    algebra: Algebra,
+    links: Sequence[Link],
+    inertial: Sequence[Sequence[Any]],
+    q: Sequence[Any],
+) -> list[list[Any]]:
+    """Return the mass matrix: column by column, the forces of a unit acceleration at rest."""
+    n = len(links)
+    mass: list[list[Any]] = [[0] * n for _ in range(n)]
+    for j in range(n):
+        unit = [int(i == j) for i in range(n)]
+        forces = joint_forces(algebra, links, inertial, q, [0] * n, unit, ZERO)
+        for i in range(j + 1):
+            mass[i][j] = mass[j][i] = forces[i]
+    return mass
+
+
+def _motion(
+    a: Algebra,
+    links: Sequence[Link],
+    q: Sequence[Any],
+    qd: Sequence[Any],
+    qdd: Sequence[Any],
+    gravity: Vector,
+) -> list[_Moving]:
+    found: list[_Moving] = []
+    still: tuple[Vector, Vector, Vector] = (ZERO, ZERO, ZERO)
+    for link, x, v, w in zip(links, q, qd, qdd, strict=True):
+        if link.parent >= 0:
+            before = found[link.parent]
+            rate, rate_change, change = before.rate, before.rate_change, before.change
+            acceleration = before.acceleration
+        else:
+            rate, rate_change, change = ZERO, ZERO, still
+            acceleration = _scaled(-1, gravity)
+        turn = _turn(a, link, x)
+
+        def into(vector: Vector, link: Link = link, turn: Any = turn) -> Vector:
+            return _times(link.rotation, _times(turn, vector))
+
+        def out(vector: Vector, link: Link = link, turn: Any = turn) -> Vector:
+            middle = _named(a, _times(_transposed(link.rotation), vector))
+            return _times(_transposed(turn), middle)
+
+        axis_before = _times(link.rotation, link.axis)
+        offset = link.position
+        if link.slides:
+            offset = _named(a, _sum(offset, _scaled(x, axis_before)))
+        here = _named(a, out(_named(a, _sum(acceleration, _times(change, offset)))))
+        own, own_change = _named(a, out(rate)), out(rate_change)
+        if link.slides:
+            along = _scaled(2 * v, _cross(own, link.axis))
+            here = _named(a, _sum(here, _scaled(w, link.axis), along))
+            own_change = _named(a, own_change)
+        else:
+            twist = _scaled(v, _cross(own, link.axis))
+            own_change = _named(a, _sum(own_change, twist, _scaled(w, link.axis)))
+            own = _named(a, _sum(own, _scaled(v, link.axis)))
+        found.append(_Moving(into, out, offset, here, _change(a, own, own_change), own, own_change))
+    return found
+
+
+def _turn(a: Algebra, link: Link, x: Any) -> tuple[Vector, Vector, Vector]:
+    """Rotation about the joint's axis (Rodrigues); its columns are the turned axes."""
+    if link.slides:
+        return (1, 0, 0), (0, 1, 0), (0, 0, 1)
+    s, c = a.name(a.sin(x)), a.name(a.cos(x))
+    k = link.axis
+    spin = ((0, -k[2], k[1]), (k[2], 0, -k[0]), (-k[1], k[0], 0))
+    rows = []
+    for i in range(3):
+        row = []
+        for j in range(3):
+            square = k[i] * k[j]
+            # Of an axis along x, y or z nothing but 0, 1, s and c remains.
+            value = square if square in (0, 1) else square * (1 - c)
+            if i == j and square != 1:
+                value = value + c
+            row.append(a.name(value + spin[i][j] * s) if spin[i][j] != 0 else a.name(value))
+        rows.append((row[0], row[1], row[2]))
+    return rows[0], rows[1], rows[2]
+
+
+def _change(a: Algebra, rate: Vector, rate_change: Vector) -> tuple[Vector, Vector, Vector]:
+    x, y, z = rate
+    dx, dy, dz = rate_change
+    xx, yy, zz = a.name(x * x), a.name(y * y), a.name(z * z)
+    xy, xz, yz = a.name(x * y), a.name(x * z), a.name(y * z)
+    return (
+        _named(a, (-yy - zz, xy - dz, xz + dy)),
+        _named(a, (xy + dz, -xx - zz, yz - dx)),
+        _named(a, (xz - dy, yz + dx, -xx - yy)),
+    )
+
+
+def _named(a: Algebra, vector: Vector) -> Vector:
+    return a.name(vector[0]), a.name(vector[1]), a.name(vector[2])
+
+
+def _symmetric(values: Sequence[Any]) -> tuple[Vector, Vector, Vector]:
+    xx, xy, xz, yy, yz, zz = values
+    return (xx, xy, xz), (xy, yy, yz), (xz, yz, zz)
+
+
+def _dot(one: Vector, other: Vector) -> Any:
+    return one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
+
+
+def _times(matrix: tuple[Vector, Vector, Vector], vector: Vector) -> Vector:
+    return _dot(matrix[0], vector), _dot(matrix[1], vector), _dot(matrix[2], vector)
+
+
+def _transposed(matrix: tuple[Vector, Vector, Vector]) -> tuple[Vector, Vector, Vector]:
+    first, second, third = zip(*matrix, strict=True)
+    return first, second, third
+
+
+def _scaled(factor: Any, vector: Vector) -> Vector:
+    return factor * vector[0], factor * vector[1], factor * vector[2]
+
+
+def _sum(*vectors: Vector) -> Vector:
+    first, second, third = (sum(parts[1:], parts[0]) for parts in zip(*vectors, strict=True))
+    return first, second, third
+
+
+def _cross(one: Vector, other: Vector) -> Vector:
+    return (
+        one[1] * other[2] - one[2] * other[1],
+        one[2] * other[0] - one[0] * other[2],
+        one[0] * other[1] - one[1] * other[0],
+    )

@@ -1,0 +1,299 @@
+"""A robot: joints in a row or in a tree, each with the body behind it, in place of energies."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from functools import cached_property
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from bampipe.errors import InputError, did_you_mean
+from bampipe.physics.expression import Name
+from bampipe.physics.newton_euler import INERTIAL, Algebra, Link, Vector, columns
+from bampipe.physics.parameter import Parameter
+from bampipe.schema import (
+    ByName,
+    Declaration,
+    NamedDeclaration,
+    Number,
+    Positive,
+    Several,
+    Text,
+)
+
+Array = NDArray[np.float64]
+
+Triple = Annotated[Several[Number], Field(min_length=3, max_length=3)]
+INERTIAL_NAMES = (
+    "mass",
+    *(f"first_moment_{axis}" for axis in "xyz"),
+    *(f"inertia_{pair}" for pair in ("xx", "xy", "xz", "yy", "yz", "zz")),
+)
+"""Names of the inertial numbers of a link, in the order of `newton_euler`."""
+_UNITS = ("kg", *("kg.m",) * 3, *("kg.m2",) * 6)
+_ROUNDING = 1e-10
+"""Rotations by quarter turns, written with eleven digits, leave less than this beside 0 and 1."""
+_NO_EFFECT = 1e-9
+"""Of the largest column: an inertial number below it changes no joint's force."""
+_LEAST_SHARE = 0.01
+"""Of the robot's mass and length: uncertainty is at least that of a link of this size."""
+_TRIANGLE = 1e-6
+"""Share by which a principal moment may exceed the sum of the other two: rounding of drawings."""
+
+
+class Joint(NamedDeclaration):
+    """A joint and the body behind it."""
+
+    kind: Literal["revolute", "prismatic"]
+    after: str = Field(default="", description="The joint before it; empty: the base")
+    position: Triple = Field(
+        default=(0.0, 0.0, 0.0), description="Of the joint in the frame of the link before, m"
+    )
+    rotation: Triple = Field(
+        default=(0.0, 0.0, 0.0),
+        description="Of its frame in that of the link before: roll, pitch and yaw about fixed"
+        " axes, rad",
+    )
+    axis: Triple = Field(default=(0.0, 0.0, 1.0), description="Of the motion, in its own frame")
+    mass: Number = Field(default=0.0, description="Of the body behind it, kg, as drawn")
+    center: Triple = Field(default=(0.0, 0.0, 0.0), description="Its centre of mass, m")
+    inertia: Annotated[Several[Number], Field(min_length=6, max_length=6)] = Field(
+        default=(0.0,) * 6,
+        description="xx, xy, xz, yy, yz, zz about the centre of mass, kg.m2",
+    )
+
+    def cross_faults(self) -> Iterator[InputError]:
+        if not math.hypot(*self.axis) > 0.0:
+            yield InputError("found a vector of length zero, expected a direction", where="axis")
+
+    @property
+    def inertial(self) -> Array:
+        """The ten numbers of the body, about the joint; see `INERTIAL_NAMES`."""
+        c = np.array(self.center)
+        about = _matrix(self.inertia) + self.mass * (c @ c * np.eye(3) - np.outer(c, c))
+        upper = about[np.triu_indices(3)]
+        return np.array([self.mass, *(self.mass * c), *upper])
+
+    @property
+    def principal_moments(self) -> tuple[float, ...]:
+        """Of the inertia about the centre of mass, rising, kg.m2."""
+        return tuple(float(m) for m in np.linalg.eigvalsh(_matrix(self.inertia)))
+
+    @property
+    def size(self) -> float:
+        """Distance from the joint at which the body's mass would have its inertia, m."""
+        if not self.mass > 0.0:
+            return 0.0
+        numbers = self.inertial
+        return float(np.sqrt(max(numbers[4] + numbers[7] + numbers[9], 0.0) / (2.0 * self.mass)))
+
+
+class Motor(Declaration):
+    """A motor and the joints that turn it."""
+
+    turns: dict[Name, Number] = Field(
+        min_length=1, description="Turns of the motor for one of each joint, rad/rad or rad/m"
+    )
+    rotor_inertia: Positive | None = Field(default=None, description="At the motor, kg.m2")
+    torque_constant: Number | None = Field(
+        default=None, description="Where its current is logged, N.m/A"
+    )
+    torque_constant_sd: Positive | None = Field(
+        default=None, description="Its standard uncertainty; it is estimated where given"
+    )
+
+
+class Row(NamedDeclaration):
+    """A joint in a table of Denavit and Hartenberg: standard form, turned about z of the last."""
+
+    d: Number = Field(default=0.0, description="Along z of the frame before, m")
+    a: Number = Field(default=0.0, description="Along its own x, m")
+    alpha: Number = Field(default=0.0, description="About its own x, rad")
+    offset: Number = Field(default=0.0, description="Angle about z where the position is 0, rad")
+    kind: Literal["revolute", "prismatic"] = "revolute"
+    mass: Number = Field(default=0.0, description="Of the body behind it, kg")
+    center: Triple = Field(default=(0.0, 0.0, 0.0), description="In the frame of this row, m")
+    inertia: Annotated[Several[Number], Field(min_length=6, max_length=6)] = Field(
+        default=(0.0,) * 6, description="As of a joint's body, in the frame of this row"
+    )
+
+
+class Robot(Declaration):
+    """Rigid bodies on joints; what stands in [energy] beside it is added."""
+
+    urdf: Text | None = Field(
+        default=None, description="URDF file beside this one that the joints are read from"
+    )
+    base: str = Field(default="", description="Link that stands still; the URDF's root by default")
+    tip: str = Field(default="", description="Last link of the chain; the URDF's only end")
+    dh: Annotated[tuple[Row, ...], ByName(Name)] = Field(
+        default=(), description="One table a joint, in place of a URDF"
+    )
+    payload: Payload | None = Field(default=None, description="A body held by the last link")
+    motors: dict[Name, Motor] = Field(
+        default={},
+        description="One table a motor; without, a drive at each joint whose torque is logged",
+    )
+    gravity: Triple = Field(default=(0.0, 0.0, -9.81), description="m/s2, in the base's frame")
+    uncertainty: Positive = Field(
+        default=0.3, description="Relative standard uncertainty of the drawn inertial numbers"
+    )
+    joints: Annotated[tuple[Joint, ...], ByName(Name)] = Field(
+        default=(), description="One table a joint, parents first; read from the URDF where given"
+    )
+
+    def cross_faults(self) -> Iterator[InputError]:
+        known: list[str] = []
+        for joint in self.joints:
+            if joint.after and joint.after not in known:
+                yield InputError(
+                    f"there is no joint {joint.after!r} above it",
+                    where=f"joints.{joint.name}.after",
+                    remedy="the joint before stands first; leave it out for the base",
+                )
+            known.append(joint.name)
+        for name, motor in self.motors.items():
+            for turned in motor.turns:
+                if turned not in known:
+                    yield InputError(
+                        f"there is no joint {turned!r}{did_you_mean(turned, known)}",
+                        where=f"motors.{name}.turns",
+                    )
+            if motor.torque_constant_sd is not None and motor.torque_constant is None:
+                yield InputError("'torque_constant' is missing", where=f"motors.{name}")
+        by_current = {motor.torque_constant is not None for motor in self.motors.values()}
+        if len(by_current) > 1:
+            yield InputError(
+                "some motors have a torque_constant and some have none",
+                where="motors",
+                remedy="log the current of all, or the torque of all",
+            )
+
+    @cached_property
+    def links(self) -> tuple[Link, ...]:
+        """The joints as `newton_euler` wants them."""
+        place = {joint.name: i for i, joint in enumerate(self.joints)}
+        return tuple(
+            Link(
+                place.get(joint.after, -1),
+                joint.kind == "prismatic",
+                _exact(np.array(joint.axis) / math.hypot(*joint.axis)),
+                _exact(np.array(joint.position)),
+                _rows(rotation_matrix(joint.rotation)),
+            )
+            for joint in self.joints
+        )
+
+    @cached_property
+    def matters(self) -> NDArray[np.bool_]:
+        """Which inertial numbers change the force of some joint, (joints, 10)."""
+        return np.abs(self.regressor).max(axis=0).reshape(-1, INERTIAL) > _NO_EFFECT * max(
+            float(np.abs(self.regressor).max(initial=0.0)), 1.0
+        )
+
+    @cached_property
+    def regressor(self) -> Array:
+        """Slopes of the joint forces by all inertial numbers along a rich motion, (rows, 10 n)."""
+        rng = np.random.default_rng(0)
+        n = len(self.joints)
+        samples = 40 * max(n, 1)
+        q, qd, qdd = (list(rng.uniform(-2.0, 2.0, (n, samples))) for _ in range(3))
+        found = columns(Algebra.numbers(), self.links, q, qd, qdd, _exact(np.array(self.gravity)))
+        table = np.array(
+            [[np.broadcast_to(c, samples) for link in row for c in link] for row in found]
+        )
+        return np.ascontiguousarray(table.transpose(0, 2, 1).reshape(-1, INERTIAL * n))
+
+    @cached_property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """The inertial numbers of all bodies, those fixed that no motion of the joints shows."""
+        heaviest = max(sum(abs(joint.mass) for joint in self.joints), 1e-3)
+        longest = max((joint.size for joint in self.joints), default=0.0) or 0.1
+        found = []
+        for joint, matters in zip(self.joints, self.matters, strict=True):
+            mass = max(abs(joint.mass), _LEAST_SHARE * heaviest)
+            size = max(joint.size, _LEAST_SHARE * longest)
+            for k, short in enumerate(INERTIAL_NAMES):
+                power = 0 if k == 0 else 1 if k < 4 else 2
+                entry = Parameter(
+                    unit=_UNITS[k],
+                    prior=float(joint.inertial[k]),
+                    sd=self.uncertainty * mass * size**power,
+                    fixed=not bool(matters[k]),
+                    weighed=True,
+                )
+                found.append(entry.renamed(f"{short}.{joint.name}"))
+        return tuple(found)
+
+    @property
+    def impossible(self) -> list[str]:
+        """What no body can have among the drawn numbers, one sentence each."""
+        return [line for joint in self.joints for line in _impossible(joint)]
+
+
+class Payload(Declaration):
+    """A body held by the last link."""
+
+    mass: Positive = Field(description="kg")
+    center: Triple = Field(default=(0.0, 0.0, 0.0), description="In the frame of the tip, m")
+    inertia: Annotated[Several[Number], Field(min_length=6, max_length=6)] = Field(
+        default=(0.0,) * 6, description="As of a joint's body"
+    )
+
+
+Robot.model_rebuild()
+
+
+def rotation_matrix(angles: tuple[float, ...]) -> Array:
+    """Rotation by roll, pitch and yaw about the fixed axes x, y, z; columns are turned axes."""
+    (sr, sp, sy), (cr, cp, cy) = np.sin(angles), np.cos(angles)
+    return np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )
+
+
+def gravity_vector(robot: Robot) -> Vector:
+    """Gravity in the frame of the base, m/s2."""
+    return _exact(np.array(robot.gravity))
+
+
+def _impossible(joint: Joint) -> Iterator[str]:
+    if joint.mass < 0.0:
+        yield f"{joint.name}: a mass of {joint.mass:g} kg"
+    moments = joint.principal_moments
+    shown = ", ".join(f"{m:.3g}" for m in moments)
+    if moments[0] < -_TRIANGLE * max(abs(moments[2]), 1e-12):
+        yield f"{joint.name}: a negative moment of inertia (principal moments {shown} kg.m2)"
+    elif moments[2] > (moments[0] + moments[1]) * (1.0 + _TRIANGLE):
+        yield (
+            f"{joint.name}: an inertia that no body has (principal moments {shown} kg.m2: the"
+            " largest exceeds the sum of the others)"
+        )
+    elif joint.mass == 0.0 and moments[2] > 0.0:
+        yield f"{joint.name}: an inertia without a mass"
+
+
+def _matrix(six: tuple[float, ...]) -> Array:
+    xx, xy, xz, yy, yz, zz = six
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+
+def _exact(vector: Array) -> Vector:
+    """Numbers with 0, 1 and -1 as integers, so that products with them vanish from the text."""
+    found: list[Any] = []
+    for value in vector:
+        near = round(float(value))
+        found.append(near if abs(value - near) < _ROUNDING and abs(near) <= 1 else float(value))
+    return found[0], found[1], found[2]
+
+
+def _rows(matrix: Array) -> tuple[Vector, Vector, Vector]:
+    return _exact(matrix[0]), _exact(matrix[1]), _exact(matrix[2])

@@ -1,0 +1,198 @@
+"""Measured arms: how far a drawing goes, what it lacks, and whether that is named unaided.
+
+Four recordings that others published; FOLDER holds one folder of files for each:
+
+- staubli_tx40 (thanhndv212/figaroh-examples, Apache-2.0): pos_read_data.csv, curr_data.csv, a URDF;
+- kuka_kr300 (JonasWeigand/Robot_Identification, MIT): A.mat, B.mat, C.mat, robot.toml;
+- dfki_double_pendulum (dfki-ric-underactuated-lab/double_pendulum, BSD-3): *.csv;
+- tiago (thanhndv212/figaroh-examples, Apache-2.0): tiago_*.csv, a URDF.
+
+    python benchmarks/robots.py FOLDER [--arm NAME ...] [--diagnose] [--out DIR]
+
+Prints the held-out error of each joint, per cent of its torque, and what the diagnosis names.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+import time
+import tomllib
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from scipy.io import loadmat
+
+BAND_HZ = {"staubli_tx40": 40.0, "kuka_kr300": 10.0, "dfki_double_pendulum": 10.0, "tiago": 5.0}
+
+
+def write_session(
+    folder: Path,
+    joints: Sequence[str],
+    rate: float,
+    trials: Mapping[str, tuple[np.ndarray, np.ndarray, np.ndarray]],
+    device: str,
+    units: Mapping[str, str] | None = None,
+    held_out: Sequence[str] = (),
+    inputs: Sequence[str] = (),
+) -> None:
+    """Write a session of positions and drive torques.
+
+    Args:
+        joints: names; rate: Hz; device: text of the device file.
+        trials: time (T,), positions (T, n) and inputs (T, m) by name.
+        units: of a joint's position, where it is not rad; held_out: trials for judging only.
+        inputs: names of the input columns; ``torque_<joint>`` where empty.
+    """
+    inputs = inputs or [f"torque_{joint}" for joint in joints]
+    (folder / "device.toml").write_text(device)
+    lines = [
+        'schema = "bampipe.session/1"', f'session_id = "{folder.name}"', 'device = "device.toml"',
+        f"sample_rate_hz = {rate}", "[time]", 'column = "t"', 'unit = "s"',
+    ]  # fmt: skip
+    for joint in joints:
+        unit = (units or {}).get(joint, "rad")
+        lines += [f"[encoders.{joint}]", f'column = "{joint}"', f'unit = "{unit}"']
+    for name in inputs:
+        lines += [f"[channels.{name}]", f'column = "{name}"', 'unit = "N.m"']
+    for name, (t, q, torque) in trials.items():
+        table = np.column_stack([t, q, torque])
+        frame = pd.DataFrame(table, columns=["t", *joints, *inputs])
+        frame.to_csv(folder / f"{name}.csv", index=False, float_format="%.10g")
+        lines += ["[[trials]]", f'file = "{name}.csv"', 'kind = "free"']
+        lines += ["hold_out = true"] if name in held_out else []
+    (folder / "session.toml").write_text("\n".join(lines) + "\n")
+
+
+def staubli_tx40(source: Path, folder: Path) -> None:
+    """Six joints at 5 kHz; the wrist's kinematic coupling is taken out, its friction is not."""
+    motor = pd.read_csv(source / "pos_read_data.csv").to_numpy()
+    drive = pd.read_csv(source / "curr_data.csv").to_numpy()
+    turns = np.diag([32.0, 32.0, 45.0, -48.0, 45.0, 32.0])
+    turns[5, 4] = 32.0
+    q = np.linalg.solve(turns, motor.T).T + np.array([0, -0.5, 0.5, 0, 0, 0]) * np.pi
+    urdf = next(source.glob("*.urdf"))
+    (folder / "arm.urdf").write_bytes(urdf.read_bytes())
+    joints = [f"joint_{k}" for k in range(1, 7)]
+    trial = np.arange(len(q)) / 5000.0, q, drive @ turns
+    device = 'name = "tx40"\n[robot]\nurdf = "arm.urdf"\n'
+    write_session(folder, joints, 5000.0, {"log": trial}, device)
+
+
+def kuka_kr300(source: Path, folder: Path) -> None:
+    """Six axes at 250 Hz: A to identify, B and C to judge; bodies by their drawing."""
+    drawn = tomllib.loads((source / "robot.toml").read_text())
+    lines = ['name = "kr300"', "[robot]", "gravity = [0.0, 0.0, 9.81]", "uncertainty = 0.02"]
+    joints = [f"axis_{k}" for k in range(1, 7)]
+    zero = np.array([0.0, -90.0, 90.0, 0.0, 0.0, 0.0])
+    for joint, link in zip(joints, drawn["links"], strict=True):
+        xx, yy, zz, xy, yz, xz = (float(v) for v in link["inertia"])
+        lines += [
+            f"[robot.dh.{joint}]", f"d = {link['d']}", f"a = {link['a']}",
+            f"alpha = {float(np.deg2rad(link['alpha_deg']))}",
+            f"offset = {float(np.deg2rad(link['offset_deg']))}",
+            f"mass = {link['mass']}", f"center = {link['com']}",
+            f"inertia = {[xx, xy, xz, yy, yz, zz]}",
+        ]  # fmt: skip
+    for joint, link in zip(joints, drawn["links"], strict=True):
+        lines += [
+            f"[robot.motors.{joint}]", f"turns = {{ {joint} = {link['gear']} }}",
+            f"rotor_inertia = {link['motor_inertia']}",
+        ]  # fmt: skip
+    trials = {}
+    for name in "ABC":
+        record = loadmat(source / f"{name}.mat", struct_as_record=False, squeeze_me=True)["rec"]
+        # The drawing stands upright where the encoders count from; its base is upside down.
+        q = np.deg2rad(record.act_pos_mot_deg.T + zero)
+        t = np.asarray(record.time_cont, dtype=float)
+        trials[name] = t - t[0], q, record.act_torque_abs_nm.T
+    write_session(folder, joints, 250.0, trials, "\n".join(lines) + "\n", held_out="BC")
+
+
+def dfki_double_pendulum(source: Path, folder: Path) -> None:
+    """Two joints, six recordings: of the links only the length of the first is taken as known."""
+    device = (
+        'name = "double_pendulum"\n[robot]\ngravity = [9.81, 0.0, 0.0]\nuncertainty = 1.0\n'
+        "[robot.dh.shoulder]\na = 0.3\nmass = 0.6\ncenter = [-0.05, 0.0, 0.0]\n"
+        "inertia = [0.001, 0.0, 0.0, 0.005, 0.0, 0.005]\n"
+        "[robot.dh.elbow]\na = 0.2\nmass = 0.6\ncenter = [-0.05, 0.0, 0.0]\n"
+        "inertia = [0.001, 0.0, 0.0, 0.005, 0.0, 0.005]\n"
+    )
+    trials = {}
+    for number, path in enumerate(sorted(source.glob("*.csv"))):
+        table = pd.read_csv(path)
+        t = table["time"].to_numpy()
+        q = table[["pos_meas1", "pos_meas2"]].to_numpy()
+        trials[f"t{number}"] = t - t[0], q, table[["tau_meas1", "tau_meas2"]].to_numpy()
+    write_session(folder, ["shoulder", "elbow"], 500.0, trials, device)
+
+
+def tiago(source: Path, folder: Path) -> None:
+    """Torso and seven joints of an arm at about 100 Hz, by motor current."""
+    joints = ["torso_lift_joint", *(f"arm_{k}_joint" for k in range(1, 8))]
+    position, effort = (
+        pd.read_csv(source / f"tiago_{what}.csv").iloc[921:6791] for what in ("position", "effort")
+    )
+    turns = np.array([1.0, 100.0, 100.0, 100.0, 100.0, 336.0, 336.0, 336.0])
+    constant = np.array([1.0, 0.136, 0.136, -0.087, -0.087, -0.0613, -0.0613, -0.0613])
+    t = position["t"].to_numpy()
+    q, current = (frame.to_numpy()[:, -8:] for frame in (position, effort))
+    urdf = next(source.glob("*.urdf"))
+    (folder / "arm.urdf").write_bytes(urdf.read_bytes())
+    device = (
+        'name = "tiago"\n[robot]\nurdf = "arm.urdf"\nbase = "torso_fixed_link"\n'
+        'tip = "arm_tool_link"\n'
+    )
+    trial = t - t[0], q, current * turns * constant
+    write_session(folder, joints, 100.0, {"log": trial}, device, {"torso_lift_joint": "m"})
+
+
+ARMS: dict[str, Callable[[Path, Path], None]] = {
+    arm.__name__: arm for arm in (staubli_tx40, kuka_kr300, dfki_double_pendulum, tiago)
+}
+
+
+def bampipe(*arguments: str) -> float:
+    """Run a command; its seconds."""
+    start = time.monotonic()
+    subprocess.run([sys.executable, "-m", "bampipe", *arguments, "--quiet"], check=True)
+    return time.monotonic() - start
+
+
+def errors(run: Path, model: str) -> str:
+    content = json.loads((run / f"models/{model}/validate.json").read_text())
+    return " ".join(
+        f"{entry['held_out_relative_error_percent']:.1f}" for entry in content["axes"].values()
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("source", type=Path)
+    parser.add_argument("--arm", action="append", choices=ARMS)
+    parser.add_argument("--diagnose", action="store_true")
+    parser.add_argument("--out", type=Path, default=Path(tempfile.mkdtemp()))
+    given = parser.parse_args()
+    for name in given.arm or ARMS:
+        folder = given.out / name
+        folder.mkdir(parents=True, exist_ok=True)
+        ARMS[name](given.source / name, folder)
+        runs = given.out / "runs"
+        common = ["--runs", str(runs)]
+        band = ["--set", f"filter.band_hz={BAND_HZ[name]}"]
+        seconds = bampipe("run", str(folder), *common, *band, "--until", "validate")
+        print(f"{name}: {errors(runs / name, 'base')} % ({seconds:.0f} s)", flush=True)
+        if given.diagnose:
+            seconds = bampipe("diagnose", str(runs / name), *common)
+            found = json.loads((runs / name / "models/base/diagnose.json").read_text())
+            verdicts = {axis: entry["verdict"] for axis, entry in found["axes"].items()}
+            print(f"  {found['selected']} {verdicts} ({seconds:.0f} s)", flush=True)
+
+
+if __name__ == "__main__":
+    main()

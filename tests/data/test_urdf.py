@@ -1,0 +1,235 @@
+"""URDF files: chains, what hangs beside them, and what is refused, with a remedy."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bampipe.data.device_file import read_device_file
+from bampipe.data.urdf import read_chain
+from bampipe.errors import InputError
+from bampipe.physics import Model, compile_model
+from bampipe.physics.registry import device_from
+from bampipe.physics.units import check_device
+
+LINK = """<link name="{name}"><inertial><origin xyz="{x} 0 0" rpy="0 0 {yaw}"/>
+<mass value="{mass}"/>
+<inertia ixx="0.1" ixy="0" ixz="0" iyy="0.2" iyz="0" izz="0.25"/></inertial></link>"""
+JOINT = """<joint name="{name}" type="{kind}"><origin xyz="{x} 0 0" rpy="0 0 0"/>
+<parent link="{parent}"/><child link="{child}"/><axis xyz="0 0 1"/>
+<limit lower="-1" upper="2" effort="40" velocity="4"/>
+<dynamics damping="0.5" friction="0.25"/></joint>"""
+
+
+def link(name: str, mass: float = 1.0, x: float = 0.0, yaw: float = 0.0) -> str:
+    return LINK.format(name=name, mass=mass, x=x, yaw=yaw)
+
+
+def joint(name: str, parent: str, child: str, kind: str = "revolute", x: float = 0.5) -> str:
+    return JOINT.format(name=name, parent=parent, child=child, kind=kind, x=x)
+
+
+def write(folder: Path, *parts: str) -> Path:
+    path = folder / "arm.urdf"
+    path.write_text(f'<?xml version="1.0"?><robot name="arm">{"".join(parts)}</robot>')
+    return path
+
+
+ARM = (
+    link("base"),
+    link("upper", 2.0, x=0.25),
+    link("lower", 1.0, x=0.25, yaw=np.pi / 2),
+    link("tool", 0.5),
+    joint("shoulder-pan", "base", "upper", x=0.0),
+    joint("elbow", "upper", "lower"),
+    joint("flange", "lower", "tool", "fixed"),
+)
+
+
+def test_a_chain_is_read_with_what_is_fixed_to_it(tmp_path: Path) -> None:
+    chain = read_chain(write(tmp_path, *ARM))
+    assert list(chain.joints) == ["shoulder_pan", "elbow"]
+    elbow = chain.joints["elbow"]
+    assert elbow["after"] == "shoulder_pan"
+    assert elbow["mass"] == pytest.approx(1.5)  # the tool is part of it
+    assert elbow["center"] == pytest.approx([(0.25 + 0.5 * 0.5) / 1.5, 0.0, 0.0])
+    # Turned by a quarter, xx and yy change places; both bodies are moved to the common centre.
+    apart = 1.0 * 0.5 / 1.5 * 0.25**2
+    assert elbow["inertia"][0] == pytest.approx(0.2 + 0.1)
+    assert elbow["inertia"][3] == pytest.approx(0.1 + 0.2 + apart)
+
+
+def test_a_device_file_needs_no_more_than_the_urdf(tmp_path: Path) -> None:
+    write(tmp_path, *ARM)
+    path = tmp_path / "device.toml"
+    path.write_text('name = "arm"\n[robot]\nurdf = "arm.urdf"\n')
+    device = device_from(read_device_file(path), str(path))
+    assert [c.name for c in device.coordinates] == ["shoulder_pan", "elbow"]
+    assert device.forces == ("torque_shoulder_pan", "torque_elbow")
+    assert device.limits["elbow"] == (-1.0, 2.0)
+    assert device.friction["elbow"].viscous.prior == 0.5
+    assert device.friction["elbow"].coulomb.prior == 0.25
+    assert device.source == "arm.urdf, base to lower"
+    assert check_device(device) == []
+
+
+def test_a_payload_is_joined_to_the_tip(tmp_path: Path) -> None:
+    held = {"mass": 1.5, "center": [0.2, 0.0, 0.0]}
+    chain = read_chain(write(tmp_path, *ARM), tip="tool", payload=held)
+    assert chain.joints["elbow"]["mass"] == pytest.approx(3.0)
+
+
+def test_joints_beside_the_chain_are_held_and_named(tmp_path: Path) -> None:
+    finger = (link("finger", 0.1), joint("grip", "tool", "finger", "prismatic", x=0.0))
+    chain = read_chain(write(tmp_path, *ARM, *finger), tip="tool")
+    assert list(chain.joints) == ["shoulder_pan", "elbow"]
+    assert chain.joints["elbow"]["mass"] == pytest.approx(1.6)
+    assert chain.notes == ("held at zero beside the chain: grip",)
+
+
+@pytest.mark.parametrize(
+    ("parts", "what", "remedy"),
+    [
+        (
+            (*ARM, link("left"), joint("other", "upper", "left")),
+            "the joints branch; chains end at lower, left",
+            'choose one: base = "..." and tip = "..." in [robot]',
+        ),
+        (
+            (*ARM, '<xacro:include filename="x" xmlns:xacro="http://ros.org/xacro"/>'),
+            "a xacro file: macros that are no URDF yet",
+            "expand it first: xacro arm.urdf > arm.urdf",
+        ),
+        (
+            (link("base"), link("b"), joint("j", "base", "b", "floating")),
+            "a joint of type 'floating'",
+            "between base and tip joints are revolute, continuous, prismatic or fixed",
+        ),
+        ((*ARM, joint("loop", "base", "lower")), "two joints above it: a closed loop", "cut"),
+        ((*ARM, joint("j", "lower", "nowhere")), "names link 'nowhere', which is not there", ""),
+        ((link("a"), link("b")), "2 links have nothing above them", "base = ..."),
+    ],
+)
+def test_what_is_no_chain_is_refused_with_a_remedy(
+    parts: tuple[str, ...], what: str, remedy: str, tmp_path: Path
+) -> None:
+    with pytest.raises(InputError) as caught:
+        read_chain(write(tmp_path, *parts))
+    assert what in caught.value.what
+    assert remedy in caught.value.remedy
+
+
+@pytest.mark.parametrize(
+    ("text", "what"),
+    [
+        ("<robot>", "not XML"),
+        ("<machine/>", "found <machine>, expected <robot>"),
+        ('<!DOCTYPE a [<!ENTITY b "c">]><robot/>', "no document type"),
+        (
+            '<robot><link name="a"><inertial><mass value="heavy"/></inertial></link></robot>',
+            "heavy",
+        ),
+    ],
+)
+def test_damaged_files_are_refused(text: str, what: str, tmp_path: Path) -> None:
+    path = tmp_path / "arm.urdf"
+    path.write_text(text)
+    with pytest.raises(InputError, match=what):
+        read_chain(path)
+
+
+def test_a_urdf_outside_the_folder_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "device.toml"
+    path.write_text('name = "arm"\n[robot]\nurdf = "../arm.urdf"\n')
+    with pytest.raises(InputError, match="leaves the folder"):
+        read_device_file(path)
+
+
+def test_a_motor_that_two_joints_turn_has_friction_and_inertia_of_their_sum(tmp_path: Path) -> None:
+    write(tmp_path, *ARM)
+    path = tmp_path / "device.toml"
+    path.write_text(
+        'name = "arm"\n[robot]\nurdf = "arm.urdf"\n'
+        "[robot.motors.one]\nturns = { shoulder_pan = 50.0 }\n"
+        "[robot.motors.two]\nturns = { shoulder_pan = -32.0, elbow = 32.0 }\n"
+        "rotor_inertia = 2e-4\n"
+    )
+    device = device_from(read_device_file(path), str(path))
+    assert check_device(device) == []
+    assert device.forces == ("torque_one", "torque_two")
+    system = compile_model(Model(device))
+    map_ = system.input_map(np.zeros((1, 2)))[0]
+    np.testing.assert_allclose(map_, [[50.0, -32.0], [0.0, 32.0]])
+    p = np.zeros(len(system.parameters))
+    p[system.index("rotor_inertia_two")] = 2e-4
+    turns = np.array([-32.0, 32.0])
+    mass = system.mass_matrix(np.zeros((1, 2)), p)[0]
+    np.testing.assert_allclose(mass, 2e-4 * np.outer(turns, turns), atol=1e-12)
+    p[:] = 0.0
+    p[system.index("viscous_two")], p[system.index("coulomb_two")] = 0.01, 0.1
+    qd = np.array([[0.3, -0.2]])
+    none, u = np.zeros((1, 2)), np.zeros((1, len(system.inputs)))
+    speed = float(turns @ qd[0])
+    required = system.required(none, qd, none, np.zeros((1, 0)), u, p)[0]
+    np.testing.assert_allclose(required, turns * (0.01 * speed + 0.1 * np.sign(speed)), rtol=1e-6)
+
+
+def test_motors_by_current_have_torque_constants(tmp_path: Path) -> None:
+    write(tmp_path, *ARM)
+    path = tmp_path / "device.toml"
+    motor = "[robot.motors.{}]\nturns = {{ {} = 100.0 }}\ntorque_constant = 0.1\n"
+    path.write_text(
+        'name = "arm"\n[robot]\nurdf = "arm.urdf"\n'
+        + motor.format("one", "shoulder_pan")
+        + "torque_constant_sd = 0.01\n"
+        + motor.format("two", "elbow")
+    )
+    device = device_from(read_device_file(path), str(path))
+    assert check_device(device) == []
+    assert device.force_unit == "A"
+    parameters = {p.name: p for p in device.parameters}
+    assert parameters["torque_constant_one"].weighed
+    assert parameters["torque_constant_two"].fixed
+
+
+@pytest.mark.parametrize(
+    ("motors", "what"),
+    [
+        ("[robot.motors.one]\nturns = { wrist = 1.0 }\n", "there is no joint 'wrist'"),
+        ("[robot.motors.one]\nturns = {}\n", "at least 1"),
+        (
+            "[robot.motors.one]\nturns = { elbow = 1.0 }\ntorque_constant = 1.0\n"
+            "[robot.motors.two]\nturns = { shoulder_pan = 1.0 }\n",
+            "some motors have a torque_constant and some have none",
+        ),
+    ],
+)
+def test_wrong_motors_are_refused(motors: str, what: str, tmp_path: Path) -> None:
+    write(tmp_path, *ARM)
+    path = tmp_path / "device.toml"
+    path.write_text(f'name = "arm"\n[robot]\nurdf = "arm.urdf"\n{motors}')
+    with pytest.raises(InputError, match=what):
+        device_from(read_device_file(path), str(path))
+
+
+def test_a_table_of_denavit_and_hartenberg_is_the_same_robot(tmp_path: Path) -> None:
+    """Two links in a plane: a DH frame at the end of each, the bodies' centres behind it."""
+    write(tmp_path, *ARM)
+    urdf, table = tmp_path / "urdf.toml", tmp_path / "dh.toml"
+    urdf.write_text('name = "arm"\n[robot]\nurdf = "arm.urdf"\ngravity = [1.0, -9.0, 0.0]\n')
+    bodies = device_from(read_device_file(urdf)).robot
+    assert bodies is not None
+    rows = [
+        f"[robot.dh.{joint.name}]\na = 0.5\nmass = {joint.mass}\n"
+        f"center = [{joint.center[0] - 0.5}, 0.0, 0.0]\ninertia = {list(joint.inertia)}\n"
+        for joint in bodies.joints
+    ]
+    table.write_text('name = "arm"\n[robot]\ngravity = [1.0, -9.0, 0.0]\n' + "".join(rows))
+    systems = [compile_model(Model(device_from(read_device_file(p)))) for p in (urdf, table)]
+    q, qd, qdd = np.random.default_rng(0).normal(size=(3, 20, 2))
+    u, z = np.zeros((20, 2)), np.zeros((20, 0))
+    p = systems[0].prior
+    one, other = (s.required(q, qd, qdd, z, u, np.append(p[:6], s.prior[6:])) for s in systems)
+    np.testing.assert_allclose(one, other, atol=1e-12)

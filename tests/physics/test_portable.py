@@ -1,0 +1,79 @@
+"""Exported functions of inverse dynamics against the compiled model, run as their users would."""
+
+from __future__ import annotations
+
+import ctypes
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from small_arm import ARM
+
+from bampipe.errors import InputError
+from bampipe.physics import Model, compile_model, registry
+from bampipe.physics.portable import portable_source
+
+
+def models() -> list[Model]:
+    arm = registry.device_from(ARM)
+    return [
+        Model(arm),
+        Model(arm, ["friction_of_sum:one-two", "stribeck:one", "load_dependent_friction:two"]),
+        Model(registry.device("bam"), ["quadratic_drag:yaw"]),
+    ]
+
+
+def sample(model: Model) -> tuple[np.ndarray, ...]:
+    system = compile_model(model)
+    rng, n = np.random.default_rng(5), len(system.coordinates)
+    q, qd, qdd = rng.uniform(0.1, 0.8, (3, 30, n))
+    u = rng.normal(size=(30, len(system.inputs)))
+    p = rng.uniform(0.1, 0.6, len(system.parameters))
+    return q, qd, qdd, u, p, system.required(q, qd, qdd, np.zeros((30, 0)), u, p)
+
+
+def used_inputs(names: tuple[str, ...], model: Model, u: np.ndarray) -> np.ndarray:
+    inputs = compile_model(model).inputs
+    return u[:, [inputs.index(name) for name in names]]
+
+
+@pytest.mark.parametrize("model", models(), ids=lambda m: f"{m.device.name}_{len(m.effects)}")
+def test_python(model: Model) -> None:
+    q, qd, qdd, u, p, required = sample(model)
+    space: dict[str, object] = {}
+    exec(portable_source(model, p, "python"), space)
+    names = space["INPUTS"]
+    given = [q, qd, qdd] + ([used_inputs(names, model, u)] if names else [])  # type: ignore[arg-type]
+    found = [space["inverse_dynamics"](*row) for row in zip(*given, strict=True)]  # type: ignore[operator]
+    np.testing.assert_allclose(found, required, rtol=1e-10, atol=1e-10)
+    assert space["COORDINATES"] == tuple(c.name for c in model.device.coordinates)
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
+@pytest.mark.parametrize("model", models(), ids=lambda m: f"{m.device.name}_{len(m.effects)}")
+def test_c(model: Model, tmp_path: Path) -> None:
+    q, qd, qdd, u, p, required = sample(model)
+    space: dict[str, object] = {}
+    exec(portable_source(model, p, "python"), space)
+    source, library = tmp_path / "model.c", tmp_path / "model.so"
+    source.write_text(portable_source(model, p, "c"))
+    command = ["cc", "-std=c99", "-Wall", "-Werror", "-O1", "-shared", "-fPIC", "-o"]
+    subprocess.run([*command, str(library), str(source), "-lm"], check=True)
+    function = ctypes.CDLL(str(library)).inverse_dynamics
+    names = space["INPUTS"]
+    given = [q, qd, qdd] + ([used_inputs(names, model, u)] if names else [])  # type: ignore[arg-type]
+    pointer = ctypes.POINTER(ctypes.c_double)
+    for k in range(len(q)):
+        out = np.empty(q.shape[1])
+        rows = [np.ascontiguousarray(part[k]) for part in given]
+        function(*(row.ctypes.data_as(pointer) for row in [*rows, out]))
+        np.testing.assert_allclose(out, required[k], rtol=1e-10, atol=1e-10)
+
+
+def test_a_model_with_memory_is_refused() -> None:
+    model = Model(registry.device("bam"), ["presliding:yaw"])
+    p = compile_model(model).prior
+    with pytest.raises(InputError, match="has internal states"):
+        portable_source(model, p, "c")

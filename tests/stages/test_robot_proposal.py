@@ -1,0 +1,95 @@
+"""`bampipe init` on a folder with a URDF and a log of all joints."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from bampipe.data.device_file import read_device_file
+from bampipe.data.session import read_session
+from bampipe.physics import Model, compile_model, registry
+from bampipe.proposal import Proposal, propose, write_proposal
+
+URDF = """<?xml version="1.0"?><robot name="arm">
+<link name="base"/>
+<link name="upper"><inertial><origin xyz="0.25 0 0"/><mass value="3"/>
+<inertia ixx="0.01" ixy="0" ixz="0" iyy="0.1" iyz="0" izz="0.1"/></inertial></link>
+<link name="lower"><inertial><origin xyz="0.2 0 0"/><mass value="2"/>
+<inertia ixx="0.01" ixy="0" ixz="0" iyy="0.05" iyz="0" izz="0.05"/></inertial></link>
+<joint name="shoulder" type="revolute"><parent link="base"/><child link="upper"/>
+<axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="40" velocity="3"/></joint>
+<joint name="elbow" type="revolute"><origin xyz="0.5 0 0"/><parent link="upper"/>
+<child link="lower"/><axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="20" velocity="3"/>
+</joint></robot>"""
+
+
+def write_log(folder: Path, gains: tuple[float, float] = (1.0, 1.0), swing: float = 1.0) -> None:
+    """A log of both joints at 200 Hz, 20 s; ``gains``: of the logged torque over the joint's."""
+    (folder / "arm.urdf").write_text(URDF)
+    (folder / "x.toml").write_text('name = "arm"\n[robot]\nurdf = "arm.urdf"\n')
+    device = registry.device_from(read_device_file(folder / "x.toml"))
+    (folder / "x.toml").unlink()
+    system = compile_model(Model(device))
+    t = np.arange(4000) / 200.0
+    waves = ((0.7, 1.1, 0.3), (0.5, 1.7, 1.1))
+    q, qd, qdd = (
+        np.column_stack([swing * f(a, 2 * np.pi * h * 0.3, p) for a, h, p in waves])
+        for f in (
+            lambda a, w, p: a * np.sin(w * t + p),
+            lambda a, w, p: a * w * np.cos(w * t + p),
+            lambda a, w, p: -a * w * w * np.sin(w * t + p),
+        )
+    )
+    p = system.prior
+    for axis in ("shoulder", "elbow"):
+        p[system.index(f"viscous.{axis}")], p[system.index(f"coulomb.{axis}")] = 0.5, 0.8
+    u = np.zeros((len(t), len(system.inputs)))
+    torque = system.required(q, qd, qdd, np.zeros((len(t), 0)), u, p)
+    torque = (torque + np.random.default_rng(0).normal(0.0, 0.05, torque.shape)) * gains
+    table = {"time_s": t, "q1": q[:, 0], "q2": q[:, 1], "tau1": torque[:, 0], "tau2": torque[:, 1]}
+    # An acceleration beside them is never taken for a drive.
+    pd.DataFrame(table | {"acc1": qdd[:, 0], "acc2": qdd[:, 1]}).to_csv(
+        folder / "log.csv", index=False
+    )
+
+
+def proposed(folder: Path) -> Proposal:
+    proposal = propose(folder)
+    write_proposal(folder, proposal)
+    return proposal
+
+
+def about(proposal: Proposal, column: str) -> list[str]:
+    return [
+        line for line in proposal.check if line.startswith(f"{column} is ") and "drawing" in line
+    ]
+
+
+def test_joints_are_paired_with_columns_in_their_order(tmp_path: Path) -> None:
+    write_log(tmp_path)
+    proposal = proposed(tmp_path)
+    session = read_session(tmp_path)
+    assert {e.axis: e.column for e in session.encoders} == {"shoulder": "q1", "elbow": "q2"}
+    assert {c.name: c.column for c in session.channels} == {
+        "torque_shoulder": "tau1",
+        "torque_elbow": "tau2",
+    }
+    assert about(proposal, "tau1") == about(proposal, "tau2") == []
+    assert proposal.fill_in == []
+
+
+def test_signs_and_reductions_are_tested_against_weight_and_inertia(tmp_path: Path) -> None:
+    write_log(tmp_path, gains=(-1.0, 0.01))
+    proposal = proposed(tmp_path)
+    (sign,), (size,) = about(proposal, "tau1"), about(proposal, "tau2")
+    assert "turn its sign, or that of shoulder" in sign
+    assert "the torque of a motor with a reduction of about" in size
+    assert float(size.rpartition(" ")[2]) == pytest.approx(100.0, rel=0.1)
+
+
+def test_a_position_beyond_the_range_is_that_of_a_motor(tmp_path: Path) -> None:
+    write_log(tmp_path, swing=8.0)
+    assert any("a position of the motor?" in line for line in proposed(tmp_path).check)
