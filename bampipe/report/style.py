@@ -41,6 +41,10 @@ COLOURS = {
 }
 """All colours in use, by the name that the page's style sheet gives them."""
 
+_LETTER, _HANDLE = 0.058, 0.42
+"""Widths in a legend, inches: of a letter on average, and of what stands before the words."""
+_MOST_LEGEND_COLUMNS = 4
+
 WIDTH = 6.69
 """Width of the text in print, inches: figures are drawn at the size at which they are printed."""
 
@@ -153,14 +157,17 @@ def limits(axes: Axes, values: Sequence[np.ndarray], *, zero: bool = False) -> N
     axes.set_ylim(low if zero and low == 0.0 else low - margin, high + margin)
 
 
-def legend_below(figure: Figure, axes: Axes, columns: int = 4) -> None:
+def legend_below(figure: Figure, axes: Axes) -> None:
     """Put one legend below all panels: nothing is covered."""
-    legend_of(figure, *axes.get_legend_handles_labels(), columns=columns)
+    legend_of(figure, *axes.get_legend_handles_labels())
 
 
-def legend_of(figure: Figure, handles: list[Any], names: list[str], columns: int = 4) -> None:
-    """Put a legend of these entries below all panels."""
-    figure.legend(handles, names, loc="outside lower center", ncols=min(columns, len(names)))
+def legend_of(figure: Figure, handles: list[Any], names: list[str]) -> None:
+    """Put a legend of these entries below all panels, in as many columns as the figure is wide."""
+    longest = max(map(len, names), default=0)
+    columns = int(figure.get_figwidth() / (_LETTER * longest + _HANDLE))
+    columns = max(1, min(_MOST_LEGEND_COLUMNS, columns, len(names)))
+    figure.legend(handles, names, loc="outside lower center", ncols=columns)
 
 
 def scaled(values: np.ndarray, unit: str) -> tuple[np.ndarray, str]:

@@ -54,7 +54,7 @@ def section(results: Results) -> Section:
             blocks.append(Subheading(f"Model `{model}`"))
         later = None if model == last else after.maps
         blocks += _model(results, model, content, later)
-    return Section(TITLE, tuple(blocks), new_page=True)
+    return Section(TITLE, tuple(blocks))
 
 
 def _model(

@@ -274,7 +274,7 @@ def _design(results: Results, panel: Any, names: list[str]) -> None:
 
 
 def _settled(panel: Any, trace: pd.DataFrame, names: list[str]) -> None:
-    """Set the range to the estimates past the first trial: the search there would hide the rest."""
+    """Set the range to every estimate from its start on, and to the bounds past the first trial."""
     later = np.flatnonzero(trace["trial_id"].ne(trace["trial_id"].iloc[0]).to_numpy())
     start = int(later[0]) + len(trace) // 100 if len(later) else len(trace) // 10
     tail = trace.iloc[start:]
@@ -282,7 +282,7 @@ def _settled(panel: Any, trace: pd.DataFrame, names: list[str]) -> None:
     for name in names:
         centre = tail[name].to_numpy()
         half = 2.5 * tail[f"{name}_sd"].to_numpy() if f"{name}_sd" in tail else 0.0
-        values += [centre - half, centre + half]
+        values += [centre - half, centre + half, trace[name].to_numpy()]
     style.limits(panel, values)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -98,23 +99,48 @@ def _picture(results: Results, rungs: Sequence[Rung]) -> Figure:
         floor = _values(rung.noise_floor.get(axis) for rung in rungs)
         panel.plot(x, error, "o-", color=style.BLUE, ms=4.5, lw=1.3, label="held-out error")
         panel.plot(x, floor, "s--", color=style.VERMILLION, ms=3.0, lw=1.0, label="noise floor")
-        for place, value, least in zip(x, error, floor, strict=True):
+        _scale(panel, np.concatenate([error, floor]))
+        low, high = panel.get_ylim()
+        middle = np.sqrt(low * high) if panel.get_yscale() == "log" else (low + high) / 2.0
+        for place, value in zip(x, error, strict=True):
             if np.isfinite(value):
-                up = -10 if least > value else 4
                 panel.annotate(
-                    wording.significant(float(value), 2), (place, value), (4, up),
-                    textcoords="offset points", ha="left", fontsize=7,
+                    wording.significant(float(value), 2), (place, value),
+                    (0, -5 if value > middle else 5), textcoords="offset points", ha="center",
+                    va="top" if value > middle else "bottom", fontsize=7,
                 )  # fmt: skip
-        top = np.nanmax(np.concatenate([error, floor, [0.0]]))
-        panel.set_ylim(0.0, 1.22 * top or 1.0)
         panel.set_xlim(-0.4, len(rungs) - 0.6)
         panel.set_xticks(x, [rungs[0].model, *(str(number) for number in x[1:])])
         panel.set_xlabel("version")
         panel.set_title(axis)
         panel.set_ylabel(style.label("RMSE", wording.unit(results.force_unit(axis))))
     style.legend_below(figure, panels[0][0])
-    caption = "The error on held-out trials falls as effects are added; the floor is what remains."
-    return Figure("ladder", caption, style.svg(figure))
+    return Figure("ladder", _caption(rungs, axes), style.svg(figure))
+
+
+def _scale(panel: Any, values: np.ndarray) -> None:
+    """Set the vertical range; logarithmic where the values span more than a decade."""
+    known = values[np.isfinite(values) & (values > 0.0)]
+    if known.size and known.max() > 10.0 * known.min():
+        panel.set_yscale("log")
+        panel.set_ylim(known.min() / 1.6, known.max() * 1.6)
+    else:
+        panel.set_ylim(0.0, 1.22 * known.max(initial=0.0) or 1.0)
+
+
+def _caption(rungs: Sequence[Rung], axes: Sequence[str]) -> str:
+    """Say by how much the error of each axis changed from the first version to the last."""
+    parts = []
+    for axis in axes:
+        before, after = (rung.held_out_rmse.get(axis) for rung in (rungs[0], rungs[-1]))
+        if before and after:
+            change = 100.0 * (after / before - 1.0)
+            verb = "falls" if change <= -1.0 else "rises" if change >= 1.0 else ""
+            size = wording.plain(abs(change), 0)
+            parts.append(f"{axis} {verb} by {size} %" if verb else f"{axis} stays as it is")
+    return (
+        f"Error on held-out trials by version, against the noise floor: {wording.listing(parts)}."
+    )
 
 
 def _values(found: Iterable[float | None]) -> np.ndarray:
