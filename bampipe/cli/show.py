@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
-from bampipe.errors import printable
+from bampipe.errors import InputError, printable
 from bampipe.run.events import Event
 from bampipe.run.request import Outcome
 
@@ -48,6 +49,19 @@ def note(text: str) -> None:
 def as_json(content: object) -> None:
     """Print ``content`` as JSON on standard output."""
     print(json.dumps(content, sort_keys=True, indent=1, ensure_ascii=False))
+
+
+def page(path: Path) -> None:
+    """Open a page in the user's browser.
+
+    Raises:
+        InputError: no browser can be started.
+    """
+    import webbrowser
+
+    if not webbrowser.open(path.resolve().as_uri()):
+        remedy = "open the file in a browser yourself, or name one in the variable BROWSER"
+        raise InputError("no browser could be started", where=str(path), remedy=remedy)
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> None:

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from bampipe.cli import places
+from bampipe.cli import places, show
 from bampipe.cli.one_stage import advise, one_stage, plain_stage, print_settings
 from bampipe.cli.options import (
     DEFAULTS,
@@ -117,9 +117,17 @@ def compare(run: RunArgument = None, options: StageOptions = DEFAULTS) -> None:
 
 
 @with_stage_options
-def report(run: RunArgument = None, options: StageOptions = DEFAULTS) -> None:
-    """Write PDF and web page of everything found so far.
+def report(
+    run: RunArgument = None,
+    open_: Annotated[
+        bool, typer.Option("--open", help="Open the page for exploring in the browser.")
+    ] = False,
+    options: StageOptions = DEFAULTS,
+) -> None:
+    """Write PDF, web page and page for exploring of everything found so far.
 
-    Example: bampipe report 2026-10-03_s01
+    Example: bampipe report 2026-10-03_s01 --open
     """
     plain_stage("report", run, options)
+    if open_ and not options.list_settings:
+        show.page(places.find_run(run, options.runs) / "report" / "explore.html")

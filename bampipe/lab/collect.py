@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import os
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
+from urllib.parse import quote
 
 from bampipe.data import lab_tables
 from bampipe.errors import InputError
@@ -83,7 +85,7 @@ def collect(runs: Path, folder: Path, *, report: bool = True, progress: Progress
         content.write(folder)
         if report:
             progress(0.7, "report")
-            _report(folder)
+            _report(folder, _pages(folder, roots))
         sessions = tuple(str(one.key["session_id"]) for one in found)
         LabResult(
             schema="bampipe.lab/1", sessions=sessions, skipped=tuple(skipped), tables=counts
@@ -91,11 +93,21 @@ def collect(runs: Path, folder: Path, *, report: bool = True, progress: Progress
     return Lab(folder, content, sessions, tuple(skipped), counts)
 
 
-def _report(folder: Path) -> None:
+def _pages(folder: Path, roots: Sequence[Path]) -> dict[str, str]:
+    """Return the folders of the sessions' reports as seen from the lab's."""
+    reports = {root.name: root.resolve() / "report" for root in roots}
+    return {
+        name: quote(os.path.relpath(report, folder.resolve()).replace(os.sep, "/"))
+        for name, report in reports.items()
+        if (report / "explore.html").is_file()
+    }
+
+
+def _report(folder: Path, pages: Mapping[str, str]) -> None:
     # matplotlib is slow to import: only here
     from bampipe.report.lab import build
 
-    made = build(folder)
+    made = build(folder, pages)
     with atomic_writer(folder / "report.pdf") as stream:
         stream.write(made.pdf)
     write_text(folder / "report.html", made.html)

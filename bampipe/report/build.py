@@ -42,7 +42,13 @@ class Report:
             if isinstance(block, Figure)
         }
         titles = tuple(section.title for section in document.sections)
-        return cls(typeset.pdf(document, recorded), page.page(document), explorer, figures, titles)
+        return cls(
+            typeset.pdf(document, recorded),
+            page.page(document, "explore.html" if explorer else ""),
+            explorer,
+            figures,
+            titles,
+        )
 
 
 def build(results: Results, progress: Callable[[float, str], None]) -> Report:

@@ -1,6 +1,7 @@
 """What a report is made of, before it is typeset: sections of text, tables and figures.
 
-Text may hold two kinds of inline mark: ``**strong**`` and code between backticks.
+Text may hold three kinds of inline mark: ``**strong**``, code between backticks, and a link to
+a page of our own, ``[words](../s01/report/report.html)``.
 """
 
 from __future__ import annotations
@@ -9,9 +10,13 @@ import re
 from dataclasses import dataclass
 from typing import Literal
 
-Span = tuple[Literal["plain", "strong", "code"], str]
+Span = tuple[Literal["plain", "strong", "code", "link"], str]
+"""Kind and text; of a link its words and its target, with a line break between."""
 
-_MARK = re.compile(r"\*\*(?P<strong>[^*]+)\*\*|`(?P<code>[^`]+)`")
+_MARK = re.compile(
+    r"\*\*(?P<strong>[^*]+)\*\*|`(?P<code>[^`]+)`"
+    r"|\[(?P<words>[^\]]+)\]\((?P<page>[\w./%+-]+\.html)\)"
+)
 
 
 def spans(text: str) -> list[Span]:
@@ -21,8 +26,12 @@ def spans(text: str) -> list[Span]:
     for match in _MARK.finditer(text):
         if match.start() > end:
             found.append(("plain", text[end : match.start()]))
-        strong, code = match["strong"], match["code"]
-        found.append(("strong", strong) if strong is not None else ("code", code))
+        if match["strong"] is not None:
+            found.append(("strong", match["strong"]))
+        elif match["code"] is not None:
+            found.append(("code", match["code"]))
+        else:
+            found.append(("link", f"{match['words']}\n{match['page']}"))
         end = match.end()
     if end < len(text):
         found.append(("plain", text[end:]))

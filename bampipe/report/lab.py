@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from datetime import datetime
 from pathlib import Path
 
@@ -20,18 +21,19 @@ _MOST_PANELS = 12
 _MOST_NAMES = 12
 
 
-def build(folder: Path) -> Report:
+def build(folder: Path, pages: Mapping[str, str]) -> Report:
     """Return the report of the lab's folder.
 
     Args:
         folder: where ``trends.json`` and the tables are.
+        pages: by session, the folder of its report as seen from there, where it has one.
     """
     trends = TrendsResult.read(folder / TrendsResult.FILE)
     with style.look():
         sections = [
             section
             for section in (
-                _summary(trends),
+                _summary(trends, pages),
                 *_charts(trends),
                 _errors(folder, trends),
                 _trials(folder),
@@ -58,7 +60,7 @@ def _subtitle(trends: TrendsResult) -> str:
     return ", ".join(parts)
 
 
-def _summary(trends: TrendsResult) -> Section:
+def _summary(trends: TrendsResult, pages: Mapping[str, str]) -> Section:
     sessions = trends.sessions
     odd = [one for one in sessions if one.verdict != "in control"]
     blocks: list[Block] = []
@@ -76,7 +78,7 @@ def _summary(trends: TrendsResult) -> Section:
         blocks.append(Paragraph(f"Besides these, {more} in the table below."))
     rows = [
         (
-            one.session,
+            _linked(one.session, pages),
             one.recorded[:16].replace("T", " ") or "–",
             f"{wording.significant(one.worst[0])} ({one.worst[1]})" if one.worst else "–",
             ", ".join(moved.parameter for moved in one.moved) or "–",
@@ -101,6 +103,14 @@ def _summary(trends: TrendsResult) -> Section:
         )
     )
     return Section("Summary", tuple(blocks))
+
+
+def _linked(session: str, pages: Mapping[str, str]) -> str:
+    """Return the session's name with links to its pages."""
+    if session not in pages:
+        return session
+    folder = pages[session]
+    return f"[{session}]({folder}/report.html) ([explore]({folder}/explore.html))"
 
 
 def _sentence(text: str) -> str:

@@ -26,10 +26,17 @@ _TEMPLATE = Path(__file__).parent / "templates" / "page.html"
 _TAGS = {"strong": "strong", "code": "code"}
 
 
-def page(document: Document) -> str:
-    """Return ``document`` as HTML with its figures inside; it refers to nothing outside."""
+def page(document: Document, beside: str = "") -> str:
+    """Return ``document`` as HTML with its figures inside.
+
+    Args:
+        document: what to show.
+        beside: name of the page for exploring in the same folder, which the contents then link.
+    """
     numbers = numbering()
     contents, body = [], []
+    if beside:
+        contents.append(f'<li><a href="{beside}"><strong>Explore the data</strong></a></li>')
     for section in document.sections:
         anchor = re.sub(r"[^a-z0-9]+", "-", section.title.lower()).strip("-")
         contents.append(f'<li><a href="#{anchor}">{html.escape(section.title)}</a></li>')
@@ -49,6 +56,10 @@ def page(document: Document) -> str:
 def _rich(text: str) -> str:
     parts = []
     for kind, body in spans(text):
+        if kind == "link":
+            words, _, target = body.partition("\n")
+            parts.append(f'<a href="{html.escape(target)}">{html.escape(words)}</a>')
+            continue
         safe = html.escape(body)
         parts.append(f"<{_TAGS[kind]}>{safe}</{_TAGS[kind]}>" if kind in _TAGS else safe)
     return "".join(parts)

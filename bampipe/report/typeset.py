@@ -96,30 +96,30 @@ def next_number(numbers: dict[type, Iterator[str]], block: Block) -> str:
 def _block(block: Block, number: str) -> dict[str, object]:
     match block:
         case Paragraph(text):
-            return {"kind": "text", "text": spans(text)}
+            return {"kind": "text", "text": _spans(text)}
         case Subheading(text):
-            return {"kind": "subheading", "text": spans(text)}
+            return {"kind": "subheading", "text": _spans(text)}
         case Bullets(items):
-            return {"kind": "bullets", "items": [spans(item) for item in items]}
+            return {"kind": "bullets", "items": [_spans(item) for item in items]}
         case Formulas(lines):
             return {"kind": "formulas", "lines": list(lines)}
         case Callout(tone, title, text):
             return {
                 "kind": "callout",
                 "tone": tone,
-                "title": spans(title),
-                "text": spans(text),
+                "title": _spans(title),
+                "text": _spans(text),
             }
         case Table():
             return {
                 "kind": "table",
                 "number": number,
-                "caption": spans(block.caption),
-                "head": [spans(cell) for cell in block.head],
+                "caption": _spans(block.caption),
+                "head": [_spans(cell) for cell in block.head],
                 "rows": [[_cell(cell) for cell in row] for row in block.rows],
                 "align": list(block.align),
                 "widths": list(block.widths or (0.0,) * len(block.head)),
-                "note": spans(block.note),
+                "note": _spans(block.note),
                 "size": _NORMAL_SIZE if len(block.head) < _MANY_COLUMNS else _SMALL_SIZE,
             }
         case Figure(name, caption, _):
@@ -127,11 +127,19 @@ def _block(block: Block, number: str) -> dict[str, object]:
                 "kind": "figure",
                 "number": number,
                 "name": name,
-                "caption": spans(caption),
+                "caption": _spans(caption),
                 "alt": caption,
             }
 
 
+def _spans(text: str) -> list[Span]:
+    """Return the spans of a text for print, where a link is its words."""
+    return [
+        ("plain", body.partition("\n")[0]) if kind == "link" else (kind, body)
+        for kind, body in spans(text)
+    ]
+
+
 def _cell(text: str) -> list[Span]:
     """Return the spans of a cell; an empty one still needs one."""
-    return spans(text) or [("plain", "")]
+    return _spans(text) or [("plain", "")]

@@ -248,6 +248,19 @@ def test_the_report_says_what_the_trends_say(tmp_path: Path) -> None:
     assert (tmp_path / "lab/figures/charts-1.svg").is_file()
 
 
+def test_the_page_links_the_pages_of_every_session(tmp_path: Path) -> None:
+    runs = make_lab(tmp_path, {})
+    for name in ("report.html", "explore.html"):
+        target = runs / "s05" / "report" / name
+        target.parent.mkdir(exist_ok=True)
+        target.write_text("")
+    collect(runs, tmp_path / "out" / "lab")
+    page = (tmp_path / "out/lab/report.html").read_text(encoding="utf-8")
+    targets = re.findall(r'href="([^"#]+)"', page)
+    assert targets == [f"../../runs/s05/report/{n}.html" for n in ("report", "explore")]
+    assert all((tmp_path / "out/lab" / target).is_file() for target in targets)
+
+
 def test_the_command(
     tmp_path: Path, command: Callable[..., tuple[int, str, str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:

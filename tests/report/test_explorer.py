@@ -5,7 +5,10 @@ from __future__ import annotations
 import base64
 import csv
 import io
+import os
 import shutil
+import subprocess
+import sys
 import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -109,6 +112,22 @@ def test_text_from_files_cannot_break_the_page(run: Path, tmp_path: Path) -> Non
 def test_a_session_that_was_only_read_has_a_page(tmp_path: Path) -> None:
     synthetic_run.write_ingest(tmp_path)
     assert "position yaw" in explorer_page(Results(tmp_path), "")
+
+
+def test_the_command_opens_the_page(tmp_path: Path) -> None:
+    synthetic_run.write_ingest(tmp_path / "s03")
+    (tmp_path / "s03/run.json").write_text('{"schema": "bampipe.run/1", "stages": {}}')
+    browser = tmp_path / "browser"
+    browser.write_text(f'#!/bin/sh\nprintf %s "$1" > {tmp_path}/opened\n')
+    browser.chmod(0o755)
+    command = [sys.executable, "-m", "bampipe", "report", str(tmp_path / "s03"), "--open"]
+    for program, code in ((str(browser), 0), ("/bin/false", 2)):
+        environment = {**os.environ, "BROWSER": program, "PATH": "", "DISPLAY": ""}
+        done = subprocess.run(command, env=environment, capture_output=True, text=True)
+        assert done.returncode == code, done.stderr
+    assert "no browser could be started" in done.stderr
+    page = tmp_path / "s03/report/explore.html"
+    assert (tmp_path / "opened").read_text() == page.as_uri()
 
 
 # In a browser.
