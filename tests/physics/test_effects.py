@@ -128,7 +128,7 @@ def test_every_canonical_name_is_there():
 @pytest.mark.parametrize("name", registry.effect_names())
 def test_says_what_a_user_needs(name):
     effect = registry.effect(name)
-    assert effect.summary and effect.looks_like
+    assert effect.summary and effect.looks_like and effect.on_the_machine
     assert re.search(r"1[6-9]\d\d|20\d\d", effect.source), "the source names a year"
     for target in effect.targets(BAM)[:1]:
         bound = Model(BAM, [f"{name}:{target}" if target else name]).effects[0]

@@ -300,6 +300,8 @@ def test_another_axis_brings_its_traces_and_maps(opened: Opened, page_file: Path
     page.wait_for_selector("text=residual pitch by velocity")
     assert figure(page, "torque pitch").count() == 1
     assert figure(page, "torque yaw").count() == 0
+    assert figure(page, "velocity pitch").count() == 1
+    assert figure(page, "velocity yaw").count() == 0
 
 
 def test_tables_sort_and_search(opened: Opened, page_file: Path) -> None:

@@ -236,7 +236,8 @@ def _windows(results: Results) -> list[Content]:
     for number, model in reversed(list(enumerate(results.models))):
         diagnosis = results.read(DiagnoseResult, model)
         for window in diagnosis.worst_windows if diagnosis else ():
-            found.append({"model": number, **window.model_dump()})
+            unit = wording.unit(window.unit)
+            found.append({"model": number, **window.model_dump(), "unit": unit})
     return found
 
 

@@ -13,6 +13,12 @@ from bampipe.results.identify import METHODS_IN_WORDS, IdentifyResult, Parameter
 from bampipe.results.stiffness import AxisStiffness, StiffnessResult
 from bampipe.results.validate import AxisError, ValidateResult
 
+_TERMS = (
+    "Held-out: each trial predicted with parameters that never saw it. RMSE: root mean square of "
+    "measured minus predicted force. Noise floor: the error that sensor noise, quantisation and "
+    "filtering alone would leave. Fit: share of the measured force that is explained."
+)
+
 
 def section(results: Results) -> Section:
     """Return the section."""
@@ -118,7 +124,9 @@ def _numbers(results: Results) -> Table | None:
         tuple(rows),
         "l" + "r" * len(axes),
         (0.0, *(1.0 for _ in axes)),
-        _others(results, identified),
+        " ".join(
+            part for part in (_others(results, identified), _TERMS if validate else "") if part
+        ),
     )
 
 
@@ -154,7 +162,5 @@ def _stiffness(entry: AxisStiffness | None) -> str:
 def _others(results: Results, parameters: Mapping[str, ParameterEstimate]) -> str:
     named = results.in_order(parameters)
     others = [name for name in named if not name.startswith(("viscous.", "coulomb."))]
-    if not others:
-        return ""
-    shown = (f"{wording.parameter(name)}: {_estimate(parameters[name])}" for name in others)
-    return "; ".join(shown) + "."
+    shown = [f"{wording.parameter(name)}: {_estimate(parameters[name])}" for name in others]
+    return "; ".join(shown) + "." if shown else ""

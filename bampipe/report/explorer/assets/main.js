@@ -64,7 +64,10 @@ async function setAxis(axis) {
   const before = state.axis;
   state.axis = axis;
   document.querySelectorAll('[name="axis"]').forEach((one) => (one.checked = one.value === axis));
-  const chosen = traceable().filter((one) => one.axis === axis || (traces.has(one.id) && one.axis !== before));
+  const follows = (id) => traces.has(id) || (id === `velocity ${axis}` && traces.has(`velocity ${before}`));
+  const chosen = traceable().filter(
+    (one) => one.axis === axis || (one.axis !== before && one.id !== `velocity ${before}` && follows(one.id)),
+  );
   await showTraces(new Set(chosen.map((one) => one.id)));
   buildStructure();
   await buildMaps();
