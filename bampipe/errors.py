@@ -1,7 +1,9 @@
 """The one exception that a user's mistake may raise, and text that is safe to show."""
 
+from __future__ import annotations
+
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from functools import partial
 
 
@@ -29,20 +31,31 @@ class InputError(Exception):
         what: what is wrong, in the user's terms.
         where: file, row, column or field, as far as known.
         remedy: what the user can do about it.
+        others: further mistakes in the same file.
     """
 
-    def __init__(self, what: str, *, where: str = "", remedy: str = "") -> None:
+    def __init__(
+        self, what: str, *, where: str = "", remedy: str = "", others: Sequence[InputError] = ()
+    ) -> None:
         self.what = what
         self.where = where
         self.remedy = remedy
+        self.others = tuple(others)
         super().__init__(what, where, remedy)
 
     def __reduce__(self) -> tuple[object, ...]:
         """Rebuild from keywords too, so that it comes whole out of a worker process."""
-        return partial(type(self), where=self.where, remedy=self.remedy), (self.what,)
+        kept = {"where": self.where, "remedy": self.remedy, "others": self.others}
+        return partial(type(self), **kept), (self.what,)
+
+    def lines(self) -> list[str]:
+        """Return every mistake, a line each."""
+        alone = InputError(self.what, where=self.where, remedy=self.remedy)
+        return [str(alone), *(line for other in self.others for line in other.lines())]
 
     def __str__(self) -> str:
         text = f"{self.where}: {self.what}" if self.where else self.what
+        text += f" (and {len(self.others)} more)" if self.others else ""
         text = f"{text}; {self.remedy}" if self.remedy else text
         return printable(" ".join(text.split()))
 

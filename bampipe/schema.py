@@ -145,8 +145,8 @@ def read(kind: type[D], content: object, where: str) -> D:
         where: the file, for messages.
 
     Raises:
-        InputError: names the file, the field (dotted), what was found, what is expected, and
-            how many other fields are wrong.
+        InputError: names the file, the field (dotted), what was found, what is expected; and so
+            for every other field that is wrong.
     """
     try:
         return kind.model_validate(content)
@@ -159,8 +159,7 @@ def refusal(
 ) -> InputError:
     """What `read` raises for an ``error`` of pydantic; ``inside``: the table that was checked."""
     first, *others = _faults(error, kind, where, inside)
-    more = f" (and {len(others)} more)" if others else ""
-    return InputError(first.what + more, where=first.where, remedy=first.remedy)
+    return InputError(first.what, where=first.where, remedy=first.remedy, others=others)
 
 
 def faults(kind: type[Declaration], content: object, where: str) -> list[InputError]:

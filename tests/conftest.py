@@ -62,7 +62,7 @@ class Toy:
 
     def request(self, **changes: Any) -> Request:
         pipeline = pipelines.load(str(self.pipeline_file))
-        return replace(Request(self.root, pipeline, session=self.session, judged="base"), **changes)
+        return replace(Request(self.root, pipeline, session=self.session, judge=True), **changes)
 
     def run(self, **changes: Any) -> Outcome:
         return run_session(self.request(**changes), self.events.append)

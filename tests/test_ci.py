@@ -13,15 +13,22 @@ from pathlib import Path
 import pytest
 from made_results import write_result
 
+from bampipe.api.opened import Run
+from bampipe.declarations.model import ModelFile
 from bampipe.declarations.pipeline import Gate
 from bampipe.errors import InputError
+from bampipe.lab.rows import of_run
+from bampipe.report.results import Results
+from bampipe.results.compare import CompareResult
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.ingest import IngestResult
 from bampipe.results.run import GateVerdict
+from bampipe.results.standing import standing
 from bampipe.results.validate import ValidateResult
-from bampipe.run import accepted, gates, pipeline
+from bampipe.run import accepted, gates, models, pipeline
 from bampipe.run.markdown import summary
-from bampipe.run.request import Outcome
+from bampipe.run.request import Outcome, Request
+from bampipe.run.state import RunState
 
 ROOT = Path(__file__).parent.parent
 CHANGE = Gate(
@@ -68,18 +75,36 @@ def test_parameters_are_held_against_those_accepted(tmp_path: Path) -> None:
         "viscous.yaw": "passed",
         "mass": "absent",
     }
-    # 10 % less two standard deviations of the difference, 2 sqrt(0.01^2 + 0.01^2) / 2.0
     verdict = next(
         v for v in gates.judge_gates(CHANGE, new, "base", folder) if v.key == "coulomb.yaw"
     )
-    assert verdict.value == pytest.approx(10.0 - 100 * 2 * 0.01 * 2**0.5 / 2.0)
-    assert "2 to 2.2, +10 %" in verdict.message
+    assert verdict.value == pytest.approx(10.0)
+    assert verdict.model == "base"
+    assert "2 to 2.2, +10 % ± 0.71 %, is beyond 5 %" in verdict.message
 
 
-def test_a_session_that_says_little_cannot_fail(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("estimate", "sd", "state"),
+    [
+        (2.58, 0.24, "failed"),  # 29 %, 2.4 standard deviations: less two of them, 5 % were left
+        (2.58, 0.40, "warned"),  # 29 %, 1.5 standard deviations: neither a change nor none
+        (2.06, 0.01, "passed"),  # 3 %, six standard deviations
+    ],
+)
+def test_a_change_passes_by_its_size_and_fails_where_it_is_sure(
+    tmp_path: Path, estimate: float, sd: float, state: str
+) -> None:
+    folder = tmp_path / "accepted"
+    accepted.accept(made(tmp_path / "runs/old", sd=0.0, mass=2.0), "base", folder)
+    assert states(made(tmp_path / "runs/a", sd=sd, mass=estimate), folder) == {"mass": state}
+
+
+def test_a_change_is_judged_of_the_model_that_was_accepted(tmp_path: Path) -> None:
     folder = tmp_path / "accepted"
     accepted.accept(made(tmp_path / "runs/old", mass=2.0), "base", folder)
-    assert states(made(tmp_path / "runs/a", sd=0.2, mass=2.2), folder) == {"mass": "passed"}
+    new = made(tmp_path / "runs/new", mass=3.0)
+    found = gates.judge_gates(CHANGE, new, "base+x", folder)
+    assert [(v.model, v.state) for v in found] == [("base", "failed")]
 
 
 def test_accepted_values_of_another_model_do_not_count(tmp_path: Path) -> None:
@@ -88,8 +113,50 @@ def test_accepted_values_of_another_model_do_not_count(tmp_path: Path) -> None:
     accepted.accept(root, "base", folder)
     (root / "models/base").rename(root / "models/base+x")
     found = gates.judge_gates(CHANGE, root, "base+x", folder)
-    assert [v.state for v in found] == ["absent"]
-    assert "of model 'base'" in found[0].message
+    assert [v.state for v in found] == ["warned"]
+    assert "of model 'base', which this run does not have" in found[0].message
+
+
+def test_checks_that_failed_are_counted_and_said(tmp_path: Path) -> None:
+    gate = next(g for g in pipeline.load().gates if g.value == "failed_checks")
+    write_result(tmp_path, ValidateResult, axes={}, failed_checks=["yaw: not white"])
+    found = gates.judge_gates(gate, tmp_path, "base", tmp_path)
+    assert [(v.state, v.value, v.model) for v in found] == [("warned", 1.0, "base")]
+    assert "yaw: not white" in found[0].message
+    write_result(tmp_path, ValidateResult, axes={}, failed_checks=[])
+    assert [v.state for v in gates.judge_gates(gate, tmp_path, "base", tmp_path)] == ["passed"]
+
+
+def test_every_command_takes_the_best_confirmed_model(
+    tmp_path: Path, command: Callable[..., tuple[int, str, str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    root = made(tmp_path / "runs/s1", mass=2.0)
+    better = "base+stribeck.yaw"
+    for name, error in (("base", 0.56), (better, 0.1)):
+        models.write(root, ModelFile(name=name, device="bam"))
+        entries = {"mass": {"estimate": 2.0 if name == "base" else 3.0, "sd": 0.1, "unit": "kg"}}
+        write_result(root, IdentifyResult, model=name, parameters=entries)
+        axis = {"held_out_rmse": error, "noise_floor": 0.1, "standing": standing(error, 0.1)}
+        write_result(root, ValidateResult, model=name, axes={"yaw": axis})
+    assert models.counting_model(root) == "base", "nothing has been compared"
+    code, out, _ = command("accept", "s1")
+    assert code == 0 and "warning: yaw: the error is above the noise floor, 5.6 times" in out
+    write_result(root, CompareResult, best=better, ladder=[{"model": "base"}, {"model": better}])
+    assert models.counting_model(root) == Run(root).model == Results(root).model == better
+    code, out, _ = command("accept", "s1")
+    assert code == 0 and f"model {better}" in out and "warning" not in out
+    kept = json.loads((tmp_path / "accepted/bam.json").read_text())
+    estimates = kept["results"][IdentifyResult.FILE]["parameters"]
+    assert kept["model"] == better and estimates["mass"]["estimate"] == 3.0
+    code, out, _ = command("accept", "s1", "--model", "base")
+    assert code == 0 and "model base" in out
+    assert [step.name for step in RunState(Request(root, pipeline.load())).steps("diagnose")] == [
+        "diagnose:base",
+        f"diagnose:{better}",
+    ]
+    row = of_run(root).tables["sessions"][0]
+    assert row["counting_model"] == better
 
 
 def test_a_damaged_file_of_accepted_values_is_named(tmp_path: Path) -> None:
@@ -132,7 +199,7 @@ def test_the_summary_is_a_table_that_no_text_breaks(tmp_path: Path) -> None:
     write_result(root, ValidateResult, axes=axes)
     text = summary(
         [
-            Outcome(root, "done", (), (bad,)),
+            Outcome(root, "done", (), (bad,), model="base"),
             Outcome(tmp_path / "s2", "refused", error="t1.csv, row 3: not a number"),
             Outcome(tmp_path / "s3", "done"),
         ]
@@ -141,8 +208,8 @@ def test_the_summary_is_a_table_that_no_text_breaks(tmp_path: Path) -> None:
     rows = [line for line in text.splitlines() if line.startswith("|")]
     assert len(rows) == 2 + 3 + 2 + 1
     for row in rows:
-        assert len(re.findall(r"(?<!\\)\|", row)) in (5, 6)
-    assert "| s1 | **gate failed** | yaw 2.00 | gates: 1 failed |" in text
+        assert len(re.findall(r"(?<!\\)\|", row)) == 6
+    assert "| s1 | **gate failed** | base | yaw 2.00 | gates: 1 failed |" in text
     assert r"error \| floor" in text and r"\<b\>" in text
 
 

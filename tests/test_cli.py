@@ -21,6 +21,7 @@ from bampipe.errors import InputError
 from bampipe.results.compare import CompareResult
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.ingest import IngestResult
+from bampipe.run.events import Event
 
 Command = Callable[..., tuple[int, str, str]]
 
@@ -92,7 +93,15 @@ def test_wrong_command_gets_a_suggestion(command: Command) -> None:
 
 
 def test_version(command: Command) -> None:
-    assert command("version") == (0, bampipe.__version__ + "\n", "")
+    assert command("version") == command("--version") == (0, bampipe.__version__ + "\n", "")
+
+
+@pytest.mark.parametrize("group", [[], ["device"]])
+def test_help_cuts_no_summary_short(group: list[str], command: Command) -> None:
+    _, out, _ = command(*group, "--help")
+    assert "..." not in out
+    if not group:
+        assert "Read a session's raw logs: convert to SI units, repair, set bad" in out
 
 
 # Run, on toy stages
@@ -105,7 +114,7 @@ def test_run_shows_steps_and_what_to_do_next(toy: Toy, command: Command) -> None
     assert "3 numbers" in out
     assert "small enough" in out
     assert out.rstrip().splitlines()[-1].startswith("next: bampipe status ")
-    assert "toy_double (never run)" in err
+    assert "toy_double\n" in err and "never run" not in err
 
 
 def test_quiet_says_nothing_on_the_way(toy: Toy, command: Command) -> None:
@@ -189,6 +198,78 @@ def test_mistakes_are_one_line_and_exit_code_two(
     toy: Toy, command: Command, extra: list[str], message: str
 ) -> None:
     assert message in one_line_error(*command("run", *arguments(toy), *extra))
+
+
+@pytest.mark.parametrize("setting", ["toy_fit.factr=5", "toy_double.factor=many"])
+def test_a_typo_in_a_setting_changes_nothing(toy: Toy, command: Command, setting: str) -> None:
+    assert command("run", *arguments(toy))[0] == 0
+    before = {p: p.read_bytes() for p in toy.root.rglob("*") if p.is_file()}
+    toy.ran()
+    code, _, _ = command("run", *arguments(toy), "--set", "toy_read.offset=1", "--set", setting)
+    assert code == 2 and toy.ran() == []
+    assert {p: p.read_bytes() for p in toy.root.rglob("*") if p.is_file()} == before
+    assert command("status", toy.root)[1].count("current") == 4
+
+
+def test_a_setting_that_a_stage_refuses_leaves_its_results_current(
+    toy: Toy, command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from bampipe.stages import toy_double  # type: ignore[attr-defined]
+
+    assert command("run", *arguments(toy))[0] == 0
+    before = toy.files()
+
+    def refuse(*_: object) -> None:
+        raise InputError("no such channel", where="toy_double.factor")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(toy_double, "execute", refuse)
+        assert command("run", *arguments(toy), "--set", "toy_double.factor=3")[0] == 2
+    assert toy.files() == before
+    assert command("status", toy.root)[1].count("current") == 4
+
+
+def test_all_faults_of_a_file_are_said(toy: Toy, command: Command) -> None:
+    path = toy.folder / "own.toml"
+    path.write_text('schema = "bampipe.pipeline/1"\nname = 3\nstage = ["toy_read"]\nsummary = 1\n')
+    code, out, err = command("run", toy.session, "--pipeline", path, "--runs", toy.runs)
+    assert code == 2 and out == ""
+    lines = err.splitlines()
+    assert len(lines) == 4 and all(line.startswith("bampipe: error: ") for line in lines)
+    for words in (
+        'unknown key "stage"',
+        "'stages' is missing",
+        "name: found 3",
+        "summary: found 1",
+    ):
+        assert words in err
+
+
+def test_a_session_may_be_named_by_its_file(toy: Toy, command: Command) -> None:
+    file = toy.session / "session.toml"
+    code, _, _ = command("run", file, "--pipeline", toy.pipeline_file, "--runs", toy.runs)
+    assert code == 0
+    assert places.find_run(str(file), toy.runs) == toy.root
+    assert places.find_sessions([str(toy.session.parent / "*" / "session.toml")]) == [toy.session]
+
+
+def test_off_a_terminal_a_long_stage_prints_a_line_now_and_then(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = [0.0]
+    monkeypatch.setattr(show.time, "monotonic", lambda: clock[0])
+    with show.Watcher(quiet=False) as watcher:
+        watcher(Event("s1", "identify", "start"))
+        for second in range(1, 31):
+            clock[0] = float(second)
+            watcher(Event("s1", "identify", "progress", second / 60.0, f"trial {second}"))
+        watcher(Event("s1", "identify", "done", 1.0))
+    assert capsys.readouterr().err.splitlines() == [
+        "identify",
+        "identify: 17 %, 10 s, trial 10",
+        "identify: 33 %, 20 s, trial 20",
+        "identify: 50 %, 30 s, trial 30",
+    ]
 
 
 def test_status_and_verify(toy: Toy, command: Command) -> None:

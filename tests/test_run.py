@@ -200,7 +200,7 @@ def test_from_needs_what_comes_before(toy: Toy) -> None:
 
 
 def test_until_stops_after_the_stage(toy: Toy) -> None:
-    toy.run(last="toy_double", judged="")
+    toy.run(last="toy_double", judge=False)
     assert toy.ran() == ALL[:2]
     toy.run()
     assert toy.ran() == ALL[2:]
@@ -406,7 +406,7 @@ def test_children_are_refreshed_once_they_were_run(toy: Toy) -> None:
     )
     toy.run()
     assert toy.ran() == [], "nobody has asked for the child yet"
-    toy.run(first="toy_fit", last="toy_fit", model=name, judged="")
+    toy.run(first="toy_fit", last="toy_fit", model=name, judge=False)
     assert toy.ran() == [f"toy_fit:{name}"]
     toy.run()
     assert toy.ran() == ["toy_sum"]

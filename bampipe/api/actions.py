@@ -10,11 +10,11 @@ import pandas as pd
 
 from bampipe.api import loop
 from bampipe.api.opened import Run, open_run
-from bampipe.run import batch, models, record, runner
+from bampipe.run import batch, record, runner
 from bampipe.run import pipeline as pipelines
 from bampipe.run.events import unheard
 from bampipe.run.request import Request
-from bampipe.run.session_name import session_id
+from bampipe.run.session_name import session_folder, session_id
 from bampipe.stages import base
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ def run_session(
         InputError: bad input; earlier results stay as they were.
     """
     batch.limit_threads(1)
-    folder = Path(session)
+    folder = session_folder(session)
     root = Path(runs) / session_id(folder)
     runner.run_session(
         Request(
@@ -59,7 +59,7 @@ def run_session(
             first=first,
             last=last,
             force=force,
-            judged=models.BASE,
+            judge=True,
         ),
         unheard,
     )
@@ -85,18 +85,18 @@ def stiffness(run: Run | Path_, **settings: object) -> pd.DataFrame:
     return _stage(run, "stiffness", "", settings).stiffness
 
 
-def identify(run: Run | Path_, model: str = "base", **settings: object) -> pd.DataFrame:
-    """Estimate a model's parameters; returns `Run.parameters`."""
+def identify(run: Run | Path_, model: str = "", **settings: object) -> pd.DataFrame:
+    """Estimate the parameters of one model, or else of all; returns `Run.parameters`."""
     return _stage(run, "identify", model, settings).parameters(model)
 
 
-def validate(run: Run | Path_, model: str = "base", **settings: object) -> pd.DataFrame:
-    """Predict trials that the fit has not seen; returns `Run.validation`."""
+def validate(run: Run | Path_, model: str = "", **settings: object) -> pd.DataFrame:
+    """Predict trials that the fit has not seen, by one model or all; returns `Run.validation`."""
     return _stage(run, "validate", model, settings).validation(model)
 
 
 def diagnose(run: Run | Path_, model: str = "", **settings: object) -> dict[str, Any]:
-    """Find what a model lacks (default: the one extended last); returns `Run.diagnosis`."""
+    """Find what a model lacks (default: the best confirmed one); returns `Run.diagnosis`."""
     chosen = model or _opened(run).model
     return _stage(run, "diagnose", chosen, settings).diagnosis(chosen)
 
@@ -117,10 +117,10 @@ def extend(run: Run | Path_, effect: str | Sequence[str], model: str = "") -> Ru
     Args:
         run: a run, or its folder.
         effect: ``name[:target]``, or ``file.toml[:target]`` for one of your own; or several.
-        model: the parent; the one extended last where empty.
+        model: the parent; the best confirmed one where empty.
 
     Returns:
-        The run, whose `Run.model` is now the child.
+        The run; its `Run.model` is the child where that lowers the held-out error.
 
     Raises:
         InputError: no such effect or parent, or one that the device cannot have.
@@ -135,7 +135,7 @@ def follow(run: Run | Path_, model: str = "") -> Run:
     """Diagnose and extend until the diagnosis says stop.
 
     Returns:
-        The run, whose `Run.model` is the last one made.
+        The run, whose `Run.model` is the best one found.
     """
     opened = _opened(run)
     loop.follow(_options(opened), model or opened.model, lambda line: None)

@@ -83,20 +83,6 @@ def settings_of(root: Path, model: str) -> dict[str, dict[str, object]]:
     return used
 
 
-def current_model(root: Path) -> str:
-    """Return the model with the most effects added; of several the one made last.
-
-    A model counts once it stands in the ladder: what a killed `extend` left unfinished does not.
-    """
-    steps = record.read(root).stages
-    compared = steps["compare"].inputs if "compare" in steps else {}
-    known = [name for name in models.names(root) if f"models/{name}/validate.json" in compared]
-    if not known:
-        return models.BASE
-    made = {name: (root / "models" / name / "model.toml").stat().st_mtime_ns for name in known}
-    return max(known, key=lambda name: (name.count("+"), made[name]))
-
-
 def _diagnosis(root: Path, model: str) -> DiagnoseResult:
     from bampipe.results.diagnose import DiagnoseResult
 

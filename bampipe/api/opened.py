@@ -10,7 +10,6 @@ from typing import Any, TypeVar
 
 import pandas as pd
 
-from bampipe.api.loop import current_model
 from bampipe.errors import InputError
 from bampipe.files import refuse_links
 from bampipe.report.results import Results
@@ -20,7 +19,7 @@ from bampipe.results.identify import IdentifyResult
 from bampipe.results.record import Record, Result
 from bampipe.results.stiffness import StiffnessResult
 from bampipe.results.validate import ValidateResult
-from bampipe.run import record
+from bampipe.run import models, record
 
 R = TypeVar("R", bound=Result)
 
@@ -43,7 +42,7 @@ class Run:
     """The results of one session. Nothing here writes; results are read once, when first used.
 
     All values are in SI units. Models are named as in the run folder: ``base``,
-    ``base+stribeck.yaw``; where a method takes a model, the default is the one extended last.
+    ``base+stribeck.yaw``; where a method takes a model, the default is the best confirmed one.
 
     Args:
         root: the run folder.
@@ -101,8 +100,8 @@ class Run:
 
     @property
     def model(self) -> str:
-        """The model extended last, which the methods below take where none is named."""
-        return current_model(self.root)
+        """The best confirmed model, which the methods below take where none is named."""
+        return models.counting_model(self.root)
 
     def effects(self, model: str = "") -> tuple[str, ...]:
         """The effects that a model has beyond the bare device."""

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from bampipe.cli import places, show
+from bampipe.data.run_folder import RunFolder
 from bampipe.run import accepted, models
 
 
@@ -19,7 +20,9 @@ def accept(
             help="Run folder, or its name under runs/; the most recent run if omitted.",
         ),
     ] = None,
-    model: Annotated[str, typer.Option(help="Model whose parameters count.")] = models.BASE,
+    model: Annotated[
+        str, typer.Option(help="Model whose parameters count; the best confirmed one if omitted.")
+    ] = "",
     force: Annotated[bool, typer.Option("--force", help="Even if a gate failed.")] = False,
     folder: Annotated[
         Path | None,
@@ -35,8 +38,11 @@ def accept(
     Example: bampipe accept 2026-10-03_s01
     """
     root = places.find_run(run, runs)
-    path = accepted.accept(root, model, folder or accepted.accepted_folder(root.parent), force)
-    show.say(f"{path}: the values of {root.name}, model {model}")
+    chosen = model or models.counting_model(root)
+    path = accepted.accept(root, chosen, folder or accepted.accepted_folder(root.parent), force)
+    show.say(f"{path}: the values of {root.name}, model {chosen}")
+    for doubt in accepted.doubts(RunFolder(root), chosen):
+        show.say(f"warning: {doubt}")
     if not quiet:
         show.say("")
         show.say(f"next: put {path} under version control; later runs are compared with it")

@@ -67,6 +67,23 @@ def effects(
         show_one(name, device, json)
 
 
+def _print_version(asked: bool) -> None:
+    if asked:
+        version()
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", callback=_print_version, is_eager=True, help="Print the version, and exit."
+        ),
+    ] = False,
+) -> None: ...
+
+
 def version() -> None:
     """Print the version of bampipe.
 
@@ -102,5 +119,5 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "version": version,
 }
 for _name, _command in COMMANDS.items():
-    app.command(_name)(_command)
-app.add_typer(device.app, name="device")
+    app.command(_name, short_help=device.summary_of(_command))(_command)
+app.add_typer(device.app, name="device", short_help=device.SUMMARY)

@@ -43,7 +43,7 @@ def demonstrate(runs: Path, force: bool, listen: Listener, tell: Callable[[str],
     root = runs / session_id(session)
     chosen = pipeline.load()
     tell(f"1. {session}: an arm with something wrong that its model does not know.")
-    run_session(Request(root, chosen, session=session, force=force, judged=models.BASE), listen)
+    run_session(Request(root, chosen, session=session, force=force, judge=True), listen)
     for axis, error in RunFolder(root).read(ValidateResult, models.BASE).axes.items():
         tell(
             f"   {axis}: error on unseen trials {error.held_out_rmse:.3g} {error.unit}, "

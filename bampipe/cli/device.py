@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -11,17 +11,21 @@ import typer
 from bampipe.cli import show
 from bampipe.cli.options import JsonOption
 
+SUMMARY = "The devices there are, their equations of motion, and device files checked."
 app = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode=None,
-    help="The devices there are, their equations of motion, and device files checked.\n\n"
-    "Example: bampipe device check rail.toml",
+    help=f"{SUMMARY}\n\nExample: bampipe device check rail.toml",
 )
 
 FaultsOnlyOption = Annotated[bool, typer.Option("--quiet", "-q", help="Faults only.")]
 
 
-@app.command("list")
+def summary_of(command: Callable[..., None]) -> str:
+    """Return the first line of a command's help: typer itself cuts it short in lists."""
+    return (command.__doc__ or "").partition("\n")[0]
+
+
 def list_(json: JsonOption = False) -> None:
     """List the built-in devices.
 
@@ -46,7 +50,6 @@ def list_(json: JsonOption = False) -> None:
     show.say("one in full: bampipe device show NAME")
 
 
-@app.command("show")
 def show_(
     device: Annotated[str, typer.Argument(help="A built-in device, or a device file.")],
     json: JsonOption = False,
@@ -89,7 +92,6 @@ def show_(
         report_faults(faults)
 
 
-@app.command()
 def check(
     file: Annotated[str, typer.Argument(help="A device file, or the name of a built-in device.")],
     json: JsonOption = False,
@@ -118,6 +120,10 @@ def check(
         show.say(f"{where}: names, units and equations fit together")
         show.say("")
         show.say(f"next: {_after(file)}")
+
+
+for _name, _command in {"list": list_, "show": show_, "check": check}.items():
+    app.command(_name, short_help=summary_of(_command))(_command)
 
 
 def _after(file: str) -> str:

@@ -27,9 +27,21 @@ def main() -> None:
     except BaseException as error:
         if not received or (isinstance(error, SystemExit) and not error.code):
             raise
-        print("bampipe: stopped; the same command goes on from here", file=sys.stderr, flush=True)
+        print(f"bampipe: stopped{_what_is_kept()}", file=sys.stderr, flush=True)
         # No joining of threads and processes at exit: nothing is left that could be lost.
         os._exit(128 + received[0])
+
+
+def _what_is_kept() -> str:
+    """Say which steps were under way, what is kept, and how to go on; of a run, else nothing."""
+    show = sys.modules.get("bampipe.cli.show")
+    known = getattr(show, "UNDER_WAY", {})
+    if not known:
+        return "; nothing was left half-written"
+    at = ", ".join(f"{step} of {run}" for run, step in sorted(known.items()) if step)
+    same = "the same command without --force" if "--force" in sys.argv else "the same command"
+    kept = "every stage that had finished is kept, and"
+    return f"{f' at {at}' if at else ''}; {kept} {same} goes on from there"
 
 
 def _run() -> None:
@@ -41,7 +53,8 @@ def _run() -> None:
     try:
         app()
     except InputError as error:
-        show.note(f"bampipe: error: {error}")
+        for line in error.lines():
+            show.note(f"bampipe: error: {line}")
         sys.exit(2)
     except BrokenPipeError:
         # Whoever read our output has closed it (`bampipe effects | head`): leave without noise.

@@ -22,14 +22,14 @@ from bampipe.cli.options import (
 )
 from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError
-from bampipe.run import batch
+from bampipe.run import batch, models
 
 
 @with_stage_options
 def diagnose(
     run: RunArgument = None,
     model: Annotated[
-        str, typer.Option(help="Model to diagnose; the one extended last if omitted.")
+        str, typer.Option(help="Model to diagnose; the best confirmed one if omitted.")
     ] = "",
     options: StageOptions = DEFAULTS,
 ) -> None:
@@ -40,15 +40,13 @@ def diagnose(
     if options.list_settings:
         print_settings("diagnose")
         return
-    from bampipe.api.loop import current_model, next_effects
+    from bampipe.results.diagnose import DiagnoseResult
 
     root = places.find_run(run, options.runs)
-    chosen = model or current_model(root)
+    chosen = model or models.counting_model(root)
     one_stage("diagnose", root, options, model=chosen)
-    name = places.next_to(root, options.runs)
-    effects = " ".join(next_effects(root, chosen))
-    command = f"bampipe extend {name} {effects}" if effects else f"bampipe report {name}"
-    advise(options.quiet, options.json, command)
+    after = RunFolder(root).read(DiagnoseResult, chosen).next
+    advise(options.quiet, options.json, after.replace("RUN", places.next_to(root, options.runs)))
 
 
 def extend(
@@ -69,7 +67,7 @@ def extend(
         ),
     ] = False,
     model: Annotated[
-        str, typer.Option(help="Model to extend; the one extended last if omitted.")
+        str, typer.Option(help="Model to extend; the best confirmed one if omitted.")
     ] = "",
     force: ForceOption = False,
     runs: RunsOption = RUNS,
@@ -103,7 +101,7 @@ def extend(
         raise InputError("no effect named", remedy="`bampipe effects` lists them; or use --auto")
     root = places.find_run(first, runs)
     pipeline = whole_pipeline(root, "")
-    parent = model or loop.current_model(root)
+    parent = model or models.counting_model(root)
     with show.Watcher(quiet or json) as watcher:
         options = loop.LoopOptions(root, pipeline, force, not no_wait, watcher)
         if auto:

@@ -14,6 +14,7 @@ import typer
 
 from bampipe.cli import places, show
 from bampipe.errors import InputError
+from bampipe.run import models
 
 if TYPE_CHECKING:
     from bampipe.monitor.monitor import Monitor
@@ -31,7 +32,9 @@ def monitor(
     run: Annotated[
         str, typer.Option("--run", help="Run folder or name; the most recent run if omitted.")
     ] = "",
-    model: Annotated[str, typer.Option("--model", help="Which model version of the run.")] = "base",
+    model: Annotated[
+        str, typer.Option("--model", help="Model of the run; the best confirmed one if omitted.")
+    ] = "",
     device: Annotated[
         str, typer.Option("--device", help="Without a run: a built-in device or a device file.")
     ] = "",
@@ -117,7 +120,9 @@ def _prepare(
         start = None
     else:
         folder = RunFolder(places.find_run(run or None, runs))
-        system, start = monitor_start.start_from_run(folder, model, options)
+        chosen = model or models.counting_model(folder.root)
+        remark(f"model {chosen} of {folder.root}")
+        system, start = monitor_start.start_from_run(folder, chosen, options)
     stream = monitor_start.open_stream(samples, system, session, strict, remark)
     return monitoring.Monitor(system, start, options, remark), stream
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from bampipe.errors import InputError, choose_from
 from bampipe.files import refuse_links
 from bampipe.run import record
-from bampipe.run.session_name import session_id
+from bampipe.run.session_name import session_folder, session_id
 
 
 def known_runs(runs: Path) -> list[Path]:
@@ -34,6 +34,7 @@ def find_run(argument: str | None, runs: Path) -> Path:
     Raises:
         InputError: there is no such run, or it holds a link.
     """
+    argument = None if argument is None else str(session_folder(argument))
     if argument is None:
         known = known_runs(runs)
         if not known:
@@ -66,7 +67,7 @@ def find_sessions(arguments: Sequence[str]) -> list[Path]:
         InputError: a pattern finds no session.
     """
     found: list[Path] = []
-    for argument in arguments:
+    for argument in (str(session_folder(name)) for name in arguments):
         if Path(argument).exists() or not glob.has_magic(argument):
             found.append(Path(argument))
             continue

@@ -20,8 +20,9 @@ from bampipe.cli.options import (
     QuietOption,
     RunsOption,
 )
+from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError
-from bampipe.run import batch, models
+from bampipe.run import batch
 from bampipe.run import junit as junit_xml
 from bampipe.run import pipeline as pipelines
 from bampipe.run.request import Outcome, Request
@@ -117,7 +118,7 @@ def run(
                 last=last,
                 force=force,
                 model=model,
-                judged=model or models.BASE,
+                judge=True,
                 accepted=accepted,
                 publish=publish,
                 processes=batch.share(min(jobs, len(folders))),
@@ -137,7 +138,7 @@ def run(
     if junit is not None:
         _write_junit(junit, outcomes)
     if markdown is not None:
-        _add_markdown(markdown, outcomes, model or models.BASE)
+        _add_markdown(markdown, outcomes)
     _report_runs(outcomes, several, json)
     refresh(runs, several, quiet or json)
     if not several:
@@ -170,13 +171,13 @@ def _write_junit(path: Path, outcomes: Sequence[Outcome]) -> None:
         raise InputError(f"cannot be written: {error.strerror}", where=str(path)) from error
 
 
-def _add_markdown(path: Path, outcomes: Sequence[Outcome], model: str) -> None:
+def _add_markdown(path: Path, outcomes: Sequence[Outcome]) -> None:
     from bampipe.run.markdown import summary
 
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("a", encoding="utf-8") as stream:
-            stream.write(summary(outcomes, model))
+            stream.write(summary(outcomes))
     except OSError as error:
         raise InputError(f"cannot be written: {error.strerror}", where=str(path)) from error
 
@@ -209,10 +210,19 @@ def _report_runs(outcomes: Sequence[Outcome], several: bool, json: bool) -> None
 
 
 def _after_run(outcome: Outcome, name: str) -> str:
+    """Return what to do now, as the results of the model that counts have it."""
+    from bampipe.results.diagnose import DiagnoseResult
+    from bampipe.results.validate import ValidateResult
+
+    run, model = RunFolder(outcome.root), outcome.model
+    if run.exists(DiagnoseResult.file(model)):
+        found = run.read(DiagnoseResult, model)
+        if any(axis.verdict != "nothing_missing" for axis in found.axes.values()):
+            return found.next.replace("RUN", name)
+    elif run.exists(ValidateResult.file(model)):
+        errors = run.read(ValidateResult, model).axes.values()
+        if any(error.standing == "above_floor" for error in errors):
+            return f"bampipe diagnose {name}"
     if (outcome.root / "report" / "report.pdf").is_file():
-        missing = any(verdict.state in ("failed", "warned") for verdict in outcome.verdicts)
-        diagnosed = any(step.step.startswith("diagnose") for step in outcome.steps)
-        if missing:
-            return f"bampipe extend {name} --auto" if diagnosed else f"bampipe diagnose {name}"
         return f"open {outcome.root / 'report' / 'report.pdf'}"
     return f"bampipe status {name}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+import time
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
 
 LARGEST_TABLE = 40
 MOST_TRIALS = 10
+QUIET_S = 10.0
+"""Off a terminal, a long step prints a line this often."""
 FIRST_COLUMNS = ("", "trial_id", "estimate", "sd", "unit", "rmse", "held_out_rmse", "noise_floor")
 
 
@@ -157,11 +160,16 @@ def summary(content: Mapping[str, object]) -> None:
         if isinstance(row.get("sentence"), str):
             say(str(row["sentence"]))
     trials(content)
-    notes = content.get("notes")
-    if isinstance(notes, list) and notes:
+    _lines(content, "failed_checks", "check failed")
+    if content.get("notes"):
         say("")
-        for line in notes:
-            say(f"note: {line}")
+    _lines(content, "notes", "note")
+
+
+def _lines(content: Mapping[str, object], name: str, word: str) -> None:
+    found = content.get(name)
+    for line in found if isinstance(found, list) else ():
+        say(f"{word}: {line}")
 
 
 def trials(content: Mapping[str, object]) -> None:
@@ -227,18 +235,27 @@ def outcome(result: Outcome) -> None:
         table(["step", "state", "time", ""], rows)
     for step in result.steps:
         trials(step.summary)
+        if step.step == "ingest":
+            _lines(step.summary, "notes", "note")
     shown = [verdict for verdict in result.verdicts if verdict.state != "absent"]
     if shown:
         say("")
         table(
-            ["gate", "", "verdict", ""],
-            [[verdict.gate, verdict.key, verdict.state, verdict.message] for verdict in shown],
+            ["gate", "model", "", "verdict", ""],
+            [[one.gate, one.model, one.key, one.state, one.message] for one in shown],
         )
+    if result.model:
+        say("")
+        say(f"model that counts: {result.model}; --model takes another")
 
 
 def _first_line(content: Mapping[str, object]) -> str:
     line = content.get("headline")
     return line if isinstance(line, str) else ""
+
+
+UNDER_WAY: dict[str, str] = {}
+"""By run: the step that has started and not ended, or ""."""
 
 
 class Watcher:
@@ -254,6 +271,7 @@ class Watcher:
         self.several = several
         self.bars: Any = None
         self.tasks: dict[str, Any] = {}
+        self.lines: dict[str, tuple[float, float]] = {}
 
     def __enter__(self) -> Watcher:
         if not self.quiet and sys.stderr.isatty():
@@ -283,19 +301,33 @@ class Watcher:
 
     def __call__(self, event: Event) -> None:
         """Show one event."""
+        name = f"{event.run}: {event.step}" if self.several else event.step
+        if event.kind in ("start", "done", "unchanged", "failed"):
+            UNDER_WAY[event.run] = event.step if event.kind == "start" else ""
         if self.quiet:
             return
-        name = f"{event.run}: {event.step}" if self.several else event.step
         if event.kind == "waiting":
             holder = event.message or "another run"
             note(f"bampipe: {holder} is at work in {event.run}; waiting for it")
         elif event.kind == "taken over":
             note(f"bampipe: {event.message} was killed in {event.run}; going on from there")
         elif self.bars is None:
-            if event.kind == "start":
-                note(f"{name} ({event.message})" if event.message else name)
+            self._write(event, name)
         else:
             self._draw(event, name)
+
+    def _write(self, event: Event, name: str) -> None:
+        """A line where a step starts, and one every so often while it goes on."""
+        now = time.monotonic()
+        if event.kind == "start":
+            self.lines[name] = now, now
+            note(f"{name} ({event.message})" if event.message else name)
+        elif event.kind == "progress":
+            started, written = self.lines.setdefault(name, (now, now))
+            if now - written >= QUIET_S:
+                self.lines[name] = started, now
+                percent = f"{100.0 * event.fraction:.0f} %, {now - started:.0f} s"
+                note(f"{name}: {percent}, {event.message}".removesuffix(", "))
 
     def _draw(self, event: Event, name: str) -> None:
         if event.kind in ("start", "progress"):

@@ -119,6 +119,9 @@ def compare(run: RunArgument = None, options: StageOptions = DEFAULTS) -> None:
 @with_stage_options
 def report(
     run: RunArgument = None,
+    model: Annotated[
+        str, typer.Option("--model", help="Shown in detail; the best confirmed one if omitted.")
+    ] = "",
     open_: Annotated[
         bool, typer.Option("--open", help="Open the page for exploring in the browser.")
     ] = False,
@@ -128,6 +131,6 @@ def report(
 
     Example: bampipe report 2026-10-03_s01 --open
     """
-    plain_stage("report", run, options)
+    plain_stage("report", run, options, detail_model=model)
     if open_ and not options.list_settings:
         show.page(places.find_run(run, options.runs) / "report" / "explore.html")

@@ -33,6 +33,7 @@ TABLES: dict[str, dict[str, pa.DataType]] = {
         "trials_repaired": _COUNT,
         "trials_set_aside": _COUNT,
         "models": _LIST,
+        "counting_model": _TEXT,
         "effects": _LIST,
         "gates_failed": _COUNT,
         "gates_warned": _COUNT,

@@ -51,14 +51,16 @@ class Gate(Declaration):
     )
     against: Literal["", "accepted"] = Field(
         default="",
-        description="Judge the change since the accepted values instead, in percent, less two"
-        " standard deviations",
+        description="Judge the change since the accepted values instead, in percent; one within two"
+        " standard deviations warns where it would fail",
     )
     judged_by: NumberPath = Field(
         default="", description="a dotted path of a word that says whether the value passes"
     )
     passes: Distinct[Text] = Field(default=(), description="Words of judged_by that pass")
-    max: Number | None = Field(default=None, description="Largest value that passes")
+    max: Number | None = Field(
+        default=None, description="Largest value that passes; of a list, the most entries"
+    )
     min: Number | None = Field(default=None, description="Smallest value that passes")
     level: Literal["fail", "warn"] = Field(
         default="fail", description="fail: exit code 1; warn: said, but the run counts as good"

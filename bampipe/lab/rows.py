@@ -161,8 +161,8 @@ def _session(root: Path, rows: SessionRows, session: IngestResult, made: tuple[s
     run_record = record.read(root)
     states = [trial["status"] for trial in rows.tables.get("quality", ())]
     verdicts = [gate.state for gate in run_record.gates]
-    had = set(models.read(root, models.BASE).effects) if models.BASE in made else set()
-    added = [e for name in made for e in models.read(root, name).effects if e not in had]
+    counting = models.counting_model(root)
+    had, has = (models.read(root, m).effects if m in made else () for m in (models.BASE, counting))
     rows.add(
         "sessions",
         sample_rate_hz=session.sample_rate_hz,
@@ -170,7 +170,8 @@ def _session(root: Path, rows: SessionRows, session: IngestResult, made: tuple[s
         trials_repaired=states.count("repaired"),
         trials_set_aside=states.count("set_aside"),
         models=list(made),
-        effects=list(dict.fromkeys(added)),
+        counting_model=counting,
+        effects=[effect for effect in has if effect not in had],
         gates_failed=verdicts.count("failed"),
         gates_warned=verdicts.count("warned"),
         failures=[f"{step}: {text}" for step, text in sorted(run_record.failures.items())],

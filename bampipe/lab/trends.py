@@ -66,39 +66,6 @@ def _ratio(between: float, sd: float, old: float) -> float:
     return (between**2 + sd**2) / variance if variance > 0.0 else 1.0
 
 
-@dataclass
-class Judged:
-    """The verdict on one session.
-
-    Attributes:
-        session: its id.
-        device: the device.
-        recorded: when it was recorded, ISO 8601, or "".
-        verdict: one of the module's five.
-        moved: parameters beyond their limits.
-        effects: those its diagnosis names; without one, those its models add to the base model.
-        unexplained: axes on which something unknown is missing.
-        diagnosed: whether a diagnosis was made.
-        worst: largest held-out error of the base model over its floor, and its axis.
-        above_floor: whether validate found the base model above its floor on some axis.
-        sentence: the verdict in words.
-        remedy: a command that would say more, or "".
-    """
-
-    session: str
-    device: str
-    recorded: str
-    verdict: str = IN_CONTROL
-    moved: tuple[MovedParameter, ...] = ()
-    effects: tuple[str, ...] = ()
-    unexplained: tuple[str, ...] = ()
-    diagnosed: bool = False
-    worst: tuple[float, str] | None = None
-    above_floor: bool = False
-    sentence: str = ""
-    remedy: str = ""
-
-
 def series(tables: Mapping[str, Sequence[TableRow]]) -> list[Series]:
     """Return the charts of every parameter of the base models, and of every stiffness.
 
@@ -125,7 +92,7 @@ def series(tables: Mapping[str, Sequence[TableRow]]) -> list[Series]:
 
 def judge_sessions(
     tables: Mapping[str, Sequence[TableRow]], charts: Sequence[Series]
-) -> list[Judged]:
+) -> list[SessionVerdict]:
     """Return the verdict on each session, in the order of recording.
 
     Args:
@@ -137,32 +104,40 @@ def judge_sessions(
 
 def _judge_session(
     row: TableRow, tables: Mapping[str, Sequence[TableRow]], charts: Sequence[Series]
-) -> Judged:
-    session, device = str(row["session_id"]), str(row["device"])
+) -> SessionVerdict:
+    session, device, model = str(row["session_id"]), str(row["device"]), row["counting_model"]
     when = row["recorded_at"]
-    judged = Judged(session, device, when.isoformat() if when is not None else "")
     mine = {
         name: [r for r in tables.get(name, ()) if r["session_id"] == session]
         for name in ("parameters", "errors", "verdicts")
     }
+    errors = [r for r in mine["errors"] if r["model"] == model]
     ratios = [
         (float(r["error_over_floor"]), str(r["axis"]))
-        for r in mine["errors"]
-        if r["model"] == BASE and r["error_over_floor"] is not None
+        for r in errors
+        if r["error_over_floor"] is not None
     ]
-    judged.worst = max(ratios, default=None)
-    judged.above_floor = any(
-        r["standing"] == "above_floor" for r in mine["errors"] if r["model"] == BASE
-    )
     named = [effect for r in mine["verdicts"] for effect in r["effects"]]
     first = [r for r in mine["verdicts"] if r["model"] == BASE]
-    judged.effects = tuple(dict.fromkeys(named if first else row["effects"]))
-    judged.unexplained = tuple(r["axis"] for r in first if r["verdict"] == "unknown_effect")
-    judged.diagnosed = bool(first)
+    last = [r for r in mine["verdicts"] if r["model"] == model]
     outside = [c for c in charts if c.device == device and _is_outside(c, session)]
-    judged.moved = tuple(_moved(c, session) for c in outside)
-    _decide(judged, outside, mine)
-    return judged
+    judged = SessionVerdict(
+        session=session,
+        device=device,
+        model=model,
+        recorded=when.isoformat() if when is not None else "",
+        verdict=IN_CONTROL,
+        moved=tuple(_moved(c, session) for c in outside),
+        effects=tuple(dict.fromkeys(named if first else row["effects"])),
+        unexplained=tuple(r["axis"] for r in last or first if r["verdict"] == "unknown_effect"),
+        diagnosed=bool(last),
+        worst=max(ratios, default=None),
+        above_floor=any(r["standing"] == "above_floor" for r in errors),
+        sentence="",
+        remedy="",
+    )
+    verdict, sentence, remedy = _decide(judged, outside, mine, row["effects"])
+    return judged.model_copy(update={"verdict": verdict, "sentence": sentence, "remedy": remedy})
 
 
 def _is_outside(c: Series, session: str) -> bool:
@@ -178,52 +153,50 @@ def _moved(c: Series, session: str) -> MovedParameter:
 
 
 def _decide(
-    judged: Judged, outside: Sequence[Series], mine: Mapping[str, Sequence[TableRow]]
-) -> None:
-    """Set verdict, sentence and remedy."""
-    lacks = [*judged.effects, *(f"something unknown on {axis}" for axis in judged.unexplained)]
-    what = " and ".join(lacks)
-    moved = ", ".join(_in_words(entry) for entry in judged.moved)
+    judged: SessionVerdict,
+    outside: Sequence[Series],
+    mine: Mapping[str, Sequence[TableRow]],
+    has: Sequence[str],
+) -> tuple[str, str, str]:
+    """Return verdict, sentence and remedy; ``has``: effects of the model that counts."""
+    unknown = [f"something unknown on {axis}" for axis in judged.unexplained]
+    diagnose = f"bampipe diagnose {judged.session} --model {judged.model}"
     if not outside:
-        if lacks:
-            judged.verdict = EFFECT
-            judged.sentence = f"lacks {what}; no parameter is beyond its limits"
-        elif not judged.diagnosed and judged.worst and judged.above_floor:
-            judged.verdict = UNKNOWN
-            judged.sentence = (
+        lacking = [*(effect for effect in judged.effects if effect not in has), *unknown]
+        if lacking:
+            return EFFECT, f"lacks {' and '.join(lacking)}; no parameter is beyond its limits", ""
+        if not judged.diagnosed and judged.worst and judged.above_floor:
+            sentence = (
                 f"error on unseen trials {judged.worst[0]:.3g} times the floor on "
                 f"{judged.worst[1]}: something is missing, not yet asked what"
             )
-            judged.remedy = f"bampipe diagnose {judged.session} --model {BASE}"
-        return
-    if not lacks:
-        judged.verdict = DEVICE if judged.diagnosed else UNKNOWN
-        judged.sentence = f"{moved}; its diagnosis finds nothing missing: the device changed"
-        if not judged.diagnosed:
-            judged.sentence = f"{moved}; whether an effect is missing has not been asked"
-            judged.remedy = f"bampipe diagnose {judged.session} --model {BASE}"
-        return
+            return UNKNOWN, sentence, diagnose
+        return IN_CONTROL, "", ""
+    what = " and ".join([*judged.effects, *unknown])
+    moved = ", ".join(_in_words(entry) for entry in judged.moved)
+    if not what:
+        if judged.diagnosed:
+            return DEVICE, f"{moved}; its diagnosis finds nothing missing: the device changed", ""
+        return UNKNOWN, f"{moved}; whether an effect is missing has not been asked", diagnose
     back, still = _with_the_effect(judged, outside, mine)
     if still:
-        judged.verdict = BOTH
-        judged.sentence = (
+        sentence = (
             f"{moved}; lacks {what}, which does not account for {', '.join(still)}: the device "
             "changed too"
         )
-    elif back:
-        judged.verdict = EFFECT
-        judged.sentence = (
+        return BOTH, sentence, ""
+    if back:
+        sentence = (
             f"{moved}; with {what} in the model {'they are' if len(back) > 1 else 'it is'} back "
             "within the limits: the device has not changed"
         )
-    else:
-        judged.verdict = EFFECT
-        judged.sentence = f"{moved}; lacks {what}, which biases the parameters"
-        judged.remedy = f"bampipe extend {judged.session} --auto, then bampipe lab"
+        return EFFECT, sentence, ""
+    remedy = f"bampipe extend {judged.session} --auto, then bampipe lab"
+    return EFFECT, f"{moved}; lacks {what}, which biases the parameters", remedy
 
 
 def _with_the_effect(
-    judged: Judged, outside: Sequence[Series], mine: Mapping[str, Sequence[TableRow]]
+    judged: SessionVerdict, outside: Sequence[Series], mine: Mapping[str, Sequence[TableRow]]
 ) -> tuple[list[str], list[str]]:
     """Return which parameters the missing effect brings back, and which it cannot account for.
 
@@ -232,7 +205,8 @@ def _with_the_effect(
     """
     models = {str(r["model"]) for r in mine["parameters"]} - {BASE}
     largest = max(models, key=lambda name: (name.count("+"), name), default="")
-    child = {r["parameter"]: r for r in mine["parameters"] if r["model"] == largest}
+    chosen = judged.model if judged.model != BASE else largest
+    child = {r["parameter"]: r for r in mine["parameters"] if r["model"] == chosen}
     clean = {
         r["axis"]
         for r in mine["verdicts"]
@@ -256,13 +230,13 @@ def _in_words(moved: MovedParameter) -> str:
     return f"{moved.parameter} {moved.percent:+.2g} %".replace("-", "−")
 
 
-def build_trends(charts: Sequence[Series], judged: Sequence[Judged]) -> TrendsResult:
+def build_trends(charts: Sequence[Series], judged: Sequence[SessionVerdict]) -> TrendsResult:
     """Return charts and verdicts as ``trends.json`` holds them."""
     return TrendsResult(
         schema="bampipe.trends/1",
         fewest_sessions=FEWEST,
         series=tuple(_chart(c) for c in charts),
-        sessions=tuple(SessionVerdict(**vars(j)) for j in judged),
+        sessions=tuple(judged),
     )
 
 

@@ -30,7 +30,7 @@ class Results:
 
     Attributes:
         root: the run folder.
-        detail_model: the model shown in detail; "" for the last of the ladder.
+        detail_model: the model shown in detail; "" for the best confirmed one.
     """
 
     root: Path
@@ -194,7 +194,8 @@ class Results:
         """
         if self.detail_model:
             return self.require_model(self.detail_model)
-        return self.models[-1] if self.models else "base"
+        compared = self.read(CompareResult)
+        return compared.best if compared and compared.best in self.models else "base"
 
     def require_model(self, name: str) -> str:
         """Return ``name``.

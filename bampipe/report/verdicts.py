@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 
 from bampipe.report import wording
 from bampipe.report.document import Callout
@@ -38,15 +38,32 @@ def ordered(results: Results, by_axis: Collection[str]) -> tuple[str, ...]:
 
 
 def overall(results: Results) -> Callout:
-    """Return the verdict on the session."""
+    """Return the verdict on the session: good where no check failed and nothing is outdated."""
     validated = results.read(ValidateResult, results.model)
     if validated is not None and validated.refused:
         return Callout(
             "attention",
             "The published parameters are refused",
-            f"{'. '.join(validated.refused)}. `bampipe identify {results.root.name} --method "
-            "least-squares` takes another estimator.",
+            f"`bampipe identify {results.root.name} --method least-squares` takes another "
+            f"estimator.{_failures(validated.failed_checks)}",
         )
+    found = _explained(results, validated)
+    failed = validated.failed_checks if validated else ()
+    if found.tone == "good" and failed:
+        count = wording.count(len(failed), "check")
+        return Callout("attention", f"{found.title}, but {count} failed", _failures(failed))
+    if found.tone == "good" and results.outdated:
+        return Callout("attention", f"{found.title}, but some results are outdated", found.text)
+    return Callout(found.tone, found.title, found.text + _failures(failed))
+
+
+def _failures(failed: Sequence[str]) -> str:
+    """Return the checks that failed, as sentences behind others."""
+    sentences = (wording.sentence(f"{one[:1].upper()}{one[1:]}".rstrip(".")) for one in failed)
+    return "".join(f" {one}." for one in sentences)
+
+
+def _explained(results: Results, validated: ValidateResult | None) -> Callout:
     if validated is not None and (wrong := _wrong_floors(results, validated)):
         return Callout(
             "attention",

@@ -21,6 +21,10 @@ class Rung(Record):
     held_out_rmse: dict[str, Size]
     noise_floor: dict[str, Size | None] = Field(description="null where none was computed")
     standing: dict[str, Standing]
+    confirmed: bool = Field(
+        description="A model without a parent; or one whose parent is confirmed, whose parameters "
+        "are not refused, and whose held-out error is lower than its parent's"
+    )
     unit: dict[str, str]
     free_run_mode: Literal["closed_loop", "open_loop"] | None = None
     free_run: dict[str, FreeRunError] = Field(default={}, description="By axis")
@@ -52,6 +56,10 @@ class CompareResult(Result):
     FILE: ClassVar[str] = "compare.json"
     STAGE: ClassVar[str] = "compare"
 
+    best: str = Field(
+        description="The model that counts where a command names none: the confirmed one with the "
+        "lowest held-out error"
+    )
     ladder: tuple[Rung, ...] = Field(min_length=1, description="Parents before children")
     parameters: dict[str, dict[str, Value]] = Field(description="By name, then by model")
     moved: tuple[Moved, ...]

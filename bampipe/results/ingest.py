@@ -60,6 +60,9 @@ class IngestResult(Result):
     default_effects: Names = Field(
         default=(), description="Effects that the device file gives the base model"
     )
+    placeholders: Names = Field(
+        default=(), description="Numbers of the device file whose source still says `fill in`"
+    )
     recorded_at: str | None = Field(description="ISO 8601, or null")
     operator: str = Field(default="", description="Who recorded it")
     device_serial: str = ""

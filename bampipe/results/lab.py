@@ -67,6 +67,7 @@ class SessionVerdict(Record):
 
     session: str
     device: str
+    model: str = Field(description="The best confirmed model, whose errors are judged")
     recorded: str = Field(description='ISO 8601, or ""')
     verdict: str
     moved: tuple[MovedParameter, ...]
@@ -74,9 +75,9 @@ class SessionVerdict(Record):
     unexplained: Names = Field(description="Axes on which something unknown is missing")
     diagnosed: bool
     worst: tuple[float, str] | None = Field(
-        description="Largest held-out error over its floor, and its axis; or null"
+        description="Largest held-out error of that model over its floor, and its axis; or null"
     )
-    above_floor: bool = Field(description="Whether the base model is above its floor on some axis")
+    above_floor: bool = Field(description="Whether that model is above its floor on some axis")
     sentence: str
     remedy: str
 

@@ -78,7 +78,9 @@ class Result(Record):
         except ValidationError as error:
             refused = refusal(error, cls, str(path))
             remedy = f"make it again with `bampipe {cls.STAGE} --force`"
-            raise InputError(refused.what, where=refused.where, remedy=remedy) from None
+            raise InputError(
+                refused.what, where=refused.where, remedy=remedy, others=refused.others
+            ) from None
 
     @classmethod
     def _checked(cls, content: object) -> Self:

@@ -59,6 +59,7 @@ class GateVerdict(Record):
     """What came of one quality gate."""
 
     gate: str
+    model: str = Field(default="", description='The model that was judged, or ""')
     key: str = Field(description='What * stood for, or ""')
     state: GateState
     value: float | None

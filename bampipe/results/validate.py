@@ -108,6 +108,9 @@ class ValidateResult(Result):
         description="Why the published parameters are refused: they err by more than 1.2 times "
         "what parameters refitted without each trial do"
     )
+    failed_checks: Names = Field(
+        description="Of data, estimate and floor, a sentence each; a model is sound without any"
+    )
     notes: Names
     axes: dict[str, JudgedError] = Field(
         description="Over all free trials and those in a viscous field, stretches at rest left out"

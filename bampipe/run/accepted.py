@@ -75,7 +75,11 @@ def accept(root: Path, model: str, folder: Path, force: bool = False) -> Path:
     names = (IdentifyResult.file(model), StiffnessResult.FILE, IngestResult.FILE)
     record.require_untouched(root, names)
     run.require(IdentifyResult.file(model), IdentifyResult.STAGE)
-    failed = [gate.gate for gate in record.read(root).gates if gate.state == "failed"]
+    failed = [
+        gate.gate
+        for gate in record.read(root).gates
+        if gate.state == "failed" and gate.model in ("", model)
+    ]
     if failed and not force:
         raise InputError(
             f"the gate {failed[0]!r} failed in this run",
@@ -108,3 +112,20 @@ def accept(root: Path, model: str, folder: Path, force: bool = False) -> Path:
     )
     write_json(path, content.model_dump(by_alias=True))
     return path
+
+
+def doubts(run: RunFolder, model: str) -> list[str]:
+    """Return what speaks against holding later sessions against ``model``, a line each."""
+    from bampipe.results.standing import STANDINGS_IN_WORDS
+    from bampipe.results.validate import ValidateResult
+
+    if not run.exists(ValidateResult.file(model)):
+        return [f"model {model} has not been validated: `bampipe validate {run.root}`"]
+    found = run.read(ValidateResult, model)
+    lines = list(found.failed_checks)
+    for axis, error in found.axes.items():
+        if error.standing == "above_floor" and error.noise_floor:
+            ratio = error.held_out_rmse / error.noise_floor
+            words = STANDINGS_IN_WORDS[error.standing]
+            lines.append(f"{axis}: the error is {words}, {ratio:.2g} times: something is missing")
+    return lines

@@ -60,7 +60,7 @@ def judge_gates(gate: Gate, root: Path, model: str, baseline: Path) -> list[Gate
     """Return the verdicts of ``gate`` on the run folder ``root``.
 
     Args:
-        gate: the gate.
+        gate: the gate; against accepted values it judges the model that was accepted.
         root: the run folder.
         model: name of the model that is judged.
         baseline: folder of the values last accepted.
@@ -68,63 +68,83 @@ def judge_gates(gate: Gate, root: Path, model: str, baseline: Path) -> list[Gate
     Raises:
         InputError: the result or the file of accepted values is damaged.
     """
+    if gate.against == accepted.ACCEPTED:
+        model, found = _judge_change(gate, root, model, baseline)
+    else:
+        found = _judge_result(gate, root, model)
+    of_model = model if "{model}" in gate.result else ""
+    return [verdict.model_copy(update={"model": of_model}) for verdict in found]
+
+
+def _judge_result(gate: Gate, root: Path, model: str) -> list[GateVerdict]:
     relative = gate.result.replace("{model}", model)
-    path = root / relative
-    if not path.is_file():
+    content = _content(root / relative)
+    if content is None:
         return [_missing(gate, "", f"there is no {relative}")]
-    content = read_json_table(path)
     values = _pick(content, gate.value)
     divisors = _pick(content, gate.divide_by) if gate.divide_by else {}
     words = _pick(content, gate.judged_by) if gate.judged_by else {}
     if not values:
         return [_missing(gate, "", f"{relative} has no {gate.value}")]
-    if gate.against == accepted.ACCEPTED:
-        return _against_accepted(gate, root, model, baseline, content)
     verdicts = []
     for key, raw in values.items():
+        if isinstance(raw, list):
+            passed = len(raw) <= (gate.max or 0.0)
+            parts = [str(item) for item in raw] or ["none"]
+            verdicts.append(_found(gate, key, passed, float(len(raw)), parts))
+            continue
         value = _number(raw)
         if value is not None and gate.divide_by:
             divisor = _number(divisors.get(key))
             value = value / divisor if divisor else None
         if gate.judged_by:
-            verdicts.append(_judged(gate, key, value, words.get(key)))
-            continue
-        if value is None:
+            verdicts.append(_judge_word(gate, key, value, words.get(key)))
+        elif value is None:
             verdicts.append(_missing(gate, key, f"{relative} has no number at {gate.value}"))
-            continue
-        verdicts.append(_hold(gate, key, value, ""))
+        else:
+            verdicts.append(_judge_number(gate, key, value))
     return verdicts
 
 
-def _judged(gate: Gate, key: str, value: float | None, word: object) -> GateVerdict:
+def _content(path: Path) -> dict[str, Any] | None:
+    return read_json_table(path) if path.is_file() else None
+
+
+def _judge_word(gate: Gate, key: str, value: float | None, word: object) -> GateVerdict:
     """Return the verdict that a stage stored as a word; ``value`` is shown beside it."""
     number = "no number" if value is None else f"{value:.4g}"
     text = f"{number}, {str(word).replace('_', ' ')}"
     return _found(gate, key, word in gate.passes, value, [text])
 
 
-def _hold(gate: Gate, key: str, value: float, suffix: str) -> GateVerdict:
-    """Return the verdict on ``value``; ``suffix`` follows the number in the message."""
+def _judge_number(gate: Gate, key: str, value: float) -> GateVerdict:
     limits = []
     if gate.max is not None and value > gate.max:
-        limits.append(f"{value:.4g}{suffix} is above {gate.max:g}")
+        limits.append(f"{value:.4g} is above {gate.max:g}")
     if gate.min is not None and value < gate.min:
-        limits.append(f"{value:.4g}{suffix} is below {gate.min:g}")
-    return _found(gate, key, not limits, value, limits or [f"{value:.4g}{suffix}"])
+        limits.append(f"{value:.4g} is below {gate.min:g}")
+    return _found(gate, key, not limits, value, limits or [f"{value:.4g}"])
 
 
-def _against_accepted(
-    gate: Gate, root: Path, model: str, baseline: Path, content: Mapping[str, Any]
-) -> list[GateVerdict]:
-    """Hold the change since the accepted values, beyond its uncertainty, against the limit."""
+def _judge_change(
+    gate: Gate, root: Path, model: str, baseline: Path
+) -> tuple[str, list[GateVerdict]]:
+    """Hold changes since the accepted values, in percent, against the limit; and of which model.
+
+    A change beyond the limit but within two standard deviations neither passes nor fails: it warns.
+    """
     from bampipe.results.ingest import IngestResult
 
     reference = accepted.read(baseline, RunFolder(root).read(IngestResult).device)
     if reference is None:
-        return [_missing(gate, "", f"nothing accepted yet in {baseline}: run `bampipe accept`")]
-    if reference.model != model:
-        what = f"the accepted values are those of model {reference.model!r}, not of {model!r}"
-        return [_missing(gate, "", what)]
+        what = f"nothing accepted yet in {baseline}: run `bampipe accept`"
+        return model, [_missing(gate, "", what)]
+    model = reference.model
+    content = _content(root / gate.result.replace("{model}", model))
+    if content is None and "{model}" in gate.result:
+        what = f"the accepted values are those of model {model!r}, which this run does not have"
+        found = _missing(gate, "", what)
+        return model, [found.model_copy(update={"state": "warned"}) if gate.optional else found]
     old = reference.results.get(gate.result, {})
     parent, _, last = gate.value.rpartition(".")
     now, before = _pick(content, gate.value), _pick(old, gate.value)
@@ -136,13 +156,19 @@ def _against_accepted(
             where = "this run" if value is None else "the accepted values"
             verdicts.append(_missing(gate, key, f"no {last} in {where}"))
             continue
-        sd = math.hypot(_number(sds.get(key)) or 0.0, _number(old_sds.get(key)) or 0.0)
-        excess = max(0.0, abs(value - accepted_value) - 2.0 * sd)
         if accepted_value == 0.0:
             verdicts.append(_missing(gate, key, "the accepted value is 0: no change in percent"))
             continue
-        change = 100.0 * (value - accepted_value) / abs(accepted_value)
-        numbers = f"{accepted_value:.4g} to {value:.4g}, {change:+.3g} %"
-        suffix = f" % beyond two standard deviations ({numbers})"
-        verdicts.append(_hold(gate, key, 100.0 * excess / abs(accepted_value), suffix))
-    return verdicts
+        scale = 100.0 / abs(accepted_value)
+        change = scale * (value - accepted_value)
+        scatter = scale * math.hypot(_number(sds.get(key)) or 0.0, _number(old_sds.get(key)) or 0.0)
+        text = f"{accepted_value:.4g} to {value:.4g}, {change:+.3g} % ± {scatter:.2g} %"
+        passed = abs(change) <= (math.inf if gate.max is None else gate.max)
+        if not passed:
+            text += f", is beyond {gate.max:g} %"
+        verdict = _found(gate, key, passed, change, [text])
+        if verdict.state == "failed" and abs(change) <= 2.0 * scatter:
+            doubt = f"{text}, but within two standard deviations: too uncertain to say"
+            verdict = verdict.model_copy(update={"state": "warned", "message": doubt})
+        verdicts.append(verdict)
+    return model, verdicts

@@ -42,6 +42,11 @@ def junit(suites: Iterable[Suite]) -> bytes:
             errors=str(int(bool(suite.error))),
             skipped=str(sum(v.state == "absent" for v in suite.verdicts)),
         )
+        models = sorted({verdict.model for verdict in suite.verdicts if verdict.model})
+        if models:
+            properties = ElementTree.SubElement(element, "properties")
+            for model in models:
+                ElementTree.SubElement(properties, "property", name="model", value=printable(model))
         if suite.error:
             case = ElementTree.SubElement(
                 element, "testcase", classname=printable(suite.name), name="the pipeline finishes"

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError, printable
-from bampipe.run.models import BASE
 from bampipe.run.request import Outcome
 
 if TYPE_CHECKING:
@@ -18,18 +17,17 @@ MOST = 30
 """So many lines of one table are shown; a summary that nobody reads to its end is none."""
 
 
-def summary(outcomes: Sequence[Outcome], model: str = BASE) -> str:
+def summary(outcomes: Sequence[Outcome]) -> str:
     """Return the summary of a run as GitHub-flavoured Markdown.
 
     Args:
         outcomes: what came of each session.
-        model: the model that was judged.
     """
     codes = [outcome.exit_code for outcome in outcomes]
     lines = [f"## bampipe: {_headline(codes)}", ""]
     lines += _table(
-        ("session", "result", "error / floor", "what"),
-        [_session(outcome, model) for outcome in outcomes],
+        ("session", "result", "model", "error / floor", "what"),
+        [_session(outcome) for outcome in outcomes],
     )
     marked = [
         (outcome.root.name, verdict)
@@ -59,9 +57,9 @@ def _headline(codes: Sequence[int]) -> str:
     return f"{total}, " + (", ".join(parts) if parts else "all gates passed")
 
 
-def _session(outcome: Outcome, model: str) -> tuple[str, ...]:
+def _session(outcome: Outcome) -> tuple[str, ...]:
     if outcome.error:
-        return outcome.root.name, STATES[outcome.exit_code], "", outcome.error
+        return outcome.root.name, STATES[outcome.exit_code], "", "", outcome.error
     counts = [
         f"{number} {word}"
         for word in ("failed", "warned")
@@ -70,7 +68,8 @@ def _session(outcome: Outcome, model: str) -> tuple[str, ...]:
     return (
         outcome.root.name,
         STATES[outcome.exit_code],
-        _errors(RunFolder(outcome.root), model),
+        outcome.model,
+        _errors(RunFolder(outcome.root), outcome.model),
         f"gates: {', '.join(counts)}" if counts else "",
     )
 

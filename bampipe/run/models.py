@@ -37,6 +37,20 @@ def read(root: Path, name: str) -> ModelFile:
     return read_model_file(root / "models" / name / "model.toml")
 
 
+def counting_model(root: Path) -> str:
+    """Return the model that counts where a command names none: the best confirmed one.
+
+    The stage compare stores it; the base model where nothing has been compared.
+    """
+    from bampipe.results.compare import CompareResult
+
+    try:
+        best = RunFolder(root).read(CompareResult).best
+    except InputError:  # not there yet, or damaged: then it is made again
+        return BASE
+    return best if best in names(root) else BASE
+
+
 def write(root: Path, model: ModelFile) -> None:
     """Write ``model`` below ``root``, whole or not at all; one that says the same is left."""
     path = root / "models" / model.name / "model.toml"

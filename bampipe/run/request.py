@@ -46,7 +46,7 @@ class Request:
         last: last stage that runs, "" for the last.
         force: run every selected step, changed or not.
         model: the only model to run; "" for the base model and what was run of the others.
-        judged: the model the gates judge; "" for no gates.
+        judge: whether the gates judge `model`, or else the model that counts.
         accepted: folder of accepted values; None for ``accepted`` beside the folder of runs.
         processes: share of the machine for stages that use several processes; 0 for all of it.
         publish: where to publish the run folder once it is done, a URL for fsspec; "" for nowhere.
@@ -61,7 +61,7 @@ class Request:
     last: str = ""
     force: bool = False
     model: str = ""
-    judged: str = ""
+    judge: bool = False
     accepted: Path | None = None
     processes: int = 0
     publish: str = ""
@@ -98,6 +98,7 @@ class Outcome:
         verdicts: of the gates.
         error: one line on what went wrong, or "".
         traceback: where bampipe itself failed, or "".
+        model: which model the gates judged, or "".
     """
 
     root: Path
@@ -106,6 +107,7 @@ class Outcome:
     verdicts: tuple[GateVerdict, ...] = ()
     error: str = ""
     traceback: str = ""
+    model: str = ""
 
     @property
     def exit_code(self) -> int:
@@ -120,6 +122,7 @@ class Outcome:
             "run": str(self.root),
             "state": self.state,
             "error": self.error,
+            "model": self.model,
             "steps": {
                 result.step: {"state": result.state, "summary": result.summary}
                 for result in self.steps

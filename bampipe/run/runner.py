@@ -14,7 +14,7 @@ from bampipe.run import accepted, hashing, models, record, staging
 from bampipe.run.events import Event, Listener, unheard
 from bampipe.run.gates import judge_gates
 from bampipe.run.request import Outcome, Request, Step, StepResult, selected
-from bampipe.run.state import RunState, lasting
+from bampipe.run.state import FIRST_TIME, RunState, lasting
 from bampipe.stages import base
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ class _Runner:
         from bampipe.results.run import StepRecord, Timing
 
         name = self.root.name
-        self.listen(Event(name, step.name, "start", 0.0, reason))
+        self.listen(Event(name, step.name, "start", 0.0, "" if reason == FIRST_TIME else reason))
         compile_ahead.begin()
         started = datetime.now(UTC)
         clock = time.perf_counter()
@@ -71,11 +71,15 @@ class _Runner:
         self.listen(Event(name, step.name, "done", 1.0))
         return StepResult(step.name, "done", reason, seconds, made.summary)
 
-    def failed(self, step: Step, error: str) -> None:
-        """Note that the step failed; what its last success left stays, and stays recorded."""
+    def failed(self, step: Step, error: str, refused: bool = False) -> None:
+        """Note that the step failed; what its last success left stays, and stays recorded.
+
+        A setting of this request that is ``refused`` is no failure of results made without it.
+        """
         shutil.rmtree(staging.folder(self.root, step), ignore_errors=True)
-        self.state.failures[step.name] = error
-        self.state.save()
+        if not (refused and step.name in self.state.records):
+            self.state.failures[step.name] = error
+            self.state.save()
         self.listen(Event(self.root.name, step.name, "failed", 0.0, error))
 
     def step(self, step: Step) -> StepResult:
@@ -84,7 +88,7 @@ class _Runner:
             if reason:
                 return self.execute(step, reason)
         except InputError as error:
-            self.failed(step, str(error))
+            self.failed(step, str(error), refused=bool(self.request.settings.get(step.stage)))
             raise
         except Exception as error:
             self.failed(step, f"{type(error).__name__}: {error}")
@@ -94,7 +98,15 @@ class _Runner:
         summary = self.state.records[step.name].summary
         return StepResult(step.name, "unchanged", "", 0.0, summary)
 
+    def check_settings(self) -> None:
+        """Refuse a mistake in the settings of any stage before one runs."""
+        for stage in selected(self.request):
+            for step in self.state.steps(stage):
+                if self.state.settings(step).keys() - {"model"}:
+                    self.state.declared(step)
+
     def run(self) -> Outcome:
+        self.check_settings()
         results: list[StepResult] = []
         pipeline = self.request.pipeline
         for stage in selected(self.request):
@@ -105,12 +117,14 @@ class _Runner:
             for step in self.state.steps(stage):
                 results.append(self.step(step))
         verdicts: list[GateVerdict] = []
-        if self.request.judged:
+        judged = ""
+        if self.request.judge:
+            judged = self.request.model or models.counting_model(self.root)
             baseline = self.request.accepted or accepted.accepted_folder(self.root.parent)
             for gate in pipeline.gates:
-                verdicts += judge_gates(gate, self.root, self.request.judged, baseline)
+                verdicts += judge_gates(gate, self.root, judged, baseline)
         self.state.close(verdicts)
-        return Outcome(self.root, "done", tuple(results), tuple(verdicts))
+        return Outcome(self.root, "done", tuple(results), tuple(verdicts), model=judged)
 
 
 def _as_stored(summary: dict[str, object], step: Step) -> dict[str, object]:

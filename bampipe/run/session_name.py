@@ -14,6 +14,11 @@ def is_name(text: str) -> bool:
     return re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9._+-]{0,127}", text) is not None
 
 
+def session_folder(path: str | Path) -> Path:
+    """Return the folder of a session, which may be named by its ``session.toml`` too."""
+    return Path(path).parent if Path(path).name == "session.toml" else Path(path)
+
+
 def session_id(session: Path) -> str:
     """Return the name of the run folder for ``session``: the id in its session file.
 

@@ -18,6 +18,8 @@ from bampipe.stages import base
 if TYPE_CHECKING:
     from bampipe.results.run import GateVerdict, RunResult
 
+FIRST_TIME = "never run"
+"""Why a step runs that has no result yet."""
 NEUTRAL = ("session", "jobs")
 """Fields of a configuration that no result depends on: a place, and a number of processes."""
 
@@ -159,7 +161,7 @@ class RunState:
         """Why the step must run; "" if it need not."""
         made = self.records.get(step.name)
         if made is None:
-            return "run.json was damaged" if self.damaged else "never run"
+            return "run.json was damaged" if self.damaged else FIRST_TIME
         if self.request.force:
             return "forced"
         for name, written in made.outputs.items():
@@ -185,10 +187,11 @@ class RunState:
             return (Step(stage),)
         if self.request.model:
             return (Step(stage, self.request.model),)
+        counting = models.counting_model(self.root)
         children = (
             name
             for name in models.names(self.root)
-            if name != models.BASE and Step(stage, name).name in self.records
+            if name != models.BASE and (name == counting or Step(stage, name).name in self.records)
         )
         return (Step(stage, models.BASE), *(Step(stage, name) for name in children))
 
@@ -203,7 +206,7 @@ class RunState:
         from bampipe.results.run import PipelineUsed
 
         noted = self._noted()
-        if self.request.judged:
+        if self.request.judge:
             used = PipelineUsed.model_validate(self.request.pipeline.content())
             noted = noted.model_copy(update={"pipeline": used, "gates": tuple(verdicts)})
         if noted != self.written:

@@ -21,6 +21,9 @@ SUMMARY = "Held-out error of every model version, and which parameters moved"
 INPUTS = ("models/*/model.toml", "models/*/identify.json", "models/*/validate.json")
 OUTPUTS = ("compare.json",)
 
+NOTICEABLE = 0.01
+"""Least fall of the held-out error, of the product over the axes, that confirms a model."""
+
 
 @checked_dataclass(frozen=True, config=STRICT)
 class Config:
@@ -52,22 +55,30 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
             remedy=f"run `bampipe validate {run.root}` first",
         )
     order = sorted(models, key=lambda n: (len(models[n].effects), n))
-    ladder = [_rung(run, name, models) for name in order]
+    ladder: dict[str, Rung] = {}
+    for name in order:
+        ladder[name] = _rung(run, name, models, ladder)
+    confirmed = [name for name in order if ladder[name].confirmed]
+    best = min(confirmed, key=lambda name: _log_error(ladder[name]), default=order[0])
     parameters: dict[str, dict[str, Value]] = {}
     for name in order:
         for key, found in run.read(IdentifyResult, name).parameters.items():
             value = Value(estimate=found.estimate, sd=found.sd, unit=found.unit)
             parameters.setdefault(key, {})[name] = value
     moved = _moved(parameters, models, order, config.sigmas)
-    return CompareResult(ladder=tuple(ladder), parameters=parameters, moved=tuple(moved)).write(out)
+    return CompareResult(
+        best=best, ladder=tuple(ladder.values()), parameters=parameters, moved=tuple(moved)
+    ).write(out)
 
 
-def _rung(run: RunFolder, name: str, models: Mapping[str, ModelFile]) -> Rung:
+def _rung(
+    run: RunFolder, name: str, models: Mapping[str, ModelFile], earlier: Mapping[str, Rung]
+) -> Rung:
     validated = run.read(ValidateResult, name)
     axes, free = validated.axes, validated.free_run
     parent, effects = models[name].parent, models[name].effects
     had = models[parent].effects if parent in models else ()
-    return Rung(
+    rung = Rung(
         model=name,
         parent=parent or None,
         added=", ".join(e for e in effects if e not in had) or None,
@@ -75,10 +86,21 @@ def _rung(run: RunFolder, name: str, models: Mapping[str, ModelFile]) -> Rung:
         held_out_rmse={axis: entry.held_out_rmse for axis, entry in axes.items()},
         noise_floor={axis: entry.noise_floor for axis, entry in axes.items()},
         standing={axis: entry.standing for axis, entry in axes.items()},
+        confirmed=not parent,
         unit={axis: entry.unit for axis, entry in axes.items()},
         free_run_mode=free.mode if free else None,
         free_run=free.axes if free else {},
     )
+    before = earlier.get(parent)
+    if before is None or not before.confirmed or validated.refused:
+        return rung
+    falls = _log_error(rung) < _log_error(before) - NOTICEABLE
+    return rung.model_copy(update={"confirmed": falls})
+
+
+def _log_error(rung: Rung) -> float:
+    """Sum over the axes of the logarithm of the held-out error: ratios count, units do not."""
+    return sum(math.log(max(error, 1e-300)) for error in rung.held_out_rmse.values())
 
 
 def _moved(

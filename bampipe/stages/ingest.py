@@ -7,7 +7,7 @@ cannot be trusted is set aside with a reason (file, row, column), and the others
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -102,7 +102,9 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
             file.write_bytes(session.device_file.read_bytes())
         else:  # with all that its URDF says: the run folder stands on its own
             file.write_text(toml_text(device.declaration), encoding="utf-8")
-    return _summary(session, rows) | {"warnings": list(description.sensor_warnings)}
+    notes = [*description.sensor_warnings]
+    notes += [f"{place}: its source still says `fill in`" for place in description.placeholders]
+    return _summary(session, rows) | {"notes": notes}
 
 
 def _device(session: Session) -> Device:
@@ -312,6 +314,7 @@ def _description(
         session_id=session.session_id,
         device=device.name,
         device_file=session.device if own else None,
+        placeholders=tuple(_placeholders(device.declaration)) if own else (),
         device_digest=digest_content(device.declaration) if own else "",
         driven=bool(device.drive),
         default_effects=device.default_effects,
@@ -347,6 +350,15 @@ def _description(
         },
         channels={channel.name: RecordedChannel(unit=channel.unit) for channel in session.channels},
     )
+
+
+def _placeholders(table: object, place: str = "device") -> Iterator[str]:
+    """Yield the dotted names of the numbers below ``table`` whose source says ``fill in``."""
+    if isinstance(table, Mapping):
+        if "value" in table and str(table.get("source", "")).startswith("fill in"):
+            yield place
+        for name, entry in table.items():
+            yield from _placeholders(entry, f"{place}.{name}")
 
 
 def _summary(session: Session, rows: list[dict[str, object]]) -> dict[str, object]:

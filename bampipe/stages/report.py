@@ -39,7 +39,7 @@ class Config:
 
     Attributes:
         detail_model: the model whose parameters and predictions are shown in detail; "" for the
-            last of the ladder (the base model where there is no other).
+            best confirmed one.
     """
 
     detail_model: str = ""

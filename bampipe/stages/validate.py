@@ -19,7 +19,9 @@ from bampipe.identification.free_run import free_runs
 from bampipe.identification.terms import describe_terms
 from bampipe.physics import System, compile_model
 from bampipe.progress import Progress
+from bampipe.results.checks import find_failed_checks
 from bampipe.results.identify import IdentifyResult
+from bampipe.results.ingest import IngestResult
 from bampipe.results.standing import standing
 from bampipe.results.validate import (
     AxisError,
@@ -149,7 +151,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         notes += _silent_joints(system, compared, floor)
     write_parquet(out / f"models/{config.model}/residuals.parquet", _table(system, compared))
     describe_terms(evidence, p, estimates.covariance, config.model).write(out)
-    return _result(system, trials, compared, floor, free, notes, config.model).write(out)
+    return _result(run, system, trials, compared, floor, free, notes, estimates).write(out)
 
 
 def _silent_joints(
@@ -284,13 +286,14 @@ def _judged(found: AxisError, level: float | None, scatter: float) -> JudgedErro
 
 
 def _result(
+    run: RunFolder,
     system: System,
     trials: MeasuredTrials,
     compared: Sequence[_Compared],
     floor: NoiseFloor | None,
     free_run: FreeRun | None,
     notes: Sequence[str],
-    model: str,
+    identified: IdentifyResult,
 ) -> ValidateResult:
     """Return what validate.json says."""
     axes = {
@@ -315,8 +318,10 @@ def _result(
     )
     on = "held-out trials" if any(c.judged for c in compared) else "the trials it was fitted to"
     refusal = f"estimate refused ({'; '.join(refused)}); " if refused else ""
+    failed = tuple(find_failed_checks(run.read(IngestResult), identified, axes))
+    many = f"; {len(failed)} checks failed" if failed else ""
     return ValidateResult(
-        model=model,
+        model=identified.model,
         axes=axes,
         trials={
             c.trial_id: TrialError.model_validate(_errors(system, [c]) | {"held_out": c.judged})
@@ -327,8 +332,9 @@ def _result(
         cutoff_hz=dict(zip(system.coordinates, trials.band.cutoff_hz, strict=True)),
         floor_replays=0 if floor is None else floor.replays,
         refused=refused,
+        failed_checks=failed,
         notes=tuple(notes),
-        headline=f"{refusal}fit on {on}: {best}",
+        headline=f"{refusal}fit on {on}: {best}{many}".replace(" 1 checks", " 1 check"),
     )
 
 

@@ -398,4 +398,4 @@ def test_an_unfinished_model_is_not_the_one_to_extend(tmp_path: Path) -> None:
     effect = "stribeck:carriage"
     child = models.child_name("base", (effect,))
     models.write(tmp_path, ModelFile(name=child, parent="base", device="slider", effects=(effect,)))
-    assert loop.current_model(tmp_path) == "base"
+    assert models.counting_model(tmp_path) == "base"

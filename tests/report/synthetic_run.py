@@ -410,7 +410,7 @@ def write_comparison(root: Path) -> None:
             "sentence": "coulomb.yaw fell by 0.21 N.m, twice its uncertainty.",
         }
     ]  # fmt: skip
-    write_result(root, CompareResult, ladder=ladder, parameters=named, moved=moved)
+    write_result(root, CompareResult, best=CHILD, ladder=ladder, parameters=named, moved=moved)
 
 
 def write_record(root: Path) -> None:

@@ -325,3 +325,17 @@ def test_text_from_files_cannot_break_the_page_or_the_print(tmp_path: Path) -> N
     assert "<script>" not in report.html
     assert nasty in text_of(report.html)
     assert report.pdf.startswith(b"%PDF")
+
+
+def test_green_means_that_no_check_failed(tmp_path: Path) -> None:
+    root = synthetic_run.write_all(tmp_path / "s01")
+    path = root / f"models/{synthetic_run.CHILD}/validate.json"
+    content = json.loads(path.read_text())
+    assert "callout good" in build(Results(root), quiet).html
+    content["failed_checks"] = ["yaw, innovations: Not white: 60 % of their variance is left."]
+    path.write_text(json.dumps(content))
+    page = build(Results(root), quiet).html
+    start = text_of(page)[:1500]
+    assert "nothing is missing, but 1 check failed" in start
+    assert "Yaw, innovations: Not white: 60 % of their variance is left." in start
+    assert "callout good" not in page

@@ -67,7 +67,11 @@ def _ladder(results: Results) -> str:
     compared = results.read(CompareResult)
     if compared is None or len(compared.ladder) < 2:
         return ""
-    first, last = compared.ladder[0], compared.ladder[-1]
+    first = compared.ladder[0]
+    number = [rung.model for rung in compared.ladder].index(results.model)
+    last = compared.ladder[number]
+    if last is first:
+        return f"Of {len(compared.ladder)} models none has a lower error than `{first.model}`."
     changes = []
     for axis in verdicts.ordered(results, first.held_out_rmse):
         before, after = first.held_out_rmse[axis], last.held_out_rmse.get(axis)
@@ -78,8 +82,8 @@ def _ladder(results: Results) -> str:
         text = f"{axis} {wording.significant(before)} to {wording.significant(after)} {unit}"
         changes.append(text + (f" (floor {wording.significant(floor)})" if floor else ""))
     return (
-        f"From model `{first.model}` to version {len(compared.ladder) - 1} (`{last.model}`) the "
-        f"error on held-out trials went: {'; '.join(changes)}."
+        f"From model `{first.model}` to version {number} (`{last.model}`), the best confirmed one, "
+        f"the error on held-out trials went: {'; '.join(changes)}."
     )
 
 

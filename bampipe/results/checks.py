@@ -1,0 +1,52 @@
+"""Every check that a model fails, in words: what report, lab, gates and command line read."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+from bampipe.results.identify import IdentifyResult
+from bampipe.results.ingest import IngestResult
+from bampipe.results.standing import STANDINGS_IN_WORDS
+from bampipe.results.validate import JudgedError
+
+_TIMING_LIMIT = 0.95
+"""Share of half a sample beyond which the timing of the inputs counts as at its limit."""
+
+
+def find_failed_checks(
+    session: IngestResult, identified: IdentifyResult, errors: Mapping[str, JudgedError]
+) -> Iterator[str]:
+    """Yield a sentence on every check that fails.
+
+    Args:
+        session: what ingest says; identified: the model; errors: its errors by axis.
+    """
+    for place in session.placeholders:
+        yield f"{place}: a placeholder, its source still says `fill in`"
+    for axis, channel in session.axes.items():
+        if channel.resolution == 0.0:
+            yield f"{axis}: resolution and noise of the encoder are not known"
+    for name, sd in session.force.noise_sd.items():
+        if sd == 0.0:
+            yield f"{name}: the noise of its samples is not known"
+    if not identified.convergence.converged:
+        yield "the estimates have not converged"
+    timing, half = identified.input_timing, 0.5 / session.sample_rate_hz
+    if timing.sd > 0.0 and abs(timing.estimate) >= _TIMING_LIMIT * half:
+        yield (
+            f"input timing: {1e3 * timing.estimate:.3g} ms, at its limit of half a sample: a delay"
+            " that the model lacks, or clocks that disagree"
+        )
+    for axis, tests in (identified.innovations or {}).items():
+        white, independent = tests.whiteness, tests.inputs
+        if (white and not white.white) or (independent and not independent.independent):
+            yield f"{axis}, innovations: {tests.sentence}"
+    for axis, error in errors.items():
+        if error.estimate == "refused":
+            yield (
+                f"{axis}: the published parameters are refused, they err by"
+                f" {error.published_rmse:.3g} {error.unit} where parameters refitted without each"
+                f" trial err by {error.held_out_rmse:.3g}"
+            )
+        if error.standing in ("floor_implausible", "floor_missing"):
+            yield f"{axis}: the error is {STANDINGS_IN_WORDS[error.standing]}"

@@ -1,0 +1,82 @@
+"""Every check that a model can fail is heard, and said with its axis."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from made_results import filled
+
+from bampipe.results.checks import find_failed_checks
+from bampipe.results.identify import IdentifyResult
+from bampipe.results.ingest import IngestResult
+from bampipe.results.validate import JudgedError
+
+SOUND: dict[str, Any] = {
+    "session": {
+        "sample_rate_hz": 500.0,
+        "axes": {"yaw": {"unit": "rad", "resolution": 1e-4}},
+        "force": {"noise_sd": {"force_x": 0.05}},
+    },
+    "fit": {
+        "convergence": {"converged": True},
+        "input_timing": {"estimate": 5e-4, "sd": 1e-4},
+        "innovations": {
+            "yaw": {
+                "sentence": "20 % from the inputs",
+                "whiteness": {"white": True},
+                "inputs": {"independent": True},
+            }
+        },
+    },
+    "yaw": {"standing": "above_floor", "estimate": "accepted"},
+}
+
+
+def failed(**changes: dict[str, Any]) -> list[str]:
+    content = {name: {**part, **changes.get(name, {})} for name, part in SOUND.items()}
+    session, fit, yaw = (
+        kind.model_validate(filled(kind, content[name]))
+        for kind, name in ((IngestResult, "session"), (IdentifyResult, "fit"), (JudgedError, "yaw"))
+    )
+    return list(find_failed_checks(session, fit, {"yaw": yaw}))
+
+
+def test_a_sound_model_fails_none() -> None:
+    assert failed() == []
+
+
+@pytest.mark.parametrize(
+    ("where", "change", "words"),
+    [
+        (
+            "session",
+            {"placeholders": ["device.constants.ratio"]},
+            "device.constants.ratio: a place",
+        ),
+        ("session", {"axes": {"yaw": {"unit": "rad", "resolution": 0.0}}}, "yaw: resolution"),
+        ("session", {"force": {"noise_sd": {"force_x": 0.0}}}, "force_x: the noise"),
+        ("fit", {"convergence": {"converged": False}}, "not converged"),
+        ("fit", {"input_timing": {"estimate": -9.9e-4, "sd": 1e-4}}, "input timing: -0.99 ms"),
+        (
+            "fit",
+            {"innovations": {"yaw": {"sentence": "Not white", "whiteness": {"white": False}}}},
+            "yaw, innovations: Not white",
+        ),
+        (
+            "fit",
+            {"innovations": {"yaw": {"sentence": "Not so", "inputs": {"independent": False}}}},
+            "yaw, innovations: Not so",
+        ),
+        ("yaw", {"estimate": "refused"}, "yaw: the published parameters are refused"),
+        ("yaw", {"standing": "floor_implausible"}, "yaw: the error is far below its noise floor"),
+        ("yaw", {"standing": "floor_missing"}, "yaw: the error is without a noise floor"),
+    ],
+)
+def test_each_check_is_heard(where: str, change: dict[str, Any], words: str) -> None:
+    found = failed(**{where: change})
+    assert len(found) == 1 and words in found[0]
+
+
+def test_a_timing_that_was_not_estimated_is_at_no_limit() -> None:
+    assert failed(fit={"input_timing": {"estimate": 1e-3, "sd": 0.0}}) == []

@@ -1,0 +1,72 @@
+"""Which model version is confirmed, and which one counts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from made_results import write_result
+
+from bampipe.data.run_folder import RunFolder
+from bampipe.declarations.model import ModelFile
+from bampipe.progress import silent
+from bampipe.results.compare import CompareResult
+from bampipe.results.identify import IdentifyResult
+from bampipe.results.validate import ValidateResult
+from bampipe.run import models
+from bampipe.stages import compare
+
+
+def add(root: Path, name: str, parent: str, refused: bool = False, **errors: float) -> None:
+    """A model version with these held-out errors by axis."""
+    effects = tuple(part.replace(".", ":") for part in name.split("+")[1:])
+    models.write(root, ModelFile(name=name, parent=parent, device="bam", effects=effects))
+    write_result(root, IdentifyResult, model=name, parameters={})
+    axes = {axis: {"held_out_rmse": error, "unit": "N.m"} for axis, error in errors.items()}
+    why = ["yaw: they err by more"] if refused else []
+    write_result(root, ValidateResult, model=name, axes=axes, refused=why)
+
+
+def compared(root: Path) -> CompareResult:
+    compare.execute(RunFolder(root), root, compare.Config(), silent)
+    return CompareResult.read(root / CompareResult.FILE)
+
+
+def test_the_best_confirmed_model_counts(tmp_path: Path) -> None:
+    add(tmp_path, "base", "", yaw=0.50, pitch=0.2)
+    add(tmp_path, "base+a.yaw", "base", yaw=0.30, pitch=0.2)
+    add(tmp_path, "base+a.yaw+b.yaw", "base+a.yaw", yaw=0.20, pitch=0.2)
+    add(tmp_path, "base+c.yaw", "base", yaw=0.25, pitch=0.2)
+    found = compared(tmp_path)
+    assert {rung.model: rung.confirmed for rung in found.ladder} == dict.fromkeys(
+        models.names(tmp_path), True
+    )
+    assert found.best == models.counting_model(tmp_path) == "base+a.yaw+b.yaw"
+
+
+@pytest.mark.parametrize(
+    ("errors", "refused"),
+    [
+        ({"yaw": 0.50, "pitch": 0.2}, False),  # the same
+        ({"yaw": 0.498, "pitch": 0.2}, False),  # a fall that a superfluous effect has, too
+        ({"yaw": 0.40, "pitch": 0.3}, False),  # one axis pays for the other
+        ({"yaw": 0.30, "pitch": 0.2}, True),  # its published parameters are refused
+    ],
+)
+def test_a_child_that_is_no_better_does_not_count(
+    tmp_path: Path, errors: dict[str, float], refused: bool
+) -> None:
+    add(tmp_path, "base", "", yaw=0.50, pitch=0.2)
+    add(tmp_path, "base+a.yaw", "base", refused, **errors)
+    add(tmp_path, "base+a.yaw+b.yaw", "base+a.yaw", yaw=0.1, pitch=0.1)
+    found = compared(tmp_path)
+    assert [rung.confirmed for rung in found.ladder] == [True, False, False]
+    assert found.best == models.counting_model(tmp_path) == "base"
+
+
+def test_a_damaged_ladder_is_as_none(tmp_path: Path) -> None:
+    add(tmp_path, "base", "", yaw=0.5)
+    add(tmp_path, "base+a.yaw", "base", yaw=0.2)
+    compared(tmp_path)
+    (tmp_path / CompareResult.FILE).write_text("{")
+    assert models.counting_model(tmp_path) == "base"
