@@ -99,7 +99,7 @@ def test_version(command: Command) -> None:
 @pytest.mark.parametrize("group", [[], ["device"]])
 def test_help_cuts_no_summary_short(group: list[str], command: Command) -> None:
     _, out, _ = command(*group, "--help")
-    assert "..." not in out
+    assert "..." not in out.partition("Commands:")[2]
     if not group:
         assert "Read a session's raw logs: convert to SI units, repair, set bad" in out
 

@@ -82,7 +82,7 @@ def _errors(run: RunFolder, model: str) -> str:
     """Return held-out error over floor, axis by axis."""
     from bampipe.results.validate import ValidateResult
 
-    if not run.exists(ValidateResult.file(model)):
+    if not model or not run.exists(ValidateResult.file(model)):
         return ""
     try:
         axes = run.read(ValidateResult, model).axes

@@ -40,6 +40,7 @@ def made(**changes: Any) -> ValidateResult:
         "cutoff_hz": {"yaw": 8.0},
         "floor_replays": 1,
         "refused": (),
+        "failed_checks": (),
         "notes": (),
         "axes": {"yaw": JUDGED},
         "trials": {"t01": TrialError(held_out=True, yaw=ERROR)},
