@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from conftest import misfits
+from made_results import write_result
 from made_runs import Made
 
 from bampipe.data import lab_tables
@@ -18,6 +19,7 @@ from bampipe.errors import InputError
 from bampipe.files import digest_file
 from bampipe.lab.collect import collect
 from bampipe.lab.folders import is_current
+from bampipe.results.compare import CompareResult
 from bampipe.run.accepted import accept
 
 ROOT = Path(__file__).parent.parent.parent
@@ -103,6 +105,22 @@ def test_what_was_not_diagnosed_is_said(tmp_path: Path) -> None:
     found = verdicts(make_lab(tmp_path, {3: unasked, 4: above}))
     assert found["s03"]["verdict"] == found["s04"]["verdict"] == "not diagnosed"
     assert found["s04"]["remedy"] == "bampipe diagnose s04 --model base"
+
+
+def test_a_session_is_judged_by_its_best_confirmed_model(tmp_path: Path) -> None:
+    name, high = "base+stribeck.yaw", {"yaw": 3.0, "pitch": 1.0}
+    extended = changed(
+        4, estimates(4), error=high, verdicts=MISSING, child=("stribeck:yaw", estimates(4))
+    )
+    runs = make_lab(tmp_path, {4: extended})
+    before = verdicts(runs)["s04"]
+    assert (before["model"], before["above_floor"]) == ("base", True)
+    assert before["verdict"] == "missing effect"
+    ladder = [{"model": "base"}, {"model": name, "parent": "base"}]
+    write_result(runs / "s04", CompareResult, best=name, ladder=ladder)
+    after = verdicts(runs)["s04"]
+    assert (after["model"], after["above_floor"], after["verdict"]) == (name, False, "in control")
+    assert after["worst"] == (1.0, "yaw")
 
 
 @pytest.mark.parametrize("sessions", [2, 9])
