@@ -45,8 +45,8 @@ class InputError(Exception):
 
     def __reduce__(self) -> tuple[object, ...]:
         """Rebuild from keywords too, so that it comes whole out of a worker process."""
-        kept = {"where": self.where, "remedy": self.remedy, "others": self.others}
-        return partial(type(self), **kept), (self.what,)
+        whole = partial(type(self), where=self.where, remedy=self.remedy, others=self.others)
+        return whole, (self.what,)
 
     def lines(self) -> list[str]:
         """Return every mistake, a line each."""

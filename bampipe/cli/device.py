@@ -122,7 +122,8 @@ def check(
         show.say(f"next: {_after(file)}")
 
 
-for _name, _command in {"list": list_, "show": show_, "check": check}.items():
+COMMANDS: dict[str, Callable[..., None]] = {"list": list_, "show": show_, "check": check}
+for _name, _command in COMMANDS.items():
     app.command(_name, short_help=summary_of(_command))(_command)
 
 

@@ -103,6 +103,7 @@ def table(found: Lab) -> None:
         [
             one.session,
             one.recorded[:16].replace("T", " "),
+            one.model,
             f"{one.worst[0]:.3g} {one.worst[1]}" if one.worst else None,
             one.verdict,
             one.sentence,
@@ -110,7 +111,7 @@ def table(found: Lab) -> None:
         for one in (sessions if len(sessions) <= MOST_SESSIONS else odd)
     ]
     if rows:
-        show.table(["session", "recorded", "error / floor", "verdict", ""], rows)
+        show.table(["session", "recorded", "model", "error / floor", "verdict", ""], rows)
     for line in _trend_lines(found.content.series):
         show.say(line)
     fewest = found.content.fewest_sessions

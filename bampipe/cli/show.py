@@ -155,7 +155,9 @@ def summary(content: Mapping[str, object]) -> None:
     if "ladder" in content:
         from bampipe.results.compare import CompareResult
 
-        _ladder(CompareResult.model_validate(content).ladder)
+        compared = CompareResult.model_validate(content)
+        _ladder(compared.ladder)
+        _counting(compared.best)
     for row in [*(_records(content.get("axes")) or []), *(_records(content.get("moved")) or [])]:
         if isinstance(row.get("sentence"), str):
             say(str(row["sentence"]))
@@ -245,8 +247,12 @@ def outcome(result: Outcome) -> None:
             [[one.gate, one.model, one.key, one.state, one.message] for one in shown],
         )
     if result.model:
-        say("")
-        say(f"model that counts: {result.model}; --model takes another")
+        _counting(result.model)
+
+
+def _counting(model: str) -> None:
+    say("")
+    say(f"model that counts: {model}; --model takes another")
 
 
 def _first_line(content: Mapping[str, object]) -> str:
