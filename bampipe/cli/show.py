@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+import threading
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -260,6 +261,14 @@ def _first_line(content: Mapping[str, object]) -> str:
     return line if isinstance(line, str) else ""
 
 
+class _Line:
+    """What was last written of a step that is under way."""
+
+    def __init__(self, now: float) -> None:
+        self.started = self.written = now
+        self.fraction, self.message = 0.0, ""
+
+
 UNDER_WAY: dict[str, str] = {}
 """By run: the step that has started and not ended, or ""."""
 
@@ -277,7 +286,8 @@ class Watcher:
         self.several = several
         self.bars: Any = None
         self.tasks: dict[str, Any] = {}
-        self.lines: dict[str, tuple[float, float]] = {}
+        self.lines: dict[str, _Line] = {}
+        self.lock, self.over = threading.Lock(), threading.Event()
 
     def __enter__(self) -> Watcher:
         if not self.quiet and sys.stderr.isatty():
@@ -294,6 +304,8 @@ class Watcher:
                 transient=True,
             )
             self.bars.start()
+        elif not self.quiet:
+            threading.Thread(target=self._keep_writing, daemon=True).start()
         return self
 
     def __exit__(
@@ -302,6 +314,7 @@ class Watcher:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
+        self.over.set()
         if self.bars is not None:
             self.bars.stop()
 
@@ -324,16 +337,30 @@ class Watcher:
 
     def _write(self, event: Event, name: str) -> None:
         """A line where a step starts, and one every so often while it goes on."""
-        now = time.monotonic()
-        if event.kind == "start":
-            self.lines[name] = now, now
-            note(f"{name} ({event.message})" if event.message else name)
-        elif event.kind == "progress":
-            started, written = self.lines.setdefault(name, (now, now))
-            if now - written >= QUIET_S:
-                self.lines[name] = started, now
-                percent = f"{100.0 * event.fraction:.0f} %, {now - started:.0f} s"
-                note(f"{name}: {percent}, {event.message}".removesuffix(", "))
+        with self.lock:
+            if event.kind == "start":
+                self.lines[name] = _Line(time.monotonic())
+                note(f"{name} ({event.message})" if event.message else name)
+            elif event.kind == "progress":
+                line = self.lines.setdefault(name, _Line(time.monotonic()))
+                line.fraction, line.message = event.fraction, event.message
+            else:
+                self.lines.pop(name, None)
+        self.write_late_lines()
+
+    def write_late_lines(self) -> None:
+        """Write a line on each step of which none was written for some time."""
+        with self.lock:
+            for name, line in self.lines.items():
+                now = time.monotonic()
+                if now - line.written >= QUIET_S:
+                    line.written = now
+                    percent = f"{100.0 * line.fraction:.0f} %, {now - line.started:.0f} s"
+                    note(f"{name}: {percent}, {line.message}".removesuffix(", "))
+
+    def _keep_writing(self) -> None:
+        while not self.over.wait(1.0):
+            self.write_late_lines()
 
     def _draw(self, event: Event, name: str) -> None:
         if event.kind in ("start", "progress"):

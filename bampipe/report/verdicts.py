@@ -40,7 +40,7 @@ def ordered(results: Results, by_axis: Collection[str]) -> tuple[str, ...]:
 def overall(results: Results) -> Callout:
     """Return the verdict on the session: good where no check failed and nothing is outdated."""
     validated = results.read(ValidateResult, results.model)
-    if validated is not None and validated.refused:
+    if validated is not None and validated.is_refused:
         return Callout(
             "attention",
             "The published parameters are refused",

@@ -104,10 +104,6 @@ class ValidateResult(Result):
     headline: str
     cutoff_hz: dict[str, Positive] = Field(description="Low-pass of both sides by axis, Hz")
     floor_replays: Count = Field(description="Replays that the noise floor is the mean of")
-    refused: Names = Field(
-        description="Why the published parameters are refused: they err by more than 1.2 times "
-        "what parameters refitted without each trial do"
-    )
     failed_checks: Names = Field(
         description="Of data, estimate and floor, a sentence each; a model is sound without any"
     )
@@ -120,3 +116,8 @@ class ValidateResult(Result):
         description="Handle force by component, identified parameters"
     )
     free_run: FreeRun | None = None
+
+    @property
+    def is_refused(self) -> bool:
+        """Whether the published parameters of any axis are refused."""
+        return any(error.estimate == "refused" for error in self.axes.values())

@@ -92,7 +92,7 @@ def _rung(
         free_run=free.axes if free else {},
     )
     before = earlier.get(parent)
-    if before is None or not before.confirmed or validated.refused:
+    if before is None or not before.confirmed or validated.is_refused:
         return rung
     falls = _log_error(rung) < _log_error(before) - NOTICEABLE
     return rung.model_copy(update={"confirmed": falls})

@@ -300,12 +300,6 @@ def _result(
         axis: _judged(found, floor.mean[i] if floor else None, floor.sd[i] if floor else 0.0)
         for i, (axis, found) in enumerate(_errors(system, compared).items())
     }
-    refused = tuple(
-        f"{axis}: the published parameters err by {entry.published_rmse:.3g} {entry.unit} on the"
-        f" trials where parameters refitted without them err by {entry.held_out_rmse:.3g}"
-        for axis, entry in axes.items()
-        if entry.estimate == "refused"
-    )
     forces = {}
     for column, name in enumerate(system.model.device.forces):
         error_of = np.concatenate([c.force_residual[c.used.all(axis=1), column] for c in compared])
@@ -317,9 +311,10 @@ def _result(
         if entry.fit_percent is not None
     )
     on = "held-out trials" if any(c.judged for c in compared) else "the trials it was fitted to"
-    refusal = f"estimate refused ({'; '.join(refused)}); " if refused else ""
+    refused = ", ".join(axis for axis, entry in axes.items() if entry.estimate == "refused")
+    refusal = f"estimate refused ({refused}); " if refused else ""
     failed = tuple(find_failed_checks(run.read(IngestResult), identified, axes))
-    many = f"; {len(failed)} checks failed" if failed else ""
+    checks = f"; {len(failed)} check{'s' if len(failed) > 1 else ''} failed" if failed else ""
     return ValidateResult(
         model=identified.model,
         axes=axes,
@@ -331,10 +326,9 @@ def _result(
         free_run=free_run,
         cutoff_hz=dict(zip(system.coordinates, trials.band.cutoff_hz, strict=True)),
         floor_replays=0 if floor is None else floor.replays,
-        refused=refused,
         failed_checks=failed,
         notes=tuple(notes),
-        headline=f"{refusal}fit on {on}: {best}{many}".replace(" 1 checks", " 1 check"),
+        headline=f"{refusal}fit on {on}: {best}{checks}",
     )
 
 

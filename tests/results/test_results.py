@@ -39,7 +39,6 @@ def made(**changes: Any) -> ValidateResult:
         "headline": "fit",
         "cutoff_hz": {"yaw": 8.0},
         "floor_replays": 1,
-        "refused": (),
         "failed_checks": (),
         "notes": (),
         "axes": {"yaw": JUDGED},

@@ -22,9 +22,9 @@ def add(root: Path, name: str, parent: str, refused: bool = False, **errors: flo
     effects = tuple(part.replace(".", ":") for part in name.split("+")[1:])
     models.write(root, ModelFile(name=name, parent=parent, device="bam", effects=effects))
     write_result(root, IdentifyResult, model=name, parameters={})
-    axes = {axis: {"held_out_rmse": error, "unit": "N.m"} for axis, error in errors.items()}
-    why = ["yaw: they err by more"] if refused else []
-    write_result(root, ValidateResult, model=name, axes=axes, refused=why)
+    said = {"unit": "N.m", "estimate": "refused" if refused else "accepted"}
+    axes = {axis: {"held_out_rmse": error, **said} for axis, error in errors.items()}
+    write_result(root, ValidateResult, model=name, axes=axes)
 
 
 def compared(root: Path) -> CompareResult:

@@ -190,6 +190,18 @@ def test_a_device_of_another_kind(tmp_path):
     assert copy.read_bytes() == (session / "my/sled.toml").read_bytes()
 
 
+def test_a_number_that_was_to_be_filled_in_is_named(tmp_path):
+    made = sled()
+    made.files["my/sled.toml"] = SLED + (
+        '\n[constants]\nratio = { value = 1.0, unit = "m/rad", source = "fill in: data sheet" }\n'
+        'load = { value = 2.0, unit = "kg", source = "weighed" }\n'
+    )
+    summary = run_ingest(made.write(tmp_path / "session"), tmp_path / "out")
+    content = read_json(tmp_path / "out/ingest/session.json")
+    assert content["placeholders"] == ["device.constants.ratio"]
+    assert summary["notes"] == ["device.constants.ratio: its source still says `fill in`"]
+
+
 def test_a_force_in_another_unit_than_the_device_takes(tmp_path):
     session = sled("N.m").write(tmp_path / "session")
     with pytest.raises(InputError, match=r'force\.unit: found "N\.m", but device \'sled\' takes N'):
