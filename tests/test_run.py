@@ -16,10 +16,12 @@ from pathlib import Path
 import install_toys
 import pytest
 from conftest import TOYS, Toy, contents
+from made_results import write_result
 
 from bampipe.declarations.model import ModelFile
 from bampipe.declarations.pipeline import Gate
 from bampipe.errors import InputError
+from bampipe.results.compare import CompareResult
 from bampipe.run import batch, gates, junit, models, record
 from bampipe.run import pipeline as pipelines
 from bampipe.run.request import Outcome
@@ -414,6 +416,28 @@ def test_children_are_refreshed_once_they_were_run(toy: Toy) -> None:
     toy.run()
     assert toy.ran() == [*ALL[:3], f"toy_fit:{name}", "toy_sum"]
     assert models.read(toy.root, name).effects == ("stribeck:yaw",)
+
+
+def test_gates_judge_the_best_confirmed_model_and_its_stages_run(toy: Toy) -> None:
+    with toy.pipeline_file.open("a") as file:
+        file.write(
+            '\n[[gates]]\nname = "fits"\nresult = "models/{model}/fit.json"\n'
+            'value = "total"\nmax = 1e9\n'
+        )
+    assert [verdict.model for verdict in toy.run().verdicts if verdict.gate == "fits"] == ["base"]
+    child = models.child_name("base", "stribeck:yaw")
+    device = models.read(toy.root, "base").device
+    file = ModelFile(name=child, parent="base", device=device, effects=("stribeck:yaw",))
+    models.write(toy.root, file)
+    write_result(toy.root, CompareResult, best=child, ladder=[{"model": "base"}, {"model": child}])
+    toy.ran()
+    outcome = toy.run()
+    assert toy.ran() == [f"toy_fit:{child}", "toy_sum"]
+    assert outcome.model == child
+    rows = [(verdict.gate, verdict.model, verdict.state) for verdict in outcome.verdicts]
+    assert ("fits", child, "passed") in rows
+    assert {model for gate, model, _ in rows if gate == "small enough"} == {""}
+    assert toy.run(model="base").model == "base"
 
 
 def test_a_new_effect_file_reruns_its_model(toy: Toy) -> None:
