@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 
-from bampipe.results.identify import IdentifyResult
+from bampipe.results.identify import METHODS_IN_WORDS, IdentifyResult
 from bampipe.results.ingest import IngestResult
 from bampipe.results.standing import STANDINGS_IN_WORDS
 from bampipe.results.validate import JudgedError
@@ -29,7 +29,10 @@ def find_failed_checks(
     for name, sd in session.force.noise_sd.items():
         if sd == 0.0:
             yield f"{name}: the noise of its samples is not known"
-    if not identified.convergence.converged:
+    published = identified.methods.get(identified.method)
+    doubts = published.doubts if published else ()
+    yield from (f"estimate by {METHODS_IN_WORDS[identified.method]}: {doubt}" for doubt in doubts)
+    if not (identified.convergence.converged or doubts):
         yield "the estimates have not converged"
     timing, half = identified.input_timing, 0.5 / session.sample_rate_hz
     if timing.sd > 0.0 and abs(timing.estimate) >= _TIMING_LIMIT * half:

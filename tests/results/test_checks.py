@@ -56,6 +56,11 @@ def test_a_sound_model_fails_none() -> None:
         ),
         ("session", {"axes": {"yaw": {"unit": "rad", "resolution": 0.0}}}, "yaw: resolution"),
         ("session", {"force": {"noise_sd": {"force_x": 0.0}}}, "force_x: the noise"),
+        (
+            "fit",
+            {"methods": {"ukf": {"doubts": ["it lost the motion"]}}},
+            "by the unscented filter: it lost the motion",
+        ),
         ("fit", {"convergence": {"converged": False}}, "not converged"),
         ("fit", {"input_timing": {"estimate": -9.9e-4, "sd": 1e-4}}, "input timing: -0.99 ms"),
         (
