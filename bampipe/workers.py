@@ -11,6 +11,7 @@ import traceback
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from bampipe.errors import InputError
@@ -38,21 +39,42 @@ def _end_after(sentinel: int) -> None:
     os._exit(1)
 
 
+_parent: multiprocessing.connection.Connection | None = None
+"""In a worker process: the way to the one that started it."""
+
+
+def send_to_parent(message: object) -> None:
+    """In a worker process: have what was passed to `process_pool` as ``hear`` called with it."""
+    if _parent is None:
+        raise RuntimeError("this process was not started as a worker")
+    _parent.send(_Message(message))
+
+
 @contextmanager
 def process_pool(
-    jobs: int, initialize: Callable[..., object], *arguments: Any
+    jobs: int,
+    initialize: Callable[..., object],
+    *arguments: Any,
+    nested: bool = False,
+    hear: Callable[[Any], None] = lambda message: None,
 ) -> Iterator[ProcessPool]:
     """A pool of worker processes for the length of the block; what they are at then is given up.
 
     Args:
         jobs: number of processes.
         initialize: called in each process before its first task, with ``arguments``.
+        nested: whether tasks start processes of their own; the workers then begin afresh.
+        hear: called with every message of `send_to_parent`.
     """
     workers: list[_Worker] = []
+
+    def start() -> None:
+        workers.append(_Worker(initialize, arguments, nested))
+
     try:
         for _ in range(jobs):
-            workers.append(_Worker(initialize, arguments))
-        yield ProcessPool(workers)
+            start()
+        yield ProcessPool(workers, start, hear)
     finally:
         for worker in workers:
             worker.process.kill()
@@ -68,24 +90,34 @@ class ProcessPool:
     of Ctrl-C, waits there for every task, or for ever if it comes while the processes start.
     """
 
-    def __init__(self, workers: list[_Worker]) -> None:
-        self._workers = workers
-        self._waiting: deque[tuple[int, object]] = deque()
+    def __init__(
+        self, workers: list[_Worker], start: Callable[[], None], hear: Callable[[Any], None]
+    ) -> None:
+        self._workers, self._start, self._hear = workers, start, hear
+        self._waiting: deque[_Task] = deque()
         self._results: dict[int, _Reply] = {}
         self._number = 0
 
     def map(
-        self, function: Callable[[Task], Returned], tasks: Iterable[Task]
+        self,
+        function: Callable[[Task], Returned],
+        tasks: Iterable[Task],
+        lost: Callable[[Task, InputError], Returned] | None = None,
     ) -> Iterator[Returned]:
         """Start ``function`` on every task, and return the results in the order of the tasks.
 
+        Args:
+            function: of a module, what it takes and returns can be pickled; tasks: what it takes.
+            lost: gives the result of a task whose worker process was ended; another takes its
+                place.
+
         Raises:
-            InputError: a worker process was ended by another.
+            InputError: a worker process was ended by another, and there is no ``lost``.
             Exception: what ``function`` raised, with the traceback of the worker as a note.
         """
         first = self._number
         for task in tasks:
-            self._waiting.append((self._number, (function, task)))
+            self._waiting.append(_Task(self._number, function, task, lost))
             self._number += 1
         self._deal()
         return self._in_order(range(first, self._number))
@@ -102,9 +134,9 @@ class ProcessPool:
     def _deal(self) -> None:
         for worker in self._workers:
             if worker.task is None and self._waiting:
-                worker.task, call = self._waiting.popleft()
+                worker.task = self._waiting.popleft()
                 try:
-                    worker.pipe.send(call)
+                    worker.pipe.send((worker.task.function, worker.task.argument))
                 except BrokenPipeError as error:
                     raise worker.lost() from error
 
@@ -113,29 +145,61 @@ class ProcessPool:
         busy = {worker.pipe: worker for worker in self._workers if worker.task is not None}
         for pipe in multiprocessing.connection.wait(list(busy)):
             worker = busy[pipe]  # type: ignore[index]
-            assert worker.task is not None
+            task = worker.task
+            assert task is not None
             try:
-                self._results[worker.task] = worker.pipe.recv()
+                answer = worker.pipe.recv()
             except (EOFError, ConnectionResetError) as error:
-                raise worker.lost() from error
+                if task.lost is None:
+                    raise worker.lost() from error
+                self._results[task.number] = task.lost(task.argument, worker.lost()), None
+                self._workers.remove(worker)
+                worker.pipe.close()
+                if self._waiting:
+                    self._start()
+                continue
+            if isinstance(answer, _Message):
+                self._hear(answer.content)
+                continue
+            self._results[task.number] = answer
             worker.task = None
         self._deal()
+
+
+@dataclass(frozen=True)
+class _Task:
+    """A call that a worker makes, and what stands for its result where the worker is ended."""
+
+    number: int
+    function: Callable[[Any], Any]
+    argument: Any
+    lost: Callable[[Any, InputError], Any] | None
+
+
+@dataclass(frozen=True)
+class _Message:
+    """What a task sends before it is done."""
+
+    content: object
 
 
 _Reply = tuple[object, Exception | None]
 
 
 class _Worker:
-    """A worker process, the pipe to it, and the number of the task it is at."""
+    """A worker process, the pipe to it, and the task it is at."""
 
-    def __init__(self, initialize: Callable[..., object], arguments: tuple[Any, ...]) -> None:
+    def __init__(
+        self, initialize: Callable[..., object], arguments: tuple[Any, ...], nested: bool
+    ) -> None:
         self.pipe, far = multiprocessing.Pipe()
-        self.process = multiprocessing.Process(
-            target=_serve, args=(far, initialize, arguments), daemon=True
+        kind = multiprocessing.get_context("spawn") if nested else multiprocessing.get_context()
+        self.process = kind.Process(  # type: ignore[attr-defined]
+            target=_serve, args=(far, initialize, arguments), daemon=not nested
         )
         self.process.start()
         far.close()
-        self.task: int | None = None
+        self.task: _Task | None = None
 
     def lost(self) -> InputError:
         self.process.join()
@@ -150,7 +214,9 @@ def _serve(
     initialize: Callable[..., object],
     arguments: tuple[Any, ...],
 ) -> None:
+    global _parent
     end_with_parent()
+    _parent = pipe
     initialize(*arguments)
     while True:
         function, task = pipe.recv()

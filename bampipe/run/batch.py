@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import multiprocessing
-import multiprocessing.connection
 import os
 import traceback
 from collections.abc import Sequence
-from typing import Any
 
 from bampipe.errors import InputError
 from bampipe.run import record
-from bampipe.run.events import Event, Listener
+from bampipe.run.events import Listener
 from bampipe.run.publish import check_address, publish
 from bampipe.run.request import Outcome, Request
 from bampipe.run.runner import run_session
-from bampipe.workers import end_with_parent
+from bampipe.workers import process_pool, send_to_parent
 
 THREAD_VARIABLES = (
     "OMP_NUM_THREADS",
@@ -76,46 +73,15 @@ def guarded(request: Request, listen: Listener) -> Outcome:
         return Outcome(request.root, "crashed", error=text, traceback=traceback.format_exc())
 
 
-def _work(pipe: multiprocessing.connection.Connection) -> None:
-    end_with_parent()
-
-    def listen(event: Event) -> None:
-        pipe.send(event)
-
-    while True:
-        request = pipe.recv()
-        if request is None:
-            return
-        pipe.send(guarded(request, listen))
+def _guarded_in_worker(request: Request) -> Outcome:
+    return guarded(request, send_to_parent)
 
 
-class _Worker:
-    def __init__(self) -> None:
-        context = multiprocessing.get_context("spawn")
-        self.pipe, far = context.Pipe()
-        self.process = context.Process(target=_work, args=(far,), daemon=False)
-        self.process.start()
-        far.close()
-        self.task: int | None = None
-
-    def give(self, index: int, request: Request) -> None:
-        self.task = index
-        self.pipe.send(request)
-
-    def stop(self) -> None:
-        if self.process.is_alive() and self.task is None:
-            self.pipe.send(None)
-        else:
-            self.process.terminate()
-        self.process.join()
-        self.pipe.close()
+def _crashed(request: Request, error: InputError) -> Outcome:
+    return Outcome(request.root, "crashed", error=error.what)
 
 
-def run_sessions(
-    requests: Sequence[Request],
-    jobs: int,
-    listen: Listener,
-) -> list[Outcome]:
+def run_sessions(requests: Sequence[Request], jobs: int, listen: Listener) -> list[Outcome]:
     """Run several sessions.
 
     A worker process that dies (killed, out of memory) costs only the session it was at work on,
@@ -131,43 +97,5 @@ def run_sessions(
     """
     if jobs <= 1 or len(requests) <= 1:
         return [guarded(request, listen) for request in requests]
-    done: dict[int, Outcome] = {}
-    waiting = list(enumerate(requests))[::-1]
-    workers: list[_Worker] = []
-
-    def settle(worker: _Worker, outcome: Outcome) -> None:
-        assert worker.task is not None
-        done[worker.task] = outcome
-        worker.task = None
-
-    try:
-        while len(done) < len(requests):
-            for worker in workers:
-                if worker.task is None and waiting:
-                    worker.give(*waiting.pop())
-            while waiting and len(workers) < jobs:
-                workers.append(_Worker())
-                workers[-1].give(*waiting.pop())
-            busy = {worker.pipe: worker for worker in workers if worker.task is not None}
-            for pipe in multiprocessing.connection.wait(list(busy)):
-                worker = busy[pipe]  # type: ignore[index]
-                try:
-                    message: Any = worker.pipe.recv()
-                except EOFError:
-                    worker.process.join()
-                    code = worker.process.exitcode
-                    assert worker.task is not None
-                    root = requests[worker.task].root
-                    text = f"the worker process died (exit code {code})"
-                    settle(worker, Outcome(root, "crashed", error=text))
-                    workers.remove(worker)
-                    worker.pipe.close()
-                    continue
-                if isinstance(message, Event):
-                    listen(message)
-                else:
-                    settle(worker, message)
-    finally:
-        for worker in workers:
-            worker.stop()
-    return [done[index] for index in range(len(requests))]
+    with process_pool(min(jobs, len(requests)), os.getpid, nested=True, hear=listen) as pool:
+        return list(pool.map(_guarded_in_worker, requests, _crashed))
