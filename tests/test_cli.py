@@ -481,11 +481,19 @@ def test_an_effect_is_not_added_twice(ingested: Path, command: Command) -> None:
     assert "has stribeck:yaw already" in error
 
 
-@pytest.mark.parametrize("selected", [["presliding:pitch", "force_delay"], []])
-def test_the_next_effects_are_all_that_the_diagnosis_selects(
-    tmp_path: Path, selected: list[str]
+@pytest.mark.parametrize(
+    ("verdict", "after"),
+    [
+        ("missing", "bampipe extend RUN stribeck:yaw --model base"),
+        ("undecided", "record more trials like these that move yaw"),
+        ("unknown_effect", "look at the residual maps of yaw with `bampipe report RUN`"),
+    ],
+)
+def test_what_to_do_next_is_what_the_diagnosis_stored(
+    ingested: Path, command: Command, verdict: str, after: str
 ) -> None:
-    from bampipe.api.loop import next_effects
+    from bampipe.cli.run import suggest_next
 
-    write_result(tmp_path, DiagnoseResult, axes={"yaw": {}}, selected=selected)
-    assert next_effects(tmp_path, "base") == tuple(selected)
+    assert suggest_next(ingested, "base", "s01") == "bampipe status s01"
+    write_result(ingested, DiagnoseResult, axes={"yaw": {"verdict": verdict}}, next=after)
+    assert suggest_next(ingested, "base", "s01") == after.replace("RUN", "s01")

@@ -89,16 +89,6 @@ def _diagnosis(root: Path, model: str) -> DiagnoseResult:
     return RunFolder(root).read(DiagnoseResult, model)
 
 
-def next_effects(root: Path, model: str) -> tuple[str, ...]:
-    """Return the effects that the diagnosis of ``model`` found, none if nothing is to be added.
-
-    Args:
-        root: the run folder; the model must have been diagnosed.
-        model: name of the model.
-    """
-    return _diagnosis(root, model).selected
-
-
 def _split_effect_file(text: str) -> tuple[Path, str] | None:
     """Split ``file.toml[:target]``; None if ``text`` names no file."""
     name, _, target = text.partition(":")
@@ -231,7 +221,9 @@ def follow(options: LoopOptions, model: str, tell: Callable[[str], None]) -> str
 def _add(
     options: LoopOptions, model: str, effects: tuple[str, ...], tell: Callable[[str], None]
 ) -> str:
-    """Extend ``model`` by those of ``effects`` that keep a strength; "" if that helps no axis."""
+    """Extend ``model`` by those of ``effects`` that keep a strength; "" if that is no better."""
+    from bampipe.results.compare import CompareResult
+
     tell(f"adding {', '.join(effects)}")
     child = extend(options, model, effects)
     idle = _without_strength(options.root, child, effects)
@@ -242,7 +234,8 @@ def _add(
         if not effects:
             return ""
         child = extend(options, model, effects)
-    if _better(options.root, model, child):
+    ladder = {rung.model: rung for rung in RunFolder(options.root).read(CompareResult).ladder}
+    if ladder[child].improves_on(ladder[model]):
         return child
     tell(f"{', '.join(effects)}: the held-out error does not fall after all, stopped at {model}")
     return ""
@@ -262,12 +255,3 @@ def _without_strength(root: Path, model: str, effects: Sequence[str]) -> tuple[s
         if effect.name in effects and strengths and unsure:
             idle.append(effect.name)
     return tuple(idle)
-
-
-def _better(root: Path, parent: str, child: str) -> bool:
-    """Whether ``child`` has a lower held-out error than ``parent`` on some axis."""
-    from bampipe.results.validate import ValidateResult
-
-    run = RunFolder(root)
-    before, after = (run.read(ValidateResult, model).axes for model in (parent, child))
-    return any(after[axis].held_out_rmse < before[axis].held_out_rmse for axis in before)

@@ -143,7 +143,7 @@ def run(
     refresh(runs, several, quiet or json)
     if not several:
         name = places.next_to(requests[0].root, runs)
-        advise(quiet, json, _after_run(outcomes[0], name))
+        advise(quiet, json, suggest_next(outcomes[0].root, outcomes[0].model, name))
     code = max(outcome.exit_code for outcome in outcomes)
     if code:
         raise typer.Exit(code)
@@ -209,12 +209,16 @@ def _report_runs(outcomes: Sequence[Outcome], several: bool, json: bool) -> None
         show.outcome(outcomes[0])
 
 
-def _after_run(outcome: Outcome, name: str) -> str:
-    """Return what to do now, as the results of the model that counts have it."""
+def suggest_next(root: Path, model: str, name: str) -> str:
+    """Return what to do after a run, as the results of the ``model`` that counts have it.
+
+    Args:
+        root: the run folder; name: how to call it in a command.
+    """
     from bampipe.results.diagnose import DiagnoseResult
     from bampipe.results.validate import ValidateResult
 
-    run, model = RunFolder(outcome.root), outcome.model
+    run = RunFolder(root)
     if run.exists(DiagnoseResult.file(model)):
         found = run.read(DiagnoseResult, model)
         if any(axis.verdict != "nothing_missing" for axis in found.axes.values()):
@@ -223,6 +227,6 @@ def _after_run(outcome: Outcome, name: str) -> str:
         errors = run.read(ValidateResult, model).axes.values()
         if any(error.standing == "above_floor" for error in errors):
             return f"bampipe diagnose {name}"
-    if (outcome.root / "report" / "report.pdf").is_file():
-        return f"open {outcome.root / 'report' / 'report.pdf'}"
+    if run.exists("report/report.pdf"):
+        return f"open {root / 'report' / 'report.pdf'}"
     return f"bampipe status {name}"

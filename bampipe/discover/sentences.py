@@ -5,7 +5,7 @@ from __future__ import annotations
 from bampipe.discover.description import describe
 from bampipe.discover.findings import AxisFinding, Contender, Diagnosis
 from bampipe.discover.influence import Stretch
-from bampipe.results.standing import STANDINGS_IN_WORDS
+from bampipe.results.standing import FLOOR_WRONG, STANDINGS_IN_WORDS
 
 
 def axis_sentences(found: Diagnosis) -> dict[str, str]:
@@ -19,7 +19,7 @@ def axis_sentences(found: Diagnosis) -> dict[str, str]:
 
 def _parts(axis: str, i: int, found: Diagnosis, unit: str) -> list[str]:
     a, name = found.axes[i], axis.capitalize()
-    if a.standing in ("floor_implausible", "floor_missing"):
+    if a.standing in FLOOR_WRONG:
         parts = [
             f"{name}: no verdict can be trusted, for its held-out error of {a.rmse_after:.3g} "
             f"{unit} is {STANDINGS_IN_WORDS[a.standing]} ({a.noise_floor:.3g} {unit})."

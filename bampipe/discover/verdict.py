@@ -16,7 +16,7 @@ from bampipe.discover.search import Search
 from bampipe.discover.settings import Settings
 from bampipe.discover.shape import explainable_share
 from bampipe.results.diagnose import Verdict
-from bampipe.results.standing import standing
+from bampipe.results.standing import FLOOR_WRONG, standing
 from bampipe.trials.noise_floor import NoiseFloor
 
 
@@ -50,7 +50,7 @@ def conclude(search: Search, s: Settings) -> Diagnosis:
         )
         verdict: Verdict
         at: dict[str, float] = {}
-        if against_floor in ("floor_implausible", "floor_missing"):
+        if against_floor in FLOOR_WRONG:
             verdict = "undecided"
         elif here:
             verdict = "missing"

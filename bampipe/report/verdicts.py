@@ -8,7 +8,7 @@ from bampipe.report import wording
 from bampipe.report.document import Callout
 from bampipe.report.results import Results
 from bampipe.results.diagnose import DiagnoseResult
-from bampipe.results.standing import STANDINGS_IN_WORDS
+from bampipe.results.standing import FLOOR_WRONG, STANDINGS_IN_WORDS
 from bampipe.results.validate import ValidateResult
 
 VERDICTS_IN_WORDS = {
@@ -141,6 +141,10 @@ def _diagnosed(results: Results, diagnosis: DiagnoseResult) -> Callout:
         )
     if by_verdict["undecided"]:
         where = wording.listing(by_verdict["undecided"])
-        return Callout("attention", f"No verdict on {where}: the noise floor is wrong", sentence)
+        wrong = [axis for axis in found if axes[axis].standing in FLOOR_WRONG]
+        title = f"Undecided on {where}: the error is above its floor, and no effect is sure"
+        if wrong:
+            title = f"No verdict on {wording.listing(wrong)}: the noise floor is wrong"
+        return Callout("attention", title, sentence)
     title = f"The model{with_effects} explains this session: nothing is missing"
     return Callout("good", title, sentence)

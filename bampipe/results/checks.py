@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 
 from bampipe.results.identify import METHODS_IN_WORDS, IdentifyResult
 from bampipe.results.ingest import IngestResult
-from bampipe.results.standing import STANDINGS_IN_WORDS
+from bampipe.results.standing import FLOOR_WRONG, STANDINGS_IN_WORDS
 from bampipe.results.validate import JudgedError
 
 _TIMING_LIMIT = 0.95
@@ -51,5 +51,5 @@ def find_failed_checks(
                 f" {error.published_rmse:.3g} {error.unit} where parameters refitted without each"
                 f" trial err by {error.held_out_rmse:.3g}"
             )
-        if error.standing in ("floor_implausible", "floor_missing"):
+        if error.standing in FLOOR_WRONG:
             yield f"{axis}: the error is {STANDINGS_IN_WORDS[error.standing]}"

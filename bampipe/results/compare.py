@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import ClassVar, Literal
 
 from pydantic import Field
@@ -9,6 +10,9 @@ from pydantic import Field
 from bampipe.results.record import Names, Record, Result, Size
 from bampipe.results.standing import Standing
 from bampipe.results.validate import FreeRunError
+
+NOTICEABLE = 0.01
+"""Least fall of the held-out error that confirms a model; a superfluous effect has less."""
 
 
 class Rung(Record):
@@ -28,6 +32,11 @@ class Rung(Record):
     unit: dict[str, str]
     free_run_mode: Literal["closed_loop", "open_loop"] | None = None
     free_run: dict[str, FreeRunError] = Field(default={}, description="By axis")
+
+    def improves_on(self, other: Rung) -> bool:
+        """Whether the held-out error, as the product over the axes, is noticeably lower."""
+        ratios = (self.held_out_rmse[a] / max(e, 1e-300) for a, e in other.held_out_rmse.items())
+        return math.prod(ratios) < 1.0 - NOTICEABLE
 
 
 class Value(Record):

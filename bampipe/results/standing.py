@@ -18,6 +18,9 @@ IMPLAUSIBLE = 0.7
 """Error over floor below which the floor is wrong: sensors noisier than the data, or a replay that
 does not resemble the machine."""
 
+FLOOR_WRONG = ("floor_implausible", "floor_missing")
+"""Standings in which an error cannot be judged."""
+
 STANDINGS_IN_WORDS = {
     "at_floor": "at the noise floor",
     "above_floor": "above the noise floor",

@@ -21,9 +21,6 @@ SUMMARY = "Held-out error of every model version, and which parameters moved"
 INPUTS = ("models/*/model.toml", "models/*/identify.json", "models/*/validate.json")
 OUTPUTS = ("compare.json",)
 
-NOTICEABLE = 0.01
-"""Least fall of the held-out error, of the product over the axes, that confirms a model."""
-
 
 @checked_dataclass(frozen=True, config=STRICT)
 class Config:
@@ -59,7 +56,9 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     for name in order:
         ladder[name] = _rung(run, name, models, ladder)
     confirmed = [name for name in order if ladder[name].confirmed]
-    best = min(confirmed, key=lambda name: _log_error(ladder[name]), default=order[0])
+    best = order[0]
+    for name in confirmed:
+        best = name if ladder[name].improves_on(ladder[best]) else best
     parameters: dict[str, dict[str, Value]] = {}
     for name in order:
         for key, found in run.read(IdentifyResult, name).parameters.items():
@@ -94,13 +93,7 @@ def _rung(
     before = earlier.get(parent)
     if before is None or not before.confirmed or validated.is_refused:
         return rung
-    falls = _log_error(rung) < _log_error(before) - NOTICEABLE
-    return rung.model_copy(update={"confirmed": falls})
-
-
-def _log_error(rung: Rung) -> float:
-    """Sum over the axes of the logarithm of the held-out error: ratios count, units do not."""
-    return sum(math.log(max(error, 1e-300)) for error in rung.held_out_rmse.values())
+    return rung.model_copy(update={"confirmed": rung.improves_on(before)})
 
 
 def _moved(

@@ -42,6 +42,7 @@ from bampipe.results.diagnose import (
     WorstWindow,
 )
 from bampipe.results.identify import IdentifyResult
+from bampipe.results.standing import FLOOR_WRONG
 from bampipe.results.terms import EffectText
 from bampipe.schema import STRICT, Count
 from bampipe.trials.folds import HELD_OUT
@@ -289,6 +290,12 @@ def _next(found: Diagnosis, model: str) -> str:
     if found.selected:
         return f"bampipe extend RUN {' '.join(found.selected)} --model {model}"
     by_axis = dict(zip(found.evidence.system.coordinates, found.axes, strict=True))
+    wrong = [axis for axis, a in by_axis.items() if a.standing in FLOOR_WRONG]
+    if wrong:
+        return (
+            f"the noise floor of {', '.join(wrong)} is wrong: hold the noise and resolution in "
+            "session.toml against what `bampipe ingest` measured"
+        )
     unknown = [axis for axis, a in by_axis.items() if a.verdict == "unknown_effect"]
     if unknown:
         return (
