@@ -194,7 +194,7 @@ class _Worker:
     ) -> None:
         self.pipe, far = multiprocessing.Pipe()
         kind = multiprocessing.get_context("spawn") if nested else multiprocessing.get_context()
-        self.process = kind.Process(  # type: ignore[attr-defined]
+        self.process = kind.Process(
             target=_serve, args=(far, initialize, arguments), daemon=not nested
         )
         self.process.start()
