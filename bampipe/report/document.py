@@ -128,12 +128,10 @@ class Section:
     Attributes:
         title: its heading.
         blocks: what it holds, in order.
-        new_page: starts on a page of its own in print.
     """
 
     title: str
     blocks: tuple[Block, ...]
-    new_page: bool = False
 
 
 @dataclass(frozen=True)

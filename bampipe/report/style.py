@@ -119,6 +119,14 @@ def panels(
     return figure, axes
 
 
+def beside(rows: int, height: float) -> tuple[Figure, list[Axes]]:
+    """Return a figure of one panel on the left and ``rows`` panels on the right, left one first."""
+    figure = Figure(figsize=(WIDTH, height), layout="constrained")
+    grid = figure.add_gridspec(rows, 2, width_ratios=(1.0, 1.7))
+    left = figure.add_subplot(grid[:, 0])
+    return figure, [left, *(figure.add_subplot(grid[row, 1]) for row in range(rows))]
+
+
 def svg(figure: Figure) -> str:
     """Return the figure as SVG: the same figure gives the same text."""
     buffer = io.StringIO()

@@ -75,7 +75,6 @@ def content(document: Document) -> dict[str, object]:
         "sections": [
             {
                 "title": section.title,
-                "new_page": section.new_page,
                 "blocks": [_block(block, next_number(numbers, block)) for block in section.blocks],
             }
             for section in document.sections

@@ -357,6 +357,17 @@ def write_diagnosis(root: Path, model: str) -> None:
         ranking=ranking if missing else [],
         selected=["stribeck:yaw"] if missing else [],
         groups={"stribeck:yaw": ["presliding:yaw"]} if missing else {},
+        contests={
+            "stribeck:yaw": [
+                {"effect": effect, "axis": "yaw", "held_out_rmse": error, "odds": odds}
+                for effect, error, odds in (
+                    ("stribeck:yaw", 0.2117, 0.7),
+                    ("presliding:yaw", 0.2323, 0.3),
+                )
+            ]
+        }
+        if missing
+        else {},
         descriptions={
             "presliding": _text("Friction builds up over a distance", "torque = -z"),
             "asymmetric_coulomb": _text("Friction differs by direction", "torque = -abs(qd)"),

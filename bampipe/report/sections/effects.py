@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
+from matplotlib.axes import Axes
 
 from bampipe.report import style, wording
 from bampipe.report.document import (
@@ -26,6 +28,7 @@ from bampipe.results.terms import ModelTerm, TermCurve, TermsResult
 TITLE = "Effects"
 _COLUMNS = 3
 _WEIGHED = 8
+_RIVALS = 3
 
 
 def section(results: Results) -> Section | None:
@@ -57,16 +60,7 @@ def _effect(results: Results, term: ModelTerm) -> list[Block]:
         Paragraph(f"{text.summary}. {_found(results, term)}".rstrip()),
         Formulas(text.formulas),
     ]
-    if term.curves:
-        caption = (
-            f"What `{term.name}` contributes: the force that it takes, with its 95 % band, against "
-            f"{_variables(term.curves)}, which it follows most, over the trials that it was "
-            "learned from."
-        )
-        blocks.append(_curves(f"effect-{name}", term.curves, caption))
-    window = _window(results, term, f"before-after-{name}")
-    if window is not None:
-        blocks.append(window)
+    blocks += _pictures(results, term, name)
     words = []
     if text.on_the_machine:
         words.append(f"**On the machine.** {text.on_the_machine}.")
@@ -102,27 +96,75 @@ def _curves(name: str, curves: Sequence[TermCurve], caption: str) -> Figure:
     width = min(style.WIDTH, 0.4 + 2.1 * columns)
     figure, panels = style.panels(rows, columns, 1.85 * rows, width=width)
     for panel, curve in zip(panels.flat, curves, strict=False):
-        x, unit = style.scaled(np.array(curve.center), curve.variable_unit)
-        panel.fill_between(x, curve.low, curve.high, color=style.BLUE, alpha=0.25, lw=0)
-        panel.plot(x, curve.mean, color=style.BLUE, marker=".", ms=3.0)
-        panel.axhline(0.0, color=style.INK, lw=0.5)
-        panel.set_title(curve.axis)
-        panel.set_xlabel(style.label(wording.words(curve.variable), unit))
-        panel.set_ylabel(style.label("force it takes", wording.unit(curve.unit)))
+        _curve(panel, curve)
     for panel in panels.flat[len(curves) :]:
         panel.set_axis_off()
     return Figure(name, caption, style.svg(figure))
 
 
-def _window(results: Results, term: ModelTerm, name: str) -> Figure | None:
-    """Draw the window that was worst before the effect was added, without and with it."""
-    compared = results.read(CompareResult)
-    rung = next(
-        (r for r in (compared.ladder if compared else ()) if _adds(r.added, term.name)), None
+def _curve(panel: Axes, curve: TermCurve) -> None:
+    x, unit = style.scaled(np.array(curve.center), curve.variable_unit)
+    panel.fill_between(x, curve.low, curve.high, color=style.BLUE, alpha=0.25, lw=0)
+    panel.plot(x, curve.mean, color=style.BLUE, marker=".", ms=3.0)
+    panel.axhline(0.0, color=style.INK, lw=0.5)
+    panel.set_title(curve.axis)
+    panel.set_xlabel(style.label(wording.words(curve.variable), unit))
+    panel.set_ylabel(style.label("force it takes", wording.unit(curve.unit)))
+
+
+def _pictures(results: Results, term: ModelTerm, name: str) -> list[Figure]:
+    """Draw the curves of an effect and, where it is known, the worst window without and with it."""
+    words = (
+        f"What `{term.name}` contributes: the force that it takes, with its 95 % band, against "
+        f"{_variables(term.curves)}, which it follows most, over the trials that it was learned "
+        "from."
     )
+    found = _window(results, term)
+    if found is None:
+        return [_curves(f"effect-{name}", term.curves, words)] if term.curves else []
+    first = term.curves[0]
+    figure, panels = style.beside(2, 2.7)
+    _curve(panels[0], first)
+    unit = wording.unit(results.force_unit(found.window.axis))
+    errors = _draw_window(panels[1], panels[2], found, unit)
+    style.legend_below(figure, panels[1])
+    size = [wording.significant(error, 2) for error in errors]
+    change = (
+        f"the residual falls from {size[0]} to {size[1]} {unit} (RMSE)"
+        if errors[1] < errors[0]
+        else f"the residual does not fall ({size[0]} and {size[1]} {unit} RMSE)"
+    )
+    whole = (
+        f"{words.replace('What', 'Left: what', 1)} Right: the worst window of {found.window.axis} "
+        f"without {found.added} ({found.window.doing}), where {change}."
+    )
+    others = term.curves[1:]
+    pictures = [Figure(f"effect-{name}", whole, style.svg(figure))]
+    if others:
+        axes = wording.listing(curve.axis for curve in others)
+        more = f"What `{term.name}` contributes on {axes}, as above."
+        pictures.append(_curves(f"effect-{name}-more", others, more))
+    return pictures
+
+
+@dataclass(frozen=True)
+class _Window:
+    """A window that was worst before effects were ``added``: residuals without and with them."""
+
+    window: WorstWindow
+    added: str
+    before: pd.DataFrame
+    after: pd.DataFrame
+
+
+def _window(results: Results, term: ModelTerm) -> _Window | None:
+    """Return the worst window of the version before the one that added the effect."""
+    compared = results.read(CompareResult)
+    rungs = compared.ladder if compared else ()
+    rung = next((one for one in rungs if _adds(one.added, term.name)), None)
     diagnosis = results.read(DiagnoseResult, rung.parent) if rung and rung.parent else None
-    axes = [curve.axis for curve in term.curves]
-    if rung is None or rung.parent is None or diagnosis is None or not axes:
+    axes = [curve.axis for curve in term.curves[:1]]
+    if rung is None or rung.parent is None or diagnosis is None:
         return None
     window = next((w for w in diagnosis.worst_windows if w.axis in axes), None)
     if window is None:
@@ -130,40 +172,37 @@ def _window(results: Results, term: ModelTerm, name: str) -> Figure | None:
     before, after = (_stretch(results, model, window) for model in (rung.parent, rung.model))
     if before is None or after is None:
         return None
-    axis = window.axis
-    figure, panels = style.panels(2, 1, 2.9, sharex=True, width=0.8 * style.WIDTH)
-    top, bottom = panels[:, 0]
-    top.plot(before["t"], before[f"torque_measured_{axis}"], color=style.FAINT, lw=2.6,
-             label="measured")  # fmt: skip
+    added = wording.listing(f"`{name}`" for name in _names(rung.added))
+    return _Window(window, added, before, after)
+
+
+def _draw_window(top: Axes, bottom: Axes, found: _Window, unit: str) -> list[float]:
+    """Draw forces above residuals; return the errors in the window, without and with."""
+    window, axis = found.window, found.window.axis
+    measured = found.before[f"torque_measured_{axis}"]
+    top.plot(found.before["t"], measured, color=style.FAINT, lw=2.6, label="measured")
     for frame, title, colour, look in (
-        (before, "without", style.VERMILLION, (0, (4, 1.5))),
-        (after, "with the effect", style.BLUE, "-"),
+        (found.before, "without", style.VERMILLION, (0, (4, 1.5))),
+        (found.after, "with", style.BLUE, "-"),
     ):
         top.plot(frame["t"], frame[f"torque_predicted_{axis}"], color=colour, ls=look, label=title)
         bottom.plot(frame["t"], frame[f"residual_{axis}"], color=colour, ls=look)
     bottom.axhline(0.0, color=style.INK, lw=0.5)
     for panel in (top, bottom):
         panel.axvspan(window.t_start, window.t_end, color=style.SKY, alpha=0.2, lw=0)
-    unit = wording.unit(results.force_unit(axis))
+    top.tick_params(labelbottom=False)
     top.set_ylabel(style.label(axis, unit))
     bottom.set_ylabel(style.label("residual", unit))
     bottom.set_xlabel(f"time in {window.trial_id} (s)")
-    style.legend_below(figure, top)
-    errors = [_rms(frame, axis, window) for frame in (before, after)]
-    caption = (
-        f"The worst window of {axis} without `{term.name}` ({window.doing}): there the residual "
-        f"falls from {wording.significant(errors[0], 2)} to {wording.significant(errors[1], 2)} "
-        f"{unit} (RMSE)."
-        if errors[1] < errors[0]
-        else f"The worst window of {axis} without `{term.name}` ({window.doing}): there the "
-        f"effect does not lower the residual ({wording.significant(errors[0], 2)} and "
-        f"{wording.significant(errors[1], 2)} {unit} RMSE)."
-    )
-    return Figure(name, caption, style.svg(figure))
+    return [_rms(frame, axis, window) for frame in (found.before, found.after)]
+
+
+def _names(added: str | None) -> list[str]:
+    return (added or "").replace(",", " ").split()
 
 
 def _adds(added: str | None, effect: str) -> bool:
-    return effect in (added or "").replace(",", " ").split()
+    return effect in _names(added)
 
 
 def _stretch(results: Results, model: str, window: WorstWindow) -> pd.DataFrame | None:
@@ -190,30 +229,25 @@ def _diagnoses(results: Results) -> Iterable[DiagnoseResult]:
 
 
 def _rivals(results: Results, effect: str) -> str:
+    """Say what else could take the place of ``effect``, all others found being in the model."""
     for diagnosis in _diagnoses(results):
-        entry = next((one for one in diagnosis.ranking if one.effect == effect), None)
-        if entry is None or effect not in diagnosis.selected:
+        if effect not in diagnosis.selected:
             continue
-        alike = diagnosis.groups.get(effect, ()) or entry.indistinguishable_from
-        if alike:
-            names = wording.listing(f"`{name}`" for name in alike)
-            return f"These trials cannot tell it from {names}."
-        others = [
-            one for one in diagnosis.ranking
-            if one.axis == entry.axis and one.effect != effect
-        ][:2]  # fmt: skip
-        unit = wording.unit(entry.unit)
-        nearest = wording.listing(
-            f"`{one.effect}` ({wording.significant(one.held_out_rmse_after)})" for one in others
-        )
-        after = wording.significant(entry.held_out_rmse_after)
-        if not others:
-            return "None fits these trials alike."
+        own, *others = diagnosis.contests.get(effect, ()) or (None,)
+        if own is None or not others:
+            return "None comes close to it on these trials."
+        unit = wording.unit(results.force_unit(own.axis)) if own.axis in results.axes else ""
+        shown = [
+            f"`{one.effect}` leaves {wording.significant(one.held_out_rmse)} {unit}"
+            + (f" (odds {wording.percent(one.odds)})" if one.odds else "")
+            for one in others[:_RIVALS]
+        ]
+        sure = "" if diagnosis.groups.get(effect) else " It fits better beyond chance."
         return (
-            f"None fits these trials alike: alone it takes the held-out error of {entry.axis} to "
-            f"{after} {unit}, the next best to {nearest}."
+            f"In its place {wording.listing(shown)} on held-out trials of {own.axis}, against "
+            f"{wording.significant(own.held_out_rmse)} {unit}.{sure}"
         )
-    return "It was put in by hand: no diagnosis has weighed it against others."
+    return "It was not found by a diagnosis of this run: none has weighed it against others."
 
 
 def _weighed(results: Results, added: set[str]) -> list[Block]:

@@ -1,4 +1,4 @@
-"""Provenance: inputs by hash, versions, settings and keys, on the last page.
+"""Provenance: inputs by hash, versions, settings and keys, last of all.
 
 Nothing here depends on when or where the stages ran: equal results give equal reports. Times and
 the machine stand in ``run.json``, and ``bampipe status`` prints them.
@@ -21,7 +21,7 @@ def section(results: Results) -> Section:
     run = results.read(RunResult)
     if run is None:
         text = "This run folder has no run.json: what was run on what is not recorded."
-        return Section(TITLE, (Paragraph(text),), new_page=True)
+        return Section(TITLE, (Paragraph(text),))
     stages = {name: made for name, made in run.stages.items() if name != "report"}
     blocks: list[Block] = [Paragraph(_versions(stages))]
     inputs = _inputs(stages)
@@ -31,7 +31,7 @@ def section(results: Results) -> Section:
     settings = _settings(stages)
     if settings is not None:
         blocks += [Subheading("Settings"), settings]
-    return Section(TITLE, tuple(blocks), new_page=True)
+    return Section(TITLE, tuple(blocks))
 
 
 def _versions(stages: Mapping[str, StepRecord]) -> str:
