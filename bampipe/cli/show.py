@@ -247,7 +247,7 @@ def outcome(result: Outcome) -> None:
             ["gate", "model", "", "verdict", ""],
             [[one.gate, one.model, one.key, one.state, one.message] for one in shown],
         )
-    if result.model:
+    if result.model and any(":" in step.step for step in result.steps):
         _counting(result.model)
 
 
