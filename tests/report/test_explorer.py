@@ -233,8 +233,10 @@ def test_one_zoom_moves_all_traces_and_reset_shows_all(opened: Opened, page_file
     assert len(csv_of(page, "velocity yaw")) == everything
 
 
-def test_versions_are_shown_and_hidden(opened: Opened, page_file: Path) -> None:
+def test_versions_are_shown_and_hidden(opened: Opened, page_file: Path, run: Path) -> None:
     page = opened(page_file)
+    counts = page.locator(".counts").inner_text()
+    assert counts.startswith("base is") == (Results(run).model == "base")
     assert "base" in figure(page, "residual yaw").locator(".key").inner_text()
     page.get_by_label("base", exact=True).uncheck()
     assert "base" not in figure(page, "residual yaw").locator(".key").inner_text()

@@ -200,7 +200,10 @@ def _one_movement(speed: np.ndarray) -> slice:
 
 def _friction(results: Results, frame: pd.DataFrame, velocity: dict[str, np.ndarray]) -> Figure:
     axes = list(velocity)
-    figure, panels = style.panels(2, len(axes), 3.9, width=min(style.WIDTH, 2.6 + 1.6 * len(axes)))
+    alone = len(axes) == 1
+    figure, panels = style.panels(1, 2, 2.2) if alone else style.panels(2, len(axes), 3.9)
+    if alone:
+        panels = panels.T
     t = frame["t"].to_numpy()
     for column, axis in enumerate(axes):
         measured = frame[f"torque_measured_{axis}"].to_numpy()
@@ -229,10 +232,12 @@ def _friction(results: Results, frame: pd.DataFrame, velocity: dict[str, np.ndar
     top_handles, top_names = panels[0, 0].get_legend_handles_labels()
     more_handles, more_names = panels[1, 0].get_legend_handles_labels()
     style.legend_of(figure, top_handles + more_handles, top_names + more_names)
+    places = ("Left", "Right") if alone else ("Top", "Bottom")
     caption = (
-        f"The friction that a model without it leaves{results.in_paper('Fig. 4')}. Top: measured "
-        "minus predicted generalised force against velocity; the arrow shows the start of one "
-        "movement. Bottom: that movement; without friction the prediction overshoots zero."
+        f"The friction that a model without it leaves{results.in_paper('Fig. 4')}. {places[0]}: "
+        "measured minus predicted generalised force against velocity; the arrow shows the start "
+        f"of one movement. {places[1]}: that movement; without friction the prediction overshoots "
+        "zero."
     )
     return Figure("error-without-friction", caption, style.svg(figure))
 

@@ -142,6 +142,10 @@ function buildControls() {
       group("Model versions", ...content.models.map((model, k) => choice("checkbox", "model", String(k), model.added ? `${model.label} (+ ${model.added})` : model.label, true, toggle, colourOf(k)))),
     );
   }
+  if (content.models.length > 1) {
+    const { label, name } = content.models[content.shown];
+    host.append(make("p", { class: "remark counts" }, `${label === name ? name : `${label} (${name})`} is the version that counts: the report is about it.`));
+  }
   const axes = content.axes.filter(({ name }) => find({ role: "measured", axis: name }).length);
   if (axes.length > 1) {
     host.append(group("Axis", ...axes.map(({ name }) => choice("radio", "axis", name, name, false, () => setAxis(name)))));
