@@ -70,6 +70,7 @@ def describe_terms(evidence: Evidence, p: Array, covariance: Covariance, model: 
         axis: [v for v in variables(evidence, axis) if v.name not in ("trial", "time")]
         for axis in range(len(system.coordinates))
     }
+    present = _residual(evidence, p)
     return TermsResult(
         model=model,
         equations=equations,
@@ -78,7 +79,7 @@ def describe_terms(evidence: Evidence, p: Array, covariance: Covariance, model: 
                 name=part.name,
                 text=part.text,
                 parameters=tuple(system.parameters[i].name for i in part.parameters),
-                curves=tuple(_curves(evidence, p, covariance, part, known)),
+                curves=tuple(_curves(evidence, p, present, covariance, part, known)),
             )
             for part in _parts(system)
         ),
@@ -114,6 +115,7 @@ def _residual(evidence: Evidence, p: Array) -> Array:
 def _curves(
     evidence: Evidence,
     p: Array,
+    present: Array,
     covariance: Covariance,
     part: _Part,
     known: dict[int, list[Variable]],
@@ -123,8 +125,7 @@ def _curves(
     system = evidence.system
     without = p.copy()
     without[list(part.strengths)] = 0.0
-    present, absent = _residual(evidence, p), _residual(evidence, without)
-    force = absent - present
+    force = _residual(evidence, without) - present
     names = [system.parameters[i].name for i in part.parameters]
     free = [i for i, name in zip(part.parameters, names, strict=True) if name in covariance.names]
     rows = [covariance.names.index(system.parameters[i].name) for i in free]
