@@ -357,6 +357,25 @@ def test_the_spectrum_shows_the_wave_of_the_residual(opened: Opened, page_file: 
     assert half == pytest.approx(-1.0, abs=0.05)
 
 
+@pytest.mark.parametrize("empty", [False, True])
+def test_a_session_without_results_opens(opened: Opened, tmp_path: Path, empty: bool) -> None:
+    root = tmp_path / "s04"
+    synthetic_run.write_ingest(root)
+    if empty:
+        path = root / "ingest/samples.parquet"
+        write_parquet(path, pd.read_parquet(path).iloc[:0])
+    page_path = tmp_path / "page.html"
+    page_path.write_text(explorer_page(Results(root), ""))
+    page = opened(page_path)
+    assert (page.locator("#plots figure").count() == 0) == empty
+    if empty:
+        assert "No trial of this session could be used" in page.locator("#plots").inner_text()
+        assert page.get_by_role("region", name="Trials").locator("tbody tr").count() == 5
+    else:
+        page.get_by_role("button", name="Zoom in").click()
+        page.get_by_role("button", name="Trial after").click()
+
+
 @pytest.mark.slow
 def test_eight_channels_of_a_million_samples(opened: Opened, tmp_path: Path) -> None:
     """Everything else must wait for these: 13.4 MB, 1.5 s to ready, 82 ms a zoom."""

@@ -181,9 +181,14 @@ function repaint() {
 async function start() {
   content.models.forEach((_, k) => state.models.add(k));
   showVerdict();
+  buildTables();
+  if (!content.trials.length) {
+    document.getElementById("plots").append(make("p", {}, "No trial of this session could be used: the table of trials says why."));
+    document.documentElement.dataset.complete = String(Math.round(performance.now()));
+    return;
+  }
   state.view = [...session];
   buildControls();
-  buildTables();
   buildLadder();
   buildParameterMap();
   drawCorrelations();
