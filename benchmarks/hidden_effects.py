@@ -43,7 +43,9 @@ SINGLES = (
     "transmission_compliance:yaw", "transmission_compliance:pitch", "backlash:yaw",
     "force_bias:x", "force_bias:z", "force_gain:x", "force_gain:z", "force_crosstalk:xy",
     "force_crosstalk:zx", "force_delay", "force_drift:y", "force_application_point",
-    "encoder_scale:yaw", "encoder_scale:extension", "brake_lag", "brake_residual_torque:yaw",
+    "shear_thinning:yaw", "maxwell_slip:yaw", "upper_stop:yaw", "lower_stop:extension",
+    "friction_by_pose:yaw-extension", "encoder_scale:yaw", "encoder_scale:extension", "brake_lag",
+    "brake_residual_torque:yaw",
 )  # fmt: skip
 PLANTS = Path(__file__).parent / "plants"
 OTHER_FORMS = {
@@ -55,11 +57,12 @@ OTHER_FORMS = {
     "drag_three_halves:pitch": "quadratic_drag:pitch",
     "viscous_by_direction:yaw": "asymmetric_coulomb:yaw",
     "ripple_square:extension": "position_dependent_friction:extension",
+    "end_cushion:yaw": "upper_stop:yaw",
 }
 """The same physics as an effect of the library in other mathematics: that effect is to be named."""
 
 OUTSIDE = (
-    "detent:pitch", "detent:extension", "cogging:yaw", "end_cushion:yaw", "friction_patch:pitch",
+    "detent:pitch", "detent:extension", "cogging:yaw", "friction_patch:pitch",
     "hum:yaw", "speed_resonance:yaw", "yaw_by_extension",
 )  # fmt: skip
 """What no effect of the library says: unknown is the answer, or an error at the floor."""

@@ -6,7 +6,6 @@ import independent
 import numpy as np
 import pandas as pd
 import pytest
-from independent import joint
 from independent.sensors import HARD, Conditions
 
 from bampipe.physics import Model, registry
@@ -16,8 +15,9 @@ BRIEF = Conditions(trials=1, seconds=0.8)
 
 
 def device_of(machine):
-    if machine == "joint":
-        return registry.device_from(tomllib.loads(joint.DEVICE), "joint.toml")
+    known = independent.MACHINES[machine]
+    if machine not in DEVICES:
+        return registry.device_from(tomllib.loads(known.DEVICE), f"{machine}.toml")
     return registry.device(DEVICES[machine])
 
 

@@ -14,6 +14,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from bampipe.discover.ranges import MachineScale, SearchRange
 from bampipe.discover.settings import Settings
 from bampipe.estimate.normal_equations import NormalEquations
 from bampipe.physics import Model, System, compile_model
@@ -29,6 +30,8 @@ from bampipe.trials.residuals import Evidence
 Array = NDArray[np.float64]
 
 _GRID = 7
+_LARGEST_RATIO = 3.0
+"""Of neighbours on the grid of a searched parameter."""
 _REFINE = 3
 _SIMILAR = 0.7
 _DENSEST = 48
@@ -176,6 +179,11 @@ class Scorer:
         return np.asarray(count * self.evidence.band.independent_share)
 
     @cached_property
+    def scale(self) -> MachineScale:
+        """What sizes the trials have."""
+        return MachineScale.of_trials(self.evidence)
+
+    @cached_property
     def before(self) -> Score:
         """The model as it is."""
         e = self.evidence
@@ -200,8 +208,9 @@ class Scorer:
         Searched parameters are scanned over their range, finely enough that neighbours on the
         grid resemble each other, and narrowed around the best; several are taken in turn.
         """
-        ranges = [_search_range(item.own[i]) for i in item.searched]
-        at = [_middle(low, high) for low, high, _ in ranges]
+        effect = item.system.model.effects[-1]
+        ranges = [self.scale.range_of(effect, item.own[i]) for i in item.searched]
+        at = [_middle(r.low, r.high) for r in ranges]
         hopeless = self._cost_before(item) - Settings().worth_searching
         for _ in range(min(len(ranges), 2)):
             for k, interval in enumerate(ranges):
@@ -252,7 +261,7 @@ class Scorer:
         item: Candidate,
         at: list[float],
         k: int,
-        interval: tuple[float, float, bool],
+        interval: SearchRange,
     ) -> tuple[float, float] | None:
         """Best value of one searched parameter, the others held, and its cost; None if it
         never matters."""
@@ -260,9 +269,16 @@ class Scorer:
         def cost(value: float) -> tuple[float, Array] | None:
             return self._in_sample(item, np.array([*at[:k], value, *at[k + 1 :]]))
 
-        low, high, ratio = interval
-        count = _GRID if len(item.searched) == 1 else _GRID - 2
-        grid = list(np.geomspace(low, high, count) if ratio else np.linspace(low, high, count))
+        low, high, count = (
+            interval.low,
+            interval.high,
+            _GRID if len(item.searched) == 1 else _GRID - 2,
+        )
+        if interval.by_ratio:
+            count = max(count, min(int(np.log(high / low) / np.log(_LARGEST_RATIO)) + 2, 2 * _GRID))
+            grid = list(np.geomspace(low, high, count))
+        else:
+            grid = list(np.linspace(low, high, count))
         known = [cost(value) for value in grid]
         if all(found is None for found in known):
             return None
@@ -367,6 +383,9 @@ class Scorer:
                 shift = fitted.solve(weight, low, high)[:start]
                 best = Score(item.name, error, weaker, shift, gain)
         assert best is not None
+        # Both sides of the equation made small explain nothing, however small the error becomes.
+        if self.independent @ best.gain <= 0.0:
+            return self._absent(item)
         return replace(best, gain=self.independent * best.gain)
 
     def _sensitivity(self, item: Candidate, own: Array) -> Array:
@@ -445,19 +464,6 @@ def _probes(p: Array, count: int, linear: Sequence[int]) -> list[Array]:
     for probe, i in zip(probes, linear, strict=False):
         probe[count + i] = 1.0
     return probes
-
-
-def _search_range(parameter: Parameter) -> tuple[float, float, bool]:
-    """Lower end, upper end, and whether to step by ratios, of a searched parameter."""
-    reach = 4.0 * (abs(parameter.typical) if parameter.typical else parameter.sd)
-    lower, upper = max(parameter.lower, -reach), min(parameter.upper, max(reach, 0.0))
-    if parameter.shape:
-        lower = parameter.lower if np.isfinite(parameter.lower) else parameter.prior - reach
-        upper = parameter.upper if np.isfinite(parameter.upper) else parameter.prior + reach
-        return lower, upper, lower > 0.0
-    if parameter.lower >= 0.0:
-        return 0.02 * reach, upper, True
-    return lower, upper, False
 
 
 def _column_similarity(a: Array, b: Array) -> float:

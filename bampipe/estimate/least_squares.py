@@ -58,6 +58,7 @@ class Problem:
         step: (n_free,) sizes of their finite differences; any size does where the residual is
             linear in the parameter.
         linear: whether the residual is linear in all of them.
+        constant: (n_free,) by which of them its slope is the same wherever it is taken.
         band: the low-pass.
         resting: by trial, (T, n_q) whether an axis stands still; see `resting`.
         precision: (n_free,) of what is known of the parameters beforehand, one over its variance,
@@ -71,6 +72,7 @@ class Problem:
     upper: Array
     step: Array
     linear: bool
+    constant: NDArray[np.bool_]
     band: Band
     resting: Sequence[NDArray[np.bool_]]
     precision: Array
@@ -101,41 +103,54 @@ class LeastSquares:
     at_bound: NDArray[np.bool_]
 
 
-def residual_and_slopes(problem: Problem, trial: int, p: Array) -> tuple[Array, Array]:
-    """Unfiltered residual of one trial (T, n_q) and its slopes (T, n_q, n_free), by differences.
+def residual_and_slopes(
+    problem: Problem, trial: int, p: Array, columns: Sequence[int] | None = None
+) -> tuple[Array, Array]:
+    """Unfiltered residual of one trial (T, n_q) and its slopes (T, n_q, n), by differences.
 
     Args:
         problem: the model as residuals.
         trial: index of the trial.
         p: (np,) parameters at which to take them; differences are forward, backward at a bound.
+        columns: free parameters by which to take slopes, by number; all by default.
     """
     base = problem.residual(trial, p)
-    slopes = np.empty((*base.shape, problem.free.size))
-    for k, index in enumerate(problem.free):
-        moved = p.copy()
+    chosen = range(problem.free.size) if columns is None else columns
+    slopes = np.empty((*base.shape, len(chosen)))
+    for column, k in enumerate(chosen):
+        index, moved = problem.free[k], p.copy()
         moved[index] += problem.step[k]
         if moved[index] > problem.upper[k]:
             moved[index] = p[index] - problem.step[k]
-        slopes[:, :, k] = (problem.residual(trial, moved) - base) / (moved[index] - p[index])
+        slopes[:, :, column] = (problem.residual(trial, moved) - base) / (moved[index] - p[index])
     return base, slopes
 
 
-def stacked_residual(problem: Problem, trial: int, p: Array) -> Stacked:
+def stacked_residual(
+    problem: Problem, trial: int, p: Array, elsewhere: Stacked | None = None
+) -> Stacked:
     """Low-pass and thin the residual of one trial and its slope by every free parameter.
 
     Args:
         problem: the model as residuals.
         trial: index of the trial.
         p: (np,) parameters at which to linearise.
+        elsewhere: the same trial at other parameters; constant slopes are taken from it.
     """
-    base, slopes = residual_and_slopes(problem, trial, p)
+    fresh = np.arange(problem.free.size) if elsewhere is None else np.flatnonzero(~problem.constant)
+    base, slopes = residual_and_slopes(problem, trial, p, [int(k) for k in fresh])
     count, n_q, n_free = slopes.shape
     columns = np.concatenate([base[:, :, None], slopes], axis=2).reshape(count, -1)
     axes = np.repeat(np.arange(n_q, dtype=np.int64), 1 + n_free)
     thin = problem.band.thin(columns, axes).reshape(-1, n_q, 1 + n_free)
     used = moving(problem.resting[trial], problem.band)
     thin *= used[:, :, None]
-    return Stacked(np.ascontiguousarray(thin[:, :, 0]), np.ascontiguousarray(thin[:, :, 1:]), used)
+    slope = np.ascontiguousarray(thin[:, :, 1:])
+    if elsewhere is not None:
+        known = elsewhere.slope.copy()
+        known[:, :, fresh] = slope
+        slope = known
+    return Stacked(np.ascontiguousarray(thin[:, :, 0]), slope, used)
 
 
 def fit(
@@ -223,7 +238,10 @@ class _Linearised:
             step = value - self.value
             stacked = [Stacked(s.residual + s.slope @ step, s.slope, s.used) for s in self.stacked]
         else:
-            stacked = [stacked_residual(self.problem, trial, p) for trial in self.trials]
+            stacked = [
+                stacked_residual(self.problem, trial, p, here)
+                for trial, here in zip(self.trials, self.stacked, strict=True)
+            ]
         return replace(self, p=p, stacked=stacked)
 
 

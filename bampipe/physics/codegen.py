@@ -99,6 +99,44 @@ def memory(q, qd, u, p, t, z0, steps, out):
 '''
 
 
+# A state whose rate is c + b*z, with b of motion and inputs: exact for c and b constant in a step,
+# and for c changing linearly where b depends on parameters alone. However stiff, it stays stable.
+LINEAR_MEMORY_LOOP = '''
+
+@njit(types.void(M, M, M, V, V, V, types.int64, M), cache=True, error_model='numpy')
+def memory(q, qd, u, p, t, z0, steps, out):
+    """Exponential steps along the samples of a motion, everything linear between samples."""
+    n = len(z0)
+    c0, b0, c1, b1 = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+    z, x, v, w = z0.copy(), q[0].copy(), qd[0].copy(), u[0].copy()
+    out[0] = z
+    memory_terms(x, v, w, p, c0, b0)
+    if RAMP:
+        steps = 1
+    for i in range(len(t) - 1):
+        h = (t[i + 1] - t[i]) / steps
+        for s in range(steps):
+            share = (s + 1) / steps
+            for j in range(len(x)):
+                x[j] = q[i, j] + share * (q[i + 1, j] - q[i, j])
+                v[j] = qd[i, j] + share * (qd[i + 1, j] - qd[i, j])
+            for j in range(len(w)):
+                w[j] = u[i, j] + share * (u[i + 1, j] - u[i, j])
+            memory_terms(x, v, w, p, c1, b1)
+            for j in range(n):
+                k = 0.5 * h * (b0[j] + b1[j])
+                if abs(k) < 1e-3:
+                    mean, ramp = 1.0 + k / 2.0 + k * k / 6.0, 0.5 + k / 6.0 + k * k / 24.0
+                else:
+                    mean = (exp(k) - 1.0) / k
+                    ramp = (mean - 1.0) / k
+                added = c0[j] * mean + (c1[j] - c0[j]) * (ramp if RAMP else 0.5 * mean)
+                z[j] = z[j] * (1.0 + k * mean) + h * added
+                c0[j], b0[j] = c1[j], b1[j]
+        out[i + 1] = z
+'''
+
+
 class _Printer(PythonCodePrinter):  # type: ignore[misc]
     """Prints with bare function names that each header defines in its own way."""
 
@@ -391,13 +429,35 @@ def residual_source(e: Equations) -> str:
 
 def memory_source(e: Equations) -> str:
     """Source of the compiled internal states along a motion."""
-    block = _block(e.rates)
+    slopes = [sp.diff(rate, z) for rate, z in zip(e.rates, e.z, strict=True)]
+    others = [set(e.z) - {z} for z in e.z]
+    coupled = any(r.free_symbols & o for r, o in zip(e.rates, others, strict=True))
+    if coupled or any(slope.free_symbols & set(e.z) for slope in slopes):
+        rate = _memory_function("memory_rate", e, {"z": e.z}, {"dz": e.rates})
+        return SCALAR_HEADER + "import numpy as np\n" + rate + MEMORY_LOOP
+    still = [rate.subs(z, 0) for rate, z in zip(e.rates, e.z, strict=True)]
+    terms = _memory_function("memory_terms", e, {}, {"c": still, "b": slopes})
+    steady = not any(slope.free_symbols & {*e.q, *e.qd, *e.u} for slope in slopes)
+    head = f"import numpy as np\nRAMP = {steady}\n"
+    return SCALAR_HEADER + head + terms + LINEAR_MEMORY_LOOP
+
+
+def _memory_function(
+    name: str,
+    e: Equations,
+    more: Mapping[str, Sequence[Any]],
+    results: Mapping[str, Sequence[Any]],
+) -> str:
+    """A compiled function of motion, inputs, parameters and ``more`` that fills ``results``."""
+    block = _block([sp.sympify(x) for part in results.values() for x in part])
     body = []
-    for group, symbols in {"q": e.q, "qd": e.qd, "u": e.u, "p": e.p, "z": e.z}.items():
+    groups = {"q": e.q, "qd": e.qd, "u": e.u, "p": e.p, **more}
+    for group, symbols in groups.items():
         body += _unpack(group, symbols, block.used)
-    body += block.lines + [f"dz[{i}] = {v}" for i, v in enumerate(block.values)]
-    rate = _compiled("memory_rate", "q, qd, u, p, z, dz", body, options="")
-    return SCALAR_HEADER + "import numpy as np\n" + rate + MEMORY_LOOP
+    places = [f"{part}[{i}]" for part, parts in results.items() for i in range(len(parts))]
+    body += block.lines
+    body += [f"{place} = {v}" for place, v in zip(places, block.values, strict=True)]
+    return _compiled(name, ", ".join([*groups, *results]), body, options="")
 
 
 def law_source(

@@ -200,10 +200,13 @@ def _derive(model: Model, named_constants: bool) -> Equations:
     moved = [*offset, *offset_rate, *offset_acceleration]
     linear: list[bool] = []
     products: list[tuple[int, int]] = []
+    constant: list[bool] = []
+    varying = {*d.p.values(), *d.z.values()}
     for i, symbol in enumerate(d.p.values()):
         slopes = [slope for e in residual if (slope := sp.diff(e, symbol)) != 0]
         curved = any(sp.diff(slope, symbol) != 0 for slope in slopes)
         linear.append(not curved and not any(e.has(symbol) for e in [*rates, *moved]))
+        constant.append(linear[i] and not any(s.free_symbols & varying for s in slopes))
         for j, earlier in enumerate([*d.p.values()][:i]):
             if any(sp.diff(slope, earlier) != 0 for slope in slopes):
                 products.append((j, i))
@@ -216,7 +219,7 @@ def _derive(model: Model, named_constants: bool) -> Equations:
         applied=applied, applied_noise=applied_noise,
         input_map=input_map, rates=rates, initial=initial,
         offset=offset, offset_rate=offset_rate, offset_acceleration=offset_acceleration,
-        kinetic=kinetic, potential=potential, linear=linear, products=products,
+        kinetic=kinetic, potential=potential, linear=linear, products=products, constant=constant,
         compensation=compensation(d, potential), delays=delays(d, applied),
     )  # fmt: skip
 

@@ -33,6 +33,8 @@ _PLACED = ("axis_pair", "device")
 """Scopes in which an expression is a table, one a place."""
 PAIR = ("a", "b")
 """Places of an effect on a pair of axes."""
+_FARTHEST = 2
+"""Of the axes of a pair, in the order of the coordinates: more lie apart in the machine, too."""
 EACH = "each"
 """Place of a device-wide input effect that stands for every force channel."""
 
@@ -102,10 +104,10 @@ class Effect(Declaration):
     ]
     summary: Text = Field(description="What it is, in one sentence")
     scope: Scope = Field(
-        description="axis: one coordinate; axis_pair: two neighbouring joints of a robot, a nearer"
-        " to the base than b (q_a, qd_a, q_b, qd_b); force_component: one reading; force_pair: a"
-        " reading that leaks into another; channel: an input that is no force; device: the whole"
-        " device"
+        description="axis: one coordinate; axis_pair: one and another (q_a, qd_a, q_b, qd_b), of a"
+        " robot two neighbouring joints, a nearer to the base where it acts on both;"
+        " force_component: one reading; force_pair: a reading that leaks into another; channel: an"
+        " input that is no force; device: the whole device"
     )
     kind: Literal["torque", "input", "energy", "measurement"] = Field(
         description="torque: acts on the joints; input: maps the measured force to the true one;"
@@ -140,9 +142,10 @@ class Effect(Declaration):
         " order, each on what the one before it leaves. scale where left out, lever for a"
         " measurement; a torque with a link is part of the drive, and of the load of what follows",
     )
-    robot: bool = Field(
-        default=False,
-        description="Whether it is one of robots only: offered where the device has joints",
+    robot: bool | None = Field(
+        default=None,
+        description="true: offered for robots only, devices of joints and bodies; false: for all"
+        " others only",
     )
     devices: Distinct[Text] = Field(
         default=(), description="Devices that it makes sense for; all where left out"
@@ -223,7 +226,7 @@ class Effect(Declaration):
         """Names after the colon that make sense for ``device``; ``("",)`` for a device effect."""
         if (self.devices and device.name not in self.devices) or (self.drive and not device.drive):
             return ()
-        if self.robot and device.robot is None:
+        if self.robot is not None and self.robot != (device.robot is not None):
             return ()
         if self.scope == "axis":
             used = self.names
@@ -235,7 +238,7 @@ class Effect(Declaration):
                 and ("dry" not in used or device.has_dry_friction(c.name))
             )
         if self.scope == "axis_pair":
-            return tuple(_neighbours(device))
+            return tuple(self.pairs(device))
         if self.scope == "channel":
             return tuple(device.channels)
         if self.scope == "force_component":
@@ -251,6 +254,22 @@ class Effect(Declaration):
                 if 0 < abs(i - j) <= near
             )
         return ("",) if self._fits(device) else ()
+
+    def pairs(self, device: Device) -> dict[str, tuple[str, str]]:
+        """The pairs of axes of ``device`` that it makes sense for, by what follows the colon.
+
+        Neighbouring joints where it acts on both, else axes that lie near each other, either way.
+        """
+        if self.kind == "energy" or (isinstance(self.torque, Mapping) and len(self.torque) > 1):
+            return _neighbours(device)
+        names = [c.name for c in device.coordinates]
+        farthest = _FARTHEST if device.robot is None else 1
+        return {
+            f"{a}-{b}": (a, b)
+            for i, a in enumerate(names)
+            for j, b in enumerate(names)
+            if 0 < abs(i - j) <= farthest
+        }
 
     @cached_property
     def names(self) -> set[str]:
@@ -297,6 +316,8 @@ class BoundEffect:
     """An effect at its target: what a model is made of.
 
     Attributes:
+        effect, target: what it is, and where: the text after the colon.
+        parameters: its parameters with their full names.
         axes: the axis or the two that it acts on, where its scope says so.
     """
 
@@ -363,10 +384,8 @@ def bind(effect: Effect, target: str, device: Device) -> BoundEffect:
             else f"effect {effect.name!r} needs a target",
             remedy=f"choose from {choices}",
         )
-    axes: tuple[str, ...] = (target,) if effect.scope == "axis" else ()
-    if effect.scope == "axis_pair":
-        axes = _neighbours(device)[target]
-    kind = device.coordinate(axes[-1]).kind if axes else ""
+    axes = _axes_of(effect, target, device)
+    kind = device.coordinate(axes[0]).kind if axes else ""
     prefix = f"{effect.name}.{target}" if target else effect.name
     bound = []
     for name, entry in effect.parameters.items():
@@ -382,13 +401,26 @@ def bind(effect: Effect, target: str, device: Device) -> BoundEffect:
     return BoundEffect(effect, target, tuple(bound), axes)
 
 
+def _axes_of(effect: Effect, target: str, device: Device) -> tuple[str, ...]:
+    """The coordinates that ``target`` stands for."""
+    if effect.scope == "axis_pair":
+        return effect.pairs(device)[target]
+    return (target,) if effect.scope == "axis" else ()
+
+
 def unit_of(unit: str, effect: Effect, target: str, device: Device) -> str:
-    """``unit`` of a parameter or state with ``input`` replaced by that of the channel acted on."""
+    """``unit`` of a parameter or state with ``input`` replaced by that of the channel acted on.
+
+    For a pair of axes, ``other`` stands for the unit of the second.
+    """
     own = device.channels[target] if effect.scope == "channel" else device.force_unit
+    units = {"input": own}
+    if effect.scope == "axis_pair":
+        units["other"] = device.coordinate(effect.pairs(device)[target][1]).unit
     above: list[str] = []
     below: list[str] = []
     for sign, part in _factors(unit):
-        for inner, piece in _factors(own) if part == "input" else [("*", part)]:
+        for inner, piece in _factors(units[part]) if part in units else [("*", part)]:
             (above if sign == inner or (sign, inner) == ("/", "/") else below).append(piece)
     return (".".join(above) or ("1" if below else "")) + "".join(f"/{p}" for p in below)
 

@@ -30,6 +30,8 @@ class Equations:
         kinetic, potential: energies, as declared, definitions put in.
         linear: for each parameter, whether the residual is linear in it.
         products: pairs of parameters, by number, of which the residual has a product.
+        constant: for each parameter, whether the slope of the residual by it depends on no
+            parameter and no internal state.
         compensation: per coordinate, the part of Q_other that balances gravity there: see
             `roles.compensation`; zero where nothing does.
         delays: parameters that shift measured forces in time: see `roles.delays`.
@@ -62,6 +64,7 @@ class Equations:
     potential: Any
     linear: list[bool]
     products: list[tuple[int, int]]
+    constant: list[bool]
     compensation: list[Any]
     delays: list[str]
 

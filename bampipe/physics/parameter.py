@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field
 
@@ -48,6 +48,10 @@ class Parameter(NamedDeclaration):
     typical: PhysicalNumber | None = Field(
         default=None,
         description="Size at which the effect is clearly there; strength 1 of the simulator",
+    )
+    within: Literal["travel", "upper half", "lower half"] | None = Field(
+        default=None,
+        description="For a position on the axis: the part of the travel where the diagnosis looks",
     )
     description: str = ""
 

@@ -31,6 +31,8 @@ class System:
         parameters: what p holds, in order.
         noise: names of the additive process noise w.
         linear: per parameter, whether the residual is linear in it; of several, see `is_linear_in`.
+        constant: per parameter, whether the slope of the residual by it is the same for all
+            parameters along the mechanism's true motion.
         touched: axes whose equation the effects change, measurement effects aside.
         moves_sensors: whether an effect of kind ``measurement`` is present.
         driven: whether what the effects add to the residual depends on the measured force of
@@ -58,6 +60,7 @@ class System:
         self.noise: tuple[str, ...] = tuple(meta["noise"])
         self.parameters: tuple[Parameter, ...] = model.parameters
         self.linear: tuple[bool, ...] = tuple(meta["linear"])
+        self.constant: tuple[bool, ...] = tuple(meta["constant"])
         self._products: list[list[int]] = meta["products"]
         self.touched: tuple[int, ...] = tuple(meta["touched"])
         self.moves_sensors: bool = meta["moves_sensors"]
@@ -163,6 +166,8 @@ class System:
         self, q: Array, qd: Array, qdd: Array, u: Array, p: Array
     ) -> tuple[Array, Array, Array]:
         """Motion of the mechanism from what the encoders read; each (T, n_q)."""
+        if not self.moves_sensors:
+            return q, qd, qdd
         n = len(self.coordinates)
         columns = self._arrays.true_motion(q.T, qd.T, qdd.T, u.T, p)
         stacked = _stack(columns, len(q))
@@ -323,6 +328,7 @@ def _generate(model: Model) -> tuple[dict[str, Any], dict[str, str]]:
         "noise": equations.noise,
         "linear": equations.linear,
         "products": equations.products,
+        "constant": equations.constant,
         "touched": [i for i, e in enumerate(added) if e != 0],
         "moves_sensors": any(e != 0 for e in equations.offset),
         "driven": any(e.has(*forces) for e in added)

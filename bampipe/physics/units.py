@@ -326,7 +326,11 @@ def _effect_symbols(item: BoundEffect, device: Device, check: _Check) -> dict[st
                 symbols["side_load"] = check.expression(side, symbols, f"side_load.{axis}", None)
         if axis in item.axes and item.effect.scope == "axis_pair":
             letter = PAIR[item.axes.index(axis)]
-            symbols |= {f"q_{letter}": unit, f"qd_{letter}": unit / second}
+            symbols |= {
+                f"q_{letter}": unit,
+                f"qd_{letter}": unit / second,
+                f"middle_{letter}": unit,
+            }
     if item.effect.scope in ("force_component", "force_pair"):
         for letter in "fg"[: 1 + (item.effect.scope == "force_pair")]:
             for order, suffix in enumerate(("", "_rate", "_curvature")):
@@ -359,7 +363,7 @@ def check_effect(effect: Effect, device: Device, target: str = "") -> list[str]:
     check = _Check()
     item = bind(effect, target, device)
     symbols = _effect_symbols(item, device, check)
-    kind = device.coordinate(item.axes[-1]).kind if item.axes else ""
+    kind = device.coordinate(item.axes[0]).kind if item.axes else ""
     for state in effect.states:
         unit = unit_of(state.unit_on(kind), effect, target, device)
         symbols[state.name] = check.unit(unit, f"states.{state.name}.unit")
@@ -372,8 +376,7 @@ def check_effect(effect: Effect, device: Device, target: str = "") -> list[str]:
         "potential": lambda _: _UNITS["J"],
     }
     for key, tree in effect.expressions.items():
-        term = key.partition(".")[0]
-        check.expression(tree, symbols, key, wanted[term](item.place(key)))
+        check.expression(tree, symbols, key, wanted[key.partition(".")[0]](item.place(key)))
     for state in effect.states:
         own = symbols[state.name]
         rate = None if own is None else own / _UNITS["s"]

@@ -182,6 +182,8 @@ class Vocabulary:
             for letter, axis in zip(PAIR, item.axes, strict=True):
                 i = self.axes.index(axis)
                 symbols |= {f"q_{letter}": self.q[i], f"qd_{letter}": self.qd[i]}
+                middle = sum(device.limits.get(axis, (0.0, 0.0))) / 2.0
+                symbols[f"middle_{letter}"] = sp.Float(middle)
         elif item.effect.scope in ("force_component", "force_pair"):
             for letter, force in zip("fg", self.targeted(item), strict=False):
                 for k, suffix in enumerate(("", "_rate", "_curvature")):

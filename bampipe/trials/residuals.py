@@ -47,13 +47,23 @@ def problem_of(
         timing: whether that time is estimated; else it stays as given.
     """
     n = len(system.parameters)
+    shaping = [i for i, linear in enumerate((*system.linear, False)) if not linear]
+    remembered: dict[tuple[int, bytes], Array] = {}
 
     def residual(trial: int, p: Array) -> Array:
         motion = motions[trial]
         u = motion.inputs(system.inputs)
         if p[n] != 0.0:
             u = u - p[n] * motion.input_rates(system.inputs)
-        return _residual_and_memory(system, motion, u, p[:n])[0]
+        # Internal states do not change with what the residual is linear in: of differences by
+        # many parameters, those of the last point serve most.
+        key = trial, p[shaping].tobytes()
+        found, z = _residual_and_memory(system, motion, u, p[:n], remembered.get(key))
+        if key not in remembered:
+            if any(other != trial for other, _ in remembered) or len(remembered) > 1:
+                remembered.clear()
+            remembered[key] = z
+        return found
 
     parameters = system.parameters
     free = [i for i, item in enumerate(parameters) if not item.fixed and item.name not in held]
@@ -83,6 +93,9 @@ def problem_of(
         upper=np.array(upper),
         step=np.array(step),
         linear=system.is_linear_in([i for i in free if i < n]),
+        constant=np.array(
+            [not timing and not system.moves_sensors and system.constant[i] for i in free]
+        ),
         band=band,
         resting=[_standstill(motion, system, band) for motion in motions],
         precision=np.array(precision),
@@ -100,9 +113,15 @@ def _standstill(motion: Motion, system: System, band: Band) -> NDArray[np.bool_]
     return resting(motion.qd, motion.qd_sd, band.rate_hz, np.array(braked))
 
 
-def _residual_and_memory(system: System, motion: Motion, u: Array, p: Array) -> tuple[Array, Array]:
-    """Residual (T, n_q) of a trial under inputs ``u`` (T, n_u), unfiltered, and states (T, n_z)."""
-    z = system.memory(motion.q, motion.qd, motion.qdd, u, p, motion.t)
+def _residual_and_memory(
+    system: System, motion: Motion, u: Array, p: Array, z: Array | None = None
+) -> tuple[Array, Array]:
+    """Residual (T, n_q) of a trial under inputs ``u`` (T, n_u), unfiltered, and states (T, n_z).
+
+    The states are ``z`` where that is given.
+    """
+    if z is None:
+        z = system.memory(motion.q, motion.qd, motion.qdd, u, p, motion.t)
     true = system.true_motion(motion.q, motion.qd, motion.qdd, u, p)
     return system.residual(*true, z, u, p), z
 

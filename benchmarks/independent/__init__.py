@@ -1,4 +1,4 @@
-"""Simulators that share no code with bampipe: sessions of four machines with a known truth.
+"""Simulators that share no code with bampipe: sessions of five machines with a known truth.
 
 Equations of motion, integrators, friction, sensors and session files are written here from the
 physics, with numpy, numba and scipy alone, so that benchmarks and tests hold the product against
@@ -12,10 +12,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from independent import axis, bam, damper, joint
+from independent import axis, bam, damper, joint, wrist
 from independent.sensors import Conditions
 
-MACHINES = {"bam": bam, "joint": joint, "axis": axis, "damper": damper}
+MACHINES = {"bam": bam, "joint": joint, "axis": axis, "damper": damper, "wrist": wrist}
 
 
 def record(

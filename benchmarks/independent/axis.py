@@ -31,11 +31,14 @@ LAWS = {
     "return_spring": {"spring": 60.0, "spring_rest": 0.05},
     "torque_ripple": {"cogging": 4.0, "cogging_wavenumber": 120.0, "cogging_phase": 0.6},
     "detent": {"detent": 12.0, "detent_at": 0.04, "detent_width": 0.005},
-    "one_sided_stop": {"stop": 600.0, "stop_at": 0.02},
+    "shear_thinning": {"thinning": 300.0, "thinning_speed": 0.03},
+    "maxwell_slip": {"slip": 14.0, "slip_distance": 2e-4},
+    "upper_stop": {"stop": 600.0, "stop_at": 0.02},
+    "rough_patch": {"rough": 12.0, "rough_at": 0.04, "rough_width": 0.006},
     "winding_cable": {"cable": 150.0, "cable_time": 1.0},
 }
 MOTOR = {"actuator_delay": 0.004, "actuator_lag": 0.005}
-OUTSIDE = ("detent", "one_sided_stop", "winding_cable")
+OUTSIDE = ("detent", "rough_patch", "winding_cable")
 EFFECTS = (
     *(f"{name}:carriage" for name in LAWS if name not in OUTSIDE),
     "actuator_delay", "actuator_lag:motor", "flexible_load:carriage",

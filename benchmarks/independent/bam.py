@@ -74,15 +74,16 @@ LAWS = {
     "return_spring": {"spring": (2.0, 2.5, 12.0), "spring_rest": (0.15, 0.1, 1.05)},
     "detent": {"detent": (1.2, 1.5, 3.0), "detent_at": (0.15, 0.1, 1.12),
                "detent_width": (0.05, 0.05, 0.02)},
-    "one_sided_stop": {"stop": (14.0, 20.0, 90.0), "stop_at": (0.3, 0.2, 1.25)},
-    "dead_zone_spring": {"slack_spring": (8.0, 10.0, 0.0), "slack": (0.3, 0.2, 1.0)},
+    "shear_thinning": {"thinning": (3.0, 3.5, 15.0), "thinning_speed": (0.3, 0.3, 0.15)},
+    "maxwell_slip": {"slip": (0.8, 1.3, 2.2), "slip_distance": (0.012, 0.012, 0.005)},
+    "upper_stop": {"stop": (14.0, 20.0, 90.0), "stop_at": (0.3, 0.2, 1.25)},
+    "rough_patch": {"rough": (1.0, 1.3, 2.5), "rough_at": (0.15, 0.1, 1.12),
+                    "rough_width": (0.08, 0.08, 0.03)},
     "winding_cable": {"cable": (4.0, 5.0, 25.0), "cable_time": (1.5, 1.5, 1.5)},
 }  # fmt: skip
 """Effects of one axis: their laws, typical for yaw, pitch and extension."""
 
-OUTSIDE = (
-    "detent", "one_sided_stop", "dead_zone_spring", "winding_cable", "friction_by_reach", "hum",
-)  # fmt: skip
+OUTSIDE = ("detent", "rough_patch", "winding_cable", "hum")
 EFFECTS = (
     *(f"{name}:{axis}" for name in LAWS if name not in OUTSIDE for axis in AXES),
     "backlash:yaw", "backlash:pitch", "inertia_mismatch:yaw", "inertia_mismatch:pitch",
@@ -90,12 +91,12 @@ EFFECTS = (
     "gravity_compensator_lag", "gravity_compensator_rate_limit", "gravity_compensator_mistuned",
     *(f"force_{kind}:{c}" for kind in ("bias", "gain", "drift") for c in COMPONENTS),
     "force_crosstalk:xy", "force_crosstalk:zx", "force_delay", "encoder_scale:yaw",
-    "encoder_scale:extension", "brake_lag", "brake_residual_torque:yaw",
+    "encoder_scale:extension", "friction_by_pose:yaw-extension", "brake_lag",
+    "brake_residual_torque:yaw",
 )  # fmt: skip
 UNKNOWN = (
-    "detent:yaw", "detent:pitch", "detent:extension", "one_sided_stop:yaw", "one_sided_stop:pitch",
-    "one_sided_stop:extension", "dead_zone_spring:yaw", "dead_zone_spring:pitch",
-    "winding_cable:yaw", "winding_cable:extension", "friction_by_reach", "hum:yaw",
+    "detent:yaw", "detent:pitch", "detent:extension", "rough_patch:yaw", "rough_patch:pitch",
+    "rough_patch:extension", "winding_cable:yaw", "winding_cable:extension", "hum:yaw",
 )  # fmt: skip
 
 
@@ -354,8 +355,9 @@ class _Specimen:
             m["brake_lag"] = self.truth["brake_lag.time_constant"] = 0.06 * size
         elif name == "brake_residual_torque":
             m["remanence"], m["remanence_decay"] = 0.05 * size, 5.0
-        elif name == "friction_by_reach":
+        elif name == "friction_by_pose":
             laws["reach_share"][0], laws["reach_rest"][0] = 2.0 * size, MIDDLE[2]
+            self.truth[f"{name}.{at}.coulomb_slope"] = 2.0 * size
         elif name == "hum":
             m["hum_torque"], m["hum_frequency"] = 0.6 * size, rng.uniform(2.0, 4.0)
         else:

@@ -31,16 +31,17 @@ MACHINE = np.dtype(
             "viscous", "coulomb", "viscous_gain", "coulomb_gain", "mass", "preload",
             "share", "distance", "symmetry", "coil_lag", "bend", "sharpness", "stiffness",
             "rest", "drag", "dry_difference", "viscous_difference",
-            "bumper", "bumper_at", "oil_spring", "dead_travel",
+            "bumper", "bumper_at", "thinning", "thinning_speed", "oil_spring", "dead_travel",
         )
     ]
 )  # fmt: skip
-OUTSIDE = ("bumper", "soft_oil", "dead_travel")
+OUTSIDE = ("soft_oil", "dead_travel")
 EFFECTS = (
     "hysteresis:piston", "channel_lag:current", "channel_saturation:current",
     "return_spring:piston", "quadratic_drag:piston", "asymmetric_coulomb:piston",
+    "upper_stop:piston", "shear_thinning:piston",
 )  # fmt: skip
-UNKNOWN = ("bumper:piston", "soft_oil:piston", "dead_travel:piston")
+UNKNOWN = ("soft_oil:piston", "dead_travel:piston")
 
 
 @njit(cache=True)
@@ -73,6 +74,7 @@ def _press(m, x, v, a, current, log_at):
             force *= abs(free) / m.dead_travel if free * speed > 0.0 else 0.0
         force += m.mass * a[k] + m.preload + m.stiffness * (x[k] - m.rest)
         force += m.drag * speed * abs(speed)
+        force += m.thinning * speed / (1.0 + abs(speed) / m.thinning_speed)
         force += m.dry_difference * np.tanh(speed / YIELD_SPEED) ** 2
         force += m.viscous_difference * abs(speed)
         if x[k] > m.bumper_at:
@@ -102,7 +104,8 @@ def _hide(
             "quadratic_drag": {"drag": 1500.0 * size},
             "asymmetric_coulomb": {"dry_difference": 15.0 * size * sign,
                                    "viscous_difference": 60.0 * size * sign},
-            "bumper": {"bumper": 6e4 * size, "bumper_at": 0.004},
+            "upper_stop": {"bumper": 6e4 * size, "bumper_at": 0.004},
+            "shear_thinning": {"thinning": 1500.0 * size, "thinning_speed": 0.02 * shape},
             "soft_oil": {"oil_spring": 6e4 / size},
             "dead_travel": {"dead_travel": 0.0006 * size},
         }[name]  # fmt: skip
@@ -112,8 +115,16 @@ def _hide(
             "coil_lag": "time_constant",
             "drag": "coefficient",
             "dry_difference": "difference",
+            "bumper": "stiffness",
+            "bumper_at": "position",
         }
-        if name in ("hysteresis", "channel_lag", "quadratic_drag", "channel_saturation"):
+        if name in (
+            "upper_stop",
+            "hysteresis",
+            "channel_lag",
+            "quadratic_drag",
+            "channel_saturation",
+        ):
             prefix = full.replace(":", ".")
             truth |= {f"{prefix}.{theirs.get(k, k)}": v for k, v in laws.items()}
         elif name == "return_spring":
@@ -163,7 +174,7 @@ def record(
         "mass": rng.uniform(0.9, 1.6), "preload": rng.uniform(-30.0, 30.0),
     }  # fmt: skip
     machine = np.zeros(1, MACHINE)[0]
-    machine["sharpness"] = machine["distance"] = 1.0
+    machine["sharpness"] = machine["distance"] = machine["thinning_speed"] = 1.0
     machine["bumper_at"] = np.inf
     for name, value in parameters.items():
         machine[name] = value

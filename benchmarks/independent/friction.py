@@ -30,8 +30,10 @@ AXIS = np.dtype(
             "spring", "spring_rest",
             "cogging", "cogging_phase", "cogging_wavenumber",
             "detent", "detent_at", "detent_width",  # a magnet that catches near one position
+            "rough", "rough_at", "rough_width",     # dry friction around one position
             "stop", "stop_at",                      # a soft stop beyond one position
-            "slack_spring", "slack",                # a spring that is loose in the middle
+            "thinning", "thinning_speed",           # viscous friction that levels off (Cross)
+            "slip", "slip_distance",                # dry friction of contacts that hold, then slip
             "cable", "cable_time",                  # a cable that winds and creeps
             "reach_share", "reach_rest",            # dry friction by another axis' position
         )
@@ -41,13 +43,13 @@ AXIS = np.dtype(
 
 _NEVER_ZERO = (
     "stribeck_speed", "dahl_distance", "wavenumber", "warming_time", "cogging_wavenumber",
-    "detent_width", "cable_time",
+    "detent_width", "cable_time", "rough_width", "thinning_speed", "slip_distance",
 )  # fmt: skip
 
 _SHAPES = {
     "stribeck_speed", "dahl_distance", "wavenumber", "ripple_phase", "warming_time", "spring_rest",
-    "cogging_wavenumber", "cogging_phase", "detent_at", "detent_width", "stop_at", "slack",
-    "cable_time",
+    "cogging_wavenumber", "cogging_phase", "detent_at", "detent_width", "stop_at",
+    "cable_time", "rough_at", "rough_width", "thinning_speed", "slip_distance",
 }  # fmt: skip
 _SAME = {
     "stribeck": {"stribeck": "force", "stribeck_speed": "speed"},
@@ -55,12 +57,19 @@ _SAME = {
     "asymmetric_coulomb": {"dry_difference": "difference",
                            "viscous_difference": "viscous_difference"},
     "quadratic_drag": {"drag": "coefficient"},
+    "upper_stop": {"stop": "stiffness", "stop_at": "position"},
     "load_dependent_friction": {"load_share": "coefficient", "side_share": "side_coefficient"},
 }  # fmt: skip
 """Laws here, by the names of the parameters in bampipe that mean the same."""
 
-MEMORY = np.dtype([("dahl", np.float64), ("heat", np.float64), ("cable", np.float64)])
-"""What an axis remembers: built-up friction (share), friction power (W), cable rest (position)."""
+CONTACTS = np.array([0.25, 0.5, 1.0, 2.0, 4.0])
+"""Of the contacts that share ``slip`` alike: distance at which each slips over the stated one."""
+
+MEMORY = np.dtype(
+    [("dahl", np.float64), ("heat", np.float64), ("cable", np.float64), ("slip", np.float64, 5)]
+)
+"""What an axis remembers: built-up friction (share), friction power (W), cable rest (position),
+force of each contact (share)."""
 
 
 def blank_laws(axes: int) -> np.ndarray:
@@ -68,7 +77,7 @@ def blank_laws(axes: int) -> np.ndarray:
     laws = np.zeros(axes, AXIS)
     for name in _NEVER_ZERO:
         laws[name] = 1.0
-    laws["stop_at"] = laws["slack"] = np.inf
+    laws["stop_at"] = np.inf
     return laws
 
 
@@ -88,8 +97,8 @@ def set_law(
     sign = rng.choice([-1.0, 1.0]) if name == "asymmetric_coulomb" else 1.0
     for key, value in typical.items():
         law[key] = value * (rng.uniform(0.85, 1.15) if key in _SHAPES else sign * size)
-    if name == "presliding":
-        law["dahl"] = min(law["dahl"], 0.95 * law["coulomb"])
+    for part in {"presliding": ("dahl",), "maxwell_slip": ("slip",)}.get(name, ()):
+        law[part] = min(law[part], 0.95 * law["coulomb"])
     of_wave = {
         "position_dependent_friction": ("ripple", "ripple_phase", "wavenumber"),
         "torque_ripple": ("cogging", "cogging_phase", "cogging_wavenumber"),
@@ -115,19 +124,19 @@ def push_along(law, q, memory):
     force -= law.detent * x * np.exp(0.5 - 0.5 * x * x)
     if q > law.stop_at:
         force -= law.stop * (q - law.stop_at)
-    if abs(q) > law.slack:
-        force -= law.slack_spring * (q - np.sign(q) * law.slack)
     return force - law.cable * (q - memory.cable)
 
 
 @njit(cache=True)
 def dry_level(law, q, v, load, side, elsewhere):
-    """Dry friction that opposes motion in the direction of ``v``; Dahl's part is not in it."""
-    level = law.coulomb + law.stribeck * np.exp(-((v / law.stribeck_speed) ** 2)) - law.dahl
+    """Dry friction that opposes motion in the direction of ``v``, without what builds up."""
+    level = law.coulomb + law.stribeck * np.exp(-((v / law.stribeck_speed) ** 2))
+    level -= law.dahl + law.slip
     level += law.dry_difference * np.sign(v)
     level += law.ripple * np.sin(law.wavenumber * q + law.ripple_phase)
     level += law.load_share * abs(load) + law.side_share * side
     level += law.reach_share * (elsewhere - law.reach_rest)
+    level += law.rough * np.exp(-(((q - law.rough_at) / law.rough_width) ** 2))
     return max(level, 0.0)
 
 
@@ -135,7 +144,8 @@ def dry_level(law, q, v, load, side, elsewhere):
 def drag_slope(law, v, memory):
     """Viscous friction as force over velocity."""
     warm = max(1.0 - law.softening * memory.heat, 0.1)
-    return law.viscous * warm + law.viscous_difference * np.sign(v) + law.drag * abs(v)
+    thin = law.thinning / (1.0 + abs(v) / law.thinning_speed)
+    return law.viscous * warm + law.viscous_difference * np.sign(v) + law.drag * abs(v) + thin
 
 
 @njit(cache=True)
@@ -144,7 +154,7 @@ def resist(law, memory, v_free, v, h, inertia, q, load, side, elsewhere):
 
     Implicit in the velocity: friction stops an axis, and never turns it round.
     """
-    impulse = -law.dahl * memory.dahl * h
+    impulse = -(law.dahl * memory.dahl + law.slip * np.mean(memory.slip)) * h
     v_free += impulse / inertia
     dry = dry_level(law, q, v_free, load, side, elsewhere) * h / inertia
     # Where the sign changes within the step, the slope of the new direction counts.
@@ -179,5 +189,8 @@ def remember(law, memory, q, v, h):
     aim = np.sign(v)
     memory.dahl = aim + (memory.dahl - aim) * np.exp(-abs(v) * h / law.dahl_distance)
     power = law.viscous * v * v + law.coulomb * abs(v)
+    for i in range(5):
+        moved = memory.slip[i] + v * h / (law.slip_distance * CONTACTS[i])
+        memory.slip[i] = min(max(moved, -1.0), 1.0)
     memory.heat += (power - memory.heat) * h / law.warming_time
     memory.cable += (q - memory.cable) * h / law.cable_time

@@ -36,11 +36,14 @@ LAWS = {
     "return_spring": {"spring": 4.0, "spring_rest": 0.3},
     "torque_ripple": {"cogging": 1.2, "cogging_wavenumber": 20.0, "cogging_phase": 0.6},
     "detent": {"detent": 4.0, "detent_at": 0.3, "detent_width": 0.08},
-    "one_sided_stop": {"stop": 40.0, "stop_at": 0.6},
+    "shear_thinning": {"thinning": 12.0, "thinning_speed": 0.3},
+    "maxwell_slip": {"slip": 4.0, "slip_distance": 0.004},
+    "upper_stop": {"stop": 40.0, "stop_at": 0.6},
+    "rough_patch": {"rough": 4.0, "rough_at": 0.3, "rough_width": 0.1},
     "winding_cable": {"cable": 12.0, "cable_time": 2.0},
 }
 MOTOR = {"actuator_delay": 0.02, "actuator_lag": 0.03, "drive_sag": 0.003}
-OUTSIDE = ("detent", "one_sided_stop", "winding_cable")
+OUTSIDE = ("detent", "rough_patch", "winding_cable")
 EFFECTS = (
     *(f"{name}:joint" for name in LAWS if name not in OUTSIDE),
     "actuator_delay", "actuator_lag:current", "drive_sag:joint",

@@ -55,6 +55,18 @@ def test_held_out_errors_are_those_of_refits_without_each_trial():
         assert found.held_out_rmse == pytest.approx(np.sqrt(square / count), rel=tolerance)
 
 
+def test_slopes_are_those_of_the_last_parameters_after_a_nonlinear_fit():
+    """Slopes that no parameter changes are carried from one iteration to the next."""
+    recipe = bam(["presliding:yaw"])
+    session = made(recipe, {"presliding.yaw.force": 0.8, "presliding.yaw.distance": 0.03}, trials=2)
+    system = system_of(recipe)
+    found = gather_evidence(system, session.motions, BAND, system.prior, session.folds)
+    assert not found.is_linear and np.abs(found.p - system.prior).max() > 0.2
+    anew = gather_evidence(system, session.motions, BAND, found.p, session.folds, most_iterations=0)
+    for carried, fresh in zip(found.jacobian, anew.jacobian, strict=True):
+        np.testing.assert_allclose(carried, fresh, rtol=1e-6, atol=1e-9)
+
+
 def test_standstill_is_left_out_and_quick_reversals_stay():
     t = np.arange(2000) / RATE
     qd = np.zeros((2000, 3))

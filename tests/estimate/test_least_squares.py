@@ -37,6 +37,7 @@ def problem(count: int = 3, truth: np.ndarray = TRUTH, **changes: object) -> Pro
         "upper": BOUNDS[1],
         "step": np.ones(3),
         "linear": True,
+        "constant": np.zeros(3, dtype=bool),
         "band": Band(RATE, (8.0,)),
         "resting": [np.zeros((len(m[0]), 1), dtype=bool) for m in motions],
     } | changes

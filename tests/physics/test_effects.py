@@ -52,6 +52,12 @@ CANONICAL = [
     "force_drift",
     "force_application_point",
     "encoder_scale",
+    "shear_thinning",
+    "upper_stop",
+    "lower_stop",
+    "maxwell_slip",
+    "unbalance",
+    "friction_by_pose",
 ]
 
 
@@ -220,12 +226,16 @@ def symbols_of(case):
     for c in BAM.coordinates:
         torque = dimension(c.torque_unit)
         known[f"brake_{c.name}"] = known[f"weight_{c.name}"] = torque
+        for letter in "ab" if bound.effect.scope == "axis_pair" else "":
+            if c.name == bound.axes["ab".index(letter)]:
+                known |= dict.fromkeys((f"q_{letter}", f"middle_{letter}"), dimension(c.unit))
+                known[f"qd_{letter}"] = dimension(f"{c.unit}/s")
         if c.name == bound.target:
             known |= dict.fromkeys(("load", "applied", "brake", "side_load", "coulomb"), torque)
             known |= {"q": dimension(c.unit), "qd": dimension(f"{c.unit}/s")}
             known["viscous"] = tuple(np.subtract(torque, dimension(f"{c.unit}/s")))
     known |= {p.name.rpartition(".")[2]: dimension(p.unit) for p in bound.parameters}
-    kind = BAM.coordinate(bound.target).kind if bound.effect.scope == "axis" else ""
+    kind = BAM.coordinate(bound.axes[0]).kind if bound.axes else ""
     for state in bound.effect.states:
         known[state.name] = dimension(state.unit_on(kind))
     expected = {"kinetic": dimension("J"), "potential": dimension("J"), "input": newton}
@@ -237,10 +247,10 @@ def test_units_are_consistent(case):
     bound, known, expected = symbols_of(case)
     check = Dimensions(known)
     for key, tree in bound.effect.expressions.items():
-        what, _, place = key.partition(".")
+        what = key.partition(".")[0]
         wanted = expected.get(what)
         if what == "torque":
-            wanted = dimension(BAM.coordinate(place or bound.target).torque_unit)
+            wanted = dimension(BAM.coordinate(bound.place(key)).torque_unit)
         elif what == "offset":
             wanted = known["q"]
         assert check.of(tree) in (wanted, ANY), key
@@ -368,7 +378,8 @@ def recorded(system, p, braked):
     return *seen, u, t
 
 
-RECOVERED = [c for c in CASES if c.partition(":")[2] in ("", "yaw", "extension", "x", "z", "xy")]
+PLACES = ("", "yaw", "extension", "x", "z", "xy", "yaw-extension")
+RECOVERED = [c for c in CASES if c.partition(":")[2] in PLACES]
 
 
 @pytest.mark.parametrize("case", RECOVERED)

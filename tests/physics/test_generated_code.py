@@ -12,6 +12,7 @@ from motions import (
     random_motion,
     typical_parameters,
 )
+from scipy.integrate import solve_ivp
 
 from bampipe.model_functions import ROWS
 from bampipe.physics import Model, compile_model, registry
@@ -195,3 +196,38 @@ def test_generated_code_holds_no_name_from_a_file(tmp_path, monkeypatch):
     for word in ("wandering", "pushing", "heaviness", "presliding", "deflection", "drift"):
         assert not any(word in text for text in sources)
     assert all(set(text) <= set(string.printable) for text in sources)
+
+
+@pytest.mark.parametrize(
+    ("machine", "effect", "share"),
+    [
+        ("bam", "presliding:yaw", 2e-3),
+        ("bam", "thermal_damping:yaw", 1e-4),
+        ("bam", "gravity_compensator_lag", 1e-4),
+        ("bam", "maxwell_slip:yaw", 2e-3),
+        ("bam", "brake_lag", 1e-4),
+        ("slider", "actuator_lag:motor", 1e-4),
+        ("magnetic_damper", "hysteresis:piston", 2e-3),
+    ],
+)
+def test_internal_states_are_those_of_a_fine_integration(machine, effect, share):
+    """Along a sampled motion, everything linear between samples; off by a share of their range."""
+    system = compile_model(Model(registry.device(machine), [effect]))
+    n, rate = len(system.coordinates), 250.0
+    t = np.arange(750) / rate
+    turn = 2 * np.pi * np.outer(t, 0.7 + 0.25 * np.arange(n))
+    q, qd = 0.05 * np.sin(turn) + 0.9, 0.05 * np.cos(turn) * (turn[1] * rate)
+    waves = np.sin(2 * np.pi * np.outer(t, 1.1 + 0.3 * np.arange(len(system.inputs))))
+    u = np.abs(waves) * 20.0
+    p = np.array([x.prior if x.typical is None else x.typical for x in system.parameters])
+    found = system.memory(q, qd, 0 * q, u, p, t)
+
+    def slope(time, z):
+        at = [np.array([np.interp(time, t, c) for c in x.T]) for x in (q, qd, u)]
+        x, dx = np.concatenate([at[0], at[1], z]), np.empty(2 * n + z.size)
+        system.derivative(x, at[2], p, np.zeros(len(system.noise)), dx)
+        return dx[2 * n :]
+
+    exact = solve_ivp(slope, (t[0], t[-1]), found[0], t_eval=t, max_step=1e-3, rtol=1e-6)
+    assert np.ptp(exact.y) > 0.0
+    np.testing.assert_allclose(found, exact.y.T, atol=share * np.ptp(exact.y))

@@ -64,7 +64,10 @@ def typical(system, strength=1.0):
 def test_every_effect_has_a_place_in_some_device(name):
     effect = registry.effect(name)
     devices = [registry.device_from(ARM), *map(registry.device, registry.device_names())]
-    assert any(effect.targets(device) for device in devices)
+    places = [(device, target) for device in devices for target in effect.targets(device)]
+    assert places
+    for device, target in places:
+        assert check_effect(effect, device, target) == []
 
 
 @pytest.mark.parametrize(("word", "sign"), [("sum", 1.0), ("difference", -1.0)])
@@ -83,9 +86,33 @@ def test_what_turns_with_two_joints_acts_on_both(word, sign):
     np.testing.assert_allclose(force[:, 1], drum, atol=1e-3)
     np.testing.assert_allclose(force[:, 0], sign * drum, atol=1e-3)
     np.testing.assert_allclose(force[:, 2], 0.0, atol=1e-12)
-    for name in names:
-        effect, _, target = name.partition(":")
-        assert check_effect(registry.effect(effect), arm, target) == []
+
+
+def test_friction_by_pose_takes_every_two_axes_either_way_and_of_a_robot_neighbours():
+    effect = registry.effect("friction_by_pose")
+    assert effect.targets(registry.device("bam")) == (
+        "yaw-pitch", "yaw-extension", "pitch-yaw", "pitch-extension", "extension-yaw",
+        "extension-pitch",
+    )  # fmt: skip
+    assert effect.targets(registry.device_from(ARM)) == (
+        "one-two",
+        "two-one",
+        "two-three",
+        "three-two",
+    )
+
+
+def test_friction_by_pose_is_counted_from_the_middle_of_the_other_axis():
+    system = compile_model(Model(registry.device("bam"), ["friction_by_pose:yaw-extension"]))
+    own = system.model.effects[0].parameters
+    assert [p.unit for p in own] == ["N.m/m", "N.m.s/rad/m"]
+    values = np.array([x.prior for x in system.parameters])
+    values[-2:] = 1.5, 0.7
+    q, qd = np.array([[0.1, 0.2, 1.3]]), np.array([[0.5, 0.0, 0.0]])
+    at = q, qd, 0 * q, np.zeros((1, 0)), np.zeros((1, len(system.inputs)))
+    added = system.contribution(*at, values)
+    # The range of the extension is 0.6 to 1.6 m.
+    np.testing.assert_allclose(added, [[-(1.5 + 0.7 * 0.5) * 0.2, 0.0, 0.0]], rtol=1e-9)
 
 
 @pytest.mark.parametrize(("machine", "case"), CASES)

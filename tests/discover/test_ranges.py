@@ -1,0 +1,61 @@
+"""Shapes are looked for at the scale of the machine."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from sessions import BAND, bam, made
+
+from bampipe.discover.chance import system_of
+from bampipe.discover.ranges import MachineScale
+from bampipe.physics import Model, registry
+from bampipe.trials.residuals import gather_evidence
+
+AXIS = MachineScale(
+    np.array([-0.05]), np.array([0.2]), np.array([0.3]), np.array([100.0]),
+    {"carriage": ("m", "N")}, 1e-3, 20.0,
+)  # fmt: skip
+"""A positioning axis: 0.25 m, 0.3 m/s, 100 N, 1 kHz."""
+
+
+def range_of(effect, parameter, scale=AXIS):
+    item = Model(registry.device("slider"), [effect]).effects[0]
+    return scale.range_of(item, item.parameter(parameter))
+
+
+@pytest.mark.parametrize(
+    ("effect", "parameter", "low", "high"),
+    [
+        ("presliding:carriage", "distance", 25e-6, 0.03),
+        ("stribeck:carriage", "speed", 3e-4, 0.2),
+        ("torque_ripple:carriage", "wavenumber", 4 * np.pi / 0.25, 60 * np.pi / 0.25),
+        ("transmission_compliance:carriage", "compliance", 2.5e-8, 2.5e-4),
+        ("drive_sag:carriage", "sag", 1e-4, 0.03),
+        ("actuator_delay", "delay", 2e-4, 0.08),
+        ("thermal_damping:carriage", "time_constant", 1.0, 60.0),
+    ],
+)
+def test_a_range_follows_travel_speed_load_and_sampling(effect, parameter, low, high):
+    found = range_of(effect, parameter)
+    assert found.by_ratio
+    assert (found.low, found.high) == pytest.approx((low, high), rel=1e-9)
+
+
+def test_a_stop_is_looked_for_in_its_half_of_the_travel():
+    upper, lower = (range_of(f"{name}_stop:carriage", "position") for name in ("upper", "lower"))
+    assert (upper.low, upper.high) == pytest.approx((0.075, 0.195))
+    assert (lower.low, lower.high) == pytest.approx((-0.045, 0.075))
+
+
+def test_the_scale_of_a_session_is_that_of_its_motion():
+    session = made(bam(), {}, trials=2)
+    system = system_of(bam())
+    evidence = gather_evidence(system, session.motions, BAND, system.prior, session.folds)
+    scale = MachineScale.of_trials(evidence)
+    q = np.concatenate([m.q for m in session.motions])
+    np.testing.assert_allclose(scale.highest - scale.lowest, np.ptp(q, axis=0))
+    force = np.concatenate([m.channels["force_z"] for m in session.motions])
+    assert scale.load[2] == pytest.approx(np.abs(force).max())
+    assert scale.interval == pytest.approx(
+        1.0 / session.motions[0].t.size * scale.duration, rel=0.01
+    )
