@@ -97,8 +97,8 @@ def test_friction_by_pose_takes_every_two_axes_either_way_and_of_a_robot_neighbo
     assert effect.targets(registry.device_from(ARM)) == (
         "one-two",
         "two-one",
-        "two-three",
-        "three-two",
+        "two-rail",
+        "rail-two",
     )
 
 
