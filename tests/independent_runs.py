@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,15 @@ import independent
 from independent.sensors import Conditions
 
 import bampipe
+from bampipe.data.run_folder import RunFolder
+from bampipe.discover.chance import system_of
+from bampipe.physics import registry
+from bampipe.physics.device import Device
+from bampipe.physics.recipe import Recipe
+from bampipe.progress import silent
+from bampipe.stages import filter as filter_stage
+from bampipe.stages import ingest
+from bampipe.trials.measured import MeasuredTrials, read_measured_trials
 
 # Dry friction as the devices write it: a true standstill has tests of its own.
 SHORT = {
@@ -17,7 +27,9 @@ SHORT = {
     "joint": Conditions(creep=True, trials=3, seconds=8.0),
     "axis": Conditions(creep=True, trials=3, seconds=5.0),
     "damper": Conditions(trials=3, seconds=6.0),
+    "wrist": Conditions(trials=3, seconds=4.0),
 }
+BUILT_IN = {"bam": "bam", "axis": "slider", "damper": "magnetic_damper"}
 PIPELINE = """schema = "bampipe.pipeline/1"
 name = "short"
 stages = ["ingest", "filter", "identify", "validate"]
@@ -37,6 +49,33 @@ def record_run(
     (root / "short.toml").write_text(PIPELINE)
     run = bampipe.run_session(root / machine, runs=root / "runs", pipeline=str(root / "short.toml"))
     return run, truth["parameters"]
+
+
+def device_of(machine: str) -> Device:
+    """The device of a machine: built in, or as its simulator writes it beside a session."""
+    if machine in BUILT_IN:
+        return registry.device(BUILT_IN[machine])
+    return registry.device_from(tomllib.loads(independent.MACHINES[machine].DEVICE))
+
+
+def record_trials(
+    root: Path, machine: str, seed: int, *effects: str, **conditions: Any
+) -> tuple[MeasuredTrials, Recipe, dict[str, float]]:
+    """Record a session with ``effects`` hidden and filter it.
+
+    Returns its trials, the bare device, and the true values of a right model.
+    """
+    chosen = replace(SHORT[machine], **conditions)
+    strengths = dict.fromkeys(effects, 1.0)
+    truth = independent.record(machine, root / machine, seed, strengths, chosen)
+    run = RunFolder(root / "run")
+    for stage in ("ingest", "filter"):
+        run.path(stage).mkdir(parents=True)
+    ingest.execute(run, run.root, ingest.Config(session=str(root / machine)), silent)
+    filter_stage.execute(run, run.root, filter_stage.Config(), silent)
+    recipe = Recipe(device_of(machine).declaration, (), ())
+    trials = read_measured_trials(run, system_of(recipe), every_input=True)
+    return trials, recipe, truth["parameters"]
 
 
 def diagnose(run: bampipe.Run) -> dict[str, Any]:

@@ -74,7 +74,7 @@ def _press(m, x, v, a, current, log_at):
             force *= abs(free) / m.dead_travel if free * speed > 0.0 else 0.0
         force += m.mass * a[k] + m.preload + m.stiffness * (x[k] - m.rest)
         force += m.drag * speed * abs(speed)
-        force += m.thinning * speed / (1.0 + abs(speed) / m.thinning_speed)
+        force += m.thinning * speed / (1.0 + (speed / m.thinning_speed) ** 2) ** 0.35
         force += m.dry_difference * np.tanh(speed / YIELD_SPEED) ** 2
         force += m.viscous_difference * abs(speed)
         if x[k] > m.bumper_at:

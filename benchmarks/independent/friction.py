@@ -32,7 +32,7 @@ AXIS = np.dtype(
             "detent", "detent_at", "detent_width",  # a magnet that catches near one position
             "rough", "rough_at", "rough_width",     # dry friction around one position
             "stop", "stop_at",                      # a soft stop beyond one position
-            "thinning", "thinning_speed",           # viscous friction that levels off (Cross)
+            "thinning", "thinning_speed",           # viscous friction that levels off (Carreau)
             "slip", "slip_distance",                # dry friction of contacts that hold, then slip
             "cable", "cable_time",                  # a cable that winds and creeps
             "reach_share", "reach_rest",            # dry friction by another axis' position
@@ -144,7 +144,7 @@ def dry_level(law, q, v, load, side, elsewhere):
 def drag_slope(law, v, memory):
     """Viscous friction as force over velocity."""
     warm = max(1.0 - law.softening * memory.heat, 0.1)
-    thin = law.thinning / (1.0 + abs(v) / law.thinning_speed)
+    thin = law.thinning / (1.0 + (v / law.thinning_speed) ** 2) ** 0.35
     return law.viscous * warm + law.viscous_difference * np.sign(v) + law.drag * abs(v) + thin
 
 

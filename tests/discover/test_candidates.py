@@ -1,17 +1,16 @@
-"""Candidates that act on what effects of the model leave."""
+"""Candidates: on what effects of the model leave, and among rivals on data of other simulators."""
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
-from independent_runs import record_run
+from independent_runs import device_of, record_trials
 
-from bampipe.data.run_folder import RunFolder
 from bampipe.discover.candidates import Scorer, candidate, candidate_model
 from bampipe.discover.chance import fit_trials, system_of
 from bampipe.discover.start import search_start
 from bampipe.physics import registry
 from bampipe.physics.recipe import Recipe
-from bampipe.trials.measured import read_measured_trials
 
 DAMPER = registry.device("magnetic_damper")
 LAG, SATURATION = "channel_lag:current", "channel_saturation:current"
@@ -20,9 +19,7 @@ LAG, SATURATION = "channel_lag:current", "channel_saturation:current"
 @pytest.fixture(scope="module")
 def trials(tmp_path_factory):
     """A damper whose coil lags and whose field saturates with the lagged current."""
-    run, _ = record_run(tmp_path_factory.mktemp("coil"), "damper", 3, LAG, SATURATION)
-    bare = system_of(Recipe(DAMPER.declaration, (), ()))
-    return read_measured_trials(RunFolder(run.root), bare, every_input=True)
+    return record_trials(tmp_path_factory.mktemp("coil"), "damper", 3, LAG, SATURATION)[0]
 
 
 @pytest.mark.parametrize(("first", "second"), [(LAG, SATURATION), (SATURATION, LAG)])
@@ -54,3 +51,36 @@ def test_only_effects_that_meet_are_taken_together():
         "encoder_scale:yaw",
     ]
     assert names("stribeck:yaw", "backlash:yaw", device="bam") == ["stribeck:yaw"]
+
+
+NAMED = [
+    ("joint", 41, "shear_thinning:joint", ("stribeck:joint", "quadratic_drag:joint")),
+    ("joint", 43, "maxwell_slip:joint", ("presliding:joint", "stribeck:joint")),
+    ("joint", 45, "presliding:joint", ("maxwell_slip:joint", "stribeck:joint")),
+    ("bam", 52, "return_spring:yaw", ("upper_stop:yaw", "lower_stop:yaw", "base_tilt")),
+    ("bam", 53, "upper_stop:yaw", ("return_spring:yaw", "lower_stop:yaw")),
+    ("bam", 54, "friction_by_pose:yaw-extension", ("friction_by_pose:yaw-pitch", "stribeck:yaw")),
+    ("wrist", 56, "unbalance:a", ("force_bias:a", "torque_ripple:a", "return_spring:a")),
+    ("damper", 57, "upper_stop:piston", ("return_spring:piston", "quadratic_drag:piston")),
+    ("axis", 58, "maxwell_slip:carriage", ("presliding:carriage", "stribeck:carriage")),
+]
+
+
+@pytest.mark.parametrize(("machine", "seed", "effect", "rivals"), NAMED)
+def test_the_right_effect_explains_most_and_has_the_true_size(
+    tmp_path, machine, seed, effect, rivals
+):
+    trials, recipe, truth = record_trials(tmp_path, machine, seed, effect)
+    scorer = Scorer(fit_trials(trials, recipe, system_of(recipe).prior))
+    device = device_of(machine)
+    scores = {
+        name: scorer.score(candidate(candidate_model(device, name))) for name in (effect, *rivals)
+    }
+    right = scores.pop(effect)
+    axis = int(np.argmax(right.gain))
+    assert right.error[axis] < 0.35 * scorer.before.error[axis]
+    assert all(right.total > 1.2 * score.total for score in scores.values() if score)
+    own = candidate(candidate_model(device, effect)).own
+    for parameter, value in zip(own, right.values, strict=True):
+        if parameter.name in truth:
+            assert value == pytest.approx(truth[parameter.name], rel=0.12), parameter.name
