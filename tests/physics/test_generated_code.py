@@ -13,6 +13,7 @@ from motions import (
     typical_parameters,
 )
 from scipy.integrate import solve_ivp
+from small_arm import ARM
 
 from bampipe.model_functions import ROWS
 from bampipe.physics import Model, compile_model, registry
@@ -25,11 +26,12 @@ def placed(name):
 
     On the BAM, where it can have it, that is the extension, which has side loads, or a force.
     """
-    for device in (BAM, *map(registry.device, registry.device_names())):
+    others = map(registry.device, registry.device_names())
+    for device in (BAM, *others, registry.device_from(ARM)):
         targets = registry.effect(name).targets(device)
         if targets:
             return device, f"{name}:{targets[-1]}" if targets[-1] else name
-    raise AssertionError(f"no built-in device can have {name}")
+    raise AssertionError(f"no device can have {name}")
 
 
 @pytest.mark.parametrize("name", registry.effect_names())
