@@ -25,6 +25,8 @@ Array = NDArray[np.float64]
 LARGEST_BYTES = 20_000_000
 _KINDS = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
 _XACRO = ("{http://www.ros.org/wiki/xacro", "{http://ros.org/wiki/xacro", "{http://ros.org/xacro")
+_UNLIMITED = 1e6
+"""Effort and velocity of a joint of which none is known: a URDF has some, and 0 is a limit."""
 _MANY = 8
 """Most names that a message lists."""
 
@@ -207,6 +209,8 @@ def _chain(
             "position": [float(v) for v in offset],
             "rotation": [float(v) for v in angles],
             "axis": joint.axis,
+            "effort": max(joint.limits.effort, 0.0),
+            "velocity": max(joint.limits.velocity, 0.0),
             **carried(joint.child).table(),
         }
         found[name] = {"after": before, **table} if before else table
@@ -441,7 +445,7 @@ def urdf_text(
         ElementTree.SubElement(entry, "axis", xyz=_text(table["axis"]))
         ElementTree.SubElement(
             entry, "limit", lower=repr(own.lower), upper=repr(own.upper),
-            effort=repr(own.effort), velocity=repr(own.velocity),
+            effort=repr(own.effort or _UNLIMITED), velocity=repr(own.velocity or _UNLIMITED),
         )  # fmt: skip
         ElementTree.SubElement(
             entry, "dynamics", damping=repr(own.damping), friction=repr(own.friction)

@@ -87,6 +87,8 @@ def _urdf(run: RunFolder, system: System, p: Array) -> str:
         limits[joint.name] = Limits(
             lower,
             upper,
+            joint.effort,
+            joint.velocity,
             damping=max(value.get(f"viscous.{joint.name}", 0.0), 0.0),
             friction=max(value.get(f"coulomb.{joint.name}", 0.0), 0.0),
         )

@@ -53,9 +53,10 @@ class Text:
 
     def name(self, value: Any) -> Any:
         """Return a symbol for ``value``; numbers, symbols and their negatives stay."""
-        value = sp.sympify(value)
-        if value.is_number or value.is_Symbol or (-value).is_Symbol:
+        if isinstance(value, int | float) or value.is_Symbol or value.is_Number:
             return value
+        if value.is_Mul and len(value.args) == 2 and value.args[0] == -1:
+            return -self.name(-value)
         if value not in self._known:
             self._known[value] = sp.Symbol(f"r_{len(self.steps)}")
             self.steps.append((self._known[value], value))

@@ -19,6 +19,7 @@ from bampipe.schema import (
     ByName,
     Declaration,
     NamedDeclaration,
+    NotNegative,
     Number,
     Positive,
     Several,
@@ -65,6 +66,8 @@ class Joint(NamedDeclaration):
         default=(0.0,) * 6,
         description="xx, xy, xz, yy, yz, zz about the centre of mass, kg.m2",
     )
+    effort: NotNegative = Field(default=0.0, description="Largest, N.m or N; 0: not known")
+    velocity: NotNegative = Field(default=0.0, description="Largest, rad/s or m/s; 0: not known")
 
     def cross_faults(self) -> Iterator[InputError]:
         if not math.hypot(*self.axis) > 0.0:

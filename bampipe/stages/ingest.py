@@ -103,8 +103,15 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         else:  # with all that its URDF says: the run folder stands on its own
             file.write_text(toml_text(device.declaration), encoding="utf-8")
     notes = [*description.sensor_warnings]
+    notes += _impossible(device)
     notes += [f"{place}: its source still says `fill in`" for place in description.placeholders]
     return _summary(session, rows) | {"notes": notes}
+
+
+def _impossible(device: Device) -> list[str]:
+    """What no body can have among the numbers of a robot's drawing."""
+    found = device.robot.impossible if device.robot is not None else []
+    return [f"drawing of {line}" for line in found]
 
 
 def _device(session: Session) -> Device:

@@ -33,7 +33,7 @@ from bampipe.results.validate import (
 )
 from bampipe.schema import STRICT, Count
 from bampipe.trials.folds import HELD_OUT, Folds
-from bampipe.trials.measured import MeasuredTrials, read_measured_trials
+from bampipe.trials.measured import MeasuredTrials, read_measured_trials, trial_of_block
 from bampipe.trials.noise_floor import NoiseFloor, find_noise_floor, floor_replays
 from bampipe.trials.reading import held_out_trials, read_motions, require_sound_motions
 from bampipe.trials.residuals import Evidence, gather_evidence
@@ -105,7 +105,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     p = identified(run, config.model, system)
     estimates = run.read(IdentifyResult, config.model)
     trials = read_measured_trials(run, system, timing=estimates.input_timing)
-    if config.hold_out_by and trials.in_blocks:
+    if config.hold_out_by and trials.blocks:
         raise InputError(
             "there is one trial only, so nothing to hold out by a channel",
             where="validate.hold_out_by",
@@ -117,9 +117,9 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     evidence = gather_evidence(system, trials.motions, trials.band, p, trials.folds)
     compared = [_compare(evidence, number, p) for number in range(len(trials.motions))]
     notes = []
-    if trials.in_blocks:
+    if trials.blocks == len(compared):
         notes.append(
-            f"One trial: it is left out in {len(compared)} blocks with gaps between them, by"
+            f"One trial: it is left out in {trials.blocks} blocks with gaps between them, by"
             " parameters fitted to the others."
         )
     if trials.folds.nothing_held_out:
@@ -139,14 +139,16 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         except InputError as error:
             notes.append(f"No noise floor: simulating the fitted model failed ({error}).")
     free: FreeRun | None = None
-    if config.free_run and not trials.in_blocks:
+    if config.free_run and not trials.blocks:
         progress(0.8, "free runs")
         unseen = [evidence.held_out_parameters(k) for k in range(len(trials.motions))]
         free = free_runs(run, system, trials.motions, unseen, [c.judged for c in compared])
     elif config.free_run:
         progress(0.8, "free runs")
         whole = read_motions(run, system, braked=True)
-        free = free_runs(run, system, whole, [evidence.p], [False])
+        held_out = held_out_trials(run)
+        judged = [motion.trial_id in held_out for motion in whole]
+        free = free_runs(run, system, whole, [evidence.p] * len(whole), judged)
     if system.model.device.robot is not None:
         notes += _silent_joints(system, compared, floor)
     write_parquet(out / f"models/{config.model}/residuals.parquet", _table(system, compared))
@@ -336,7 +338,11 @@ def _table(system: System, compared: Sequence[_Compared]) -> pd.DataFrame:
     """Return residuals.parquet: predictions by parameters that have not seen the trial."""
     frames = []
     for c in compared:
-        columns: dict[str, object] = {"trial_id": c.trial_id, "t": c.t, "held_out": c.judged}
+        columns: dict[str, object] = {
+            "trial_id": trial_of_block(c.trial_id),
+            "t": c.t,
+            "held_out": c.judged,
+        }
         for i, axis in enumerate(system.coordinates):
             measured = c.measured[:, i]
             columns[f"torque_measured_{axis}"] = measured

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -41,7 +42,7 @@ class MeasuredTrials:
         sensors: that read them; kinematics: the filters they went through.
         band: in which residuals are compared.
         folds: which a fit may see, and which are left out together.
-        in_blocks: whether the motions are blocks of the only trial.
+        blocks: how many of the motions are blocks of the only trial that is not held out.
     """
 
     motions: Sequence[Motion]
@@ -49,7 +50,12 @@ class MeasuredTrials:
     kinematics: Kinematics
     band: Band
     folds: Folds
-    in_blocks: bool = False
+    blocks: int = 0
+
+
+def trial_of_block(name: str) -> str:
+    """The trial that the block called ``name`` was cut from; ``name`` itself where it is none."""
+    return re.sub(r"@\d+\.\ds$", "", name)
 
 
 def cut_blocks(motion: Motion, band: Band) -> list[Motion]:
@@ -106,19 +112,31 @@ def read_measured_trials(
     late_s = 0.0
     if timing is not None and abs(timing.estimate) + 2.0 * timing.sd < 0.5 / band.rate_hz:
         late_s = timing.estimate
-    fitted = free_trials(run, fitted=True, braked=system.braked)
+    fitted, held_out = free_trials(run, fitted=True, braked=system.braked), held_out_trials(run)
     motions = read_motions(run, system, braked=True, every_input=every_input, late_s=late_s)
     trials = MeasuredTrials(
         motions,
         read_sensors(run, system),
         read_kinematics(run, system),
         band,
-        Folds.of_trials(names, held_out_trials(run), fitted),
+        Folds.of_trials(names, held_out, fitted),
     )
-    if len(names) > 1:
-        return trials
-    blocks = cut_blocks(motions[0], band)
+    alone = [k for k, name in enumerate(names) if name not in held_out]
+    return _with_blocks(trials, alone[0], held_out) if len(alone) == 1 else trials
+
+
+def _with_blocks(trials: MeasuredTrials, alone: int, held_out: Collection[str]) -> MeasuredTrials:
+    """The same with the only trial that is not held out, number ``alone``, in blocks."""
+    blocks = cut_blocks(trials.motions[alone], trials.band)
     if len(blocks) == 1:
         return trials
-    names = tuple(block.trial_id for block in blocks)
-    return replace(trials, motions=blocks, folds=Folds.of_trials(names, (), names), in_blocks=True)
+    motions = [*trials.motions]
+    motions[alone : alone + 1] = blocks
+    every = [motion.trial_id for motion in motions]
+    fitted = [block.trial_id for block in blocks] if trials.folds.fitted[alone] else []
+    return replace(
+        trials,
+        motions=motions,
+        folds=Folds.of_trials(every, held_out, fitted),
+        blocks=len(blocks),
+    )

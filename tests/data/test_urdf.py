@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from bampipe.errors import InputError
 from bampipe.physics import Model, compile_model
 from bampipe.physics.registry import device_from
 from bampipe.physics.units import check_device
+from bampipe.run.hashing import digest_session
 
 LINK = """<link name="{name}"><inertial><origin xyz="{x} 0 0" rpy="0 0 {yaw}"/>
 <mass value="{mass}"/>
@@ -233,3 +235,26 @@ def test_a_table_of_denavit_and_hartenberg_is_the_same_robot(tmp_path: Path) -> 
     p = systems[0].prior
     one, other = (s.required(q, qd, qdd, z, u, np.append(p[:6], s.prior[6:])) for s in systems)
     np.testing.assert_allclose(one, other, atol=1e-12)
+
+
+def test_a_session_depends_on_its_urdf(tmp_path: Path) -> None:
+    write(tmp_path, *ARM)
+    (tmp_path / "device.toml").write_text('name = "arm"\n[robot]\nurdf = "arm.urdf"\n')
+    (tmp_path / "session.toml").write_text('device = "device.toml"\n')
+    before = digest_session(tmp_path)
+    write(tmp_path, *ARM, link("weight", 3.0), joint("grip", "tool", "weight", "fixed"))
+    after = digest_session(tmp_path)
+    assert {name for name in after if after[name] != before[name]} == {"session:arm.urdf"}
+
+
+def test_an_encoder_that_reads_two_joints_gives_the_position_of_its_own() -> None:
+    from bampipe.data.quality.channels import part_readings
+
+    encoders = [
+        SimpleNamespace(axis="one", also_reads={}),
+        SimpleNamespace(axis="two", also_reads={"one": 1.0}),
+    ]
+    si = {"q_one": np.array([0.1, 0.2]), "q_two": np.array([0.4, 0.7])}
+    part_readings(SimpleNamespace(encoders=encoders), si)  # type: ignore[arg-type]
+    np.testing.assert_allclose(si["q_one"], [0.1, 0.2])
+    np.testing.assert_allclose(si["q_two"], [0.3, 0.5])

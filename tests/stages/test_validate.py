@@ -175,6 +175,7 @@ def test_one_long_trial_is_left_out_in_blocks(tmp_path: Path) -> None:
     assert all(entry["held_out"] for entry in content["trials"].values())
     table = read_parquet(run.path("models/base/residuals.parquet"))
     assert table["held_out"].all()
+    assert set(table["trial_id"]) == {"t00"}
     assert (table["t"].diff().dropna() > 0.0).all()  # blocks do not overlap
     assert 10.0 < table["t"].iloc[-1] < 12.0
 

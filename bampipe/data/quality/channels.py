@@ -136,7 +136,7 @@ def to_si(table: TrialTable) -> dict[str, np.ndarray]:
         values *= encoder.scale
         si[f"q_{encoder.axis}"] = values
         source[f"q_{encoder.axis}"] = encoder.column
-    _part_readings(session, si)
+    part_readings(session, si)
     if session.force is not None:
         force = session.force
         for column, zero in zip(force.columns, force.zero, strict=True):
@@ -166,7 +166,7 @@ def to_si(table: TrialTable) -> dict[str, np.ndarray]:
     return si
 
 
-def _part_readings(session: Session, si: dict[str, np.ndarray]) -> None:
+def part_readings(session: Session, si: dict[str, np.ndarray]) -> None:
     """Take the positions of joints out of the readings of motors that several of them turn."""
     if not any(encoder.also_reads for encoder in session.encoders):
         return
