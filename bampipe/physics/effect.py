@@ -233,7 +233,7 @@ class Effect(Declaration):
             return tuple(
                 c.name
                 for c in device.coordinates
-                if all(getattr(p, c.kind, p) is not None for p in self.parameters.values())
+                if not (self.robot and self._lacks(c.kind))
                 and ("brake" not in used or c.name in device.brakes)
                 and ("dry" not in used or device.has_dry_friction(c.name))
             )
@@ -277,6 +277,10 @@ class Effect(Declaration):
         trees = [*self.expressions.values()]
         trees += [tree for state in self.states for tree in (state.rate, state.initial)]
         return set().union(*map(expression.names, trees))
+
+    def _lacks(self, kind: str) -> bool:
+        """Whether a parameter has no entry for this kind of axis: robots have joints of both."""
+        return any(getattr(entry, kind, entry) is None for entry in self.parameters.values())
 
     def _fits(self, device: Device) -> bool:
         """Whether every name that a device-wide effect uses exists in ``device``."""
