@@ -384,7 +384,7 @@ class Scorer:
                 best = Score(item.name, error, weaker, shift, gain)
         assert best is not None
         # Both sides of the equation made small explain nothing, however small the error becomes.
-        if self.independent @ best.gain <= 0.0:
+        if self.independent @ best.gain < Settings().worth_searching:
             return self._absent(item)
         return replace(best, gain=self.independent * best.gain)
 
