@@ -233,7 +233,7 @@ class Effect(Declaration):
             return tuple(
                 c.name
                 for c in device.coordinates
-                if not (self.robot and self._lacks(c.kind))
+                if not (self.robot is not None and self._lacks(c.kind))
                 and ("brake" not in used or c.name in device.brakes)
                 and ("dry" not in used or device.has_dry_friction(c.name))
             )
