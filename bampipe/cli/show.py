@@ -193,6 +193,9 @@ def _ladder(rungs: Sequence[Rung]) -> None:
     axes = list(dict.fromkeys(axis for rung in rungs for axis in rung.held_out_rmse))
     body = []
     for rung in rungs:
+        for step in rung.steps:
+            errors = [cell for axis in axes for cell in (number(step.held_out_rmse[axis]), "")]
+            body.append(["  fitted in the search", ", ".join(step.effects), *errors])
         cells = [rung.model, rung.added or ""]
         for axis in axes:
             error, floor = rung.held_out_rmse.get(axis), rung.noise_floor.get(axis)

@@ -15,6 +15,13 @@ NOTICEABLE = 0.01
 """Least fall of the held-out error that confirms a model; a superfluous effect has less."""
 
 
+class SearchStep(Record):
+    """A set of effects on the way from the parent, as the diagnosis of the parent fitted it."""
+
+    effects: Names = Field(description="Beyond those of the parent")
+    held_out_rmse: dict[str, Size] = Field(description="By axis")
+
+
 class Rung(Record):
     """One model version."""
 
@@ -22,6 +29,9 @@ class Rung(Record):
     parent: str | None
     added: str | None = Field(description="Effects that the parent lacks")
     effects: Names
+    steps: tuple[SearchStep, ...] = Field(
+        description="Between the parent and this model, where its diagnosis added several effects"
+    )
     held_out_rmse: dict[str, Size]
     noise_floor: dict[str, Size | None] = Field(description="null where none was computed")
     standing: dict[str, Standing]

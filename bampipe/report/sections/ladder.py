@@ -40,6 +40,9 @@ def _steps(results: Results, rungs: Sequence[Rung]) -> Table:
     axes = _axes(results, rungs)
     rows = []
     for rung in rungs:
+        for step in rung.steps:
+            errors = [wording.significant(step.held_out_rmse.get(axis)) for axis in axes]
+            rows.append(("in the search", f"`{', '.join(step.effects)}`", *errors))
         cells = []
         for axis in axes:
             error = rung.held_out_rmse.get(axis)
