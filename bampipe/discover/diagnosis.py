@@ -7,10 +7,13 @@
    told apart by replaying each of them: the pattern of all their scores must look like the
    measured one. Those that pass alike are reported as one group. An earlier effect that a later
    one makes superfluous is dropped.
-4. What is left is compared with the noise floor of the final model, found by replaying it.
+4. What is left is compared with the noise floor of the final model, found by replaying it, in the
+   band of the session and in another one.
 """
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +22,7 @@ from bampipe.discover.bench import Bench
 from bampipe.discover.candidates import library
 from bampipe.discover.chance import Progress, workers
 from bampipe.discover.findings import Diagnosis
+from bampipe.discover.other_band import judge_in_other_band
 from bampipe.discover.search import search
 from bampipe.discover.settings import Settings
 from bampipe.discover.verdict import conclude
@@ -54,4 +58,6 @@ def diagnose(
     device, extra = recipe.model().device, [effect_from(e) for e in recipe.extra]
     with workers(trials, settings.jobs) as pool:
         bench = Bench(trials, settings, pool, tuple(library(device, recipe.effects, extra)))
-        return conclude(search(bench, recipe, start, progress), settings)
+        found = conclude(search(bench, recipe, start, progress), settings)
+    progress(0.95, "holding the final model against its floor in another band")
+    return replace(found, other_band=judge_in_other_band(trials, found.evidence, settings.seed))

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from bampipe.discover.influence import Stretch
+from bampipe.discover.other_band import AxisInBand
 from bampipe.results.diagnose import Verdict
 from bampipe.results.standing import Standing
 from bampipe.trials.residuals import Evidence
@@ -115,6 +116,7 @@ class Diagnosis:
         transient: candidates that only one second speaks for: their axis and that second.
         evidence: of the model with all selected effects.
         initial: of the model as given.
+        other_band: how the final model stands in another band, by axis.
     """
 
     axes: tuple[AxisFinding, ...]
@@ -126,3 +128,4 @@ class Diagnosis:
     transient: Mapping[str, tuple[int, Stretch]]
     evidence: Evidence
     initial: Evidence
+    other_band: tuple[AxisInBand | None, ...] = ()

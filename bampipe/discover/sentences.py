@@ -38,7 +38,20 @@ def _parts(axis: str, i: int, found: Diagnosis, unit: str) -> list[str]:
         parts.append(f"{left}: {describe(judged, i)}.")
     elif a.standing == "above_floor":
         parts.append(_excused(a, unit))
-    return parts
+    return parts + _other_band(i, found)
+
+
+def _other_band(i: int, found: Diagnosis) -> list[str]:
+    """Where another reasonable band gives another standing, that it does."""
+    other = found.other_band[i] if found.other_band else None
+    if other is None or other.standing == found.axes[i].standing:
+        return []
+    ratio = other.rmse / max(other.noise_floor, 1e-30)
+    return [
+        f"In another band, up to {other.cutoff_hz:.3g} Hz, the error is {ratio:.2f} times the noise"
+        f" floor there: look at it with `bampipe filter --set band_hz={other.cutoff_hz:.3g}` and "
+        "diagnose again."
+    ]
 
 
 def _verdict(a: AxisFinding, found: Diagnosis, unit: str) -> str:

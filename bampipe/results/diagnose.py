@@ -23,6 +23,15 @@ class Stretch(Record):
     t_end: float
 
 
+class OtherBand(Record):
+    """How the final model stands in another band than that of the session."""
+
+    cutoff_hz: Size
+    rmse: Size = Field(description="Cross-validated, by one linear step")
+    noise_floor: Size = Field(description="The same of replays")
+    standing: Standing
+
+
 class AxisVerdict(Record):
     """What one axis lacks."""
 
@@ -39,6 +48,9 @@ class AxisVerdict(Record):
     worst_second: Stretch = Field(description="Where the residual with what was found is largest")
     rmse_without_worst_second: Size = Field(
         description="rmse_after but for it; whether something remains is judged by this"
+    )
+    other_band: OtherBand | None = Field(
+        description="null where no other band is reasonable: below 8 Hz, or above the motion's"
     )
     unit: str
     explainable_share: UpToOne = Field(

@@ -1,0 +1,86 @@
+"""Whether a verdict would be another one in another band.
+
+A low-pass may hide what acts above it, and lets in what the sensors do not resolve.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bampipe.discover.candidates import Scorer
+from bampipe.estimate.low_pass import Band
+from bampipe.estimate.simulation import Runaway
+from bampipe.results.standing import Standing, standing
+from bampipe.trials.band import LEAST_HZ
+from bampipe.trials.measured import MeasuredTrials
+from bampipe.trials.noise_floor import FLOOR_SEED, NoiseFloor, replay_evidence
+from bampipe.trials.residuals import Evidence, gather_evidence
+
+_REPLAYS = 3
+
+
+@dataclass(frozen=True)
+class AxisInBand:
+    """How the final model stands on one axis in another band.
+
+    Attributes:
+        cutoff_hz: of the low-pass.
+        rmse, noise_floor: cross-validated error of the model and of its replays, N.m or N.
+        standing: one against the other.
+    """
+
+    cutoff_hz: float
+    rmse: float
+    noise_floor: float
+    standing: Standing
+
+
+def judge_in_other_band(
+    trials: MeasuredTrials, evidence: Evidence, seed: int
+) -> tuple[AxisInBand | None, ...]:
+    """Hold the final model against its floor in a band twice as wide, else half as wide.
+
+    Args:
+        trials: the measured trials; evidence: the final model, fitted.
+        seed: of the replays.
+
+    Returns:
+        By axis; None where neither band lies between the least one and the motion's bandwidth, or
+        the model cannot be replayed.
+    """
+    known, count = trials.band, len(evidence.system.coordinates)
+    motion_hz = [trials.kinematics.axes[name].bandwidth_hz for name in evidence.system.coordinates]
+    cutoffs = []
+    for cutoff, most in zip(known.cutoff_hz, motion_hz, strict=True):
+        wider, narrower = 2.0 * cutoff, 0.5 * cutoff
+        fits = wider <= min(most, 0.2 * known.rate_hz)
+        cutoffs.append(wider if fits else narrower if narrower >= LEAST_HZ else cutoff)
+    if np.allclose(cutoffs, known.cutoff_hz):
+        return (None,) * count
+    band = Band(known.rate_hz, tuple(cutoffs), known.margin_s)
+    measured = gather_evidence(evidence.system, trials.motions, band, evidence.p, trials.folds)
+    error = Scorer(measured).before.error
+    try:
+        replays = [
+            replay_evidence(
+                evidence.system, measured.p, trials.motions, trials.sensors, trials.kinematics,
+                band, trials.folds, (seed, FLOOR_SEED, k),
+            )
+            for k in range(_REPLAYS)
+        ]  # fmt: skip
+    except Runaway:
+        return (None,) * count
+    floor = NoiseFloor.of_errors([Scorer(replay).before.error for replay in replays])
+    return tuple(
+        None
+        if cutoff == was
+        else AxisInBand(
+            cutoff,
+            float(error[i]),
+            float(floor.mean[i]),
+            standing(float(error[i]), float(floor.mean[i]), float(floor.sd[i])),
+        )
+        for i, (cutoff, was) in enumerate(zip(cutoffs, known.cutoff_hz, strict=True))
+    )
