@@ -47,6 +47,9 @@ class Replicate:
     share: Array
 
 
+_STEPS_OF_A_REPLAY = 4
+"""Most Gauss-Newton steps of the fit to a replay: it starts at the parameters that made it."""
+
 _open_trials: MeasuredTrials | None = None
 
 
@@ -147,7 +150,9 @@ def run_replicate(task: ReplicateTask) -> Replicate:
         system, task.p, trials.motions, trials.sensors, trials.kinematics, task.seed
     )
     analysed = system_of(task.analysed)
-    evidence = gather_evidence(analysed, replays, trials.band, task.start, trials.folds)
+    evidence = gather_evidence(
+        analysed, replays, trials.band, task.start, trials.folds, most_iterations=_STEPS_OF_A_REPLAY
+    )
     scorer = Scorer(evidence)
     found = {c.name: scorer.score(c) for c in candidates_of(task.analysed, task.names)}
     axes = range(len(system.coordinates))
