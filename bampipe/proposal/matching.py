@@ -42,7 +42,8 @@ class Matcher:
         """The column that has the words of ``name``, of one of the roles."""
         wanted, numbers = set(words(name)), set(_numbers(name))
         for column in self.found.of(*roles):
-            alike = wanted <= set(words(column.name)) and numbers <= set(_numbers(column.name))
+            counted = set(_numbers(column.name))
+            alike = wanted <= set(words(column.name)) and (numbers <= counted or not counted)
             if column.name == name or alike:
                 return column
         ordered = self.joints.get(name)
