@@ -20,6 +20,10 @@ class EncoderChannel(Record):
         description="Step in which the readings move; null where they lie on no grid"
     )
     noise_sd: Size = Field(description="Of a reading, its rounding included")
+    scale: float = Field(default=1.0, description="rad or m for one raw unit, by session.toml")
+    zero: float = Field(default=0.0, description="Raw reading at position 0, by session.toml")
+    counts_per_unit: float | None = Field(default=None, description="As in session.toml, or null")
+    raw_unit: str = Field(default="", description="Unit that session.toml gives the column")
 
 
 class ForceChannels(Record):
@@ -32,12 +36,19 @@ class ForceChannels(Record):
     noise_sd_measured: dict[str, Size | None] = Field(
         description="By channel; null where too little is recorded"
     )
+    calibration: tuple[tuple[float, ...], ...] = Field(
+        default=(), description="One row a component: `unit` for one raw unit of each column"
+    )
+    zero: tuple[float, ...] = Field(default=(), description="Raw readings without force")
+    raw_unit: str = Field(default="", description="Unit of the raw columns")
 
 
 class RecordedChannel(Record):
     """A brake command, or another recorded channel."""
 
     unit: str
+    scale: float = Field(default=1.0, description="SI value = scale * raw + offset")
+    offset: float = 0.0
 
 
 class IngestResult(Result):

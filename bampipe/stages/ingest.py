@@ -339,6 +339,10 @@ def _description(
                 resolution_stated=encoders[encoder.axis].stated,
                 resolution_measured=encoders[encoder.axis].measured,
                 noise_sd=encoders[encoder.axis].noise_sd,
+                scale=encoder.scale,
+                zero=encoder.zero,
+                counts_per_unit=encoder.counts_per_unit,
+                raw_unit=encoder.stated_unit,
             )
             for encoder in session.encoders
         },
@@ -348,6 +352,9 @@ def _description(
             noise_sd={name: found.noise_sd for name, found in forces.items()},
             noise_sd_stated=stated,
             noise_sd_measured={name: found.measured for name, found in forces.items()},
+            calibration=force.calibration if force else (),
+            zero=force.zero if force else (),
+            raw_unit=force.raw_unit if force else "",
         ),
         sensor_warnings=tuple(
             sensor.warning for sensor in (*encoders.values(), *forces.values()) if sensor.warning
@@ -355,7 +362,12 @@ def _description(
         brakes={
             f"brake_{brake.axis}": RecordedChannel(unit=brake.unit) for brake in session.brakes
         },
-        channels={channel.name: RecordedChannel(unit=channel.unit) for channel in session.channels},
+        channels={
+            channel.name: RecordedChannel(
+                unit=channel.unit, scale=channel.scale, offset=channel.offset
+            )
+            for channel in session.channels
+        },
     )
 
 

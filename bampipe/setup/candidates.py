@@ -1,0 +1,140 @@
+"""Set-ups that a person may have meant: what each says of the signals, cheapest mistakes first."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import combinations, permutations
+from typing import Literal
+
+import numpy as np
+
+from bampipe.setup.signals import Change, Signals
+
+Kind = Literal["sign", "scale", "exchange", "zero", "clock"]
+
+DEGREE = math.pi / 180.0
+FACTORS: dict[str, tuple[tuple[str, float], ...]] = {
+    "rad": (("deg", DEGREE), ("rev", 2.0 * math.pi), ("mrad", 1e-3)),
+    "m": (("mm", 1e-3), ("cm", 1e-2), ("um", 1e-6), ("in", 0.0254)),
+    "N": (("mN", 1e-3), ("kN", 1e3), ("kgf", 9.80665), ("gf", 9.80665e-3), ("lbf", 4.44822)),
+    "N.m": (("mN.m", 1e-3), ("kN.m", 1e3), ("N.mm", 1e-3), ("N.cm", 1e-2)),
+    "A": (("mA", 1e-3),),
+    "V": (("mV", 1e-3),),
+}
+"""Units that are taken for the SI unit, and that for them, by SI unit."""
+PLAIN = (10.0, 100.0, 1000.0, 2.0, 4.0)
+"""Gains of an amplifier and edges of an encoder that are forgotten, or counted twice."""
+CLOCKS = (1e-3, 1e3, 1e-6, 1e6, 1e-9, 1e9)
+USUAL = ("deg", "mm", "mN", "kN", "mA", "mV", "mN.m", "kN.m", "kgf")
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One mistake, as the change of the signals that sets it right.
+
+    Attributes:
+        kind: what kind of mistake; signals: which it concerns, none for a clock.
+        change: what it makes of the readings.
+        cost: how unlikely a person is to make it, in the unit of the score.
+        factor, offset: of a scale or clock; of a zero, rad or m.
+        unit: that was meant, or that was stated for the SI unit, "" where no unit explains it.
+    """
+
+    kind: Kind
+    signals: tuple[str, ...]
+    change: Change
+    cost: float
+    factor: float = 1.0
+    offset: float = 0.0
+    unit: str = ""
+
+
+def scaled(
+    signals: Signals, names: Sequence[str], factor: float, cost: float, unit: str = ""
+) -> Candidate:
+    """Signals ``names`` read 1/``factor`` times what they should."""
+    gain = np.eye(len(signals.names))
+    for place in signals.places(names):
+        gain[place, place] = factor
+    none = np.zeros(len(signals.names))
+    return Candidate("scale", tuple(names), Change(gain, none), cost, factor, unit=unit)
+
+
+def shifted(signals: Signals, axis: str, offset: float, cost: float) -> Candidate:
+    """The zero of ``axis`` is off: ``offset`` must be added, rad or m."""
+    change = Change.none(len(signals.names))
+    change.offset[signals.places([axis])] = offset
+    return Candidate("zero", (axis,), change, cost, offset=offset)
+
+
+def groups_of_like(signals: Signals) -> tuple[tuple[str, ...], ...]:
+    """Signals that share a file entry or a habit: each alone, then all axes of a unit, all forces."""
+    alone = [(name,) for name in (*signals.axes, *signals.forces, *signals.channels)]
+    together = [
+        tuple(a for a, u in zip(signals.axes, signals.units, strict=False) if u == unit)
+        for unit in ("rad", "m")
+    ]
+    return tuple(dict.fromkeys([*alone, *(g for g in (*together, signals.forces) if len(g) > 1)]))
+
+
+def sign_candidates(signals: Signals) -> Iterator[Candidate]:
+    """Reversed encoders, forces, channels and brake commands."""
+    groups = [(name,) for name in (*signals.axes, *signals.forces, *signals.channels)]
+    for many in (signals.forces, signals.brakes):
+        groups += [many] if len(many) > 1 else []
+    groups += [(name,) for name in signals.brakes]
+    for names in groups:
+        change = scaled(signals, names, -1.0, 0.0).change
+        yield Candidate("sign", tuple(names), change, 0.0 if len(names) == 1 else 1.0, -1.0)
+
+
+def exchange_candidates(signals: Signals) -> Iterator[Candidate]:
+    """Columns that stand for each other: as raw readings, or with all that belongs to them."""
+    count = len(signals.names)
+    inverse = np.linalg.inv(signals.gain)
+    pools = [*combinations(signals.names[: count - len(signals.brakes)], 2)]
+    cycles = [c for many in (signals.axes, signals.forces) for c in combinations(many, 3)]
+    for names in (*pools, *cycles):
+        places = signals.places(names)
+        for order in permutations(places):
+            if any(a == b for a, b in zip(places, order, strict=True)):
+                continue
+            swap = np.eye(count)
+            swap[places] = np.eye(count)[list(order)]
+            raw = signals.gain @ swap @ inverse
+            changes = [Change(raw, signals.offset - raw @ signals.offset)]
+            if not np.allclose(raw, swap) or changes[0].offset.any():
+                changes.append(Change(swap, np.zeros(count)))
+            for change in changes:
+                yield Candidate("exchange", tuple(names), change, 0.5 if len(names) == 2 else 2.0)
+
+
+def clock_candidates(signals: Signals) -> Iterator[Candidate]:
+    """Time stamps in another unit than stated, the stated rate as well."""
+    for factor in CLOCKS:
+        none = Change.none(len(signals.names))
+        yield Candidate("clock", (), Change(none.gain, none.offset, factor), 2.0, factor)
+
+
+def unit_candidates(signals: Signals) -> Iterator[Candidate]:
+    """Units taken for others, and factors of gains and counters."""
+    units = dict(zip(signals.names, signals.units, strict=True))
+    for names in groups_of_like(signals):
+        for unit, factor in FACTORS.get(units[names[0]], ()):
+            cost = 0.5 if unit in USUAL else 2.0
+            yield scaled(signals, names, factor, cost, unit)
+            yield scaled(signals, names, 1.0 / factor, cost, unit)
+        for factor in PLAIN:
+            cost = 2.0
+            yield scaled(signals, names, factor, cost)
+            yield scaled(signals, names, 1.0 / factor, cost)
+
+
+def quarter_turns(signals: Signals) -> Iterator[Candidate]:
+    """A rotary axis counted from another of its four main directions."""
+    for axis, unit in zip(signals.axes, signals.units, strict=False):
+        if unit == "rad":
+            for turn in (-0.5, 0.5, 1.0):
+                yield shifted(signals, axis, turn * math.pi, 1.0)

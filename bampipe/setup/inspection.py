@@ -1,0 +1,131 @@
+"""The set-up of a session held against its trials: what later stages and readers are given."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from bampipe.errors import InputError
+from bampipe.estimate.low_pass import Band
+from bampipe.physics import System
+from bampipe.results.ingest import IngestResult
+from bampipe.results.setup import AxisSetup, SetupMistake, SetupResult
+from bampipe.setup.placeholders import Placeholder, find_placeholders
+from bampipe.setup.plausibility import LEAST_MOVING, Plausibility
+from bampipe.setup.search import Finding, Search, shorten, spoilt_axes
+from bampipe.setup.signals import Change, Signals
+from bampipe.setup.words import describe_candidate, describe_evidence
+from bampipe.trials.folds import Folds
+from bampipe.trials.motion import Motion
+
+
+def inspect_setup(
+    system: System, session: IngestResult, motions: Sequence[Motion], band: Band, folds: Folds
+) -> SetupResult:
+    """Hold the set-up of a session against some of its trials.
+
+    Args:
+        system: the bare device; session: as ingested.
+        motions: some trials, with every input of the device; band: of the residual.
+        folds: which of these trials are fitted, which are left out together.
+
+    Raises:
+        InputError: the device leaves the scale of its equation open.
+    """
+    short = shorten(motions)
+    _require_scale(system, short)
+    signals = Signals.of_session(system, session)
+    placeholders = find_placeholders(system, session)
+    search = Search(system, short, band, folds, signals)
+    held = search.judge(Change.none(len(signals.names)), short)
+    findings = search.find_mistakes(held, tuple(n for p in placeholders for n in p.signals))
+    mistakes = tuple(_record(system, session, found, placeholders) for found in findings)
+    axes = {
+        axis: _axis(place, axis, held, mistakes) for place, axis in enumerate(system.coordinates)
+    }
+    warnings = [
+        f"{axis} hardly moves: it stands still in {100.0 * (1.0 - entry.moving_share):.0f} % of the"
+        " samples, and its parameters rest on little"
+        for axis, entry in axes.items()
+        if entry.state == "hardly_moves"
+    ]
+    named = " ".join(mistake.sentence for mistake in mistakes)
+    warnings += [
+        f"{p.sentence}: the scale of all estimates rests on it"
+        for p in placeholders
+        if p.sentence not in named
+    ]
+    return SetupResult(
+        headline="; ".join(mistake.sentence for mistake in mistakes),
+        mistakes=mistakes,
+        warnings=tuple(warnings),
+        tested=search.tested,
+        axes=axes,
+    )
+
+
+def _axis(
+    place: int, axis: str, held: Plausibility | None, mistakes: Sequence[SetupMistake]
+) -> AxisSetup:
+    if held is None:
+        return AxisSetup(state="mistaken" if mistakes else "sound", error_percent=None,
+                         moving_share=1.0)  # fmt: skip
+    still = held.moving[place] < LEAST_MOVING
+    spoilt = any(axis in mistake.axes for mistake in mistakes)
+    return AxisSetup(
+        state="mistaken" if spoilt else "hardly_moves" if still else "sound",
+        error_percent=None if still else 100.0 * held.error[place],
+        moving_share=held.moving[place],
+    )
+
+
+def _record(
+    system: System, session: IngestResult, found: Finding, placeholders: Sequence[Placeholder]
+) -> SetupMistake:
+    candidate, axes = found.candidate, spoilt_axes(found)
+    sentence = describe_candidate(candidate, session)
+    if candidate.kind == "scale":
+        left = [p for p in placeholders if set(candidate.signals) <= set(p.signals)]
+        if left:
+            sentence = f"{left[0].sentence}, a placeholder: {sentence}"
+
+    def errors(of: Plausibility) -> dict[str, float]:
+        return dict(zip(system.coordinates, 100.0 * of.error, strict=True))
+
+    return SetupMistake(
+        kind=candidate.kind,
+        signals=candidate.signals,
+        factor=candidate.factor,
+        offset=candidate.offset,
+        axes=tuple(system.coordinates[i] for i in axes),
+        sentence=sentence,
+        evidence=describe_evidence(system, axes, found.before, found.after),
+        error_before=errors(found.before),
+        error_after=errors(found.after),
+        alternatives=tuple(describe_candidate(rival, session) for rival in found.rivals),
+    )
+
+
+def _require_scale(system: System, motions: Sequence[Motion]) -> None:
+    """Refuse a device whose residual can be made zero by setting all free parameters to zero."""
+    free = [i for i, item in enumerate(system.parameters) if not item.fixed]
+    if not free or not all(system.linear[i] for i in free):
+        return
+    nothing = system.prior
+    nothing[free] = 0.0
+    for motion in motions:
+        u = motion.inputs(system.inputs)
+        sizes = []
+        for p in (nothing, system.prior):
+            z = system.memory(motion.q, motion.qd, motion.qdd, u, p, motion.t)
+            sizes.append(np.abs(system.residual(motion.q, motion.qd, motion.qdd, z, u, p)).max())
+        if not sizes[0] <= 1e-12 * sizes[1]:
+            return
+    names = ", ".join(system.parameters[i].name for i in free)
+    raise InputError(
+        f"the scale of its equation is undetermined: with {names} all at zero, nothing is left to"
+        " explain",
+        where=f"device {system.model.device.name!r}",
+        remedy="make a constant of one that is known, such as the gain of the input",
+    )

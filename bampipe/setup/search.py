@@ -1,0 +1,309 @@
+"""The search for set-up mistakes: one after the other, each by what setting it right changes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.estimate.low_pass import Band
+from bampipe.physics import System
+from bampipe.setup.candidates import (
+    Candidate,
+    clock_candidates,
+    exchange_candidates,
+    groups_of_like,
+    quarter_turns,
+    scaled,
+    shifted,
+    sign_candidates,
+    unit_candidates,
+)
+from bampipe.setup.plausibility import Plausibility, judge_setup
+from bampipe.setup.signals import Change, Signals
+from bampipe.trials.folds import Folds
+from bampipe.trials.motion import Motion
+
+Array = NDArray[np.float64]
+
+SUSPICIOUS_ERROR = 0.25
+"""Held-out error, as a share of the applied force, from which other set-ups are tried. Right ones
+stand below 0.15 with any one effect hidden, a gravity compensator that lags behind at 0.36."""
+LOST_ERROR = 0.4
+"""The same from which scales and zeros of any size are tried, too."""
+SUSPICIOUS_PRIORS = 5.0
+"""Sum of objections from which other set-ups are tried: two parameters beyond two deviations."""
+LEAST_GAIN = 8.0
+"""Score that setting a mistake right must gain: an axis' error falls to 37 %, or to less of some."""
+LEAST_GAIN_PLACEHOLDER = 4.0
+"""The same for a scale that stands at exactly 1, as nobody has filled it in."""
+EXPLAINED = 0.6
+"""Held-out error that must be left of a spoilt axis at most, as a share of the applied force."""
+JUDGED_ERROR, RANKED_ERROR = 0.1, 0.01
+"""Errors below these are alike: when a mistake is named, and when mistakes are ranked."""
+ALIKE = 1.5
+"""Difference of scores within which two mistakes cannot be told apart."""
+LEAST_FACTOR, LEAST_TURN, LEAST_SHIFT = 1.5, 0.25, 0.3
+"""A factor, an angle (rad) and a share of an axis' travel below which what is off is no mistake of
+set-up but an effect to be diagnosed."""
+MOST_MISTAKES = 4
+_SAMPLES, _SCREENED_SAMPLES = 12_000, 3_000
+_SHORTLIST = 6
+_DECADES = np.arange(-20, 21) / 4.0
+_STEPS = 24
+_MOST_TRIALS = 8
+_HALVINGS = 10
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One mistake with the two set-ups it lies between.
+
+    Attributes:
+        candidate: that sets it right; rivals: others that do so as well.
+        before, after: what the set-ups explain.
+        gain: of the score.
+    """
+
+    candidate: Candidate
+    rivals: tuple[Candidate, ...]
+    before: Plausibility
+    after: Plausibility
+    gain: float
+
+
+@dataclass
+class Search:
+    """Tries set-ups on a part of the trials; all on a small part, the best of them on more.
+
+    Attributes:
+        system: the bare device; motions: the trials as they are stated, short enough.
+        band: of the residual; folds: of the trials; signals: of the session.
+        tested: number of set-ups tried.
+    """
+
+    system: System
+    motions: Sequence[Motion]
+    band: Band
+    folds: Folds
+    signals: Signals
+    tested: int = field(default=0, init=False)
+
+    @cached_property
+    def screened(self) -> Sequence[Motion]:
+        """The part of the trials that every set-up is tried on."""
+        return shorten(self.motions, _SCREENED_SAMPLES)
+
+    def judge(self, change: Change, motions: Sequence[Motion]) -> Plausibility | None:
+        """What a set-up explains of ``motions``; None where it cannot be computed with."""
+        with np.errstate(all="ignore"):
+            changed = [change.of_motion(motion, self.signals) for motion in motions]
+        return judge_setup(self.system, changed, change.of_band(self.band), self.folds)
+
+    def screen(self, candidate: Candidate, change: Change) -> float:
+        """Score and cost of a candidate on top of ``change``; infinite where it makes no sense."""
+        if not _is_gross(candidate, self.motions, self.signals):
+            return math.inf
+        self.tested += 1
+        found = self.judge(candidate.change.after(change), self.screened)
+        return math.inf if found is None else found.score(RANKED_ERROR) + candidate.cost
+
+    def find_mistakes(
+        self, stated: Plausibility | None, placeholders: Sequence[str]
+    ) -> tuple[Finding, ...]:
+        """The mistakes of the set-up, the one that spoils most first.
+
+        Args:
+            stated: what the set-up as it is stated explains of ``motions``.
+            placeholders: signals whose scale stands at exactly 1.
+        """
+        change, now = Change.none(len(self.signals.names)), stated
+        found: list[Finding] = []
+        while len(found) < MOST_MISTAKES and self._is_suspicious(now, placeholders):
+            step = self._best(change, now, placeholders)
+            if step is None:
+                break
+            found.append(step)
+            change, now = step.candidate.change.after(change), step.after
+        return tuple(f for f in found if now is None or self._is_explained(f, now))
+
+    def _is_suspicious(self, now: Plausibility | None, placeholders: Sequence[str]) -> bool:
+        if now is None or now.error.max() > SUSPICIOUS_ERROR:
+            return True
+        most = LEAST_GAIN_PLACEHOLDER if placeholders else SUSPICIOUS_PRIORS
+        return bool(now.objections.sum() > most)
+
+    def _is_lost(self, now: Plausibility | None) -> bool:
+        """Whether so much is unexplained that a scale or zero of any size is worth trying."""
+        return (
+            now is None or now.error.max() > LOST_ERROR or now.objections.sum() > SUSPICIOUS_PRIORS
+        )
+
+    def _is_explained(self, finding: Finding, last: Plausibility) -> bool:
+        spoilt = spoilt_axes(finding)
+        return bool((last.error[spoilt] < EXPLAINED).all())
+
+    def _best(
+        self, change: Change, now: Plausibility | None, placeholders: Sequence[str]
+    ) -> Finding | None:
+        """The mistake whose correction gains most beyond what is stated, None if none does."""
+        before = now or _nothing_explained(self.system)
+        tried = self._try_best(change, self._discrete())
+        best = self._choose(before, tried, placeholders)
+        if self._is_lost(best.after if best else now):
+            tried += self._try_best(change, self._continuous(change))
+            best = self._choose(before, tried, placeholders)
+        return best
+
+    def _discrete(self) -> Iterator[Candidate]:
+        yield from sign_candidates(self.signals)
+        yield from exchange_candidates(self.signals)
+        yield from clock_candidates(self.signals)
+        yield from unit_candidates(self.signals)
+        yield from quarter_turns(self.signals)
+
+    def _continuous(self, change: Change) -> list[Candidate]:
+        """Scales and zeros of any size: the best families on a grid, then refined."""
+        families: list[tuple[Callable[[float], Candidate], Array]] = []
+        for names in groups_of_like(self.signals):
+            families.append((partial(_scaled_by_power, self.signals, names), _DECADES))
+        for place, axis in enumerate(self.signals.axes):
+            changed = [change.of_motion(motion, self.signals) for motion in self.screened]
+            q = np.concatenate([motion.q[:, place] for motion in changed])
+            reach = 2.0 * max(float(np.ptp(q)), float(np.abs(np.median(q))))
+            size = math.pi if self.signals.units[place] == "rad" else reach
+            grid = size * np.linspace(-1.0, 1.0, _STEPS)
+            families.append((partial(_shifted_by, self.signals, axis), grid))
+        coarse = []
+        for family, grid in families:
+            scores = [self.screen(family(x), change) for x in grid]
+            coarse.append((min(scores), family, grid, float(grid[int(np.argmin(scores))])))
+        coarse.sort(key=lambda one: one[0])
+        return [self._refined(change, *one) for one in coarse[: _SHORTLIST // 2]]
+
+    def _refined(
+        self,
+        change: Change,
+        least: float,
+        family: Callable[[float], Candidate],
+        grid: Array,
+        best: float,
+    ) -> Candidate:
+        """The best candidate of a family near ``best``, where it scores ``least``."""
+        step = float(grid[1] - grid[0])
+        for _ in range(_HALVINGS):
+            step *= 0.5
+            for x in (best - step, best + step):
+                score = self.screen(family(x), change)
+                if score < least:
+                    best, least = x, score
+        return family(best)
+
+    def _try_best(
+        self, change: Change, candidates: Iterable[Candidate]
+    ) -> list[tuple[Candidate, Plausibility]]:
+        """Screen all candidates; return the best with what they explain of all trials."""
+        screened = [(self.screen(candidate, change), candidate) for candidate in candidates]
+        screened.sort(key=lambda one: one[0])
+        tried = []
+        for score, candidate in screened[:_SHORTLIST]:
+            if math.isfinite(score):
+                found = self.judge(candidate.change.after(change), self.motions)
+                if found is not None:
+                    tried.append((candidate, found))
+        return tried
+
+    def _choose(
+        self,
+        before: Plausibility,
+        tried: Sequence[tuple[Candidate, Plausibility]],
+        placeholders: Sequence[str],
+    ) -> Finding | None:
+        ranked = sorted(tried, key=lambda one: one[1].score(RANKED_ERROR) + one[0].cost)
+        for candidate, after in ranked:
+            gain = before.score(JUDGED_ERROR) - after.score(JUDGED_ERROR) - candidate.cost
+            hinted = candidate.kind == "scale" and set(candidate.signals) <= set(placeholders)
+            if gain < (LEAST_GAIN_PLACEHOLDER if hinted else LEAST_GAIN):
+                continue
+            own = after.score(RANKED_ERROR) + candidate.cost
+            rivals = tuple(
+                other
+                for other, found in ranked
+                if other is not candidate
+                and (other.kind, other.signals) != (candidate.kind, candidate.signals)
+                and found.score(RANKED_ERROR) + other.cost < own + ALIKE
+            )
+            return Finding(candidate, _distinct(rivals), before, after, gain)
+        return None
+
+
+def shorten(motions: Sequence[Motion], most: int = _SAMPLES) -> list[Motion]:
+    """The middle of each trial, so that all have ``most`` samples together at most."""
+    return [_middle(motion, most // max(len(motions), 1)) for motion in motions]
+
+
+def spread(count: int) -> list[int]:
+    """Numbers of some trials of ``count``, spread over the session."""
+    chosen = np.linspace(0, count - 1, min(count, _MOST_TRIALS))
+    return [int(number) for number in np.unique(chosen.round())]
+
+
+def _middle(motion: Motion, most: int) -> Motion:
+    first = max((motion.t.size - most) // 2, 0)
+    cut = slice(first, first + most)
+    return replace(
+        motion,
+        t=motion.t[cut],
+        q=motion.q[cut],
+        qd=motion.qd[cut],
+        qdd=motion.qdd[cut],
+        qd_sd=motion.qd_sd[cut],
+        channels={name: values[cut] for name, values in motion.channels.items()},
+        _columns={},
+    )
+
+
+def _scaled_by_power(signals: Signals, names: tuple[str, ...], power: float) -> Candidate:
+    return scaled(signals, names, 10.0**power, 3.0)
+
+
+def _shifted_by(signals: Signals, axis: str, offset: float) -> Candidate:
+    return shifted(signals, axis, offset, 3.0)
+
+
+def spoilt_axes(finding: Finding) -> list[int]:
+    """Axes whose error falls by more than a third once the mistake is set right; else all its own."""
+    before, after = finding.before.error, finding.after.error
+    fallen = [i for i in range(len(before)) if after[i] < before[i] / 1.5]
+    return fallen or list(range(len(before)))
+
+
+def _nothing_explained(system: System) -> Plausibility:
+    n = len(system.coordinates)
+    objections = np.full(len(system.parameters), 0.5)
+    return Plausibility(np.full(n, 1e3), np.ones(n), system.prior, objections)
+
+
+def _is_gross(candidate: Candidate, motions: Sequence[Motion], signals: Signals) -> bool:
+    """Whether a scale or zero is off by more than what an effect would explain."""
+    if candidate.kind == "scale":
+        return abs(math.log(candidate.factor)) > math.log(LEAST_FACTOR)
+    if candidate.kind != "zero":
+        return True
+    place = signals.places(candidate.signals)[0]
+    if signals.units[place] == "rad":
+        return abs(candidate.offset) > LEAST_TURN
+    travel = max(float(np.ptp(motion.q[:, place])) for motion in motions)
+    return abs(candidate.offset) > LEAST_SHIFT * travel
+
+
+def _distinct(candidates: Sequence[Candidate]) -> tuple[Candidate, ...]:
+    """The first of each kind and signals."""
+    found: dict[tuple[str, tuple[str, ...]], Candidate] = {}
+    for candidate in candidates:
+        found.setdefault((candidate.kind, candidate.signals), candidate)
+    return tuple(found.values())

@@ -1,0 +1,142 @@
+"""The recorded signals of a session, and what becomes of a motion when one means something else."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.estimate.low_pass import Band
+from bampipe.physics import System
+from bampipe.physics.device import derivative
+from bampipe.results.ingest import IngestResult
+from bampipe.trials.motion import Motion
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Signals:
+    """Axes, forces, other channels and brakes in one order, and how raw columns became them.
+
+    Attributes:
+        names: of the signals, the axes first; axes, forces, channels, brakes: those of each kind.
+        units: SI unit of each.
+        gain: (n, n), offset: (n,): value = gain @ raw + offset.
+    """
+
+    axes: tuple[str, ...]
+    forces: tuple[str, ...]
+    channels: tuple[str, ...]
+    brakes: tuple[str, ...]
+    units: tuple[str, ...]
+    gain: Array
+    offset: Array
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of all signals."""
+        return (*self.axes, *self.inputs)
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Signals that are no coordinates."""
+        return (*self.forces, *self.channels, *self.brakes)
+
+    def places(self, names: Sequence[str]) -> list[int]:
+        """Positions of the signals called ``names``."""
+        return [self.names.index(name) for name in names]
+
+    @classmethod
+    def of_session(cls, system: System, session: IngestResult) -> Signals:
+        """The signals of a session that a model uses."""
+        device = system.model.device
+        axes, forces = system.coordinates, tuple(device.forces)
+        channels = tuple(name for name in device.channels if name not in forces)
+        brakes = tuple(device.brakes[a] for a in axes if a in device.brakes)
+        inputs = (*forces, *channels, *brakes)
+        units = [session.axes[axis].unit for axis in axes]
+        units += [device.force_unit] * len(forces) + [device.channels[name] for name in channels]
+        units += [
+            "N.m" if session.axes[axis].unit == "rad" else "N"
+            for axis in axes
+            if axis in device.brakes
+        ]
+        gain, offset = np.eye(len(axes) + len(inputs)), np.zeros(len(axes) + len(inputs))
+        for i, axis in enumerate(axes):
+            encoder = session.axes[axis]
+            gain[i, i], offset[i] = encoder.scale, -encoder.scale * encoder.zero
+        for i, name in enumerate(inputs, len(axes)):
+            if name in session.channels:
+                channel = session.channels[name]
+                gain[i, i], offset[i] = channel.scale, channel.offset
+        matrix = np.array(session.force.calibration)
+        places = [i for i, name in enumerate(inputs, len(axes)) if name in session.force.columns]
+        # Where several columns make one component, no column can stand for another.
+        if matrix.shape == (len(places), len(places)) and places:
+            order = [session.force.columns.index((*axes, *inputs)[i]) for i in places]
+            matrix = matrix[np.ix_(order, order)]
+            gain[np.ix_(places, places)] = matrix
+            offset[places] = -matrix @ np.array(session.force.zero)[order]
+        return cls(axes, forces, channels, brakes, tuple(units), gain, offset)
+
+
+@dataclass(frozen=True)
+class Change:
+    """Signals and clock as another set-up has them: value' = gain @ value + offset, t' = time * t.
+
+    Attributes:
+        gain: (n, n); offset: (n,), in the order of the signals; time: of the clock.
+    """
+
+    gain: Array
+    offset: Array
+    time: float = 1.0
+
+    @classmethod
+    def none(cls, count: int) -> Change:
+        """The set-up as it is stated, of ``count`` signals."""
+        return cls(np.eye(count), np.zeros(count))
+
+    def after(self, first: Change) -> Change:
+        """Both, ``first`` first."""
+        return Change(
+            self.gain @ first.gain, self.gain @ first.offset + self.offset, self.time * first.time
+        )
+
+    def of_motion(self, motion: Motion, signals: Signals) -> Motion:
+        """The motion that another set-up makes of the same readings."""
+        n = len(signals.axes)
+        none = np.zeros_like(motion.t)
+        orders = []
+        for order, positions in enumerate((motion.q, motion.qd, motion.qdd)):
+            inputs = [
+                motion.channels.get(derivative(name, order), none) for name in signals.inputs
+            ]
+            values = np.column_stack([positions, *inputs]) @ self.gain.T
+            orders.append((values + self.offset if order == 0 else values) / self.time**order)
+        sd = np.zeros((motion.t.size, len(self.gain)))
+        sd[:, :n] = motion.qd_sd
+        channels = {}
+        for i, name in enumerate(signals.inputs, n):
+            channels[name] = orders[0][:, i]
+        return replace(
+            motion,
+            t=motion.t * self.time,
+            q=orders[0][:, :n],
+            qd=orders[1][:, :n],
+            qdd=orders[2][:, :n],
+            qd_sd=np.sqrt(sd**2 @ (self.gain[:n] ** 2).T) / self.time,
+            channels={**motion.channels, **channels},
+            _columns={},
+        )
+
+    def of_band(self, band: Band) -> Band:
+        """The same band, in the time of another clock."""
+        return Band(
+            band.rate_hz / self.time,
+            tuple(f / self.time for f in band.cutoff_hz),
+            band.margin_s * self.time,
+        )

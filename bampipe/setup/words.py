@@ -1,0 +1,151 @@
+"""Set-up mistakes in words: what is wrong, what to write instead, and what speaks for it."""
+
+from __future__ import annotations
+
+import math
+
+from bampipe.physics import System
+from bampipe.results.ingest import IngestResult
+from bampipe.setup.candidates import FACTORS, Candidate
+from bampipe.setup.plausibility import Plausibility, distance_from_prior
+
+
+def describe_candidate(candidate: Candidate, session: IngestResult) -> str:
+    """One sentence without a full stop: the mistake, a colon, what to write in session.toml."""
+    if candidate.kind == "clock":
+        return _clock(candidate, session)
+    if candidate.kind == "zero":
+        return _zero(candidate, session)
+    if candidate.kind == "exchange":
+        who = " and ".join(candidate.signals)
+        return f"{who} are exchanged: exchange their columns"
+    return _sign(candidate, session) if candidate.kind == "sign" else _scale(candidate, session)
+
+
+def describe_evidence(
+    system: System, axes: list[int], before: Plausibility, after: Plausibility
+) -> str:
+    """What setting it right changes: held-out errors, and parameters that were not believable."""
+    parts = [
+        f"held-out error of {system.coordinates[i]} falls from"
+        f" {percent(before.error[i])} to {percent(after.error[i])} of the applied force"
+        for i in axes
+        if after.error[i] < before.error[i] / 1.5
+    ]
+    back = [
+        f"{item.name} goes from {old:.3g} to {new:.3g} {item.unit}, where {item.prior:g} ±"
+        f" {item.sd:g} is expected"
+        for item, old, new in zip(system.parameters, before.p, after.p, strict=True)
+        if abs(distance_from_prior(item, old)) > abs(distance_from_prior(item, new)) + 1.0
+    ]
+    return "; ".join(parts or back[:3])
+
+
+def percent(share: float) -> str:
+    """A share in per cent, two digits, no more than a reader wants of a very large one."""
+    return f"{100.0 * share:.2g} %" if share < 10.0 else "over 1000 %"
+
+
+def _sign(candidate: Candidate, session: IngestResult) -> str:
+    names = candidate.signals
+    if len(names) > 1:
+        if names[0] in session.force.columns:
+            return (
+                f"{', '.join(names)} all have the wrong sign, as forces on the hand taken for those"
+                f" of the hand have: negate {_force_entry(session)}"
+            )
+        return f"{', '.join(names)} have the wrong sign: negate their columns"
+    name = names[0]
+    if name in session.axes:
+        counts = session.axes[name].counts_per_unit
+        fix = "negate counts_per_unit" if counts else "counts_per_unit = -1"
+        return f"the encoder of {name} counts the other way: {fix}"
+    if name in session.force.columns:
+        row = " in its row" if len(session.force.columns) > 1 else ""
+        return f"{name} has the wrong sign: negate {_force_entry(session)}{row}"
+    if name in session.channels:
+        return f"{name} has the wrong sign: negate scale of channels.{name}"
+    return f"{name} has the wrong sign: negate its column"
+
+
+def _scale(candidate: Candidate, session: IngestResult) -> str:
+    factor = candidate.factor
+    off = (
+        f"{1.0 / factor:.3g} times too much" if factor < 1.0 else f"{factor:.3g} times too little"
+    )
+    who = " and ".join(candidate.signals)
+    verb = "read" if len(candidate.signals) > 1 else "reads"
+    fixes = dict.fromkeys(_scale_fix(name, candidate, session) for name in candidate.signals)
+    unit = _si(candidate, session)
+    like = ""
+    if candidate.unit and unit:
+        meant, stated = (candidate.unit, unit) if _is_stated_as_si(candidate, unit) else (
+            unit, candidate.unit)  # fmt: skip
+        like = f", as {meant} read as {stated}"
+    return f"{who} {verb} {off}{like}: {'; '.join(fixes)}"
+
+
+def _scale_fix(name: str, candidate: Candidate, session: IngestResult) -> str:
+    factor = candidate.factor
+    if name in session.axes:
+        encoder = session.axes[name]
+        if encoder.counts_per_unit:
+            return (
+                f"counts_per_unit of {name} should be about {encoder.counts_per_unit / factor:.4g},"
+                f" not {encoder.counts_per_unit:.6g}"
+            )
+        unit = _unit_meant(candidate, encoder.raw_unit, encoder.unit)
+        return f'unit = "{unit}"' if unit else f"counts_per_unit = {1.0 / factor:.4g}"
+    if name in session.force.columns:
+        unit = _unit_meant(candidate, session.force.raw_unit, session.force.unit)
+        if unit:
+            return f'unit = "{unit}" of [force]'
+        row = " of its row" if len(candidate.signals) < len(session.force.columns) else ""
+        return f"multiply {_force_entry(session)}{row} by {factor:.3g}"
+    return f"multiply scale of channels.{name} by {factor:.3g}"
+
+
+def _unit_meant(candidate: Candidate, stated: str, si: str) -> str:
+    """The unit to write in place of ``stated``, "" where no unit explains the factor."""
+    if not candidate.unit:
+        return ""
+    if stated == si and _is_stated_as_si(candidate, si):
+        return candidate.unit
+    return si if stated == candidate.unit and not _is_stated_as_si(candidate, si) else ""
+
+
+def _is_stated_as_si(candidate: Candidate, si: str) -> bool:
+    """Whether readings in ``candidate.unit`` were taken for ``si``, not the other way round."""
+    return math.isclose(candidate.factor, dict(FACTORS[si])[candidate.unit])
+
+
+def _si(candidate: Candidate, session: IngestResult) -> str:
+    name = candidate.signals[0]
+    if name in session.axes:
+        return session.axes[name].unit
+    if name in session.channels:
+        found = session.channels[name].unit
+        return found if found in FACTORS else ""
+    return session.force.unit if session.force.unit in FACTORS else ""
+
+
+def _force_entry(session: IngestResult) -> str:
+    return "calibration_n_per_v" if session.force.raw_unit == "V" else "the columns of [force]"
+
+
+def _zero(candidate: Candidate, session: IngestResult) -> str:
+    axis = candidate.signals[0]
+    encoder = session.axes[axis]
+    off = candidate.offset
+    size = f"{math.degrees(off):.3g}°" if encoder.unit == "rad" else f"{off:.3g} m"
+    zero = encoder.zero - off / encoder.scale
+    return f"the zero of {axis} is off by {size}: zero_counts should be about {zero:.6g}"
+
+
+def _clock(candidate: Candidate, session: IngestResult) -> str:
+    factor = candidate.factor
+    how = f"{1.0 / factor:.4g} times too slowly" if factor < 1.0 else f"{factor:.4g} times too fast"
+    return (
+        f"the clock runs {how}: correct the unit of the time column, and sample_rate_hz, which"
+        f" would be {session.sample_rate_hz / factor:.4g}"
+    )

@@ -1,0 +1,233 @@
+"""Set-up mistakes in sessions of the independent simulators: how many are named, and how rightly.
+
+    python benchmarks/mistakes.py bam joint axis damper --seeds 3
+    python benchmarks/mistakes.py joint --only "degrees for radians"
+
+Each session is recorded soundly, then its session file or its logs are spoilt as a person would.
+It goes through ingest and filter; a line says what was named, then comes a table.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import re
+import shutil
+import sys
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pandas as pd
+from independent import record
+from independent.sensors import Conditions
+
+import bampipe
+
+PIPELINE = """schema = "bampipe.pipeline/1"
+name = "mistakes"
+stages = ["ingest", "filter"]
+"""
+DEGREES = 180.0 / math.pi
+SHORT = {
+    "bam": Conditions(trials=4, seconds=10.0, rate_hz=250.0, viscous_trials=1),
+    "joint": Conditions(trials=4),
+    "axis": Conditions(trials=4, seconds=5.0),
+    "damper": Conditions(trials=4),
+}
+
+
+@dataclass(frozen=True)
+class Mistake:
+    """One mistake of a person.
+
+    Attributes:
+        spoil: makes it in a session folder.
+        key: what must be named, ``kind:channel``.
+    """
+
+    spoil: Callable[[Path], None]
+    key: str
+
+
+def _rewrite(file: Path, pattern: str, new: str | Callable[[re.Match[str]], str]) -> None:
+    text, count = re.subn(pattern, new, file.read_text(encoding="utf-8"))
+    if not count:
+        raise ValueError(f"{file}: nothing matches {pattern!r}")
+    file.write_text(text, encoding="utf-8")
+
+
+def set_text(pattern: str, new: str, file: str = "session.toml") -> Callable[[Path], None]:
+    """Return what replaces ``pattern`` in a file of the session."""
+    return lambda folder: _rewrite(folder / file, pattern, new)
+
+
+def scale_number(pattern: str, factor: float) -> Callable[[Path], None]:
+    """Return what multiplies the number after ``pattern`` in the session file."""
+
+    def scaled(match: re.Match[str]) -> str:
+        return f"{match[1]}{float(match[2]) * factor!r}"
+
+    return lambda folder: _rewrite(folder / "session.toml", f"({pattern})([-0-9.e+]+)", scaled)
+
+
+def scale_column(column: str, factor: float, offset: float = 0.0) -> Callable[[Path], None]:
+    """Return what writes ``factor * column + offset`` in place of a column of every log."""
+
+    def spoil(folder: Path) -> None:
+        for file in sorted(folder.glob("trials/*.csv")):
+            frame = pd.read_csv(file)
+            frame[column] = frame[column] * factor + offset
+            frame.to_csv(file, index=False, float_format="%.9g", lineterminator="\n")
+
+    return spoil
+
+
+def exchange_columns(one: str, other: str) -> Callable[[Path], None]:
+    """Return what exchanges two column names in the session file."""
+
+    def spoil(folder: Path) -> None:
+        names = {f'"{one}"': f'"{other}"', f'"{other}"': f'"{one}"'}
+        _rewrite(folder / "session.toml", "|".join(names), lambda match: names[match[0]])
+
+    return spoil
+
+
+def calibrate(change: Callable[[list[list[float]]], list[list[float]]]) -> Callable[[Path], None]:
+    """Return what changes the calibration matrix in the session file."""
+
+    def changed(match: re.Match[str]) -> str:
+        return f"{match[1]}{change(json.loads(match[2]))}"
+
+    return lambda folder: _rewrite(
+        folder / "session.toml", r"(calibration_n_per_v = )(\[\[.*\]\])", changed
+    )
+
+
+def do_all(*changes: Callable[[Path], None]) -> Callable[[Path], None]:
+    """Return what makes several changes."""
+
+    def spoil(folder: Path) -> None:
+        for change in changes:
+            change(folder)
+
+    return spoil
+
+
+def flip_rows(*rows: int) -> Callable[[Path], None]:
+    """Return what negates rows of the calibration matrix."""
+    return calibrate(
+        lambda matrix: [
+            [-v for v in row] if number in rows else row for number, row in enumerate(matrix)
+        ]
+    )
+
+
+def scale_all(factor: float) -> Callable[[Path], None]:
+    """Return what multiplies the calibration matrix."""
+    return calibrate(lambda matrix: [[v * factor for v in row] for row in matrix])
+
+
+def identity(matrix: list[list[float]]) -> list[list[float]]:
+    """Return the calibration that nobody has made yet."""
+    return [[float(i == j) for j in range(len(matrix))] for i in range(len(matrix))]
+
+
+def per_unit(axis: str, factor: float) -> Callable[[Path], None]:
+    """Return what multiplies the counts of one unit of an axis."""
+    return scale_number(rf"\n{axis} = .*counts_per_unit = ", factor)
+
+
+SOUND = Mistake(lambda folder: None, "")
+MISTAKES: Mapping[str, Mapping[str, Mistake]] = {
+    "bam": {
+        "encoder of the yaw reversed": Mistake(per_unit("yaw", -1.0), "sign:yaw"),
+        "encoder of the pitch reversed": Mistake(per_unit("pitch", -1.0), "sign:pitch"),
+        "encoder of the extension reversed": Mistake(per_unit("extension", -1.0), "sign:extension"),
+        "one force component reversed": Mistake(flip_rows(2), "sign:force_z"),
+        "force of the hand for that on the hand": Mistake(flip_rows(0, 1, 2), "sign:force"),
+        "counts per degree for a radian": Mistake(
+            do_all(per_unit("yaw", 1 / DEGREES), per_unit("pitch", 1 / DEGREES)),
+            "scale:yaw+scale:pitch",
+        ),
+        "counts per millimetre for a metre": Mistake(per_unit("extension", 1e-3), "scale:extension"),
+        "a quarter of the counts (no quadrature)": Mistake(per_unit("yaw", 0.25), "scale:yaw"),
+        "counts per radian left at 1": Mistake(per_unit("yaw", 1 / 21333.3333), "scale:yaw"),
+        "encoder columns exchanged": Mistake(
+            exchange_columns("enc_yaw", "enc_pitch"), "exchange:yaw+pitch"
+        ),
+        "force columns exchanged": Mistake(
+            exchange_columns("force_x_v", "force_y_v"), "exchange:force_x+force_y"
+        ),
+        "force calibrated in kgf": Mistake(scale_all(1 / 9.81), "scale:force"),
+        "force calibrated in grams": Mistake(scale_all(1000 / 9.81), "scale:force"),
+        "gain of one amplifier ten times": Mistake(
+            calibrate(lambda m: [m[0], m[1], [10.0 * v for v in m[2]]]), "scale:force_z"
+        ),
+        "calibration left at 1": Mistake(calibrate(identity), "scale:force"),
+        "pitch counted from the vertical": Mistake(
+            set_text(r"(\npitch = .*zero_counts = )(-?\d+)", r"\g<1>12008"), "zero:pitch"
+        ),
+        "extension counted from the centre of gravity": Mistake(
+            set_text(r"(\nextension = .*zero_counts = )(-?\d+)", r"\g<1>18367"), "zero:extension"
+        ),
+        "brake commands negative": Mistake(
+            do_all(*(scale_column(f"brake_{a}", -1.0) for a in ("yaw", "pitch", "extension"))),
+            "sign:brakes",
+        ),
+        "clock in milliseconds for microseconds": Mistake(scale_column("time_us", 1e-3), "clock"),
+    },
+    "joint": {
+        "encoder reversed": Mistake(scale_column("q", -1.0), "sign:joint"),
+        "current reversed": Mistake(scale_column("i", -1.0), "sign:current"),
+        "degrees for radians": Mistake(scale_column("q", DEGREES), "scale:joint"),
+        "revolutions for radians": Mistake(scale_column("q", 0.5 / math.pi), "scale:joint"),
+        "radians for degrees": Mistake(
+            set_text('unit = "rad", resolution = 5e-05', 'unit = "deg", resolution = 5e-05'),
+            "scale:joint",
+        ),
+        "milliamperes for amperes": Mistake(scale_column("i", 1000.0), "scale:current"),
+        "motor constant left at 1": Mistake(
+            set_text("value = 10.0", "value = 1.0", "joint.toml"), "scale:current"
+        ),
+        "position and current exchanged": Mistake(
+            exchange_columns("q", "i"), "exchange:joint+current"
+        ),
+        "clock in milliseconds for seconds": Mistake(scale_column("t", 1000.0), "clock"),
+    },
+    "axis": {
+        "encoder reversed": Mistake(scale_column("q", -1.0), "sign:carriage"),
+        "force reversed": Mistake(flip_rows(0), "sign:force_motor"),
+        "millimetres for metres": Mistake(scale_column("q", 1000.0), "scale:carriage"),
+        "metres for millimetres": Mistake(
+            set_text('unit = "m", resolution = 1e-07', 'unit = "mm", resolution = 1e-07'),
+            "scale:carriage",
+        ),
+        "calibration left at 1": Mistake(scale_all(1 / 35.0), "scale:force_motor"),
+        "force in millinewtons": Mistake(scale_all(1000.0), "scale:force_motor"),
+        "position and force exchanged": Mistake(
+            exchange_columns("q", "u"), "exchange:carriage+force_motor"
+        ),
+        "clock in milliseconds for seconds": Mistake(scale_column("t", 1000.0), "clock"),
+        "clock and rate in milliseconds": Mistake(
+            do_all(scale_column("t", 1000.0), set_text("sample_rate_hz = 1000.0", "sample_rate_hz = 1.0")),
+            "clock",
+        ),
+    },
+    "damper": {
+        "encoder reversed": Mistake(scale_column("x", -1.0), "sign:piston"),
+        "load cell reversed": Mistake(scale_column("f", -1.0), "sign:force_load_cell"),
+        "millimetres for metres": Mistake(set_text('unit = "mm"', 'unit = "m"'), "scale:piston"),
+        "kilonewtons for newtons": Mistake(scale_column("f", 1e-3), "scale:force_load_cell"),
+        "milliamperes for amperes": Mistake(scale_column("i", 1000.0), "scale:current"),
+        "force and current exchanged": Mistake(
+            exchange_columns("f", "i"), "exchange:force_load_cell+current"
+        ),
+        "position and force exchanged": Mistake(
+            exchange_columns("x", "f"), "exchange:piston+force_load_cell"
+        ),
+        "clock in milliseconds for seconds": Mistake(scale_column("t", 1000.0), "clock"),
+    },
+}  # fmt: skip
