@@ -16,6 +16,7 @@ from bampipe.results.ingest import IngestResult
 from bampipe.results.lab import LabResult, TrendsResult
 from bampipe.results.performance import PerformanceResult
 from bampipe.results.run import RunResult
+from bampipe.results.setup import SetupResult
 from bampipe.results.stiffness import StiffnessResult
 from bampipe.results.terms import TermsResult
 from bampipe.results.truth import TruthResult
@@ -39,6 +40,7 @@ FILES: dict[str, type[Declaration]] = {
     "lab": LabResult,
     "performance": PerformanceResult,
     "run": RunResult,
+    "setup": SetupResult,
     "stiffness": StiffnessResult,
     "trends": TrendsResult,
     "truth": TruthResult,

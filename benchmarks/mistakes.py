@@ -13,15 +13,17 @@ import argparse
 import json
 import math
 import re
-import shutil
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pandas as pd
-from independent import record
+from independent import MACHINES, record
 from independent.sensors import Conditions
 
 import bampipe
@@ -31,6 +33,7 @@ name = "mistakes"
 stages = ["ingest", "filter"]
 """
 DEGREES = 180.0 / math.pi
+FORCES = "force_x+force_y+force_z"
 SHORT = {
     "bam": Conditions(trials=4, seconds=10.0, rate_hz=250.0, viscous_trials=1),
     "joint": Conditions(trials=4),
@@ -95,6 +98,18 @@ def exchange_columns(one: str, other: str) -> Callable[[Path], None]:
     return spoil
 
 
+def exchange_headers(one: str, other: str) -> Callable[[Path], None]:
+    """Return what exchanges two columns of every log."""
+
+    def spoil(folder: Path) -> None:
+        for file in sorted(folder.glob("trials/*.csv")):
+            frame = pd.read_csv(file)
+            frame[[one, other]] = frame[[other, one]].to_numpy()
+            frame.to_csv(file, index=False, float_format="%.9g", lineterminator="\n")
+
+    return spoil
+
+
 def calibrate(change: Callable[[list[list[float]]], list[list[float]]]) -> Callable[[Path], None]:
     """Return what changes the calibration matrix in the session file."""
 
@@ -147,26 +162,28 @@ MISTAKES: Mapping[str, Mapping[str, Mistake]] = {
         "encoder of the pitch reversed": Mistake(per_unit("pitch", -1.0), "sign:pitch"),
         "encoder of the extension reversed": Mistake(per_unit("extension", -1.0), "sign:extension"),
         "one force component reversed": Mistake(flip_rows(2), "sign:force_z"),
-        "force of the hand for that on the hand": Mistake(flip_rows(0, 1, 2), "sign:force"),
+        "force of the hand for that on the hand": Mistake(flip_rows(0, 1, 2), f"sign:{FORCES}"),
         "counts per degree for a radian": Mistake(
             do_all(per_unit("yaw", 1 / DEGREES), per_unit("pitch", 1 / DEGREES)),
-            "scale:yaw+scale:pitch",
+            "scale:yaw+pitch",
         ),
-        "counts per millimetre for a metre": Mistake(per_unit("extension", 1e-3), "scale:extension"),
+        "counts per millimetre for a metre": Mistake(
+            per_unit("extension", 1e-3), "scale:extension"
+        ),
         "a quarter of the counts (no quadrature)": Mistake(per_unit("yaw", 0.25), "scale:yaw"),
         "counts per radian left at 1": Mistake(per_unit("yaw", 1 / 21333.3333), "scale:yaw"),
         "encoder columns exchanged": Mistake(
             exchange_columns("enc_yaw", "enc_pitch"), "exchange:yaw+pitch"
         ),
-        "force columns exchanged": Mistake(
-            exchange_columns("force_x_v", "force_y_v"), "exchange:force_x+force_y"
+        "force wires exchanged": Mistake(
+            exchange_headers("force_x_v", "force_y_v"), "exchange:force_x+force_y"
         ),
-        "force calibrated in kgf": Mistake(scale_all(1 / 9.81), "scale:force"),
-        "force calibrated in grams": Mistake(scale_all(1000 / 9.81), "scale:force"),
+        "force calibrated in kgf": Mistake(scale_all(1 / 9.81), f"scale:{FORCES}"),
+        "force calibrated in grams": Mistake(scale_all(1000 / 9.81), f"scale:{FORCES}"),
         "gain of one amplifier ten times": Mistake(
             calibrate(lambda m: [m[0], m[1], [10.0 * v for v in m[2]]]), "scale:force_z"
         ),
-        "calibration left at 1": Mistake(calibrate(identity), "scale:force"),
+        "calibration left at 1": Mistake(calibrate(identity), f"scale:{FORCES}"),
         "pitch counted from the vertical": Mistake(
             set_text(r"(\npitch = .*zero_counts = )(-?\d+)", r"\g<1>12008"), "zero:pitch"
         ),
@@ -175,9 +192,9 @@ MISTAKES: Mapping[str, Mapping[str, Mistake]] = {
         ),
         "brake commands negative": Mistake(
             do_all(*(scale_column(f"brake_{a}", -1.0) for a in ("yaw", "pitch", "extension"))),
-            "sign:brakes",
+            "sign:brake_yaw+brake_pitch+brake_extension",
         ),
-        "clock in milliseconds for microseconds": Mistake(scale_column("time_us", 1e-3), "clock"),
+        "clock in milliseconds for microseconds": Mistake(scale_column("time_us", 1e-3), "clock:"),
     },
     "joint": {
         "encoder reversed": Mistake(scale_column("q", -1.0), "sign:joint"),
@@ -195,7 +212,7 @@ MISTAKES: Mapping[str, Mapping[str, Mistake]] = {
         "position and current exchanged": Mistake(
             exchange_columns("q", "i"), "exchange:joint+current"
         ),
-        "clock in milliseconds for seconds": Mistake(scale_column("t", 1000.0), "clock"),
+        "clock in milliseconds for seconds": Mistake(scale_column("t", 1000.0), "clock:"),
     },
     "axis": {
         "encoder reversed": Mistake(scale_column("q", -1.0), "sign:carriage"),
@@ -210,10 +227,13 @@ MISTAKES: Mapping[str, Mapping[str, Mistake]] = {
         "position and force exchanged": Mistake(
             exchange_columns("q", "u"), "exchange:carriage+force_motor"
         ),
-        "clock in milliseconds for seconds": Mistake(scale_column("t", 1000.0), "clock"),
+        "clock in milliseconds for seconds": Mistake(scale_column("t", 1000.0), "clock:"),
         "clock and rate in milliseconds": Mistake(
-            do_all(scale_column("t", 1000.0), set_text("sample_rate_hz = 1000.0", "sample_rate_hz = 1.0")),
-            "clock",
+            do_all(
+                scale_column("t", 1000.0),
+                set_text("sample_rate_hz = 1000.0", "sample_rate_hz = 1.0"),
+            ),
+            "clock:",
         ),
     },
     "damper": {
@@ -228,6 +248,140 @@ MISTAKES: Mapping[str, Mapping[str, Mistake]] = {
         "position and force exchanged": Mistake(
             exchange_columns("x", "f"), "exchange:piston+force_load_cell"
         ),
-        "clock in milliseconds for seconds": Mistake(scale_column("t", 1000.0), "clock"),
+        "clock in milliseconds for seconds": Mistake(scale_column("t", 1000.0), "clock:"),
     },
 }  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Case:
+    """One session: a machine with one mistake, or sound with hidden effects."""
+
+    machine: str
+    mistake: str
+    seed: int
+    effects: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What was said of one session.
+
+    Attributes:
+        case: the session.
+        verdict: "named", "tied" (named beside others that the trials cannot tell from it), "read"
+            (ingest named it), "missed", or "nothing" of a sound session.
+        beside: other mistakes named.
+        said: the sentences; seconds: that ingest and filter took.
+    """
+
+    case: Case
+    verdict: str
+    beside: int
+    said: str
+    seconds: float
+
+    def line(self) -> str:
+        """One line of the log."""
+        what = self.case.mistake or " + ".join(self.case.effects) or "sound"
+        return f"{self.case.machine} {self.case.seed} {what}: {self.verdict} | {self.said}"
+
+
+def run_case(case: Case) -> Outcome:
+    """Record, spoil and judge one session."""
+    mistake = MISTAKES[case.machine][case.mistake] if case.mistake else SOUND
+    with tempfile.TemporaryDirectory() as name:
+        root = Path(name)
+        folder = root / "session"
+        strengths = dict.fromkeys(case.effects, 1.0)
+        record(case.machine, folder, case.seed, strengths, SHORT[case.machine])
+        mistake.spoil(folder)
+        (root / "mistakes.toml").write_text(PIPELINE)
+        begun = time.perf_counter()
+        try:
+            run = bampipe.run_session(
+                folder, runs=root / "runs", pipeline=str(root / "mistakes.toml")
+            )
+        except bampipe.InputError as refusal:
+            seconds = time.perf_counter() - begun
+            verdict = "read" if case.mistake and "unit" in str(refusal) else "missed"
+            return Outcome(case, verdict, 0, str(refusal).replace(name, ""), seconds)
+        seconds = time.perf_counter() - begun
+        setup = json.loads((run.root / "filter/setup.json").read_text(encoding="utf-8"))
+        repairs = "; ".join(run.trials["repairs"])
+    return judge(case, mistake.key, setup["mistakes"], repairs, seconds)
+
+
+def judge(
+    case: Case, key: str, found: Sequence[Mapping[str, Any]], repairs: str, seconds: float
+) -> Outcome:
+    """Hold what was named against what was done."""
+
+    def key_of(one: Mapping[str, Any]) -> str:
+        return f"{one['kind']}:{'+'.join(one['signals'])}"
+
+    said = " / ".join(one["sentence"] for one in found)
+    named = [key_of(one) for one in found]
+    tied = [key_of(other) for one in found for other in one.get("alternatives", [])]
+    if key in named and not any(one.get("alternatives") for one in found):
+        verdict = "named"
+    elif key in named or key in tied:
+        verdict = "tied"
+    elif key == "clock:" and "time stamps are in" in repairs:
+        verdict, said = "read", repairs.partition(";")[0]
+    else:
+        verdict = "missed" if key else "nothing"
+    right = key in named or verdict == "tied"
+    return Outcome(case, verdict, len(found) - right, said, seconds)
+
+
+def write_table(outcomes: Sequence[Outcome]) -> str:
+    """Counts by machine and mistake, as Markdown."""
+    lines = ["| machine | mistake | named | beside others alike | by ingest | missed |"]
+    lines.append("|-|-|-|-|-|-|")
+    spoilt = [o for o in outcomes if o.case.mistake]
+    for machine, mistake in dict.fromkeys((o.case.machine, o.case.mistake) for o in spoilt):
+        some = [o for o in spoilt if (o.case.machine, o.case.mistake) == (machine, mistake)]
+        counts = [sum(o.verdict == v for o in some) for v in ("named", "tied", "read", "missed")]
+        lines.append(f"| {machine} | {mistake} | {' | '.join(str(c or '') for c in counts)} |")
+    if spoilt:
+        right = sum(o.verdict != "missed" for o in spoilt)
+        beside = sum(o.beside > 0 for o in spoilt)
+        lines.append(
+            f"\n{right} of {len(spoilt)} named ({right / len(spoilt):.1%}), in {beside} something"
+            f" else as well; {np.median([o.seconds for o in spoilt]):.1f} s a session."
+        )
+    sound = [o for o in outcomes if not o.case.mistake]
+    if sound:
+        wrong = sum(o.beside > 0 or o.verdict != "nothing" for o in sound)
+        lines.append(f"\n{wrong} of {len(sound)} sound sessions said to be mistaken.")
+    return "\n".join(lines)
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Run the cases asked for, print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("machine", nargs="*", default=list(MISTAKES), help=", ".join(MISTAKES))
+    parser.add_argument("--only", nargs="*", default=[], help="names of mistakes")
+    parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--first-seed", type=int, default=1)
+    parser.add_argument("--sound", action="store_true", help="sound sessions, each with an effect")
+    options = parser.parse_args(arguments)
+    cases = []
+    for machine in options.machine:
+        for seed in range(options.first_seed, options.first_seed + options.seeds):
+            if options.sound:
+                hidden = (*MACHINES[machine].EFFECTS, *MACHINES[machine].UNKNOWN)
+                cases += [Case(machine, "", seed, effects) for effects in ((), *zip(hidden))]
+            else:
+                names = options.only or list(MISTAKES[machine])
+                cases += [Case(machine, name, seed) for name in names]
+    outcomes = []
+    for case in cases:
+        outcomes.append(run_case(case))
+        print(outcomes[-1].line(), flush=True)
+    print(write_table(outcomes))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

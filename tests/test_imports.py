@@ -47,6 +47,7 @@ LAWS = {
     "results": law("pydantic", "errors files schema"),
     "data": law("numpy scipy pandas pyarrow h5py pydantic", "errors schema files results"),
     "trials": law("numpy scipy pandas pyarrow numba", "errors files results physics estimate data"),
+    "setup": law("numpy", "errors results physics estimate trials"),
     "identification": law(
         "numpy scipy pandas pyarrow numba pydantic",
         "schema errors results progress physics estimate data trials discover",
@@ -64,7 +65,7 @@ LAWS = {
     "stages": law(
         "numpy scipy pandas pyarrow numba pydantic",
         "errors files schema results progress physics estimate data declarations trials "
-        "identification discover report",
+        "identification setup discover report",
     ),
     "report": law(
         "numpy matplotlib typst pandas pyarrow bampipe", "declarations errors files results"

@@ -135,6 +135,7 @@ def summary(content: Mapping[str, object]) -> None:
         content: the summary of a stage. ``headline`` is a line; ``axes``, ``parameters``,
             ``directions``, ``trials``, ``ranking`` and ``ladder`` are tables; ``notes`` are lines.
     """
+    setup(content)
     if isinstance(content.get("headline"), str):
         say(str(content["headline"]))
     for name in ("axes", "parameters", "directions", "trials", "ranking"):
@@ -173,6 +174,13 @@ def _lines(content: Mapping[str, object], name: str, word: str) -> None:
     found = content.get(name)
     for line in found if isinstance(found, list) else ():
         say(f"{word}: {line}")
+
+
+def setup(content: Mapping[str, object]) -> None:
+    """Print what is wrong or doubtful in the session and device files, a line each."""
+    lines = content.get("setup")
+    for line in lines if isinstance(lines, list) else []:
+        say(f"set-up: {line}")
 
 
 def trials(content: Mapping[str, object]) -> None:
@@ -232,7 +240,9 @@ def _free_runs(rungs: Sequence[Rung]) -> None:
 
 
 def outcome(result: Outcome) -> None:
-    """Print the steps of a run and its gates."""
+    """Print the steps of a run and its gates, what is wrong with the set-up first."""
+    for step in result.steps:
+        setup(step.summary)
     rows = []
     for step in result.steps:
         took = f"{step.seconds:.1f} s" if step.state == "done" else ""

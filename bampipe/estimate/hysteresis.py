@@ -37,6 +37,10 @@ is a poor likeness of a long transition with a sharp end, and the slope needs a 
 _LARGEST_SLOPE_CHANGE = 0.02
 """Post-yield at all: the slopes of the first and second half of what is used differ by less."""
 
+_SYSTEMATIC = 0.25
+"""Share of the change of the slope by which the stiffness may be off: with it, 95 to 100 % of the
+intervals hold the truth for loops that turn round in seven ways (docs/benchmarks.md)."""
+
 
 @dataclass(frozen=True)
 class Branch:
@@ -88,8 +92,11 @@ class Hysteresis:
 
     Attributes:
         stiffness: of all post-yield parts together, N.m/rad or N/m.
-        sd: standard deviation over the cycles; with one cycle, that of its regression.
-        standard_error: of the regression over all branches.
+        standard_error: of that, by the scatter over the cycles or by the regression over all
+            branches, whichever is larger.
+        systematic: its uncertainty from what is left of the transition: a quarter of the change of
+            the slope, or of the standard error of that change where it is larger.
+        scatter: standard deviation over the cycles; with one cycle, that of its regression.
         cycles: cycle by cycle.
         branches: all whole branches.
         transition: torque after a reversal from which the loop is taken as post-yield, N.m or N.
@@ -100,8 +107,9 @@ class Hysteresis:
     """
 
     stiffness: float
-    sd: float
     standard_error: float
+    systematic: float
+    scatter: float
     cycles: tuple[Cycle, ...]
     branches: tuple[Branch, ...]
     transition: float
@@ -295,10 +303,12 @@ def hysteresis(
     stiffness = 1.0 / compliance
     standard_error = error * stiffness**2
     values = [cycle.stiffness for cycle in cycles]
+    scatter = float(np.std(values, ddof=1)) if len(values) > 1 else standard_error
     return Hysteresis(
         stiffness=stiffness,
-        sd=float(np.std(values, ddof=1)) if len(values) > 1 else standard_error,
-        standard_error=standard_error,
+        standard_error=max(standard_error, scatter / float(np.sqrt(len(values)))),
+        systematic=_SYSTEMATIC * stiffness * max(abs(slope_change), slope_change_error),
+        scatter=scatter,
         cycles=cycles,
         branches=branches,
         transition=start,

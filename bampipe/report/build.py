@@ -7,11 +7,12 @@ import importlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from bampipe.report import page, style, typeset
+from bampipe.report import page, style, typeset, wording
 from bampipe.report.document import Block, Callout, Document, Figure, Section
 from bampipe.report.explorer.page import explorer_page
 from bampipe.report.results import Results
 from bampipe.report.sections import SECTIONS
+from bampipe.results.setup import SetupResult
 
 
 @dataclass(frozen=True)
@@ -81,6 +82,28 @@ def build(results: Results, progress: Callable[[float, str], None]) -> Report:
 
 def _warnings(results: Results) -> tuple[Block, ...]:
     """Return what must be known before anything else is read."""
+    return (*_setup(results), *_outdated(results))
+
+
+def _setup(results: Results) -> tuple[Block, ...]:
+    setup = results.read(SetupResult)
+    if setup is None:
+        return ()
+    blocks: list[Block] = []
+    for mistake in setup.mistakes:
+        text = f"Set right, {mistake.evidence}."
+        if mistake.alternatives:
+            others = "; ".join(other.sentence for other in mistake.alternatives)
+            text += f" The trials cannot tell it from: {others}."
+        text += " Nothing below counts before the session file is corrected."
+        blocks.append(Callout("attention", f"Set-up: {mistake.sentence}", text))
+    if setup.warnings:
+        text = " ".join(f"{wording.sentence(line)}." for line in setup.warnings)
+        blocks.append(Callout("note", "Doubtful set-up", text))
+    return tuple(blocks)
+
+
+def _outdated(results: Results) -> tuple[Block, ...]:
     if not results.outdated:
         return ()
     steps = ", ".join(f"`{step}`" for step in results.outdated)

@@ -49,6 +49,7 @@ class RecordedChannel(Record):
     unit: str
     scale: float = Field(default=1.0, description="SI value = scale * raw + offset")
     offset: float = 0.0
+    raw_unit: str = Field(default="", description="Unit of the column, where it is not rescaled")
 
 
 class IngestResult(Result):

@@ -9,24 +9,33 @@ from pydantic import Field
 from bampipe.results.record import Names, Record, Result, Share, Size
 from bampipe.schema import Count
 
+Kind = Literal["sign", "scale", "exchange", "zero", "clock"]
 
-class SetupMistake(Record):
-    """One mistake in a session or device file, with what speaks for it."""
 
-    kind: Literal["sign", "scale", "exchange", "zero", "clock"]
-    signals: Names = Field(description="Axes, force channels and other channels that it concerns")
+class PossibleMistake(Record):
+    """One mistake in a session or device file."""
+
+    kind: Kind
+    signals: Names = Field(
+        description="Axes, force channels and other channels that it concerns; none of a clock"
+    )
+    sentence: str = Field(description="What is wrong, and what to write instead")
+
+
+class SetupMistake(PossibleMistake):
+    """A mistake that was found, with what speaks for it."""
+
     factor: float = Field(
         default=1.0, description="By which their readings must be multiplied, of a scale or clock"
     )
     offset: float = Field(default=0.0, description="Which must be added, rad or m, of a zero")
     axes: Names = Field(description="Whose equations it spoils")
-    sentence: str = Field(description="What is wrong, and what to write instead")
     evidence: str = Field(description="What changes once it is set right")
     error_before: dict[str, Size] = Field(
         description="Held-out error by axis, per cent of the applied force"
     )
     error_after: dict[str, Size] = Field(description="The same with it set right")
-    alternatives: Names = Field(
+    alternatives: tuple[PossibleMistake, ...] = Field(
         default=(), description="Other mistakes that the trials cannot tell from this one"
     )
 
@@ -57,5 +66,8 @@ class SetupResult(Result):
     @property
     def lines(self) -> tuple[str, ...]:
         """The mistakes, then the warnings, a line each."""
-        found = tuple(f"{m.sentence} ({m.evidence})" for m in self.mistakes)
-        return found + self.warnings
+        found = []
+        for mistake in self.mistakes:
+            either = "".join(f"; or {other.sentence}" for other in mistake.alternatives)
+            found.append(f"{mistake.sentence}{either} ({mistake.evidence})")
+        return (*found, *self.warnings)

@@ -51,8 +51,15 @@ class AxisStiffness(Record):
     """Stiffness of one axis over its locked trials."""
 
     stiffness: Positive
-    sd: Size = Field(description="Standard deviation over the cycles")
-    standard_error: Size = Field(description="Standard error of the regression over all cycles")
+    sd: Size = Field(description="Standard uncertainty: standard_error and systematic together")
+    standard_error: Size = Field(
+        description="By the scatter over the cycles, or of the regression over all, the larger"
+    )
+    systematic: Size = Field(
+        description="A quarter of what the slope changes by where loops should be straight, or "
+        "could change by"
+    )
+    cycle_scatter: Size = Field(description="Standard deviation over the cycles")
     unit: str = Field(description="Of the stiffness: N.m/rad or N/m")
     n_cycles: int = Field(ge=1)
     bandwidth_rad_s: Positive = Field(description="sqrt(stiffness / inertia) at bandwidth_pose")

@@ -6,13 +6,11 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations, permutations
-from typing import Literal
 
 import numpy as np
 
+from bampipe.results.setup import Kind
 from bampipe.setup.signals import Change, Signals
-
-Kind = Literal["sign", "scale", "exchange", "zero", "clock"]
 
 DEGREE = math.pi / 180.0
 FACTORS: dict[str, tuple[tuple[str, float], ...]] = {
@@ -70,7 +68,7 @@ def shifted(signals: Signals, axis: str, offset: float, cost: float) -> Candidat
 
 
 def groups_of_like(signals: Signals) -> tuple[tuple[str, ...], ...]:
-    """Signals that share a file entry or a habit: each alone, then all axes of a unit, all forces."""
+    """Signals that share a mistake: each alone, then all axes of one unit, then all forces."""
     alone = [(name,) for name in (*signals.axes, *signals.forces, *signals.channels)]
     together = [
         tuple(a for a, u in zip(signals.axes, signals.units, strict=False) if u == unit)
@@ -81,7 +79,9 @@ def groups_of_like(signals: Signals) -> tuple[tuple[str, ...], ...]:
 
 def sign_candidates(signals: Signals) -> Iterator[Candidate]:
     """Reversed encoders, forces, channels and brake commands."""
-    groups = [(name,) for name in (*signals.axes, *signals.forces, *signals.channels)]
+    groups: list[tuple[str, ...]] = [
+        (name,) for name in (*signals.axes, *signals.forces, *signals.channels)
+    ]
     for many in (signals.forces, signals.brakes):
         groups += [many] if len(many) > 1 else []
     groups += [(name,) for name in signals.brakes]
@@ -120,12 +120,15 @@ def clock_candidates(signals: Signals) -> Iterator[Candidate]:
 
 def unit_candidates(signals: Signals) -> Iterator[Candidate]:
     """Units taken for others, and factors of gains and counters."""
-    units = dict(zip(signals.names, signals.units, strict=True))
     for names in groups_of_like(signals):
-        for unit, factor in FACTORS.get(units[names[0]], ()):
+        place = signals.places(names)[0]
+        si, stated = signals.units[place], signals.stated[place]
+        for unit, factor in FACTORS.get(si, ()):
             cost = 0.5 if unit in USUAL else 2.0
-            yield scaled(signals, names, factor, cost, unit)
-            yield scaled(signals, names, 1.0 / factor, cost, unit)
+            if stated == si:
+                yield scaled(signals, names, factor, cost, unit)
+            elif stated == unit:
+                yield scaled(signals, names, 1.0 / factor, cost, unit)
         for factor in PLAIN:
             cost = 2.0
             yield scaled(signals, names, factor, cost)

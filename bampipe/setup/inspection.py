@@ -10,12 +10,12 @@ from bampipe.errors import InputError
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import System
 from bampipe.results.ingest import IngestResult
-from bampipe.results.setup import AxisSetup, SetupMistake, SetupResult
+from bampipe.results.setup import AxisSetup, PossibleMistake, SetupMistake, SetupResult
 from bampipe.setup.placeholders import Placeholder, find_placeholders
 from bampipe.setup.plausibility import LEAST_MOVING, Plausibility
 from bampipe.setup.search import Finding, Search, shorten, spoilt_axes
 from bampipe.setup.signals import Change, Signals
-from bampipe.setup.words import describe_candidate, describe_evidence
+from bampipe.setup.words import describe_candidate, describe_evidence, describe_size
 from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion
 
@@ -85,10 +85,9 @@ def _record(
 ) -> SetupMistake:
     candidate, axes = found.candidate, spoilt_axes(found)
     sentence = describe_candidate(candidate, session)
-    if candidate.kind == "scale":
-        left = [p for p in placeholders if set(candidate.signals) <= set(p.signals)]
-        if left:
-            sentence = f"{left[0].sentence}, a placeholder: {sentence}"
+    left = [p for p in placeholders if set(candidate.signals) <= set(p.signals)]
+    if candidate.kind == "scale" and left:
+        sentence = f"{left[0].sentence}, a placeholder: {describe_size(candidate)}"
 
     def errors(of: Plausibility) -> dict[str, float]:
         return dict(zip(system.coordinates, 100.0 * of.error, strict=True))
@@ -103,7 +102,12 @@ def _record(
         evidence=describe_evidence(system, axes, found.before, found.after),
         error_before=errors(found.before),
         error_after=errors(found.after),
-        alternatives=tuple(describe_candidate(rival, session) for rival in found.rivals),
+        alternatives=tuple(
+            PossibleMistake(
+                kind=rival.kind, signals=rival.signals, sentence=describe_candidate(rival, session)
+            )
+            for rival in found.rivals
+        ),
     )
 
 

@@ -1,4 +1,4 @@
-"""Scales that nobody has filled in: of sensors, and of the constants that the input goes through."""
+"""Scales that nobody has filled in: of sensors, and of constants that the input goes through."""
 
 from __future__ import annotations
 

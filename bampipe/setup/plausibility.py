@@ -15,7 +15,7 @@ from bampipe.physics import System
 from bampipe.physics.parameter import Parameter
 from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion
-from bampipe.trials.residuals import gather_evidence
+from bampipe.trials.residuals import Evidence, gather_evidence
 
 Array = NDArray[np.float64]
 
@@ -24,6 +24,11 @@ WEIGHT = 8.0
 beyond `FARTHEST` deviations of its prior."""
 FARTHEST = 4.0
 """Standard deviations beyond which a parameter is as unbelievable as it can be."""
+CERTAIN = 5.0
+"""Standard deviations of the fit within which a parameter is taken to be where its prior is: those
+of a model that lacks something are too small."""
+VAGUE = 100.0
+"""Deviations of its prior within which a parameter is even where the trials say nothing of it."""
 LEAST_MOVING = 0.05
 """Share of the samples in which an axis must move for its equation to be judged."""
 
@@ -34,7 +39,7 @@ class Plausibility:
 
     Attributes:
         error: held-out error by axis as a share of the applied force, (n_q,); 1 where the axis
-            hardly moves or nothing is applied.
+            hardly moves, 0 where nothing is applied.
         moving: share of the samples in which each axis moves, (n_q,).
         p: parameters, (n_p,).
         objections: half the squared distance of each from its prior, in its deviations, (n_p,).
@@ -44,6 +49,11 @@ class Plausibility:
     moving: Array
     p: Array
     objections: Array
+
+    @property
+    def worst_error(self) -> float:
+        """Of the axes that move."""
+        return float(self.error[self.moving >= LEAST_MOVING].max(initial=0.0))
 
     def score(self, least: float) -> float:
         """The lower, the better; errors below ``least`` are as good as each other."""
@@ -65,13 +75,29 @@ def judge_setup(
             evidence = gather_evidence(system, motions, band, system.prior, folds)
             error, moving = evidence.held_out_rmse, _moving(evidence.used)
             size = _applied(system, motions, band, evidence.p, evidence.used)
+            sd = _standard_deviations(evidence)
         except (InputError, ValueError, np.linalg.LinAlgError):
             return None
-        share = np.where((size > 0.0) & (moving >= LEAST_MOVING), error / size, 1.0)
+        share = np.where(size > 0.0, error / size, 0.0)
+        share = np.where(moving >= LEAST_MOVING, share, 1.0)
     if not np.isfinite(share).all():
         return None
-    objections = [_objection(*pair) for pair in zip(system.parameters, evidence.p, strict=True)]
+    objections = [
+        _objection(item, value, CERTAIN * spread)
+        for item, value, spread in zip(system.parameters, evidence.p, sd, strict=True)
+    ]
     return Plausibility(share, moving, evidence.p, np.array(objections))
+
+
+def _standard_deviations(evidence: Evidence) -> Array:
+    """Of the fitted parameters, (n_p,), as if samples were independent; zero of those held."""
+    sums, free = evidence.sums, list(evidence.free)
+    prior_sd = np.array([evidence.system.parameters[i].sd for i in free])
+    normal = np.einsum("q,kqij->ij", evidence.weight, sums.xx)
+    normal += np.diag(1.0 / np.maximum(VAGUE * prior_sd, np.finfo(float).tiny) ** 2)
+    sd = np.zeros(len(evidence.p))
+    sd[free] = np.sqrt(np.diag(np.linalg.inv(normal)))
+    return sd
 
 
 def _moving(used: Sequence[NDArray[np.bool_]]) -> Array:
@@ -112,5 +138,6 @@ def distance_from_prior(item: Parameter, value: float) -> float:
     return (value - item.prior) / item.sd
 
 
-def _objection(item: Parameter, value: float) -> float:
-    return 0.5 * min(distance_from_prior(item, value) ** 2, FARTHEST**2)
+def _objection(item: Parameter, value: float, margin: float) -> float:
+    nearest = min(max(item.prior, value - margin), value + margin)
+    return 0.5 * min(distance_from_prior(item, nearest) ** 2, FARTHEST**2)

@@ -38,7 +38,7 @@ LOST_ERROR = 0.4
 SUSPICIOUS_PRIORS = 5.0
 """Sum of objections from which other set-ups are tried: two parameters beyond two deviations."""
 LEAST_GAIN = 8.0
-"""Score that setting a mistake right must gain: an axis' error falls to 37 %, or to less of some."""
+"""Score that setting a mistake right must gain: the error of one axis falls to 37 %, say."""
 LEAST_GAIN_PLACEHOLDER = 4.0
 """The same for a scale that stands at exactly 1, as nobody has filled it in."""
 EXPLAINED = 0.6
@@ -51,11 +51,14 @@ LEAST_FACTOR, LEAST_TURN, LEAST_SHIFT = 1.5, 0.25, 0.3
 """A factor, an angle (rad) and a share of an axis' travel below which what is off is no mistake of
 set-up but an effect to be diagnosed."""
 MOST_MISTAKES = 4
+HIGHEST_HZ = 10.0
+"""Set-ups are compared below this: gross as they are, they show there, and an input that is taken
+for a position has derivatives up to no more than some 25 Hz."""
 _SAMPLES, _SCREENED_SAMPLES = 12_000, 3_000
 _SHORTLIST = 6
 _DECADES = np.arange(-20, 21) / 4.0
 _STEPS = 24
-_MOST_TRIALS = 8
+_MOST_TRIALS = 6
 _HALVINGS = 10
 
 
@@ -140,7 +143,7 @@ class Search:
     def _is_lost(self, now: Plausibility | None) -> bool:
         """Whether so much is unexplained that a scale or zero of any size is worth trying."""
         return (
-            now is None or now.error.max() > LOST_ERROR or now.objections.sum() > SUSPICIOUS_PRIORS
+            now is None or now.worst_error > LOST_ERROR or now.objections.sum() > SUSPICIOUS_PRIORS
         )
 
     def _is_explained(self, finding: Finding, last: Plausibility) -> bool:
@@ -248,7 +251,7 @@ def shorten(motions: Sequence[Motion], most: int = _SAMPLES) -> list[Motion]:
 
 def spread(count: int) -> list[int]:
     """Numbers of some trials of ``count``, spread over the session."""
-    chosen = np.linspace(0, count - 1, min(count, _MOST_TRIALS))
+    chosen = np.linspace(0, max(count - 1, 0), min(count, _MOST_TRIALS))
     return [int(number) for number in np.unique(chosen.round())]
 
 
@@ -276,7 +279,7 @@ def _shifted_by(signals: Signals, axis: str, offset: float) -> Candidate:
 
 
 def spoilt_axes(finding: Finding) -> list[int]:
-    """Axes whose error falls by more than a third once the mistake is set right; else all its own."""
+    """Axes whose error falls by more than a third once the mistake is set right; all, if none."""
     before, after = finding.before.error, finding.after.error
     fallen = [i for i in range(len(before)) if after[i] < before[i] / 1.5]
     return fallen or list(range(len(before)))

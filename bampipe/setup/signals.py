@@ -23,7 +23,7 @@ class Signals:
 
     Attributes:
         names: of the signals, the axes first; axes, forces, channels, brakes: those of each kind.
-        units: SI unit of each.
+        units: SI unit of each; stated: the unit that the session file gives its readings.
         gain: (n, n), offset: (n,): value = gain @ raw + offset.
     """
 
@@ -32,6 +32,7 @@ class Signals:
     channels: tuple[str, ...]
     brakes: tuple[str, ...]
     units: tuple[str, ...]
+    stated: tuple[str, ...]
     gain: Array
     offset: Array
 
@@ -57,13 +58,15 @@ class Signals:
         channels = tuple(name for name in device.channels if name not in forces)
         brakes = tuple(device.brakes[a] for a in axes if a in device.brakes)
         inputs = (*forces, *channels, *brakes)
-        units = [session.axes[axis].unit for axis in axes]
+        units: list[str] = [session.axes[axis].unit for axis in axes]
         units += [device.force_unit] * len(forces) + [device.channels[name] for name in channels]
         units += [
             "N.m" if session.axes[axis].unit == "rad" else "N"
             for axis in axes
             if axis in device.brakes
         ]
+        stated = [session.axes[axis].raw_unit or session.axes[axis].unit for axis in axes]
+        stated += [_stated(name, session) for name in inputs]
         gain, offset = np.eye(len(axes) + len(inputs)), np.zeros(len(axes) + len(inputs))
         for i, axis in enumerate(axes):
             encoder = session.axes[axis]
@@ -80,7 +83,13 @@ class Signals:
             matrix = matrix[np.ix_(order, order)]
             gain[np.ix_(places, places)] = matrix
             offset[places] = -matrix @ np.array(session.force.zero)[order]
-        return cls(axes, forces, channels, brakes, tuple(units), gain, offset)
+        return cls(axes, forces, channels, brakes, tuple(units), tuple(stated), gain, offset)
+
+
+def _stated(name: str, session: IngestResult) -> str:
+    if name in session.channels:
+        return session.channels[name].raw_unit or session.channels[name].unit
+    return session.force.unit if session.force.raw_unit in ("", "V") else session.force.raw_unit
 
 
 @dataclass(frozen=True)
@@ -112,9 +121,7 @@ class Change:
         none = np.zeros_like(motion.t)
         orders = []
         for order, positions in enumerate((motion.q, motion.qd, motion.qdd)):
-            inputs = [
-                motion.channels.get(derivative(name, order), none) for name in signals.inputs
-            ]
+            inputs = [motion.channels.get(derivative(name, order), none) for name in signals.inputs]
             values = np.column_stack([positions, *inputs]) @ self.gain.T
             orders.append((values + self.offset if order == 0 else values) / self.time**order)
         sd = np.zeros((motion.t.size, len(self.gain)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 from bampipe.physics import System
 from bampipe.results.ingest import IngestResult
@@ -17,8 +18,7 @@ def describe_candidate(candidate: Candidate, session: IngestResult) -> str:
     if candidate.kind == "zero":
         return _zero(candidate, session)
     if candidate.kind == "exchange":
-        who = " and ".join(candidate.signals)
-        return f"{who} are exchanged: exchange their columns"
+        return f"{listing(candidate.signals)} are exchanged: exchange their columns"
     return _sign(candidate, session) if candidate.kind == "sign" else _scale(candidate, session)
 
 
@@ -43,7 +43,19 @@ def describe_evidence(
 
 def percent(share: float) -> str:
     """A share in per cent, two digits, no more than a reader wants of a very large one."""
-    return f"{100.0 * share:.2g} %" if share < 10.0 else "over 1000 %"
+    if share >= 10.0:
+        return "over 1000 %"
+    return f"{100.0 * share:.0f} %" if share >= 0.1 else f"{100.0 * share:.2g} %"
+
+
+def number(value: float) -> str:
+    """A factor, three digits, without powers of ten as long as that is short."""
+    return f"{value:.0f}" if 1000.0 <= abs(value) < 1e6 else f"{value:.3g}"
+
+
+def listing(names: Sequence[str]) -> str:
+    """Names as a sentence has them."""
+    return " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
 
 
 def _sign(candidate: Candidate, session: IngestResult) -> str:
@@ -51,10 +63,10 @@ def _sign(candidate: Candidate, session: IngestResult) -> str:
     if len(names) > 1:
         if names[0] in session.force.columns:
             return (
-                f"{', '.join(names)} all have the wrong sign, as forces on the hand taken for those"
+                f"{listing(names)} all have the wrong sign, as forces on the hand taken for those"
                 f" of the hand have: negate {_force_entry(session)}"
             )
-        return f"{', '.join(names)} have the wrong sign: negate their columns"
+        return f"{listing(names)} have the wrong sign: negate their columns"
     name = names[0]
     if name in session.axes:
         counts = session.axes[name].counts_per_unit
@@ -68,21 +80,26 @@ def _sign(candidate: Candidate, session: IngestResult) -> str:
     return f"{name} has the wrong sign: negate its column"
 
 
-def _scale(candidate: Candidate, session: IngestResult) -> str:
+def describe_size(candidate: Candidate) -> str:
+    """By how much signals read too much or too little."""
     factor = candidate.factor
-    off = (
-        f"{1.0 / factor:.3g} times too much" if factor < 1.0 else f"{factor:.3g} times too little"
-    )
-    who = " and ".join(candidate.signals)
+    off = f"{number(1.0 / factor)} times too much"
+    if factor > 1.0:
+        off = f"{number(factor)} times too little"
     verb = "read" if len(candidate.signals) > 1 else "reads"
+    return f"{listing(candidate.signals)} {verb} about {off}"
+
+
+def _scale(candidate: Candidate, session: IngestResult) -> str:
     fixes = dict.fromkeys(_scale_fix(name, candidate, session) for name in candidate.signals)
     unit = _si(candidate, session)
     like = ""
     if candidate.unit and unit:
-        meant, stated = (candidate.unit, unit) if _is_stated_as_si(candidate, unit) else (
-            unit, candidate.unit)  # fmt: skip
+        meant, stated = candidate.unit, unit
+        if not _is_stated_as_si(candidate, unit):
+            meant, stated = stated, meant
         like = f", as {meant} read as {stated}"
-    return f"{who} {verb} {off}{like}: {'; '.join(fixes)}"
+    return f"{describe_size(candidate)}{like}: {'; '.join(fixes)}"
 
 
 def _scale_fix(name: str, candidate: Candidate, session: IngestResult) -> str:
@@ -90,19 +107,18 @@ def _scale_fix(name: str, candidate: Candidate, session: IngestResult) -> str:
     if name in session.axes:
         encoder = session.axes[name]
         if encoder.counts_per_unit:
-            return (
-                f"counts_per_unit of {name} should be about {encoder.counts_per_unit / factor:.4g},"
-                f" not {encoder.counts_per_unit:.6g}"
-            )
+            stated = encoder.counts_per_unit
+            right = number(stated / factor)
+            return f"counts_per_unit of {name} should be about {right}, not {number(stated)}"
         unit = _unit_meant(candidate, encoder.raw_unit, encoder.unit)
-        return f'unit = "{unit}"' if unit else f"counts_per_unit = {1.0 / factor:.4g}"
+        return f'unit = "{unit}"' if unit else f"counts_per_unit = {number(1.0 / factor)}"
     if name in session.force.columns:
         unit = _unit_meant(candidate, session.force.raw_unit, session.force.unit)
         if unit:
             return f'unit = "{unit}" of [force]'
         row = " of its row" if len(candidate.signals) < len(session.force.columns) else ""
-        return f"multiply {_force_entry(session)}{row} by {factor:.3g}"
-    return f"multiply scale of channels.{name} by {factor:.3g}"
+        return f"multiply {_force_entry(session)}{row} by {number(factor)}"
+    return f"multiply scale of channels.{name} by {number(factor)}"
 
 
 def _unit_meant(candidate: Candidate, stated: str, si: str) -> str:

@@ -43,6 +43,7 @@ from bampipe.results.diagnose import (
     WorstWindow,
 )
 from bampipe.results.identify import IdentifyResult
+from bampipe.results.setup import SetupResult
 from bampipe.results.standing import FLOOR_WRONG
 from bampipe.results.terms import EffectText
 from bampipe.schema import STRICT, Count
@@ -53,7 +54,7 @@ _DESCRIBED = 12
 """Effects of the ranking whose formulas are stored with it."""
 
 SUMMARY = "Find which physical effect the model lacks"
-INPUTS = (*INGESTED, *FILTERED, *IDENTIFIED_MODEL)
+INPUTS = (*INGESTED, *FILTERED, "filter/setup.json?", *IDENTIFIED_MODEL)
 OUTPUTS = ("models/{model}/diagnose.json", "models/{model}/map_variables.parquet")
 
 
@@ -67,6 +68,7 @@ class Config:
         significance: chance of a false alarm in a session that is accepted.
         jobs: worker processes; 0 means one for each processor, eight at most.
         seed: of the noise in the replays.
+        trust_setup: whether to diagnose in spite of a mistake that was named in the set-up.
     """
 
     model: str = "base"
@@ -74,15 +76,18 @@ class Config:
     significance: Annotated[float, Field(gt=0, lt=1)] = 0.01
     jobs: Count = 0
     seed: Count = 0
+    trust_setup: bool = False
 
 
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
     """Diagnose one model; write what it lacks, and what its residual was mapped against.
 
     Raises:
-        InputError: fewer than two moving trials, a setting out of range, or an axis that no force
-            acts on.
+        InputError: fewer than two moving trials, a setting out of range, an axis that no force
+            acts on, or a mistake in the set-up.
     """
+    if not config.trust_setup:
+        _require_sound_setup(run)
     model = load_model(run, config.model)
     system = compile_model(model)
     if system.undriven:
@@ -114,6 +119,20 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     samples = _map_variables(found)
     write_parquet(out / f"models/{config.model}/map_variables.parquet", samples)
     return _summary(_result(found, trials, recipe, config.model).write(out))
+
+
+def _require_sound_setup(run: RunFolder) -> None:
+    """Refuse to look for physics where the signals do not mean what is stated."""
+    if not run.exists(SetupResult.FILE):
+        return
+    mistakes = run.read(SetupResult).mistakes
+    if mistakes:
+        raise InputError(
+            f"no effect is looked for, since the set-up is wrong: {mistakes[0].sentence}"
+            f" ({mistakes[0].evidence})",
+            where=str(run.path(SetupResult.FILE)),
+            remedy="correct the session file and run it again, or --set trust_setup=true",
+        )
 
 
 def _summary(result: dict[str, Any]) -> dict[str, object]:

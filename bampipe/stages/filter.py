@@ -18,13 +18,18 @@ from bampipe.declarations.model_file import load_device
 from bampipe.errors import InputError
 from bampipe.estimate import butterworth, kalman_smoother
 from bampipe.estimate.differentiation import Array, Flags, UniformGrid, uniform_grid
-from bampipe.physics import Model, compile_model
+from bampipe.estimate.low_pass import Band
+from bampipe.physics import Model, System, compile_model
 from bampipe.progress import Progress
 from bampipe.results.filter import AxisDifferentiation, FilterResult, ForceFilter, ResidualBand
 from bampipe.results.ingest import EncoderChannel, IngestResult
+from bampipe.results.setup import SetupResult
 from bampipe.schema import STRICT, NotNegative, Positive
+from bampipe.setup.inspection import inspect_setup
+from bampipe.setup.search import HIGHEST_HZ, spread
 from bampipe.trials.band import find_band
 from bampipe.trials.cache import TrialCache
+from bampipe.trials.folds import Folds
 from bampipe.trials.kinematics import AxisFilter, Kinematics
 from bampipe.trials.motion import input_derivatives, n_samples
 from bampipe.trials.reading import read_motion_of
@@ -32,7 +37,7 @@ from bampipe.trials.sensors import Sensors
 
 SUMMARY = "Velocity and acceleration from the encoders, with error bands"
 INPUTS = (*INGESTED, "ingest/device.toml?")
-OUTPUTS = FILTERED
+OUTPUTS = (*FILTERED, "filter/setup.json")
 
 _SHORTEST = 32
 _TUNING_PART = 2000
@@ -110,7 +115,8 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
             remedy="look at ingest/trials.parquet for the reasons",
         )
     choices = {
-        axis: _choose(records[axis], rate, axes[axis].resolution or 0.0, config) for axis in axes
+        axis: _choose(axis, records[axis], rate, axes[axis].resolution or 0.0, config)
+        for axis in axes
     }
     method = "kalman" if config.method == "auto" else config.method
     kinematics = Kinematics(
@@ -134,13 +140,41 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
             for axis in axes:
                 levels[axis].append(errors[axis])
     progress(0.95, "the band of motion and force")
-    bands = _bands(run, out, session, kinematics, [k for k in ids if k in interpolated], config)
+    written = [k for k in ids if k in interpolated]
+    system = compile_model(Model(load_device(run, session.device)))
+    bands = _bands(system, out, session, kinematics, written, config)
     result = _result(config, kinematics, axes, choices, levels, interpolated, skipped, bands)
-    return result.write(out)
+    progress(0.97, "the set-up")
+    setup = _inspect(system, out, session, trials, written, bands)
+    setup.write(out)
+    return result.write(out) | {"setup": list(setup.lines)}
+
+
+def _inspect(
+    system: System,
+    out: Path,
+    session: IngestResult,
+    trials: pd.DataFrame,
+    ids: Sequence[str],
+    bands: Mapping[str, ResidualBand],
+) -> SetupResult:
+    """Hold the set-up against trials spread over the session."""
+    kinds = trials.set_index("trial_id")
+    free = (kinds["kind"] == MOVING[0]) & ~kinds["hold_out"].astype(bool)
+    fitted, others = ([k for k in ids if free[k] == side] for side in (True, False))
+    chosen = [some[k] for some in (fitted, others) for k in spread(len(some))]
+    motions = [
+        read_motion_of(out / "filter/kinematics.parquet", name, system, every_input=True)
+        for name in chosen
+    ]
+    # What brakes do is no part of the bare device: it is judged by braked trials, not fitted.
+    folds = Folds.of_trials(chosen, (), fitted)
+    cutoffs = tuple(min(bands[axis].cutoff_hz, HIGHEST_HZ) for axis in system.coordinates)
+    return inspect_setup(system, session, motions, Band(session.sample_rate_hz, cutoffs), folds)
 
 
 def _bands(
-    run: RunFolder,
+    system: System,
     out: Path,
     session: IngestResult,
     kinematics: Kinematics,
@@ -148,11 +182,9 @@ def _bands(
     config: Config,
 ) -> dict[str, ResidualBand]:
     """Find the band in which residuals are compared, from the trials just written."""
-    device = load_device(run, session.device)
-    system = compile_model(Model(device))
     path = out / "filter/kinematics.parquet"
     motions = TrialCache(lambda k: read_motion_of(path, ids[k], system), len(ids), n_samples)
-    sensors = Sensors.from_result(session, system.coordinates, device.forces)
+    sensors = Sensors.from_result(session, system.coordinates, system.model.device.forces)
     return find_band(system, motions, sensors, kinematics, config.band_hz)
 
 
@@ -189,9 +221,9 @@ def _tuning_records(
 
 
 def _choose(
-    records: list[tuple[Array, Flags]], rate: float, resolution: float, config: Config
+    axis: str, records: list[tuple[Array, Flags]], rate: float, resolution: float, config: Config
 ) -> _Choice:
-    """Return how to differentiate the axis with these ``records``."""
+    """Return how to differentiate ``axis``, of which there are these ``records``."""
     fits = {
         order: kalman_smoother.maximum_likelihood(
             records,
@@ -202,6 +234,13 @@ def _choose(
         )
         for order in kalman_smoother.ORDERS
     }
+    fits = {k: found for k, found in fits.items() if np.isfinite(found.log_likelihood)}
+    if not fits:
+        raise InputError(
+            f"{axis} moves in no way that a filter could follow",
+            where=f"encoders.{axis}",
+            remedy="is this the column of its position, in its unit?",
+        )
     order = max(fits, key=lambda k: fits[k].log_likelihood)
     best = fits[order].model
     noise_sd = best.noise_sd

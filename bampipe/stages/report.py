@@ -16,6 +16,7 @@ INPUTS = (
     "ingest/trials.parquet",
     "ingest/samples.parquet?",
     "filter/filter.json?",
+    "filter/setup.json?",
     "filter/kinematics.parquet?",
     "stiffness/stiffness.json?",
     "stiffness/loops.parquet?",

@@ -151,7 +151,9 @@ def _axis(
     weights = np.array([len(trial.found.cycles) for trial in trials]) / len(cycles)
     stiffness = float(weights @ [trial.found.stiffness for trial in trials])
     error = float(np.linalg.norm(weights * [trial.found.standard_error for trial in trials]))
-    sd = float(np.std(values, ddof=1)) if len(values) > 1 else float(trials[0].found.sd)
+    # What is left of the transition has the same sign in every trial.
+    systematic = float(weights @ [trial.found.systematic for trial in trials])
+    scatter = float(np.std(values, ddof=1)) if len(values) > 1 else trials[0].found.scatter
     for trial in trials:
         if not trial.found.yielded:
             notes.append(
@@ -170,8 +172,10 @@ def _axis(
     stated = "maximum_extension" if "maximum_extension" in bandwidths else "recorded"
     return AxisStiffness(
         stiffness=stiffness,
-        sd=sd,
+        sd=float(np.hypot(error, systematic)),
         standard_error=error,
+        systematic=systematic,
+        cycle_scatter=scatter,
         unit=unit,
         n_cycles=len(cycles),
         bandwidth_rad_s=bandwidths[stated].rad_s,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import tomllib
 from collections.abc import Callable
@@ -50,10 +51,22 @@ def proposed(folder: Path, device: str = "") -> tuple[dict, object]:
     return tomllib.loads((folder / "session.toml").read_text()), proposal
 
 
+def give_source(folder: Path) -> None:
+    """Write where the constants of the input come from, as `bampipe init` asks."""
+    file = folder / "device.toml"
+    text, count = re.subn('source = "fill in: [^"]*"', 'source = "data sheet"', file.read_text())
+    assert count
+    file.write_text(text)
+
+
 def test_a_joint_with_motor_current(tmp_path):
     write_joint_logs(tmp_path / "arm")
     session, proposal = proposed(tmp_path / "arm")
-    assert session["sample_rate_hz"] == 100 and proposal.fill_in == []
+    (left,) = proposal.fill_in
+    assert session["sample_rate_hz"] == 100 and left.startswith("torque_per_ampere in device.toml")
+    with pytest.raises(InputError, match=r'torque_per_ampere\.source: found "fill in: data sheet'):
+        samples(tmp_path / "arm", tmp_path / "out", "run_1")
+    give_source(tmp_path / "arm")
     assert session["encoders"]["joint"] == {"column": "joint_angle", "unit": "deg"}
     assert session["channels"]["motor_current"] == {"column": "motor_current", "unit": "mA"}
     device = registry.device_from(tomllib.loads((tmp_path / "arm/device.toml").read_text()))
@@ -131,7 +144,7 @@ def test_duty_cycle_and_supply_make_a_motor(tmp_path):
     duty, supply = session["channels"]["duty"], session["channels"]["supply"]
     assert duty == {"column": "pwm_percent", "unit": "percent"}
     assert supply == {"column": "vbat", "unit": "V"}
-    assert any("torque_constant is not yours yet" in line for line in proposal.check)
+    assert any(line.startswith("torque_constant in") for line in proposal.fill_in)
     device = registry.device_from(tomllib.loads((tmp_path / "arm/device.toml").read_text()))
     assert check_device(device) == [] and device.force_unit == ""
 

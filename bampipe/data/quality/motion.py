@@ -17,7 +17,7 @@ def refuse_wrong_motion(table: TrialTable, columns: dict[str, np.ndarray]) -> No
             shown = ", ".join(f"{e.axis} {travel[e.axis]:.2g} {e.unit}" for e in session.encoders)
             raise table.fault(
                 f"declared {entry.kind}, but never moves ({shown})",
-                remedy="were the encoders on? or is it a locked trial?",
+                remedy="were the encoders on, and is their unit right? or is it a locked trial?",
             )
         for encoder in session.encoders:
             if travel[encoder.axis] == 0.0:

@@ -59,7 +59,10 @@ def _table(results: Results, axes: Mapping[str, AxisStiffness]) -> Table:
         pose = _pose(results, entry)
         if pose:
             poses.setdefault(pose, axis)
-    note = "± standard deviation over the load cycles. Loop width at constant deflection."
+    note = (
+        "± standard uncertainty: scatter of the cycles, and what is left of the turn of the loop."
+        " Loop width at constant deflection."
+    )
     if poses:
         note += f" Bandwidth √(K/M) at {'; '.join(poses)}."
     return Table(

@@ -1,0 +1,98 @@
+"""Mistakes in session files of independent simulators are named; sound ones are left alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import independent
+import mistakes
+import numpy as np
+import pytest
+from mistakes import MISTAKES, Case, run_case
+
+import bampipe
+from bampipe.results.setup import SetupResult
+
+NAMED = [
+    ("joint", "degrees for radians"),
+    ("joint", "milliamperes for amperes"),
+    ("joint", "motor constant left at 1"),
+    ("joint", "position and current exchanged"),
+    ("axis", "millimetres for metres"),
+    ("axis", "calibration left at 1"),
+    ("axis", "clock and rate in milliseconds"),
+    ("damper", "kilonewtons for newtons"),
+    ("damper", "force and current exchanged"),
+    ("bam", "encoder of the pitch reversed"),
+    ("bam", "counts per radian left at 1"),
+    ("bam", "encoder columns exchanged"),
+    ("bam", "pitch counted from the vertical"),
+    ("bam", "brake commands negative"),
+]
+TIED = [("joint", "encoder reversed"), ("axis", "force reversed"), ("damper", "load cell reversed")]
+
+
+@pytest.mark.parametrize(("machine", "mistake"), NAMED)
+def test_a_mistake_is_named_as_what_it_is(machine: str, mistake: str) -> None:
+    found = run_case(Case(machine, mistake, 31))
+    assert found.verdict in ("named", "tied") and found.beside == 0, found.line()
+
+
+@pytest.mark.parametrize(("machine", "mistake"), TIED)
+def test_both_are_given_where_one_axis_cannot_tell_encoder_from_force(
+    machine: str, mistake: str
+) -> None:
+    found = run_case(Case(machine, mistake, 31))
+    assert found.verdict == "tied" and found.beside == 0, found.line()
+
+
+@pytest.mark.parametrize("mistake", ["clock in milliseconds for seconds", "metres for millimetres"])
+def test_what_ingest_sees_is_said_by_ingest(mistake: str) -> None:
+    assert run_case(Case("axis", mistake, 31)).verdict == "read"
+
+
+@pytest.mark.parametrize(
+    ("machine", "effect"),
+    [
+        ("joint", "load_dependent_friction:joint"),
+        ("axis", "flexible_load:carriage"),
+        ("damper", "hysteresis:piston"),
+        # A third of the torque about the pitch is left: other set-ups are tried, and none is right.
+        ("bam", "gravity_compensator_lag"),
+        ("bam", "encoder_scale:yaw"),
+    ],
+)
+def test_a_missing_effect_is_no_mistake(machine: str, effect: str) -> None:
+    found = run_case(Case(machine, "", 31, (effect,)))
+    assert found.verdict == "nothing" and found.beside == 0, found.line()
+
+
+@pytest.fixture(scope="module")
+def reversed_joint(tmp_path_factory: pytest.TempPathFactory) -> bampipe.Run:
+    root = tmp_path_factory.mktemp("reversed")
+    independent.record("joint", root / "session", 31, {}, mistakes.SHORT["joint"])
+    MISTAKES["joint"]["encoder reversed"].spoil(root / "session")
+    stages = '["ingest", "filter", "identify", "validate"]'
+    (root / "short.toml").write_text(mistakes.PIPELINE.replace('["ingest", "filter"]', stages))
+    return bampipe.run_session(root / "session", runs=root / "runs", pipeline=root / "short.toml")
+
+
+def test_the_evidence_is_measured(reversed_joint: bampipe.Run) -> None:
+    (mistake,) = SetupResult.read(reversed_joint.root / "filter/setup.json").mistakes
+    assert mistake.axes == ("joint",)
+    assert mistake.error_before["joint"] > 50.0
+    assert mistake.error_after["joint"] < 3.0
+    assert "of the applied force" in mistake.evidence
+    q = reversed_joint.kinematics["q_joint"]
+    assert np.ptp(q) > 0.5
+
+
+def test_no_effect_is_looked_for_under_a_mistake(reversed_joint: bampipe.Run) -> None:
+    with pytest.raises(bampipe.InputError, match="the set-up is wrong: "):
+        bampipe.diagnose(reversed_joint, replicates=4, jobs=1)
+
+
+def test_the_report_says_it_first(reversed_joint: bampipe.Run) -> None:
+    bampipe.report(reversed_joint)
+    page = Path(reversed_joint.root / "report/report.html").read_text(encoding="utf-8")
+    assert 0 < page.index("Set-up: ") < page.index("Summary") + 400
