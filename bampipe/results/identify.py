@@ -36,6 +36,14 @@ class ParameterEstimate(Record):
         default=None,
         description="Part of sd by which methods that predict alike disagree beyond noise",
     )
+    calibration_sd: Size | None = Field(
+        default=None,
+        description="Part of sd that comes from sensors and constants known so well only; null "
+        "where no such uncertainty is stated",
+    )
+    statistical_sd: Size | None = Field(
+        default=None, description="The rest of sd, null where all of it is statistical"
+    )
     least_squares_bias: float | None = Field(
         default=None,
         description="What filtering adds to least squares, found by replaying the fit",

@@ -24,6 +24,7 @@ class EncoderChannel(Record):
     zero: float = Field(default=0.0, description="Raw reading at position 0, by session.toml")
     counts_per_unit: float | None = Field(default=None, description="As in session.toml, or null")
     raw_unit: str = Field(default="", description="Unit that session.toml gives the column")
+    scale_sd: Size = Field(default=0.0, description="Standard uncertainty of scale, as a share")
 
 
 class ForceChannels(Record):
@@ -41,6 +42,12 @@ class ForceChannels(Record):
     )
     zero: tuple[float, ...] = Field(default=(), description="Raw readings without force")
     raw_unit: str = Field(default="", description="Unit of the raw columns")
+    gain_sd: Size = Field(
+        default=0.0, description="Standard uncertainty of each component's gain, as a share"
+    )
+    crosstalk_sd: Size = Field(
+        default=0.0, description="That of how much of another component each shows, as a share"
+    )
 
 
 class RecordedChannel(Record):
@@ -50,6 +57,7 @@ class RecordedChannel(Record):
     scale: float = Field(default=1.0, description="SI value = scale * raw + offset")
     offset: float = 0.0
     raw_unit: str = Field(default="", description="Unit of the column, where it is not rescaled")
+    scale_sd: Size = Field(default=0.0, description="Standard uncertainty of scale, as a share")
 
 
 class IngestResult(Result):

@@ -51,13 +51,18 @@ class AxisStiffness(Record):
     """Stiffness of one axis over its locked trials."""
 
     stiffness: Positive
-    sd: Size = Field(description="Standard uncertainty: standard_error and systematic together")
+    sd: Size = Field(
+        description="Standard uncertainty: standard_error, systematic and calibration_sd together"
+    )
     standard_error: Size = Field(
         description="By the scatter over the cycles, or of the regression over all, the larger"
     )
     systematic: Size = Field(
         description="A quarter of what the slope changes by where loops should be straight, or "
         "could change by"
+    )
+    calibration_sd: Size = Field(
+        description="Part that the stated uncertainty of sensors makes; 0 where none is stated"
     )
     cycle_scatter: Size = Field(description="Standard deviation over the cycles")
     unit: str = Field(description="Of the stiffness: N.m/rad or N/m")

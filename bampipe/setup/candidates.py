@@ -10,7 +10,7 @@ from itertools import combinations, permutations
 import numpy as np
 
 from bampipe.results.setup import Kind
-from bampipe.setup.signals import Change, Signals
+from bampipe.trials.signals import Change, Signals
 
 DEGREE = math.pi / 180.0
 FACTORS: dict[str, tuple[tuple[str, float], ...]] = {

@@ -14,10 +14,10 @@ from bampipe.results.setup import AxisSetup, PossibleMistake, SetupMistake, Setu
 from bampipe.setup.placeholders import Placeholder, find_placeholders
 from bampipe.setup.plausibility import LEAST_MOVING, Plausibility
 from bampipe.setup.search import Finding, Search, shorten, spoilt_axes
-from bampipe.setup.signals import Change, Signals
 from bampipe.setup.words import describe_candidate, describe_evidence, describe_size
 from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion
+from bampipe.trials.signals import Change, Signals
 
 
 def inspect_setup(

@@ -24,9 +24,9 @@ from bampipe.setup.candidates import (
     unit_candidates,
 )
 from bampipe.setup.plausibility import Plausibility, judge_setup
-from bampipe.setup.signals import Change, Signals
 from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion
+from bampipe.trials.signals import Change, Signals
 
 Array = NDArray[np.float64]
 

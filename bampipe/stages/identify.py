@@ -18,6 +18,11 @@ from bampipe.discover.start import search_start
 from bampipe.errors import InputError
 from bampipe.estimate.least_squares import fit
 from bampipe.identification.bodies import base_estimates, make_possible, summarise_bases
+from bampipe.identification.calibration import (
+    describe_calibration,
+    propagate_calibration,
+    with_calibration,
+)
 from bampipe.identification.estimates import Estimate, collect_result
 from bampipe.identification.filter_choice import FilterChoice
 from bampipe.identification.filter_estimate import estimate_by_filter
@@ -39,6 +44,7 @@ from bampipe.identification.output_estimate import estimate_by_output_error
 from bampipe.identification.sensor_noise import sensor_noise
 from bampipe.physics import System, compile_model
 from bampipe.progress import Progress
+from bampipe.results.ingest import IngestResult
 from bampipe.schema import STRICT, Positive
 from bampipe.trials.folds import Folds
 from bampipe.trials.measured import read_measured_trials
@@ -179,9 +185,22 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         # What the filter's innovations say of model and noise holds whatever is published.
         estimate = replace(estimate, report={**estimates[0].evidence, **estimate.report})
     methods = tabulate_methods(system, estimate, judged, lost)
+    moved = propagate_calibration(
+        system,
+        read_recipe(run, config.model, system.model),
+        run.read(IngestResult),
+        read_motions(run, system, fitted=True, braked=system.braked, every_input=True),
+        estimate,
+    )
+    estimate = with_calibration(estimate, moved)
     engine = config.engine if estimate.method == "ukf" else "compiled"
     bases = base_estimates(system, estimate.p, estimate.covariance)
-    notes = [*describe_methods(system, methods), *notes, *summarise_bases(system, bases)]
+    notes = [
+        *describe_methods(system, methods),
+        *notes,
+        *describe_calibration(estimate, moved),
+        *summarise_bases(system, bases),
+    ]
     result = collect_result(
         system, estimate, identifiability, motions, config.model, engine, methods, notes, bases
     )

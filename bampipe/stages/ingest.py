@@ -362,6 +362,7 @@ def _description(
                 zero=encoder.zero,
                 counts_per_unit=encoder.counts_per_unit,
                 raw_unit=encoder.stated_unit,
+                scale_sd=encoder.scale_sd,
             )
             for encoder in session.encoders
         },
@@ -374,6 +375,8 @@ def _description(
             calibration=force.calibration if force else (),
             zero=force.zero if force else (),
             raw_unit=force.raw_unit if force else "",
+            gain_sd=force.gain_sd if force else 0.0,
+            crosstalk_sd=force.crosstalk_sd if force else 0.0,
         ),
         sensor_warnings=tuple(
             sensor.warning for sensor in (*encoders.values(), *forces.values()) if sensor.warning
@@ -387,6 +390,7 @@ def _description(
                 scale=channel.scale,
                 offset=channel.offset,
                 raw_unit=channel.raw_unit,
+                scale_sd=channel.scale_sd,
             )
             for channel in session.channels
         },

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,6 +29,8 @@ from bampipe.results.stiffness import (
     StiffnessResult,
 )
 from bampipe.schema import STRICT, Positive
+from bampipe.trials.motion import Motion
+from bampipe.trials.signals import Signals, calibration_changes
 
 SUMMARY = "Stiffness, loop width and bandwidth of the locked axes"
 INPUTS = (*INGESTED, "ingest/device.toml?")
@@ -53,7 +56,8 @@ class _Loops:
     """The loops of one locked trial.
 
     ``pose`` is the median reading of every axis (n_q,), ``torque`` and ``deflection`` (T,) are
-    the whole record of the locked axis.
+    the whole record of the locked axis, ``calibration`` the share by which one standard
+    uncertainty of each sensor's calibration changes the stiffness.
     """
 
     trial_id: str
@@ -62,6 +66,7 @@ class _Loops:
     deflection: Array
     rate: float
     found: Hysteresis
+    calibration: Mapping[str, float]
 
 
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
@@ -137,7 +142,38 @@ def _loops_of(
         found = hysteresis(torque, deflection, rate)
     except ValueError as error:
         return str(error)
-    return _Loops(trial_id, np.median(q, axis=0), torque, deflection, rate, found)
+    pose = np.median(q, axis=0)
+    channels = {name: held[name] for name in system.inputs}
+    motion = Motion(trial_id, grid.t, q, still, still, still, channels)
+    calibration = _calibration(system, session, motion, number, torque, deflection)
+    return _Loops(trial_id, pose, torque, deflection, rate, found, calibration)
+
+
+def _calibration(
+    system: System,
+    session: IngestResult,
+    motion: Motion,
+    number: int,
+    torque: Array,
+    deflection: Array,
+) -> dict[str, float]:
+    """Share of the stiffness of axis ``number`` that one standard uncertainty of each source is."""
+    signals, p = Signals.of_session(system, session), system.prior
+    found = {}
+    for name, change in calibration_changes(signals):
+        moved = change.of_motion(motion, signals)
+        u, still = moved.inputs(system.inputs), moved.qd
+        z = system.memory(moved.q, still, still, u, p, moved.t)
+        theirs = system.applied(moved.q, still, still, z, u, p)[:, number]
+        torques, deflections = _slope(theirs, torque), _slope(moved.q[:, number], deflection)
+        found[name] = torques / deflections - 1.0
+    return found
+
+
+def _slope(values: Array, against: Array) -> float:
+    """Of the straight line through ``values`` (T,) over ``against`` (T,)."""
+    centred = against - against.mean()
+    return float(values @ centred / (centred @ centred))
 
 
 def _axis(
@@ -153,6 +189,11 @@ def _axis(
     error = float(np.linalg.norm(weights * [trial.found.standard_error for trial in trials]))
     # What is left of the transition has the same sign in every trial.
     systematic = float(weights @ [trial.found.systematic for trial in trials])
+    shares: dict[str, float] = defaultdict(float)
+    for weight, trial in zip(weights, trials, strict=True):
+        for name, share in trial.calibration.items():
+            shares[name] += weight * share
+    calibration = stiffness * float(np.linalg.norm(list(shares.values())))
     scatter = float(np.std(values, ddof=1)) if len(values) > 1 else trials[0].found.scatter
     for trial in trials:
         if not trial.found.yielded:
@@ -172,9 +213,10 @@ def _axis(
     stated = "maximum_extension" if "maximum_extension" in bandwidths else "recorded"
     return AxisStiffness(
         stiffness=stiffness,
-        sd=float(np.hypot(error, systematic)),
+        sd=float(np.linalg.norm([error, systematic, calibration])),
         standard_error=error,
         systematic=systematic,
+        calibration_sd=calibration,
         cycle_scatter=scatter,
         unit=unit,
         n_cycles=len(cycles),

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import independent
 import mistakes
 import numpy as np
+import pandas as pd
 import pytest
-from mistakes import MISTAKES, Case, run_case
+from mistakes import MISTAKES, Case, run_case, set_text
 
 import bampipe
 from bampipe.results.setup import SetupResult
@@ -65,6 +67,52 @@ def test_what_ingest_sees_is_said_by_ingest(mistake: str) -> None:
 def test_a_missing_effect_is_no_mistake(machine: str, effect: str) -> None:
     found = run_case(Case(machine, "", 31, (effect,)))
     assert found.verdict == "nothing" and found.beside == 0, found.line()
+
+
+def inspected(root: Path, *changes: Callable[[Path], None]) -> SetupResult:
+    """The set-up of a joint's session, changed by ``changes`` before it is read."""
+    independent.record("joint", root / "session", 31, {}, mistakes.SHORT["joint"])
+    for change in changes:
+        change(root / "session")
+    (root / "short.toml").write_text(mistakes.PIPELINE)
+    pipeline = str(root / "short.toml")
+    run = bampipe.run_session(root / "session", runs=root / "runs", pipeline=pipeline)
+    return SetupResult.read(run.root / "filter/setup.json")
+
+
+def test_a_scale_of_one_is_said_even_where_nothing_contradicts_it(tmp_path: Path) -> None:
+    """As where torques are counted in amperes: priors that fit it, a source that owns up to it."""
+    amperes = (
+        set_text("value = 10.0", "value = 1.0", "joint.toml"),
+        set_text(r"prior = (\d+)\.0, sd = (\d+)\.0", r"prior = \1e-1, sd = \2e-1", "joint.toml"),
+    )
+    found = inspected(tmp_path, *amperes)
+    assert found.mistakes == ()
+    (line,) = found.lines
+    assert line.startswith("torque_per_ampere of the device file is 1 N.m/A, source 'data sheet'")
+
+
+def test_an_axis_that_hardly_moves_is_said(tmp_path: Path) -> None:
+    def stop(folder: Path) -> None:
+        for file in folder.glob("trials/*.csv"):
+            frame = pd.read_csv(file)
+            frame.loc[frame["t"] > 0.6, "q"] = frame["q"].iloc[55]
+            frame.to_csv(file, index=False)
+
+    found = inspected(tmp_path, stop)
+    assert found.axes["joint"].state == "hardly_moves"
+    assert any(line.startswith("joint hardly moves: it stands still in") for line in found.lines)
+
+
+def test_a_device_without_a_scale_is_refused(tmp_path: Path) -> None:
+    free = set_text(
+        r"\[parameters\]",
+        '[parameters]\ngain = { unit = "1", prior = 1.0, sd = 1.0 }',
+        "joint.toml",
+    )
+    used = set_text(r"torque_per_ampere\*current", "gain*torque_per_ampere*current", "joint.toml")
+    with pytest.raises(bampipe.InputError, match="the scale of its equation is undetermined: with"):
+        inspected(tmp_path, free, used)
 
 
 @pytest.fixture(scope="module")

@@ -47,6 +47,7 @@ ChannelName = Annotated[
     Field(json_schema_extra={"pattern": "^[A-Za-z][A-Za-z0-9_]*$"}),
 ]
 Column = Annotated[Text, Field(description="A column (or MATLAB variable) of the trial files")]
+Uncertainty = Annotated[float, Field(ge=0, lt=1)]
 Columns = Annotated[Distinct[Column], Field(min_length=1)]
 
 
@@ -124,6 +125,9 @@ class Encoder(NamedDeclaration):
         alias="unit",
         description="A unit of velocity where no position was recorded: it is integrated",
     )  # fmt: skip
+    scale_sd: Uncertainty = Field(
+        default=0.0, description="Standard uncertainty of its scale, as a share: 0.001 for 0.1 %"
+    )
     velocity: Velocity | None = Field(
         default=None,
         description="A velocity recorded beside it: checks unit and sign of the position",
@@ -234,6 +238,15 @@ class Force(Declaration):
         | None
     ) = None
     zero_v: Several[Number] | None = None
+    gain_sd: Uncertainty = Field(
+        default=0.0,
+        description="Standard uncertainty of each component's gain, as a share: 0.01 for 1 %",
+    )
+    crosstalk_sd: Uncertainty = Field(
+        default=0.0,
+        description="Standard uncertainty of how much of another component each one shows, as a"
+        " share",
+    )
     noise_sd: NotNegative | None = Field(
         default=None,
         alias="noise_sd_n",
@@ -387,6 +400,9 @@ class Channel(NamedDeclaration):
     stated_unit: str = Field(alias="unit")
     stated_scale: Number = Field(default=1.0, alias="scale")
     stated_offset: Number = Field(default=0.0, alias="offset")
+    scale_sd: Uncertainty = Field(
+        default=0.0, description="Standard uncertainty of its scale, as a share: 0.01 for 1 %"
+    )
     wrap_bits: Literal[8, 16, 24, 32] | None = Field(
         default=None,
         description="The column is a register of so many bits; with signed = true its upper half"

@@ -65,6 +65,7 @@ def _parameters(results: Results, identified: IdentifyResult) -> Table:
         if method != identified.method and tried.parameters
     ]
     bounded = any(parameters[name].bound_sd is not None for name in names)
+    calibrated = any(parameters[name].calibration_sd is not None for name in names)
     rows = []
     for name in names:
         entry = parameters[name]
@@ -77,6 +78,7 @@ def _parameters(results: Results, identified: IdentifyResult) -> Table:
                 f"`{name}`",
                 wording.plain(value, decimals) + (" *" if entry.at_bound else ""),
                 wording.significant(sd, 2) if sd else "fixed",
+                *((wording.significant(entry.calibration_sd, 2),) if calibrated else ()),
                 *((wording.significant(entry.bound_sd, 2),) if bounded else ()),
                 wording.interval(value - half, value + half, sd) if sd else "–",
                 *(
@@ -87,6 +89,12 @@ def _parameters(results: Results, identified: IdentifyResult) -> Table:
             )
         )
     note = "Interval: estimate ± 1.96 standard deviations."
+    if calibrated:
+        note += (
+            " Calibration: the part of SD that the stated uncertainty of sensors and constants is."
+        )
+    else:
+        note += " No uncertainty of a calibration is stated: it is in no interval."
     if bounded:
         note += " Bound: the least SD that these sensors allow on these trials (Cramér-Rao)."
     if others:
@@ -102,13 +110,14 @@ def _parameters(results: Results, identified: IdentifyResult) -> Table:
             "Name",
             "Estimate",
             "SD",
+            *(("Calibration",) if calibrated else ()),
             *(("Bound",) if bounded else ()),
             "95 % interval",
             *(METHODS_IN_WORDS[method].removeprefix("the ").capitalize() for method in others),
             "Unit",
         ),
         tuple(rows),
-        "llrrr" + "r" * (len(others) + bounded) + "l",
+        "llrrr" + "r" * (len(others) + bounded + calibrated) + "l",
         note=note,
     )
 

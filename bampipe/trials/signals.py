@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,6 +25,8 @@ class Signals:
         names: of the signals, the axes first; axes, forces, channels, brakes: those of each kind.
         units: SI unit of each; stated: the unit that the session file gives its readings.
         gain: (n, n), offset: (n,): value = gain @ raw + offset.
+        gain_sd: (n, n) standard uncertainty of the calibration, as a share: value' = (1 + that)
+            @ value.
     """
 
     axes: tuple[str, ...]
@@ -35,6 +37,7 @@ class Signals:
     stated: tuple[str, ...]
     gain: Array
     offset: Array
+    gain_sd: Array
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -75,15 +78,30 @@ class Signals:
             if name in session.channels:
                 channel = session.channels[name]
                 gain[i, i], offset[i] = channel.scale, channel.offset
-        matrix = np.array(session.force.calibration)
-        places = [i for i, name in enumerate(inputs, len(axes)) if name in session.force.columns]
+        force = session.force
+        matrix = np.array(force.calibration)
+        places = [i for i, name in enumerate(inputs, len(axes)) if name in force.columns]
         # Where several columns make one component, no column can stand for another.
         if matrix.shape == (len(places), len(places)) and places:
             order = [session.force.columns.index((*axes, *inputs)[i]) for i in places]
             matrix = matrix[np.ix_(order, order)]
             gain[np.ix_(places, places)] = matrix
             offset[places] = -matrix @ np.array(session.force.zero)[order]
-        return cls(axes, forces, channels, brakes, tuple(units), tuple(stated), gain, offset)
+        gain_sd = np.zeros_like(gain)
+        gain_sd[np.ix_(places, places)] = force.crosstalk_sd
+        for i, name in enumerate((*axes, *inputs)):
+            gain_sd[i, i] = (
+                session.axes[name].scale_sd
+                if name in session.axes
+                else session.channels[name].scale_sd
+                if name in session.channels
+                else force.gain_sd
+                if name in force.columns
+                else 0.0
+            )
+        return cls(
+            axes, forces, channels, brakes, tuple(units), tuple(stated), gain, offset, gain_sd
+        )
 
 
 def _stated(name: str, session: IngestResult) -> str:
@@ -147,3 +165,12 @@ class Change:
             tuple(f / self.time for f in band.cutoff_hz),
             band.margin_s * self.time,
         )
+
+
+def calibration_changes(signals: Signals) -> Iterator[tuple[str, Change]]:
+    """What one standard uncertainty of each calibration makes of the signals, by its name."""
+    for row, column in np.argwhere(signals.gain_sd > 0.0):
+        change = Change.none(len(signals.names))
+        change.gain[row, column] += signals.gain_sd[row, column]
+        one, other = signals.names[row], signals.names[column]
+        yield f"scale of {one}" if row == column else f"{other} in {one}", change
