@@ -38,7 +38,7 @@ def inspect_setup(
     signals = Signals.of_session(system, session)
     placeholders = find_placeholders(system, session)
     search = Search(system, short, band, folds, signals)
-    held = search.judge(Change.none(len(signals.names)), short)
+    held = search.judge(Change.none(len(signals.names)))
     findings = search.find_mistakes(held, tuple(n for p in placeholders for n in p.signals))
     mistakes = tuple(_record(system, session, found, placeholders) for found in findings)
     axes = {

@@ -62,17 +62,19 @@ class Plausibility:
 
 
 def judge_setup(
-    system: System, motions: Sequence[Motion], band: Band, folds: Folds
+    system: System, motions: Sequence[Motion], band: Band, folds: Folds, steps: int
 ) -> Plausibility | None:
     """Fit the bare device by least squares; None where it cannot be computed with.
 
     Args:
         system: the bare device; motions: as the set-up has them; band: of the residual.
-        folds: which trials are fitted, which left out together.
+        folds: which trials are fitted, which left out together; steps: of the fit, the most.
     """
     with np.errstate(all="ignore"):
         try:
-            evidence = gather_evidence(system, motions, band, system.prior, folds)
+            evidence = gather_evidence(
+                system, motions, band, system.prior, folds, most_iterations=steps
+            )
             error, moving = evidence.held_out_rmse, _moving(evidence.used)
             size = _applied(system, motions, band, evidence.p, evidence.used)
             sd = _standard_deviations(evidence)

@@ -30,11 +30,9 @@ from bampipe.trials.signals import Change, Signals
 
 Array = NDArray[np.float64]
 
-SUSPICIOUS_ERROR = 0.25
+SUSPICIOUS_ERROR = 0.4
 """Held-out error, as a share of the applied force, from which other set-ups are tried. Right ones
 stand below 0.15 with any one effect hidden, a gravity compensator that lags behind at 0.36."""
-LOST_ERROR = 0.4
-"""The same from which scales and zeros of any size are tried, too."""
 SUSPICIOUS_PRIORS = 5.0
 """Sum of objections from which other set-ups are tried: two parameters beyond two deviations."""
 LEAST_GAIN = 8.0
@@ -55,6 +53,7 @@ HIGHEST_HZ = 10.0
 """Set-ups are compared below this: gross as they are, they show there, and an input that is taken
 for a position has derivatives up to no more than some 25 Hz."""
 _SAMPLES, _SCREENED_SAMPLES = 12_000, 3_000
+_SCREENING_STEPS = 3
 _SHORTLIST = 6
 _DECADES = np.arange(-20, 21) / 4.0
 _STEPS = 24
@@ -97,22 +96,37 @@ class Search:
     tested: int = field(default=0, init=False)
 
     @cached_property
-    def screened(self) -> Sequence[Motion]:
-        """The part of the trials that every set-up is tried on."""
-        return shorten(self.motions, _SCREENED_SAMPLES)
+    def screened(self) -> tuple[Sequence[Motion], Folds]:
+        """The part of the trials that every set-up is tried on: two that are fitted, one braked."""
+        folds = self.folds
+        fitted = [k for k, fits in enumerate(folds.fitted) if fits]
+        others = [k for k, fits in enumerate(folds.fitted) if not fits]
+        chosen = [*dict.fromkeys([*fitted[:1], *fitted[-1:]]), *others[:1]]
+        part = Folds(
+            *(
+                tuple(field[k] for k in chosen)
+                for field in (folds.groups, folds.fitted, folds.judged)
+            )
+        )
+        return shorten([self.motions[k] for k in chosen], _SCREENED_SAMPLES), part
 
-    def judge(self, change: Change, motions: Sequence[Motion]) -> Plausibility | None:
-        """What a set-up explains of ``motions``; None where it cannot be computed with."""
+    def judge(self, change: Change) -> Plausibility | None:
+        """What a set-up explains of the trials; None where it cannot be computed with."""
+        return self._judge(change, self.motions, self.folds, 12)
+
+    def _judge(
+        self, change: Change, motions: Sequence[Motion], folds: Folds, steps: int
+    ) -> Plausibility | None:
         with np.errstate(all="ignore"):
             changed = [change.of_motion(motion, self.signals) for motion in motions]
-        return judge_setup(self.system, changed, change.of_band(self.band), self.folds)
+        return judge_setup(self.system, changed, change.of_band(self.band), folds, steps)
 
     def screen(self, candidate: Candidate, change: Change) -> float:
         """Score and cost of a candidate on top of ``change``; infinite where it makes no sense."""
         if not _is_gross(candidate, self.motions, self.signals):
             return math.inf
         self.tested += 1
-        found = self.judge(candidate.change.after(change), self.screened)
+        found = self._judge(candidate.change.after(change), *self.screened, _SCREENING_STEPS)
         return math.inf if found is None else found.score(RANKED_ERROR) + candidate.cost
 
     def find_mistakes(
@@ -140,12 +154,6 @@ class Search:
         most = LEAST_GAIN_PLACEHOLDER if placeholders else SUSPICIOUS_PRIORS
         return bool(now.objections.sum() > most)
 
-    def _is_lost(self, now: Plausibility | None) -> bool:
-        """Whether so much is unexplained that a scale or zero of any size is worth trying."""
-        return (
-            now is None or now.worst_error > LOST_ERROR or now.objections.sum() > SUSPICIOUS_PRIORS
-        )
-
     def _is_explained(self, finding: Finding, last: Plausibility) -> bool:
         spoilt = spoilt_axes(finding)
         return bool((last.error[spoilt] < EXPLAINED).all())
@@ -157,7 +165,7 @@ class Search:
         before = now or _nothing_explained(self.system)
         tried = self._try_best(change, self._discrete())
         best = self._choose(before, tried, placeholders)
-        if self._is_lost(best.after if best else now):
+        if self._is_suspicious(best.after if best else now, ()):
             tried += self._try_best(change, self._continuous(change))
             best = self._choose(before, tried, placeholders)
         return best
@@ -175,7 +183,7 @@ class Search:
         for names in groups_of_like(self.signals):
             families.append((partial(_scaled_by_power, self.signals, names), _DECADES))
         for place, axis in enumerate(self.signals.axes):
-            changed = [change.of_motion(motion, self.signals) for motion in self.screened]
+            changed = [change.of_motion(motion, self.signals) for motion in self.screened[0]]
             q = np.concatenate([motion.q[:, place] for motion in changed])
             reach = 2.0 * max(float(np.ptp(q)), float(np.abs(np.median(q))))
             size = math.pi if self.signals.units[place] == "rad" else reach
@@ -215,7 +223,7 @@ class Search:
         tried = []
         for score, candidate in screened[:_SHORTLIST]:
             if math.isfinite(score):
-                found = self.judge(candidate.change.after(change), self.motions)
+                found = self.judge(candidate.change.after(change))
                 if found is not None:
                     tried.append((candidate, found))
         return tried

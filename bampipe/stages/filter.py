@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -32,7 +32,7 @@ from bampipe.trials.cache import TrialCache
 from bampipe.trials.folds import Folds
 from bampipe.trials.kinematics import AxisFilter, Kinematics
 from bampipe.trials.motion import input_derivatives, n_samples
-from bampipe.trials.reading import read_motion_of
+from bampipe.trials.reading import held_out_trials, read_motion_of
 from bampipe.trials.sensors import Sensors
 
 SUMMARY = "Velocity and acceleration from the encoders, with error bands"
@@ -145,7 +145,8 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     bands = _bands(system, out, session, kinematics, written, config)
     result = _result(config, kinematics, axes, choices, levels, interpolated, skipped, bands)
     progress(0.97, "the set-up")
-    setup = _inspect(system, out, session, trials, written, bands)
+    free = set(trials.loc[trials["kind"] == MOVING[0], "trial_id"]) - held_out_trials(run)
+    setup = _inspect(system, out, session, written, free, bands)
     setup.write(out)
     return result.write(out) | {"setup": list(setup.lines)}
 
@@ -154,14 +155,12 @@ def _inspect(
     system: System,
     out: Path,
     session: IngestResult,
-    trials: pd.DataFrame,
     ids: Sequence[str],
+    free: Collection[str],
     bands: Mapping[str, ResidualBand],
 ) -> SetupResult:
-    """Hold the set-up against trials spread over the session."""
-    kinds = trials.set_index("trial_id")
-    free = (kinds["kind"] == MOVING[0]) & ~kinds["hold_out"].astype(bool)
-    fitted, others = ([k for k in ids if free[k] == side] for side in (True, False))
+    """Hold the set-up against some trials ``ids``, those in ``free`` fitted."""
+    fitted, others = ([k for k in ids if (k in free) == side] for side in (True, False))
     chosen = [some[k] for some in (fitted, others) for k in spread(len(some))]
     motions = [
         read_motion_of(out / "filter/kinematics.parquet", name, system, every_input=True)
