@@ -216,9 +216,12 @@ def suggest_next(root: Path, model: str, name: str) -> str:
         root: the run folder; name: how to call it in a command.
     """
     from bampipe.results.diagnose import DiagnoseResult
+    from bampipe.results.setup import SetupResult
     from bampipe.results.validate import ValidateResult
 
     run = RunFolder(root)
+    if run.exists(SetupResult.FILE) and run.read(SetupResult).mistakes:
+        return "correct the session file as the first line says, and run it again"
     if run.exists(DiagnoseResult.file(model)):
         found = run.read(DiagnoseResult, model)
         if any(axis.verdict != "nothing_missing" for axis in found.axes.values()):

@@ -103,10 +103,9 @@ class Search:
         others = [k for k, fits in enumerate(folds.fitted) if not fits]
         chosen = [*dict.fromkeys([*fitted[:1], *fitted[-1:]]), *others[:1]]
         part = Folds(
-            *(
-                tuple(field[k] for k in chosen)
-                for field in (folds.groups, folds.fitted, folds.judged)
-            )
+            tuple(folds.groups[k] for k in chosen),
+            tuple(folds.fitted[k] for k in chosen),
+            tuple(folds.judged[k] for k in chosen),
         )
         return shorten([self.motions[k] for k in chosen], _SCREENED_SAMPLES), part
 

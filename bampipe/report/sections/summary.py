@@ -10,6 +10,7 @@ from bampipe.report.document import Block, Paragraph, Section, Table
 from bampipe.report.results import Results
 from bampipe.results.compare import CompareResult
 from bampipe.results.identify import METHODS_IN_WORDS, IdentifyResult, ParameterEstimate
+from bampipe.results.setup import SetupResult
 from bampipe.results.stiffness import AxisStiffness, StiffnessResult
 from bampipe.results.validate import AxisError, ValidateResult
 
@@ -22,7 +23,10 @@ _TERMS = (
 
 def section(results: Results) -> Section:
     """Return the section."""
-    blocks: list[Block] = [verdicts.overall(results), Paragraph(_done(results))]
+    setup = results.read(SetupResult)
+    blocks: list[Block] = [Paragraph(_done(results))]
+    if setup is None or not setup.mistakes:  # else no verdict on the model counts
+        blocks.insert(0, verdicts.overall(results))
     ladder = _ladder(results)
     if ladder:
         blocks.append(Paragraph(ladder))
