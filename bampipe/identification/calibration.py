@@ -102,7 +102,7 @@ def _sources(system: System, recipe: Recipe, session: IngestResult) -> Iterator[
     for name, change in calibration_changes(signals):
         yield _Source(name, system, partial(change.of_motion, signals=signals))
     for name, constant in system.model.device.constants.items():
-        if constant.sd:
+        if constant.sd and name in recipe.device.get("constants", {}):
             declaration = deepcopy(dict(recipe.device))
             declaration["constants"][name]["value"] = constant.value + constant.sd
             changed = compile_model(replace(recipe, device=declaration).model())

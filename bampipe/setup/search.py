@@ -49,6 +49,9 @@ LEAST_FACTOR, LEAST_TURN, LEAST_SHIFT = 1.5, 0.25, 0.3
 """A factor, an angle (rad) and a share of an axis' travel below which what is off is no mistake of
 set-up but an effect to be diagnosed."""
 MOST_MISTAKES = 4
+MOST_AXES = 3
+"""With more, only signs, the clock and units of all axes or inputs at once are tried: what may be
+exchanged, shifted or scaled grows faster than what a fit of a robot's bodies leaves time for."""
 HIGHEST_HZ = 10.0
 """Set-ups are compared below this: gross as they are, they show there, and an input that is taken
 for a position has derivatives up to no more than some 25 Hz."""
@@ -95,6 +98,11 @@ class Search:
     signals: Signals
     tested: int = field(default=0, init=False)
 
+    @property
+    def has_few_axes(self) -> bool:
+        """Whether every kind of mistake can be tried in a few seconds."""
+        return len(self.signals.axes) <= MOST_AXES
+
     @cached_property
     def screened(self) -> tuple[Sequence[Motion], Folds]:
         """The part of the trials that every set-up is tried on: two that are fitted, one braked."""
@@ -107,7 +115,8 @@ class Search:
             tuple(folds.fitted[k] for k in chosen),
             tuple(folds.judged[k] for k in chosen),
         )
-        return shorten([self.motions[k] for k in chosen], _SCREENED_SAMPLES), part
+        most = _SCREENED_SAMPLES if self.has_few_axes else _SCREENED_SAMPLES // 2
+        return shorten([self.motions[k] for k in chosen], most), part
 
     def judge(self, change: Change) -> Plausibility | None:
         """What a set-up explains of the trials; None where it cannot be computed with."""
@@ -164,17 +173,20 @@ class Search:
         before = now or _nothing_explained(self.system)
         tried = self._try_best(change, self._discrete())
         best = self._choose(before, tried, placeholders)
-        if self._is_suspicious(best.after if best else now, ()):
+        if self.has_few_axes and self._is_suspicious(best.after if best else now, ()):
             tried += self._try_best(change, self._continuous(change))
             best = self._choose(before, tried, placeholders)
         return best
 
     def _discrete(self) -> Iterator[Candidate]:
         yield from sign_candidates(self.signals)
-        yield from exchange_candidates(self.signals)
         yield from clock_candidates(self.signals)
-        yield from unit_candidates(self.signals)
-        yield from quarter_turns(self.signals)
+        for candidate in unit_candidates(self.signals):
+            if self.has_few_axes or len(candidate.signals) > 1:
+                yield candidate
+        if self.has_few_axes:
+            yield from exchange_candidates(self.signals)
+            yield from quarter_turns(self.signals)
 
     def _continuous(self, change: Change) -> list[Candidate]:
         """Scales and zeros of any size: the best families on a grid, then refined."""
