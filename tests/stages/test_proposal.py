@@ -214,7 +214,7 @@ def test_nothing_is_overwritten(tmp_path, command: Command):
     (tmp_path / "device.toml").unlink()
     assert command("init", tmp_path, "--dry")[0] == 0 and not (tmp_path / "session.toml").exists()
     code, out, _ = command("init", tmp_path)
-    assert code == 0 and out.rstrip().splitlines()[-1].startswith("next: bampipe ")
+    assert code == 0 and out.rstrip().splitlines()[-1].startswith("next: edit the files in ")
     before = (tmp_path / "session.toml").read_bytes()
     code, _, err = command("init", tmp_path)
     assert code == 2 and "there is a session.toml already; it is left alone" in err
