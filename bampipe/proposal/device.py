@@ -166,8 +166,8 @@ def new_device(folder: Path, match: Matcher, notes: Notes) -> ChosenDevice:
         f"{DEVICE}: one {kind} axis '{starter.axis}' driven by a {role}; put in what you know of it"
     )
     for constant in starter.placeholders:
-        notes.fill_in.append(
-            f"{constant} in {DEVICE}, value and source: all forces and inertias scale with it"
+        notes.check.append(
+            f"{DEVICE}: {constant} is not yours yet: all forces and inertias scale with it"
         )
     if any(fit.gravity):
         notes.check.append(f"{DEVICE}: gravity on '{starter.axis}', since the motion shows it")

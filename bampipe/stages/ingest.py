@@ -6,7 +6,6 @@ cannot be trusted is set aside with a reason (file, row, column), and the others
 
 from __future__ import annotations
 
-import json
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -118,31 +117,13 @@ def _impossible(device: Device) -> list[str]:
 def _device(session: Session) -> Device:
     path = session.device_file
     if path is not None:
-        device = registry.device_from(read_device_file(path), str(path))
-        _refuse_blanks(device, str(path))
-        return device
+        return registry.device_from(read_device_file(path), str(path))
     try:
         return registry.device(session.device)
     except InputError as error:
         raise InputError(
             error.what, where=f"{session.root / 'session.toml'}: device", remedy=error.remedy
         ) from error
-
-
-def _refuse_blanks(device: Device, where: str) -> None:
-    """Refuse constants that `bampipe init` left to the user, and that are still as it left them.
-
-    Raises:
-        InputError: the source of a constant still says what to fill in.
-    """
-    for name, constant in device.constants.items():
-        if "fill in" in constant.source.lower():
-            raise InputError(
-                f"found {json.dumps(constant.source)}, expected where its value,"
-                f" {constant.value:g} {constant.unit}, comes from",
-                where=f"{where}: constants.{name}.source",
-                remedy="every estimate scales with it: give its value and its source",
-            )
 
 
 def _match(session: Session, device: Device) -> None:
