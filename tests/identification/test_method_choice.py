@@ -57,7 +57,17 @@ def judged(method, error, value, *doubts):
     """One parameter by one method, known to 0.1, and its held-out error."""
     one = np.ones(1)
     problem = Problem(
-        lambda trial, p: one, 1, np.array([0]), -one, one, one, True, Band(100.0, (8.0,)), ()
+        lambda trial, p: one,
+        1,
+        np.array([0]),
+        -one,
+        one,
+        one,
+        True,
+        Band(100.0, (8.0,)),
+        (),
+        np.zeros(1),
+        np.zeros(1),
     )
     return Judged(
         Estimate(
