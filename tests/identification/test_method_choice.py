@@ -57,18 +57,9 @@ def judged(method, error, value, *doubts):
     """One parameter by one method, known to 0.1, and its held-out error."""
     one = np.ones(1)
     problem = Problem(
-        lambda trial, p: one,
-        1,
-        np.array([0]),
-        -one,
-        one,
-        one,
-        True,
-        Band(100.0, (8.0,)),
-        (),
-        np.zeros(1),
-        np.zeros(1),
-    )
+        lambda trial, p: one, 1, np.array([0]), -one, one, one, True, one > 0.0,
+        Band(100.0, (8.0,)), (), np.zeros(1), np.zeros(1),
+    )  # fmt: skip
     return Judged(
         Estimate(
             method, np.array([value, 0.0]), problem, np.array([[0.01]]), one > 2.0, (), doubts, (),
