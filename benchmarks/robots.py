@@ -169,7 +169,8 @@ def bampipe(*arguments: str) -> float:
 def errors(run: Path, model: str) -> str:
     content = json.loads((run / f"models/{model}/validate.json").read_text())
     return " ".join(
-        f"{entry['held_out_relative_error_percent']:.1f}" for entry in content["axes"].values()
+        f"{axis} {entry['held_out_relative_error_percent']:.1f}"
+        for axis, entry in content["axes"].items()
     )
 
 
