@@ -5,7 +5,9 @@
 
 Each session hides a drawn set of effects (``--counts``) or a named one (``--hidden``, joined by
 ``+``). It is diagnosed once, or followed by ``extend --auto``, without the truth; one line a
-session, then a table. ``--list`` prints what each machine can hide.
+session, then a table. With ``--given`` the model is given the hidden effects, and what is asked is
+whether their parameters are found and their intervals hold. ``--list`` prints what each machine can
+hide.
 """
 
 from __future__ import annotations
@@ -19,18 +21,29 @@ from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from independent import MACHINES, record
 from independent.sensors import GOOD, HARD, Conditions
 
 import bampipe
+from bampipe.data.run_folder import RunFolder
+from bampipe.declarations.model_file import load_model
+from bampipe.files import write_text
+from bampipe.progress import silent
+from bampipe.results.identify import IdentifyResult
+from bampipe.results.ingest import IngestResult
+from bampipe.results.validate import ValidateResult
+from bampipe.stages import filter as filter_stage
+from bampipe.stages import identify, ingest, validate
 
 PIPELINE = """schema = "bampipe.pipeline/1"
 name = "recovery"
 stages = ["ingest", "filter", "identify", "validate"]
 """
 DAYS = {"good": GOOD} | HARD
+RIGHT = "right"
 
 
 @dataclass(frozen=True)
@@ -45,6 +58,30 @@ class Case:
     seed: int
     replicates: int
     auto: bool
+    given: bool
+
+
+@dataclass(frozen=True)
+class Found:
+    """A parameter of a right model: its truth, and what was found.
+
+    Attributes:
+        kind: "device", "strength" or "shape"; bound: its Cramer-Rao bound.
+        determined: whether its effect counts as identified.
+    """
+
+    name: str
+    kind: str
+    truth: float
+    estimate: float
+    sd: float
+    bound: float
+    determined: bool
+
+    @property
+    def z(self) -> float:
+        """Error in standard deviations."""
+        return (self.estimate - self.truth) / self.sd
 
 
 @dataclass(frozen=True)
@@ -57,8 +94,8 @@ class Outcome:
         named: effects found, in order; groups: what each was said to be like.
         verdicts: of the last diagnosis, by axis.
         over_floor: held-out error over noise floor with what was found, by axis.
-        z: error over standard deviation of each parameter that has a truth, where the set is right.
-        seconds: of the diagnosis, or of the whole loop.
+        parameters: those that have a truth, where the set is right; method: that found them.
+        seconds: of the diagnosis, or of the whole loop, or of the identification.
         failure: the message, if a stage refused.
     """
 
@@ -69,7 +106,8 @@ class Outcome:
     groups: tuple[tuple[str, ...], ...] = ()
     verdicts: tuple[str, ...] = ()
     over_floor: tuple[float, ...] = ()
-    z: tuple[float, ...] = ()
+    parameters: tuple[Found, ...] = ()
+    method: str = ""
     seconds: float = 0.0
     failure: str = ""
 
@@ -100,6 +138,10 @@ class Outcome:
         """One line of the log."""
         if self.failure:
             said = f"FAILED {self.failure}"
+        elif self.case.given:
+            worst = max(self.parameters, key=lambda found: abs(found.z))
+            ratios = ", ".join(f"{r:.2f}" for r in self.over_floor)
+            said = f"{self.method} | {worst.name} {worst.z:+.1f} sd | {ratios}"
         else:
             alike = [f"{n} (or {', '.join(g)})" if g else n for n, g in
                      zip(self.named, self.groups, strict=True)]  # fmt: skip
@@ -118,31 +160,31 @@ def run_case(case: Case) -> Outcome:
         root = Path(folder)
         strengths = dict.fromkeys(case.effects, case.strength)
         truth = record(case.machine, root / "session", case.seed, strengths, day)
-        (root / "recovery.toml").write_text(PIPELINE)
-        begun = time.perf_counter()
         try:
-            run = bampipe.run_session(
-                root / "session", runs=root / "runs", pipeline=str(root / "recovery.toml")
-            )
-            begun = time.perf_counter()
-            if case.auto:
-                run = bampipe.follow(run)
-                named = tuple(run.model.split("+")[1:])
-            diagnosis = bampipe.diagnose(run, replicates=case.replicates, jobs=1, seed=case.seed)
+            if case.given:
+                return _identify_given(case, root, truth["parameters"])
+            return _search(case, root, truth)
         except bampipe.InputError as problem:
             return Outcome(case, failure=str(problem))
-        seconds = time.perf_counter() - begun
-        axes = diagnosis["axes"].values()
-        groups = diagnosis["groups"] if not case.auto else {}
-        named = named if case.auto else tuple(diagnosis["selected"])
-        z: tuple[float, ...] = ()
-        if set(named) == set(case.effects) and case.auto:
-            table = run.parameters(run.model)
-            z = tuple(
-                float((table.estimate[n] - value) / table.sd[n])
-                for n, value in truth["parameters"].items()
-                if n in table.index
-            )
+
+
+def _search(case: Case, root: Path, truth: dict[str, Any]) -> Outcome:
+    (root / "recovery.toml").write_text(PIPELINE)
+    run = bampipe.run_session(
+        root / "session", runs=root / "runs", pipeline=str(root / "recovery.toml")
+    )
+    begun = time.perf_counter()
+    if case.auto:
+        run = bampipe.follow(run)
+        named = tuple(run.model.split("+")[1:])
+    diagnosis = bampipe.diagnose(run, replicates=case.replicates, jobs=1, seed=case.seed)
+    seconds = time.perf_counter() - begun
+    axes = diagnosis["axes"].values()
+    groups = diagnosis["groups"] if not case.auto else {}
+    named = named if case.auto else tuple(diagnosis["selected"])
+    parameters: tuple[Found, ...] = ()
+    if set(named) == set(case.effects) and case.auto:
+        parameters = _hold_against(RunFolder(run.root), run.model, truth["parameters"])
     return Outcome(
         case,
         tuple(truth["effects"]),
@@ -151,8 +193,62 @@ def run_case(case: Case) -> Outcome:
         tuple(tuple(groups.get(n, ())) for n in named),
         tuple(a["verdict"] for a in axes),
         tuple(round(a["rmse_after"] / a["noise_floor"], 3) for a in axes),
-        z,
-        seconds,
+        parameters,
+        seconds=seconds,
+    )
+
+
+def _identify_given(case: Case, root: Path, truth: dict[str, float]) -> Outcome:
+    """Identify the model that has the hidden effects."""
+    run = RunFolder(root / "run")
+    ingest.execute(run, run.root, ingest.Config(session=str(root / "session")), silent)
+    device = run.read(IngestResult).device
+    model = f"""schema = "bampipe.model/1"
+name = "{RIGHT}"
+device = "{device}"
+effects = {json.dumps(case.effects)}
+"""
+    bare = model.replace(RIGHT, "base").replace(json.dumps(case.effects), "[]")
+    write_text(run.path("models/base/model.toml"), bare)
+    write_text(run.path(f"models/{RIGHT}/model.toml"), model)
+    filter_stage.execute(run, run.root, filter_stage.Config(), silent)
+    begun = time.process_time()
+    identify.execute(run, run.root, identify.Config(model=RIGHT), silent)
+    seconds = time.process_time() - begun
+    validate.execute(run, run.root, validate.Config(model=RIGHT, free_run=False), silent)
+    axes = run.read(ValidateResult, RIGHT).axes.values()
+    return Outcome(
+        case,
+        hidden=case.effects,
+        over_floor=tuple(round(a.published_rmse / (a.noise_floor or np.nan), 3) for a in axes),
+        parameters=_hold_against(run, RIGHT, truth),
+        method=run.read(IdentifyResult, RIGHT).method,
+        seconds=seconds,
+    )
+
+
+def _hold_against(run: RunFolder, model: str, truth: dict[str, float]) -> tuple[Found, ...]:
+    """The parameters of a model that have a truth."""
+    loaded = load_model(run, model)
+    of_device = {item.name for item in loaded.device.parameters}
+    strengths = {item.name for item in loaded.parameters if item.strength}
+    result = run.read(IdentifyResult, model)
+    return tuple(
+        Found(
+            name,
+            "device" if name in of_device else "strength" if name in strengths else "shape",
+            value,
+            result.parameters[name].estimate,
+            result.parameters[name].sd,
+            result.parameters[name].bound_sd or np.nan,
+            all(
+                found.identified
+                for effect, found in result.effects.items()
+                if name.startswith(f"{effect.replace(':', '.')}.")
+            ),
+        )
+        for name, value in truth.items()
+        if name in result.parameters
     )
 
 
@@ -179,12 +275,14 @@ def write_table(outcomes: Sequence[Outcome]) -> str:
         "|-|-|-|-|-|-|-|-|-|-|-|",
     ]
     done = [o for o in outcomes if not o.failure]
+    searched = [o for o in done if not o.case.given]
+    lines = lines if searched else []
 
     def kind(o: Outcome) -> tuple[str, str, int, int]:
         return o.case.machine, o.case.day, len(o.hidden), len(o.outside)
 
-    for key in sorted({kind(o) for o in done}):
-        some = [o for o in done if kind(o) == key]
+    for key in sorted({kind(o) for o in searched}):
+        some = [o for o in searched if kind(o) == key]
         machine, day, hidden, outside = key
         clean = not hidden and not outside
         named = sum(len(o.named) for o in some)
@@ -203,16 +301,33 @@ def write_table(outcomes: Sequence[Outcome]) -> str:
             + f" | {np.median(worst):.2f}, at most {max(worst):.2f} | "
             f"{np.median([o.seconds for o in some]):.0f} |"
         )
-    z = np.abs([value for o in done for value in o.z])
-    if len(z):
-        lines.append(
-            f"\n{np.mean(z < 1.96):.1%} of {len(z)} parameters of right models within 1.96 standard"
-            f" deviations of the truth, the farthest {z.max():.1f} off."
-        )
+    lines += _coverage(done)
     failed = len(outcomes) - len(done)
     if failed:
         lines.append(f"\n{failed} sessions were refused.")
     return "\n".join(lines)
+
+
+def _coverage(outcomes: Sequence[Outcome]) -> list[str]:
+    """How often intervals of right models hold the truth, and how near strengths and shapes are."""
+    lines = []
+    table = [(o, p) for o in outcomes for p in o.parameters]
+    for method in sorted({o.method for o, _ in table}):
+        for kind in ("device", "strength", "shape"):
+            some = [p for o, p in table if o.method == method and p.kind == kind]
+            z = np.abs([p.z for p in some])
+            if not some:
+                continue
+            near = {"strength": 0.05, "shape": 0.15}.get(kind, 0.05)
+            off = np.array([abs(p.estimate / p.truth - 1.0) for p in some if p.truth != 0.0])
+            lines.append(
+                f"\n{method or 'loop'}, {kind}: {np.mean(z < 1.96):.1%} of {len(z)} within 1.96"
+                f" standard deviations of the truth, {int(np.sum(z > 3.0))} beyond 3,"
+                f" {int(np.sum(z > 4.0))} beyond 4, the farthest {z.max():.1f} off;"
+                f" {np.mean(off < near):.1%} within {100 * near:.0f} %;"
+                f" {sum(not p.determined for p in some)} said not to be identified."
+            )
+    return lines
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -228,6 +343,7 @@ def main(arguments: Sequence[str]) -> None:
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--first-seed", type=int, default=1)
     parser.add_argument("--replicates", type=int, default=10)
+    parser.add_argument("--given", action="store_true", help="give the model the hidden effects")
     parser.add_argument("--auto", action="store_true", help="follow the diagnosis to its end")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--out", type=Path, help="write the outcomes as JSON")
@@ -247,7 +363,7 @@ def main(arguments: Sequence[str]) -> None:
                 ]
                 cases += [
                     Case(machine, effects, options.strength, day, options.creep, seed,
-                         options.replicates, options.auto)
+                         options.replicates, options.auto, options.given)
                     for effects in sets
                 ]  # fmt: skip
     outcomes = []

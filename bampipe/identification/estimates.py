@@ -10,21 +10,26 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from bampipe.estimate.influence import find_worst_stretch
 from bampipe.estimate.least_squares import LeastSquares, Problem
 from bampipe.estimate.output_error import OutputError
 from bampipe.identification.filter_tables import as_filtered
 from bampipe.physics import System
+from bampipe.physics.effect import BoundEffect
 from bampipe.results.identify import (
     BaseEstimate,
     Convergence,
     Covariance,
+    EffectEstimate,
     IdentifiabilityReport,
     IdentifyResult,
+    Influence,
     InputTiming,
     Method,
     MethodTried,
     ParameterEstimate,
     StateBound,
+    WorstSecond,
 )
 from bampipe.trials.motion import Motion
 
@@ -32,6 +37,13 @@ Array = NDArray[np.float64]
 
 MOST_SHOWN = 24
 """Parameters that a headline lists."""
+NORMAL_95 = 1.96
+"""Standard deviations of a 95 % interval."""
+_STRETCH_S = 1.0
+_MOVES, _OUTLYING = 1.0, 6.0
+"""Standard deviations by which the worst second moves a parameter, and times what a typical one
+does, from which on it is said: of hundreds of seconds of Gaussian noise, the worst moves it by 3 to
+4 times the typical."""
 
 
 @dataclass(frozen=True)
@@ -84,9 +96,19 @@ class Estimate:
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
 
-def input_timing(p: Array, variance: float) -> InputTiming:
-    """Return the timing of the inputs, the last of ``p``."""
-    return InputTiming(estimate=p[-1], sd=np.sqrt(variance), unit="s")
+def input_timing(p: Array, problem: Problem, covariance: Array) -> InputTiming:
+    """Return the timing of the inputs, the last of ``p`` and, where it was estimated, of a problem.
+
+    Args:
+        p: (n_p + 1,) parameters; problem: as fitted; covariance: (n_free, n_free).
+    """
+    timed = problem.free[-1] == len(p) - 1
+    return InputTiming(
+        estimate=p[-1],
+        sd=np.sqrt(covariance[-1, -1]) if timed else 0.0,
+        unit="s",
+        limit=problem.upper[-1] if timed else 0.0,
+    )
 
 
 def trace_row(
@@ -122,7 +144,6 @@ def estimate_of_fit(
         held_out, details, report: as of `Estimate`; rows: makes those of its trace.
     """
     count = int(np.sum(problem.free < len(system.parameters)))
-    timed = count < problem.free.size
     sd = 3.0 * np.median(np.concatenate([motion.qd_sd for motion in motions]), axis=0)
 
     def tabulate() -> tuple[pd.DataFrame, pd.DataFrame]:
@@ -139,7 +160,7 @@ def estimate_of_fit(
         doubts=() if fit.converged else ("its search has not converged",),
         details=details[:count],
         report={
-            "input_timing": input_timing(p, fit.covariance[-1, -1] if timed else 0.0),
+            "input_timing": input_timing(p, problem, fit.covariance),
             "convergence": Convergence(iterations=fit.iterations, converged=fit.converged),
             "state_3sigma": {
                 axis: StateBound(velocity=sd[i]) for i, axis in enumerate(system.coordinates)
@@ -156,12 +177,19 @@ def collect_result(
     identifiability: IdentifiabilityReport,
     motions: Sequence[Motion],
     model: str,
+    raw: LeastSquares,
     engine: Literal["compiled", "filterpy"],
     methods: Mapping[Method, MethodTried],
     notes: Sequence[str],
     base_parameters: tuple[BaseEstimate, ...] | None = None,
 ) -> IdentifyResult:
-    """Return what identify.json says."""
+    """Return what identify.json says.
+
+    Args:
+        system: the model; estimate: the published one; identifiability: of its parameters.
+        motions: the trials; model: its name; raw: the least-squares fit to the same trials.
+        engine: of the filter; methods: all that were tried; notes: on how it came about.
+    """
     free, sd = estimate.free, estimate.sd
     names = tuple(system.parameters[i].name for i in free)
     parameters = {
@@ -175,18 +203,35 @@ def collect_result(
         )
         for i, (name, place) in enumerate(zip(names, free, strict=True))
     }
+    effects = {each.name: _judge_effect(each, parameters) for each in system.model.effects}
+    unknown = [name for name, found in effects.items() if not found.identified]
+    warning = f"not identified: {', '.join(unknown)}; " if unknown else ""
+    timing = estimate.report["input_timing"]
+    influence = _assess_influence(names, estimate, motions, raw)
     return IdentifyResult(
         model=model,
-        headline=_headline(parameters),
+        headline=warning + _headline(parameters),
         method=estimate.method,
         engine=engine,
         methods=dict(methods),
         parameters=parameters,
+        effects=effects,
+        influence=influence,
         covariance=Covariance(names=names, matrix=estimate.covariance.tolist()),
         trials=tuple(motion.trial_id for motion in motions),
         identifiability=identifiability,
         base_parameters=base_parameters,
-        notes=(*notes, *identifiability.sentences),
+        notes=(
+            *(
+                f"`{name}` does not count as identified: {'; '.join(found.reasons)}."
+                for name, found in effects.items()
+                if not found.identified
+            ),
+            *([_describe_limit(timing)] if timing.is_at_limit else []),
+            *filter(None, [influence.worst_second.sentence]),
+            *notes,
+            *identifiability.sentences,
+        ),
         **estimate.report,
     )
 
@@ -200,3 +245,78 @@ def _headline(parameters: Mapping[str, ParameterEstimate]) -> str:
     if len(shown) <= MOST_SHOWN:
         return ", ".join(shown)
     return f"{', '.join(shown[:MOST_SHOWN])} and {len(shown) - MOST_SHOWN} more"
+
+
+def _assess_influence(
+    names: Sequence[str], estimate: Estimate, motions: Sequence[Motion], raw: LeastSquares
+) -> Influence:
+    """Return how far each trial, and the worst second, move the parameters."""
+    moved = [
+        (p[estimate.free] - estimate.value) / np.maximum(estimate.sd, np.finfo(float).tiny)
+        for p in estimate.held_out
+    ]
+    worst = find_worst_stretch(estimate.problem, raw, _STRETCH_S)
+    count = len(names)
+    place = int(np.argmax(np.abs(worst.move[:count])))
+    trial, move = motions[worst.trial].trial_id, float(worst.move[place])
+    stands_out = abs(move) > max(_MOVES, _OUTLYING * float(worst.typical[place]))
+    return Influence(
+        trials={
+            motion.trial_id: dict(zip(names, (float(x) for x in row), strict=True))
+            for motion, row in zip(motions, moved, strict=True)
+        },
+        worst_second=WorstSecond(
+            trial=trial,
+            start_s=worst.start_s,
+            parameter=names[place],
+            move=move,
+            sentence=f"The second from {worst.start_s:.1f} s of trial {trial} on moves"
+            f" `{names[place]}` by {abs(move):.1f} standard deviations of least squares, a typical"
+            f" one by {worst.typical[place]:.2g}: look there for a transient or an outlier."
+            if stands_out
+            else "",
+        ),
+    )
+
+
+def _judge_effect(
+    effect: BoundEffect, parameters: Mapping[str, ParameterEstimate]
+) -> EffectEstimate:
+    """Say whether an effect is determined: a strength that is not nothing, and all of its shape.
+
+    Of several strengths, such as those of sine and cosine, one is enough. A shape that cannot be
+    negative needs an interval smaller than itself.
+    """
+    free = [(item, parameters[item.name]) for item in effect.parameters if item.name in parameters]
+    faults = {item.name: _fault(item.name, entry) for item, entry in free}
+    strengths = [faults[item.name] for item, _ in free if item.strength]
+    shapes = [
+        faults[item.name]
+        for item, entry in free
+        if item.shape and (item.lower >= 0.0 or entry.at_bound)
+    ]
+    reasons = [fault for fault in shapes if fault]
+    if strengths and all(strengths):
+        reasons = [*strengths, *reasons]
+    return EffectEstimate(identified=not reasons, reasons=tuple(reasons))
+
+
+def _fault(name: str, entry: ParameterEstimate) -> str:
+    """Return why a parameter is not determined, "" where it is."""
+    if entry.at_bound:
+        return f"`{name}` lies at the limit of its range"
+    if NORMAL_95 * entry.sd >= abs(entry.estimate):
+        half = NORMAL_95 * entry.sd
+        return (
+            f"`{name}` is {entry.estimate:.2g} ± {half:.2g} {entry.unit}".rstrip()
+            + ", an interval larger than itself"
+        )
+    return ""
+
+
+def _describe_limit(timing: InputTiming) -> str:
+    way = "later" if timing.estimate > 0.0 else "earlier"
+    return (
+        f"The force acts {1e3 * timing.limit:.3g} ms or more {way} than logged, half a sample, all"
+        " that the timing of the samples may be: a delay or a lag acts that the model lacks."
+    )

@@ -188,7 +188,7 @@ def estimate_by_filter(
         "nis": nis,
         "innovations": innovation_tests(system, found, trials, clear_by_axis),
         "noise": noise_levels(system, found.settings, noise),
-        "input_timing": input_timing(p, scaled[-1, -1] if timing else 0.0),
+        "input_timing": input_timing(p, problem, scaled),
         "blocks": blocks,
         "restarts": found.restarts,
         "repeats": found.repeats,

@@ -16,7 +16,7 @@ from bampipe.physics import System
 from bampipe.trials.folds import Folds
 from bampipe.trials.kinematics import Kinematics
 from bampipe.trials.motion import Motion
-from bampipe.trials.replay import replay_motions
+from bampipe.trials.replay import UNLIKE, replay_motions
 from bampipe.trials.residuals import problem_of
 from bampipe.trials.sensors import Sensors
 
@@ -26,10 +26,6 @@ _CORRECTIONS = 5
 """Most replays of a nonlinear model, until its fit is the measured one's."""
 _SAME = 1.0
 """Standard deviations within which the two fits are the same."""
-_UNLIKE = 1.4
-"""Residual that a fit leaves of a replay, over that of the measurement, beyond which the replay is
-no likeness of the machine and its bias another: sound ones leave 0.01 to 1.15 (force noise is left
-out), that of a stiff damper 77."""
 _FARTHEST = 3.0
 """Standard deviations that a nonlinear fit moves at most where a trial is left out."""
 _SLOPE = (0.3, 3.0)
@@ -92,12 +88,19 @@ def remove_bias(
     count = len(system.parameters)
     timing = bool(free[-1] == count)
 
+    known: dict[bytes, Array] = {}
+
     def bias_at(p: Array) -> Array:
+        if p.tobytes() not in known:
+            known[p.tobytes()] = replayed_bias(p)
+        return known[p.tobytes()]
+
+    def replayed_bias(p: Array) -> Array:
         replays = replay_motions(
             system, p[:count], motions, sensors, kinematics, (0, 0), force_noise=False
         )
         again = fit(problem_of(system, replays, problem.band, timing=timing), raw.p)
-        if np.any(again.residual_sd > _UNLIKE * raw.residual_sd):
+        if np.any(again.residual_sd > UNLIKE * raw.residual_sd):
             raise InputError("the replay of the model does not resemble the machine")
         return np.asarray((again.p - np.append(p[:count], 0.0))[free])
 

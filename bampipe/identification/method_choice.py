@@ -51,15 +51,22 @@ class Judged:
 def judge(squares: UnbiasedFit, folds: Folds, estimate: Estimate) -> Judged:
     """Return the error (n_q,) of predictions of each trial by parameters that have not seen it.
 
+    A prediction from filtered motions needs the parameters that a fit to such motions would have
+    if these were true: filtering blurs a change of direction, and the truth itself would look
+    worse than a fit that has taken on the blur.
+
     Args:
         squares: the fit to all trials, linearised, of the same problem.
         folds: of its trials; estimate: whose `held_out` parameters are judged.
     """
     problem, raw = squares.problem, squares.raw
+    shift = _bias(squares, estimate)
     total, count = np.zeros(len(raw.residual_sd)), np.zeros(len(raw.residual_sd))
-    for trial, (stacked, p) in enumerate(zip(raw.stacked, estimate.held_out, strict=True)):
+    for trial, (stacked, left_out) in enumerate(zip(raw.stacked, estimate.held_out, strict=True)):
         if not folds.judged[trial]:
             continue
+        p = left_out.copy()
+        p[problem.free] = np.clip(p[problem.free] + shift, problem.lower, problem.upper)
         if problem.linear:
             found = stacked.residual + stacked.slope @ (p - raw.p)[problem.free]
         else:
@@ -67,6 +74,18 @@ def judge(squares: UnbiasedFit, folds: Folds, estimate: Estimate) -> Judged:
         total += np.sum(found**2, axis=0)
         count += np.sum(stacked.used, axis=0)
     return Judged(estimate, np.sqrt(total / np.maximum(count, 1.0)))
+
+
+def _bias(squares: UnbiasedFit, estimate: Estimate) -> Array:
+    """Return what filtering would add to a fit if an estimate were true, (n_free,)."""
+    nothing = np.zeros(squares.problem.free.size)
+    if squares.bias is None or squares.bias_at is None:
+        return nothing
+    if squares.problem.linear:
+        return squares.bias
+    with suppress(InputError):
+        return squares.bias_at(estimate.p)
+    return nothing
 
 
 def relative_errors(system: System, judged: Sequence[Judged]) -> Array:
@@ -131,15 +150,17 @@ def _disagreement(one: Estimate, other: Estimate, squares: UnbiasedFit) -> Array
 
     Where the model is nonlinear, least squares know less than the others and scatter on their own:
     they are asked what they would be if the other answer were true, and count if that is not so.
+    A fit to filtered motions can move by many times what the truth does, so that this does not say
+    how far the two are apart.
     """
     variance = one.sd**2 + other.sd**2
-    difference = one.value - other.value
+    difference = np.abs(one.value - other.value)
     by_squares = [each.method == "least-squares" for each in (one, other)]
     if not squares.problem.linear and any(by_squares) and np.any(difference**2 > variance):
         # An answer that cannot be replayed is all the more in doubt.
         with suppress(InputError):
-            difference = squares.gap(other.p if by_squares[0] else one.p)[: len(difference)]
-            difference[difference**2 < _SCATTER**2 * variance] = 0.0
+            gap = np.abs(squares.gap(other.p if by_squares[0] else one.p)[: len(difference)])
+            difference = np.where(gap < _SCATTER * np.sqrt(variance), 0.0, difference)
     return np.asarray(np.sqrt(np.maximum(difference**2 - variance, 0.0)))
 
 

@@ -82,12 +82,58 @@ class MethodTried(Record):
     doubts: Names = Field(default=(), description="Why it may not be believed")
 
 
+class WorstSecond(Record):
+    """The second that moves a parameter of the least-squares fit most."""
+
+    trial: str
+    start_s: Size = Field(description="Since the start of the trial, s")
+    parameter: str
+    move: float = Field(description="Change of it without that second, in standard deviations")
+    sentence: str = Field(
+        default="", description="In words, where it stands out as a transient or an outlier does"
+    )
+
+
+class Influence(Record):
+    """How far parts of the data move the parameters."""
+
+    trials: dict[str, dict[str, float]] = Field(
+        description="By trial and parameter: change of the published estimate where the trial is "
+        "left out, in standard deviations"
+    )
+    worst_second: WorstSecond
+
+
+class EffectEstimate(Record):
+    """Whether the trials determine an effect of the model."""
+
+    identified: bool
+    reasons: Names = Field(default=(), description="Why it does not count as identified")
+
+
 class InputTiming(Record):
     """Time by which forces were sampled after positions, within half a sample."""
 
     estimate: float
     sd: Size = Field(description="0 where it was not estimated")
     unit: Literal["s"]
+    limit: Size = Field(
+        default=0.0, description="Half a sample, all that it may be; 0 where it was not estimated"
+    )
+
+    @property
+    def is_known(self) -> bool:
+        """Whether it is known to be below its limit, so that it can be taken off.
+
+        At the limit it stands for a delay or lag that the model lacks, and taking off a part would
+        hide what it is.
+        """
+        return abs(self.estimate) + 2.0 * self.sd < self.limit
+
+    @property
+    def is_at_limit(self) -> bool:
+        """Whether it ends within a twentieth of its limit."""
+        return 0.0 < 0.95 * self.limit <= abs(self.estimate)
 
 
 class StateBound(Record):
@@ -239,6 +285,12 @@ class IdentifyResult(Result):
     parameters: dict[str, ParameterEstimate] = Field(
         description="By name: viscous.<axis>, coulomb.<axis>, mass, <effect>[.<axis>].<parameter>"
     )
+    effects: dict[str, EffectEstimate] = Field(
+        default={},
+        description="By effect of the model. One whose strength or shape is at a bound, or has an "
+        "interval larger than itself, does not count as identified",
+    )
+    influence: Influence
     covariance: Covariance
     input_timing: InputTiming
     state_3sigma: dict[str, StateBound] = Field(description="By axis")

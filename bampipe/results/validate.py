@@ -40,8 +40,14 @@ class JudgedError(AxisError):
     )
     noise_floor_sd: Size = Field(description="Scatter of one replay")
     standing: Standing
+    expected_ratio: Annotated[float, Field(ge=1)] = Field(
+        default=1.0,
+        description="published_rmse over held_out_rmse if the published parameters were true, from "
+        "a replay; asked where it is above 1.2 on the trials",
+    )
     estimate: Literal["accepted", "refused"] = Field(
-        description="Refused where published_rmse is more than 1.2 times held_out_rmse"
+        description="Refused where published_rmse is more than 1.2 times held_out_rmse and more "
+        "than 1.2 times what is expected"
     )
 
 

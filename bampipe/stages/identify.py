@@ -202,7 +202,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         *summarise_bases(system, bases),
     ]
     result = collect_result(
-        system, estimate, identifiability, motions, config.model, engine, methods, notes, bases
+        system, estimate, identifiability, motions, config.model, raw, engine, methods, notes, bases
     )
     states, trace = estimate.tabulate()
     write_parquet(out / f"models/{config.model}/states.parquet", states)

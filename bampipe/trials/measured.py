@@ -101,17 +101,14 @@ def read_measured_trials(
         run: the run folder; system: the model.
         every_input: as in `read_motion`.
         timing: time by which inputs were sampled after positions, as identified. It is taken off
-            where it is known to be less than half a sample, its limit. At the limit it stands for
-            a delay or lag that the model lacks, and taking off a part would hide what it is.
+            where it is known (`InputTiming.is_known`).
 
     Raises:
         InputError: there is no free trial, or a file or column is missing.
     """
     names = free_trials(run, braked=True)
     band = read_band(run, system)
-    late_s = 0.0
-    if timing is not None and abs(timing.estimate) + 2.0 * timing.sd < 0.5 / band.rate_hz:
-        late_s = timing.estimate
+    late_s = timing.estimate if timing is not None and timing.is_known else 0.0
     fitted, held_out = free_trials(run, fitted=True, braked=system.braked), held_out_trials(run)
     motions = read_motions(run, system, braked=True, every_input=every_input, late_s=late_s)
     trials = MeasuredTrials(

@@ -30,6 +30,10 @@ from bampipe.trials.sensors import Sensors
 
 Array = NDArray[np.float64]
 
+UNLIKE = 3.0
+"""Residual that a fit leaves of a replay, over that of the measurement, beyond which the replay is
+no likeness of the machine: sound ones leave 0.01 to 1.15 (without force noise), those of a Stribeck
+friction that its fit has sharpened up to 1.9, that of a stiff damper 77."""
 FOLLOWED_HZ = 10.0
 """Highest frequency of the motion to follow where encoder and handle move apart."""
 

@@ -10,6 +10,7 @@ from slider import RATE, TRUTH, record
 
 from bampipe.errors import InputError
 from bampipe.estimate.butterworth import zero_phase
+from bampipe.estimate.influence import find_worst_stretch
 from bampipe.estimate.least_squares import Problem, fit, stacked_residual
 from bampipe.estimate.low_pass import Band
 from bampipe.estimate.standstill import resting
@@ -207,3 +208,22 @@ def test_axes_that_count_unequally_and_disagree_are_weighed_to_rest() -> None:
     found = fit(shared, np.array([5.0]))
     assert found.converged
     assert found.iterations < 10
+
+
+def test_the_second_with_a_transient_is_found() -> None:
+    inner = problem(3)
+    bump = np.zeros(inner.resting[1].shape)
+    first = int(4.5 * RATE)
+    bump[first : first + int(0.3 * RATE)] = 30.0
+    hit = problem(3, residual=lambda k, p: inner.residual(k, p) + (k == 1) * bump)
+    found = fit(hit, TRUTH)
+    worst = find_worst_stretch(hit, found)
+    assert worst.trial == 1
+    assert worst.start_s <= 4.65 < worst.start_s + 1.0
+    # What the fit without the bump would be, to first order.
+    clean = (fit(inner, TRUTH).p - found.p) / np.sqrt(np.diag(found.covariance))
+    place = int(np.argmax(np.abs(worst.move)))
+    assert worst.move[place] == pytest.approx(clean[place], rel=0.3)
+    assert abs(worst.move[place]) > 6.0 * worst.typical[place]
+    undisturbed = find_worst_stretch(inner, fit(inner, TRUTH))
+    assert np.all(np.abs(undisturbed.move) < 6.0 * undisturbed.typical)

@@ -49,7 +49,7 @@ def test_machines_that_stand_still_are_published_right(tmp_path, machine, seed):
     published = found["methods"][found["method"]]["held_out_rmse"]
     for tried in found["methods"].values():
         for axis, error in tried.get("held_out_rmse", published).items():
-            assert published[axis] < 1.05 * error
+            assert published[axis] < 1.2 * error
     assert all(a["estimate"] == "accepted" for a in result(run, "validate")["axes"].values())
 
 

@@ -329,7 +329,9 @@ def test_innovations_of_the_right_model_pass_and_those_of_a_late_force_do_not(
         assert entry["whiteness"]["white"], (axis, entry)
         assert entry["inputs"]["independent"], (axis, entry)
     late = simulated_run(tmp_path / "late", late=10)
-    told = identified(late)["innovations"]
+    content = identified(late)
+    assert any(note.startswith("The force acts 1 ms or more ") for note in content["notes"])
+    told = content["innovations"]
     assert not told["yaw"]["inputs"]["independent"]
     assert "Not independent of the inputs" in told["yaw"]["sentence"]
 
