@@ -79,8 +79,8 @@ def judge_in_other_band(
         else AxisInBand(
             cutoff,
             float(error[i]),
-            float(floor.mean[i]),
-            standing(float(error[i]), float(floor.mean[i]), float(floor.sd[i])),
+            float(floor.level[i]),
+            standing(float(error[i]), float(floor.level[i]), float(floor.sd[i])),
         )
         for i, (cutoff, was) in enumerate(zip(cutoffs, known.cutoff_hz, strict=True))
     )

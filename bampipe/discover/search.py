@@ -178,8 +178,8 @@ def _keeps_the_floor(
     error = Scorer(evidence).before.error
     after, earlier = (NoiseFloor.of_errors([r.error for r in some]) for some in (replays, before))
     return not any(
-        standing(float(error[i]), float(after.mean[i])) == "floor_implausible"
-        and after.mean[i] > 2.0 * earlier.mean[i]
+        standing(float(error[i]), float(after.level[i])) == "floor_implausible"
+        and after.level[i] > 2.0 * earlier.level[i]
         for i in range(len(error))
     )
 

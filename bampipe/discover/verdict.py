@@ -25,14 +25,14 @@ def conclude(search: Search, s: Settings) -> Diagnosis:
     evidence = search.evidence
     before, after = search.initial.held_out_rmse, evidence.held_out_rmse
     floor = NoiseFloor.of_errors([r.held_out_rmse for r in search.final])
-    bare_floor = NoiseFloor.of_errors([r.held_out_rmse for r in search.level.replicates]).mean
+    bare_floor = NoiseFloor.of_errors([r.held_out_rmse for r in search.level.replicates]).level
     shares = np.array([r.share for r in search.final])
     reach = {n: _reach(search, n, s.worth) for n in search.selected}
     odds = {n: _odds_of_group(search, n, s) for n in search.selected}
     findings = []
     weak = set()
     for axis in range(len(before)):
-        level, scatter = float(floor.mean[axis]), float(floor.sd[axis])
+        level, scatter = float(floor.level[axis]), float(floor.sd[axis])
         by_chance = float(shares[:, axis].max())
         given = _share_beyond_chance(explainable_share(search.initial, axis), by_chance)
         share = given

@@ -178,7 +178,7 @@ def _silent_joints(
         if entry.fit_percent is None or entry.fit_percent >= SILENT_PERCENT:
             continue
         size = _rms([c.measured for c in compared], [c.used for c in compared])[i]
-        buried = floor is not None and entry.held_out_rmse < 2.0 * floor.mean[i]
+        buried = floor is not None and entry.held_out_rmse < 2.0 * floor.level[i]
         why = "noise and friction bury it" if buried else "the model lacks what drives it"
         share = max(entry.fit_percent, 0.0)
         found.append(
@@ -345,7 +345,7 @@ def _result(
         axis: _judged(
             found,
             float(expected[i]),
-            floor.mean[i] if floor else None,
+            floor.level[i] if floor else None,
             floor.sd[i] if floor else 0.0,
         )
         for i, (axis, found) in enumerate(_errors(system, compared).items())

@@ -25,6 +25,8 @@ Array = NDArray[np.float64]
 FLOOR_SEED = 0
 """First number, after the user's, of the seeds of replays of the model as it is: the same replays
 serve as noise floor in every stage."""
+_SD_OF_DEVIATION = 1.4826
+"""Standard deviation of a normal distribution over its median absolute deviation."""
 ENOUGH_SAMPLES, MOST_REPLAYS = 250_000, 6
 """Replays are repeated until they hold so many samples, but no oftener than this: the floor of a
 session of forty thousand samples is then known to about 1 %, and longer ones need fewer."""
@@ -35,20 +37,22 @@ class NoiseFloor:
     """Held-out error of replays.
 
     Attributes:
-        mean, sd: over replays, by axis, (n_q,), N.m or N; ``sd`` is that of one replay.
+        level: median over replays, by axis, (n_q,), N.m or N. On a few short trials the fit to a
+            replay may run away when one is left out; such a replay must not raise the floor.
+        sd: scatter of one replay, from the median deviation.
         replays: how many.
     """
 
-    mean: Array
+    level: Array
     sd: Array
     replays: int
 
     @classmethod
     def of_errors(cls, errors: Sequence[Array]) -> NoiseFloor:
-        """Mean and scatter of the errors (n_q,) of replays."""
+        """Median and scatter of the errors (n_q,) of replays."""
         found = np.array(errors)
-        sd = found.std(axis=0, ddof=1) if len(found) > 1 else np.zeros(found.shape[1])
-        return cls(found.mean(axis=0), sd, len(found))
+        level = np.median(found, axis=0)
+        return cls(level, _SD_OF_DEVIATION * np.median(np.abs(found - level), axis=0), len(found))
 
 
 def floor_replays(motions: Sequence[Motion]) -> int:
