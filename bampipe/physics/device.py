@@ -103,6 +103,11 @@ class Inputs(Declaration):
         description="Whether they come from a motor rather than a force sensor: effects of"
         " motors are then candidates",
     )
+    prescribed: bool = Field(
+        default=False,
+        description="Whether a machine prescribes the motion and the force is what that takes:"
+        " replays keep the motion as measured",
+    )
     brakes: dict[Name, Name] = Field(
         default={}, description="Channel of the commanded brake, by coordinate"
     )
@@ -227,6 +232,11 @@ class Device(Declaration):
     def drive(self) -> bool:
         """Whether they come from a motor rather than a force sensor."""
         return self.inputs.drive
+
+    @property
+    def prescribed(self) -> bool:
+        """Whether a machine prescribes the motion, as on a test bench."""
+        return self.inputs.prescribed
 
     @property
     def brakes(self) -> Mapping[str, str]:

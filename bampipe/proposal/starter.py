@@ -18,6 +18,7 @@ _TAKEN = frozenset(
 )
 _FROM_A_MOTOR = frozenset(["effort", "torque", "tau"])
 _DRIVE = "drive = true                        # from a motor; false: from a force sensor\n"
+_PRESCRIBED = "prescribed = true                   # guess: a test bench gives the stroke\n"
 _YIELDS = 2e-3
 
 
@@ -107,7 +108,7 @@ def _inputs(source: Input, drive: Drive) -> str:
     return f"""[inputs]
 force = ["{source.name}"]{comment}
 force_unit = "{source.si}"
-{_DRIVE if motor else ""}{channels}"""
+{_DRIVE if motor else _PRESCRIBED if drive.coil else ""}{channels}"""
 
 
 def _friction(axis: Axis, found: Driven) -> str:

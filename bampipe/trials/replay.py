@@ -1,8 +1,9 @@
 """The fitted model in place of the machine: recordings that contain nothing the model lacks.
 
 Noise floors, chance levels and the bias of least squares come from here. The model is driven along
-nearly the measured motion by the measured force plus an arm; what it does is read by the same
-sensors and goes through the same filters.
+nearly the measured motion by the measured force plus an arm; on a test bench, which prescribes the
+motion, it keeps that and takes the force it needs. What it does is read by the same sensors and
+goes through the same filters.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from bampipe.physics.device import derivative
 from bampipe.trials.cache import MOST_SAMPLES, TrialCache
 from bampipe.trials.kinematics import Kinematics
 from bampipe.trials.motion import Motion, Recording, n_samples
+from bampipe.trials.residuals import residual_and_memory
 from bampipe.trials.sensors import Sensors
 
 Array = NDArray[np.float64]
@@ -54,6 +56,9 @@ def replay_recording(
         Runaway: the simulated motion grows without bounds.
     """
     u = motion.inputs(system.inputs)
+    if system.model.device.prescribed:
+        force = _required_force(system, p, motion, u)
+        return _read(system, motion, motion.q, force, sensors, rng)
     n = len(system.coordinates)
     q, qd = _reference(system, p, motion, u, sensors.rate_hz)
     start = np.concatenate([q[0], qd[0], system.initial_memory(q[0], u[0], p)])
@@ -72,18 +77,36 @@ def replay_recording(
     for i in range(len(x)):
         system.measure(x[i], total[i], p, reading)
         seen[i] = reading[:n]
-    scatter = sensors.scatter_sd
-    if scatter.any():
-        seen += rng.normal(size=seen.shape) * scatter
+    force = total[:, [at[f] for f in forces]]
+    return _read(system, motion, seen, force, sensors, rng)
+
+
+def _required_force(system: System, p: Array, motion: Motion, u: Array) -> Array:
+    """The force that the model needs for the motion as measured, (T, n_f): none is left over."""
+    left, _ = residual_and_memory(system, motion, u, p)
+    gains = system.input_map(motion.q, u, p)
+    forces = [system.inputs.index(name) for name in system.model.device.forces]
+    excess = np.einsum("tfq,tq->tf", np.linalg.pinv(gains), left)
+    return np.asarray(u[:, forces] - excess)
+
+
+def _read(
+    system: System,
+    motion: Motion,
+    q: Array,
+    force: Array,
+    sensors: Sensors,
+    rng: np.random.Generator,
+) -> Recording:
+    """What the sensors make of positions (T, n_q) and forces (T, n_f)."""
+    seen = q + rng.normal(size=q.shape) * sensors.scatter_sd if sensors.scatter_sd.any() else q
     step = np.where(sensors.resolution > 0.0, sensors.resolution, 1.0)
-    offset = rng.uniform(0.0, 1.0, n) * step
+    offset = rng.uniform(0.0, 1.0, q.shape[1]) * step
     read = (np.floor((seen + offset) / step) + 0.5) * step - offset
     read = np.where(sensors.resolution > 0.0, read, seen)
-    force = total[:, [at[f] for f in forces]]
-    force = force + rng.normal(size=force.shape) * sensors.force_sd
-    return Recording(
-        motion.trial_id, read, {**motion.channels, **dict(zip(forces, force.T, strict=True))}
-    )
+    noisy = force + rng.normal(size=force.shape) * sensors.force_sd
+    named = dict(zip(system.model.device.forces, noisy.T, strict=True))
+    return Recording(motion.trial_id, read, {**motion.channels, **named})
 
 
 def replay_motion(

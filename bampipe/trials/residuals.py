@@ -58,7 +58,7 @@ def problem_of(
         # Internal states do not change with what the residual is linear in: of differences by
         # many parameters, those of the last point serve most.
         key = trial, p[shaping].tobytes()
-        found, z = _residual_and_memory(system, motion, u, p[:n], remembered.get(key))
+        found, z = residual_and_memory(system, motion, u, p[:n], remembered.get(key))
         if key not in remembered:
             if any(other != trial for other, _ in remembered) or len(remembered) > 1:
                 remembered.clear()
@@ -113,7 +113,7 @@ def _standstill(motion: Motion, system: System, band: Band) -> NDArray[np.bool_]
     return resting(motion.qd, motion.qd_sd, band.rate_hz, np.array(braked))
 
 
-def _residual_and_memory(
+def residual_and_memory(
     system: System, motion: Motion, u: Array, p: Array, z: Array | None = None
 ) -> tuple[Array, Array]:
     """Residual (T, n_q) of a trial under inputs ``u`` (T, n_u), unfiltered, and states (T, n_z).
@@ -243,7 +243,7 @@ class Evidence:
     def unfiltered_at(self, trial: int, p: Array) -> tuple[Array, Array]:
         """The same with the parameters ``p``, (n_p,)."""
         u = self.motions[trial].inputs(self.system.inputs)
-        return _residual_and_memory(self.system, self.motions[trial], u, p)
+        return residual_and_memory(self.system, self.motions[trial], u, p)
 
 
 def gather_evidence(

@@ -143,3 +143,14 @@ def test_the_suggested_trial_tells_more_than_the_trials_at_hand(tmp_path):
     assert names_of(found, name) == {"actuator_delay", "actuator_lag:motor"}
     advice = found["suggested_trial"]
     assert advice is None or advice["separation"] > max(1.0, advice["separation_now"])
+
+
+def test_a_damper_on_a_test_bench_lacks_nothing_or_the_lag_of_its_coil(tmp_path):
+    run, _ = record_run(tmp_path, "damper", 501)
+    (clean,) = diagnose(run)["axes"].values()
+    assert clean["verdict"] == "nothing_missing"
+    assert 0.8 < error_over_floor(clean) < 1.2
+    lagging, _ = record_run(tmp_path / "lag", "damper", 502, "channel_lag:current")
+    found = diagnose(lagging)
+    assert found["selected"] == ["channel_lag:current"]
+    assert error_over_floor(found["axes"]["piston"]) < 1.2

@@ -79,6 +79,8 @@ def test_a_damper_with_a_coil(tmp_path):
     assert axis["velocity"] == {"column": "Velocity", "unit": "mm/s"}
     assert session["force"]["columns"] == ["Force"] and session["force"]["unit"] == "N"
     assert session["channels"]["coil_current"] == {"column": "Current", "unit": "A"}
+    device = tomllib.loads((tmp_path / "damper" / "device.toml").read_text())
+    assert device["inputs"]["prescribed"] is True
     found = samples(tmp_path / "damper", tmp_path / "out", "versuch2")
     truth = damper_log(2)
     np.testing.assert_allclose(found["q_carriage"], 1e-3 * truth["Displacement"], atol=1e-8)
