@@ -185,13 +185,11 @@ def _keeps_the_floor(
 
 
 def _carries_over(before: Evidence, after: Evidence, s: Settings) -> bool:
-    """Whether some axis errs less on the trials that a session holds out, by what is worth it.
+    """Whether some axis errs less, by what is worth it, on trials that the fit has not seen at all.
 
-    They choose no effect, but one that does nothing for them is none. The second that is worst for
-    both does not count.
+    They choose no effect, but one that does nothing for them is none. The worst second of each does
+    not count.
     """
-    if HELD_OUT not in before.folds.groups:
-        return True
     axes = range(len(before.held_out_rmse))
     return any(
         np.log(error_without_second(before, i)[1] / error_without_second(after, i)[1]) > s.worth

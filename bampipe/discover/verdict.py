@@ -135,7 +135,8 @@ def _listed(
     contest: tuple[Contender, ...], odds: Mapping[str, float], s: Settings
 ) -> tuple[Contender, ...]:
     """The effect found, and the rivals that come close to it by any of the scores."""
-    if not contest:
+    if not contest or contest[0].score <= 0.0:
+        # Its linear step from the model without it leads astray: no number to compare by.
         return ()
     mine = contest[0]
 
