@@ -4,7 +4,7 @@
 2. The same is done with replays of the fitted model, which lack nothing: the chance level.
 3. The best candidate that beats chance is added, and so on until none does; later ones must also
    beat replays of the model with those before them. Candidates that come close to the best are
-   told apart by replaying each of them: the pattern of all their scores must look like the
+   distinguished by replaying each of them: the pattern of all their scores must look like the
    measured one. Those that pass alike are reported as one group. An earlier effect that a later
    one makes superfluous is dropped.
 4. What is left is compared with the noise floor of the final model, found by replaying it, in the

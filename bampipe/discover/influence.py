@@ -95,41 +95,19 @@ def error_without_second(evidence: Evidence, axis: int) -> tuple[Stretch, float]
     return worst, float(np.sqrt(max(left, 0.0) / max(count, 1.0)))
 
 
-@dataclass(frozen=True)
-class Influence:
-    """Gains of candidates that are compared, as a whole and with less to go by.
-
-    Attributes:
-        second: the second that speaks most for the best of them; trial: the trial.
-        without_second, without_trial: scores without it, by candidate, the shapes held; those
-            without the trial are empty where fewer than three are fitted.
-    """
-
-    second: Stretch
-    trial: Stretch
-    without_second: dict[str, Score]
-    without_trial: dict[str, Score]
-
-
-def find_influence(
-    evidence: Evidence, items: Sequence[Candidate], scores: Sequence[Score]
-) -> Influence:
-    """Score candidates without the second and without the trial that speak most for the first.
+def score_without(
+    evidence: Evidence, items: Sequence[Candidate], scores: Sequence[Score], stretch: Stretch
+) -> dict[str, Score]:
+    """Score candidates as if ``stretch`` had not been recorded, their shapes held.
 
     Args:
         evidence: of the model without any of them.
-        items: candidates, the best first; scores: theirs, in the same order.
+        items: candidates; scores: theirs, in the same order.
+        stretch: what is left out.
     """
-    gained = Scorer(evidence).gain_by_sample(items[0], scores[0])
-    second, trial = largest_second(evidence, gained), largest_trial(evidence, gained)
-
-    def again(stretch: Stretch) -> dict[str, Score]:
-        scorer = Scorer(without(evidence, stretch))
-        found = {
-            item.name: scorer.score_at(item, score.values)
-            for item, score in zip(items, scores, strict=True)
-        }
-        return {name: score for name, score in found.items() if score is not None}
-
-    enough = len(evidence.folds.fitted_trials) > 2
-    return Influence(second, trial, again(second), again(trial) if enough else {})
+    scorer = Scorer(without(evidence, stretch))
+    found = {
+        item.name: scorer.score_at(item, score.values)
+        for item, score in zip(items, scores, strict=True)
+    }
+    return {name: score for name, score in found.items() if score is not None}

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,7 @@ from bampipe.discover.bench import Bench
 from bampipe.discover.candidates import Score, Scorer
 from bampipe.discover.chance import candidates_of
 from bampipe.discover.findings import Contender
-from bampipe.discover.influence import find_influence
+from bampipe.discover.influence import largest_second, largest_trial, score_without
 from bampipe.discover.settings import Settings
 from bampipe.discover.start import with_effect, without_effect
 from bampipe.physics.recipe import Recipe
@@ -38,7 +39,7 @@ class FittedSet:
     added: tuple[str, ...]
     evidence: Evidence
 
-    @property
+    @cached_property
     def error(self) -> Array:
         """Cross-validated error among the fitted trials, by axis."""
         return Scorer(self.evidence).before.error
@@ -91,15 +92,16 @@ def polish(
         scores = bench.scores(fewer.recipe, fewer.evidence.p, [name, *others])
         contest = weigh(fewer, name, scores)
         best = contest[0] if contest else None
-        # Alone it has been told from its rivals by replays already.
+        # An effect that is alone has been compared with its rivals by replays already.
         if len(found.added) > 1 and best and best.effect != name and name not in swapped:
             mine = next(c for c in contest if c.effect == name)
-            other = extend_set(bench, fewer, scores[best.effect])
-            if _beats(best, mine, s) and np.sum(np.log(other.error / found.error)) < 0.0:
-                swapped |= {name, best.effect}
-                found, contests = other, {}
-                waiting = list(found.added)
-                continue
+            if _beats(best, mine, s):
+                other = extend_set(bench, fewer, scores[best.effect])
+                if np.sum(np.log(other.error / found.error)) < 0.0:
+                    swapped |= {name, best.effect}
+                    found, contests = other, {}
+                    waiting = list(found.added)
+                    continue
         contests[name] = tuple(sorted(contest, key=lambda c: c.effect != name))
     return found, contests
 
@@ -118,7 +120,14 @@ def weigh(fewer: FittedSet, name: str, scores: Mapping[str, Score]) -> list[Cont
         return []
     names = [name, *(n for n in scores if n != name)]
     items = candidates_of(fewer.recipe, names)
-    influence = find_influence(fewer.evidence, items, [scores[n] for n in names])
+    known = [scores[n] for n in names]
+    gained = Scorer(fewer.evidence).gain_by_sample(items[0], known[0])
+    second = largest_second(fewer.evidence, gained)
+    without_second = score_without(fewer.evidence, items, known, second)
+    without_trial: dict[str, Score] = {}
+    if len(fewer.evidence.folds.fitted_trials) > 2:
+        trial = largest_trial(fewer.evidence, gained)
+        without_trial = score_without(fewer.evidence, items, known, trial)
     axis = int(np.argmax(scores[name].gain))
     contenders = [
         Contender(
@@ -126,8 +135,8 @@ def weigh(fewer: FittedSet, name: str, scores: Mapping[str, Score]) -> list[Cont
             axis,
             float(scores[n].error[axis]),
             scores[n].total,
-            influence.without_trial[n].total if n in influence.without_trial else None,
-            influence.without_second[n].total if n in influence.without_second else 0.0,
+            without_trial[n].total if n in without_trial else None,
+            without_second[n].total if n in without_second else 0.0,
         )
         for n in names
     ]

@@ -1,4 +1,4 @@
-"""Candidates that come close to each other, told apart by replaying each of them."""
+"""Candidates that come close to each other, distinguished by replaying each of them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from bampipe.discover.bench import Bench
 from bampipe.discover.candidates import Score, Scorer
 from bampipe.discover.chance import Progress, Replicate, candidates_of
-from bampipe.discover.influence import Stretch, find_influence
+from bampipe.discover.influence import Stretch, largest_second, score_without
 from bampipe.discover.level import Level
 from bampipe.discover.settings import Settings
 from bampipe.discover.start import with_effect
@@ -65,20 +65,20 @@ def choose(
         if excess > s.rival_share * top and int(np.argmax(level.excess(scores[name]))) == axis
     ]
     items = candidates_of(recipe, close)
-    influence = find_influence(evidence, items, [scores[name] for name in close])
-    rest = influence.without_second
-    independent = Scorer(evidence).independent
+    scorer, known = Scorer(evidence), [scores[name] for name in close]
+    second = largest_second(evidence, scorer.gain_by_sample(items[0], known[0]))
+    rest = score_without(evidence, items, known, second)
 
     def stands(name: str) -> bool:
         score = rest.get(name)
         return (
             score is not None
             and level.p_value(score) < s.significance
-            and bool(np.any(score.gain / independent > 0.5 * s.worth))
+            and bool(np.any(score.gain / scorer.independent > 0.5 * s.worth))
         )
 
     firm = sorted((n for n in close if stands(n)), key=lambda n: -rest[n].total)
-    transient = {name: influence.second for name in close if name not in firm}
+    transient = {name: second for name in close if name not in firm}
     if not firm:
         return Choice("", (), transient)
     rivals = firm[: s.most_rivals]

@@ -97,7 +97,7 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
     while len(current.added) + len(dropped) < s.most_effects:
         evidence = current.evidence
         known = level
-        significant, likely = _weigh(bench, scores, known, evidence, replayed)
+        significant, likely = _weigh(bench, scores, level, evidence, replayed)
         if significant and current.added:
             # What a model with the first effects leaves by chance may look like another one.
             close = {name: scores[name] for _, name in significant}
@@ -118,14 +118,8 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
             less = reduce_set(bench, wider, earlier)
             if is_superfluous(wider, less, s):
                 wider = less
-        try:
-            replays = bench.replicas(wider.recipe, wider.evidence.p, s.rival_replicates, (), (3,))
-            sound = _keeps_the_floor(wider.evidence, replays, replayed) and _carries_over(
-                current.evidence, wider.evidence, s
-            )
-        except Runaway:
-            sound = False
-        if not sound:
+        replays = _sound_replays(bench, current, wider, replayed)
+        if not replays:
             # It resembles what is missing in these trials, but no mechanism could have it.
             dropped.add(chosen.winner)
             scores = {name: score for name, score in scores.items() if name != chosen.winner}
@@ -135,8 +129,8 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
         groups[chosen.winner] = chosen.alike
         steps.append(_step(current))
         progress(0.45 + 0.05 * len(steps), f"added {chosen.winner}, looking for more")
-        rest = [n for n in bench.names if n not in current.added and n not in dropped]
-        rest = [n for n in rest if n not in transient]
+        out = {*current.added, *dropped, *transient}
+        rest = [n for n in bench.names if n not in out]
         scores = bench.scores(current.recipe, current.evidence.p, rest)
     progress(0.8, "weighing each effect beside its rivals")
     rivals = {name: _rivals(first, name, groups.get(name, ()), s) for name in current.added}
@@ -165,6 +159,23 @@ def _rivals(first: Mapping[str, Score], name: str, alike: Sequence[str], s: Sett
     others = [n for n in first if n != name and first[n].gain[axis] > 0.0]
     others.sort(key=lambda n: -float(first[n].gain[axis]))
     return [*alike, *(n for n in others[: s.most_rivals] if n not in alike)]
+
+
+def _sound_replays(
+    bench: Bench, before: FittedSet, after: FittedSet, replayed: Sequence[Replicate]
+) -> list[Replicate]:
+    """Replays of a model with one effect more; none if no mechanism could have that effect.
+
+    The trials that the fit has not seen are asked first: replays cost more.
+    """
+    s = bench.settings
+    if not _carries_over(before.evidence, after.evidence, s):
+        return []
+    try:
+        replays = bench.replicas(after.recipe, after.evidence.p, s.rival_replicates, (), (3,))
+    except Runaway:
+        return []
+    return replays if _keeps_the_floor(after.evidence, replays, replayed) else []
 
 
 def _keeps_the_floor(

@@ -144,7 +144,7 @@ def _motion(
     lower, upper = limits if limits is not None else (-0.5, 0.5)
     middle, size = (lower + upper) / 2.0, (upper - lower) / 4.0
     q, qd, qdd = np.full_like(t, middle), np.zeros_like(t), np.zeros_like(t)
-    # Frequencies that no two axes share, so that axes can be told apart.
+    # Frequencies that no two axes share, so that axes can be distinguished.
     for order, frequency in enumerate((0.11, 0.37, 0.83)):
         w = 2.0 * np.pi * frequency * (1.0 + 0.13 * number)
         a, phase = size / (1.0 + 2.0 * order), 0.7 * number + order

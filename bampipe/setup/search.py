@@ -44,7 +44,7 @@ EXPLAINED = 0.6
 JUDGED_ERROR, RANKED_ERROR = 0.1, 0.01
 """Errors below these are alike: when a mistake is named, and when mistakes are ranked."""
 ALIKE = 1.5
-"""Difference of scores within which two mistakes cannot be told apart."""
+"""Difference of scores within which two mistakes cannot be distinguished."""
 LEAST_FACTOR, LEAST_TURN, LEAST_SHIFT = 1.5, 0.25, 0.3
 """A factor, an angle (rad) and a share of an axis' travel below which what is off is no mistake of
 set-up but an effect to be diagnosed."""

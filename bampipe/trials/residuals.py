@@ -222,11 +222,19 @@ class Evidence:
 
     def held_out_residual(self, trial: int) -> Array:
         """The residual of a trial with parameters that have not seen it, (K, n_q)."""
-        step = self.held_out_steps[trial]
-        if self.is_linear or not step.any():
-            return np.asarray(self.residual[trial] + self.jacobian[trial] @ step)
-        found, _ = self.unfiltered_at(trial, self.held_out_parameters(trial))
-        return self.band.thin(found) * self.used[trial]
+        if trial not in self._held_out:
+            step = self.held_out_steps[trial]
+            if self.is_linear or not step.any():
+                found = self.residual[trial] + self.jacobian[trial] @ step
+            else:
+                whole, _ = self.unfiltered_at(trial, self.held_out_parameters(trial))
+                found = self.band.thin(whole) * self.used[trial]
+            self._held_out[trial] = found
+        return self._held_out[trial]
+
+    @cached_property
+    def _held_out(self) -> dict[int, Array]:
+        return {}
 
     def held_out_parameters(self, trial: int) -> Array:
         """Those parameters, (n_p,)."""
