@@ -21,7 +21,7 @@ from bampipe.discover.influence import largest_second, largest_trial, score_with
 from bampipe.discover.settings import Settings
 from bampipe.discover.start import with_effect, without_effect
 from bampipe.physics.recipe import Recipe
-from bampipe.trials.residuals import Evidence
+from bampipe.trials.residuals import Evidence, residual_and_memory
 
 Array = NDArray[np.float64]
 
@@ -41,8 +41,28 @@ class FittedSet:
 
     @cached_property
     def error(self) -> Array:
-        """Cross-validated error among the fitted trials, by axis."""
-        return Scorer(self.evidence).before.error
+        """Cross-validated error among the fitted trials over `slope_by_force`, by axis.
+
+        What only makes both sides of the equation small, noise included, explains nothing.
+        """
+        return Scorer(self.evidence).before.error / self.slope_by_force
+
+    @cached_property
+    def slope_by_force(self) -> Array:
+        """Root mean square slope of the first trial's residual by its force, by axis, (n_q,)."""
+        evidence = self.evidence
+        system, motion = evidence.system, evidence.motions[0]
+        u = motion.inputs(system.inputs)
+        plain, _ = residual_and_memory(system, motion, u, evidence.p)
+        total = np.zeros(plain.shape[1])
+        for name in system.model.device.forces:
+            column = system.inputs.index(name)
+            step = 1e-3 * max(float(np.abs(u[:, column]).max()), 1e-9)
+            moved = u.copy()
+            moved[:, column] += step
+            changed, _ = residual_and_memory(system, motion, moved, evidence.p)
+            total += np.mean(np.square((changed - plain) / step), axis=0)
+        return np.asarray(np.sqrt(np.maximum(total, 1e-30)))
 
 
 def extend_set(bench: Bench, known: FittedSet, score: Score) -> FittedSet:

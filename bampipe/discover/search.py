@@ -22,7 +22,7 @@ from bampipe.physics.recipe import Recipe
 from bampipe.results.standing import AT_FLOOR, standing
 from bampipe.trials.folds import HELD_OUT
 from bampipe.trials.noise_floor import FLOOR_SEED, NoiseFloor
-from bampipe.trials.residuals import Evidence, residual_and_memory
+from bampipe.trials.residuals import Evidence
 
 Array = NDArray[np.float64]
 
@@ -169,7 +169,7 @@ def _sound_replays(
     The trials that the fit has not seen are asked first: replays cost more.
     """
     s = bench.settings
-    if not _carries_over(before.evidence, after.evidence, s):
+    if not _carries_over(before, after, s):
         return []
     try:
         replays = bench.replicas(after.recipe, after.evidence.p, s.rival_replicates, (), (3,))
@@ -195,36 +195,18 @@ def _keeps_the_floor(
     )
 
 
-def _carries_over(before: Evidence, after: Evidence, s: Settings) -> bool:
+def _carries_over(before: FittedSet, after: FittedSet, s: Settings) -> bool:
     """Whether some axis errs less, by what is worth it, on trials that the fit has not seen at all.
 
     They choose no effect, but one that does nothing for them is none. The worst second of each does
     not count.
     """
-    # What only makes both sides of the equation small, noise included, explains nothing.
-    weaker = np.log(_slope_by_force(after) / _slope_by_force(before))
-    axes = range(len(before.held_out_rmse))
-    return any(
-        np.log(error_without_second(before, i)[1] / error_without_second(after, i)[1]) + weaker[i]
-        > s.worth
-        for i in axes
-    )
 
+    def error(known: FittedSet, axis: int) -> float:
+        return float(error_without_second(known.evidence, axis)[1] / known.slope_by_force[axis])
 
-def _slope_by_force(evidence: Evidence) -> Array:
-    """Root mean square change of the residual of the first trial by its force, by axis, (n_q,)."""
-    system, motion = evidence.system, evidence.motions[0]
-    u = motion.inputs(system.inputs)
-    plain, _ = residual_and_memory(system, motion, u, evidence.p)
-    total = np.zeros(plain.shape[1])
-    for name in system.model.device.forces:
-        column = system.inputs.index(name)
-        step = 1e-3 * max(float(np.abs(u[:, column]).max()), 1e-9)
-        moved = u.copy()
-        moved[:, column] += step
-        changed, _ = residual_and_memory(system, motion, moved, evidence.p)
-        total += np.mean(np.square((changed - plain) / step), axis=0)
-    return np.asarray(np.sqrt(np.maximum(total, 1e-30)))
+    axes = range(len(before.error))
+    return any(np.log(error(before, i) / error(after, i)) > s.worth for i in axes)
 
 
 def _weigh(
