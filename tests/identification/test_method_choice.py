@@ -35,7 +35,9 @@ def test_a_damper_whose_motion_the_filter_loses_is_identified(tmp_path):
     assert lost["held_out_rmse"]["piston"] > 5.0 * judged["axes"]["piston"]["held_out_rmse"]
     assert "viscous_gain" in lost["disagrees"]
     assert found["notes"][0].startswith("Published by least squares, not by the unscented filter: ")
-    assert any("replay of the model does not resemble the machine" in n for n in found["notes"])
+    # A bench prescribes the motion and is replayed with it: the bias of filtering is small.
+    gain = found["parameters"]["viscous_gain"]
+    assert abs(gain["least_squares_bias"]) < 0.02 * gain["estimate"]
 
 
 @pytest.mark.parametrize(("machine", "seed"), [("axis", 503), ("joint", 502)])
