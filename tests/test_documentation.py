@@ -10,7 +10,6 @@ from test_imports import LAWS
 
 from bampipe.physics import Model, compile_model, registry
 from bampipe.physics.expression import FUNCTIONS
-from bampipe.physics.readable import describe_equations
 from bampipe.physics.units import check_device, check_effect
 
 ROOT = Path(__file__).parent.parent
@@ -32,14 +31,9 @@ def test_example_effect_is_consistent_and_compiles_on_every_axis():
         assert f"snag.{axis}.drag" in [p.name for p in system.parameters]
 
 
-def test_example_device_is_consistent_and_has_the_equations_shown():
+def test_example_device_is_consistent_and_has_effects():
     device = registry.device_from(tomllib.loads(blocks("devices.md")[0]), "rail.toml")
     assert check_device(device) == []
-    text = (ROOT / "docs/devices.md").read_text(encoding="utf-8")
-    shown = re.findall(r"^ {6}([xMhQ]\S* = .*)$", text, re.M)
-    assert len(shown) == 4
-    derived = [line.strip() for line in describe_equations(device).splitlines()]
-    assert all(line in derived for line in shown)
     for name in ("stribeck:position", "force_bias:x", "inertia_mismatch:position"):
         Model(device, (name,))
 

@@ -40,7 +40,8 @@ def run_session(
         session: folder of the session.
         runs: folder that holds the run folders.
         pipeline: name of a pipeline, or a file of your own.
-        first, last: stages to start from and to stop after; all where empty.
+        first: stage to start from; the first one where empty.
+        last: stage to stop after; the last one where empty.
         force: run even what did not change.
         settings: by stage, then by name: ``{"identify": {"method": "least-squares"}}``.
 

@@ -92,7 +92,7 @@ def show_one(text: str, device_name: str, json: bool) -> None:
     for line in effect.formulas:
         show.say(f"  {line}")
     show.say("")
-    rows = list(_parameter_rows(effect))
+    rows = list(parameter_rows(effect))
     head = ["parameter", "axis", "unit", "prior", "sd", "lower", "upper", "typical", ""]
     used = [
         column
@@ -121,7 +121,7 @@ def show_one(text: str, device_name: str, json: bool) -> None:
         show.say(line)
 
 
-def _parameter_rows(effect: Effect) -> Iterator[list[object]]:
+def parameter_rows(effect: Effect) -> Iterator[list[object]]:
     """Name, kind of axis, unit, numbers and description of each parameter."""
     from bampipe.physics.effect import ParameterByKind
 

@@ -90,12 +90,16 @@ class Pipeline(Declaration):
     """What ``bampipe run`` does."""
 
     schema_: Literal["bampipe.pipeline/1"] = Field(alias="schema")
-    name: Annotated[str, StringConstraints(pattern="^[A-Za-z0-9_-]+$")]
+    name: Annotated[str, StringConstraints(pattern="^[A-Za-z0-9_-]+$")] = Field(
+        description="Letters, digits, '_' and '-'"
+    )
     summary: str = Field(default="", description="What the pipeline is for, in one sentence")
     stages: Annotated[Several[StageName], AfterValidator(_in_order), Field(min_length=1)] = Field(
         description="The stages, in order"
     )
-    model: BaseModelTable = BaseModelTable()
+    model: BaseModelTable = Field(
+        default=BaseModelTable(), description="The base model, where it is not the bare device"
+    )
     settings: dict[StageName, dict[str, Any]] = Field(
         {}, description="By stage: fields of its configuration, in place of the defaults"
     )

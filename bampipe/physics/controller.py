@@ -18,7 +18,7 @@ from bampipe.schema import Declaration
 class Integral(Declaration):
     """One state of a controller, such as the integral of its error; kept within its limits."""
 
-    unit: str
+    unit: str = Field(description="Coherent SI")
     rate: Expression = Field(
         description="Its rate of change, of what a command may use; its unit per second"
     )

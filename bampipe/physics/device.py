@@ -73,7 +73,7 @@ class Constant(Declaration):
     unit: str = Field(default="", description="Coherent SI; empty for a pure number")
     source: str = Field(default="", description="Where it comes from")
     sd: NotNegative | None = Field(default=None, description="Its standard uncertainty")
-    description: str = ""
+    description: str = Field(default="", description="What it is, in a few words")
 
 
 class Energy(Declaration):
@@ -119,23 +119,23 @@ class Inputs(Declaration):
 class ProcessNoise(Declaration):
     """Further process noise of the filter."""
 
-    unit: str = ""
+    unit: str = Field(default="", description="Coherent SI, of the noise")
     torque: dict[Name, Expression] = Field(description="Per coordinate: gain of the noise")
-    description: str = ""
+    description: str = Field(default="", description="What it is, in a few words")
 
 
 class Friction(Declaration):
     """Friction along one coordinate."""
 
-    viscous: Parameter
-    coulomb: Parameter
+    viscous: Parameter = Field(description="Force by velocity")
+    coulomb: Parameter = Field(description="Force of sliding, whatever the velocity")
 
 
 class Limits(Declaration):
     """Range of one coordinate."""
 
-    lower: PhysicalNumber
-    upper: PhysicalNumber
+    lower: PhysicalNumber = Field(description="Least position, rad or m")
+    upper: PhysicalNumber = Field(description="Largest position, rad or m")
 
     def cross_faults(self) -> Iterator[InputError]:
         if not self.lower < self.upper:

@@ -42,9 +42,9 @@ EACH = "each"
 class ParameterByKind(Declaration):
     """A parameter whose unit and prior depend on the kind of axis."""
 
-    rotary: Parameter | None = None
-    linear: Parameter | None = None
-    description: str = ""
+    rotary: Parameter | None = Field(default=None, description="On a rotary axis")
+    linear: Parameter | None = Field(default=None, description="On a linear axis")
+    description: str = Field(default="", description="What it is, in a few words")
 
 
 def _shape_of_parameter(entry: object) -> str:
@@ -70,7 +70,7 @@ Expressions = Annotated[
 class Unit(Declaration):
     """The unit of a state on one kind of axis."""
 
-    unit: str
+    unit: str = Field(description="Coherent SI")
 
 
 class State(NamedDeclaration):
@@ -82,10 +82,10 @@ class State(NamedDeclaration):
         validate_default=True,
         description="Value at the start of a trial; 0 where left out",
     )
-    unit: str = ""
-    rotary: Unit | None = None
-    linear: Unit | None = None
-    description: str = ""
+    unit: str = Field(default="", description="Coherent SI, where it is the same on every axis")
+    rotary: Unit | None = Field(default=None, description="On a rotary axis")
+    linear: Unit | None = Field(default=None, description="On a linear axis")
+    description: str = Field(default="", description="What it is, in a few words")
 
     def unit_on(self, kind: str) -> str:
         """Unit of the state on a ``kind`` of axis; of an effect of no axis where empty."""
@@ -155,8 +155,12 @@ class Effect(Declaration):
         default="", description="What to do on the machine about it, in one sentence"
     )
     source: Text = Field(description="Literature, with year")
-    parameters: dict[Name, EffectParameter] = Field(min_length=1)
-    states: Annotated[tuple[State, ...], ByName(Name)] = ()
+    parameters: dict[Name, EffectParameter] = Field(
+        min_length=1, description="Its numbers, by name; each the same for all axes, or by kind"
+    )
+    states: Annotated[tuple[State, ...], ByName(Name)] = Field(
+        default=(), description="Internal states, by name, where it has memory"
+    )
     _declaration: Mapping[str, Any] = PrivateAttr({})
 
     @property

@@ -53,7 +53,7 @@ class Parameter(NamedDeclaration):
         default=None,
         description="For a position on the axis: the part of the travel where the diagnosis looks",
     )
-    description: str = ""
+    description: str = Field(default="", description="What it is, in a few words")
 
     def cross_faults(self) -> Iterator[InputError]:
         if not self.lower <= self.prior <= self.upper:

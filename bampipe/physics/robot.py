@@ -49,7 +49,7 @@ _TRIANGLE = 1e-6
 class Joint(NamedDeclaration):
     """A joint and the body behind it."""
 
-    kind: Literal["revolute", "prismatic"]
+    kind: Literal["revolute", "prismatic"] = Field(description="Turns about z, or slides along it")
     after: str = Field(default="", description="The joint before it; empty: the base")
     position: Triple = Field(
         default=(0.0, 0.0, 0.0), description="Of the joint in the frame of the link before, m"
@@ -117,7 +117,9 @@ class Row(NamedDeclaration):
     a: Number = Field(default=0.0, description="Along its own x, m")
     alpha: Number = Field(default=0.0, description="About its own x, rad")
     offset: Number = Field(default=0.0, description="Angle about z where the position is 0, rad")
-    kind: Literal["revolute", "prismatic"] = "revolute"
+    kind: Literal["revolute", "prismatic"] = Field(
+        default="revolute", description="Turns about z of the row before, or slides along it"
+    )
     mass: Number = Field(default=0.0, description="Of the body behind it, kg")
     center: Triple = Field(default=(0.0, 0.0, 0.0), description="In the frame of this row, m")
     inertia: Annotated[Several[Number], Field(min_length=6, max_length=6)] = Field(

@@ -23,7 +23,9 @@ class Dialect(Declaration):
         default="", description="What stands between columns; a blank: any number of them"
     )
     decimal: Literal["", ".", ","] = Field(default="", description="Decimal sign")
-    encoding: Literal["", "utf-8", "utf-16", "latin-1", "cp1252"] = ""
+    encoding: Literal["", "utf-8", "utf-16", "latin-1", "cp1252"] = Field(
+        default="", description="Of the characters"
+    )
     names: Distinct[Text] = Field(
         default=(), description="Names of the columns, for files without a header"
     )

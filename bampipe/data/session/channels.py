@@ -48,7 +48,7 @@ ChannelName = Annotated[
 ]
 Column = Annotated[Text, Field(description="A column (or MATLAB variable) of the trial files")]
 Uncertainty = Annotated[float, Field(ge=0, lt=1)]
-Columns = Annotated[Distinct[Column], Field(min_length=1)]
+Columns = Annotated[Distinct[Column], Field(min_length=1, description="Columns of the trial files")]
 
 
 def _unit(text: str) -> units.RecordedUnit:
@@ -102,7 +102,7 @@ class Velocity(Declaration):
     """A recorded velocity of one axis, for checking its position: SI value = raw * scale."""
 
     column: Column
-    unit: str
+    unit: str = Field(description="A unit of velocity, such as rad/s or mm/s")
 
     @property
     def scale(self) -> float:
@@ -232,12 +232,14 @@ class Force(Declaration):
         "V", "N", "N.m", "mN", "kN", "mN.m", "N.cm", "N.mm", "kN.m", "kgf", "lbf", "lbf.in",
         "lbf.ft",
     ] = Field(alias="unit", description="Of the columns; only V needs a calibration")  # fmt: skip
-    frame: str = ""
+    frame: str = Field(default="", description="In which the components are given: free text")
     calibration_n_per_v: (
         Annotated[Several[Annotated[Several[Number], Field(min_length=1)]], Field(min_length=1)]
         | None
-    ) = None
-    zero_v: Several[Number] | None = None
+    ) = Field(default=None, description="One row a component, one number a column")
+    zero_v: Several[Number] | None = Field(
+        default=None, description="Reading of each column without load"
+    )
     gain_sd: Uncertainty = Field(
         default=0.0,
         description="Standard uncertainty of each component's gain, as a share: 0.01 for 1 %",
@@ -397,9 +399,13 @@ class Channel(NamedDeclaration):
     """Any other recorded input: scale * raw + offset, in the unit given, which becomes SI."""
 
     column: Column
-    stated_unit: str = Field(alias="unit")
-    stated_scale: Number = Field(default=1.0, alias="scale")
-    stated_offset: Number = Field(default=0.0, alias="offset")
+    stated_unit: str = Field(alias="unit", description="Of the scaled value; results are in SI")
+    stated_scale: Number = Field(
+        default=1.0, alias="scale", description="What a raw reading is multiplied by"
+    )
+    stated_offset: Number = Field(
+        default=0.0, alias="offset", description="What is then added, in the unit"
+    )
     scale_sd: Uncertainty = Field(
         default=0.0, description="Standard uncertainty of its scale, as a share: 0.01 for 1 %"
     )
@@ -408,7 +414,9 @@ class Channel(NamedDeclaration):
         description="The column is a register of so many bits; with signed = true its upper half"
         " stands for negative numbers (two's complement)",
     )
-    signed: bool = False
+    signed: bool = Field(
+        default=False, description="Whether a register of wrap_bits holds negative numbers"
+    )
 
     @property
     def _raw(self) -> units.RecordedUnit:

@@ -70,7 +70,9 @@ class TrialEntry(NamedDeclaration):
     file: Annotated[Text, AfterValidator(checked_by(_inside))] = Field(
         description="Path relative to the session folder"
     )
-    kind: Literal["free", "locked", "viscous"]
+    kind: Literal["free", "locked", "viscous"] = Field(
+        description="free: moved at will; locked: a brake holds one axis; viscous: in a field"
+    )
     locked_axis: ChannelName | None = Field(
         default=None, description="The locked axis, of a locked trial"
     )
@@ -168,12 +170,16 @@ class Session(Declaration):
     encoders: Annotated[tuple[Encoder, ...], ByName(ChannelName, least=1)] = Field(
         description="One entry an axis"
     )
-    force: Force | None = None
-    brake_table: BrakeTable | None = Field(default=None, alias="brakes")
+    force: Force | None = Field(default=None, description="Force sensor, or force of the motors")
+    brake_table: BrakeTable | None = Field(
+        default=None, alias="brakes", description="Commanded braking"
+    )
     channels: Annotated[tuple[Channel, ...], ByName(ChannelName)] = Field(
         default=(), description="Any other recorded input"
     )
-    trials: Annotated[Several[TrialEntry], Field(min_length=1), AfterValidator(_with_ids)]
+    trials: Annotated[Several[TrialEntry], Field(min_length=1), AfterValidator(_with_ids)] = Field(
+        description="One entry a trial"
+    )
     _root: Path = PrivateAttr(Path())
 
     @property
