@@ -10,6 +10,7 @@ from bampipe.physics.device import Device
 from bampipe.physics.effect import Effect
 from bampipe.results.compare import CompareResult
 from bampipe.results.diagnose import DiagnoseResult
+from bampipe.results.draft import DraftResult
 from bampipe.results.filter import FilterResult
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.ingest import IngestResult
@@ -34,6 +35,7 @@ FILES: dict[str, type[Declaration]] = {
     "session": Session,
     "compare": CompareResult,
     "diagnose": DiagnoseResult,
+    "draft": DraftResult,
     "filter": FilterResult,
     "identify": IdentifyResult,
     "ingest": IngestResult,

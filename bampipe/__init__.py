@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from bampipe.api.actions import (
         compare,
         diagnose,
+        draft,
         extend,
         filter,
         follow,
@@ -43,6 +44,7 @@ __all__ = [
     "Run",
     "compare",
     "diagnose",
+    "draft",
     "extend",
     "filter",
     "follow",

@@ -35,6 +35,7 @@ COMMANDS = [
     "performance",
     "validate",
     "diagnose",
+    "draft",
     "extend",
     "compare",
     "report",

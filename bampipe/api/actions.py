@@ -102,6 +102,12 @@ def diagnose(run: Run | Path_, model: str = "", **settings: object) -> dict[str,
     return _stage(run, "diagnose", chosen, settings).diagnosis(chosen)
 
 
+def draft(run: Run | Path_, model: str = "", **settings: object) -> dict[str, Any]:
+    """Draft a formula for what no effect explains; returns `Run.drafts`."""
+    chosen = model or _opened(run).model
+    return _stage(run, "draft", chosen, settings).drafts(chosen)
+
+
 def compare(run: Run | Path_, **settings: object) -> pd.DataFrame:
     """Put the models beside one another; returns `Run.ladder`."""
     return _stage(run, "compare", "", settings).ladder

@@ -95,8 +95,27 @@ def _split_effect_file(text: str) -> tuple[Path, str] | None:
     return (Path(name), target) if name.endswith(".toml") else None
 
 
-def _named(text: str) -> tuple[str, Path | None]:
-    """Return the effect ``name[:target]`` and the file it comes from, if it is a lab's own."""
+def drafts_of(root: Path, model: str) -> dict[str, Path]:
+    """Files of the effects drafted for ``model``, by ``name[:target]``."""
+    from bampipe.results.draft import DraftResult
+
+    run = RunFolder(root)
+    if not run.exists(DraftResult.file(model)):
+        return {}
+    effects = run.read(DraftResult, model).effects
+    return {name: run.path(effect.file) for name, effect in effects.items()}
+
+
+def _named(text: str, drafts: Mapping[str, Path]) -> tuple[str, Path | None]:
+    """Return the effect ``name[:target]`` and the file it comes from, if it is not built in.
+
+    Args:
+        text: ``name[:target]``, or ``file.toml[:target]``.
+        drafts: of the model that is extended; their target may be left out.
+    """
+    for name, file in drafts.items():
+        if text in (name, name.partition(":")[0]):
+            return name, file
     effect_file = _split_effect_file(text)
     if effect_file is None:
         return text, None
@@ -114,7 +133,8 @@ def extend(options: LoopOptions, parent: str, effects: Sequence[str]) -> str:
     Args:
         options: run folder, settings, listener.
         parent: name of a model of this run.
-        effects: each ``name[:target]``, or ``file.toml[:target]`` for a lab's own.
+        effects: each ``name[:target]`` of the library or of a draft for the parent, or
+            ``file.toml[:target]`` for a lab's own.
 
     Returns:
         The name of the child.
@@ -124,7 +144,8 @@ def extend(options: LoopOptions, parent: str, effects: Sequence[str]) -> str:
             has already; nothing is left behind.
     """
     root = options.root
-    named = dict(_named(effect) for effect in effects)
+    drafts = drafts_of(root, parent)
+    named = dict(_named(effect, drafts) for effect in effects)
     child = models.child_name(parent, tuple(named))
     for name in named:
         if "/" in name or not is_normal(child):
@@ -186,16 +207,20 @@ def _write_child(root: Path, parent: str, named: Mapping[str, Path | None]) -> N
     load_model(RunFolder(root), child)
 
 
-def follow(options: LoopOptions, model: str, tell: Callable[[str], None]) -> str:
+def follow(
+    options: LoopOptions, model: str, tell: Callable[[str], None], draft: bool = False
+) -> str:
     """Diagnose, add all that was found at once, and confirm it by one more diagnosis.
 
     An effect that the identified model gives no strength is left out again. What the confirmation
-    finds beyond the set is added likewise, until it finds nothing more.
+    finds beyond the set is added likewise, until it finds nothing more; then what is drafted for
+    the rest, where that is asked for.
 
     Args:
         options: run folder, settings, listener.
         model: name of the model to start from.
         tell: called with a line on each thing found and done.
+        draft: whether to draft a formula where the diagnosis finds no name.
 
     Returns:
         The name of the last model that is better than its parent.
@@ -206,9 +231,12 @@ def follow(options: LoopOptions, model: str, tell: Callable[[str], None]) -> str
         diagnosis = _diagnosis(options.root, model)
         for axis, entry in sorted(diagnosis.axes.items()):
             tell(f"{model}, {axis}: {entry.verdict.replace('_', ' ')}")
-        if not diagnosis.selected:
+        found = diagnosis.selected
+        if not found and draft and diagnosis.unnamed_axes:
+            found = _drafted(options, model, tell)
+        if not found:
             break
-        child = _add(options, model, diagnosis.selected, tell)
+        child = _add(options, model, found, tell)
         if not child:
             break
         model = child
@@ -216,6 +244,16 @@ def follow(options: LoopOptions, model: str, tell: Callable[[str], None]) -> str
         tell(f"stopped after {MOST_ROUNDS} rounds")
     options.run("compare", "compare", "")
     return model
+
+
+def _drafted(options: LoopOptions, model: str, tell: Callable[[str], None]) -> tuple[str, ...]:
+    """Draft formulas for what ``model`` leaves; return the names of their effects."""
+    from bampipe.results.draft import DraftResult
+
+    options.run("draft", "draft", model)
+    found = RunFolder(options.root).read(DraftResult, model)
+    tell(found.sentence)
+    return found.selected
 
 
 def _add(

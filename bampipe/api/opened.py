@@ -15,6 +15,7 @@ from bampipe.files import refuse_links
 from bampipe.report.results import Results
 from bampipe.results.compare import CompareResult
 from bampipe.results.diagnose import DiagnoseResult
+from bampipe.results.draft import DraftResult
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.record import Record, Result
 from bampipe.results.stiffness import StiffnessResult
@@ -139,6 +140,10 @@ class Run:
     def diagnosis(self, model: str = "") -> dict[str, Any]:
         """What the model lacks: verdict of each axis, ranking, residual maps, advice."""
         return self._read(DiagnoseResult, model).model_dump(mode="json")
+
+    def drafts(self, model: str = "") -> dict[str, Any]:
+        """Formulas drafted for what no effect explains: curves, constants, chance level."""
+        return self._read(DraftResult, model).model_dump(mode="json")
 
     def ranking(self, model: str = "") -> pd.DataFrame:
         """The candidate effects, best first: error before and after, chance level."""

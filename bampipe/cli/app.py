@@ -103,6 +103,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "performance": stages.performance,
     "validate": stages.validate,
     "diagnose": loop.diagnose,
+    "draft": loop.draft,
     "extend": loop.extend,
     "compare": stages.compare,
     "report": stages.report,

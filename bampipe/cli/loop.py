@@ -1,4 +1,4 @@
-"""``bampipe diagnose``, ``bampipe extend`` and ``bampipe demo``: the loop as commands."""
+"""``bampipe diagnose``, ``draft``, ``extend`` and ``demo``: the loop as commands."""
 
 from __future__ import annotations
 
@@ -49,6 +49,30 @@ def diagnose(
     advise(options.quiet, options.json, after.replace("RUN", places.next_to(root, options.runs)))
 
 
+@with_stage_options
+def draft(
+    run: RunArgument = None,
+    model: Annotated[
+        str, typer.Option(help="Model to draft for; the best confirmed one if omitted.")
+    ] = "",
+    options: StageOptions = DEFAULTS,
+) -> None:
+    """Draft a formula for what no effect explains, as an effect file, with its chance level.
+
+    Example: bampipe draft 2026-10-03_s01
+    """
+    if options.list_settings:
+        print_settings("draft")
+        return
+    from bampipe.results.draft import DraftResult
+
+    root = places.find_run(run, options.runs)
+    chosen = model or models.counting_model(root)
+    one_stage("draft", root, options, model=chosen)
+    after = RunFolder(root).read(DraftResult, chosen).next
+    advise(options.quiet, options.json, after.replace("RUN", places.next_to(root, options.runs)))
+
+
 def extend(
     first: Annotated[
         str | None,
@@ -57,7 +81,8 @@ def extend(
     others: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="EFFECT...", help="Effects to add, name[:target], or effect files[:target]."
+            metavar="EFFECT...",
+            help="Effects to add, name[:target], built in or drafted; or effect files[:target].",
         ),
     ] = None,
     auto: Annotated[
@@ -65,6 +90,10 @@ def extend(
         typer.Option(
             "--auto", help="Add what the diagnosis finds, and confirm, until it says stop."
         ),
+    ] = False,
+    draft: Annotated[
+        bool,
+        typer.Option("--draft", help="With --auto: draft a formula where no effect has a name."),
     ] = False,
     model: Annotated[
         str, typer.Option(help="Model to extend; the best confirmed one if omitted.")
@@ -81,13 +110,15 @@ def extend(
 
     Example: bampipe extend 2026-10-03_s01 effects/snag.toml:yaw
 
-    Example: bampipe extend 2026-10-03_s01 --auto
+    Example: bampipe extend 2026-10-03_s01 --auto --draft
     """
     from bampipe.api import loop
     from bampipe.results.compare import CompareResult
 
     batch.limit_threads(1)
     effects = others or []
+    if draft and not auto:
+        raise InputError("--draft goes with --auto", remedy="or use `bampipe draft RUN`")
     if auto and effects:
         raise InputError("--auto chooses the effects itself", remedy=f"leave out {effects[0]!r}")
     if (
@@ -105,7 +136,8 @@ def extend(
     with show.Watcher(quiet or json) as watcher:
         options = loop.LoopOptions(root, pipeline, force, not no_wait, watcher)
         if auto:
-            last = loop.follow(options, parent, lambda line: None if json else show.say(line))
+            tell = (lambda line: None) if json else show.say
+            last = loop.follow(options, parent, tell, draft)
         else:
             last = loop.extend(options, parent, effects)
     ladder = RunFolder(root).read(CompareResult).model_dump(mode="json")

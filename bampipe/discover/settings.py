@@ -49,6 +49,10 @@ class Settings:
         ripple_share: least share of that which a sine carries to be called a ripple.
         direction_likeness: correlation of the residual in both directions from which on it is
             called the same, as of a spring, or opposite, as of friction.
+        draft_replicates: replays on which a formula is searched as on the measurement, twice as
+            many more where the decision is close; draft_significance: chance of a formula where
+            nothing is missing.
+        draft_worth: least drop of log error on held-out trials for each constant of a formula.
         jobs: worker processes.
         seed: of all noise.
     """
@@ -81,5 +85,8 @@ class Settings:
     variable_share: float = 0.2
     ripple_share: float = 0.5
     direction_likeness: float = 0.6
+    draft_replicates: int = 6
+    draft_significance: float = 0.05
+    draft_worth: float = 0.03
     jobs: int = 2
     seed: int = 0

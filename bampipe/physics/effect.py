@@ -237,7 +237,7 @@ class Effect(Declaration):
             return tuple(
                 c.name
                 for c in device.coordinates
-                if not (self.robot is not None and self._lacks(c.kind))
+                if not self._lacks(c.kind)
                 and ("brake" not in used or c.name in device.brakes)
                 and ("dry" not in used or device.has_dry_friction(c.name))
             )
@@ -283,7 +283,7 @@ class Effect(Declaration):
         return set().union(*map(expression.names, trees))
 
     def _lacks(self, kind: str) -> bool:
-        """Whether a parameter has no entry for this kind of axis: robots have joints of both."""
+        """Whether a parameter has no entry for this kind of axis."""
         return any(getattr(entry, kind, entry) is None for entry in self.parameters.values())
 
     def _fits(self, device: Device) -> bool:

@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field
 
 from bampipe.results.record import Names, Record, Result, Share, Size
-from bampipe.results.standing import Standing
+from bampipe.results.standing import FLOOR_WRONG, Standing
 from bampipe.results.terms import EffectText
 from bampipe.schema import Count
 
@@ -171,3 +171,15 @@ class DiagnoseResult(Result):
     suggested_trial: SuggestedTrial | None
     maps: dict[str, dict[str, ResidualMap]] = Field(description="By axis, then variable")
     worst_windows: tuple[WorstWindow, ...]
+
+    @property
+    def unnamed_axes(self) -> Names:
+        """Axes that lack something for which no effect of the library was found."""
+        return tuple(
+            axis
+            for axis, entry in self.axes.items()
+            if entry.remains
+            and not entry.effects
+            and entry.verdict in ("unknown_effect", "undecided")
+            and entry.standing not in FLOOR_WRONG
+        )

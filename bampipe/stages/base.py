@@ -58,6 +58,7 @@ STAGES: tuple[str, ...] = (
     "performance",
     "validate",
     "diagnose",
+    "draft",
     "compare",
     "report",
 )
@@ -72,6 +73,7 @@ PER_MODEL: tuple[str, ...] = (
     "performance",
     "validate",
     "diagnose",
+    "draft",
 )
 """Stages whose ``Config`` has a field ``model``: they run once for each model."""
 

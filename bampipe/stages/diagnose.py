@@ -319,10 +319,7 @@ def _next(found: Diagnosis, model: str) -> str:
         )
     unknown = [axis for axis, a in by_axis.items() if a.verdict == "unknown_effect"]
     if unknown:
-        return (
-            f"look at the residual maps of {', '.join(unknown)} with `bampipe report RUN`, write "
-            "an effect file of that shape, and add it with `bampipe extend RUN FILE`"
-        )
+        return f"bampipe draft RUN --model {model}"
     undecided = [axis for axis, a in by_axis.items() if a.verdict == "undecided" and a.odds]
     if undecided:
         return (

@@ -1,0 +1,84 @@
+"""A drafted term as the text of an effect file: what a person renames, edits and keeps."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from bampipe.discover.drafts.forms import rounded
+from bampipe.discover.drafts.search import Term
+
+_PLACE_IN_WIDTHS = 2.0
+_PLACE_IN_SPANS = 0.1
+_LENGTH_RATIO = 3.0
+_WAVES = 0.5
+"""How far around what was found a later fit looks for a place (in widths of the shape, or in spans
+where it has none), a length (as a ratio) and a wavenumber (in waves on the range)."""
+
+
+def declare(term: Term, source: str) -> dict[str, Any]:
+    """The declaration of a term with what was found in it.
+
+    Strengths keep the prior 0, where the effect is absent, and get the value found as the typical
+    one; what shapes the effect starts from the value found.
+    """
+    entries = {}
+    for name, entry in term.form.entries().items():
+        entries[name] = dict(entry)
+        if name in term.values:
+            interval = f"{term.values[name]:.4g} ± {1.96 * term.sd[name]:.2g} {entry['unit']}"
+            entries[name]["description"] += f"; drafted as {interval}".rstrip()
+            entries[name] |= _numbers(term, name, entry)
+    return term.form.declaration(source, term.name, entries)
+
+
+def _numbers(term: Term, name: str, entry: Mapping[str, Any]) -> dict[str, float]:
+    """Prior, spread, bounds and typical value of one constant."""
+    value, span = term.values[name], term.form.span
+    kind = term.form.shape.searched.get(name)
+    if kind is None:
+        size = max(2.0 * abs(value), 1e-6)
+        return {"sd": rounded(size), "typical": rounded(value)}
+    low, high = entry["lower"], entry["upper"]
+    if kind == "place":
+        width = term.values.get("width")
+        reach = _PLACE_IN_SPANS * span.width if width is None else _PLACE_IN_WIDTHS * width
+        low, high = value - reach, value + reach
+    elif kind == "length":
+        low, high = value / _LENGTH_RATIO, value * _LENGTH_RATIO
+    else:
+        reach = 2.0 * np.pi * _WAVES / span.width
+        low, high = max(value - reach, 0.5 * value), value + reach
+    return {
+        "prior": rounded(value),
+        "sd": rounded(0.25 * (high - low)),
+        "lower": rounded(low),
+        "upper": rounded(high),
+        "typical": rounded(value),
+    }
+
+
+def write_toml(declaration: Mapping[str, Any]) -> str:
+    """The text of an effect file."""
+    plain = {k: v for k, v in declaration.items() if not isinstance(v, Mapping)}
+    lines = [f"{key} = {_value(value)}" for key, value in plain.items()]
+    if isinstance(declaration.get("torque"), Mapping):
+        lines += ["", "[torque]"]
+        lines += [f"{key} = {_value(value)}" for key, value in declaration["torque"].items()]
+    for name, entry in declaration["parameters"].items():
+        lines += ["", f"[parameters.{name}]"]
+        lines += [f"{key} = {_value(value)}" for key, value in entry.items()]
+    return "\n".join(lines) + "\n"
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return "{ " + ", ".join(f"{k} = {_value(v)}" for k, v in value.items()) + " }"
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False)
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    return repr(float(value))

@@ -1,0 +1,409 @@
+"""What a draft may say: a factor times a shape of one coordinate, each constant with its unit.
+
+A form is a few words of a grammar, and an effect file like any other once its numbers are found.
+Arguments of functions are ratios, so that every strength is a force or torque.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.physics.device import Coordinate as Axis
+from bampipe.physics.device import Device
+
+Array = NDArray[np.float64]
+
+FORCE: Final = "force"
+FRICTION: Final = "friction"
+DAMPING: Final = "damping"
+INERTIA: Final = "inertia"
+Factor = Literal["force", "friction", "damping", "inertia"]
+FACTORS: Mapping[Factor, str] = {
+    FORCE: "{shape}",
+    FRICTION: "({shape})*sgn({rate})",
+    DAMPING: "({shape})*{rate}/top_speed",
+    INERTIA: "({shape})*{rate}**2/(2*top_acceleration)",
+}
+_NEAR = 2
+"""Axes whose motion may matter, in the order of the coordinates; see `effect.pairs`."""
+
+
+@dataclass(frozen=True)
+class Coordinate:
+    """A quantity that a residual may follow.
+
+    Attributes:
+        words: what it is, such as ``position``, ``speed of extension``.
+        name: the same as part of a name.
+        text: in an expression of an effect.
+        quantity: of the motion: ``position``, ``speed``, ``velocity``, ``load``, ``time``.
+        axis: number of the coordinate that it is of.
+        unit: SI.
+    """
+
+    words: str
+    name: str
+    text: str
+    quantity: str
+    axis: int
+    unit: str
+
+
+@dataclass(frozen=True)
+class Span:
+    """The range of a coordinate in the trials."""
+
+    low: float
+    high: float
+
+    @property
+    def width(self) -> float:
+        """From end to end."""
+        return self.high - self.low
+
+    @property
+    def middle(self) -> float:
+        """Half-way."""
+        return 0.5 * (self.low + self.high)
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A function of one coordinate ``x``, linear in its strengths.
+
+    Attributes:
+        name, text: as in names and in expressions, where ``x`` stands for the coordinate.
+        strengths: what it is linear in, each with what it means.
+        searched: constants that shape it, each with its kind: ``place``, ``length``,
+            ``wavenumber``.
+        fixed: constants that scale it and are not estimated: ``middle``, ``reach`` of the span.
+        columns: value by strength: of x (T, 1), the searched constants (G,) and the fixed ones,
+            each (T, G).
+        words: what it does, of ``{x}``.
+    """
+
+    name: str
+    text: str
+    strengths: Mapping[str, str]
+    searched: Mapping[str, str]
+    fixed: tuple[str, ...]
+    columns: Callable[..., tuple[Array, ...]]
+    words: str
+
+
+def _ratio(x: Array, c: Mapping[str, Any]) -> Array:
+    return np.asarray((x - c["middle"]) / c["reach"])
+
+
+def _away(x: Array, c: Mapping[str, Any]) -> Array:
+    return np.asarray((x - c["place"]) / c["width"])
+
+
+_AT_END = "what it comes to at the end of the range"
+_U = "((x - middle)/reach)"
+_V = "((x - place)/width)"
+SHAPES = {
+    shape.name: shape
+    for shape in (
+        Shape(
+            "slope", f"height*{_U}", {"height": _AT_END}, {}, ("middle", "reach"),
+            lambda x, c: (_ratio(x, c),), "changes in proportion to {x}",
+        ),
+        Shape(
+            "parabola", f"slope*{_U} + bow*{_U}**2",
+            {"slope": "its linear part at the end of the range",
+             "bow": "its quadratic part there"}, {}, ("middle", "reach"),
+            lambda x, c: (_ratio(x, c), _ratio(x, c) ** 2), "follows a parabola in {x}",
+        ),
+        Shape(
+            "cubic", f"slope*{_U} + bow*{_U}**2 + twist*{_U}**3",
+            {"slope": "its linear part at the end of the range",
+             "bow": "its quadratic part there", "twist": "its cubic part there"},
+            {}, ("middle", "reach"),
+            lambda x, c: (_ratio(x, c), _ratio(x, c) ** 2, _ratio(x, c) ** 3),
+            "follows a cubic curve in {x}",
+        ),
+        Shape(
+            "bump", f"height*exp(-{_V}**2)", {"height": "at its top"},
+            {"place": "place", "width": "length"}, (),
+            lambda x, c: (np.exp(-(_away(x, c) ** 2)),),
+            "has a bump at one {x}",
+        ),
+        Shape(
+            "snag", f"height*{_V}*exp((1 - {_V}**2)/2)", {"height": "at either bump"},
+            {"place": "place", "width": "length"}, (),
+            lambda x, c: (_away(x, c) * np.exp(0.5 * (1.0 - _away(x, c) ** 2)),),
+            "has opposite bumps on the two sides of one {x}",
+        ),
+        Shape(
+            "step", f"height*tanh{_V}", {"height": "half of the step"},
+            {"place": "place", "width": "length"}, (),
+            lambda x, c: (np.tanh(_away(x, c)),), "changes from one level to another at one {x}",
+        ),
+        Shape(
+            "rise", "height*max(x - place, 0)/reach",
+            {"height": "what it grows by over half the range"}, {"place": "place"}, ("reach",),
+            lambda x, c: (np.maximum(x - c["place"], 0.0) / c["reach"],),
+            "begins at one {x} and grows in proportion beyond it",
+        ),
+        Shape(
+            "fall", "height*max(place - x, 0)/reach",
+            {"height": "what it grows by over half the range"}, {"place": "place"}, ("reach",),
+            lambda x, c: (np.maximum(c["place"] - x, 0.0) / c["reach"],),
+            "ends at one {x} and grows in proportion below it",
+        ),
+        Shape(
+            "dead_zone", "height*(x - clip(x, place - width, place + width))/reach",
+            {"height": "what it grows by over half the range"},
+            {"place": "place", "width": "length"}, ("reach",),
+            lambda x, c: (
+                (x - np.clip(x, c["place"] - c["width"], c["place"] + c["width"])) / c["reach"],
+            ),
+            "is nothing within a range of {x} and grows in proportion beyond either end of it",
+        ),
+        Shape(
+            "ripple", "sine*sin(wavenumber*x) + cosine*cos(wavenumber*x)",
+            {"sine": "in phase with the sine", "cosine": "in phase with the cosine"},
+            {"wavenumber": "wavenumber"}, (),
+            lambda x, c: (np.sin(c["wavenumber"] * x), np.cos(c["wavenumber"] * x)),
+            "ripples with {x}",
+        ),
+        Shape(
+            "decay", "height*exp(-x/width)", {"height": "at zero"}, {"width": "length"}, (),
+            lambda x, c: (np.exp(-x / c["width"]),), "fades as {x} grows",
+        ),
+    )
+}  # fmt: skip
+
+# What each factor may follow, by the quantity and whose it is; what the library has is not
+# drafted again: springs and stops, rippling friction, drag, friction by load or by pose.
+_CURVES = ("parabola", "cubic", "bump", "snag", "step")
+_GRAMMAR: Mapping[tuple[str, bool, Factor], tuple[str, ...]] = {
+    ("position", True, FORCE): (*_CURVES, "dead_zone", "ripple"),
+    ("position", True, FRICTION): ("slope", "parabola", "cubic", "bump", "step", "rise", "fall"),
+    ("position", True, DAMPING): ("slope", "parabola", "bump", "step"),
+    ("position", True, INERTIA): ("slope", "bump"),
+    ("position", False, FORCE): ("slope", *_CURVES, "rise", "fall", "ripple"),
+    ("position", False, FRICTION): ("parabola", "bump", "step", "rise", "fall"),
+    ("position", False, DAMPING): ("parabola", "bump", "step"),
+    ("position", False, INERTIA): ("slope", "parabola"),
+    ("speed", True, FORCE): ("parabola", "bump", "decay"),
+    ("speed", True, FRICTION): ("cubic", "bump", "decay", "rise"),
+    ("speed", False, FRICTION): ("slope", "decay"),
+    ("velocity", False, FORCE): ("slope", "step"),
+    ("load", True, FRICTION): ("parabola", "rise"),
+    ("time", True, FORCE): ("slope", "decay", "ripple"),
+    ("time", True, FRICTION): ("slope", "decay"),
+    ("time", True, DAMPING): ("slope", "decay"),
+}
+_SEES = {
+    FORCE: "the same in both directions of motion",
+    FRICTION: "opposite in the two directions of motion",
+    DAMPING: "in proportion to velocity",
+    INERTIA: "in proportion to acceleration",
+}
+_ACTS = {FORCE: "A force", FRICTION: "Friction", DAMPING: "Damping", INERTIA: "Inertia"}
+
+
+def coordinates(device: Device, axis: int) -> tuple[Coordinate, ...]:
+    """What the residual of ``axis`` may follow."""
+    own = device.coordinates[axis]
+    found = [
+        Coordinate("position", "position", "q", "position", axis, own.unit),
+        Coordinate("speed", "speed", "abs(qd)", "speed", axis, f"{own.unit}/s"),
+        Coordinate("load", "load", "load", "load", axis, own.torque_unit),
+        Coordinate("time", "time", "t", "time", axis, "s"),
+    ]
+    for k, other in enumerate(device.coordinates):
+        if 0 < abs(k - axis) <= _NEAR:
+            n, u = other.name, other.unit
+            found += [
+                Coordinate(f"position of {n}", f"position_of_{n}", n, "position", k, u),
+                Coordinate(f"speed of {n}", f"speed_of_{n}", f"abs(qd_{n})", "speed", k, f"{u}/s"),
+                Coordinate(
+                    f"velocity of {n}", f"velocity_of_{n}", f"qd_{n}", "velocity", k, f"{u}/s"
+                ),
+            ]
+    return tuple(found)
+
+
+@dataclass(frozen=True)
+class Form:
+    """A factor times a shape of a coordinate, acting on one axis.
+
+    Attributes:
+        axis: that it acts on, and its number.
+        factor, shape, coordinate: its words.
+        span: of the coordinate in the trials.
+        scale: of the factor: the highest speed or acceleration of the axis; 1 for others.
+    """
+
+    axis: Axis
+    number: int
+    factor: Factor
+    shape: Shape
+    coordinate: Coordinate
+    span: Span
+    scale: float
+
+    @property
+    def name(self) -> str:
+        """Name of the effect: ``bump_by_position``, ``friction_step_by_speed_of_extension``."""
+        head = "" if self.factor == FORCE else f"{self.factor}_"
+        tail = "" if self.is_own else f"_on_{self.axis.name}"
+        return f"{head}{self.shape.name}_by_{self.coordinate.name}{tail}"
+
+    @property
+    def is_own(self) -> bool:
+        """Whether it speaks of its own axis only, so that its file fits any axis."""
+        return self.coordinate.axis == self.number
+
+    @property
+    def canonical(self) -> str:
+        """Its name as a model has it."""
+        return f"{self.name}:{self.axis.name}" if self.is_own else self.name
+
+    @property
+    def constants(self) -> int:
+        """How many numbers are estimated."""
+        return len(self.shape.strengths) + len(self.shape.searched)
+
+    @property
+    def expression(self) -> str:
+        """The torque as an effect file writes it; the kinetic energy where it is an inertia."""
+        rate = "qd" if self.is_own else f"qd_{self.axis.name}"
+        shape = re.sub(r"\bx\b", self.coordinate.text, self.shape.text)
+        return FACTORS[self.factor].format(shape=shape, rate=rate)
+
+    @property
+    def summary(self) -> str:
+        """What it is, in one sentence."""
+        words = self.shape.words.format(x=self.coordinate.words)
+        return f"{_ACTS[self.factor]} on the axis that {words}"
+
+    @property
+    def looks_like(self) -> str:
+        """How it shows in a residual."""
+        words = self.shape.words.format(x=self.coordinate.words)
+        return f"residual that {words}, {_SEES[self.factor]}"
+
+    def fixed(self) -> dict[str, tuple[float, str]]:
+        """Constants that are not estimated, with their units."""
+        unit = self.coordinate.unit
+        known = {"middle": self.span.middle, "reach": 0.5 * self.span.width}
+        found = {name: (rounded(known[name]), unit) for name in self.shape.fixed}
+        if self.factor == DAMPING:
+            found["top_speed"] = (rounded(self.scale), f"{self.axis.unit}/s")
+        if self.factor == INERTIA:
+            found["top_acceleration"] = (rounded(self.scale), f"{self.axis.unit}/s2")
+        return found
+
+    def limits(self) -> dict[str, tuple[float, float, str]]:
+        """Lower and upper bound and unit of the searched constants."""
+        low, width, unit = self.span.low, self.span.width, self.coordinate.unit
+        by_kind = {
+            "place": (low - 0.25 * width, low + 1.25 * width, unit),
+            "length": (0.003 * width, 2.0 * width, unit),
+            "wavenumber": (np.pi / width, 1e4 * np.pi / width, f"1/{unit}"),
+        }
+        return {name: by_kind[kind] for name, kind in self.shape.searched.items()}
+
+    def entries(self) -> dict[str, dict[str, Any]]:
+        """The parameters of its effect file, the estimates still unknown."""
+        unit = self.axis.torque_unit
+        found: dict[str, dict[str, Any]] = {}
+        for name, words in self.shape.strengths.items():
+            found[name] = {
+                "unit": unit, "prior": 0.0, "sd": 1.0, "strength": True, "description": words,
+            }  # fmt: skip
+        for name, (low, high, of) in self.limits().items():
+            low, high = rounded(low), rounded(high)
+            middle = rounded(0.5 * (low + high) if low <= 0.0 else float(np.sqrt(low * high)))
+            found[name] = {
+                "unit": of, "prior": middle, "sd": rounded(0.1 * (high - low)),
+                "lower": low, "upper": high,
+                "description": KINDS_IN_WORDS[self.shape.searched[name]],
+            }  # fmt: skip
+        for name, (value, of) in self.fixed().items():
+            found[name] = {
+                "unit": of, "prior": value, "sd": 0.0, "fixed": True,
+                "description": "scales the formula",
+            }  # fmt: skip
+        return found
+
+    def declaration(
+        self, source: str, name: str = "", entries: Mapping[str, Mapping[str, Any]] | None = None
+    ) -> dict[str, Any]:
+        """The effect file.
+
+        Args:
+            source: where it comes from; name: of the effect, that of the form where empty.
+            entries: its parameters; `entries` of the form where left out.
+        """
+        parameters: dict[str, Any] = {}
+        for key, entry in (entries or self.entries()).items():
+            numbers = {k: value for k, value in entry.items() if k != "description"}
+            # The unit of an axis' own motion is that of its kind.
+            held = {self.axis.kind: numbers} if self.is_own else numbers
+            parameters[key] = {"description": entry["description"], **held}
+        acts: dict[str, Any] = {"kind": "torque", "torque": self.expression}
+        if self.factor == INERTIA:
+            acts = {"kind": "energy", "kinetic": self.expression}
+        elif not self.is_own:
+            acts["torque"] = {self.axis.name: self.expression}
+        return {
+            "schema": "bampipe.effect/1",
+            "name": name or self.name,
+            "summary": self.summary,
+            "scope": "axis" if self.is_own else "device",
+            "looks_like": self.looks_like,
+            "source": source,
+            **acts,
+            "parameters": parameters,
+        }
+
+
+KINDS_IN_WORDS = {
+    "place": "where it is",
+    "length": "how far it reaches",
+    "wavenumber": "2 pi over the distance between two ripples",
+}
+
+
+def rounded(value: float) -> float:
+    """Six digits: enough for any constant, and the same on every machine."""
+    return float(f"{value:.6g}")
+
+
+def forms(
+    device: Device,
+    axis: int,
+    spans: Mapping[str, Span],
+    scales: Mapping[str, float],
+) -> Iterator[Form]:
+    """Every form for one axis.
+
+    Args:
+        device: the mechanism; axis: number of the coordinate.
+        spans: of the coordinates in the trials, by their words; those without one do not vary.
+        scales: of the factors ``damping`` and ``inertia``.
+    """
+    for coordinate in coordinates(device, axis):
+        if coordinate.words not in spans:
+            continue
+        for (quantity, own, factor), shapes in _GRAMMAR.items():
+            if quantity != coordinate.quantity or own != (coordinate.axis == axis):
+                continue
+            for name in shapes:
+                if name == "ripple" and quantity == "position" and own and device.drive:
+                    continue  # the library has the ripple of a motor
+                yield Form(
+                    device.coordinates[axis], axis, factor, SHAPES[name], coordinate,
+                    spans[coordinate.words], scales.get(factor, 1.0),
+                )  # fmt: skip

@@ -1,0 +1,387 @@
+"""The search for a formula on one axis: screened, held against chance, fitted with the model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import t as student
+
+from bampipe.discover.bench import Bench
+from bampipe.discover.candidates import Score, Scorer
+from bampipe.discover.chance import Progress, fit_trials, open_trials, system_of, workers
+from bampipe.discover.drafts.forms import Form
+from bampipe.discover.drafts.screen import Screened, screen
+from bampipe.discover.settings import Settings
+from bampipe.discover.start import with_effect
+from bampipe.estimate.least_squares import fit
+from bampipe.physics.recipe import Recipe
+from bampipe.results.standing import AT_FLOOR
+from bampipe.trials.measured import MeasuredTrials
+from bampipe.trials.replay import replay_motions
+from bampipe.trials.residuals import Evidence, gather_evidence, problem_of
+
+Array = NDArray[np.float64]
+
+MOST_TERMS = 2
+MOST_LISTED = 5
+_FITTED = (6, 3)
+"""Forms refitted with the model, best of the first pass first: of the first term, of the next."""
+_NO_MORE_THAN = 0.5
+"""A form is refitted if its gain comes up to this share of the best one's."""
+_CLOSE = 6.0
+"""Where the p-value is within this factor of the significance, on either side, more replays are
+made: on both, or the second look would be another chance of a false alarm."""
+_SEED = 11
+"""First number, after the user's, of the seeds of these replays."""
+_STEPS_OF_A_REPLAY = 4
+"""Most Gauss-Newton steps of the fit to a replay: it starts at the parameters that made it."""
+
+
+@dataclass(frozen=True)
+class Term:
+    """A form with its numbers.
+
+    Attributes:
+        form: what it is; name: of its effect, which differs where two terms have one form.
+        values, sd: of its constants, by name, as fitted with the model.
+        covariance: of them, in that order.
+    """
+
+    form: Form
+    name: str
+    values: dict[str, float]
+    covariance: Array
+
+    @property
+    def sd(self) -> dict[str, float]:
+        """Standard deviations of the constants."""
+        spread = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+        return dict(zip(self.values, map(float, spread), strict=True))
+
+    @property
+    def canonical(self) -> str:
+        """Its name as a model has it."""
+        return f"{self.name}:{self.form.axis.name}" if self.form.is_own else self.name
+
+    def curve(self, count: int = 61) -> tuple[Array, Array, Array]:
+        """Coordinate, torque and its standard deviation along the range travelled, (count,) each.
+
+        At full speed or acceleration where the term is in proportion to these, and in the positive
+        direction of motion where it is friction.
+        """
+        x = np.linspace(self.form.span.low, self.form.span.high, count)
+        values = np.array(list(self.values.values()))
+        middle = self._at(x, values)
+        slopes = []
+        for k in range(len(values)):
+            moved, step = values.copy(), 1e-4 * max(abs(values[k]), 1e-9)
+            moved[k] += step
+            slopes.append((self._at(x, moved) - middle) / step)
+        slope = np.array(slopes)
+        variance = np.einsum("kt,kl,lt->t", slope, self.covariance, slope)
+        return x, middle, np.sqrt(np.maximum(variance, 0.0))
+
+    def _at(self, x: Array, values: Array) -> Array:
+        shape = self.form.shape
+        known = dict(zip(self.values, values, strict=True))
+        constants: dict[str, Any] = {n: v for n, (v, _) in self.form.fixed().items()} | known
+        columns = shape.columns(x[:, None], constants)
+        found = sum(known[n] * c for n, c in zip(shape.strengths, columns, strict=True))
+        return np.asarray(found)[:, 0]
+
+
+@dataclass(frozen=True)
+class Option:
+    """A model with some terms, on the list of error against length.
+
+    Attributes:
+        terms: forms and the names of their effects.
+        constants: how many numbers they have.
+        held_out_rmse: by axis, (n_q,), N.m or N.
+    """
+
+    terms: tuple[tuple[Form, str], ...]
+    constants: int
+    held_out_rmse: Array
+
+
+@dataclass(frozen=True)
+class Chance:
+    """What the same search finds on replays of a model, which lack nothing.
+
+    Attributes:
+        gain: of the best form on the measured trials; gains: on each replay.
+        p_value: chance of such a gain.
+        floor: median error of the replays on the axis, N.m or N.
+    """
+
+    gain: float
+    gains: tuple[float, ...]
+    p_value: float
+    floor: float
+
+
+@dataclass(frozen=True)
+class AxisDraft:
+    """What a search for a formula on one axis came to.
+
+    Attributes:
+        axis: its number.
+        terms: found, at most `MOST_TERMS`.
+        chance: of the first term, and of the next where one was looked for.
+        options: error against number of constants, shortest first; the model as given first.
+        before, after: held-out error without and with the terms, N.m or N.
+        recipe: the model with them; evidence: its fit.
+    """
+
+    axis: int
+    terms: tuple[Term, ...]
+    chance: tuple[Chance, ...]
+    options: tuple[Option, ...]
+    before: float
+    after: float
+    recipe: Recipe
+    evidence: Evidence
+
+
+@dataclass(frozen=True)
+class ReplayTask:
+    """A replay on which to search as on the measurement."""
+
+    recipe: Recipe
+    p: Array
+    axis: int
+    seed: tuple[int, ...]
+
+
+def run_replay(task: ReplayTask) -> tuple[float, float]:
+    """Gain of the best form on one replay, and error of the model there."""
+    trials, system = open_trials(), system_of(task.recipe)
+    replays = replay_motions(
+        system, task.p, trials.motions, trials.sensors, trials.kinematics, task.seed
+    )
+    evidence = gather_evidence(
+        system, replays, trials.band, task.p, trials.folds, most_iterations=_STEPS_OF_A_REPLAY
+    )
+    found = screen(evidence, task.axis)
+    error = float(Scorer(evidence).before.error[task.axis])
+    return (found[0].gain if found else 0.0), error
+
+
+@dataclass(frozen=True)
+class FitTask:
+    """A model to fit to the measured trials from a starting point."""
+
+    recipe: Recipe
+    start: Array
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """Parameters of a fit and its error on held-out trials, by axis."""
+
+    p: Array
+    held_out_rmse: Array
+
+
+def run_fit(task: FitTask) -> Fitted:
+    """Fit a model, all its parameters together."""
+    evidence = fit_trials(open_trials(), task.recipe, task.start)
+    return Fitted(evidence.p, evidence.held_out_rmse)
+
+
+def draft(
+    trials: MeasuredTrials,
+    recipe: Recipe,
+    start: Array,
+    axes: Sequence[int],
+    settings: Settings,
+    source: str,
+    progress: Progress = lambda fraction, message: None,
+) -> list[AxisDraft]:
+    """Search a formula for what a model leaves on each of some axes, one after the other.
+
+    Args:
+        trials: the measured trials; recipe: the model; start: of its parameters, (n_p,).
+        axes: numbers of the coordinates.
+        settings: how carefully to look.
+        source: that the effect files state.
+        progress: called with a fraction and a message.
+    """
+    found: list[AxisDraft] = []
+    with workers(trials, settings.jobs) as pool:
+        bench = Bench(trials, settings, pool, ())
+        known = recipe
+        for k, axis in enumerate(axes):
+            name = recipe.model().device.coordinates[axis].name
+            part = AxisSearch(bench, axis, source)
+
+            def tell(share: float, message: str, k: int = k, name: str = name) -> None:
+                progress((k + share) / len(axes), f"{name}: {message}")
+
+            found.append(part.run(known, start, tell))
+            known, start = found[-1].recipe, found[-1].evidence.p
+    return found
+
+
+class AxisSearch:
+    """The search for a formula on one axis."""
+
+    def __init__(self, bench: Bench, axis: int, source: str) -> None:
+        self._bench, self._axis, self._source = bench, axis, source
+
+    @cached_property
+    def _settings(self) -> Settings:
+        return self._bench.settings
+
+    def run(self, recipe: Recipe, start: Array, progress: Progress) -> AxisDraft:
+        """Add terms to a model as long as one beats chance and is worth its constants."""
+        axis, s = self._axis, self._settings
+        evidence = self._bench.fit(recipe, start)
+        before = evidence.held_out_rmse
+        options = [Option((), 0, before)]
+        current, chances = options[0], []
+        for number in range(MOST_TERMS):
+            progress(0.05 + 0.4 * number, "holding every form against the residual")
+            screened = screen(evidence, axis)
+            progress(0.15 + 0.4 * number, "searching replays for as good a formula")
+            chances.append(self._chance(recipe, evidence, screened))
+            if chances[-1].p_value > s.draft_significance:
+                break
+            progress(0.3 + 0.4 * number, "fitting the best forms with the model")
+            wider = self._fitted(recipe, evidence, current, screened, _FITTED[number])
+            options += [option for option, _, _ in wider]
+            chosen = min(wider, key=lambda entry: self._cost(entry[0]))
+            if self._cost(chosen[0]) >= self._cost(current):
+                break
+            current, recipe, p = chosen
+            evidence = self._bench.fit(recipe, p)
+            if Scorer(evidence).before.error[axis] < AT_FLOOR * chances[-1].floor:
+                break
+        terms = self._terms(evidence, current)
+        return AxisDraft(
+            axis, terms, tuple(chances), self._listed(options, current), float(before[axis]),
+            float(current.held_out_rmse[axis]), recipe, evidence,
+        )  # fmt: skip
+
+    def _cost(self, option: Option) -> float:
+        """Log of the held-out error plus what its constants must be worth."""
+        error = float(option.held_out_rmse[self._axis])
+        return float(np.log(error)) + self._settings.draft_worth * option.constants
+
+    def _chance(self, recipe: Recipe, evidence: Evidence, screened: Sequence[Screened]) -> Chance:
+        """Hold the best form's gain against what the same search finds on replays."""
+        s = self._settings
+        gain = screened[0].gain if screened else 0.0
+        found = self._replays(recipe, evidence, 0, s.draft_replicates)
+        p_value = self._p_value(gain, evidence, [g for g, _ in found])
+        low, high = s.draft_significance / _CLOSE, s.draft_significance * _CLOSE
+        if low < p_value < high:
+            more = 2 * s.draft_replicates
+            found += self._replays(recipe, evidence, s.draft_replicates, more)
+            p_value = self._p_value(gain, evidence, [g for g, _ in found])
+        floor = float(np.median([error for _, error in found]))
+        return Chance(gain, tuple(g for g, _ in found), p_value, floor)
+
+    def _replays(
+        self, recipe: Recipe, evidence: Evidence, first: int, count: int
+    ) -> list[tuple[float, float]]:
+        seed = (self._settings.seed, _SEED, self._axis, len(recipe.effects))
+        tasks = [
+            ReplayTask(recipe, evidence.p, self._axis, (*seed, k))
+            for k in range(first, first + count)
+        ]
+        return list(self._bench.pool(run_replay, tasks))
+
+    def _p_value(self, gain: float, evidence: Evidence, gains: Sequence[float]) -> float:
+        """Chance of a gain, by Student's t: the best of all forms on each replay is one draw."""
+        count = len(gains)
+        # No replay is perfect: its log error is off by this, as a log likelihood.
+        off = self._settings.replay_error * float(Scorer(evidence).independent[self._axis])
+        spread = np.hypot(np.std(gains, ddof=1) * np.sqrt(1.0 + 1.0 / count), off)
+        return float(student.sf((gain - np.mean(gains)) / spread, count - 1))
+
+    def _fitted(
+        self,
+        recipe: Recipe,
+        evidence: Evidence,
+        current: Option,
+        screened: Sequence[Screened],
+        count: int,
+    ) -> list[tuple[Option, Recipe, Array]]:
+        """The model with each of the best forms, all parameters fitted together."""
+        least = _NO_MORE_THAN * screened[0].gain
+        chosen = [found for found in screened if found.gain >= least][:count]
+        tasks, terms = [], []
+        for found in chosen:
+            taken = [name for _, name in current.terms]
+            name = found.form.name if found.form.name not in taken else f"other_{found.form.name}"
+            declaration = found.form.declaration(self._source, name)
+            canonical = name + found.form.canonical.removeprefix(found.form.name)
+            wider = replace(
+                recipe,
+                effects=(*recipe.effects, canonical),
+                extra=(*recipe.extra, declaration),
+            )
+            values = np.array([
+                found.values.get(short, entry_prior)
+                for short, entry_prior in _priors(wider, canonical).items()
+            ])  # fmt: skip
+            score = Score(canonical, np.zeros(0), values, np.zeros(0), np.zeros(0))
+            tasks.append(FitTask(wider, with_effect(wider, evidence, score)))
+            terms.append((*current.terms, (found.form, name)))
+        fits = self._bench.pool(run_fit, tasks)
+        return [
+            (
+                Option(term, sum(form.constants for form, _ in term), fitted.held_out_rmse),
+                task.recipe,
+                fitted.p,
+            )
+            for term, task, fitted in zip(terms, tasks, fits, strict=True)
+        ]
+
+    def _terms(self, evidence: Evidence, option: Option) -> tuple[Term, ...]:
+        """The terms of the final model with values and covariance, fitted with all parameters."""
+        trials = self._bench.trials
+        problem = problem_of(evidence.system, evidence.motions, evidence.band)
+        found = fit(
+            problem, np.append(evidence.p, 0.0), trials=trials.folds.fitted_trials,
+            most_iterations=1,
+        )  # fmt: skip
+        place = {int(i): k for k, i in enumerate(problem.free)}
+        terms = []
+        for form, name in option.terms:
+            prefix = f"{name}.{form.axis.name}" if form.is_own else name
+            shape = form.shape
+            short = [*shape.strengths, *shape.searched]
+            index = [evidence.system.index(f"{prefix}.{constant}") for constant in short]
+            rows = [place[i] for i in index]
+            values = {c: float(evidence.p[i]) for c, i in zip(short, index, strict=True)}
+            terms.append(Term(form, name, values, found.covariance[np.ix_(rows, rows)]))
+        return tuple(terms)
+
+    def _listed(self, options: Sequence[Option], chosen: Option) -> tuple[Option, ...]:
+        """Options that no shorter one beats, the model as given first, and the chosen one."""
+        ordered = sorted(options, key=lambda o: (o.constants, self._cost(o)))
+        front: list[Option] = []
+        for option in ordered:
+            error = option.held_out_rmse[self._axis]
+            if option is chosen or all(error < o.held_out_rmse[self._axis] for o in front):
+                front.append(option)
+        while len(front) > MOST_LISTED:
+            front.remove(max((o for o in front if o is not chosen and o.terms), key=self._cost))
+        return tuple(front)
+
+
+def _priors(recipe: Recipe, effect: str) -> dict[str, float]:
+    """Priors of the parameters of one effect of a model, by their short names."""
+    system = system_of(recipe)
+    prefix = f"{effect.replace(':', '.')}."
+    return {
+        p.name.removeprefix(prefix): p.prior for p in system.parameters if p.name.startswith(prefix)
+    }

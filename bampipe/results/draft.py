@@ -1,0 +1,102 @@
+"""``models/<model>/draft.json``: a formula for what no effect of the library explains."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal
+
+from pydantic import Field
+
+from bampipe.results.record import Names, Record, Result, Share, Size
+from bampipe.schema import Count
+
+DraftVerdict = Literal["drafted", "nothing_beyond_chance", "no_lower_error"]
+
+
+class Constant(Record):
+    """A number of a formula, as fitted together with all parameters of the model."""
+
+    value: float
+    low: float = Field(description="Lower end of its 95 % interval")
+    high: float
+    unit: str
+
+
+class DraftCurve(Record):
+    """A formula along what it follows, at full speed or acceleration where in proportion to it."""
+
+    variable: str
+    variable_unit: str
+    unit: str = Field(description="Of the force")
+    at: tuple[float, ...]
+    mean: tuple[float, ...]
+    low: tuple[float, ...] = Field(description="95 % band by the constants' covariance")
+    high: tuple[float, ...]
+
+
+class DraftedEffect(Record):
+    """A formula that was written as an effect file."""
+
+    file: str = Field(description="Relative to the run folder")
+    axis: str
+    expression: str
+    acts_as: Literal["force", "friction", "damping", "inertia"]
+    constants: dict[str, Constant]
+    summary: str
+    looks_like: str
+    sentence: str
+    curve: DraftCurve
+
+
+class ChanceOfDraft(Record):
+    """What the same search finds where nothing is missing: on replays of the model."""
+
+    gain: float = Field(description="Of the best formula, log likelihood ratio on trials left out")
+    gains: tuple[float, ...] = Field(description="Of the best formula on each replay")
+    p_value: Share
+
+
+class DraftOption(Record):
+    """One length of formula and the error that it leaves."""
+
+    effects: Names = Field(description="None for the model as it is")
+    constants: Count
+    held_out_rmse: Size
+
+
+class NearestEffect(Record):
+    """An effect of the library beside the draft."""
+
+    effect: str
+    held_out_rmse: Size
+    sentence: str
+
+
+class AxisDraft(Record):
+    """What was searched on one axis, and found."""
+
+    verdict: DraftVerdict
+    effects: Names = Field(description="Drafted; they are what `extend` adds")
+    chance: tuple[ChanceOfDraft, ...] = Field(
+        min_length=1, description="Of the first formula, and of the next where one was looked for"
+    )
+    options: tuple[DraftOption, ...] = Field(description="Shortest first")
+    rmse_before: Size = Field(description="On held-out trials")
+    rmse_after: Size
+    noise_floor: Size = Field(description="Median error of the replays that give the chance level")
+    unit: str
+    nearest: tuple[NearestEffect, ...]
+    sentence: str
+
+
+class DraftResult(Result):
+    """A formula for what no effect of the library explains, axis by axis."""
+
+    FILE: ClassVar[str] = "models/{model}/draft.json"
+    STAGE: ClassVar[str] = "draft"
+
+    model: str
+    sentence: str = Field(description="The findings in words")
+    next: str = Field(description="What to do now")
+    axes: dict[str, AxisDraft] = Field(min_length=1)
+    effects: dict[str, DraftedEffect] = Field(description="By name, as a model has it")
+    selected: Names

@@ -1,0 +1,292 @@
+"""Stage draft: a formula for what no effect explains, as an effect file, with its chance level."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field
+from pydantic.dataclasses import dataclass as checked_dataclass
+
+from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
+from bampipe.declarations.model_file import IDENTIFIED_MODEL, identified, load_model, read_recipe
+from bampipe.discover.drafts.effect_file import declare, write_toml
+from bampipe.discover.drafts.search import AxisDraft as FoundDraft
+from bampipe.discover.drafts.search import Term, draft
+from bampipe.discover.settings import Settings
+from bampipe.errors import InputError
+from bampipe.files import write_text
+from bampipe.physics import compile_model
+from bampipe.physics.system import System
+from bampipe.progress import Progress
+from bampipe.results.diagnose import DiagnoseResult
+from bampipe.results.draft import (
+    AxisDraft,
+    ChanceOfDraft,
+    Constant,
+    DraftCurve,
+    DraftedEffect,
+    DraftOption,
+    DraftResult,
+    DraftVerdict,
+    NearestEffect,
+)
+from bampipe.results.identify import IdentifyResult
+from bampipe.results.ingest import IngestResult
+from bampipe.schema import STRICT, Count
+from bampipe.trials.measured import read_measured_trials
+
+SUMMARY = "Draft a formula for what no effect of the library explains"
+INPUTS = (*INGESTED, *FILTERED, *IDENTIFIED_MODEL, "models/{model}/diagnose.json")
+OUTPUTS = ("models/{model}/draft.json", "models/{model}/drafts/*.toml")
+
+_NEAREST = 3
+"""Effects of the library that are held against a draft."""
+
+
+@checked_dataclass(frozen=True, config=STRICT)
+class Config:
+    """Settings of the stage.
+
+    Attributes:
+        model: which model version to draft for.
+        replicates: replays on which a formula is searched as on the measurement.
+        significance: chance of a formula where nothing is missing.
+        jobs: worker processes; 0 means one for each processor, eight at most.
+        seed: of the noise in the replays.
+    """
+
+    model: str = "base"
+    replicates: Annotated[int, Field(ge=4)] = 6
+    significance: Annotated[float, Field(gt=0, lt=1)] = 0.05
+    jobs: Count = 0
+    seed: Count = 0
+
+
+def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
+    """Draft formulas for one model; write them and what they rest on.
+
+    Raises:
+        InputError: there is no diagnosis of the model, it found effects that are not added yet, or
+            it calls nothing unknown; or an axis moves too little for a search.
+    """
+    diagnosis = run.read(DiagnoseResult, config.model)
+    model = load_model(run, config.model)
+    system = compile_model(model)
+    axes = _axes_to_draft(diagnosis, system, run)
+    timing = run.read(IdentifyResult, config.model).input_timing
+    trials = read_measured_trials(run, system, every_input=True, timing=timing)
+    trials = replace(trials, motions=tuple(trials.motions))
+    settings = Settings(
+        draft_replicates=config.replicates,
+        draft_significance=config.significance,
+        jobs=config.jobs or min(8, os.cpu_count() or 1),
+        seed=config.seed,
+    )
+    source = _source(run.read(IngestResult))
+    recipe = read_recipe(run, config.model, model)
+    start = identified(run, config.model, system)
+    found = draft(trials, recipe, start, axes, settings, source, progress)
+    effects: dict[str, DraftedEffect] = {}
+    for axis in found:
+        for term in axis.terms:
+            file = f"models/{config.model}/drafts/{term.name}.toml"
+            write_text(out / file, write_toml(declare(term, source)))
+            effects[term.canonical] = _effect(term, file, system)
+    result = _result(found, effects, diagnosis, system)
+    content = result.write(out)
+    return {
+        "axes": {
+            axis: {
+                "verdict": entry.verdict,
+                "rmse_before": entry.rmse_before,
+                "rmse_after": entry.rmse_after,
+                "noise_floor": entry.noise_floor,
+                "unit": entry.unit,
+                "p_value": entry.chance[0].p_value,
+                "sentence": entry.sentence,
+            }
+            for axis, entry in result.axes.items()
+        },
+        "selected": content["selected"],
+    }
+
+
+def _axes_to_draft(diagnosis: DiagnoseResult, system: System, run: RunFolder) -> list[int]:
+    """Numbers of the axes that lack something without a name.
+
+    Raises:
+        InputError: there are none, or what has a name is not in the model yet.
+    """
+    if diagnosis.selected:
+        named = " ".join(diagnosis.selected)
+        raise InputError(
+            f"the diagnosis of model {diagnosis.model!r} names {named}: what is left without it is "
+            "not known yet",
+            where=str(run.root),
+            remedy=f"`bampipe extend {run.root} {named} --model {diagnosis.model}`, then diagnose",
+        )
+    found = [system.coordinates.index(axis) for axis in diagnosis.unnamed_axes]
+    if not found:
+        raise InputError(
+            f"nothing to draft: the diagnosis of model {diagnosis.model!r} calls nothing unknown",
+            where=str(run.root),
+            remedy="a formula is drafted where the verdict is unknown_effect, or undecided with "
+            "something left",
+        )
+    return found
+
+
+def _source(session: IngestResult) -> str:
+    """Where a draft comes from: dated by the recording, so that it is the same whenever made."""
+    on = f", recorded on {session.recorded_at[:10]}" if session.recorded_at else ""
+    return f"drafted by bampipe from {session.session_id}{on}"
+
+
+def _effect(term: Term, file: str, system: System) -> DraftedEffect:
+    form = term.form
+    unit = form.axis.torque_unit
+    units = {name: unit for name in form.shape.strengths}
+    units |= {name: of for name, (_, _, of) in form.limits().items()}
+    at, mean, sd = term.curve()
+    constants = {
+        name: Constant(
+            value=value,
+            low=value - 1.96 * term.sd[name],
+            high=value + 1.96 * term.sd[name],
+            unit=units[name],
+        )
+        for name, value in term.values.items()
+    }
+    numbers = ", ".join(
+        f"{name} {c.value:.4g} ± {0.5 * (c.high - c.low):.2g} {c.unit}"
+        for name, c in constants.items()
+    )
+    return DraftedEffect(
+        file=file,
+        axis=form.axis.name,
+        expression=form.expression,
+        acts_as=form.factor,
+        constants=constants,
+        summary=form.summary,
+        looks_like=form.looks_like,
+        sentence=f"{form.summary}: {numbers}.",
+        curve=DraftCurve(
+            variable=form.coordinate.words,
+            variable_unit=form.coordinate.unit,
+            unit=unit,
+            at=tuple(at),
+            mean=tuple(mean),
+            low=tuple(mean - 1.96 * sd),
+            high=tuple(mean + 1.96 * sd),
+        ),
+    )
+
+
+def _result(
+    found: Sequence[FoundDraft],
+    effects: dict[str, DraftedEffect],
+    diagnosis: DiagnoseResult,
+    system: System,
+) -> DraftResult:
+    axes = {
+        system.coordinates[axis.axis]: _axis(axis, effects, diagnosis, system) for axis in found
+    }
+    selected = tuple(effects)
+    if selected:
+        advice = f"bampipe extend RUN {' '.join(selected)} --model {diagnosis.model}"
+    else:
+        advice = (
+            "record more trials like these: what is missing follows nothing that a formula could "
+            "be held against"
+        )
+    return DraftResult(
+        model=diagnosis.model,
+        sentence=" ".join(entry.sentence for entry in axes.values()),
+        next=advice,
+        axes=axes,
+        effects=effects,
+        selected=selected,
+    )
+
+
+def _axis(
+    found: FoundDraft,
+    effects: dict[str, DraftedEffect],
+    diagnosis: DiagnoseResult,
+    system: System,
+) -> AxisDraft:
+    axis, unit = system.coordinates[found.axis], system.torque_units[found.axis]
+    names = tuple(term.canonical for term in found.terms)
+    beats_chance = len(found.options) > 1
+    verdict: DraftVerdict = "drafted" if names else "nothing_beyond_chance"
+    if beats_chance and not names:
+        verdict = "no_lower_error"
+    options = tuple(
+        DraftOption(
+            effects=tuple(name for _, name in option.terms),
+            constants=option.constants,
+            held_out_rmse=option.held_out_rmse[found.axis],
+        )
+        for option in found.options
+    )
+    chances = tuple(
+        ChanceOfDraft(gain=c.gain, gains=c.gains, p_value=min(c.p_value, 1.0)) for c in found.chance
+    )
+    return AxisDraft(
+        verdict=verdict,
+        effects=names,
+        chance=chances,
+        options=options,
+        rmse_before=found.before,
+        rmse_after=found.after,
+        noise_floor=found.chance[-1].floor,
+        unit=unit,
+        nearest=_nearest(axis, found, diagnosis, unit) if names else (),
+        sentence=_sentence(axis, found, [effects[name] for name in names], unit),
+    )
+
+
+def _nearest(
+    axis: str, found: FoundDraft, diagnosis: DiagnoseResult, unit: str
+) -> tuple[NearestEffect, ...]:
+    """Effects of the library that come closest, and by how much the draft does better."""
+    rows = [row for row in diagnosis.ranking if row.axis == axis]
+    rows.sort(key=lambda row: row.held_out_rmse_after)
+    return tuple(
+        NearestEffect(
+            effect=row.effect,
+            held_out_rmse=row.held_out_rmse_after,
+            sentence=(
+                f"{row.effect} leaves {row.held_out_rmse_after:.3g} {unit}, "
+                f"{row.held_out_rmse_after / max(found.after, 1e-30):.2g} times what the draft "
+                "leaves"
+            ),
+        )
+        for row in rows[:_NEAREST]
+    )
+
+
+def _sentence(axis: str, found: FoundDraft, effects: Sequence[DraftedEffect], unit: str) -> str:
+    name, chance = axis.capitalize(), found.chance[0]
+    by_chance = (
+        f"the best formula gains {chance.gain:.3g} in log likelihood on trials left out; on "
+        f"{len(chance.gains)} replays, where nothing is missing, the same search gains "
+        f"{np.mean(chance.gains):.2g} (p = {chance.p_value:.2g})"
+    )
+    if not effects:
+        if len(found.options) > 1:
+            return (
+                f"{name}: no draft, for no formula lowers the held-out error enough; {by_chance}."
+            )
+        return f"{name}: no draft, for chance would have given as good a formula; {by_chance}."
+    floor = found.chance[-1].floor
+    return (
+        f"{name}: {' '.join(effect.sentence for effect in effects)} The held-out error falls from "
+        f"{found.before:.3g} to {found.after:.3g} {unit}, {found.after / max(floor, 1e-30):.2f} "
+        f"times the noise floor; {by_chance}."
+    )
