@@ -9,7 +9,9 @@ import inspect
 import json
 import re
 import textwrap
+import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 import typer
@@ -47,6 +49,7 @@ def pages() -> dict[str, str]:
         "effects.md": effects(),
         "devices.md": devices(),
         "python.md": python(),
+        "versions.md": versions(),
     }
 
 
@@ -259,4 +262,30 @@ def python() -> str:
     for name in bampipe.__all__:
         home: Callable[..., object] = getattr(bampipe, name)
         text.append(f"::: {home.__module__}.{home.__name__}\n")
+    return "\n".join(text)
+
+
+def versions() -> str:
+    """The page of the versions: what is asked for, and what `constraints.txt` holds."""
+    root = Path(__file__).parents[1]
+    project = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    pinned: dict[str, list[str]] = {}
+    for line in (root / "constraints.txt").read_text(encoding="utf-8").splitlines():
+        name, _, version = line.partition(" ;")[0].partition("==")
+        pinned.setdefault(name.lower(), []).append(version)
+    extras = {"": project["dependencies"], **project["optional-dependencies"]}
+    rows = []
+    for extra, wanted in extras.items():
+        for text in wanted:
+            name, span = re.match(r"([\w.-]+)(?:\[.*\])?(.*)", text).groups()  # type: ignore[union-attr]
+            if name != project["name"]:
+                rows.append(
+                    (name, span, ", ".join(pinned.get(name.lower(), ())), extra and code(extra))
+                )
+    text = (
+        "# Versions\n",
+        f"These pages are of bampipe {bampipe.__version__}, for Python "
+        f"{project['requires-python']} ([what was run](../install.md#supported-range)).\n",
+        table(("library", "range", "in constraints.txt", "extra"), rows),
+    )
     return "\n".join(text)

@@ -15,6 +15,8 @@ from typing import Any
 
 from mkdocs.structure.files import File, Files
 
+import bampipe
+
 sys.path.insert(0, str(Path(__file__).parent))
 import reference
 
@@ -78,6 +80,7 @@ def address_of(source: str) -> str:
 
 
 def on_config(config: Any) -> Any:
-    """Build the same bytes wherever the site is built: no date of the day."""
+    """Say of which version the pages are, and give the same bytes on any day."""
     os.environ.setdefault("SOURCE_DATE_EPOCH", "0")
+    config.copyright = f"bampipe {bampipe.__version__}"
     return config

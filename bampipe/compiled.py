@@ -12,7 +12,6 @@ Processes that start together share the work: what one of them is compiling, ano
 
 from __future__ import annotations
 
-import fcntl
 import gc
 import hashlib
 import os
@@ -24,6 +23,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numba
+from filelock import lock_descriptor
 from numba.core import caching, typeinfer
 
 from bampipe import compile_ahead
@@ -96,7 +96,7 @@ def _one_process_at_a_time(cache: Any) -> Iterator[None]:
         return
     lock = cache.index.with_suffix(".lock")
     try:
-        handle = os.open(lock, os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600)
+        handle = os.open(lock, os.O_CREAT | os.O_RDWR, 0o600)
     except OSError:
         yield
         return
@@ -104,15 +104,15 @@ def _one_process_at_a_time(cache: Any) -> Iterator[None]:
         deadline = time.monotonic() + _PATIENCE_S
         while time.monotonic() < deadline:
             try:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                break
-            except BlockingIOError:
+                if lock_descriptor(handle, blocking=False):
+                    break
                 time.sleep(0.02)
             except OSError:  # a file system without locks
                 break
         yield
     finally:
-        lock.unlink(missing_ok=True)
+        with suppress(FileNotFoundError, PermissionError):  # Windows keeps what is open
+            lock.unlink()
         os.close(handle)
 
 

@@ -195,6 +195,10 @@ def make_compiled_folder(sources: Path) -> Path:
 
 
 def _require_private(folder: Path) -> None:
+    if not hasattr(
+        os, "geteuid"
+    ):  # Windows: a user's folders are closed to others by its own means
+        return
     status = folder.stat()
     if status.st_uid != os.geteuid():
         raise InputError(

@@ -71,7 +71,7 @@ LAWS = {
         "numpy matplotlib typst pandas pyarrow bampipe", "declarations errors files results"
     ),
     "run": law(
-        "pydantic dask distributed fsspec bampipe",
+        "pydantic dask distributed filelock fsspec bampipe",
         "progress compile_ahead errors files schema results data declarations stages.base workers",
     ),
     "lab": law("numpy scipy", "progress errors files results data report run stages.base"),
@@ -197,6 +197,25 @@ def test_help_imports_nothing_heavy() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stderr.strip() == "[]"
+
+
+def test_what_only_posix_has_is_not_needed_to_import(tmp_path: Path) -> None:
+    """As on Windows: modules that are not there, functions and flags that `os` lacks."""
+    code = (
+        "import os, sys\n"
+        "for name in ('fcntl', 'grp', 'pwd', 'resource', 'termios'): sys.modules[name] = None\n"
+        "for name in ('O_CLOEXEC', 'O_NOFOLLOW', 'O_NONBLOCK', 'fork', 'geteuid', 'pread',\n"
+        "             'pwrite', 'register_at_fork', 'sched_getaffinity'): delattr(os, name)\n"
+        "from bampipe.cli.app import app\n"
+        "import bampipe.compiled, bampipe.run.runner, bampipe.workers\n"
+        "from pathlib import Path\n"
+        "from bampipe import generated_code\n"
+        "from bampipe.run import lock\n"
+        "os.close(lock._open(Path('lock')))\n"
+        "generated_code._require_private(Path())\n"
+        "app(['--help'], standalone_mode=False)\n"
+    )
+    subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, check=True)
 
 
 def test_help_is_quick() -> None:

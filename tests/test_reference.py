@@ -73,3 +73,12 @@ def test_everything_exported_has_its_docstring() -> None:
         found = getattr(bampipe, name)
         assert f"::: {found.__module__}.{found.__name__}" in PAGES["python.md"]
         assert found.__doc__
+
+
+def test_every_dependency_has_the_version_that_was_tried() -> None:
+    rows = re.findall(
+        r"^\| ([\w.-]+) \| ([^|]*) \| ([^|]*) \| `?(\w*)`? ?\|$", PAGES["versions.md"], re.M
+    )
+    assert bampipe.__version__ in PAGES["versions.md"]
+    assert {"numpy", "filelock", "mkdocs"} <= {name for name, *_ in rows}
+    assert [name for name, _, tried, extra in rows if not tried and extra in ("", "dev")] == []

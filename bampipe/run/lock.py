@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
 import os
 import platform
 import stat
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+
+from filelock import lock_descriptor
 
 from bampipe.errors import InputError
 
@@ -24,7 +25,8 @@ def _close_in_child() -> None:
     _held.clear()
 
 
-os.register_at_fork(after_in_child=_close_in_child)
+if hasattr(os, "register_at_fork"):  # nothing is forked on Windows
+    os.register_at_fork(after_in_child=_close_in_child)
 
 
 @contextlib.contextmanager
@@ -52,7 +54,7 @@ def hold(
     handle = _open(path)
     _held.add(handle)
     try:
-        if not _take(handle):
+        if not lock_descriptor(handle, blocking=False):
             if not wait:
                 raise InputError(
                     f"another bampipe is at work here, {_name(handle)}".rstrip(", "),
@@ -60,7 +62,7 @@ def hold(
                     remedy="wait until it is done, or leave out --no-wait",
                 )
             waiting(_name(handle))
-            while not _take(handle):
+            while not lock_descriptor(handle, blocking=False):
                 time.sleep(0.1)
         left = _name(handle)
         if left:
@@ -77,7 +79,7 @@ def hold(
 
 def _open(path: Path) -> int:
     """Open the lock file without waiting for the other end of a pipe, nor following a link."""
-    flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
+    flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
     try:
         handle = os.open(path, flags, 0o666)
     except OSError as error:
@@ -96,21 +98,16 @@ def _not_a_lock(path: Path) -> InputError:
     )
 
 
-def _take(handle: int) -> bool:
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        if error.errno not in (errno.EWOULDBLOCK, errno.EACCES):
-            raise
-        return False
-    return True
-
-
 def _write_name(handle: int, name: str) -> None:
     with contextlib.suppress(OSError):  # a full disk: the lock holds without a name
         os.ftruncate(handle, 0)
-        os.pwrite(handle, name.encode(), 0)
+        os.lseek(handle, 0, os.SEEK_SET)
+        os.write(handle, name.encode())
 
 
 def _name(handle: int) -> str:
-    return os.pread(handle, 200, 0).decode(errors="replace")
+    os.lseek(handle, 0, os.SEEK_SET)
+    try:
+        return os.read(handle, 200).decode(errors="replace")
+    except PermissionError:  # Windows keeps what is locked to its holder
+        return ""
