@@ -115,6 +115,6 @@ class Bench:
         )
 
     def gaining(self, scores: Mapping[str, Score], scorer: Scorer) -> list[str]:
-        """Candidates whose gain could be worth having; chance lowers it at most by half of that."""
-        least = 0.5 * self.settings.worth
+        """Candidates whose gain could be worth having: what chance gives only lowers it."""
+        least = self.settings.worth
         return [n for n, s in scores.items() if np.any(s.gain / scorer.independent > least)]

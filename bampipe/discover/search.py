@@ -93,18 +93,10 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
     dropped: set[str] = set()
     transient: dict[str, Stretch] = {}
     steps = [_step(current)]
-    replayed = level.replicates
+    known = level
     while len(current.added) + len(dropped) < s.most_effects:
         evidence = current.evidence
-        known = level
-        significant, likely = _weigh(bench, scores, level, evidence, replayed)
-        if significant and current.added:
-            # What a model with the first effects leaves by chance may look like another one.
-            close = {name: scores[name] for _, name in significant}
-            seed = (4, len(current.added))
-            known = bench.level(current.recipe, evidence, list(close), seed)
-            significant, fewer = _weigh(bench, close, known, evidence, replayed)
-            likely |= fewer
+        significant, likely = _weigh(bench, scores, known, evidence)
         if not significant:
             break
         chosen = choose(bench, significant, known, current.recipe, evidence, scores, progress)
@@ -118,20 +110,18 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
             less = reduce_set(bench, wider, earlier)
             if is_superfluous(wider, less, s):
                 wider = less
-        replays = _sound_replays(bench, current, wider, replayed)
-        if not replays:
+        out = {*wider.added, *current.added, *dropped, *transient}
+        sound = _sound_level(bench, current, wider, known, [n for n in bench.names if n not in out])
+        if sound is None:
             # It resembles what is missing in these trials, but no mechanism could have it.
             dropped.add(chosen.winner)
             scores = {name: score for name, score in scores.items() if name != chosen.winner}
             continue
         dropped |= {*current.added, chosen.winner} - {*wider.added}
-        current, replayed = wider, replays
+        current, (scores, known) = wider, sound
         groups[chosen.winner] = chosen.alike
         steps.append(_step(current))
         progress(0.45 + 0.05 * len(steps), f"added {chosen.winner}, looking for more")
-        out = {*current.added, *dropped, *transient}
-        rest = [n for n in bench.names if n not in out]
-        scores = bench.scores(current.recipe, current.evidence.p, rest)
     progress(0.8, "weighing each effect beside its rivals")
     rivals = {name: _rivals(first, name, groups.get(name, ()), s) for name in current.added}
     found, contests = polish(bench, current, rivals)
@@ -161,21 +151,27 @@ def _rivals(first: Mapping[str, Score], name: str, alike: Sequence[str], s: Sett
     return [*alike, *(n for n in others[: s.most_rivals] if n not in alike)]
 
 
-def _sound_replays(
-    bench: Bench, before: FittedSet, after: FittedSet, replayed: Sequence[Replicate]
-) -> list[Replicate]:
-    """Replays of a model with one effect more; none if no mechanism could have that effect.
+def _sound_level(
+    bench: Bench, before: FittedSet, after: FittedSet, known: Level, names: Sequence[str]
+) -> tuple[dict[str, Score], Level] | None:
+    """Scores of ``names`` against a model with one effect more, and their chance level.
 
-    The trials that the fit has not seen are asked first: replays cost more.
+    What a model with the first effects leaves by chance may look like another one: every model has
+    a chance level of its own. None if no mechanism could have the effect; the trials that the fit
+    has not seen are asked first, for replays cost more.
     """
-    s = bench.settings
-    if not _carries_over(before, after, s):
-        return []
+    if not _carries_over(before, after, bench.settings):
+        return None
+    evidence = after.evidence
+    scores = bench.scores(after.recipe, evidence.p, names)
+    asked = bench.gaining(scores, Scorer(evidence))
     try:
-        replays = bench.replicas(after.recipe, after.evidence.p, s.rival_replicates, (), (3,))
+        level = bench.level(after.recipe, evidence, asked, (FLOOR_SEED,))
     except Runaway:
-        return []
-    return replays if _keeps_the_floor(after.evidence, replays, replayed) else []
+        return None
+    if not _keeps_the_floor(evidence, level.replicates, known.replicates):
+        return None
+    return scores, level
 
 
 def _keeps_the_floor(
@@ -214,7 +210,6 @@ def _weigh(
     scores: Mapping[str, Score],
     level: Level,
     evidence: Evidence,
-    replayed: Sequence[Replicate],
 ) -> tuple[list[tuple[float, str]], dict[str, tuple[float, Array]]]:
     """Candidates that beat chance and are worth having, and those that are worth it but do not.
 
@@ -229,6 +224,7 @@ def _weigh(
         return np.asarray(AT_FLOOR * errors.mean(axis=0) + 2.0 * errors.std(axis=0, ddof=1))
 
     # Trials that the session holds out may be above their floor where the fitted ones are not.
+    replayed = level.replicates
     error, replays = scorer.before.error, np.array([r.error for r in replayed])
     above = error > ceiling(replays)
     if HELD_OUT in evidence.folds.groups:

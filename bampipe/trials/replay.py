@@ -59,7 +59,6 @@ def replay_recording(
     if system.model.device.prescribed:
         force = _required_force(system, p, motion, u)
         return _read(system, motion, motion.q, force, sensors, rng)
-    n = len(system.coordinates)
     q, qd = _reference(system, p, motion, u, sensors.rate_hz)
     start = np.concatenate([q[0], qd[0], system.initial_memory(q[0], u[0], p)])
     at = {name: i for i, name in enumerate(system.inputs)}
@@ -72,11 +71,7 @@ def replay_recording(
         rate=[at.get(derivative(f, 1), -1) for f in forces],
         curvature=[at.get(derivative(f, 2), -1) for f in forces],
     )  # fmt: skip
-    seen = np.empty((len(x), n))
-    reading = np.empty(2 * n)
-    for i in range(len(x)):
-        system.measure(x[i], total[i], p, reading)
-        seen[i] = reading[:n]
+    seen = system.encoder_readings(x, total, p)[:, : len(system.coordinates)]
     force = total[:, [at[f] for f in forces]]
     return _read(system, motion, seen, force, sensors, rng)
 
