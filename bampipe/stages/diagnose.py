@@ -66,6 +66,7 @@ class Config:
         model: which model version to diagnose.
         replicates: replays of the fitted model for the chance level; more is slower and sharper.
         significance: chance of a false alarm in a session that is accepted.
+        most_effects: the most effects that are tried before the search ends.
         jobs: worker processes; 0 means one for each processor, eight at most.
         seed: of the noise in the replays.
         trust_setup: whether to diagnose in spite of a mistake that was named in the set-up.
@@ -74,6 +75,7 @@ class Config:
     model: str = "base"
     replicates: Annotated[int, Field(ge=4)] = 10
     significance: Annotated[float, Field(gt=0, lt=1)] = 0.01
+    most_effects: Annotated[int, Field(ge=1)] = 8
     jobs: Count = 0
     seed: Count = 0
     trust_setup: bool = False
@@ -112,6 +114,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     settings = Settings(
         replicates=config.replicates,
         significance=config.significance,
+        most_effects=config.most_effects,
         jobs=config.jobs or min(8, os.cpu_count() or 1),
         seed=config.seed,
     )
