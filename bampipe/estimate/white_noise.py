@@ -3,13 +3,15 @@
 A difference of order k, divided by the root of its squared weights, has the standard deviation of
 white noise, while that of a smooth signal falls with every order. The least over several orders
 therefore bounds the noise from above, and is the noise wherever the signal is smooth over a few
-samples.
+samples. A hum is neither: where the sampling is slow, no difference takes it out, and it has next
+to nothing at the frequencies of the motion. It is fitted and taken off first.
 """
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
 
 Array = NDArray[np.float64]
 
@@ -23,6 +25,10 @@ _FEWEST = 200
 """Samples below which noise is not measured."""
 _STRETCHES, _STRETCH = 8, 2000
 """A longer record is looked at in so many stretches of so many samples: enough for 1 %."""
+_MOST_LINES, _LINE, _LOWEST_LINE = 6, 40.0, 0.1
+"""At most so many sines are taken off. One stands so far above the typical power of white noise,
+which chance reaches once in 10^17 frequencies, and has at least so many cycles a sample: below,
+differences take it out themselves."""
 
 
 def white_noise_sd(record: Array, t: Array | None = None) -> float:
@@ -53,6 +59,7 @@ def _difference_noise(record: Array, t: Array | None) -> float:
         parts = (slice(start, start + _STRETCH) for start in starts)
         some = [_difference_noise(record[p], None if t is None else t[p]) for p in parts]
         return float(np.median(some))
+    record = _without_lines(record, np.arange(record.size, dtype=float) if t is None else t)
     stamps = np.arange(record.size, dtype=float) if t is None else t / float(np.median(np.diff(t)))
     found = []
     for order in _ORDERS:
@@ -68,6 +75,46 @@ def _difference_noise(record: Array, t: Array | None) -> float:
             typical = float(np.sqrt(np.mean(np.square(size))))
         found.append(typical)
     return float(min(found))
+
+
+def _without_lines(record: Array, t: Array) -> Array:
+    """Take off the sines that stand far above the white noise of a record (T,), sampled at ``t``.
+
+    Second differences keep the signal out of the fits; those of a sine are taken at the time stamps
+    as they are.
+    """
+    rate = (t.size - 1) / float(t[-1] - t[0])
+    frequency = np.fft.rfftfreq(t.size - 2)
+    high = frequency > _LOWEST_LINE
+    white = np.square(2.0 * np.sin(np.pi * frequency[high])) ** 2
+    window = np.hanning(t.size - 2)
+    for _ in range(_MOST_LINES):
+        wanted = np.diff(record, 2)
+        power = np.square(np.abs(np.fft.rfft(window * wanted)[high])) / white
+        peak = int(np.argmax(power))
+        if power[peak] <= _LINE * float(np.median(power)) / np.log(2.0):
+            break
+        middle, apart = frequency[high][peak], frequency[1]
+
+        def fitted(cycles: float, wanted: Array = wanted) -> tuple[Array, float]:
+            phase = 2.0 * np.pi * cycles * rate * t
+            pair = np.column_stack([np.sin(phase), np.cos(phase)])
+            size, *_ = np.linalg.lstsq(np.diff(pair, 2, axis=0), wanted, rcond=None)
+            left = wanted - np.diff(pair, 2, axis=0) @ size
+            return pair @ size, float(left @ left)
+
+        # Uneven stamps tell a sine from its aliases.
+        lines = [
+            minimize_scalar(
+                lambda cycles: fitted(cycles)[1],
+                bounds=(alias - apart, alias + apart),
+                method="bounded",
+            )
+            for alias in (middle, 1.0 - middle, 1.0 + middle)
+        ]
+        best = min(lines, key=lambda line: float(line.fun))
+        record = record - fitted(float(best.x))[0]
+    return record
 
 
 def counting_step(record: Array) -> float:
