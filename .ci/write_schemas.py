@@ -15,6 +15,7 @@ from bampipe.results.filter import FilterResult
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.ingest import IngestResult
 from bampipe.results.lab import LabResult, TrendsResult
+from bampipe.results.next import NextResult
 from bampipe.results.performance import PerformanceResult
 from bampipe.results.run import RunResult
 from bampipe.results.setup import SetupResult
@@ -40,6 +41,7 @@ FILES: dict[str, type[Declaration]] = {
     "identify": IdentifyResult,
     "ingest": IngestResult,
     "lab": LabResult,
+    "next": NextResult,
     "performance": PerformanceResult,
     "run": RunResult,
     "setup": SetupResult,

@@ -36,6 +36,7 @@ COMMANDS = [
     "validate",
     "diagnose",
     "draft",
+    "next",
     "extend",
     "compare",
     "report",

@@ -52,6 +52,9 @@ LAWS = {
         "numpy scipy pandas pyarrow numba pydantic",
         "schema errors results progress physics estimate data trials discover",
     ),
+    "next_trial": law(
+        "numpy scipy", "errors results physics estimate trials identification discover"
+    ),
     "declarations": law("numpy pydantic", "errors files schema stages.base results physics data"),
     "simulator": law(
         "numpy scipy pandas pyarrow numba pydantic",
@@ -65,7 +68,7 @@ LAWS = {
     "stages": law(
         "numpy scipy pandas pyarrow numba pydantic",
         "errors files schema results progress physics estimate data declarations trials "
-        "identification setup discover report",
+        "identification setup discover next_trial report",
     ),
     "report": law(
         "numpy matplotlib typst pandas pyarrow bampipe", "declarations errors files results"

@@ -104,6 +104,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "validate": stages.validate,
     "diagnose": loop.diagnose,
     "draft": loop.draft,
+    "next": stages.next_,
     "extend": loop.extend,
     "compare": stages.compare,
     "report": stages.report,

@@ -104,7 +104,7 @@ def one_stage(
 
 
 def plain_stage(
-    stage: str, run: str | None, options: StageOptions, model: str = "", **more: str
+    stage: str, run: str | None, options: StageOptions, model: str = "", **more: object
 ) -> None:
     """Run ``stage`` on the run that ``run`` means, or list its settings.
 
@@ -119,6 +119,8 @@ def plain_stage(
     name = places.next_to(root, options.runs)
     if stage == "report":
         command = f"open {root / 'report' / 'report.pdf'}"
+    elif stage == "next":
+        command = "record that trial, add it to session.toml, and run the session again"
     else:
         command = f"bampipe {AFTER[stage]} {name}"
     advise(options.quiet, options.json, command)

@@ -16,6 +16,7 @@ from bampipe.cli.options import (
     StageOptions,
     with_stage_options,
 )
+from bampipe.run import models
 from bampipe.run.session_name import session_id
 
 
@@ -105,6 +106,33 @@ def validate(
     Example: bampipe validate 2026-10-03_s01
     """
     plain_stage("validate", run, options, model)
+
+
+@with_stage_options
+def next_(
+    run: RunArgument = None,
+    model: Annotated[
+        str, typer.Option(help="Model to design for; the best confirmed one if omitted.")
+    ] = "",
+    purpose: Annotated[
+        str,
+        typer.Option(
+            "--for", help="precision, decision, sensitivity, or a parameter; auto if omitted."
+        ),
+    ] = "",
+    seconds: Annotated[float, typer.Option(help="Length of the trial; 20 if omitted.")] = 0.0,
+    options: StageOptions = DEFAULTS,
+) -> None:
+    """Say which trial to record next, in one sentence, and what it is expected to give.
+
+    Example: bampipe next 2026-10-03_s01
+
+    Example: bampipe next 2026-10-03_s01 --for coulomb.yaw --seconds 30
+    """
+    chosen = model
+    if not options.list_settings and not model:
+        chosen = models.counting_model(places.find_run(run, options.runs))
+    plain_stage("next", run, options, chosen, purpose=purpose, seconds=seconds)
 
 
 @with_stage_options

@@ -25,6 +25,7 @@ from bampipe.physics.registry import effect as built_in
 from bampipe.physics.registry import effect_names
 from bampipe.physics.signals import follows
 from bampipe.trials.folds import Folds
+from bampipe.trials.motion import Motion
 from bampipe.trials.residuals import Evidence
 
 Array = NDArray[np.float64]
@@ -420,27 +421,11 @@ class Scorer:
         axes = list(range(len(system.coordinates)) if system.moves_sensors else system.touched)
         columns, changes = [], []
         for trial, (motion, used) in enumerate(zip(e.motions, e.used, strict=True)):
-            u = motion.inputs(system.inputs)
-            rows = []
-            if item.joint:
-                plain, _ = e.unfiltered(trial)
-                at = motion.q, motion.qd, motion.qdd
-                z = system.memory(*at, u, p, motion.t)
-                for probe in _probes(p, count, item.linear):
-                    rows.append(
-                        system.applied(*at, z, u, probe) - system.required(*at, z, u, probe) - plain
-                    )
-            elif system.moves_sensors:
-                true = system.true_motion(motion.q, motion.qd, motion.qdd, u, p)
-                inputs = motion.inputs(e.system.inputs)
-                plain, memory = e.unfiltered(trial)
-                rows.append(e.system.residual(*true, memory, inputs, e.p) - plain)
-            else:
-                z = system.memory(motion.q, motion.qd, motion.qdd, u, p, motion.t)
-                rows = [
-                    system.contribution(motion.q, motion.qd, motion.qdd, z, u, probe)
-                    for probe in _probes(p, count, item.linear)
-                ]
+            z = None if system.moves_sensors and not item.joint else memory_of(item, motion, p)
+            rows = [
+                added_residual(item, motion, probe, e.system, e.p, e.unfiltered(trial), z)
+                for probe in _probes(p, count, item.linear)
+            ]
             thin = self._thin(rows, used, axes)
             if item.linear:
                 columns.append(thin.transpose(0, 2, 1))
@@ -456,6 +441,44 @@ class Scorer:
         for r, values in enumerate(rows):
             out[:, r, axes] = self.evidence.band.thin(values[:, axes], axes) * used[:, axes]
         return out
+
+
+def memory_of(item: Candidate, motion: Motion, p: Array) -> Array:
+    """Internal states (T, n_z) of a candidate with the parameters ``p`` of its system."""
+    system = item.system
+    u = motion.inputs(system.inputs)
+    return system.memory(motion.q, motion.qd, motion.qdd, u, p, motion.t)
+
+
+def added_residual(
+    item: Candidate,
+    motion: Motion,
+    p: Array,
+    base: System,
+    base_p: Array,
+    unfiltered: tuple[Array, Array],
+    z: Array | None = None,
+) -> Array:
+    """What a candidate adds to the residual of a model along a motion, (T, n_q), N.m or N.
+
+    Args:
+        item: the candidate; motion: the trial.
+        p: parameters of its system, its own last.
+        base, base_p: the model without it, and its parameters.
+        unfiltered: residual (T, n_q) and internal states (T, n_z) of that model on the trial.
+        z: internal states of the candidate, from `memory_of`, where they are known already.
+    """
+    system, (plain, memory) = item.system, unfiltered
+    at = motion.q, motion.qd, motion.qdd
+    u = motion.inputs(system.inputs)
+    if system.moves_sensors and not item.joint:
+        true = system.true_motion(*at, u, p)
+        return base.residual(*true, memory, motion.inputs(base.inputs), base_p) - plain
+    if z is None:
+        z = memory_of(item, motion, p)
+    if item.joint:
+        return system.applied(*at, z, u, p) - system.required(*at, z, u, p) - plain
+    return system.contribution(*at, z, u, p)
 
 
 def _probes(p: Array, count: int, linear: Sequence[int]) -> list[Array]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,7 @@ from bampipe.estimate.identifiability import (
 from bampipe.estimate.least_squares import Problem, residual_and_slopes
 from bampipe.identification.sensor_noise import Noise
 from bampipe.physics import System
-from bampipe.physics.structure import DeterminableNumber, Structure, structure
+from bampipe.physics.structure import DeterminableNumber, structure
 from bampipe.results.identify import (
     Combined,
     DeviceNumber,
@@ -69,7 +69,10 @@ def assess_identifiability(
     known = structure(system)
     n_p = len(system.parameters)
     names = [system.parameters[i].name if i < n_p else TIMING for i in problem.free]
-    joint = [_of_trial(system, known, motions, problem, k, p, noise) for k in range(len(motions))]
+    joint = [
+        find_information(system, motion, problem, k, p, noise, known.slopes)
+        for k, motion in enumerate(motions)
+    ]
     n = len(names)
     total = np.sum(joint, axis=0)
     total[:n, :n] += np.diag(problem.precision)
@@ -127,24 +130,36 @@ def assess_identifiability(
     return report, undetermined_covariance(own, assumed)[place]
 
 
-def _of_trial(
+def find_information(
     system: System,
-    known: Structure,
-    motions: Sequence[Motion],
+    motion: Motion,
     problem: Problem,
     trial: int,
     p: Array,
     noise: Noise,
+    further: Callable[..., Array] | None = None,
 ) -> Array:
-    """Return the information of one trial on the parameters, then on the device's numbers."""
-    motion, own = motions[trial], p[:-1]
+    """Return the information of one trial on the estimated parameters, by sensor noise alone.
+
+    Args:
+        system: the model; motion: the trial; problem: its inverse dynamics, in which it has the
+            number ``trial``.
+        p: (n_p + 1,) parameters, the timing of the inputs last.
+        noise: of the sensors.
+        further: slopes (T, n_q, m) of the residual by further numbers at a motion, internal states,
+            inputs and parameters.
+
+    Returns:
+        (n, n), or (n + m, n + m) with those numbers last.
+    """
+    own = p[:-1]
     n = len(system.coordinates)
     u = motion.inputs(system.inputs) - p[-1] * motion.input_rates(system.inputs)
     z = system.memory(motion.q, motion.qd, motion.qdd, u, own, motion.t)
-    moved = system.true_motion(motion.q, motion.qd, motion.qdd, u, own)
-    slope = np.concatenate(
-        [residual_and_slopes(problem, trial, p)[1], known.slopes(*moved, z, u, own)], axis=2
-    )
+    slope = residual_and_slopes(problem, trial, p)[1]
+    if further is not None:
+        moved = system.true_motion(motion.q, motion.qd, motion.qdd, u, own)
+        slope = np.concatenate([slope, further(*moved, z, u, own)], axis=2)
     slope *= ~problem.resting[trial][:, :, None]
     push = system.input_map(motion.q, u, own) * noise.process_sd[noise.is_force]
     inertia = np.diagonal(system.mass_matrix(motion.q, own), axis1=1, axis2=2).mean(axis=0)

@@ -111,13 +111,17 @@ class TransientCandidate(Record):
 
 
 class SuggestedTrial(Record):
-    """What to record to tell a group apart; separations in noise floors."""
+    """What to record to tell a group apart."""
 
     between: Names
-    axis: str
+    axis: str = Field(description="Where it shows most")
     design: str
-    separation: Size
-    separation_now: Size
+    separation: Size = Field(
+        description="Error there of the wrong one, refitted, in noise floors; on that trial"
+    )
+    separation_now: Size = Field(description="The same on the trials at hand")
+    confusion: Share = Field(description="Chance of taking one for the other, with that trial")
+    confusion_now: Share
     sentence: str
 
 

@@ -59,6 +59,7 @@ STAGES: tuple[str, ...] = (
     "validate",
     "diagnose",
     "draft",
+    "next",
     "compare",
     "report",
 )
@@ -74,6 +75,7 @@ PER_MODEL: tuple[str, ...] = (
     "validate",
     "diagnose",
     "draft",
+    "next",
 )
 """Stages whose ``Config`` has a field ``model``: they run once for each model."""
 

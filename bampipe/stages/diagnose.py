@@ -16,7 +16,6 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
 from bampipe.data.store import write_parquet
 from bampipe.declarations.model_file import IDENTIFIED_MODEL, identified, load_model, read_recipe
-from bampipe.discover.advice import advise
 from bampipe.discover.diagnosis import diagnose
 from bampipe.discover.findings import Diagnosis
 from bampipe.discover.influence import Stretch as FoundStretch
@@ -25,6 +24,12 @@ from bampipe.discover.settings import Settings
 from bampipe.discover.shape import residual_map, variables, worst_windows
 from bampipe.errors import InputError
 from bampipe.identification.terms import effect_text
+from bampipe.next_trial.choice import rank_designs
+from bampipe.next_trial.forecast import NOTHING
+from bampipe.next_trial.motion import Rehearsal
+from bampipe.next_trial.primitives import Envelope
+from bampipe.next_trial.questions import find_ambiguity, make_contest
+from bampipe.next_trial.words import describe
 from bampipe.physics import compile_model, registry
 from bampipe.physics.effect import effect_from
 from bampipe.physics.recipe import Recipe
@@ -52,6 +57,9 @@ from bampipe.trials.measured import MeasuredTrials, read_measured_trials
 
 _DESCRIBED = 12
 """Effects of the ranking whose formulas are stored with it."""
+_SUGGESTED_S = 20.0
+_LOWERS = 0.5
+"""Share of the chance of confusion that a suggested trial must leave at most."""
 
 SUMMARY = "Find which physical effect the model lacks"
 INPUTS = (*INGESTED, *FILTERED, "filter/setup.json?", *IDENTIFIED_MODEL)
@@ -121,7 +129,11 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     found = diagnose(trials, recipe, start, settings, progress)
     samples = _map_variables(found)
     write_parquet(out / f"models/{config.model}/map_variables.parquet", samples)
-    return _summary(_result(found, trials, recipe, config.model).write(out))
+    progress(0.97, "a trial that would decide what these do not")
+    result = _with_suggestion(
+        _result(found, recipe, config.model), found, trials, recipe, config.seed
+    )
+    return _summary(result.write(out))
 
 
 def _require_sound_setup(run: RunFolder) -> None:
@@ -157,7 +169,7 @@ def _summary(result: dict[str, Any]) -> dict[str, object]:
     }
 
 
-def _result(found: Diagnosis, trials: MeasuredTrials, recipe: Recipe, model: str) -> DiagnoseResult:
+def _result(found: Diagnosis, recipe: Recipe, model: str) -> DiagnoseResult:
     names = found.evidence.system.coordinates
     units = found.evidence.system.torque_units
     sentences = axis_sentences(found)
@@ -221,7 +233,7 @@ def _result(found: Diagnosis, trials: MeasuredTrials, recipe: Recipe, model: str
             TransientCandidate(effect=effect, axis=names[axis], second=_stretch(second))
             for effect, (axis, second) in found.transient.items()
         ),
-        suggested_trial=_suggestion(found, trials, recipe),
+        suggested_trial=None,
         maps=_maps(found),
         worst_windows=tuple(
             WorstWindow(**vars(w), unit=units[names.index(w.axis)])
@@ -276,44 +288,68 @@ def _map_variables(found: Diagnosis) -> pd.DataFrame:
     return pd.DataFrame(columns)
 
 
-def _suggestion(found: Diagnosis, trials: MeasuredTrials, recipe: Recipe) -> SuggestedTrial | None:
-    """The trial that would tell apart two effects that these trials do not."""
-    pairs = [(name, group[0]) for name, group in found.groups.items() if group]
-    pairs += [
-        (first, second)
-        for a in found.axes
-        if len(a.odds) > 1 and not a.effects
-        for first, second in [list(a.odds)[:2]]
-    ]
-    ranked = {r.effect: r for r in found.ranking}
-    for first, second in pairs:
-        if first not in ranked or second not in ranked:
-            continue
-        axis = ranked[first].axis
-        values = {n: np.array(list(ranked[n].values.values())) for n in (first, second)}
-        floor = found.axes[axis].noise_floor
-        advice = advise(trials, recipe, found.initial, axis, first, second, values, floor)
-        if advice is None:
-            continue
-        return SuggestedTrial(
-            between=(first, second),
-            axis=found.initial.system.coordinates[axis],
-            design=advice.design,
-            separation=advice.separation,
-            separation_now=advice.separation_now,
-            sentence=(
-                f"To tell {first} from {second}, record {advice.design}: taking one for the "
-                f"other would there leave {advice.separation:.1f} noise floors, against "
-                f"{advice.separation_now:.1f} in these trials."
-            ),
-        )
-    return None
+def _with_suggestion(
+    result: DiagnoseResult, found: Diagnosis, trials: MeasuredTrials, recipe: Recipe, seed: int
+) -> DiagnoseResult:
+    """The result with the trial that would tell apart what these trials do not."""
+    asked = find_ambiguity(result)
+    if asked is None:
+        return result
+    system, p = found.initial.system, found.initial.p
+    floor = np.array([axis.noise_floor for axis in found.axes])
+    values = {name: value for row in found.ranking for name, value in row.values.items()}
+    contest = make_contest(trials, recipe, p, asked, values, floor)
+    if contest is None:
+        return result
+    seen = Envelope.of_trials(trials.motions, system.model.device)
+    rehearsal = Rehearsal(system, p, trials.sensors, trials.kinematics, seen, seed)
+    fitted = [trials.motions[k] for k in trials.folds.fitted_trials]
+    at_hand = contest.sums(fitted)
+    tried = rank_designs(
+        rehearsal,
+        lambda motion: -contest.confusion(contest.contrasts(at_hand + contest.sums([motion]))),
+        _SUGGESTED_S,
+        seen.movable,
+        with_rests=True,
+    )[0]
+    now, sums = contest.contrasts(at_hand), [contest.sums([motion]) for motion in tried.motions]
+    then = [contest.contrasts(at_hand + new, new) for new in sums]
+    weights = contest.weights()
+    pair = max(weights, key=lambda pair: weights[pair] * now[pair].confusion)
+    confusion = float(np.median([one[pair].confusion for one in then]))
+    if confusion > _LOWERS * now[pair].confusion:
+        return result
+    left = np.median([one[pair].left for one in then], axis=0) / floor
+    axis = int(np.argmax(left))
+    first, second = (contest.rivals[k].name or NOTHING for k in pair)
+    design = describe(tried.design, seen, system.model.device)
+    return result.model_copy(
+        update={
+            "suggested_trial": SuggestedTrial(
+                between=(first, second),
+                axis=system.coordinates[axis],
+                design=design,
+                separation=float(left[axis]),
+                separation_now=float(now[pair].left[axis] / floor[axis]),
+                confusion=confusion,
+                confusion_now=now[pair].confusion,
+                sentence=(
+                    f"To tell {first} from {second}, record this: {design} The chance of confusing"
+                    f" them would fall from {100.0 * now[pair].confusion:.0f} to"
+                    f" {100.0 * confusion:.0f} %."
+                ),
+            )
+        }
+    )
 
 
 def _next(found: Diagnosis, model: str) -> str:
+    by_axis = dict(zip(found.evidence.system.coordinates, found.axes, strict=True))
+    undecided = [axis for axis, a in by_axis.items() if a.verdict == "undecided" and a.odds]
+    if undecided:
+        return f"bampipe next RUN --model {model}"
     if found.selected:
         return f"bampipe extend RUN {' '.join(found.selected)} --model {model}"
-    by_axis = dict(zip(found.evidence.system.coordinates, found.axes, strict=True))
     wrong = [axis for axis, a in by_axis.items() if a.standing in FLOOR_WRONG]
     if wrong:
         return (
@@ -323,10 +359,4 @@ def _next(found: Diagnosis, model: str) -> str:
     unknown = [axis for axis, a in by_axis.items() if a.verdict == "unknown_effect"]
     if unknown:
         return f"bampipe draft RUN --model {model}"
-    undecided = [axis for axis, a in by_axis.items() if a.verdict == "undecided" and a.odds]
-    if undecided:
-        return (
-            f"record more trials like these that move {', '.join(undecided)}, or try the likeliest "
-            f"with `bampipe extend RUN {next(iter(by_axis[undecided[0]].odds))} --model {model}`"
-        )
     return "nothing to add; `bampipe report RUN` writes it up"

@@ -58,7 +58,7 @@ def replay_recording(
     u = motion.inputs(system.inputs)
     if system.model.device.prescribed:
         force = _required_force(system, p, motion, u)
-        return _read(system, motion, motion.q, force, sensors, rng)
+        return read_by_sensors(system, motion, motion.q, force, sensors, rng)
     q, qd = _reference(system, p, motion, u, sensors.rate_hz)
     start = np.concatenate([q[0], qd[0], system.initial_memory(q[0], u[0], p)])
     at = {name: i for i, name in enumerate(system.inputs)}
@@ -73,7 +73,7 @@ def replay_recording(
     )  # fmt: skip
     seen = system.encoder_readings(x, total, p)[:, : len(system.coordinates)]
     force = total[:, [at[f] for f in forces]]
-    return _read(system, motion, seen, force, sensors, rng)
+    return read_by_sensors(system, motion, seen, force, sensors, rng)
 
 
 def _required_force(system: System, p: Array, motion: Motion, u: Array) -> Array:
@@ -85,7 +85,7 @@ def _required_force(system: System, p: Array, motion: Motion, u: Array) -> Array
     return np.asarray(u[:, forces] - excess)
 
 
-def _read(
+def read_by_sensors(
     system: System,
     motion: Motion,
     q: Array,

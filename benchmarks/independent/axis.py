@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from independent.person import follow
 from independent.sensors import (
     GOOD,
     Conditions,
@@ -72,13 +73,17 @@ def record(
     rate_hz = c.rate_hz or RATE_HZ
     steps = round((c.seconds or 6.0) / STEP)
     trials = []
-    for number in range(c.trials or 4):
+    for number, task in enumerate([*(None,) * (c.trials or 4), *c.tasks]):
         rng = np.random.default_rng([seed, 1 + number])
-        goal, rate = draw_moves(rng, steps, 0.12, 0.3 * c.pace, 0.1)
-        kick = np.repeat(rng.choice([-60.0, 0.0, 0.0, 60.0], steps // 1500 + 1), 1500)[:steps]
+        if task is None:
+            goal, rate = draw_moves(rng, steps, 0.12, 0.3 * c.pace, 0.1)
+        else:
+            goal, rate = (column[:, 0] for column in follow(rng, task, ("carriage",), STEP))
+        kicks = rng.choice([-60.0, 0.0, 0.0, 60.0], len(goal) // 1500 + 1)
+        kick = np.repeat(kicks, 1500)[: len(goal)]
         # With edges of 20 ms, samples determine what happens between them.
         kick = np.convolve(kick, np.hanning(200) / np.hanning(200).sum(), mode="same")
-        at = sample_steps(rng, steps, 1.0 / (rate_hz * STEP), c)
+        at = sample_steps(rng, len(goal), 1.0 / (rate_hz * STEP), c)
         motion = move(specimen.machine, specimen.law, goal, rate, kick, at)
         t = at * STEP
         step = COUNT * c.coarse

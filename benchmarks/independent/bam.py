@@ -16,6 +16,7 @@ from numba import njit
 from scipy.signal import butter, lfilter, sosfiltfilt
 
 from independent.friction import MEMORY, blank_laws, push_along, remember, resist, set_law
+from independent.person import follow
 from independent.sensors import (
     GOOD,
     Conditions,
@@ -45,6 +46,8 @@ COUNTS = {"yaw": (21333.3333, 12000), "pitch": (10191.0828, -4000), "extension":
 CALIBRATION = np.array([[12.0, 0.15, -0.1], [0.1, 11.5, 0.2], [-0.05, 0.1, 24.0]])
 ZERO_V = np.array([0.021, -0.034, 0.012])
 NOISE = 0.05
+FIELD = 40.0
+"""Cartesian damping that the brakes render in viscous trials, N.s/m."""
 MIDDLE, REACH = np.array([0.0, 0.0, 1.1]), np.array([1.2, 0.7, 0.38])
 HASTE = np.array([12.0, 12.0, 5.0])
 SIGN_WIDTHS = np.array([1e-3, 1e-3, 2.5e-4])
@@ -445,17 +448,21 @@ def record(
         columns |= {f"brake_{axis}": brake[:, i] for i, axis in enumerate(AXES)}
         write_trial(folder / trials[-1]["file"], columns)
 
-    free = c.trials or 5
-    for number in range(free + c.viscous_trials):
-        braked = number >= free
+    usual = (c.trials or 5, c.viscous_trials)
+    kinds = [(kind == 1, None) for kind in (0, 1) for _ in range(usual[kind])]
+    for number, (braked, task) in enumerate([*kinds, *((t.brakes > 0.0, t) for t in c.tasks)]):
         rng = np.random.default_rng([seed, 1 + number])
-        wanted, rate = _draw_wanted(rng, steps, 0.6 if braked else 1.0, c.pace)
+        if task is None:
+            wanted, rate = _draw_wanted(rng, steps, 0.6 if braked else 1.0, c.pace)
+        else:
+            wanted, rate = follow(rng, task, AXES, STEP)
         machine = specimen.machine
         machine["hand_frequency"], machine["hand_lag"] = rng.uniform(8.0, 11.0), 0.012
-        machine["field"] = 40.0
-        at = sample_steps(rng, steps, 1.0 / (rate_hz * STEP), c)
+        field = FIELD if task is None else FIELD * task.brakes
+        machine["field"] = field
+        at = sample_steps(rng, len(wanted), 1.0 / (rate_hz * STEP), c)
         q, force, brake = _move(machine, specimen.laws, wanted, rate, at, braked)
-        more = {"viscous_n_s_per_m": 40.0} if braked else {}
+        more = {"viscous_n_s_per_m": field} if braked else {}
         log("viscous" if braked else "free", at * STEP, q, force, brake, **more)
     for i, axis in enumerate(AXES if c.locked_trials else ()):
         rng = np.random.default_rng([seed, 100 + i])

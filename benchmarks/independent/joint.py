@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from independent.person import follow
 from independent.sensors import (
     GOOD,
     Conditions,
@@ -115,17 +116,19 @@ def record(
     rate_hz = c.rate_hz or RATE_HZ
     steps = round((c.seconds or 15.0) / STEP)
     trials = []
-    for number in range(c.trials or 5):
+    for number, task in enumerate([*(None,) * (c.trials or 5), *c.tasks]):
         rng = np.random.default_rng([seed, 1 + number])
-        if number % 2:
+        if task is not None:
+            goal, rate = (column[:, 0] for column in follow(rng, task, ("joint",), STEP))
+        elif number % 2:
             goal, rate = draw_moves(rng, steps, 1.2, 1.8 * c.pace, 0.15)
         else:
             goal, rate = draw_waves(rng, steps, 1.2, 0.8 * c.pace)
-        at = sample_steps(rng, steps, 1.0 / (rate_hz * STEP), c, jitter=0.08)
+        at = sample_steps(rng, len(goal), 1.0 / (rate_hz * STEP), c, jitter=0.08)
         # The stamps have whole milliseconds and are true to that.
         at = np.unique(np.rint(at / 10).astype(np.int64) * 10)
-        at = at[at < steps]
-        motion = move(specimen.machine, specimen.law, goal, rate, np.zeros(steps), at)
+        at = at[at < len(goal)]
+        motion = move(specimen.machine, specimen.law, goal, rate, np.zeros(len(goal)), at)
         t = at * STEP
         current = read_force(rng, t, motion[:, 1:] / TORQUE_PER_AMPERE, NOISE, c)[:, 0]
         step = COUNT * c.coarse

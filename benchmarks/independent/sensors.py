@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from independent.person import Task
+
 
 @dataclass(frozen=True)
 class Conditions:
@@ -28,6 +30,7 @@ class Conditions:
         creep: dry friction is the smoothed one of the device file instead of a true standstill.
         hold: a motor's command is held for 1 ms, so that it acts half of that late.
         viscous_trials, locked_trials: of a machine with brakes.
+        tasks: free trials beside those, in which somebody follows a sentence.
     """
 
     trials: int | None = None
@@ -43,6 +46,7 @@ class Conditions:
     hold: bool = False
     viscous_trials: int = 0
     locked_trials: bool = False
+    tasks: tuple[Task, ...] = ()
 
 
 GOOD = Conditions()

@@ -1,0 +1,70 @@
+"""The best of many primitives: tried exactly, in other surroundings, and as people follow them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.next_trial.motion import HASTY, Rehearsal
+from bampipe.next_trial.primitives import Primitive, list_primitives, vary_surroundings
+from bampipe.trials.motion import Motion
+
+Array = NDArray[np.float64]
+
+_VERSIONS = (1, 2, 3, 4, HASTY)
+"""As followed by different people."""
+_FINALISTS = 5
+_VARIED = 2
+"""Of the best, so many are tried in other surroundings."""
+_QUANTILE = 0.1
+"""Of the worth over versions, by which designs are ranked: a bad day must still do."""
+
+Worth = Callable[[Motion], float]
+"""What a motion is worth: larger is better."""
+
+
+@dataclass(frozen=True)
+class Tried:
+    """A design, and what it is worth.
+
+    Attributes:
+        design: the primitive.
+        worth: the quantile by which designs are ranked.
+        motions: its versions.
+    """
+
+    design: Primitive
+    worth: float
+    motions: tuple[Motion, ...]
+
+
+def rank_designs(
+    rehearsal: Rehearsal,
+    worth: Worth,
+    seconds: float,
+    axes: Sequence[int],
+    with_rests: bool,
+    progress: Callable[[float, str], None] = lambda fraction, message: None,
+) -> list[Tried]:
+    """Try primitives about ``axes`` of so many seconds; the best ones as followed, best first."""
+    designs = list_primitives(rehearsal.seen, seconds, axes, with_rests)
+    values = []
+    for k, design in enumerate(designs):
+        progress(0.6 * k / len(designs), f"trying {len(designs)} designs")
+        values.append(worth(rehearsal.record(design, 0)))
+    order = sorted(range(len(designs)), key=lambda k: -values[k])
+    best = [(values[k], designs[k]) for k in order[:_FINALISTS]]
+    for _, design in best[:_VARIED]:
+        for other in vary_surroundings(rehearsal.seen, design):
+            best.append((worth(rehearsal.record(other, 0)), other))
+    best.sort(key=lambda pair: -pair[0])
+    tried = []
+    for k, (_, design) in enumerate(best[:_FINALISTS]):
+        progress(0.7 + 0.3 * k / _FINALISTS, "following the best ones roughly")
+        motions = tuple(rehearsal.record(design, version) for version in _VERSIONS)
+        worths = [worth(motion) for motion in motions]
+        tried.append(Tried(design, float(np.quantile(worths, _QUANTILE)), motions))
+    return sorted(tried, key=lambda one: -one.worth)

@@ -1,0 +1,123 @@
+"""What the proposed trials are expected to give, as it is stored."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.next_trial.choice import Tried
+from bampipe.next_trial.discrimination import Contest, Sums
+from bampipe.next_trial.motion import Rehearsal
+from bampipe.next_trial.precision import Precision
+from bampipe.next_trial.primitives import Primitive
+from bampipe.next_trial.words import describe
+from bampipe.results.next import ExpectedConfusion, ExpectedSd, Move, Proposal
+from bampipe.trials.motion import Motion
+
+Array = NDArray[np.float64]
+
+NOTHING = "nothing missing"
+"""Name of the rival that no effect is missing."""
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """What is needed to say what a design gives.
+
+    Attributes:
+        rehearsal: the fitted model that designs are tried with.
+        precision: what is known of its parameters.
+        contest: effects to be told apart, if there are any; at_hand: its sums over the trials.
+    """
+
+    rehearsal: Rehearsal
+    precision: Precision
+    contest: Contest | None = None
+    at_hand: Sums | None = None
+
+    def confusion_with(self, motion: Motion) -> float:
+        """Chance of confusing the rivals once ``motion`` has been recorded, over all pairs."""
+        assert self.contest is not None and self.at_hand is not None
+        return self.contest.confusion(
+            self.contest.contrasts(self.at_hand + self.contest.sums([motion]))
+        )
+
+    def proposal(self, tried: Tried) -> Proposal:
+        """The record of a design that has been tried."""
+        system, design = self.rehearsal.system, tried.design
+        device = system.model.device
+        axes = device.coordinates
+        added = [self.precision.of_motion(motion) for motion in tried.motions]
+        pose = {
+            axes[i].name: float(design.pose[i]) for i in range(len(axes)) if i not in design.strokes
+        }
+        return Proposal(
+            sentence=describe(design, self.rehearsal.seen, device),
+            seconds=design.seconds,
+            moves=_moves(design, self.rehearsal),
+            pose=pose,
+            brakes=design.field,
+            levels=dict(design.levels or {}),
+            worth=tried.worth,
+            information_gain=float(np.median([self.precision.gain(one) for one in added])),
+            # Of a model that lacks something, uncertainties are not worth a forecast.
+            sd={} if self.contest else self._sd(added, design.seconds),
+            confusion=self._confusion(tried.motions),
+        )
+
+    def _sd(self, added: Sequence[Array], seconds: float) -> dict[str, ExpectedSd]:
+        system, found = self.rehearsal.system, self.precision
+        after = np.array([found.sd_with(one, seconds) for one in added])
+        units = {q.name: q.unit for q in system.parameters}
+        return {
+            name: ExpectedSd(
+                before=found.sd[k],
+                after=float(np.median(after[:, k])),
+                after_at_worst=float(np.quantile(after[:, k], 0.9)),
+                unit=units[name],
+            )
+            for k, name in enumerate(found.names)
+        }
+
+    def _confusion(self, motions: Sequence[Motion]) -> tuple[ExpectedConfusion, ...]:
+        if self.contest is None or self.at_hand is None:
+            return ()
+        contest, axes = self.contest, self.rehearsal.system.coordinates
+        now = contest.contrasts(self.at_hand)
+        sums = [contest.sums([motion]) for motion in motions]
+        then = [contest.contrasts(self.at_hand + new, new) for new in sums]
+        weights = contest.weights()
+        return tuple(
+            ExpectedConfusion(
+                between=tuple(contest.rivals[i].name or NOTHING for i in pair),
+                weight=weights[pair],
+                before=before.confusion,
+                after=float(np.median([found[pair].confusion for found in then])),
+                distance_before=before.distance,
+                distance_after=float(np.median([found[pair].distance for found in then])),
+                left={
+                    axis: float(np.median([found[pair].left[k] for found in then]))
+                    / float(contest.floor[k])
+                    for k, axis in enumerate(axes)
+                },
+            )
+            for pair, before in now.items()
+        )
+
+
+def _moves(design: Primitive, rehearsal: Rehearsal) -> dict[str, Move]:
+    axes = rehearsal.system.model.device.coordinates
+    return {
+        axes[i].name: Move(
+            low=stroke.low,
+            high=stroke.high,
+            slow=stroke.slow,
+            fast=stroke.fast,
+            rest_s=stroke.rest_s,
+            unit=axes[i].unit,
+        )
+        for i, stroke in design.strokes.items()
+    }

@@ -1,0 +1,161 @@
+"""A primitive as the fitted model would record it: the motion prescribed, the force that it takes.
+
+People follow a sentence roughly. Each version of a primitive has speeds, turns and a drift of its
+own, and goes through the sensors and filters of the session.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.next_trial.primitives import PEAK, Envelope, Primitive, Stroke
+from bampipe.physics import System
+from bampipe.physics.device import LAST_ORDER, derivative
+from bampipe.trials.kinematics import Kinematics
+from bampipe.trials.motion import Motion
+from bampipe.trials.replay import read_by_sensors
+from bampipe.trials.residuals import residual_and_memory
+from bampipe.trials.sensors import Sensors
+
+Array = NDArray[np.float64]
+
+_SPEED, _RANGE, _TURN, _DRIFT = 0.2, 0.15, 0.1, 0.05
+"""How far people are off: speed and range of a trial, each turn and the slow drift of the middle,
+the last two as shares of the range."""
+HASTY = -1
+"""Number of the version of somebody who covers half the range at twice the speed."""
+_STEPS = 4
+"""Of the search for the force, where what the model requires depends on the force itself."""
+
+
+@dataclass(frozen=True)
+class Rehearsal:
+    """What designs are tried with.
+
+    Attributes:
+        system, p: the fitted model and its parameters.
+        sensors, kinematics: of the session.
+        seen: what the trials have shown to be possible.
+        seed: of the versions and of the noise.
+    """
+
+    system: System
+    p: Array
+    sensors: Sensors
+    kinematics: Kinematics
+    seen: Envelope
+    seed: int
+
+    def record(self, design: Primitive, version: int) -> Motion:
+        """One version of a design, recorded; 0 is followed exactly, `HASTY` hardly at all."""
+        rng = np.random.default_rng([self.seed, 1 + version])
+        given = design if version == 0 else _as_followed(design, self.seen, rng, version == HASTY)
+        return self._observe(*self._path(given, rng, exact=version == 0), given, rng)
+
+    def _path(
+        self, design: Primitive, rng: np.random.Generator, exact: bool
+    ) -> tuple[Array, Array, Array]:
+        """Position, velocity and acceleration along a design, each (T, n_q)."""
+        t = np.arange(int(design.seconds * self.sensors.rate_hz)) / self.sensors.rate_hz
+        n = len(self.system.coordinates)
+        q, qd, qdd = np.tile(design.pose, (t.size, 1)), np.zeros((t.size, n)), np.zeros((t.size, n))
+        for axis, stroke in design.strokes.items():
+            path = stroke_path(stroke, t, rng, 0.0 if exact else _TURN)
+            drift = 0.0 if exact else _DRIFT * (stroke.high - stroke.low)
+            w, phase = 2.0 * np.pi * rng.uniform(0.02, 0.1), rng.uniform(0.0, 2.0 * np.pi)
+            q[:, axis] = path[0] + drift * np.sin(w * t + phase)
+            qd[:, axis] = path[1] + drift * w * np.cos(w * t + phase)
+            qdd[:, axis] = path[2] - drift * w**2 * np.sin(w * t + phase)
+        return q, qd, qdd
+
+    def _observe(
+        self, q: Array, qd: Array, qdd: Array, design: Primitive, rng: np.random.Generator
+    ) -> Motion:
+        """The motion as sensors and filters give it, with the force that the model takes."""
+        system, device = self.system, self.system.model.device
+        t = np.arange(len(q)) / self.sensors.rate_hz
+        channels = {"t": t}
+        for name, (_, usual, _) in self.seen.levels.items():
+            channels[name] = np.full(t.size, (design.levels or {}).get(name, usual))
+        for axis, brake in device.brakes.items():
+            i = system.coordinates.index(axis)
+            channels[brake] = design.field * self.seen.field[i] * np.abs(qd[:, i])
+        for force in device.forces:
+            channels |= {derivative(force, k): np.zeros(t.size) for k in range(LAST_ORDER + 1)}
+        motion = Motion("design", t, q, qd, qdd, np.zeros_like(q), channels)
+        motion = self._with_force(motion)
+        applied = motion.inputs(device.forces)
+        recording = read_by_sensors(system, motion, motion.q, applied, self.sensors, rng)
+        return self.kinematics.observe(recording, device.forces)
+
+    def _with_force(self, motion: Motion) -> Motion:
+        """The motion with the force that leaves no residual."""
+        system, forces = self.system, self.system.model.device.forces
+        for _ in range(_STEPS):
+            u = motion.inputs(system.inputs)
+            left, _ = residual_and_memory(system, motion, u, self.p)
+            gains = system.input_map(motion.q, u, self.p)
+            excess = np.einsum("tfq,tq->tf", np.linalg.pinv(gains), left)
+            changed = {}
+            for k, name in enumerate(forces):
+                values = motion.channels[name] - excess[:, k]
+                rates = self.kinematics.input_rates(values)
+                changed[name] = values
+                changed |= {derivative(name, o + 1): rate for o, rate in enumerate(rates)}
+            motion = motion.with_channels(changed)
+            if not system.driven and not system.memory_names:
+                break
+        return motion
+
+
+def _as_followed(
+    design: Primitive, seen: Envelope, rng: np.random.Generator, hastily: bool
+) -> Primitive:
+    """A design as a person follows it: other speeds and turns, within what has been seen."""
+    strokes = {}
+    for axis, stroke in design.strokes.items():
+        speed = 2.0 if hastily else 1.0 + rng.uniform(-_SPEED, _SPEED)
+        share = 0.5 if hastily else 1.0 + rng.uniform(-_RANGE, _RANGE)
+        width = share * (stroke.high - stroke.low)
+        room = 0.5 * (stroke.high - stroke.low) * _TURN
+        middle = 0.5 * (stroke.low + stroke.high) + rng.uniform(-room, room)
+        strokes[axis] = replace(
+            stroke,
+            low=max(middle - 0.5 * width, float(seen.low[axis])),
+            high=min(middle + 0.5 * width, float(seen.high[axis])),
+            slow=speed * stroke.slow,
+            fast=speed * stroke.fast,
+        )
+    return replace(design, strokes=strokes)
+
+
+def stroke_path(
+    stroke: Stroke, t: Array, rng: np.random.Generator, jitter: float
+) -> tuple[Array, Array, Array]:
+    """Position, velocity and acceleration, each (T,), of strokes of least jerk between two turns.
+
+    Args:
+        stroke: what to do; t: (T,) times from 0 on, s.
+        rng: source of the speed of each stroke within its band, and of where it turns.
+        jitter: how far turns are off, as a share of the travel.
+    """
+    q, qd, qdd = np.empty(t.size), np.zeros(t.size), np.zeros(t.size)
+    travel = stroke.high - stroke.low
+    start, at, k = 0.0, 0.5 * (stroke.low + stroke.high), 0
+    while start <= t[-1]:
+        end = stroke.high if k % 2 == 0 else stroke.low
+        inwards = -1.0 if k % 2 == 0 else 1.0
+        goal = end + inwards * jitter * travel * rng.uniform(0.0, 1.0)
+        speed = np.exp(rng.uniform(np.log(stroke.slow), np.log(stroke.fast)))
+        length = max(PEAK * abs(goal - at) / speed, 1e-3)
+        s = np.clip((t - start) / length, 0.0, 1.0)
+        here = (t >= start) & (t < start + length + stroke.rest_s)
+        way, s = goal - at, s[here]
+        q[here] = at + way * s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
+        qd[here] = way / length * 30.0 * s**2 * (1.0 - s) ** 2
+        qdd[here] = way / length**2 * 60.0 * s * (1.0 - s) * (1.0 - 2.0 * s)
+        start, at, k = start + length + stroke.rest_s, goal, k + 1
+    return q, qd, qdd

@@ -1,0 +1,171 @@
+"""What the next trial is for: effects to be told apart, effects that these trials do not show."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.discover.candidates import Scorer, library
+from bampipe.discover.chance import candidates_of, fit_trials, system_of
+from bampipe.discover.settings import Settings
+from bampipe.next_trial.discrimination import Contest, Rival, Sums
+from bampipe.next_trial.sensitivity import Visibility, refine, typical_rival, weigh_visibility
+from bampipe.physics.recipe import Recipe
+from bampipe.physics.registry import effect_from
+from bampipe.results.diagnose import DiagnoseResult
+from bampipe.trials.measured import MeasuredTrials
+from bampipe.trials.motion import Motion
+from bampipe.trials.residuals import Evidence
+
+Array = NDArray[np.float64]
+
+_LIKELY = 0.02
+"""Odds below which a rival is not worth a trial."""
+_MOST_RIVALS = 4
+
+
+@dataclass(frozen=True)
+class Ambiguity:
+    """Effects that a diagnosis could not tell apart.
+
+    Attributes:
+        odds: by effect; "" for none.
+        others: effects found beside them, which are taken for granted.
+    """
+
+    odds: Mapping[str, float]
+    others: tuple[str, ...]
+
+
+def find_ambiguity(found: DiagnoseResult) -> Ambiguity | None:
+    """The most open question of a diagnosis; None where every effect found stands clear."""
+    s, open_questions = Settings(), []
+    for name in found.selected:
+        contest = found.contests.get(name, ())
+        scores = {c.effect: c.score for c in contest}
+        ranked = {row.effect: row.score for row in found.ranking}
+        alike = {name, *found.groups.get(name, ())}
+        scores |= {other: ranked[other] for other in alike - {*scores} if other in ranked}
+        top = max(scores.values(), default=0.0)
+        if len(scores) < 2 or top <= 0.0:
+            continue
+        scale = np.hypot(s.score_sd, s.score_error * top)
+        odds = {other: float(np.exp((score - top) / scale)) for other, score in scores.items()}
+        open_questions.append((odds, tuple(n for n in found.selected if n != name)))
+    for axis in found.axes.values():
+        if axis.verdict == "undecided" and axis.likely and not axis.effects:
+            odds = {
+                name: share for name, share in axis.likely.items() if name not in found.selected
+            }
+            if odds:
+                odds |= {"": max(1.0 - sum(odds.values()), _LIKELY)}
+                open_questions.append((odds, found.selected))
+    best: Ambiguity | None = None
+    for odds, others in open_questions:
+        total = sum(odds.values())
+        shares = {name: share / total for name, share in odds.items() if share > _LIKELY * total}
+        shares = dict(sorted(shares.items(), key=lambda pair: -pair[1])[:_MOST_RIVALS])
+        if len(shares) > 1 and (best is None or max(shares.values()) < max(best.odds.values())):
+            total = sum(shares.values())
+            best = Ambiguity({n: share / total for n, share in shares.items()}, others)
+    return best
+
+
+def make_contest(
+    trials: MeasuredTrials,
+    recipe: Recipe,
+    start: Array,
+    asked: Ambiguity,
+    values: Mapping[str, float],
+    floor: Array,
+) -> Contest | None:
+    """The rivals of ``asked`` fitted to the trials; None where fewer than two can be.
+
+    Args:
+        trials: the measured trials; recipe: the model that was diagnosed.
+        start: (n_p,) its parameters.
+        values: of effects beside the rivals, by parameter.
+        floor: (n_q,) noise floor of each axis.
+    """
+    wider = replace(recipe, effects=(*recipe.effects, *asked.others))
+    system = system_of(wider)
+    known = {q.name: value for q, value in zip(system_of(recipe).parameters, start, strict=True)}
+    begin = np.array([known.get(q.name, values.get(q.name, q.prior)) for q in system.parameters])
+    evidence = fit_trials(trials, wider, begin)
+    scorer, rivals = Scorer(evidence), []
+    named = [name for name in asked.odds if name]
+    for item in candidates_of(wider, named):
+        score = scorer.score(item)
+        if score is not None:
+            rivals.append(Rival(item, score.values, asked.odds[item.name]))
+    if "" in asked.odds:
+        rivals.append(Rival(None, np.zeros(0), asked.odds[""]))
+    if len(rivals) < 2:
+        return None
+    return Contest(system, evidence.p, tuple(rivals), trials.band, floor)
+
+
+@dataclass(frozen=True)
+class Blindness:
+    """What the trials at hand would have shown of the library's effects.
+
+    Attributes:
+        contest: every effect at its typical strength; at_hand: its sums over the trials.
+        found: from which strength on each would have been found.
+        tests: number of candidates of a diagnosis.
+    """
+
+    contest: Contest
+    at_hand: Sums
+    found: tuple[Visibility, ...]
+    tests: int
+
+    @property
+    def hidden(self) -> list[int]:
+        """Numbers of the effects that would go unnoticed at their typical size, worst first."""
+        order = sorted(range(len(self.found)), key=lambda k: -self.found[k].factor)
+        return [k for k in order if self.found[k].is_hidden]
+
+    def narrowed(self, chosen: Sequence[int]) -> Blindness:
+        """The same for some of the effects."""
+        contest = replace(self.contest, rivals=tuple(self.found[k].rival for k in chosen))
+        start = self.at_hand.squares.shape[1] - len(self.contest.rivals)
+        rows = [*range(start), *(start + k for k in chosen)]
+        squares = self.at_hand.squares[:, rows][:, :, rows]
+        found = tuple(self.found[k] for k in chosen)
+        return Blindness(contest, replace(self.at_hand, squares=squares), found, self.tests)
+
+    def factors_with(self, motions: Sequence[Motion]) -> Array:
+        """From which factor on each effect is found once ``motions`` have been recorded."""
+        now = np.array([one.factor for one in self.found])
+        total = self.at_hand + self.contest.sums(motions)
+        before, after = (
+            np.array([v.factor for v in weigh_visibility(self.contest, sums, self.tests)])
+            for sums in (self.at_hand, total)
+        )
+        # What is not linear in its strength is taken to change alike.
+        ratio = np.ones(len(now))
+        known = np.isfinite(before) & np.isfinite(now)
+        ratio[known] = now[known] / before[known]
+        return np.asarray(after * ratio)
+
+
+def find_blindness(evidence: Evidence, recipe: Recipe, floor: Array) -> Blindness:
+    """What the trials would have shown of every effect of the library that the model lacks."""
+    device, extra = recipe.model().device, [effect_from(e) for e in recipe.extra]
+    scale = Scorer(evidence).scale
+    items = candidates_of(recipe, library(device, recipe.effects, extra))
+    rivals = [rival for item in items if (rival := typical_rival(item, scale)) is not None]
+    contest = Contest(
+        evidence.system, evidence.p, tuple(rivals), evidence.band, floor, refits=False
+    )
+    judged = [
+        m for m, fitted in zip(evidence.motions, evidence.folds.fitted, strict=True) if fitted
+    ]
+    at_hand = contest.sums(judged)
+    found = weigh_visibility(contest, at_hand, len(rivals))
+    refined = tuple(refine(contest, judged, one, len(rivals)) for one in found)
+    return Blindness(contest, at_hand, refined, len(rivals))

@@ -1,0 +1,136 @@
+"""What trials would have revealed: the smallest strength of each effect that a diagnosis finds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import norm
+from scipy.stats import t as student
+
+from bampipe.discover.candidates import Candidate
+from bampipe.discover.ranges import MachineScale
+from bampipe.discover.settings import Settings
+from bampipe.next_trial.discrimination import Contest, Rival, Sums
+from bampipe.physics.parameter import Parameter
+from bampipe.trials.motion import Motion
+
+Array = NDArray[np.float64]
+
+PROBABILITY = 0.9
+"""With which the strength would have been revealed."""
+LARGE = 1.0
+"""Of the size at which an effect is clearly there: what goes unnoticed at that size is hidden."""
+
+
+@dataclass(frozen=True)
+class Visibility:
+    """How large an effect must be to be found.
+
+    Attributes:
+        rival: the effect with its typical strengths and shape.
+        factor: of the typical strength, from which on it is found; infinite where the trials do
+            not excite it.
+        axis: where it shows first.
+    """
+
+    rival: Rival
+    factor: float
+    axis: int
+
+    @property
+    def parameter(self) -> Parameter:
+        """The strength that is meant."""
+        assert self.rival.item is not None
+        return self.rival.item.own[_strengths(self.rival.item)[0]]
+
+    @property
+    def typical(self) -> float:
+        """Its typical size, in its unit."""
+        assert self.rival.item is not None
+        return float(abs(self.rival.values[_strengths(self.rival.item)[0]]))
+
+    @property
+    def is_hidden(self) -> bool:
+        """Whether the effect would go unnoticed at its typical size."""
+        return self.factor > LARGE
+
+
+def _strengths(item: Candidate) -> list[int]:
+    return [i for i, q in enumerate(item.own) if q.strength and not q.fixed]
+
+
+def typical_rival(item: Candidate, scale: MachineScale) -> Rival | None:
+    """An effect at its typical strength, its shape within the range that the trials show.
+
+    None where it has no strength.
+    """
+    strengths = _strengths(item)
+    if not strengths:
+        return None
+    effect, values = item.system.model.effects[-1], []
+    for i, q in enumerate(item.own):
+        value = q.prior if q.typical is None else q.typical
+        if i in strengths:
+            value = value or q.sd
+        elif not q.fixed:
+            interval = scale.range_of(effect, q)
+            if not interval.low <= value <= interval.high:
+                positive = interval.low > 0.0
+                ends = np.array([interval.low, interval.high])
+                value = float(np.exp(np.log(ends).mean()) if positive else ends.mean())
+        values.append(value)
+    return Rival(item, np.array(values), 0.0)
+
+
+def weigh_visibility(contest: Contest, sums: Sums, tests: int) -> list[Visibility]:
+    """From which strength on each rival of ``contest`` would be found with `PROBABILITY`.
+
+    The gain in log likelihood must exceed the chance level after Bonferroni's correction, and the
+    error must fall by what is worth an effect on an axis at its floor.
+
+    Args:
+        contest: the library's effects at their typical strengths; sums: of the trials.
+        tests: number of candidates.
+    """
+    s = Settings()
+    count = np.maximum(sums.count, 1.0)
+    independent = np.maximum(count * contest.band.independent_share, 1.0)
+    level = student.isf(min(s.significance / max(tests, 1), 0.5), s.most_replicates - 1)
+    sure = norm.ppf(PROBABILITY)
+    found = []
+    for rival, left in zip(contest.rivals, contest.left_by_model(sums), strict=True):
+        by_chance = 0.5 * len(rival.free)
+        spread = np.hypot(np.sqrt(by_chance), s.replay_error * float(independent.mean()))
+        total = by_chance + level * spread
+        total += sure * np.sqrt(2.0 * total)
+        needed = np.maximum(total / independent, s.worth_at_floor)
+        needed += sure * np.sqrt(2.0 * needed / independent)
+        ratio = np.expm1(2.0 * needed) * count * contest.floor**2 / np.maximum(left, 1e-300)
+        axis = int(np.argmin(ratio))
+        excited = left[axis] > 1e-12 * count[axis] * contest.floor[axis] ** 2
+        factor = float(np.sqrt(ratio[axis])) if excited else np.inf
+        found.append(Visibility(rival, factor, axis))
+    return found
+
+
+def refine(
+    contest: Contest, motions: Sequence[Motion], found: Visibility, tests: int
+) -> Visibility:
+    """The same with the effect at the strength found: it may not be linear in its strength."""
+    item = found.rival.item
+    assert item is not None
+    if len(item.linear) == len(_strengths(item)) or not 1e-3 < found.factor < 1e3:
+        return found
+    values = found.rival.values.copy()
+    strengths = _strengths(item)
+    for _ in range(3):
+        own = [item.own[i] for i in strengths]
+        scaled = [found.rival.values[i] * found.factor for i in strengths]
+        values[strengths] = np.clip(scaled, [q.lower for q in own], [q.upper for q in own])
+        probe = replace(contest, rivals=(replace(found.rival, values=values),))
+        again = weigh_visibility(probe, probe.sums(motions), tests)[0]
+        found = replace(found, factor=found.factor * again.factor, axis=again.axis)
+    return found

@@ -1,0 +1,94 @@
+"""A primitive in a sentence that a student can follow."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from bampipe.next_trial.primitives import GENTLE, PEAK, Envelope, Primitive, Stroke
+from bampipe.physics.device import Device
+
+_SLOW, _FAST = 0.12, 0.45
+"""Of the speed that the trials show: where a motion is called slow, and where fast."""
+
+
+def describe(design: Primitive, seen: Envelope, device: Device) -> str:
+    """Say what to do in one sentence."""
+    axes = device.coordinates
+    first = design.axis
+    beside = [i for i, one in design.strokes.items() if i != first and _is_gentle(one, seen, i)]
+    strokes = {i: one for i, one in design.strokes.items() if i not in beside}
+    names = [axes[i].name for i in strokes]
+    ends = [_ends(one, axes[i].unit) for i, one in strokes.items()]
+    pace, times = _pace(design.strokes[first], seen, first), [_times(s) for s in strokes.values()]
+    if len(strokes) == 1:
+        text = f"Move {names[0]} {pace} back and forth {ends[0]}, {times[0]}"
+    elif len(set(times)) == 1:
+        each = ", ".join(f"{name} {end}" for name, end in zip(names, ends, strict=True))
+        text = f"Move {_joined(names)} {pace} back and forth at once, {each}, {times[0]}"
+    else:
+        each = ", ".join(
+            f"{name} {end}, {time}" for name, end, time in zip(names, ends, times, strict=True)
+        )
+        text = f"Move {_joined(names)} back and forth at once, {each}"
+    text += f", for {design.seconds:.3g} s"
+    if beside:
+        about = _joined([_about(design.strokes[i], axes[i].unit) for i in beside])
+        text += f"; meanwhile keep {_joined([axes[i].name for i in beside])} moving gently, {about}"
+    still = [i for i in range(len(axes)) if i not in design.strokes]
+    if still:
+        text += f"; leave {_joined([axes[i].name for i in still])} alone"
+    if design.field:
+        share = "half as strong as" if design.field < 1.0 else "as"
+        text += f"; with the brakes on, {share} in the viscous trials"
+    for name, level in (design.levels or {}).items():
+        unit = device.channels[name]
+        text += f"; with {name} held at {level:.3g} {unit}".rstrip()
+    return text + "."
+
+
+def _is_gentle(stroke: Stroke, seen: Envelope, axis: int) -> bool:
+    return bool(stroke.high - stroke.low <= (2.0 * GENTLE + 0.01) * (seen.high - seen.low)[axis])
+
+
+def _about(stroke: Stroke, unit: str) -> str:
+    """Around where an axis is moved, and how far."""
+    middle, half = 0.5 * (stroke.low + stroke.high), 0.5 * (stroke.high - stroke.low)
+    if unit == "rad":
+        return f"{math.degrees(middle):.0f}° ± {math.degrees(half):.0f}°"
+    return f"{1e3 * middle:.0f} ± {1e3 * half:.0f} mm"
+
+
+def _pace(stroke: Stroke, seen: Envelope, axis: int) -> str:
+    share = np.sqrt(stroke.slow * stroke.fast) / float(seen.speed[axis])
+    if share < _SLOW:
+        return "slowly"
+    return "fast" if share > _FAST else "at an easy pace"
+
+
+def _ends(stroke: Stroke, unit: str) -> str:
+    """Where to turn: degrees or millimetres first, for a person; the unit of the files after."""
+    if unit == "rad":
+        low, high = math.degrees(stroke.low), math.degrees(stroke.high)
+        return f"between {low:.0f}° and {high:.0f}° ({stroke.low:.2f} to {stroke.high:.2f} rad)"
+    low, high = 1e3 * stroke.low, 1e3 * stroke.high
+    digits = 0 if high - low > 10.0 else 2
+    return f"between {low:.{digits}f} and {high:.{digits}f} mm"
+
+
+def _times(stroke: Stroke) -> str:
+    """How long a stroke takes, and how fast it is at its middle."""
+    travel = stroke.high - stroke.low
+    short, long = (PEAK * travel / speed for speed in (stroke.fast, stroke.slow))
+    text = f"{short:.2g} s each way"
+    if f"{long:.2g}" != f"{short:.2g}":
+        text = f"{short:.2g} to {long:.2g} s each way, now quicker, now slower"
+    if stroke.rest_s:
+        text += f", with a rest of {stroke.rest_s:.2g} s at each end"
+    return text
+
+
+def _joined(parts: Sequence[str]) -> str:
+    return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"

@@ -1,0 +1,94 @@
+"""``models/<model>/next.json``: the trial to record next, and what it is expected to give."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal
+
+from pydantic import Field
+
+from bampipe.results.record import Names, Record, Result, Share, Size
+
+Purpose = Literal["precision", "decision", "sensitivity"]
+"""What a trial is for: smaller uncertainties, one effect told from others, effects shown that the
+trials at hand would not have shown."""
+
+
+class Move(Record):
+    """Back and forth of one axis."""
+
+    low: float
+    high: float
+    slow: Size = Field(description="Least and")
+    fast: Size = Field(description="most of the highest speed of each stroke")
+    rest_s: Size = 0.0
+    unit: Literal["rad", "m"]
+
+
+class ExpectedSd(Record):
+    """Standard deviation of one parameter."""
+
+    before: Size = Field(description="As published")
+    after: Size = Field(description="Median over versions of the trial")
+    after_at_worst: Size = Field(description="Of nine trials in ten")
+    unit: str
+
+
+class ExpectedConfusion(Record):
+    """Chance of taking one effect for another."""
+
+    between: Names
+    weight: Share = Field(description="Box-Hill weight of the pair: product of the odds")
+    before: Share
+    after: Share = Field(description="Median over versions of the trial")
+    distance_before: Size = Field(description="Expected log likelihood ratio, nats")
+    distance_after: Size
+    left: dict[str, Size] = Field(
+        description="By axis: error on the new trial of the wrong one refitted, in noise floors"
+    )
+
+
+class Proposal(Record):
+    """One trial that could be recorded."""
+
+    sentence: str
+    seconds: Size
+    moves: dict[str, Move] = Field(description="By axis; the first is the one that it is about")
+    pose: dict[str, float] = Field(description="Where the other axes are held, rad or m")
+    brakes: Share = Field(default=0.0, description="Share of the commands of the viscous trials")
+    levels: dict[str, float] = Field(default={}, description="Of further channels")
+    worth: float = Field(description="By which proposals are ranked; of nine versions in ten")
+    information_gain: float = Field(description="Half the drop of the log determinant, nats")
+    sd: dict[str, ExpectedSd] = Field(
+        default={}, description="By parameter; none where the model lacks something"
+    )
+    confusion: tuple[ExpectedConfusion, ...] = ()
+
+
+class Detectable(Record):
+    """The smallest strength of an effect that the trials would have revealed."""
+
+    parameter: str
+    smallest: Size | None = Field(description="null where they do not excite it")
+    typical: float = Field(description="Size at which the effect is clearly there")
+    unit: str
+    axis: str = Field(description="Where it shows first")
+    with_proposal: Size | None = Field(
+        default=None, description="The same once the first proposal has been recorded"
+    )
+
+
+class NextResult(Result):
+    """The trial to record next, and what it is expected to give."""
+
+    FILE: ClassVar[str] = "models/{model}/next.json"
+    STAGE: ClassVar[str] = "next"
+
+    model: str
+    purpose: Purpose
+    parameter: str = Field(default="", description="The one that is to become precise")
+    trials: Names = Field(description="At hand when this was proposed")
+    sentence: str = Field(description="What to record")
+    why: str
+    expected: str = Field(description="What it is expected to give")
+    proposals: tuple[Proposal, ...] = Field(description="Best first")
+    sensitivity: dict[str, Detectable] = Field(default={}, description="By effect of the library")

@@ -1,0 +1,252 @@
+"""Stage next: the trial to record next, in one sentence, and what it is expected to give."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+from pydantic.dataclasses import dataclass as checked_dataclass
+
+from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
+from bampipe.declarations.model_file import IDENTIFIED_MODEL, identified, load_model, read_recipe
+from bampipe.errors import InputError, choose_from
+from bampipe.identification.filter_choice import FilterChoice
+from bampipe.identification.sensor_noise import sensor_noise
+from bampipe.next_trial.choice import Tried, Worth, rank_designs
+from bampipe.next_trial.forecast import Forecast
+from bampipe.next_trial.motion import Rehearsal
+from bampipe.next_trial.precision import Precision
+from bampipe.next_trial.primitives import Envelope
+from bampipe.next_trial.questions import (
+    Blindness,
+    find_ambiguity,
+    find_blindness,
+    make_contest,
+)
+from bampipe.next_trial.reasons import say_expected, say_why
+from bampipe.physics import compile_model
+from bampipe.progress import Progress
+from bampipe.results.diagnose import DiagnoseResult
+from bampipe.results.identify import IdentifyResult
+from bampipe.results.next import Detectable, NextResult, Purpose
+from bampipe.results.validate import ValidateResult
+from bampipe.schema import STRICT, Count
+from bampipe.trials.measured import read_measured_trials, trial_of_block
+from bampipe.trials.motion import Motion
+from bampipe.trials.residuals import Evidence, gather_evidence
+
+SUMMARY = "The trial to record next, and what it is expected to give"
+INPUTS = (
+    *INGESTED,
+    *FILTERED,
+    *IDENTIFIED_MODEL,
+    "models/{model}/validate.json?",
+    "models/{model}/diagnose.json?",
+)
+OUTPUTS = ("models/{model}/next.json",)
+
+Array = NDArray[np.float64]
+
+_SHOWN = 3
+"""Proposals in the summary."""
+_WATCHED = 12
+"""Hidden effects that designs are tried for."""
+_LITTLE = 0.05
+"""Sum of log strengths by which a trial for hidden effects must lower what goes unnoticed."""
+_HOPELESS = 100.0
+"""Of the typical strength: beyond, one unnoticed size is like another."""
+
+
+@checked_dataclass(frozen=True, config=STRICT)
+class Config:
+    """Settings of the stage.
+
+    Attributes:
+        model: which model version.
+        purpose: ``precision`` of all parameters; ``decision`` between effects that the diagnosis
+            could not tell apart; ``sensitivity`` to effects that the trials at hand would not have
+            shown; the name of a parameter; or ``auto``: what the diagnosis asks for.
+        seconds: length of the trial.
+        seed: of how people differ, and of sensor noise.
+    """
+
+    model: str = "base"
+    purpose: str = "auto"
+    seconds: Annotated[float, Field(ge=4, le=600)] = 20.0
+    seed: Count = 0
+
+
+def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
+    """Propose a trial for one identified model."""
+    model = load_model(run, config.model)
+    system = compile_model(model)
+    if system.undriven:
+        raise InputError(
+            f"no force acts on {system.undriven[0]}: its motion cannot be prescribed, so no trial"
+            " can be designed",
+            where=f"device {model.device.name!r}",
+        )
+    p = identified(run, config.model, system)
+    found = run.read(IdentifyResult, config.model)
+    purpose = config.purpose
+    kinds = ("auto", "precision", "decision", "sensitivity")
+    names = list(found.parameters)
+    if purpose not in (*kinds, *names):
+        raise InputError(
+            f"nothing is called {purpose!r} that a trial could be for",
+            remedy=choose_from(purpose, [*kinds, *names]),
+        )
+    diagnosed = None
+    if run.exists(DiagnoseResult.file(config.model)):
+        diagnosed = run.read(DiagnoseResult, config.model)
+    elif purpose == "decision":
+        raise InputError(
+            "what is to be decided is not known yet",
+            where=str(run.root),
+            remedy=f"run `bampipe diagnose {run.root}` first",
+        )
+    progress(0.0, "what the trials at hand say")
+    trials = read_measured_trials(run, system, every_input=True, timing=found.input_timing)
+    recipe = read_recipe(run, config.model, model)
+    evidence = gather_evidence(system, trials.motions, trials.band, p, trials.folds)
+    floor = _floor(run, config.model, diagnosed, evidence)
+    fitted = [trials.motions[k] for k in trials.folds.fitted_trials]
+    noise = sensor_noise(trials.sensors, system, fitted, p, FilterChoice())
+    seen = Envelope.of_trials(trials.motions, model.device)
+    rehearsal = Rehearsal(system, p, trials.sensors, trials.kinematics, seen, config.seed)
+    precision = Precision.of_trials(system, fitted, trials.band, p, found, noise)
+    contest, blindness = None, None
+    asked = find_ambiguity(diagnosed) if diagnosed else None
+    if asked is not None and diagnosed is not None:
+        values = {name: v for row in diagnosed.ranking for name, v in row.parameters.items()}
+        contest = make_contest(trials, recipe, p, asked, values, floor)
+    if purpose == "decision" and contest is None:
+        raise InputError(
+            "the diagnosis left nothing to decide",
+            where=str(run.path(DiagnoseResult.file(config.model))),
+            remedy="ask for precision, sensitivity, or a parameter by name",
+        )
+    chosen: Purpose
+    if purpose == "auto":
+        nothing = diagnosed is not None and all(
+            axis.verdict == "nothing_missing" for axis in diagnosed.axes.values()
+        )
+        chosen = "decision" if contest else "sensitivity" if nothing else "precision"
+    else:
+        chosen = purpose if purpose in kinds else "precision"  # type: ignore[assignment]
+    if chosen == "sensitivity":
+        progress(0.1, "what these trials would have shown of each effect")
+        blindness = find_blindness(evidence, recipe, floor)
+    at_hand = contest.sums(fitted) if contest else None
+    forecast = Forecast(rehearsal, precision, contest, at_hand)
+    parameter = purpose if purpose in names else ""
+    worth = _worth(chosen, parameter, forecast, blindness)
+    axes = seen.movable
+    if not axes:
+        raise InputError("no axis moves in the trials at hand", where=str(run.root))
+
+    def rank(worth: Worth, with_rests: bool, first: float) -> list[Tried]:
+        def report(fraction: float, message: str) -> None:
+            progress(first + 0.3 * fraction, message)
+
+        return rank_designs(rehearsal, worth, config.seconds, axes, with_rests, report)
+
+    tried = rank(worth, chosen != "precision", 0.2)
+    if chosen == "sensitivity" and tried[0].worth < _LITTLE:
+        # Nothing that a person could do here shows more: then for the parameters.
+        tried = rank(_worth("precision", "", forecast, None), False, 0.5)
+    progress(0.9, "what they are expected to give")
+    proposals = tuple(forecast.proposal(one) for one in tried)
+    best = proposals[0]
+    table = _sensitivity(blindness, tried[0]) if blindness else {}
+    result = NextResult(
+        model=config.model,
+        purpose=chosen,
+        parameter=parameter,
+        trials=tuple(dict.fromkeys(trial_of_block(m.trial_id) for m in trials.motions)),
+        sentence=best.sentence,
+        why=say_why(chosen, parameter, best, table),
+        expected=say_expected(chosen, parameter, best, table),
+        proposals=proposals,
+        sensitivity=table,
+    )
+    result.write(out)
+    return _summary(result)
+
+
+def _floor(
+    run: RunFolder, model: str, diagnosed: DiagnoseResult | None, evidence: Evidence
+) -> Array:
+    """Noise floor of each axis, (n_q,), N.m or N; what the fit leaves where there is none."""
+    left = evidence.rmse()
+    known: Mapping[str, float | None] = {}
+    if diagnosed is not None:
+        known = {axis: entry.noise_floor for axis, entry in diagnosed.axes.items()}
+    elif run.exists(ValidateResult.file(model)):
+        entries = run.read(ValidateResult, model).axes
+        known = {axis: entry.noise_floor for axis, entry in entries.items()}
+    found = [
+        known.get(axis) or float(left[i]) for i, axis in enumerate(evidence.system.coordinates)
+    ]
+    return np.maximum(found, 1e-12)
+
+
+def _worth(
+    purpose: Purpose, parameter: str, forecast: Forecast, blindness: Blindness | None
+) -> Worth:
+    precision = forecast.precision
+    if purpose == "decision":
+        return lambda motion: -forecast.confusion_with(motion)
+    if blindness is not None and blindness.hidden:
+        watched = blindness.narrowed(blindness.hidden[:_WATCHED])
+        now = np.minimum([v.factor for v in watched.found], _HOPELESS)
+
+        def shown(motion: Motion) -> float:
+            then = np.clip(watched.factors_with([motion]), 1.0, now)
+            return float(np.sum(np.log(now / then)))
+
+        return shown
+    if parameter:
+        place = precision.names.index(parameter)
+        return lambda motion: float(
+            np.log(
+                precision.sd[place]
+                / precision.sd_with(precision.of_motion(motion), motion.t[-1])[place]
+            )
+        )
+    return lambda motion: precision.gain(precision.of_motion(motion))
+
+
+def _sensitivity(blindness: Blindness, best: Tried) -> dict[str, Detectable]:
+    """The smallest strength of each effect that shows, without and with the best trial."""
+    after = np.median([blindness.factors_with([motion]) for motion in best.motions], axis=0)
+    axes = blindness.contest.system.coordinates
+    return {
+        found.rival.name: Detectable(
+            parameter=found.parameter.name,
+            smallest=found.factor * found.typical if np.isfinite(found.factor) else None,
+            typical=found.typical,
+            unit=found.parameter.unit,
+            axis=axes[found.axis],
+            with_proposal=factor * found.typical if np.isfinite(factor) else None,
+        )
+        for found, factor in zip(blindness.found, after, strict=True)
+    }
+
+
+def _summary(result: NextResult) -> dict[str, object]:
+    """The sentence first, then why and what for; the runners-up beside their worth."""
+    return {
+        "headline": result.sentence,
+        "why": result.why,
+        "expected": result.expected,
+        "notes": [result.why, result.expected],
+        "purpose": result.purpose,
+        "proposals": [
+            {"worth": one.worth, "sentence": one.sentence} for one in result.proposals[:_SHOWN]
+        ],
+    }

@@ -1,0 +1,84 @@
+"""Proposals, followed by somebody on machines whose simulators share no code with the product."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from independent.person import Task
+from independent_runs import diagnose, record_run
+
+import bampipe
+from bampipe.errors import InputError
+from bampipe.results.identify import IdentifyResult
+from bampipe.results.next import NextResult
+
+FASTEST = 2.4  # of the joint, rad/s
+LONG = {"trials": 4, "seconds": 12.0}
+UNDECIDED = {"trials": 2, "pace": 0.4}
+
+
+def propose(run: bampipe.Run, **settings) -> tuple[NextResult, Path]:
+    bampipe.run_stage(run, "next", **settings)
+    path = run.root / NextResult.file("base")
+    return NextResult.read(path), path
+
+
+def filter_sd_of(run: bampipe.Run, name: str) -> float:
+    found = IdentifyResult.read(run.root / IdentifyResult.file("base")).parameters[name].filter_sd
+    assert found is not None
+    return found
+
+
+def test_the_uncertainty_forecast_is_the_one_that_comes(tmp_path):
+    run, _ = record_run(tmp_path / "now", "joint", 922, **LONG)
+    found, path = propose(run, purpose="coulomb.joint", seconds=12.0)
+    assert found.purpose == "precision"
+    forecast = found.proposals[0].sd
+    after, _ = record_run(tmp_path / "after", "joint", 922, **LONG, tasks=(Task.read(path),))
+    more, _ = record_run(tmp_path / "more", "joint", 922, **LONG | {"trials": 5})
+    came = after.parameters("base").sd
+    for name in ("coulomb.joint", "viscous.joint", "moment", "inertia"):
+        assert came[name] / 1.3 < forecast[name].after < 1.3 * came[name], name
+    sloppy = Task.read(path, reach=0.5, haste=2.0)
+    rough, _ = record_run(tmp_path / "rough", "joint", 922, **LONG, tasks=(sloppy,))
+    # By the filter's own uncertainty: the scatter of blocks of time is itself known to a tenth.
+    gained, by_chance, roughly = (
+        filter_sd_of(one, "coulomb.joint") ** -2 - filter_sd_of(run, "coulomb.joint") ** -2
+        for one in (after, more, rough)
+    )
+    assert gained > 1.5 * by_chance
+    assert roughly > 0.7 * gained
+    # Coulomb friction shows in slow motion.
+    assert found.proposals[0].moves["joint"].fast < 0.1 * FASTEST
+
+
+def test_what_is_undecided_is_decided_after_the_proposed_trial(tmp_path):
+    run, _ = record_run(tmp_path / "now", "joint", 902, "quadratic_drag:joint", **UNDECIDED)
+    before = diagnose(run)
+    assert before["axes"]["joint"]["verdict"] == "undecided"
+    asked = before["suggested_trial"]
+    assert set(asked["between"]) == {"quadratic_drag:joint", "stribeck:joint"}
+    assert asked["confusion"] < 0.5 * asked["confusion_now"]
+    assert asked["separation"] > asked["separation_now"]
+    found, path = propose(run)
+    assert found.purpose == "decision"
+    assert found.proposals[0].confusion[0].after < 0.1
+    after, _ = record_run(
+        tmp_path / "after", "joint", 902, "quadratic_drag:joint", **UNDECIDED,
+        tasks=(Task.read(path),),
+    )  # fmt: skip
+    again = diagnose(after)
+    assert again["selected"] == ["quadratic_drag:joint"]
+    assert again["axes"]["joint"]["verdict"] == "missing"
+
+
+def test_bad_requests_are_refused_in_one_line(tmp_path):
+    run, _ = record_run(tmp_path, "joint", 5)
+    with pytest.raises(InputError, match=r"coulomb\.join'.*coulomb\.joint"):
+        bampipe.run_stage(run, "next", purpose="coulomb.join")
+    with pytest.raises(InputError, match=r"not known yet.*bampipe diagnose"):
+        bampipe.run_stage(run, "next", purpose="decision")
+    content = json.loads((run.root / "run.json").read_text())
+    assert "next:base" not in content["stages"]
