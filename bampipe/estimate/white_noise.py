@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import median_filter
 from scipy.optimize import minimize_scalar
 
 Array = NDArray[np.float64]
@@ -20,15 +21,19 @@ _SLOWEST_HZ, _COLOURED = 100.0, 2.0
 """A sensor's own low-pass keeps noise out of neighbouring samples that acts at the frequencies of
 the motion all the same. Thinned to this rate, a record shows that noise; but its signal is less
 smooth, so that the result counts from this factor on only."""
+_JUMP = 10.0
+"""Second difference, over the median one, from which on it is no part of a sine in noise."""
+_UNEVEN = 1e-3
+"""Range of the time between samples, as a share of it, from which on aliases differ."""
 _NORMAL_MEDIAN = 0.6744897501960817
 _FEWEST = 200
 """Samples below which noise is not measured."""
 _STRETCHES, _STRETCH = 8, 2000
 """A longer record is looked at in so many stretches of so many samples: enough for 1 %."""
-_MOST_LINES, _LINE, _LOWEST_LINE = 6, 40.0, 0.1
-"""At most so many sines are taken off. One stands so far above the typical power of white noise,
-which chance reaches once in 10^17 frequencies, and has at least so many cycles a sample: below,
-differences take it out themselves."""
+_MOST_LINES, _LINE, _LOWEST_LINE, _BESIDE = 6, 40.0, 0.1, 31
+"""At most so many sines are taken off. One stands so far above the typical power of so many
+frequencies around it, which chance reaches once in 10^17 of them, and has at least so many cycles a
+sample: below, differences take it out themselves."""
 
 
 def white_noise_sd(record: Array, t: Array | None = None) -> float:
@@ -45,9 +50,21 @@ def white_noise_sd(record: Array, t: Array | None = None) -> float:
     fine = _difference_noise(record, t)
     if t is None or t.size < 2:
         return fine
-    every = int(1.0 / (_SLOWEST_HZ * float(np.median(np.diff(t)))))
-    coarse = _difference_noise(record[::every], t[::every]) if every > 1 else fine
+    every = round(1.0 / (_SLOWEST_HZ * float(np.median(np.diff(t)))))
+    coarse = _thinned_noise(record, t, every) if every > 1 else fine
     return coarse if coarse > _COLOURED * fine else fine
+
+
+def _thinned_noise(record: Array, t: Array, every: int) -> float:
+    """Noise of every so-manieth sample, without the sines that the whole record shows."""
+    length = min(record.size, every * _STRETCH // 4)
+    starts = np.linspace(0, record.size - length, min(_STRETCHES // 2, record.size // length))
+    found = []
+    for start in starts.astype(int):
+        part = slice(start, start + length)
+        clear = _without_lines(record[part], t[part], _LOWEST_LINE / every)
+        found.append(_difference_noise(clear[::every], t[part][::every]))
+    return float(np.median(found))
 
 
 def _difference_noise(record: Array, t: Array | None) -> float:
@@ -59,8 +76,8 @@ def _difference_noise(record: Array, t: Array | None) -> float:
         parts = (slice(start, start + _STRETCH) for start in starts)
         some = [_difference_noise(record[p], None if t is None else t[p]) for p in parts]
         return float(np.median(some))
-    record = _without_lines(record, np.arange(record.size, dtype=float) if t is None else t)
     stamps = np.arange(record.size, dtype=float) if t is None else t / float(np.median(np.diff(t)))
+    record = _without_lines(record, stamps, _LOWEST_LINE)
     found = []
     for order in _ORDERS:
         windows = np.lib.stride_tricks.sliding_window_view(stamps, order + 1)
@@ -77,30 +94,36 @@ def _difference_noise(record: Array, t: Array | None) -> float:
     return float(min(found))
 
 
-def _without_lines(record: Array, t: Array) -> Array:
-    """Take off the sines that stand far above the white noise of a record (T,), sampled at ``t``.
+def _without_lines(record: Array, t: Array, lowest: float) -> Array:
+    """Take off the sines that stand far above what is around them in the spectrum of a record (T,).
 
     Second differences keep the signal out of the fits; those of a sine are taken at the time stamps
-    as they are.
+    ``t`` (T,) as they are. ``lowest`` is the least frequency of a line, in cycles a sample.
     """
     rate = (t.size - 1) / float(t[-1] - t[0])
+    uniform = float(np.ptp(np.diff(t))) * rate < _UNEVEN
     frequency = np.fft.rfftfreq(t.size - 2)
-    high = frequency > _LOWEST_LINE
-    white = np.square(2.0 * np.sin(np.pi * frequency[high])) ** 2
+    high = frequency > lowest
     window = np.hanning(t.size - 2)
     for _ in range(_MOST_LINES):
         wanted = np.diff(record, 2)
-        power = np.square(np.abs(np.fft.rfft(window * wanted)[high])) / white
-        peak = int(np.argmax(power))
-        if power[peak] <= _LINE * float(np.median(power)) / np.log(2.0):
+        # A jump of the signal, as where friction turns over, would drown every line.
+        even = np.abs(wanted) <= _JUMP * float(np.median(np.abs(wanted)))
+        power = np.square(np.abs(np.fft.rfft(window * wanted * even)[high]))
+        above = power / np.maximum(median_filter(power, _BESIDE), np.finfo(float).tiny)
+        peak = int(np.argmax(above))
+        if above[peak] <= _LINE / np.log(2.0):
             break
         middle, apart = frequency[high][peak], frequency[1]
 
-        def fitted(cycles: float, wanted: Array = wanted) -> tuple[Array, float]:
+        def fitted(
+            cycles: float, wanted: Array = wanted[even], even: NDArray[np.bool_] = even
+        ) -> tuple[Array, float]:
             phase = 2.0 * np.pi * cycles * rate * t
             pair = np.column_stack([np.sin(phase), np.cos(phase)])
-            size, *_ = np.linalg.lstsq(np.diff(pair, 2, axis=0), wanted, rcond=None)
-            left = wanted - np.diff(pair, 2, axis=0) @ size
+            columns = np.diff(pair, 2, axis=0)[even]
+            size, *_ = np.linalg.lstsq(columns, wanted, rcond=None)
+            left = wanted - columns @ size
             return pair @ size, float(left @ left)
 
         # Uneven stamps tell a sine from its aliases.
@@ -110,7 +133,7 @@ def _without_lines(record: Array, t: Array) -> Array:
                 bounds=(alias - apart, alias + apart),
                 method="bounded",
             )
-            for alias in (middle, 1.0 - middle, 1.0 + middle)
+            for alias in ((middle,) if uniform else (middle, 1.0 - middle, 1.0 + middle))
         ]
         best = min(lines, key=lambda line: float(line.fun))
         record = record - fitted(float(best.x))[0]
