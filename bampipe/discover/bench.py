@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,18 +16,24 @@ from bampipe.discover.chance import (
     ReplicateTask,
     ScoreTask,
     fit_trials,
+    open_trials,
     prepare,
     run_replicate,
     run_scores,
 )
 from bampipe.discover.level import Level
 from bampipe.discover.settings import Settings
+from bampipe.estimate.least_squares import fit
 from bampipe.physics.recipe import Recipe
 from bampipe.trials.measured import MeasuredTrials
 from bampipe.trials.noise_floor import FLOOR_SEED, floor_replays
-from bampipe.trials.residuals import Evidence
+from bampipe.trials.residuals import Evidence, problem_of
 
 Array = NDArray[np.float64]
+
+_STEPS_OF_TIMING, _SURE = 4, 3.0
+"""Most Gauss-Newton steps of a fit that starts at the right parameters, and standard deviations by
+which the timing must differ to be changed."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +58,28 @@ class Bench:
         tasks = [PrepareTask(recipe, self.names[k::parts]) for k in range(parts)]
         list(self.pool(prepare, tasks))
 
+    def retimed(self, evidence: Evidence) -> Bench:
+        """The same with inputs moved by the timing that a model with more effects gives them.
+
+        A lean model takes a part of what it lacks for inputs sampled late; kept, that part would
+        look like a delay as soon as the rest is found.
+        """
+        trials, system = self.trials, evidence.system
+        if trials.limit_s == 0.0 or not set(evidence.free).isdisjoint(system.delays):
+            return self
+        problem = problem_of(system, trials.motions, trials.band, timing=True)
+        found = fit(
+            problem,
+            np.append(evidence.p, 0.0),
+            trials=evidence.folds.fitted_trials,
+            most_iterations=_STEPS_OF_TIMING,
+        )
+        step, sd = float(found.p[-1]), float(np.sqrt(found.covariance[-1, -1]))
+        late_s = trials.late_s + step
+        if abs(step) < _SURE * sd or abs(late_s) + 2.0 * sd > trials.limit_s:
+            return self
+        return replace(self, trials=open_trials(late_s))
+
     def fit(self, recipe: Recipe, start: Array) -> Evidence:
         """Least squares of a model on the measured trials."""
         return fit_trials(self.trials, recipe, start)
@@ -75,7 +103,14 @@ class Bench:
         into, start = analysed or (recipe, p)
         tasks = [
             ReplicateTask(
-                recipe, p, into, start, (self.settings.seed, *seed, k), tuple(names), share
+                recipe,
+                p,
+                into,
+                start,
+                (self.settings.seed, *seed, k),
+                tuple(names),
+                self.trials.late_s,
+                share,
             )
             for k in range(first, first + count)
         ]
@@ -89,7 +124,8 @@ class Bench:
     def scores(self, recipe: Recipe, p: Array, names: Sequence[str]) -> dict[str, Score]:
         """Scores of candidates against a model on the measured trials."""
         parts = 2 * self.settings.jobs
-        tasks = [ScoreTask(recipe, p, tuple(names[k::parts])) for k in range(parts)]
+        late_s = self.trials.late_s
+        tasks = [ScoreTask(recipe, p, tuple(names[k::parts]), late_s) for k in range(parts)]
         merged: dict[str, Score] = {}
         for found in self.pool(run_scores, tasks):
             merged |= found

@@ -51,24 +51,32 @@ _STEPS_OF_A_REPLAY = 4
 """Most Gauss-Newton steps of the fit to a replay: it starts at the parameters that made it."""
 
 _open_trials: MeasuredTrials | None = None
+_timed_trials: MeasuredTrials | None = None
+"""The same with the timing that was asked for last."""
 
 
 def _enter(trials: MeasuredTrials) -> None:
-    global _open_trials
-    _open_trials = trials
+    global _open_trials, _timed_trials
+    _open_trials = _timed_trials = trials
     _systems.clear()
     _candidates.clear()
 
 
-def open_trials() -> MeasuredTrials:
-    """The trials that this process works on.
+def open_trials(late_s: float | None = None) -> MeasuredTrials:
+    """The trials that this process works on, with ``late_s`` taken off their inputs where given.
 
     Raises:
         RuntimeError: no pool has been opened.
     """
-    if _open_trials is None:
+    global _timed_trials
+    if _open_trials is None or _timed_trials is None:
         raise RuntimeError("no trials are open in this process")
-    return _open_trials
+    if late_s is None:
+        return _open_trials
+    if late_s != _timed_trials.late_s:
+        # From the trials as they came, whatever was asked before: the same bytes in any process.
+        _timed_trials = _open_trials.with_input_timing(late_s)
+    return _timed_trials
 
 
 _systems: dict[str, System] = {}
@@ -131,6 +139,7 @@ class ReplicateTask:
         analysed, start: the model that is fitted to the replay, and where its fit starts.
         seed: of the sensor noise.
         names: candidates to score.
+        late_s: time by which inputs were sampled after positions.
         share: whether to find the explainable share.
     """
 
@@ -140,12 +149,13 @@ class ReplicateTask:
     start: Array
     seed: tuple[int, ...]
     names: tuple[str, ...]
+    late_s: float | None = None
     share: bool = False
 
 
 def run_replicate(task: ReplicateTask) -> Replicate:
     """Replay, filter, fit and score one replicate."""
-    trials, system = open_trials(), system_of(task.recipe)
+    trials, system = open_trials(task.late_s), system_of(task.recipe)
     replays = replay_motions(
         system, task.p, trials.motions, trials.sensors, trials.kinematics, task.seed
     )
@@ -170,11 +180,12 @@ class ScoreTask:
     recipe: Recipe
     evidence_p: Array
     names: tuple[str, ...]
+    late_s: float | None = None
 
 
 def run_scores(task: ScoreTask) -> dict[str, Score]:
     """Score candidates against the measured session."""
-    trials = open_trials()
+    trials = open_trials(task.late_s)
     evidence = gather_evidence(
         system_of(task.recipe), trials.motions, trials.band, task.evidence_p, trials.folds,
         most_iterations=1,

@@ -58,6 +58,8 @@ def diagnose(
     device, extra = recipe.model().device, [effect_from(e) for e in recipe.extra]
     with workers(trials, settings.jobs) as pool:
         bench = Bench(trials, settings, pool, tuple(library(device, recipe.effects, extra)))
-        found = conclude(search(bench, recipe, start, progress), settings)
+        searched = search(bench, recipe, start, progress)
+        found = conclude(searched, settings)
     progress(0.95, "holding the final model against its floor in another band")
-    return replace(found, other_band=judge_in_other_band(trials, found.evidence, settings.seed))
+    other = judge_in_other_band(searched.trials, found.evidence, settings.seed)
+    return replace(found, other_band=other)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ from bampipe.estimate.simulation import Runaway
 from bampipe.physics.recipe import Recipe
 from bampipe.results.standing import AT_FLOOR, standing
 from bampipe.trials.folds import HELD_OUT
+from bampipe.trials.measured import MeasuredTrials
 from bampipe.trials.noise_floor import FLOOR_SEED, NoiseFloor
 from bampipe.trials.residuals import Evidence
 
@@ -32,6 +33,7 @@ class Search:
     """What a search came to.
 
     Attributes:
+        trials: the measured trials, timed as the model with every effect found wants them.
         recipe: the model as given.
         initial: its fit.
         level: chance level of candidates against it.
@@ -47,6 +49,7 @@ class Search:
         final: replays of the final model, with explainable shares.
     """
 
+    trials: MeasuredTrials
     recipe: Recipe
     initial: Evidence
     level: Level
@@ -111,14 +114,17 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
             if is_superfluous(wider, less, s):
                 wider = less
         out = {*wider.added, *current.added, *dropped, *transient}
-        sound = _sound_level(bench, current, wider, known, [n for n in bench.names if n not in out])
+        timed = bench.retimed(wider.evidence)
+        if timed is not bench:
+            wider = replace(wider, evidence=timed.fit(wider.recipe, wider.evidence.p))
+        sound = _sound_level(timed, current, wider, known, [n for n in bench.names if n not in out])
         if sound is None:
             # It resembles what is missing in these trials, but no mechanism could have it.
             dropped.add(chosen.winner)
             scores = {name: score for name, score in scores.items() if name != chosen.winner}
             continue
         dropped |= {*current.added, chosen.winner} - {*wider.added}
-        current, (scores, known) = wider, sound
+        bench, current, (scores, known) = timed, wider, sound
         groups[chosen.winner] = chosen.alike
         steps.append(_step(current))
         progress(0.45 + 0.05 * len(steps), f"added {chosen.winner}, looking for more")
@@ -131,7 +137,7 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
     final = bench.floor_replicas(found.recipe, found.evidence.p)
     main = {name: contest[0].axis for name, contest in contests.items() if contest}
     return Search(
-        base, initial, level, first, found,
+        bench.trials, base, initial, level, first, found,
         {name: groups.get(name, ()) for name in found.added},
         contests, main, likely, transient, tuple(steps), tuple(final),
     )  # fmt: skip

@@ -43,6 +43,8 @@ class MeasuredTrials:
         band: in which residuals are compared.
         folds: which a fit may see, and which are left out together.
         blocks: how many of the motions are blocks of the only trial that is not held out.
+        late_s: time by which inputs were sampled after positions, taken off already; limit_s: the
+            most that it may be, zero where it is not estimated.
     """
 
     motions: Sequence[Motion]
@@ -51,6 +53,15 @@ class MeasuredTrials:
     band: Band
     folds: Folds
     blocks: int = 0
+    late_s: float = 0.0
+    limit_s: float = 0.0
+
+    def with_input_timing(self, late_s: float) -> MeasuredTrials:
+        """The same with ``late_s`` taken off, instead of `late_s`."""
+        if late_s == self.late_s:
+            return self
+        moved = tuple(m.with_input_timing(late_s - self.late_s) for m in self.motions)
+        return replace(self, motions=moved, late_s=late_s)
 
 
 def trial_of_block(name: str) -> str:
@@ -117,6 +128,8 @@ def read_measured_trials(
         read_kinematics(run, system),
         band,
         Folds.of_trials(names, held_out, fitted),
+        late_s=late_s,
+        limit_s=timing.limit if timing is not None else 0.0,
     )
     alone = [k for k, name in enumerate(names) if name not in held_out]
     return _with_blocks(trials, alone[0], held_out) if len(alone) == 1 else trials
