@@ -346,6 +346,28 @@ def test_effects(command: Command) -> None:
     )
 
 
+def test_an_adopted_effect_stands_beside_the_base_model_of_every_run(
+    tmp_path: Path, command: Command
+) -> None:
+    built_in = "bampipe/physics/effects/stribeck.toml"
+    text = (Path(__file__).parent.parent / built_in).read_text(encoding="utf-8")
+    mine = tmp_path / "mine.toml"
+    mine.write_text(text)
+    runs = tmp_path / "runs"
+    from bampipe.run import models
+
+    code, _, err = command("effects", "adopt", mine, "--runs", runs)
+    assert code == 2
+    assert "built-in effect 'stribeck'" in err
+    mine.write_text(text.replace('name = "stribeck"', 'name = "our_stribeck"'))
+    code, out, _ = command("effects", "adopt", mine, "--runs", runs)
+    assert code == 0
+    assert "our_stribeck.toml" in out
+    models.ensure_base(runs / "s01", "bam", ())
+    copy = runs / "s01" / "models" / "base" / "effects" / "our_stribeck.toml"
+    assert copy.read_text() == mine.read_text()
+
+
 def test_one_effect_in_full(command: Command) -> None:
     code, out, _ = command("effects", "stribeck:yaw")
     assert code == 0

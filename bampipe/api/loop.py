@@ -232,8 +232,8 @@ def follow(
         for axis, entry in sorted(diagnosis.axes.items()):
             tell(f"{model}, {axis}: {entry.verdict.replace('_', ' ')}")
         found = diagnosis.selected
-        if not found and draft and diagnosis.unnamed_axes:
-            found = _drafted(options, model, tell)
+        if draft and diagnosis.unnamed_axes:
+            found = _drafted(options, model, tell) or found
         if not found:
             break
         child = _add(options, model, found, tell)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -15,10 +16,11 @@ from bampipe.cli.fetch import fetch
 from bampipe.cli.init import init
 from bampipe.cli.lab import lab
 from bampipe.cli.monitor import monitor
-from bampipe.cli.options import JsonOption
+from bampipe.cli.options import RUNS, JsonOption, RunsOption
 from bampipe.cli.run import run
 from bampipe.cli.simulate import simulate
 from bampipe.errors import InputError
+from bampipe.run import models
 
 app = typer.Typer(
     name="bampipe",
@@ -34,31 +36,43 @@ app = typer.Typer(
 
 def effects(
     name: Annotated[
-        str | None, typer.Argument(help="An effect, name[:target], or an effect file; or check.")
+        str | None,
+        typer.Argument(help="An effect, name[:target], or an effect file; or check, or adopt."),
     ] = None,
     file: Annotated[
-        str | None, typer.Argument(metavar="[FILE]", help="After check: the effect file.")
+        str | None, typer.Argument(metavar="[FILE]", help="After check or adopt: the effect file.")
     ] = None,
     device: Annotated[
         str, typer.Option(help="Device the effect is shown or checked on; a name or a file.")
     ] = "bam",
+    runs: RunsOption = RUNS,
     json: JsonOption = False,
 ) -> None:
-    """List the effects a model can have; with a name, show one in full; or check an effect file.
+    """List the effects a model can have; with a name, show one in full; check or adopt a file.
+
+    An adopted file is copied beside the run folders, and every run there weighs it from then on.
 
     Example: bampipe effects
 
     Example: bampipe effects stribeck:yaw
 
     Example: bampipe effects check snag.toml --device rail.toml
+
+    Example: bampipe effects adopt runs/2026-10-03_s01/models/base/drafts/snag_by_position.toml
     """
     from bampipe.cli.device import check_effect_file
     from bampipe.cli.effects import list_all, show_one
 
+    if name in ("check", "adopt") and file is None:
+        raise InputError("which effect file?", remedy=f"bampipe effects {name} FILE")
     if name == "check":
-        if file is None:
-            raise InputError("which effect file?", remedy="bampipe effects check FILE")
-        check_effect_file(file, device, json)
+        check_effect_file(str(file), device, json)
+    elif name == "adopt":
+        copy = models.adopt_effect(Path(str(file)), runs)
+        if json:
+            show.as_json({"file": str(copy)})
+        else:
+            show.say(f"{copy}: every run in {runs} weighs it from its next diagnosis on")
     elif file is not None:
         raise InputError(f"{file!r} is one argument too many", remedy="bampipe effects NAME")
     elif name is None:

@@ -55,6 +55,10 @@ def draft(
     model: Annotated[
         str, typer.Option(help="Model to draft for; the best confirmed one if omitted.")
     ] = "",
+    curve: Annotated[
+        bool,
+        typer.Option("--curve", help="A curve through points instead, where it is to predict."),
+    ] = False,
     options: StageOptions = DEFAULTS,
 ) -> None:
     """Draft a formula for what no effect explains, as an effect file, with its chance level.
@@ -68,7 +72,7 @@ def draft(
 
     root = places.find_run(run, options.runs)
     chosen = model or models.counting_model(root)
-    one_stage("draft", root, options, model=chosen)
+    one_stage("draft", root, options, model=chosen, more={"curve": True} if curve else {})
     after = RunFolder(root).read(DraftResult, chosen).next
     advise(options.quiet, options.json, after.replace("RUN", places.next_to(root, options.runs)))
 

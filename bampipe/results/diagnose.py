@@ -178,12 +178,9 @@ class DiagnoseResult(Result):
 
     @property
     def unnamed_axes(self) -> Names:
-        """Axes that lack something for which no effect of the library was found."""
+        """Axes on which something is left that no effect of the library explains."""
         return tuple(
             axis
             for axis, entry in self.axes.items()
-            if entry.remains
-            and not entry.effects
-            and entry.verdict in ("unknown_effect", "undecided")
-            and entry.standing not in FLOOR_WRONG
+            if entry.remains and entry.standing not in FLOOR_WRONG
         )

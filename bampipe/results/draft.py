@@ -71,6 +71,15 @@ class NearestEffect(Record):
     sentence: str
 
 
+class CurveBound(Record):
+    """What a free curve leaves: no formula of the same quantity could do much better."""
+
+    variable: str
+    acts_as: Literal["force", "friction", "damping", "inertia"]
+    points: Count
+    held_out_rmse: Size
+
+
 class AxisDraft(Record):
     """What was searched on one axis, and found."""
 
@@ -84,6 +93,9 @@ class AxisDraft(Record):
     rmse_after: Size
     noise_floor: Size = Field(description="Median error of the replays that give the chance level")
     unit: str
+    bound: CurveBound | None = Field(
+        description="A curve of what the first formula follows; null where nothing was drafted"
+    )
     nearest: tuple[NearestEffect, ...]
     sentence: str
 

@@ -23,11 +23,12 @@ from bampipe.files import write_text
 from bampipe.physics import compile_model
 from bampipe.physics.system import System
 from bampipe.progress import Progress
-from bampipe.results.diagnose import DiagnoseResult
+from bampipe.results.diagnose import AxisVerdict, DiagnoseResult
 from bampipe.results.draft import (
     AxisDraft,
     ChanceOfDraft,
     Constant,
+    CurveBound,
     DraftCurve,
     DraftedEffect,
     DraftOption,
@@ -58,6 +59,7 @@ class Config:
         significance: chance of a formula where nothing is missing.
         jobs: worker processes; 0 means one for each processor, eight at most.
         seed: of the noise in the replays.
+        curve: whether to draft a curve through points, where prediction is all that is wanted.
     """
 
     model: str = "base"
@@ -65,14 +67,14 @@ class Config:
     significance: Annotated[float, Field(gt=0, lt=1)] = 0.05
     jobs: Count = 0
     seed: Count = 0
+    curve: bool = False
 
 
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
     """Draft formulas for one model; write them and what they rest on.
 
     Raises:
-        InputError: there is no diagnosis of the model, it found effects that are not added yet, or
-            it calls nothing unknown; or an axis moves too little for a search.
+        InputError: there is no diagnosis of the model, or nothing is left by it without a name.
     """
     diagnosis = run.read(DiagnoseResult, config.model)
     model = load_model(run, config.model)
@@ -90,9 +92,11 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     source = _source(run.read(IngestResult))
     recipe = read_recipe(run, config.model, model)
     start = identified(run, config.model, system)
-    found = draft(trials, recipe, start, axes, settings, source, progress)
+    found = draft(trials, recipe, start, axes, settings, source, config.curve, progress)
     effects: dict[str, DraftedEffect] = {}
     for axis in found:
+        if not _beats_named_effects(axis, diagnosis, system, settings):
+            continue
         for term in axis.terms:
             file = f"models/{config.model}/drafts/{term.name}.toml"
             write_text(out / file, write_toml(declare(term, source)))
@@ -120,25 +124,24 @@ def _axes_to_draft(diagnosis: DiagnoseResult, system: System, run: RunFolder) ->
     """Numbers of the axes that lack something without a name.
 
     Raises:
-        InputError: there are none, or what has a name is not in the model yet.
+        InputError: there are none.
     """
-    if diagnosis.selected:
-        named = " ".join(diagnosis.selected)
-        raise InputError(
-            f"the diagnosis of model {diagnosis.model!r} names {named}: what is left without it is "
-            "not known yet",
-            where=str(run.root),
-            remedy=f"`bampipe extend {run.root} {named} --model {diagnosis.model}`, then diagnose",
-        )
     found = [system.coordinates.index(axis) for axis in diagnosis.unnamed_axes]
     if not found:
         raise InputError(
-            f"nothing to draft: the diagnosis of model {diagnosis.model!r} calls nothing unknown",
+            f"nothing to draft: the diagnosis of model {diagnosis.model!r} leaves nothing unnamed",
             where=str(run.root),
-            remedy="a formula is drafted where the verdict is unknown_effect, or undecided with "
-            "something left",
+            remedy="a formula is drafted where `remains` is true: something is left without a name",
         )
     return found
+
+
+def _beats_named_effects(
+    found: FoundDraft, diagnosis: DiagnoseResult, system: System, settings: Settings
+) -> bool:
+    """Whether the terms found leave less than the effects that the diagnosis names there."""
+    entry = diagnosis.axes[system.coordinates[found.axis]]
+    return not entry.effects or found.after < entry.rmse_after * np.exp(-settings.draft_worth)
 
 
 def _source(session: IngestResult) -> str:
@@ -162,6 +165,7 @@ def _effect(term: Term, file: str, system: System) -> DraftedEffect:
         )
         for name, value in term.values.items()
     }
+    is_curve = form.shape.name == "curve"
     numbers = ", ".join(
         f"{name} {c.value:.4g} ± {0.5 * (c.high - c.low):.2g} {c.unit}"
         for name, c in constants.items()
@@ -174,7 +178,7 @@ def _effect(term: Term, file: str, system: System) -> DraftedEffect:
         constants=constants,
         summary=form.summary,
         looks_like=form.looks_like,
-        sentence=f"{form.summary}: {numbers}.",
+        sentence=f"{form.summary}." if is_curve else f"{form.summary}: {numbers}.",
         curve=DraftCurve(
             variable=form.coordinate.words,
             variable_unit=form.coordinate.unit,
@@ -197,7 +201,10 @@ def _result(
         system.coordinates[axis.axis]: _axis(axis, effects, diagnosis, system) for axis in found
     }
     selected = tuple(effects)
-    if selected:
+    if not selected and diagnosis.selected:
+        named = " ".join(diagnosis.selected)
+        advice = f"bampipe extend RUN {named} --model {diagnosis.model}"
+    elif selected:
         advice = f"bampipe extend RUN {' '.join(selected)} --model {diagnosis.model}"
     else:
         advice = (
@@ -221,7 +228,7 @@ def _axis(
     system: System,
 ) -> AxisDraft:
     axis, unit = system.coordinates[found.axis], system.torque_units[found.axis]
-    names = tuple(term.canonical for term in found.terms)
+    names = tuple(term.canonical for term in found.terms if term.canonical in effects)
     beats_chance = len(found.options) > 1
     verdict: DraftVerdict = "drafted" if names else "nothing_beyond_chance"
     if beats_chance and not names:
@@ -243,11 +250,23 @@ def _axis(
         chance=chances,
         options=options,
         rmse_before=found.before,
-        rmse_after=found.after,
+        rmse_after=found.after if names else found.before,
         noise_floor=found.chance[-1].floor,
         unit=unit,
+        bound=_bound(found),
         nearest=_nearest(axis, found, diagnosis, unit) if names else (),
-        sentence=_sentence(axis, found, [effects[name] for name in names], unit),
+        sentence=_sentence(found, [effects[name] for name in names], diagnosis.axes[axis], axis),
+    )
+
+
+def _bound(found: FoundDraft) -> CurveBound | None:
+    if found.bound is None:
+        return None
+    return CurveBound(
+        variable=found.bound.form.coordinate.words,
+        acts_as=found.bound.form.factor,
+        points=found.bound.points,
+        held_out_rmse=found.bound.held_out_rmse,
     )
 
 
@@ -271,22 +290,37 @@ def _nearest(
     )
 
 
-def _sentence(axis: str, found: FoundDraft, effects: Sequence[DraftedEffect], unit: str) -> str:
-    name, chance = axis.capitalize(), found.chance[0]
+def _sentence(
+    found: FoundDraft, effects: Sequence[DraftedEffect], diagnosed: AxisVerdict, axis: str
+) -> str:
+    name, chance, unit = axis.capitalize(), found.chance[0], diagnosed.unit
     by_chance = (
         f"the best formula gains {chance.gain:.3g} in log likelihood on trials left out; on "
         f"{len(chance.gains)} replays, where nothing is missing, the same search gains "
         f"{np.mean(chance.gains):.2g} (p = {chance.p_value:.2g})"
     )
+    if not effects and found.terms:
+        return (
+            f"{name}: no draft, for {', '.join(diagnosed.effects)} leaves no more "
+            f"({diagnosed.rmse_after:.3g} {unit}) than the best formula ({found.after:.3g} {unit})."
+        )
+    if not effects and len(found.options) > 1:
+        return f"{name}: no draft, for no formula lowers the held-out error enough; {by_chance}."
     if not effects:
-        if len(found.options) > 1:
-            return (
-                f"{name}: no draft, for no formula lowers the held-out error enough; {by_chance}."
-            )
         return f"{name}: no draft, for chance would have given as good a formula; {by_chance}."
     floor = found.chance[-1].floor
     return (
         f"{name}: {' '.join(effect.sentence for effect in effects)} The held-out error falls from "
         f"{found.before:.3g} to {found.after:.3g} {unit}, {found.after / max(floor, 1e-30):.2f} "
-        f"times the noise floor; {by_chance}."
+        f"times the noise floor{_beside_curve(found, unit)}; {by_chance}."
+    )
+
+
+def _beside_curve(found: FoundDraft, unit: str) -> str:
+    """What a free curve would leave, where that is less."""
+    if found.bound is None or found.bound.held_out_rmse > found.after:
+        return ""
+    return (
+        f" (a free curve along {found.bound.form.coordinate.words} leaves "
+        f"{found.bound.held_out_rmse:.3g} {unit})"
     )

@@ -110,5 +110,6 @@ zero_v = [0.0]
 noise_sd_n = {NOISE}
 """
     truth = tell_truth("axis", seed, effects, OUTSIDE, specimen.truth, c)
+    truth["hidden_laws"] = specimen.hidden_laws
     write_session(folder, head, trials, truth)
     return truth

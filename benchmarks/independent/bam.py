@@ -83,10 +83,20 @@ LAWS = {
     "rough_patch": {"rough": (1.0, 1.3, 2.5), "rough_at": (0.15, 0.1, 1.12),
                     "rough_width": (0.08, 0.08, 0.03)},
     "winding_cable": {"cable": (4.0, 5.0, 25.0), "cable_time": (1.5, 1.5, 1.5)},
+    "slack_spring": {"slack_spring": (5.0, 8.0, 40.0), "slack": (0.2, 0.12, 0.08),
+                     "slack_at": (0.1, 0.05, 1.1)},
+    "speed_band": {"band": (1.0, 1.3, 2.5), "band_at": (0.5, 0.35, 0.2),
+                   "band_width": (0.12, 0.1, 0.06)},
+    "tightening": {"tightening": (1.2, 2.5, 8.0), "tightening_from": (-0.8, -0.5, 0.9)},
+    "imbalance": {"cogging": (1.0, 1.5, 4.0), "cogging_wavenumber": (2.5, 2.5, 6.0),
+                  "cogging_phase": (0.6, 0.6, 0.6)},
 }  # fmt: skip
 """Effects of one axis: their laws, typical for yaw, pitch and extension."""
 
-OUTSIDE = ("detent", "rough_patch", "winding_cable", "hum")
+OUTSIDE = (
+    "detent", "rough_patch", "winding_cable", "hum", "slack_spring", "speed_band", "tightening",
+    "imbalance",
+)  # fmt: skip
 EFFECTS = (
     *(f"{name}:{axis}" for name in LAWS if name not in OUTSIDE for axis in AXES),
     "backlash:yaw", "backlash:pitch", "inertia_mismatch:yaw", "inertia_mismatch:pitch",
@@ -100,6 +110,7 @@ EFFECTS = (
 UNKNOWN = (
     "detent:yaw", "detent:pitch", "detent:extension", "rough_patch:yaw", "rough_patch:pitch",
     "rough_patch:extension", "winding_cable:yaw", "winding_cable:extension", "hum:yaw",
+    "slack_spring:yaw", "speed_band:extension", "tightening:pitch", "imbalance:yaw",
 )  # fmt: skip
 
 
@@ -307,6 +318,7 @@ class _Specimen:
         self.bias, self.drift, self.mix = np.zeros(3), np.zeros(3), np.eye(3)
         self.delay, self.scale, self.compliance = 0.0, np.ones(3), np.zeros(3)
         self.truth = {"mass": float(self.machine["mass"])}
+        self.hidden_laws: dict[str, dict[str, float]] = {}
         self.stiffness = rng.uniform([2000.0, 1900.0, 95e3], [2600.0, 2300.0, 120e3])
         for i, axis in enumerate(AXES):
             self.truth[f"viscous.{axis}"] = self.laws["viscous"][i]
@@ -324,6 +336,7 @@ class _Specimen:
         if name in LAWS:
             typical = {key: values[axis] for key, values in LAWS[name].items()}
             self.truth |= set_law(laws[axis], full, typical, size, rng)
+            self.hidden_laws[full] = {key: float(laws[axis][key]) for key in typical}
         elif name == "backlash":
             m["gap"], m["contact"], m["loose_axis"] = 0.03 * size, 2e4, axis
         elif name == "inertia_mismatch":
@@ -468,6 +481,7 @@ def record(
         rng = np.random.default_rng([seed, 100 + i])
         log("locked", *_hold(specimen, rng, i), locked_axis=axis)
     truth = tell_truth("bam", seed, effects, OUTSIDE, specimen.truth, c)
+    truth["hidden_laws"] = specimen.hidden_laws
     truth["stiffness"] = dict(zip(AXES, specimen.stiffness.tolist(), strict=True))
     write_session(folder, _head(c, rate_hz), trials, truth)
     return truth

@@ -36,6 +36,9 @@ AXIS = np.dtype(
             "slip", "slip_distance",                # dry friction of contacts that hold, then slip
             "cable", "cable_time",                  # a cable that winds and creeps
             "reach_share", "reach_rest",            # dry friction by another axis' position
+            "slack_spring", "slack", "slack_at",    # a spring that is slack around one position
+            "band", "band_at", "band_width",        # dry friction around one speed
+            "tightening", "tightening_from",        # dry friction along the travel
         )
     ]
 )  # fmt: skip
@@ -44,12 +47,14 @@ AXIS = np.dtype(
 _NEVER_ZERO = (
     "stribeck_speed", "dahl_distance", "wavenumber", "warming_time", "cogging_wavenumber",
     "detent_width", "cable_time", "rough_width", "thinning_speed", "slip_distance",
+    "band_width",
 )  # fmt: skip
 
 _SHAPES = {
     "stribeck_speed", "dahl_distance", "wavenumber", "ripple_phase", "warming_time", "spring_rest",
     "cogging_wavenumber", "cogging_phase", "detent_at", "detent_width", "stop_at",
     "cable_time", "rough_at", "rough_width", "thinning_speed", "slip_distance",
+    "slack", "slack_at", "band_at", "band_width", "tightening_from",
 }  # fmt: skip
 _SAME = {
     "stribeck": {"stribeck": "force", "stribeck_speed": "speed"},
@@ -124,6 +129,9 @@ def push_along(law, q, memory):
     force -= law.detent * x * np.exp(0.5 - 0.5 * x * x)
     if q > law.stop_at:
         force -= law.stop * (q - law.stop_at)
+    past = q - law.slack_at
+    if abs(past) > law.slack:
+        force -= law.slack_spring * (past - np.sign(past) * law.slack)
     return force - law.cable * (q - memory.cable)
 
 
@@ -137,6 +145,8 @@ def dry_level(law, q, v, load, side, elsewhere):
     level += law.load_share * abs(load) + law.side_share * side
     level += law.reach_share * (elsewhere - law.reach_rest)
     level += law.rough * np.exp(-(((q - law.rough_at) / law.rough_width) ** 2))
+    level += law.band * np.exp(-(((abs(v) - law.band_at) / law.band_width) ** 2))
+    level += law.tightening * (q - law.tightening_from)
     return max(level, 0.0)
 
 

@@ -42,9 +42,14 @@ LAWS = {
     "upper_stop": {"stop": 40.0, "stop_at": 0.6},
     "rough_patch": {"rough": 4.0, "rough_at": 0.3, "rough_width": 0.1},
     "winding_cable": {"cable": 12.0, "cable_time": 2.0},
+    "slack_spring": {"slack_spring": 15.0, "slack": 0.4, "slack_at": 0.2},
+    "speed_band": {"band": 3.0, "band_at": 0.6, "band_width": 0.15},
+    "tightening": {"tightening": 2.5, "tightening_from": -1.5},
 }
 MOTOR = {"actuator_delay": 0.02, "actuator_lag": 0.03, "drive_sag": 0.003}
-OUTSIDE = ("detent", "rough_patch", "winding_cable")
+OUTSIDE = (
+    "detent", "rough_patch", "winding_cable", "slack_spring", "speed_band", "tightening",
+)  # fmt: skip
 EFFECTS = (
     *(f"{name}:joint" for name in LAWS if name not in OUTSIDE),
     "actuator_delay", "actuator_lag:current", "drive_sag:joint",
@@ -153,6 +158,7 @@ joint = {{ column = "q", unit = "rad", resolution = {COUNT * c.coarse!r} }}
 current = {{ column = "i", unit = "A" }}
 """
     truth = tell_truth("joint", seed, effects, OUTSIDE, specimen.truth, c)
+    truth["hidden_laws"] = specimen.hidden_laws
     write_session(folder, head, trials, truth)
     (folder / "joint.toml").write_text(DEVICE, encoding="utf-8")
     return truth

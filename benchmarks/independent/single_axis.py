@@ -98,6 +98,7 @@ class Specimen:
     Attributes:
         machine: record of dtype MACHINE; law: of dtype ``friction.AXIS``.
         truth: what an identification of the right model must find.
+        hidden_laws: by effect, the laws of ``friction`` that it switched on.
     """
 
     def __init__(self, axis: str, values: Mapping[str, float], friction: Mapping[str, float]):
@@ -109,6 +110,7 @@ class Specimen:
         for name, value in friction.items():
             self.law[name] = value
         self.truth = {f"{name}.{axis}": friction[name] for name in ("viscous", "coulomb")}
+        self.hidden_laws: dict[str, dict[str, float]] = {}
 
     def hide(
         self,
@@ -123,6 +125,7 @@ class Specimen:
             size = strength * rng.uniform(0.85, 1.15)
             if name in laws and at == self.axis:
                 self.truth |= set_law(self.law, full, laws[name], size, rng)
+                self.hidden_laws[full] = {key: float(self.law[key]) for key in laws[name]}
             elif name in motor:
                 field, theirs = MOTOR[name]
                 self.machine[field] = size * motor[name]

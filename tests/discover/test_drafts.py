@@ -171,11 +171,8 @@ def test_what_is_missing_for_a_draft_is_said(tmp_path, detent):
     run = RunFolder(tmp_path / "run")
     path = run.path(DiagnoseResult.file("base"))
     known = path.read_text(encoding="utf-8")
-    path.write_text(known.replace('"unknown_effect"', '"nothing_missing"'), encoding="utf-8")
-    with pytest.raises(InputError, match="calls nothing unknown"):
-        draft_stage.execute(run, tmp_path, draft_stage.Config(), silent)
-    path.write_text(known.replace('"selected": []', '"selected": ["stribeck:yaw"]'))
-    with pytest.raises(InputError, match=r"names stribeck:yaw: what is left without it"):
+    path.write_text(known.replace('"remains": true', '"remains": false'), encoding="utf-8")
+    with pytest.raises(InputError, match="leaves nothing unnamed"):
         draft_stage.execute(run, tmp_path, draft_stage.Config(), silent)
     path.unlink()
     with pytest.raises(InputError, match=r"diagnose\.json is missing"):

@@ -12,11 +12,13 @@ from pathlib import Path
 import pandas as pd
 import pytest
 import synthetic_run
+from made_results import write_result
 
 from bampipe.errors import InputError
 from bampipe.report import style
 from bampipe.report.build import Report, build
 from bampipe.report.results import Results
+from bampipe.results.draft import DraftResult
 
 
 def quiet(fraction: float, message: str) -> None:
@@ -341,3 +343,57 @@ def test_green_means_that_no_check_failed(tmp_path: Path) -> None:
     assert "nothing is missing, but 1 check failed" in start
     assert "Yaw, innovations: Not white: 60 % of their variance is left." in start
     assert "callout good" not in page
+
+
+def test_a_draft_is_shown_with_its_curve_its_length_and_its_chance(
+    full_run: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(full_run, tmp_path / "s01")
+    curve = {
+        "variable": "position",
+        "variable_unit": "rad",
+        "unit": "N.m",
+        "at": [-0.1, 0.0, 0.1],
+        "mean": [0.0, -1.5, 0.0],
+        "low": [-0.1, -1.6, -0.1],
+        "high": [0.1, -1.4, 0.1],
+    }
+    axis = {
+        "verdict": "drafted",
+        "effects": ["bump_by_position:yaw"],
+        "chance": [{"gain": 900.0, "gains": [4.0, 6.0, 5.0, 7.0], "p_value": 1e-6}],
+        "options": [
+            {"effects": [], "constants": 0, "held_out_rmse": 0.5},
+            {"effects": ["bump_by_position"], "constants": 3, "held_out_rmse": 0.02},
+        ],
+        "rmse_before": 0.5,
+        "rmse_after": 0.02,
+        "noise_floor": 0.019,
+        "unit": "N.m",
+        "nearest": [{"effect": "upper_stop:yaw", "held_out_rmse": 0.48, "sentence": "?"}],
+        "sentence": "Yaw: a force on the axis that has a bump at one position.",
+    }
+    effect = {
+        "axis": "yaw",
+        "expression": "height*exp(-((q - place)/width)**2)",
+        "acts_as": "force",
+        "curve": curve,
+    }
+    write_result(
+        tmp_path / "s01",
+        DraftResult,
+        model="base",
+        axes={"yaw": axis},
+        effects={"bump_by_position:yaw": effect},
+        selected=["bump_by_position:yaw"],
+    )
+    report = build(Results(tmp_path / "s01"), quiet)
+    assert "Drafts" in report.sections
+    words = text_of(report.html)
+    assert "Yaw: a force on the axis that has a bump at one position." in words
+    assert "height*exp(-((q - place)/width)**2)" in words
+    assert row_of(report.html, "the draft")[1] == "0.0200"
+    assert row_of(report.html, "upper_stop:yaw")[1] == "0.480"
+    drawn = report.figures["draft-base-yaw"]
+    for label in ("constants", "first formula", "draft"):
+        assert label in drawn

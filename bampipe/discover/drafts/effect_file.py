@@ -47,7 +47,7 @@ def _numbers(term: Term, name: str, entry: Mapping[str, Any]) -> dict[str, float
         width = term.values.get("width")
         reach = _PLACE_IN_SPANS * span.width if width is None else _PLACE_IN_WIDTHS * width
         low, high = value - reach, value + reach
-    elif kind == "length":
+    elif kind in ("length", "time"):
         low, high = value / _LENGTH_RATIO, value * _LENGTH_RATIO
     else:
         reach = 2.0 * np.pi * _WAVES / span.width
@@ -70,6 +70,9 @@ def write_toml(declaration: Mapping[str, Any]) -> str:
         lines += [f"{key} = {_value(value)}" for key, value in declaration["torque"].items()]
     for name, entry in declaration["parameters"].items():
         lines += ["", f"[parameters.{name}]"]
+        lines += [f"{key} = {_value(value)}" for key, value in entry.items()]
+    for name, entry in declaration.get("states", {}).items():
+        lines += ["", f"[states.{name}]"]
         lines += [f"{key} = {_value(value)}" for key, value in entry.items()]
     return "\n".join(lines) + "\n"
 

@@ -13,6 +13,7 @@ from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 
 from bampipe.physics.device import Coordinate as Axis
 from bampipe.physics.device import Device
@@ -39,7 +40,7 @@ class Coordinate:
     """A quantity that a residual may follow.
 
     Attributes:
-        words: what it is, such as ``position``, ``speed of extension``.
+        words: what it is, such as ``position``, ``extension speed``.
         name: the same as part of a name.
         text: in an expression of an effect.
         quantity: of the motion: ``position``, ``speed``, ``velocity``, ``load``, ``time``.
@@ -84,8 +85,11 @@ class Shape:
             ``wavenumber``.
         fixed: constants that scale it and are not estimated: ``middle``, ``reach`` of the span.
         columns: value by strength: of x (T, 1), the searched constants (G,) and the fixed ones,
-            each (T, G).
+            each (T, G); with a state, of x along a trial and its ``interval``, s.
         words: what it does, of ``{x}``.
+        state: where it has memory, its name, rate and value at the start; the state has the unit
+            of the coordinate.
+        drawn: of a shape with memory, its curve for motion that is quicker than what it remembers.
     """
 
     name: str
@@ -95,6 +99,15 @@ class Shape:
     fixed: tuple[str, ...]
     columns: Callable[..., tuple[Array, ...]]
     words: str
+    state: tuple[str, str, str] | None = None
+    drawn: Callable[..., tuple[Array, ...]] | None = None
+
+
+def _lagged(x: Array, c: Mapping[str, Any], first: float) -> Array:
+    """x (T, 1) behind a first-order lag of each ``c["lag"]`` (G,), (T, G)."""
+    keeps = np.exp(-c["interval"] / np.atleast_1d(c["lag"]))
+    found = [lfilter([0.5 * (1 - a), 0.5 * (1 - a)], [1.0, -a], x[:, 0] - first) for a in keeps]
+    return np.asarray(found).T + first
 
 
 def _ratio(x: Array, c: Mapping[str, Any]) -> Array:
@@ -103,6 +116,20 @@ def _ratio(x: Array, c: Mapping[str, Any]) -> Array:
 
 def _away(x: Array, c: Mapping[str, Any]) -> Array:
     return np.asarray((x - c["place"]) / c["width"])
+
+
+KNOTS = 16
+"""Points of a curve in an effect file: an expression has no room for many more."""
+
+
+def hats(x: Array, low: float, spacing: float, count: int) -> Array:
+    """Piecewise linear columns (T, count), each 1 at its knot and 0 at all others."""
+    at = (x - low) / spacing
+    return np.asarray(np.maximum(1.0 - np.abs(at - np.arange(count)), 0.0))
+
+
+def _curve_columns(x: Array, c: Mapping[str, Any]) -> tuple[Array, ...]:
+    return tuple(column[:, None] for column in hats(x, c["start"], c["spacing"], KNOTS).T)
 
 
 _AT_END = "what it comes to at the end of the range"
@@ -178,6 +205,26 @@ SHAPES = {
             "decay", "height*exp(-x/width)", {"height": "at zero"}, {"width": "length"}, (),
             lambda x, c: (np.exp(-x / c["width"]),), "fades as {x} grows",
         ),
+        Shape(
+            "relaxing", "height*(x - rest)/reach",
+            {"height": "what a quick motion over half the range builds up"}, {"lag": "time"},
+            ("reach",), lambda x, c: ((x - _lagged(x, c, float(x[0, 0]))) / c["reach"],),
+            "builds up with {x} and relaxes with time", ("rest", "(x - rest)/lag", "x"),
+            lambda x, c: (_ratio(x, c | {"middle": x.mean()}),),
+        ),
+        Shape(
+            "lagging", "height*trail/reach", {"height": "what it comes to at the end of the range"},
+            {"lag": "time"}, ("reach",), lambda x, c: (_lagged(x, c, 0.0) / c["reach"],),
+            "follows {x} with a lag", ("trail", "(x - trail)/lag", "0"),
+            lambda x, c: (x / c["reach"],),
+        ),
+        Shape(
+            "curve",
+            " + ".join(f"h{k}*max(1 - abs((x - start)/spacing - {k}), 0)" for k in range(KNOTS)),
+            {f"h{k}": f"at point {k + 1} of {KNOTS}" for k in range(KNOTS)}, {},
+            ("start", "spacing"), _curve_columns,
+            f"is a curve through {KNOTS} points along {{x}}; it is no formula",
+        ),
     )
 }  # fmt: skip
 
@@ -185,7 +232,7 @@ SHAPES = {
 # drafted again: springs and stops, rippling friction, drag, friction by load or by pose.
 _CURVES = ("parabola", "cubic", "bump", "snag", "step")
 _GRAMMAR: Mapping[tuple[str, bool, Factor], tuple[str, ...]] = {
-    ("position", True, FORCE): (*_CURVES, "dead_zone", "ripple"),
+    ("position", True, FORCE): (*_CURVES, "dead_zone", "ripple", "relaxing"),
     ("position", True, FRICTION): ("slope", "parabola", "cubic", "bump", "step", "rise", "fall"),
     ("position", True, DAMPING): ("slope", "parabola", "bump", "step"),
     ("position", True, INERTIA): ("slope", "bump"),
@@ -194,14 +241,22 @@ _GRAMMAR: Mapping[tuple[str, bool, Factor], tuple[str, ...]] = {
     ("position", False, DAMPING): ("parabola", "bump", "step"),
     ("position", False, INERTIA): ("slope", "parabola"),
     ("speed", True, FORCE): ("parabola", "bump", "decay"),
-    ("speed", True, FRICTION): ("cubic", "bump", "decay", "rise"),
+    ("speed", True, FRICTION): ("cubic", "bump", "decay", "rise", "lagging"),
     ("speed", False, FRICTION): ("slope", "decay"),
     ("velocity", False, FORCE): ("slope", "step"),
+    ("velocity", True, FORCE): ("lagging",),
+    ("direction", True, FORCE): ("lagging",),
     ("load", True, FRICTION): ("parabola", "rise"),
     ("time", True, FORCE): ("slope", "decay", "ripple"),
     ("time", True, FRICTION): ("slope", "decay"),
     ("time", True, DAMPING): ("slope", "decay"),
 }
+_CURVED: Mapping[tuple[str, bool, Factor], tuple[str, ...]] = {
+    (quantity, own, factor): ("curve",)
+    for quantity, own in (("position", True), ("position", False), ("speed", True))
+    for factor in (FORCE, FRICTION)
+}
+"""Where a curve may be put in place of a formula."""
 _SEES = {
     FORCE: "the same in both directions of motion",
     FRICTION: "opposite in the two directions of motion",
@@ -217,6 +272,8 @@ def coordinates(device: Device, axis: int) -> tuple[Coordinate, ...]:
     found = [
         Coordinate("position", "position", "q", "position", axis, own.unit),
         Coordinate("speed", "speed", "abs(qd)", "speed", axis, f"{own.unit}/s"),
+        Coordinate("velocity", "velocity", "qd", "velocity", axis, f"{own.unit}/s"),
+        Coordinate("direction", "direction", "sgn(qd)", "direction", axis, ""),
         Coordinate("load", "load", "load", "load", axis, own.torque_unit),
         Coordinate("time", "time", "t", "time", axis, "s"),
     ]
@@ -224,11 +281,9 @@ def coordinates(device: Device, axis: int) -> tuple[Coordinate, ...]:
         if 0 < abs(k - axis) <= _NEAR:
             n, u = other.name, other.unit
             found += [
-                Coordinate(f"position of {n}", f"position_of_{n}", n, "position", k, u),
-                Coordinate(f"speed of {n}", f"speed_of_{n}", f"abs(qd_{n})", "speed", k, f"{u}/s"),
-                Coordinate(
-                    f"velocity of {n}", f"velocity_of_{n}", f"qd_{n}", "velocity", k, f"{u}/s"
-                ),
+                Coordinate(f"{n} position", f"{n}_position", n, "position", k, u),
+                Coordinate(f"{n} speed", f"{n}_speed", f"abs(qd_{n})", "speed", k, f"{u}/s"),
+                Coordinate(f"{n} velocity", f"{n}_velocity", f"qd_{n}", "velocity", k, f"{u}/s"),
             ]
     return tuple(found)
 
@@ -240,7 +295,7 @@ class Form:
     Attributes:
         axis: that it acts on, and its number.
         factor, shape, coordinate: its words.
-        span: of the coordinate in the trials.
+        span: of the coordinate in the trials; times: time between samples and of a trial, s.
         scale: of the factor: the highest speed or acceleration of the axis; 1 for others.
     """
 
@@ -250,11 +305,12 @@ class Form:
     shape: Shape
     coordinate: Coordinate
     span: Span
+    times: Span
     scale: float
 
     @property
     def name(self) -> str:
-        """Name of the effect: ``bump_by_position``, ``friction_step_by_speed_of_extension``."""
+        """Name of the effect: ``bump_by_position``, ``slope_by_extension_position_on_yaw``."""
         head = "" if self.factor == FORCE else f"{self.factor}_"
         tail = "" if self.is_own else f"_on_{self.axis.name}"
         return f"{head}{self.shape.name}_by_{self.coordinate.name}{tail}"
@@ -278,8 +334,11 @@ class Form:
     def expression(self) -> str:
         """The torque as an effect file writes it; the kinetic energy where it is an inertia."""
         rate = "qd" if self.is_own else f"qd_{self.axis.name}"
-        shape = re.sub(r"\bx\b", self.coordinate.text, self.shape.text)
+        shape = self._of_coordinate(self.shape.text)
         return FACTORS[self.factor].format(shape=shape, rate=rate)
+
+    def _of_coordinate(self, text: str) -> str:
+        return re.sub(r"\bx\b", self.coordinate.text, text)
 
     @property
     def summary(self) -> str:
@@ -296,7 +355,12 @@ class Form:
     def fixed(self) -> dict[str, tuple[float, str]]:
         """Constants that are not estimated, with their units."""
         unit = self.coordinate.unit
-        known = {"middle": self.span.middle, "reach": 0.5 * self.span.width}
+        known = {
+            "middle": self.span.middle,
+            "reach": 0.5 * self.span.width,
+            "start": self.span.low,
+            "spacing": self.span.width / (KNOTS - 1),
+        }
         found = {name: (rounded(known[name]), unit) for name in self.shape.fixed}
         if self.factor == DAMPING:
             found["top_speed"] = (rounded(self.scale), f"{self.axis.unit}/s")
@@ -311,6 +375,7 @@ class Form:
             "place": (low - 0.25 * width, low + 1.25 * width, unit),
             "length": (0.003 * width, 2.0 * width, unit),
             "wavenumber": (np.pi / width, 1e4 * np.pi / width, f"1/{unit}"),
+            "time": (2.0 * self.times.low, 2.0 * self.times.high, "s"),
         }
         return {name: by_kind[kind] for name, kind in self.shape.searched.items()}
 
@@ -366,12 +431,23 @@ class Form:
             "source": source,
             **acts,
             "parameters": parameters,
+            **self._states(),
         }
+
+    def _states(self) -> dict[str, Any]:
+        if self.shape.state is None:
+            return {}
+        name, rate, initial = self.shape.state
+        unit: dict[str, Any] = {"unit": self.coordinate.unit}
+        held = {self.axis.kind: unit} if self.is_own else unit
+        texts = {"rate": self._of_coordinate(rate), "initial": self._of_coordinate(initial)}
+        return {"states": {name: texts | held}}
 
 
 KINDS_IN_WORDS = {
     "place": "where it is",
     "length": "how far it reaches",
+    "time": "time in which it follows",
     "wavenumber": "2 pi over the distance between two ripples",
 }
 
@@ -385,19 +461,24 @@ def forms(
     device: Device,
     axis: int,
     spans: Mapping[str, Span],
+    times: Span,
     scales: Mapping[str, float],
+    curves: bool = False,
 ) -> Iterator[Form]:
     """Every form for one axis.
 
     Args:
         device: the mechanism; axis: number of the coordinate.
         spans: of the coordinates in the trials, by their words; those without one do not vary.
+        times: time between samples and of a trial, s.
         scales: of the factors ``damping`` and ``inertia``.
+        curves: curves through points in place of formulas.
     """
+    grammar = _CURVED if curves else _GRAMMAR
     for coordinate in coordinates(device, axis):
         if coordinate.words not in spans:
             continue
-        for (quantity, own, factor), shapes in _GRAMMAR.items():
+        for (quantity, own, factor), shapes in grammar.items():
             if quantity != coordinate.quantity or own != (coordinate.axis == axis):
                 continue
             for name in shapes:
@@ -405,5 +486,5 @@ def forms(
                     continue  # the library has the ripple of a motor
                 yield Form(
                     device.coordinates[axis], axis, factor, SHAPES[name], coordinate,
-                    spans[coordinate.words], scales.get(factor, 1.0),
+                    spans[coordinate.words], times, scales.get(factor, 1.0),
                 )  # fmt: skip

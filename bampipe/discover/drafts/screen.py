@@ -7,7 +7,7 @@ that measured trials and replays can be searched alike.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -24,6 +24,7 @@ from bampipe.discover.drafts.forms import (
     Span,
     coordinates,
     forms,
+    hats,
 )
 from bampipe.estimate.low_pass import low_pass_at
 from bampipe.trials.folds import HELD_OUT
@@ -35,12 +36,15 @@ _FINER = 3
 """Times the thinned rate at which columns are made, at least."""
 _LENGTHS = (0.02, 0.6, 6)
 """Of the range, from, to, how many."""
+_LAGS = 12
 _PLACES_APART = 0.05
 """Of the range, for shapes without a length of their own."""
 _NEAREST = 1.3
 """Distance of neighbouring places, in lengths of the shape."""
 _WAVES_APART = 0.4
 """Between neighbouring wavenumbers, in waves on the range: they still resemble each other."""
+_KNOTS = (8, 16, 32, 64)
+"""Points of the curves that bound what a formula could do."""
 _MOST_WAVES, _MOST_WAVES_IN_TIME = 30.0, 300.0
 _REFINED = 12
 """Forms whose searched constants are refined, the best on the grid."""
@@ -71,9 +75,14 @@ class Screened:
 class Screen:
     """The residual of one axis, ready to be held against forms."""
 
-    def __init__(self, evidence: Evidence, axis: int) -> None:
-        """Take the fitted trials of ``evidence``; ``axis`` is the number of the coordinate."""
-        self.evidence, self.axis = evidence, axis
+    def __init__(self, evidence: Evidence, axis: int, curves: bool = False) -> None:
+        """Take the fitted trials of ``evidence``.
+
+        Args:
+            evidence: of the model; axis: number of the coordinate.
+            curves: whether curves through points are looked for in place of formulas.
+        """
+        self.evidence, self.axis, self._curves = evidence, axis, curves
         groups, fitted = evidence.folds.groups, evidence.folds.fitted
         self.trials = [k for k, fits in enumerate(fitted) if fits and groups[k] != HELD_OUT]
         self._rows = [evidence.used[k][:, axis] for k in self.trials]
@@ -146,6 +155,7 @@ class Screen:
                     "position": q[:, c.axis],
                     "speed": np.abs(qd[:, c.axis]),
                     "velocity": qd[:, c.axis],
+                    "direction": values[FRICTION],
                     "load": load,
                     "time": motion.t[rows],
                 }
@@ -173,7 +183,12 @@ class Screen:
     def forms(self) -> list[Form]:
         """Every form that these trials can hold the residual against."""
         device = self.evidence.system.model.device
-        return list(forms(device, self.axis, self.spans, self.scales))
+        return list(forms(device, self.axis, self.spans, self._times, self.scales, self._curves))
+
+    @cached_property
+    def _times(self) -> Span:
+        trials = [self.evidence.motions[k].t for k in self.trials]
+        return Span(float(np.median(np.diff(trials[0]))), max(float(np.ptp(t)) for t in trials))
 
     def columns(self, form: Form, searched: dict[str, Array]) -> Array:
         """What each strength adds to the low-passed residual, (m, n, G).
@@ -182,17 +197,17 @@ class Screen:
             form: what acts; searched: its searched constants, each (G,).
         """
         constants = {name: value for name, (value, _) in form.fixed().items()} | searched
+        constants["interval"] = 1.0 / self._rate_hz
+        return self._acting(form, lambda x: form.shape.columns(x, constants))
+
+    def _acting(self, form: Form, shape: Callable[[Array], Sequence[Array]]) -> Array:
+        """Columns of ``shape`` of the form's coordinate, (m, n, G), acting as the form does."""
         cutoff = self.evidence.band.cutoff_hz[self.axis]
         by_trial = []
         for i, (_, kept) in enumerate(self._sampling):
             x = self.signals[form.coordinate.words][i]
             factor = self.signals[form.factor][i] / form.scale
-            values = np.stack(
-                [
-                    np.broadcast_to(c, (len(x), max([1, *map(len, searched.values())])))
-                    for c in form.shape.columns(x, constants)
-                ]
-            )
+            values = np.stack(np.broadcast_arrays(*shape(x)))
             acting = values * factor
             if form.factor == INERTIA:
                 # By Lagrange's equation of the kinetic energy.
@@ -238,6 +253,8 @@ class Screen:
             points = _places(span, _PLACES_APART * span.width)[None]
         elif names == ("width",):
             points = lengths[None]
+        elif names == ("lag",):
+            points = np.geomspace(4.0 * self._times.low, self._times.high, _LAGS)[None]
         elif names == ("wavenumber",):
             most = _MOST_WAVES
             if form.coordinate.quantity == "time":
@@ -274,12 +291,13 @@ class Screen:
 
         if names:
             start = np.array([at[n] for n in names])
-            step = {"place": 0.02, "length": 0.02, "wavenumber": 0.15 * 2.0 * np.pi}
+            step = {"place": 0.02, "wavenumber": 0.15 * 2.0 * np.pi}
             sizes = []
             for name, kind in form.shape.searched.items():
                 width = form.span.width
-                sizes.append(step[kind] / width if kind == "wavenumber" else step[kind] * width)
-                if kind == "length":
+                size = step.get(kind, 0.0)
+                sizes.append(size / width if kind == "wavenumber" else size * width)
+                if kind in ("length", "time"):
                     sizes[-1] = 0.25 * at[name]
             simplex = np.vstack([start, start + np.diag(sizes)])
             options = {"maxfev": _TRIES, "initial_simplex": simplex, "xatol": 1e-6, "fatol": 0.0}
@@ -290,6 +308,27 @@ class Screen:
         strengths = self._explained(columns)[1][0]
         values = dict(zip(form.shape.strengths, map(float, strengths), strict=True)) | at
         return Screened(form, values, self._gain(columns[:, :, 0].T))
+
+    def curve_bound(self, form: Form) -> tuple[int, float]:
+        """What no formula of the form's coordinate, acting as it does, could do better.
+
+        Curves through ever more points: the number of the best, and the share of the held-out error
+        that it leaves.
+        """
+        before, found = self._held_out(self._basis), []
+        span = form.span
+        for count in _KNOTS:
+            spacing = span.width / (count - 1)
+
+            def knots(x: Array, spacing: float = spacing, count: int = count) -> list[Array]:
+                inside = np.clip(x, span.low, span.high)
+                return [c[:, None] for c in hats(inside, span.low, spacing, count).T]
+
+            columns = self._acting(form, knots)[:, :, 0].T
+            after = self._held_out(np.column_stack([self._basis, columns]))
+            found.append((float(np.sqrt(after / before)), count))
+        share, count = min(found)
+        return count, share
 
     def _gain(self, columns: Array) -> float:
         """Log likelihood ratio, on trials left out, of columns (n, m) beside the model's own."""
@@ -317,6 +356,6 @@ def _places(span: Span, length: float) -> Array:
     return np.asarray(span.low + span.width * (np.arange(count) + 0.5) / count)
 
 
-def screen(evidence: Evidence, axis: int) -> Sequence[Screened]:
-    """Forms that may explain the residual of ``axis``, best first."""
-    return Screen(evidence, axis).search()
+def screen(evidence: Evidence, axis: int, curves: bool = False) -> Sequence[Screened]:
+    """Forms that may explain the residual of ``axis``, best first; or curves in their place."""
+    return Screen(evidence, axis, curves).search()

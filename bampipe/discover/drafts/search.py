@@ -15,12 +15,11 @@ from bampipe.discover.bench import Bench
 from bampipe.discover.candidates import Score, Scorer
 from bampipe.discover.chance import Progress, fit_trials, open_trials, system_of, workers
 from bampipe.discover.drafts.forms import Form
-from bampipe.discover.drafts.screen import Screened, screen
+from bampipe.discover.drafts.screen import Screen, Screened, screen
 from bampipe.discover.settings import Settings
 from bampipe.discover.start import with_effect
 from bampipe.estimate.least_squares import fit
 from bampipe.physics.recipe import Recipe
-from bampipe.results.standing import AT_FLOOR
 from bampipe.trials.measured import MeasuredTrials
 from bampipe.trials.replay import replay_motions
 from bampipe.trials.residuals import Evidence, gather_evidence, problem_of
@@ -90,7 +89,7 @@ class Term:
         shape = self.form.shape
         known = dict(zip(self.values, values, strict=True))
         constants: dict[str, Any] = {n: v for n, (v, _) in self.form.fixed().items()} | known
-        columns = shape.columns(x[:, None], constants)
+        columns = (shape.drawn or shape.columns)(x[:, None], constants)
         found = sum(known[n] * c for n, c in zip(shape.strengths, columns, strict=True))
         return np.asarray(found)[:, 0]
 
@@ -127,6 +126,20 @@ class Chance:
 
 
 @dataclass(frozen=True)
+class Bound:
+    """The held-out error that a free curve leaves, where a formula acts as ``form`` does.
+
+    Attributes:
+        form: whose coordinate and factor it has; points: of the curve.
+        held_out_rmse: N.m or N.
+    """
+
+    form: Form
+    points: int
+    held_out_rmse: float
+
+
+@dataclass(frozen=True)
 class AxisDraft:
     """What a search for a formula on one axis came to.
 
@@ -136,6 +149,7 @@ class AxisDraft:
         chance: of the first term, and of the next where one was looked for.
         options: error against number of constants, shortest first; the model as given first.
         before, after: held-out error without and with the terms, N.m or N.
+        bound: what no formula in the first term's coordinate could do better; None without terms.
         recipe: the model with them; evidence: its fit.
     """
 
@@ -145,6 +159,7 @@ class AxisDraft:
     options: tuple[Option, ...]
     before: float
     after: float
+    bound: Bound | None
     recipe: Recipe
     evidence: Evidence
 
@@ -156,6 +171,7 @@ class ReplayTask:
     recipe: Recipe
     p: Array
     axis: int
+    curves: bool
     seed: tuple[int, ...]
 
 
@@ -168,7 +184,7 @@ def run_replay(task: ReplayTask) -> tuple[float, float]:
     evidence = gather_evidence(
         system, replays, trials.band, task.p, trials.folds, most_iterations=_STEPS_OF_A_REPLAY
     )
-    found = screen(evidence, task.axis)
+    found = screen(evidence, task.axis, task.curves)
     error = float(Scorer(evidence).before.error[task.axis])
     return (found[0].gain if found else 0.0), error
 
@@ -202,6 +218,7 @@ def draft(
     axes: Sequence[int],
     settings: Settings,
     source: str,
+    curves: bool = False,
     progress: Progress = lambda fraction, message: None,
 ) -> list[AxisDraft]:
     """Search a formula for what a model leaves on each of some axes, one after the other.
@@ -211,6 +228,7 @@ def draft(
         axes: numbers of the coordinates.
         settings: how carefully to look.
         source: that the effect files state.
+        curves: whether a curve through points will do, where prediction is all that is wanted.
         progress: called with a fraction and a message.
     """
     found: list[AxisDraft] = []
@@ -219,7 +237,7 @@ def draft(
         known = recipe
         for k, axis in enumerate(axes):
             name = recipe.model().device.coordinates[axis].name
-            part = AxisSearch(bench, axis, source)
+            part = AxisSearch(bench, axis, source, curves)
 
             def tell(share: float, message: str, k: int = k, name: str = name) -> None:
                 progress((k + share) / len(axes), f"{name}: {message}")
@@ -232,8 +250,9 @@ def draft(
 class AxisSearch:
     """The search for a formula on one axis."""
 
-    def __init__(self, bench: Bench, axis: int, source: str) -> None:
-        self._bench, self._axis, self._source = bench, axis, source
+    def __init__(self, bench: Bench, axis: int, source: str, curves: bool) -> None:
+        self._bench, self._axis = bench, axis
+        self._source, self._curves = source, curves
 
     @cached_property
     def _settings(self) -> Settings:
@@ -243,12 +262,12 @@ class AxisSearch:
         """Add terms to a model as long as one beats chance and is worth its constants."""
         axis, s = self._axis, self._settings
         evidence = self._bench.fit(recipe, start)
-        before = evidence.held_out_rmse
+        bare, before = evidence, evidence.held_out_rmse
         options = [Option((), 0, before)]
         current, chances = options[0], []
         for number in range(MOST_TERMS):
             progress(0.05 + 0.4 * number, "holding every form against the residual")
-            screened = screen(evidence, axis)
+            screened = screen(evidence, axis, self._curves)
             progress(0.15 + 0.4 * number, "searching replays for as good a formula")
             chances.append(self._chance(recipe, evidence, screened))
             if chances[-1].p_value > s.draft_significance:
@@ -261,12 +280,16 @@ class AxisSearch:
                 break
             current, recipe, p = chosen
             evidence = self._bench.fit(recipe, p)
-            if Scorer(evidence).before.error[axis] < AT_FLOOR * chances[-1].floor:
-                break
+            if Scorer(evidence).before.error[axis] < s.surely * chances[-1].floor:
+                break  # what is left is for a diagnosis of the model with the draft
         terms = self._terms(evidence, current)
+        bound = None
+        if terms:
+            points, share = Screen(bare, axis).curve_bound(terms[0].form)
+            bound = Bound(terms[0].form, points, share * float(before[axis]))
         return AxisDraft(
             axis, terms, tuple(chances), self._listed(options, current), float(before[axis]),
-            float(current.held_out_rmse[axis]), recipe, evidence,
+            float(current.held_out_rmse[axis]), bound, recipe, evidence,
         )  # fmt: skip
 
     def _cost(self, option: Option) -> float:
@@ -293,7 +316,7 @@ class AxisSearch:
     ) -> list[tuple[float, float]]:
         seed = (self._settings.seed, _SEED, self._axis, len(recipe.effects))
         tasks = [
-            ReplayTask(recipe, evidence.p, self._axis, (*seed, k))
+            ReplayTask(recipe, evidence.p, self._axis, self._curves, (*seed, k))
             for k in range(first, first + count)
         ]
         return list(self._bench.pool(run_replay, tasks))

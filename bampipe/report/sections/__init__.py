@@ -11,6 +11,7 @@ SECTIONS: tuple[str, ...] = (
     "device",
     "validation",
     "diagnosis",
+    "drafts",
     "effects",
     "ladder",
     "published",
