@@ -127,6 +127,25 @@ def _named(text: str, drafts: Mapping[str, Path]) -> tuple[str, Path | None]:
     return f"{effect.name}:{target}" if target else effect.name, path
 
 
+def adopt_effect(file: Path, runs: Path) -> Path:
+    """Copy an effect file to where every run of the folder ``runs`` finds it; return the copy.
+
+    Raises:
+        InputError: it is no effect file, or its name is that of a built-in effect.
+    """
+    from bampipe.declarations.files import read_effect
+    from bampipe.physics import registry
+
+    effect = registry.effect_from(read_effect(str(file)), str(file))
+    if effect.name in registry.effect_names():
+        raise InputError(
+            f"there is a built-in effect {effect.name!r}", where=str(file), remedy="rename yours"
+        )
+    target = runs / models.ADOPTED / f"{effect.name}.toml"
+    record.replace_text(target, file.read_text(encoding="utf-8"))
+    return target
+
+
 def extend(options: LoopOptions, parent: str, effects: Sequence[str]) -> str:
     """Make the child of ``parent`` that has ``effects`` too; identify, validate, compare.
 

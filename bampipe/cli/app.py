@@ -20,7 +20,6 @@ from bampipe.cli.options import RUNS, JsonOption, RunsOption
 from bampipe.cli.run import run
 from bampipe.cli.simulate import simulate
 from bampipe.errors import InputError
-from bampipe.run import models
 
 app = typer.Typer(
     name="bampipe",
@@ -68,7 +67,9 @@ def effects(
     if name == "check":
         check_effect_file(str(file), device, json)
     elif name == "adopt":
-        copy = models.adopt_effect(Path(str(file)), runs)
+        from bampipe.api.loop import adopt_effect
+
+        copy = adopt_effect(Path(str(file)), runs)
         if json:
             show.as_json({"file": str(copy)})
         else:

@@ -86,25 +86,6 @@ def ensure_base(root: Path, device: str, effects: tuple[str, ...]) -> None:
     write(root, ModelFile(name=BASE, device=device, effects=effects))
 
 
-def adopt_effect(file: Path, runs: Path) -> Path:
-    """Copy an effect file to where every run of the folder ``runs`` finds it; return the copy.
-
-    Raises:
-        InputError: it is no effect file, or its name is that of a built-in effect.
-    """
-    from bampipe.declarations.files import read_effect
-    from bampipe.physics import registry
-
-    effect = registry.effect_from(read_effect(str(file)), str(file))
-    if effect.name in registry.effect_names():
-        raise InputError(
-            f"there is a built-in effect {effect.name!r}", where=str(file), remedy="rename yours"
-        )
-    target = runs / ADOPTED / f"{effect.name}.toml"
-    record.replace_text(target, file.read_text(encoding="utf-8"))
-    return target
-
-
 def _bring_adopted_effects(root: Path) -> None:
     """Put the effects that the lab has adopted beside the base model: diagnoses weigh them."""
     for source in sorted((root.parent / ADOPTED).glob("*.toml")):
