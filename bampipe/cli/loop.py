@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from bampipe.cli import places, show
+from bampipe.cli.forecast import say_what_came
 from bampipe.cli.one_stage import advise, one_stage, print_settings, whole_pipeline
 from bampipe.cli.options import (
     DEFAULTS,
@@ -45,6 +46,8 @@ def diagnose(
     root = places.find_run(run, options.runs)
     chosen = model or models.counting_model(root)
     one_stage("diagnose", root, options, model=chosen)
+    if not options.json:
+        say_what_came(root, chosen, is_diagnosed=True)
     after = RunFolder(root).read(DiagnoseResult, chosen).next
     advise(options.quiet, options.json, after.replace("RUN", places.next_to(root, options.runs)))
 

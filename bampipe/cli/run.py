@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from bampipe.cli import places, show
+from bampipe.cli.forecast import say_what_came
 from bampipe.cli.lab import refresh
 from bampipe.cli.one_stage import advise, assignments
 from bampipe.cli.options import (
@@ -141,6 +142,10 @@ def run(
         _add_markdown(markdown, outcomes)
     _report_runs(outcomes, several, json)
     refresh(runs, several, quiet or json)
+    if not several and not json:
+        made = {step.step for step in outcomes[0].steps}
+        one = outcomes[0].model
+        say_what_came(outcomes[0].root, one, f"diagnose:{one}" in made)
     if not several:
         name = places.next_to(requests[0].root, runs)
         advise(quiet, json, suggest_next(outcomes[0].root, outcomes[0].model, name))

@@ -16,6 +16,7 @@ from bampipe.cli.options import (
     StageOptions,
     with_stage_options,
 )
+from bampipe.errors import InputError
 from bampipe.run import models
 from bampipe.run.session_name import session_id
 
@@ -121,6 +122,13 @@ def next_(
         ),
     ] = "",
     seconds: Annotated[float, typer.Option(help="Length of the trial; 20 if omitted.")] = 0.0,
+    plan: Annotated[
+        bool, typer.Option("--plan", help="Also a set of trials, as a sheet to print.")
+    ] = False,
+    sd: Annotated[
+        str,
+        typer.Option(metavar="SHARE", help="With --plan: of each parameter, such as 5%."),
+    ] = "",
     options: StageOptions = DEFAULTS,
 ) -> None:
     """Say which trial to record next, in one sentence, and what it is expected to give.
@@ -128,11 +136,24 @@ def next_(
     Example: bampipe next 2026-10-03_s01
 
     Example: bampipe next 2026-10-03_s01 --for coulomb.yaw --seconds 30
+
+    Example: bampipe next 2026-10-03_s01 --plan --sd 2%
     """
     chosen = model
     if not options.list_settings and not model:
         chosen = models.counting_model(places.find_run(run, options.runs))
-    plain_stage("next", run, options, chosen, purpose=purpose, seconds=seconds)
+    more: dict[str, object] = {"sd": _share(sd)} if sd else {}
+    plain_stage("next", run, options, chosen, purpose=purpose, seconds=seconds, plan=plan, **more)
+    if plan and not (options.json or options.quiet or options.list_settings):
+        show.say(f"sheet: {places.find_run(run, options.runs)}/models/{chosen}/protocol.pdf")
+
+
+def _share(text: str) -> float:
+    """The number that ``5%`` or ``0.05`` means."""
+    try:
+        return float(text.removesuffix("%")) / (100.0 if text.endswith("%") else 1.0)
+    except ValueError as error:
+        raise InputError(f"--sd: {text!r} is not a share", remedy="write 5% or 0.05") from error
 
 
 @with_stage_options

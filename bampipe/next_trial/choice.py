@@ -16,7 +16,12 @@ Array = NDArray[np.float64]
 
 _VERSIONS = (1, 2, 3, 4, HASTY)
 """As followed by different people."""
-_FINALISTS = 5
+_WORK = 2.5e7
+"""Samples times parameters of all designs that are tried exactly: those of a robot with 80 numbers
+take
+seconds each, and some are left out."""
+_FEWEST = 12
+_FINALISTS, _OF_FEW = 5, 2
 _VARIED = 2
 """Of the best, so many are tried in other surroundings."""
 _QUANTILE = 0.1
@@ -51,19 +56,24 @@ def rank_designs(
 ) -> list[Tried]:
     """Try primitives about ``axes`` of so many seconds; the best ones as followed, best first."""
     designs = list_primitives(rehearsal.seen, seconds, axes, with_rests)
+    one = seconds * rehearsal.sensors.rate_hz * len(rehearsal.system.parameters)
+    most = max(_FEWEST, int(_WORK / one))
+    is_quick = len(designs) <= most
+    finalists = _FINALISTS if is_quick else _OF_FEW
+    designs = designs[:: -(-len(designs) // most)]
     values = []
     for k, design in enumerate(designs):
         progress(0.6 * k / len(designs), f"trying {len(designs)} designs")
         values.append(worth(rehearsal.record(design, 0)))
     order = sorted(range(len(designs)), key=lambda k: -values[k])
-    best = [(values[k], designs[k]) for k in order[:_FINALISTS]]
-    for _, design in best[:_VARIED]:
+    best = [(values[k], designs[k]) for k in order[:finalists]]
+    for _, design in best[: _VARIED * is_quick]:
         for other in vary_surroundings(rehearsal.seen, design):
             best.append((worth(rehearsal.record(other, 0)), other))
     best.sort(key=lambda pair: -pair[0])
     tried = []
-    for k, (_, design) in enumerate(best[:_FINALISTS]):
-        progress(0.7 + 0.3 * k / _FINALISTS, "following the best ones roughly")
+    for k, (_, design) in enumerate(best[:finalists]):
+        progress(0.7 + 0.3 * k / finalists, "following the best ones roughly")
         motions = tuple(rehearsal.record(design, version) for version in _VERSIONS)
         worths = [worth(motion) for motion in motions]
         tried.append(Tried(design, float(np.quantile(worths, _QUANTILE)), motions))

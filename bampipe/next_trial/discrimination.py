@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -96,6 +96,8 @@ class Contest:
         rivals: the effects; band: of residuals.
         floor: (n_q,) noise floor of each axis, N.m or N.
         refits: whether rivals are fitted, and not only the model without them.
+        timing_s: by how much the inputs may be sampled late or early, which is fitted beside the
+            model's parameters, last; 0 where it is not.
     """
 
     system: System
@@ -104,6 +106,7 @@ class Contest:
     band: Band
     floor: Array
     refits: bool = True
+    timing_s: float = 0.0
 
     def sums(self, motions: Sequence[Motion]) -> Sums:
         """The sums over ``motions``."""
@@ -114,7 +117,7 @@ class Contest:
         )
 
     def _sums_of(self, motion: Motion) -> Sums:
-        problem = problem_of(self.system, [motion], self.band)
+        problem = problem_of(self.system, [motion], self.band, timing=self.timing_s > 0.0)
         base = stacked_residual(problem, 0, np.append(self.p, 0.0))
         u = motion.inputs(self.system.inputs)
         unfiltered = residual_and_memory(self.system, motion, u, self.p)
@@ -192,18 +195,32 @@ class Contest:
         base = list(range(places[0][0]))
         return [self._left(total, total, target, base) for target, _ in places]
 
+    def timing_of(self, total: Sums) -> list[float]:
+        """For each rival, the timing that the model alone takes it for, s."""
+        places = self._places(total.squares)
+        base = list(range(places[0][0]))
+        return [abs(float(self._fit(total, target, base)[-1])) for target, _ in places]
+
+    def without_timing(self, total: Sums) -> tuple[Contest, Sums]:
+        """The same where no timing is fitted."""
+        last = self._places(total.squares)[0][0] - 1
+        squares = np.delete(np.delete(total.squares, last, axis=1), last, axis=2)
+        return replace(self, timing_s=0.0), replace(total, squares=squares)
+
     def _left(self, total: Sums, on: Sums, target: int, fitted: Sequence[int]) -> Array:
         """Sum of squares of column ``target`` that ``fitted`` ones leave on some trials, (n_q,)."""
-        weight = 1.0 / self.floor**2
+        vector = np.zeros(total.squares.shape[1])
+        vector[target], vector[list(fitted)] = 1.0, -self._fit(total, target, fitted)
+        return np.asarray(np.maximum(np.einsum("p,apq,q->a", vector, on.squares, vector), 0.0))
+
+    def _fit(self, total: Sums, target: int, fitted: Sequence[int]) -> Array:
+        """Coefficients with which ``fitted`` columns come closest to column ``target``."""
         columns = list(fitted)
-        joint = np.einsum("apq,a->pq", total.squares, weight)
+        joint = np.einsum("apq,a->pq", total.squares, 1.0 / self.floor**2)
         normal, moment = joint[np.ix_(columns, columns)], joint[columns, target]
         scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
         scaled = normal * np.outer(scale, scale)
-        b = scale * np.linalg.lstsq(scaled, scale * moment, rcond=1e-9)[0]
-        vector = np.zeros(total.squares.shape[1])
-        vector[target], vector[columns] = 1.0, -b
-        return np.asarray(np.maximum(np.einsum("p,apq,q->a", vector, on.squares, vector), 0.0))
+        return np.asarray(scale * np.linalg.lstsq(scaled, scale * moment, rcond=1e-9)[0])
 
     def _compare(self, total: Sums, nothing: Array, left: Array) -> tuple[float, float]:
         """Distance in log likelihood, and the chance that noise and imperfect models hide it.

@@ -57,7 +57,7 @@ class Forecast:
         return Proposal(
             sentence=describe(design, self.rehearsal.seen, device),
             seconds=design.seconds,
-            moves=_moves(design, self.rehearsal),
+            moves=describe_moves(design, self.rehearsal),
             pose=pose,
             brakes=design.field,
             levels=dict(design.levels or {}),
@@ -108,7 +108,8 @@ class Forecast:
         )
 
 
-def _moves(design: Primitive, rehearsal: Rehearsal) -> dict[str, Move]:
+def describe_moves(design: Primitive, rehearsal: Rehearsal) -> dict[str, Move]:
+    """The record of the strokes of a design."""
     axes = rehearsal.system.model.device.coordinates
     return {
         axes[i].name: Move(

@@ -12,7 +12,7 @@ from bampipe.discover.candidates import Scorer, library
 from bampipe.discover.chance import candidates_of, fit_trials, system_of
 from bampipe.discover.settings import Settings
 from bampipe.next_trial.discrimination import Contest, Rival, Sums
-from bampipe.next_trial.sensitivity import Visibility, refine, typical_rival, weigh_visibility
+from bampipe.next_trial.sensitivity import Bar, Visibility, refine, typical_rival, weigh_visibility
 from bampipe.physics.recipe import Recipe
 from bampipe.physics.registry import effect_from
 from bampipe.results.diagnose import DiagnoseResult
@@ -115,13 +115,13 @@ class Blindness:
     Attributes:
         contest: every effect at its typical strength; at_hand: its sums over the trials.
         found: from which strength on each would have been found.
-        tests: number of candidates of a diagnosis.
+        bar: what a diagnosis asks of an effect.
     """
 
     contest: Contest
     at_hand: Sums
     found: tuple[Visibility, ...]
-    tests: int
+    bar: Bar
 
     @property
     def hidden(self) -> list[int]:
@@ -136,14 +136,14 @@ class Blindness:
         rows = [*range(start), *(start + k for k in chosen)]
         squares = self.at_hand.squares[:, rows][:, :, rows]
         found = tuple(self.found[k] for k in chosen)
-        return Blindness(contest, replace(self.at_hand, squares=squares), found, self.tests)
+        return Blindness(contest, replace(self.at_hand, squares=squares), found, self.bar)
 
     def factors_with(self, motions: Sequence[Motion]) -> Array:
         """From which factor on each effect is found once ``motions`` have been recorded."""
         now = np.array([one.factor for one in self.found])
         total = self.at_hand + self.contest.sums(motions)
         before, after = (
-            np.array([v.factor for v in weigh_visibility(self.contest, sums, self.tests)])
+            np.array([v.factor for v in weigh_visibility(self.contest, sums, self.bar)])
             for sums in (self.at_hand, total)
         )
         # What is not linear in its strength is taken to change alike.
@@ -153,19 +153,25 @@ class Blindness:
         return np.asarray(after * ratio)
 
 
-def find_blindness(evidence: Evidence, recipe: Recipe, floor: Array) -> Blindness:
-    """What the trials would have shown of every effect of the library that the model lacks."""
+def find_blindness(
+    evidence: Evidence, recipe: Recipe, error: Array, floor: Array, floor_sd: Array, timing_s: float
+) -> Blindness:
+    """What the trials would have shown of every effect of the library that the model lacks.
+
+    Args:
+        evidence: the model's fit; recipe: the model.
+        error: (n_q,) held-out error; floor, floor_sd: (n_q,) of its noise, N.m or N.
+        timing_s: by how much the inputs may be sampled late or early; 0 where that is not fitted.
+    """
     device, extra = recipe.model().device, [effect_from(e) for e in recipe.extra]
     scale = Scorer(evidence).scale
     items = candidates_of(recipe, library(device, recipe.effects, extra))
     rivals = [rival for item in items if (rival := typical_rival(item, scale)) is not None]
     contest = Contest(
-        evidence.system, evidence.p, tuple(rivals), evidence.band, floor, refits=False
+        evidence.system, evidence.p, tuple(rivals), evidence.band, error, False, timing_s
     )
-    judged = [
-        m for m, fitted in zip(evidence.motions, evidence.folds.fitted, strict=True) if fitted
-    ]
-    at_hand = contest.sums(judged)
-    found = weigh_visibility(contest, at_hand, len(rivals))
-    refined = tuple(refine(contest, judged, one, len(rivals)) for one in found)
-    return Blindness(contest, at_hand, refined, len(rivals))
+    motions = [evidence.motions[k] for k in evidence.folds.fitted_trials]
+    at_hand, bar = contest.sums(motions), Bar.of_errors(error, floor, floor_sd, len(items))
+    found = weigh_visibility(contest, at_hand, bar)
+    refined = tuple(refine(contest, motions, one, bar) for one in found)
+    return Blindness(contest, at_hand, refined, bar)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from bampipe.results.next import Detectable, ExpectedConfusion, Proposal, Purpose
 
@@ -23,13 +23,16 @@ def say_why(
             f" confusing them is {_chance(pair.before)}."
         )
     if purpose == "sensitivity":
-        hidden = _hidden(table)
+        hidden, never = _hidden(table), _never(table)
         if hidden:
-            return f"These trials would not have shown {_listed(hidden, table)}."
-        return (
-            "These trials would have shown every effect of the library at its typical size, so the"
-            " next one is for the parameters."
-        )
+            why = f"These trials would not have shown {_listed(hidden, table)}."
+        else:
+            every = "every other effect" if never else "every effect"
+            why = f"These trials would have shown {every} of the library at its typical size."
+        if never:
+            one = "one effect stays" if len(never) == 1 else f"{len(never)} effects stay"
+            why += f" In trials like these {one} out of sight at any size ({_some(never)})."
+        return why
     if parameter:
         return f"Of the motions tried, this one says most of `{parameter}`."
     return "Of the motions tried, this one adds most to what is known of all parameters together."
@@ -77,26 +80,38 @@ def _chance(value: float) -> str:
 
 
 def _hidden(table: Mapping[str, Detectable]) -> list[str]:
-    """Effects that would go unnoticed at their typical size, those never excited first."""
+    """Effects that go unnoticed at their typical size though trials can show them, worst first."""
+    factors = {
+        name: float("inf") if entry.smallest is None else entry.smallest / entry.typical
+        for name, entry in table.items()
+        if entry.smallest is not None or entry.with_proposal is not None
+    }
+    return sorted((n for n in factors if factors[n] > 1.0), key=lambda n: -factors[n])
 
-    def factor(name: str) -> float:
-        smallest = table[name].smallest
-        return float("inf") if smallest is None else smallest / table[name].typical
 
-    return sorted((name for name in table if factor(name) > 1.0), key=lambda n: -factor(n))
+def _never(table: Mapping[str, Detectable]) -> list[str]:
+    """Effects that neither the trials at hand nor the one proposed show, whatever their size."""
+    return [
+        name
+        for name, entry in table.items()
+        if entry.smallest is None and entry.with_proposal is None
+    ]
 
 
 def _listed(names: list[str], table: Mapping[str, Detectable]) -> str:
     parts = []
     for name in names[:_SHOWN]:
         entry = table[name]
-        if entry.smallest is None:
-            parts.append(f"{name} of any size")
-        else:
-            parts.append(f"{name} below {entry.smallest:.2g} {entry.unit}".rstrip())
-    more = len(names) - len(parts)
-    return _joined(parts) + (f", and {more} more" if more else "")
+        size = "at any size" if entry.smallest is None else f"below {entry.smallest:.2g}"
+        parts.append(f"{name} {size} {entry.unit if entry.smallest else ''}".rstrip())
+    return _some(parts, len(names) - len(parts))
 
 
-def _joined(parts: list[str]) -> str:
+def _some(names: Sequence[str], more: int = 0) -> str:
+    more += max(len(names) - _SHOWN, 0)
+    shown = list(names[:_SHOWN])
+    return f"{', '.join(shown)} and {more} more" if more else _joined(shown)
+
+
+def _joined(parts: Sequence[str]) -> str:
     return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"

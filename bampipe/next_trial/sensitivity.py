@@ -15,6 +15,7 @@ from bampipe.discover.ranges import MachineScale
 from bampipe.discover.settings import Settings
 from bampipe.next_trial.discrimination import Contest, Rival, Sums
 from bampipe.physics.parameter import Parameter
+from bampipe.results.standing import AT_FLOOR
 from bampipe.trials.motion import Motion
 
 Array = NDArray[np.float64]
@@ -85,20 +86,60 @@ def typical_rival(item: Candidate, scale: MachineScale) -> Rival | None:
     return Rival(item, np.array(values), 0.0)
 
 
-def weigh_visibility(contest: Contest, sums: Sums, tests: int) -> list[Visibility]:
+@dataclass(frozen=True)
+class Bar:
+    """What a diagnosis asks of an effect.
+
+    Attributes:
+        drop: (n_q,) of the log error of an axis that is worth an effect there.
+        tests: number of candidates.
+    """
+
+    drop: Array
+    tests: int
+
+    @classmethod
+    def of_errors(cls, error: Array, floor: Array, floor_sd: Array, tests: int) -> Bar:
+        """What counts is 16 % of an error at its floor, or what lifts it above its floor.
+
+        Args:
+            error: (n_q,) at hand; floor, floor_sd: (n_q,) of the noise, N.m or N.
+            tests: number of candidates.
+        """
+        s = Settings()
+        lift = np.log((AT_FLOOR * floor + 2.0 * floor_sd) / error)
+        return cls(np.minimum(s.worth_at_floor, np.maximum(s.worth, lift)), tests)
+
+
+def weigh_visibility(contest: Contest, sums: Sums, bar: Bar) -> list[Visibility]:
     """From which strength on each rival of ``contest`` would be found with `PROBABILITY`.
 
     The gain in log likelihood must exceed the chance level after Bonferroni's correction, and the
-    error must fall by what is worth an effect on an axis at its floor.
+    error must fall by what is worth an effect. What the timing of the inputs can imitate, it does,
+    as far as it may.
 
     Args:
-        contest: the library's effects at their typical strengths; sums: of the trials.
-        tests: number of candidates.
+        contest: the library's effects at their typical strengths, its floor the error at hand.
+        sums: of the trials; bar: what is asked of an effect.
     """
+    found = _weigh(contest, sums, bar)
+    if not contest.timing_s:
+        return found
+    sharp = _weigh(*contest.without_timing(sums), bar)
+    late = contest.timing_of(sums)
+    return [
+        one
+        if other.factor >= one.factor
+        else replace(other, factor=min(one.factor, max(other.factor, contest.timing_s / late_s)))
+        for one, other, late_s in zip(found, sharp, np.maximum(late, 1e-300), strict=True)
+    ]
+
+
+def _weigh(contest: Contest, sums: Sums, bar: Bar) -> list[Visibility]:
     s = Settings()
     count = np.maximum(sums.count, 1.0)
     independent = np.maximum(count * contest.band.independent_share, 1.0)
-    level = student.isf(min(s.significance / max(tests, 1), 0.5), s.most_replicates - 1)
+    level = student.isf(min(s.significance / max(bar.tests, 1), 0.5), s.most_replicates - 1)
     sure = norm.ppf(PROBABILITY)
     found = []
     for rival, left in zip(contest.rivals, contest.left_by_model(sums), strict=True):
@@ -106,7 +147,7 @@ def weigh_visibility(contest: Contest, sums: Sums, tests: int) -> list[Visibilit
         spread = np.hypot(np.sqrt(by_chance), s.replay_error * float(independent.mean()))
         total = by_chance + level * spread
         total += sure * np.sqrt(2.0 * total)
-        needed = np.maximum(total / independent, s.worth_at_floor)
+        needed = np.maximum(total / independent, bar.drop)
         needed += sure * np.sqrt(2.0 * needed / independent)
         ratio = np.expm1(2.0 * needed) * count * contest.floor**2 / np.maximum(left, 1e-300)
         axis = int(np.argmin(ratio))
@@ -116,9 +157,7 @@ def weigh_visibility(contest: Contest, sums: Sums, tests: int) -> list[Visibilit
     return found
 
 
-def refine(
-    contest: Contest, motions: Sequence[Motion], found: Visibility, tests: int
-) -> Visibility:
+def refine(contest: Contest, motions: Sequence[Motion], found: Visibility, bar: Bar) -> Visibility:
     """The same with the effect at the strength found: it may not be linear in its strength."""
     item = found.rival.item
     assert item is not None
@@ -131,6 +170,6 @@ def refine(
         scaled = [found.rival.values[i] * found.factor for i in strengths]
         values[strengths] = np.clip(scaled, [q.lower for q in own], [q.upper for q in own])
         probe = replace(contest, rivals=(replace(found.rival, values=values),))
-        again = weigh_visibility(probe, probe.sums(motions), tests)[0]
+        again = weigh_visibility(probe, probe.sums(motions), bar)[0]
         found = replace(found, factor=found.factor * again.factor, axis=again.axis)
     return found

@@ -57,8 +57,8 @@ def _about(stroke: Stroke, unit: str) -> str:
     """Around where an axis is moved, and how far."""
     middle, half = 0.5 * (stroke.low + stroke.high), 0.5 * (stroke.high - stroke.low)
     if unit == "rad":
-        return f"{math.degrees(middle):.0f}° ± {math.degrees(half):.0f}°"
-    return f"{1e3 * middle:.0f} ± {1e3 * half:.0f} mm"
+        return f"{math.degrees(middle):.0f}° ± {math.degrees(half):.0f}°".replace("-", "−")
+    return f"{1e3 * middle:.0f} ± {1e3 * half:.0f} mm".replace("-", "−")
 
 
 def _pace(stroke: Stroke, seen: Envelope, axis: int) -> str:
@@ -72,10 +72,11 @@ def _ends(stroke: Stroke, unit: str) -> str:
     """Where to turn: degrees or millimetres first, for a person; the unit of the files after."""
     if unit == "rad":
         low, high = math.degrees(stroke.low), math.degrees(stroke.high)
-        return f"between {low:.0f}° and {high:.0f}° ({stroke.low:.2f} to {stroke.high:.2f} rad)"
+        text = f"between {low:.0f}° and {high:.0f}° ({stroke.low:.2f} to {stroke.high:.2f} rad)"
+        return text.replace("-", "−")
     low, high = 1e3 * stroke.low, 1e3 * stroke.high
     digits = 0 if high - low > 10.0 else 2
-    return f"between {low:.{digits}f} and {high:.{digits}f} mm"
+    return f"between {low:.{digits}f} and {high:.{digits}f} mm".replace("-", "−")
 
 
 def _times(stroke: Stroke) -> str:

@@ -7,6 +7,7 @@ from typing import ClassVar, Literal
 from pydantic import Field
 
 from bampipe.results.record import Names, Record, Result, Share, Size
+from bampipe.schema import Count
 
 Purpose = Literal["precision", "decision", "sensitivity"]
 """What a trial is for: smaller uncertainties, one effect told from others, effects shown that the
@@ -77,6 +78,45 @@ class Detectable(Record):
     )
 
 
+class PlannedTrial(Record):
+    """One trial of a plan."""
+
+    sentence: str
+    seconds: Size
+    times: Count = Field(description="How often it is recorded")
+    moves: dict[str, Move] = Field(description="By axis; the first is the one that it is about")
+
+
+class PlannedSd(Record):
+    """Standard deviation of one parameter, without and with the trials of a plan."""
+
+    before: Size
+    after: Size
+    asked: Size
+    unit: str
+
+
+class PlannedConfusion(Record):
+    """Chance of taking one effect for another, without and with the trials of a plan."""
+
+    between: Names
+    before: Share
+    after: Share
+
+
+class Plan(Record):
+    """The trials that bring every uncertainty below what is asked."""
+
+    sentence: str
+    seconds: Size = Field(description="Of all trials")
+    is_enough: bool = Field(description="Whether what is asked is expected to be reached")
+    trials: tuple[PlannedTrial, ...]
+    sd: dict[str, PlannedSd] = Field(
+        default={}, description="By parameter; none where the model lacks something"
+    )
+    confusion: tuple[PlannedConfusion, ...] = ()
+
+
 class NextResult(Result):
     """The trial to record next, and what it is expected to give."""
 
@@ -92,3 +132,4 @@ class NextResult(Result):
     expected: str = Field(description="What it is expected to give")
     proposals: tuple[Proposal, ...] = Field(description="Best first")
     sensitivity: dict[str, Detectable] = Field(default={}, description="By effect of the library")
+    plan: Plan | None = None

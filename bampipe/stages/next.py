@@ -19,6 +19,7 @@ from bampipe.identification.sensor_noise import sensor_noise
 from bampipe.next_trial.choice import Tried, Worth, rank_designs
 from bampipe.next_trial.forecast import Forecast
 from bampipe.next_trial.motion import Rehearsal
+from bampipe.next_trial.plan import Goal, plan_trials, record_plan
 from bampipe.next_trial.precision import Precision
 from bampipe.next_trial.primitives import Envelope
 from bampipe.next_trial.questions import (
@@ -32,7 +33,8 @@ from bampipe.physics import compile_model
 from bampipe.progress import Progress
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.identify import IdentifyResult
-from bampipe.results.next import Detectable, NextResult, Purpose
+from bampipe.results.ingest import IngestResult
+from bampipe.results.next import Detectable, NextResult, Plan, Purpose
 from bampipe.results.validate import ValidateResult
 from bampipe.schema import STRICT, Count
 from bampipe.trials.measured import read_measured_trials, trial_of_block
@@ -47,7 +49,7 @@ INPUTS = (
     "models/{model}/validate.json?",
     "models/{model}/diagnose.json?",
 )
-OUTPUTS = ("models/{model}/next.json",)
+OUTPUTS = ("models/{model}/next.json", "models/{model}/protocol*.pdf")
 
 Array = NDArray[np.float64]
 
@@ -71,12 +73,18 @@ class Config:
             could not tell apart; ``sensitivity`` to effects that the trials at hand would not have
             shown; the name of a parameter; or ``auto``: what the diagnosis asks for.
         seconds: length of the trial.
+        plan: whether to make a set of trials, and its protocol sheet.
+        sd: what the plan is to bring every standard deviation below, as a share of the estimate.
+        confusion: what it is to bring every chance of confusing two effects below.
         seed: of how people differ, and of sensor noise.
     """
 
     model: str = "base"
     purpose: str = "auto"
     seconds: Annotated[float, Field(ge=4, le=600)] = 20.0
+    plan: bool = False
+    sd: Annotated[float, Field(gt=0, lt=1)] = 0.05
+    confusion: Annotated[float, Field(gt=0, lt=0.5)] = 0.05
     seed: Count = 0
 
 
@@ -140,7 +148,9 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         chosen = purpose if purpose in kinds else "precision"  # type: ignore[assignment]
     if chosen == "sensitivity":
         progress(0.1, "what these trials would have shown of each effect")
-        blindness = find_blindness(evidence, recipe, floor)
+        error, spread = _errors(diagnosed, evidence)
+        limit = found.input_timing.limit
+        blindness = find_blindness(evidence, recipe, error, floor, spread, limit)
     at_hand = contest.sums(fitted) if contest else None
     forecast = Forecast(rehearsal, precision, contest, at_hand)
     parameter = purpose if purpose in names else ""
@@ -163,6 +173,16 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     proposals = tuple(forecast.proposal(one) for one in tried)
     best = proposals[0]
     table = _sensitivity(blindness, tried[0]) if blindness else {}
+    plan: Plan | None = None
+    if config.plan:
+        progress(0.92, "planning a set of trials")
+        estimates = [found.parameters[name].estimate for name in precision.names]
+        goal = _goal(config, np.array(estimates), contest is None)
+        for name, entry in proposals[0].sd.items():
+            # What the best design for all leaves too uncertain gets a design of its own.
+            if entry.after > goal.sd[precision.names.index(name)]:
+                tried += rank(_worth("precision", name, forecast, None), False, 0.92)[:1]
+        plan = record_plan(forecast, goal, plan_trials(forecast, tried, goal))
     result = NextResult(
         model=config.model,
         purpose=chosen,
@@ -173,7 +193,14 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         expected=say_expected(chosen, parameter, best, table),
         proposals=proposals,
         sensitivity=table,
+        plan=plan,
     )
+    if plan is not None:
+        # typst is slow to import: only here
+        from bampipe.report.protocol import protocol_sheet
+
+        sheet = protocol_sheet(plan, run.read(IngestResult).session_id, config.model)
+        (out / f"models/{config.model}/protocol.pdf").write_bytes(sheet)
     result.write(out)
     return _summary(result)
 
@@ -193,6 +220,22 @@ def _floor(
         known.get(axis) or float(left[i]) for i, axis in enumerate(evidence.system.coordinates)
     ]
     return np.maximum(found, 1e-12)
+
+
+def _goal(config: Config, estimates: Array, is_complete: bool) -> Goal:
+    """What a plan is to reach; no uncertainty of parameters where the model lacks something."""
+    asked = np.where(is_complete & (estimates != 0.0), config.sd * np.abs(estimates), np.inf)
+    return Goal(asked, config.confusion)
+
+
+def _errors(diagnosed: DiagnoseResult | None, evidence: Evidence) -> tuple[Array, Array]:
+    """Held-out error of each axis, and the scatter of its floor, each (n_q,), N.m or N."""
+    axes = evidence.system.coordinates
+    if diagnosed is None:
+        return np.maximum(evidence.held_out_rmse, 1e-12), np.zeros(len(axes))
+    entries = [diagnosed.axes[axis] for axis in axes]
+    error = np.maximum([entry.rmse_before for entry in entries], 1e-12)
+    return error, np.array([entry.noise_floor_sd for entry in entries])
 
 
 def _worth(
@@ -240,11 +283,12 @@ def _sensitivity(blindness: Blindness, best: Tried) -> dict[str, Detectable]:
 
 def _summary(result: NextResult) -> dict[str, object]:
     """The sentence first, then why and what for; the runners-up beside their worth."""
+    planned = [f"plan: {result.plan.sentence}"] if result.plan is not None else []
     return {
         "headline": result.sentence,
         "why": result.why,
         "expected": result.expected,
-        "notes": [result.why, result.expected],
+        "notes": [result.why, result.expected, *planned],
         "purpose": result.purpose,
         "proposals": [
             {"worth": one.worth, "sentence": one.sentence} for one in result.proposals[:_SHOWN]

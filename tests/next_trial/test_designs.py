@@ -69,8 +69,9 @@ def test_a_sentence_says_where_how_fast_and_how_long():
     said = describe(design, SEEN, registry.device("bam"))
     assert said.startswith("Move yaw slowly back and forth between")
     stroke = design.strokes[0]
-    assert f"{np.degrees(stroke.low):.0f}°" in said
-    assert f"({stroke.low:.2f} to {stroke.high:.2f} rad)" in said
+    assert f"{np.degrees(stroke.high):.0f}°" in said
+    assert f"to {stroke.high:.2f} rad)" in said
+    assert "-" not in said.replace("back and forth", "")
     assert "for 20 s" in said
     assert "keep pitch and extension moving gently" in said
     assert " mm" in said

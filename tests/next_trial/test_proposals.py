@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
+import independent
 import pytest
 from independent.person import Task
-from independent_runs import diagnose, record_run
+from independent_runs import SHORT, diagnose, record_run
 
 import bampipe
 from bampipe.errors import InputError
+from bampipe.results.forecast import compare_forecast
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.next import NextResult
 
@@ -82,3 +85,58 @@ def test_bad_requests_are_refused_in_one_line(tmp_path):
         bampipe.run_stage(run, "next", purpose="decision")
     content = json.loads((run.root / "run.json").read_text())
     assert "next:base" not in content["stages"]
+
+
+def test_effects_are_found_from_the_strength_on_that_the_trials_would_have_shown(tmp_path):
+    run, _ = record_run(tmp_path / "clean", "joint", 931)
+    found, _ = propose(run, purpose="sensitivity")
+    entry = found.sensitivity["quadratic_drag:joint"]
+    assert entry.parameter == "quadratic_drag.joint.coefficient"
+    assert entry.smallest is not None
+    truth = record_at(tmp_path / "size", 1.0)["quadratic_drag.joint.coefficient"]
+    for share, selected in ((0.4, []), (1.25, ["quadratic_drag:joint"])):
+        folder = tmp_path / f"{share}"
+        hidden = record_at(folder, share * entry.smallest / truth)
+        assert hidden[entry.parameter] == pytest.approx(share * entry.smallest, rel=1e-6)
+        pipeline = tmp_path / "clean" / "short.toml"
+        again = bampipe.run_session(folder, runs=tmp_path / "runs", pipeline=str(pipeline))
+        assert diagnose(again)["selected"] == selected, share
+    # An offset of the motor is one to the data with the device's own.
+    assert found.sensitivity["force_bias:current"].smallest is None
+
+
+def record_at(folder: Path, strength: float) -> dict[str, float]:
+    """Record a joint with a drag of some strength; its true parameters."""
+    hidden = {"quadratic_drag:joint": strength}
+    return independent.record("joint", folder, 931, hidden, SHORT["joint"])["parameters"]
+
+
+def test_a_plan_reaches_what_is_asked_in_few_trials_and_says_what_came(tmp_path):
+    run, _ = record_run(tmp_path / "now", "joint", 922, **LONG)
+    names = ("coulomb.joint", "viscous.joint", "inertia", "moment")
+    found, path = propose(run, purpose="coulomb.joint", seconds=12.0, plan=True, sd=0.002)
+    assert found.plan is not None
+    sheet = (path.parent / "protocol.pdf").read_bytes()
+    assert sheet.startswith(b"%PDF")
+    assert found.plan.seconds == sum(one.times * one.seconds for one in found.plan.trials)
+    assert all(found.plan.sd[n].after < found.plan.sd[n].before for n in names)
+    easy, _ = propose(run, purpose="coulomb.joint", seconds=12.0, plan=True, sd=0.9)
+    assert easy.plan is not None
+    assert easy.plan.is_enough
+    assert easy.plan.trials == ()
+    # The same run folder, the session with the proposed trial in it.
+    independent.record(
+        "joint", tmp_path / "now" / "joint", 922, {},
+        replace(SHORT["joint"], **LONG, tasks=(Task.read(path),)),
+    )  # fmt: skip
+    again = bampipe.run_session(
+        tmp_path / "now" / "joint",
+        runs=tmp_path / "now" / "runs",
+        pipeline=str(tmp_path / "now" / "short.toml"),
+    )
+    identified = IdentifyResult.read(again.root / IdentifyResult.file("base"))
+    (said,) = compare_forecast(easy, identified, None)
+    came = identified.parameters["coulomb.joint"].sd
+    assert said.startswith("`coulomb.joint`: ±")
+    assert f"± {came:.2g} came" in said
+    assert compare_forecast(easy, identified.model_copy(update={"trials": easy.trials}), None) == ()

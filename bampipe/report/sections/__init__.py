@@ -12,6 +12,7 @@ SECTIONS: tuple[str, ...] = (
     "validation",
     "diagnosis",
     "drafts",
+    "next_trial",
     "effects",
     "ladder",
     "published",

@@ -1,0 +1,213 @@
+"""A set of trials, chosen one after another, that brings every uncertainty below what is asked."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.next_trial.choice import Tried
+from bampipe.next_trial.discrimination import Sums
+from bampipe.next_trial.forecast import NOTHING, Forecast, describe_moves
+from bampipe.next_trial.primitives import Primitive
+from bampipe.next_trial.words import describe
+from bampipe.results.next import Plan, PlannedConfusion, PlannedSd, PlannedTrial
+
+Array = NDArray[np.float64]
+
+_MOST_TRIALS = 8
+_WORTHWHILE = 0.01
+"""Fall of the distance to the goal, in nats, below which a further trial is not worth recording."""
+_SHORTER = 0.5
+_SHORTEST_S = 5.0
+
+
+@dataclass(frozen=True)
+class Goal:
+    """What is asked of a plan.
+
+    Attributes:
+        sd: most standard deviation of each parameter, (n,); infinite where nothing is asked.
+        confusion: most chance of confusing two rivals.
+    """
+
+    sd: Array
+    confusion: float
+
+
+@dataclass(frozen=True)
+class _Option:
+    """A design and what one trial of it adds, its median version taken."""
+
+    design: Primitive
+    information: Array
+    sums: Sums | None
+
+    def lasting(self, seconds: float) -> _Option:
+        """The same for another time: what a trial adds is in proportion to that."""
+        share = seconds / self.design.seconds
+        return _Option(
+            replace(self.design, seconds=seconds),
+            share * self.information,
+            self.sums.scaled(share) if self.sums is not None else None,
+        )
+
+
+@dataclass(frozen=True)
+class TrialPlan:
+    """Trials to record, in order.
+
+    Attributes:
+        designs: what to do.
+        sd: (n,) standard deviations expected in the end.
+        confusion: chance of confusing each pair of rivals in the end.
+        is_enough: whether the goal is reached.
+    """
+
+    designs: tuple[Primitive, ...]
+    sd: Array
+    confusion: dict[tuple[int, int], float]
+    is_enough: bool
+
+
+def plan_trials(forecast: Forecast, tried: Sequence[Tried], goal: Goal) -> TrialPlan:
+    """Choose trials greedily until the goal is reached, then leave out and shorten what can be.
+
+    Args:
+        forecast: of what trials give; tried: the designs to choose from; goal: what is asked.
+    """
+    options = [_option(forecast, one) for one in tried]
+    chosen: list[_Option] = []
+    left = _distance(forecast, chosen, goal)
+    while left > 0.0 and len(chosen) < _MOST_TRIALS:
+        distances = [_distance(forecast, [*chosen, option], goal) for option in options]
+        best = int(np.argmin(distances))
+        if distances[best] > left - _WORTHWHILE:
+            break
+        chosen, left = [*chosen, options[best]], distances[best]
+    if left <= 0.0:
+        chosen = _trimmed(forecast, chosen, goal)
+    sd, confusion = _outcome(forecast, chosen)
+    return TrialPlan(tuple(one.design for one in chosen), sd, confusion, left <= 0.0)
+
+
+def _trimmed(forecast: Forecast, chosen: list[_Option], goal: Goal) -> list[_Option]:
+    """The same without trials, or with shorter ones, as long as the goal stays reached."""
+    for k in range(len(chosen) - 1, -1, -1):
+        fewer = [*chosen[:k], *chosen[k + 1 :]]
+        if _distance(forecast, fewer, goal) <= 0.0:
+            chosen = fewer
+            continue
+        while (seconds := _SHORTER * chosen[k].design.seconds) >= _SHORTEST_S:
+            shorter = [*chosen[:k], chosen[k].lasting(seconds), *chosen[k + 1 :]]
+            if _distance(forecast, shorter, goal) > 0.0:
+                break
+            chosen = shorter
+    return chosen
+
+
+def _option(forecast: Forecast, tried: Tried) -> _Option:
+    """A design by the version whose information is the median one."""
+    added = [forecast.precision.of_motion(motion) for motion in tried.motions]
+    order = np.argsort([forecast.precision.gain(one) for one in added])
+    middle = int(order[len(order) // 2])
+    sums = forecast.contest.sums([tried.motions[middle]]) if forecast.contest else None
+    return _Option(tried.design, added[middle], sums)
+
+
+def _outcome(
+    forecast: Forecast, chosen: Sequence[_Option]
+) -> tuple[Array, dict[tuple[int, int], float]]:
+    """Standard deviations (n,) and chances of confusion, with ``chosen`` trials recorded."""
+    precision, contest, sums = forecast.precision, forecast.contest, forecast.at_hand
+    added = np.zeros_like(precision.information)
+    for one in chosen:
+        added = added + one.information
+        if sums is not None and one.sums is not None:
+            sums = sums + one.sums
+    seconds = sum(one.design.seconds for one in chosen)
+    sd = precision.sd_with(added, seconds) if chosen else precision.sd
+    if contest is None or sums is None:
+        return sd, {}
+    return sd, {pair: found.confusion for pair, found in contest.contrasts(sums).items()}
+
+
+def _distance(forecast: Forecast, chosen: Sequence[_Option], goal: Goal) -> float:
+    """How far trials are from the goal: sum of the logarithms of what is too large, nats."""
+    sd, confusion = _outcome(forecast, chosen)
+    far = float(np.sum(np.maximum(np.log(sd / goal.sd), 0.0)))
+    return far + sum(max(float(np.log(c / goal.confusion)), 0.0) for c in confusion.values())
+
+
+def record_plan(forecast: Forecast, goal: Goal, found: TrialPlan) -> Plan:
+    """The record of a plan."""
+    system, precision, seen = forecast.rehearsal.system, forecast.precision, forecast.rehearsal.seen
+    units = {q.name: q.unit for q in system.parameters}
+    seconds = sum(design.seconds for design in found.designs)
+    confusion: tuple[PlannedConfusion, ...] = ()
+    if forecast.contest is not None and forecast.at_hand is not None:
+        now, rivals = forecast.contest.contrasts(forecast.at_hand), forecast.contest.rivals
+        confusion = tuple(
+            PlannedConfusion(
+                between=tuple(rivals[k].name or NOTHING for k in pair),
+                before=now[pair].confusion,
+                after=after,
+            )
+            for pair, after in found.confusion.items()
+        )
+    return Plan(
+        sentence=_sentence(len(found.designs), seconds, found.is_enough),
+        seconds=seconds,
+        is_enough=found.is_enough,
+        trials=tuple(
+            PlannedTrial(
+                sentence=describe(design, seen, system.model.device),
+                seconds=design.seconds,
+                times=times,
+                moves=describe_moves(design, forecast.rehearsal),
+            )
+            for design, times in _counted(found.designs)
+        ),
+        sd={}
+        if forecast.contest is not None
+        else {
+            name: PlannedSd(
+                before=precision.sd[k], after=found.sd[k], asked=goal.sd[k], unit=units[name]
+            )
+            for k, name in enumerate(precision.names)
+        },
+        confusion=confusion,
+    )
+
+
+def _counted(designs: Sequence[Primitive]) -> list[tuple[Primitive, int]]:
+    """Each design once, with how often it is recorded."""
+    counted: list[tuple[Primitive, int]] = []
+    for design in designs:
+        known = [k for k, (other, _) in enumerate(counted) if other is design]
+        if known:
+            counted[known[0]] = design, counted[known[0]][1] + 1
+        else:
+            counted.append((design, 1))
+    return counted
+
+
+def _sentence(count: int, seconds: float, is_enough: bool) -> str:
+    if not count:
+        return (
+            "The trials at hand are enough: nothing needs to be recorded."
+            if is_enough
+            else "No trial that could be recorded here brings the uncertainties nearer to what is"
+            " asked."
+        )
+    trials = "one trial" if count == 1 else f"{count} trials"
+    if is_enough:
+        return (
+            f"With {trials}, {seconds:.0f} s in all, every uncertainty is expected to be reached."
+        )
+    return (
+        f"With {trials}, {seconds:.0f} s in all, not every uncertainty is expected to be reached;"
+        " more of them bring little."
+    )

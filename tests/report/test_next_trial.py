@@ -1,0 +1,85 @@
+"""The section on what to record next, and the protocol sheet."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+from bampipe.report.document import Callout, Table
+from bampipe.report.protocol import protocol_sheet
+from bampipe.report.sections import next_trial
+from bampipe.results.next import NextResult, Plan
+
+MOVE = {"low": -0.4, "high": 0.4, "slow": 0.02, "fast": 0.1, "unit": "rad"}
+SENTENCE = "Move yaw slowly back and forth between −23° and 23°, for 20 s."
+FOUND = {
+    "model": "base",
+    "purpose": "sensitivity",
+    "trials": ["t01", "t02"],
+    "sentence": SENTENCE,
+    "why": "These trials would not have shown stribeck:yaw below 2 N.m.",
+    "expected": "It would show stribeck:yaw from 0.5 N.m on with 90 % probability.",
+    "proposals": [
+        {
+            "sentence": SENTENCE,
+            "seconds": 20.0,
+            "moves": {"yaw": MOVE},
+            "pose": {"pitch": 0.0},
+            "worth": 1.0,
+            "information_gain": 0.4,
+            "sd": {
+                "coulomb.yaw": {
+                    "before": 0.01, "after": 0.005, "after_at_worst": 0.006, "unit": "N.m"
+                }
+            },
+        }
+    ],
+    "sensitivity": {
+        "stribeck:yaw": {
+            "parameter": "stribeck.yaw.force", "smallest": 2.0, "typical": 1.0, "unit": "N.m",
+            "axis": "yaw", "with_proposal": 0.5,
+        },
+        "force_bias:x": {
+            "parameter": "force_bias.x.bias", "smallest": None, "typical": 1.0, "unit": "N",
+            "axis": "yaw",
+        },
+    },
+}  # fmt: skip
+
+
+def results_with(found: NextResult | None) -> SimpleNamespace:
+    return SimpleNamespace(
+        read=lambda kind, model="": found if kind is NextResult else None,
+        root=SimpleNamespace(name="s01"),
+    )
+
+
+def test_the_section_stands_only_where_somebody_asked():
+    assert next_trial.section(results_with(None)) is None
+
+
+def test_the_section_says_what_to_do_and_what_went_unseen():
+    section = next_trial.section(results_with(NextResult.model_validate(FOUND)))
+    first = section.blocks[0]
+    assert isinstance(first, Callout)
+    assert first.text == SENTENCE
+    sd, sensitivity = (block for block in section.blocks if isinstance(block, Table))
+    assert sd.rows == (("`coulomb.yaw`", "0.010", "0.0050", "0.0060", "N·m"),)
+    # What no trial shows stands first, with a dash.
+    assert [row[0] for row in sensitivity.rows] == ["`force_bias:x`", "`stribeck:yaw`"]
+    assert sensitivity.rows[0][3] == "–"
+    assert sensitivity.rows[1][3:6] == ("2.0", "0.50", "1.0")
+
+
+def test_the_protocol_sheet_is_the_same_pdf_again():
+    plan = Plan.model_validate(
+        {
+            "sentence": "With 3 trials, 60 s in all, what is asked is expected to be reached.",
+            "seconds": 60.0,
+            "is_enough": True,
+            "trials": [{"sentence": SENTENCE, "seconds": 20.0, "times": 3, "moves": {"yaw": MOVE}}],
+            "sd": {"coulomb.yaw": {"before": 0.01, "after": 0.004, "asked": 0.005, "unit": "N.m"}},
+        }
+    )
+    sheet = protocol_sheet(plan, "s01", "base")
+    assert sheet.startswith(b"%PDF")
+    assert sheet == protocol_sheet(plan, "s01", "base")
