@@ -34,6 +34,9 @@ _GRID = 7
 _LARGEST_RATIO = 3.0
 """Of neighbours on the grid of a searched parameter."""
 _REFINE = 3
+_STARTS = (0.5, 0.8)
+"""Shares of their ranges at which several searched parameters start, one after the other: a sharp
+resonance is missed between the points of a grid, one that is damped well shows from afar."""
 _SIMILAR = 0.7
 _DENSEST = 48
 _SHARES = (1.0, 0.9, 0.8, 0.65, 0.5, 0.35, 0.2, 0.1, 0.05)
@@ -207,12 +210,37 @@ class Scorer:
         """Refit with ``item`` added; None where it does nothing in these trials.
 
         Searched parameters are scanned over their range, finely enough that neighbours on the
-        grid resemble each other, and narrowed around the best; several are taken in turn.
+        grid resemble each other, and narrowed around the best; several are taken in turn, from
+        `_STARTS`.
         """
         effect = item.system.model.effects[-1]
         ranges = [self.scale.range_of(effect, item.own[i]) for i in item.searched]
-        at = [_middle(r.low, r.high) for r in ranges]
         hopeless = self._cost_before(item) - Settings().worth_searching
+        found = [
+            self._search(item, ranges, start, hopeless)
+            for start in (_STARTS if len(ranges) > 1 else _STARTS[:1])
+        ]
+        costs = [each[1] if each is not None else np.inf for each in found]
+        chosen = found[int(np.argmin(costs))]
+        if chosen is None:
+            return None
+        at, cost = chosen
+        if ranges and cost > hopeless:
+            return self._absent(item)
+        best = self._at(item, np.array(at))
+        # An error of exactly zero, on an axis that nothing drives, is no explanation.
+        return best if best is not None and np.isfinite(best.gain).all() else None
+
+    def _search(
+        self, item: Candidate, ranges: Sequence[SearchRange], start: float, hopeless: float
+    ) -> tuple[list[float], float] | None:
+        """Best searched parameters, and their cost; None if one never matters.
+
+        Begins with every one at a share ``start`` of its range, and ends where the first round of
+        all leaves more than ``hopeless``.
+        """
+        at = [r.within(start) for r in ranges]
+        cost = -np.inf
         for _ in range(min(len(ranges), 2)):
             for k, interval in enumerate(ranges):
                 found = self._scan(item, at, k, interval)
@@ -220,10 +248,8 @@ class Scorer:
                     return None
                 at[k], cost = found
                 if cost > hopeless:
-                    return self._absent(item)
-        best = self._at(item, np.array(at))
-        # An error of exactly zero, on an axis that nothing drives, is no explanation.
-        return best if best is not None and np.isfinite(best.gain).all() else None
+                    return at, cost
+        return at, cost
 
     def score_at(self, item: Candidate, values: Array) -> Score | None:
         """Refit with ``item`` added, its searched parameters held at those of ``values``."""
@@ -280,6 +306,9 @@ class Scorer:
             grid = list(np.geomspace(low, high, count))
         else:
             grid = list(np.linspace(low, high, count))
+        if at[k] not in grid:
+            # Where the others were searched from must not be lost between two points.
+            grid = sorted([*grid, at[k]])
         known = [cost(value) for value in grid]
         if all(found is None for found in known):
             return None

@@ -43,6 +43,12 @@ class SearchRange:
     high: float
     by_ratio: bool
 
+    def within(self, share: float) -> float:
+        """The value that lies a share of the way from the lower to the upper end."""
+        if self.low > 0.0 and self.high > 0.0:
+            return float(self.low ** (1.0 - share) * self.high**share)
+        return float(self.low + share * (self.high - self.low))
+
 
 @dataclass(frozen=True)
 class MachineScale:

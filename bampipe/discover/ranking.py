@@ -17,7 +17,11 @@ Array = NDArray[np.float64]
 
 
 def rank(search: Search, selected: Sequence[str], before: Array) -> list[Ranked]:
-    """Selected effects with their groups, then the others by their score beyond chance."""
+    """Selected effects with their groups, then the others by their score beyond chance.
+
+    Selected effects are held against the model that they were added to, others against the model
+    as given: what a second effect does may not show before the first is there.
+    """
     order: list[str] = []
     for name in selected:
         order += [n for n in (name, *search.groups.get(name, ())) if n not in order]
@@ -29,8 +33,11 @@ def rank(search: Search, selected: Sequence[str], before: Array) -> list[Ranked]
     for name in [*order, *others]:
         if name not in search.first:
             continue
-        score = search.first[name]
-        excess = search.level.excess(score)
+        score, error = search.first[name], before
+        excess, p_value = search.level.excess(score), search.level.p_value(score)
+        if name in selected and name in search.additions:
+            found = search.additions[name]
+            score, error, excess, p_value = found.score, found.before, found.excess, found.p_value
         axis = int(np.argmax(excess))
         group = next(({g, *r} - {name} for g, r in search.groups.items() if name in (g, *r)), set())
         own = [q.name for q in _own_parameters(search.recipe, name)]
@@ -38,9 +45,9 @@ def rank(search: Search, selected: Sequence[str], before: Array) -> list[Ranked]
             Ranked(
                 name,
                 axis,
-                float(before[axis]),
+                float(error[axis]),
                 float(score.error[axis]),
-                search.level.p_value(score),
+                p_value,
                 float(excess.sum()),
                 dict(zip(own, [float(v) for v in score.values], strict=True)),
                 tuple(sorted(group)),

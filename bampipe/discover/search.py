@@ -29,6 +29,22 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
+class Addition:
+    """An effect as it stood when it was chosen.
+
+    Attributes:
+        score: against the model that it was added to.
+        p_value: chance that a candidate scores so high where nothing is missing.
+        excess: gain beyond chance, by axis; before: held-out error of that model, by axis.
+    """
+
+    score: Score
+    p_value: float
+    excess: Array
+    before: Array
+
+
+@dataclass(frozen=True)
 class Search:
     """What a search came to.
 
@@ -42,6 +58,7 @@ class Search:
         groups: for each effect found, in order, the others that these trials cannot tell from it.
         contests: for each, those who contend for its place, itself first.
         main: for each, the axis on which it helps most.
+        additions: for each, how it stood against the model that it was added to.
         likely: p-value and gain in log error by axis of candidates that would lower the error of
             the final model, but do not beat chance.
         transient: candidates that only one second speaks for, and that second.
@@ -58,6 +75,7 @@ class Search:
     groups: Mapping[str, tuple[str, ...]]
     contests: Mapping[str, tuple[Contender, ...]]
     main: Mapping[str, int]
+    additions: Mapping[str, Addition]
     likely: Mapping[str, tuple[float, Array]]
     transient: Mapping[str, Stretch]
     steps: tuple[Step, ...]
@@ -93,6 +111,7 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
     level = bench.level(base, initial, bench.gaining(first, Scorer(initial)), (FLOOR_SEED,))
     current, scores = FittedSet(base, (), initial), dict(first)
     groups: dict[str, tuple[str, ...]] = {}
+    additions: dict[str, Addition] = {}
     dropped: set[str] = set()
     transient: dict[str, Stretch] = {}
     steps = [_step(current)]
@@ -107,7 +126,11 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
         scores = {n: score for n, score in scores.items() if n not in chosen.transient}
         if not chosen.winner:
             continue
-        wider = extend_set(bench, current, scores[chosen.winner])
+        score = scores[chosen.winner]
+        addition = Addition(
+            score, known.p_value(score), known.excess(score), current.evidence.held_out_rmse
+        )
+        wider = extend_set(bench, current, score)
         for earlier in wider.added[:-1]:
             # What resembles the missing effect may come first: it takes a little of several others.
             less = reduce_set(bench, wider, earlier)
@@ -126,6 +149,7 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
         dropped |= {*current.added, chosen.winner} - {*wider.added}
         bench, current, (scores, known) = timed, wider, sound
         groups[chosen.winner] = chosen.alike
+        additions[chosen.winner] = addition
         steps.append(_step(current))
         progress(0.45 + 0.05 * len(steps), f"added {chosen.winner}, looking for more")
     progress(0.8, "weighing each effect beside its rivals")
@@ -139,7 +163,7 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
     return Search(
         bench.trials, base, initial, level, first, found,
         {name: groups.get(name, ()) for name in found.added},
-        contests, main, likely, transient, tuple(steps), tuple(final),
+        contests, main, additions, likely, transient, tuple(steps), tuple(final),
     )  # fmt: skip
 
 

@@ -17,10 +17,9 @@ from scipy.optimize import minimize_scalar
 Array = NDArray[np.float64]
 
 _ORDERS = (2, 3, 4, 5, 6)
-_SLOWEST_HZ, _COLOURED = 100.0, 2.0
+_SLOWEST_HZ = 100.0
 """A sensor's own low-pass keeps noise out of neighbouring samples that acts at the frequencies of
-the motion all the same. Thinned to this rate, a record shows that noise; but its signal is less
-smooth, so that the result counts from this factor on only."""
+the motion all the same. Thinned to this rate, a record shows that noise."""
 _JUMP = 10.0
 """Second difference, over the median one, from which on it is no part of a sine in noise."""
 _UNEVEN = 1e-3
@@ -44,19 +43,21 @@ def white_noise_sd(record: Array, t: Array | None = None) -> float:
 
     Args:
         record: samples.
-        t: (T,) their time stamps, s, which need not be uniform. Given, noise that is not white
-            between neighbouring samples is looked for too; a uniform record needs none.
+        t: (T,) their time stamps, s, which need not be uniform; a uniform record needs none.
     """
-    fine = _difference_noise(record, t)
-    if t is None or t.size < 2:
-        return fine
-    every = round(1.0 / (_SLOWEST_HZ * float(np.median(np.diff(t)))))
-    coarse = _thinned_noise(record, t, every) if every > 1 else fine
-    return coarse if coarse > _COLOURED * fine else fine
+    return _difference_noise(record, t)
 
 
-def _thinned_noise(record: Array, t: Array, every: int) -> float:
-    """Noise of every so-manieth sample, without the sines that the whole record shows."""
+def slow_noise_sd(record: Array, t: Array) -> float:
+    """The same of a record (T,) at stamps ``t`` (T,), thinned to `_SLOWEST_HZ`.
+
+    It shows noise that a sensor's own low-pass keeps out of neighbouring samples, and takes a
+    signal for noise that is not smooth from one kept sample to the next. Sines that the whole
+    record shows are taken off. NaN where the record is too short, or no faster.
+    """
+    every = round(1.0 / (_SLOWEST_HZ * float(np.median(np.diff(t))))) if t.size > _FEWEST else 0
+    if every < 2:
+        return float("nan")
     length = min(record.size, every * _STRETCH // 4)
     starts = np.linspace(0, record.size - length, min(_STRETCHES // 2, record.size // length))
     found = []

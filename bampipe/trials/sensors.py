@@ -11,11 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bampipe.estimate.white_noise import counting_step, white_noise_sd
+from bampipe.estimate.white_noise import counting_step, slow_noise_sd, white_noise_sd
 from bampipe.results.ingest import IngestResult
 
 Array = NDArray[np.float64]
 
+_COLOURED = 2.0
+"""Factor from which on the noise of a thinned record is more than that of the whole one."""
 DISAGREEMENT = 2.0
 """Factor between stated and measured noise beyond which a warning is given."""
 
@@ -26,18 +28,22 @@ class RecordNoise:
 
     Attributes:
         step: of its counts, 0.0 where its values lie on no grid.
-        white_sd: standard deviation of its white noise, NaN where the record is too short.
+        white_sd: standard deviation of its white noise; slow_sd: of noise that reaches over several
+            samples, or of a signal that is as fast. NaN where the record is too short.
     """
 
     step: float
     white_sd: float
+    slow_sd: float
 
     @classmethod
     def of(cls, record: Array, t: Array | None = None) -> RecordNoise:
         """Measure a record (T,) with time stamps ``t`` (T,); see `white_noise_sd`."""
         sound = np.isfinite(record)
         stamps = None if t is None else t[sound]
-        return cls(counting_step(record[sound]), white_noise_sd(record[sound], stamps))
+        record = record[sound]
+        slow = float("nan") if stamps is None else slow_noise_sd(record, stamps)
+        return cls(counting_step(record), white_noise_sd(record, stamps), slow)
 
 
 @dataclass(frozen=True)
@@ -80,7 +86,7 @@ def settle_encoder(
     elif stated:
         step = stated
     rounding = step / np.sqrt(12.0)
-    white = _typical_white(records) or 0.0
+    white = _typical_noise(records, rounding) or 0.0
     # Rounding alone leaves differences of a third to one step; more than that is noise beside it.
     noise = white if white > DISAGREEMENT * rounding else rounding
     if stated and not warning and noise > rounding:
@@ -101,8 +107,8 @@ def settle_force(
         name, unit: for messages; stated: by the session file, or None.
         records: of its samples, by trial.
     """
-    measured = _typical_white(records)
     stated = stated if stated is not None and stated > 0.0 else None
+    measured = _typical_noise(records, stated)
     warning = ""
     if stated is not None and measured is not None:
         ratio = measured / stated
@@ -122,9 +128,24 @@ def _typical_step(records: Sequence[RecordNoise]) -> float:
     return float(np.median(steps)) if 2 * len(steps) > len(records) else 0.0
 
 
-def _typical_white(records: Sequence[RecordNoise]) -> float | None:
-    whites = [record.white_sd for record in records if np.isfinite(record.white_sd)]
-    return float(np.median(whites)) if whites else None
+def _typical_noise(records: Sequence[RecordNoise], stated: float | None) -> float | None:
+    """Noise of a channel, the same in every trial, however much its signal adds in some.
+
+    Noise over several samples counts where it is clearly more than that of neighbouring ones, and
+    what is stated does not speak for the latter: a fast signal is told from it in no other way.
+    """
+    white = _lower_quartile([record.white_sd for record in records])
+    slow = _lower_quartile([record.slow_sd for record in records])
+    if white is None or slow is None or slow <= _COLOURED * white:
+        return white
+    if stated and stated**2 < white * slow:
+        return white
+    return slow
+
+
+def _lower_quartile(values: Sequence[float]) -> float | None:
+    finite = [value for value in values if np.isfinite(value)]
+    return float(np.quantile(finite, 0.25)) if finite else None
 
 
 @dataclass(frozen=True)

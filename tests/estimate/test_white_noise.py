@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bampipe.estimate.white_noise import white_noise_sd
+from bampipe.estimate.white_noise import slow_noise_sd, white_noise_sd
+from bampipe.trials.sensors import RecordNoise, settle_force
 
 
 @pytest.mark.parametrize("rate_hz", [94.0, 250.0, 1000.0])
@@ -19,3 +20,27 @@ def test_a_hum_is_no_white_noise(rate_hz, hum, jitter):
     mains = np.sin(100.0 * np.pi * t + 1.0) + 0.2 * np.sin(300.0 * np.pi * t)
     record = motion + 0.02 * (rng.normal(size=t.size) + hum * mains)
     assert white_noise_sd(record, t) == pytest.approx(0.02, rel=0.2)
+    assert not slow_noise_sd(record, t) > 0.03
+
+
+def test_a_fast_signal_in_some_trials_is_no_noise():
+    """A stroke of noise up to 60 Hz beside smooth ones, as dampers are tested with."""
+    rng = np.random.default_rng(2)
+    t = np.arange(5000) / 500.0
+    smooth = 50.0 * np.sin(8.0 * t)
+    tones = np.arange(1.0, 60.0, 0.1)
+    fast = np.sin(np.outer(t, 2.0 * np.pi * tones) + rng.uniform(0.0, 6.0, tones.size)).sum(axis=1)
+    signals = (smooth, smooth + 20.0 * fast, smooth, smooth + 20.0 * fast)
+    records = [RecordNoise.of(signal + rng.normal(size=t.size), t) for signal in signals]
+    assert records[1].slow_sd > 10.0
+    found = settle_force("force", "N", None, records)
+    assert found.noise_sd == pytest.approx(1.0, rel=0.15)
+
+
+def test_noise_that_a_sensor_smooths_is_seen_at_a_lower_rate():
+    rng = np.random.default_rng(3)
+    t = np.arange(20000) / 1000.0
+    smoothed = np.convolve(rng.normal(size=t.size), np.ones(10) / 10.0, "same")
+    record = RecordNoise.of(np.sin(3.0 * t) + smoothed, t)
+    assert settle_force("force", "N", None, [record]).noise_sd == pytest.approx(0.316, rel=0.1)
+    assert settle_force("force", "N", record.white_sd, [record]).noise_sd == record.white_sd
