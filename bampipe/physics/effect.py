@@ -386,6 +386,9 @@ def bind(effect: Effect, target: str, device: Device) -> BoundEffect:
     if target not in targets:
         choices = ", ".join(f"{effect.name}:{t}" if t else effect.name for t in targets)
         hint = did_you_mean(target, targets)
+        kinds = {c.name: c.kind for c in device.coordinates}
+        if target in kinds and effect._lacks(kinds[target]):
+            hint = f": a parameter has no entry for a {kinds[target]} axis"
         raise InputError(
             f"effect {effect.name!r} has no target {target!r}{hint}"
             if target
