@@ -217,6 +217,10 @@ def _ladder(rungs: Sequence[Rung]) -> None:
     table(head, body)
     if any(rung.free_run for rung in rungs):
         _free_runs(rungs)
+    from bampipe.results.compare import horizons_of
+
+    if horizons := horizons_of(rungs):
+        _drift(rungs, horizons)
     say("")
 
 
@@ -237,6 +241,23 @@ def _free_runs(rungs: Sequence[Rung]) -> None:
     say("")
     say("free run: position error of the model left to itself over held-out trials")
     table(head, body)
+
+
+def _drift(rungs: Sequence[Rung], horizons: Sequence[float]) -> None:
+    """Print how far each model version drifts within each horizon."""
+    units = {axis: found.unit for rung in rungs for axis, found in rung.drift.items()}
+    within = " / ".join(f"{horizon:g}" for horizon in horizons)
+    body = []
+    for rung in rungs:
+        cells = [rung.model]
+        for axis in units:
+            found = rung.median_drift(axis)
+            values = (found.get(horizon) for horizon in horizons)
+            cells.append(" / ".join("–" if value is None else f"{value:.2g}" for value in values))
+        body.append(cells)
+    say("")
+    say(f"drift: distance from the measured position after {within} s left to itself, median")
+    table(["model", *(f"{axis}, {unit}" for axis, unit in units.items())], body)
 
 
 def outcome(result: Outcome) -> None:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import ClassVar, Literal
 
 from pydantic import Field
 
 from bampipe.results.record import Names, Record, Result, Size
 from bampipe.results.standing import Standing
-from bampipe.results.validate import FreeRunError
+from bampipe.results.validate import AxisDrift, FreeRunError
 
 NOTICEABLE = 0.01
 """Least fall of the held-out error that confirms a model; a superfluous effect has less."""
@@ -42,11 +43,23 @@ class Rung(Record):
     unit: dict[str, str]
     free_run_mode: Literal["closed_loop", "open_loop"] | None = None
     free_run: dict[str, FreeRunError] = Field(default={}, description="By axis")
+    drift: dict[str, AxisDrift] = Field(default={}, description="By axis: short free runs")
+
+    def median_drift(self, axis: str) -> dict[float, float]:
+        """Median drift of one axis, rad or m, by horizon in s; empty where there is none."""
+        found = self.drift.get(axis)
+        return {h.horizon_s: h.median for h in found.horizons} if found else {}
 
     def improves_on(self, other: Rung) -> bool:
         """Whether the held-out error, as the product over the axes, is noticeably lower."""
         ratios = (self.held_out_rmse[a] / max(e, 1e-300) for a, e in other.held_out_rmse.items())
         return math.prod(ratios) < 1.0 - NOTICEABLE
+
+
+def horizons_of(rungs: Iterable[Rung]) -> list[float]:
+    """Every horizon, s, at which the drift of some version is known; shortest first."""
+    drifts = (found for rung in rungs for found in rung.drift.values())
+    return sorted({h.horizon_s for found in drifts for h in found.horizons})
 
 
 class Value(Record):

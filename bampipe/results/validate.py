@@ -88,6 +88,24 @@ class CommandError(Record):
     relative_error_percent: Size
 
 
+class Drift(Record):
+    """Distance of the simulated position from the measured one, some time after a common start."""
+
+    horizon_s: Positive = Field(description="How long the model has run freely, s")
+    median: Size = Field(description="Over the windows in which the axis moves")
+    quantile_90: Size
+    displacement: Size = Field(description="How far the axis itself has moved by then, median")
+    windows: Count = Field(description="Starts from which the axis moves within the horizon")
+
+
+class AxisDrift(Record):
+    """Drift of one axis under the recorded inputs alone, without controller."""
+
+    unit: str = Field(description="rad or m")
+    horizons: tuple[Drift, ...] = Field(description="Shortest first")
+    reason: str = Field(default="", description="Why there is none at the longer horizons")
+
+
 class FreeRun(Record):
     """The model left to itself over held-out trials."""
 
@@ -97,6 +115,9 @@ class FreeRun(Record):
     trials: dict[str, dict[str, FreeRunError]] = Field(default={})
     forces: dict[str, CommandError] = Field(
         default={}, description="Commanded force channels, closed loop"
+    )
+    drift: dict[str, AxisDrift] = Field(
+        default={}, description="By axis: short free runs from many starts of each trial"
     )
 
 

@@ -96,6 +96,7 @@ def _rung(
         unit={axis: entry.unit for axis, entry in axes.items()},
         free_run_mode=free.mode if free else None,
         free_run=free.axes if free else {},
+        drift=free.drift if free else {},
     )
     before = earlier.get(parent)
     if before is None or not before.confirmed or validated.is_refused:

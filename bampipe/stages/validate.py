@@ -15,6 +15,7 @@ from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
 from bampipe.data.store import read_parquet, write_parquet
 from bampipe.declarations.model_file import IDENTIFIED_MODEL, identified, load_model
 from bampipe.errors import InputError
+from bampipe.identification.drift import find_drift
 from bampipe.identification.free_run import free_runs
 from bampipe.identification.terms import describe_terms
 from bampipe.physics import System, compile_model
@@ -34,6 +35,7 @@ from bampipe.results.validate import (
 from bampipe.schema import STRICT, Count
 from bampipe.trials.folds import HELD_OUT, Folds
 from bampipe.trials.measured import MeasuredTrials, read_measured_trials, trial_of_block
+from bampipe.trials.motion import Motion
 from bampipe.trials.noise_floor import (
     NoiseFloor,
     find_noise_floor,
@@ -74,7 +76,7 @@ class Config:
         repeats: replays for the noise floor; 0 takes as many as the length of the session asks
             for, which is what `diagnose` does.
         seed: of their sensor noise.
-        free_run: whether to run the model freely over every trial.
+        free_run: whether to run the model freely over every trial, and from many starts in it.
         hold_out_by: a channel that is constant in each trial, such as a gain or a supply voltage:
             trials at one value of it are held out together. Empty: one trial at a time.
     """
@@ -153,13 +155,13 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     if config.free_run and not trials.blocks:
         progress(0.8, "free runs")
         unseen = [evidence.held_out_parameters(k) for k in range(len(trials.motions))]
-        free = free_runs(run, system, trials.motions, unseen, [c.judged for c in compared])
+        free = _run_freely(run, system, trials.motions, unseen, [c.judged for c in compared])
     elif config.free_run:
         progress(0.8, "free runs")
         whole = read_motions(run, system, braked=True)
         held_out = held_out_trials(run)
         judged = [motion.trial_id in held_out for motion in whole]
-        free = free_runs(run, system, whole, [evidence.p] * len(whole), judged)
+        free = _run_freely(run, system, whole, [evidence.p] * len(whole), judged)
     if system.model.device.robot is not None:
         notes += _silent_joints(system, compared, floor)
     write_parquet(out / f"models/{config.model}/residuals.parquet", _table(system, compared))
@@ -167,6 +169,19 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     return _result(run, system, trials, compared, expected, floor, free, notes, estimates).write(
         out
     )
+
+
+def _run_freely(
+    run: RunFolder,
+    system: System,
+    motions: Sequence[Motion],
+    parameters: Sequence[Array],
+    judged: Sequence[bool],
+) -> FreeRun:
+    """Leave the model to itself, over whole trials and over short horizons."""
+    drift = find_drift(system, motions, parameters, judged)
+    found = free_runs(run, system, motions, parameters, judged)
+    return found.model_copy(update={"drift": drift})
 
 
 def _silent_joints(

@@ -10,7 +10,7 @@ import numpy as np
 from bampipe.report import style, verdicts, wording
 from bampipe.report.document import Block, Bullets, Figure, Section, Table
 from bampipe.report.results import Results
-from bampipe.results.compare import CompareResult, Rung, Value
+from bampipe.results.compare import CompareResult, Rung, Value, horizons_of
 
 TITLE = "Model versions"
 _MOST_COLUMNS = 3
@@ -25,6 +25,8 @@ def section(results: Results) -> Section | None:
     blocks: list[Block] = [_steps(results, rungs), _picture(results, rungs)]
     if any(rung.free_run for rung in rungs):
         blocks.append(_free_runs(results, rungs))
+    if horizons_of(rungs):
+        blocks.append(_drift(results, rungs))
     if compared.parameters:
         blocks.append(_parameters(results, rungs, compared.parameters))
     if compared.moved:
@@ -84,6 +86,27 @@ def _free_runs(results: Results, rungs: Sequence[Rung]) -> Table:
         ("Version", "Loop", *units),
         tuple(rows),
         "ll" + "rr" * len(axes),
+    )
+
+
+def _drift(results: Results, rungs: Sequence[Rung]) -> Table:
+    """How far each version drifts within each horizon: the medians."""
+    axes = _axes(results, rungs)
+    horizons = horizons_of(rungs)
+    rows = []
+    for rung in rungs:
+        cells = []
+        for axis in axes:
+            found = rung.median_drift(axis)
+            cells.append(" / ".join(wording.significant(found.get(h), 2) for h in horizons))
+        rows.append((_version(rungs, rung), *cells))
+    units = (f"{axis} ({wording.unit(results.unit(axis))})" for axis in axes)
+    within = " / ".join(wording.plain(h, 1) for h in horizons)
+    return Table(
+        f"Drift of each version left to itself for {within} s under the recorded inputs, median",
+        ("Version", *units),
+        tuple(rows),
+        "l" + "r" * len(axes),
     )
 
 

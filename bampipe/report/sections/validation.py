@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ import pandas as pd
 from bampipe.report import style, verdicts, wording
 from bampipe.report.document import Block, Bullets, Figure, Paragraph, Section, Table
 from bampipe.report.results import Results
-from bampipe.results.validate import ValidateResult
+from bampipe.results.validate import AxisDrift, ValidateResult
 
 TITLE = "Validation"
 _WINDOW_S = 12.0
@@ -29,6 +30,8 @@ def section(results: Results) -> Section:
         blocks.append(_by_trial(results, validated))
     if validated.forces:
         blocks.append(Paragraph(_at_the_handle(validated, results.pusher)))
+    if validated.free_run is not None and validated.free_run.drift:
+        blocks += _drift(results, validated.free_run.drift)
     if validated.notes:
         blocks.append(Bullets(validated.notes))
     residuals = _shown_trial(results)
@@ -105,6 +108,40 @@ def _at_the_handle(validated: ValidateResult, pusher: str) -> str:
     )
     place = "At the handle" if pusher == "hand" else f"Of the {pusher}"
     return f"{place} the error is {wording.listing(shown)} (RMSE)."
+
+
+def _drift(results: Results, drift: Mapping[str, AxisDrift]) -> list[Block]:
+    """Return how far the model drifts in short free runs, and where it is not said why."""
+    axes = verdicts.ordered(results, drift)
+    horizons = sorted({h.horizon_s for axis in axes for h in drift[axis].horizons})
+    reasons = tuple(f"{axis}: {drift[axis].reason}" for axis in axes if drift[axis].reason)
+    blocks: list[Block] = []
+    rows = []
+    for axis in axes:
+        found = {h.horizon_s: h for h in drift[axis].horizons}
+        cells = []
+        for horizon in horizons:
+            h = found.get(horizon)
+            shown = (h.median, h.quantile_90, h.displacement) if h else ()
+            cells += [wording.significant(value, 2) for value in shown] or ["–"] * 3
+        rows.append((axis, *cells, wording.unit(results.unit(axis))))
+    if horizons:
+        head = (("in " + wording.plain(h, 1) + " s", "90 %", "moved") for h in horizons)
+        blocks.append(
+            Table(
+                "Drift of the model left to itself",
+                ("Axis", *(name for names in head for name in names), "Unit"),
+                tuple(rows),
+                "l" + "rrr" * len(horizons) + "l",
+                (),
+                "From many moments of each trial the model runs freely under the recorded inputs, "
+                "with parameters that never saw the trial: distance from the measured position, "
+                "median and 90 % quantile, beside how far the axis itself has moved by then.",
+            )
+        )
+    if reasons:
+        blocks.append(Bullets(reasons))
+    return blocks
 
 
 def _shown_trial(results: Results) -> pd.DataFrame | None:

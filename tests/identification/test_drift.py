@@ -1,0 +1,91 @@
+"""Short free runs: their drift by hand, on an independent simulator, and where there is none."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from independent_runs import record_trials
+
+from bampipe.discover.chance import system_of
+from bampipe.identification.drift import HORIZONS_S, find_drift
+from bampipe.physics import Model, compile_model, registry
+from bampipe.trials.motion import Motion
+
+MASS, DT = 50.0, 1e-3
+SLIDER = compile_model(Model(registry.device("slider")))
+
+
+def motion(seconds: float = 10.0, size: float = 0.1) -> Motion:
+    """A carriage on a sine, and the force that moves it without friction."""
+    t = np.arange(0.0, seconds, DT)
+    rate = 2.0 * np.pi * 0.7
+    q = size * np.sin(rate * t)[:, None]
+    qd = rate * size * np.cos(rate * t)[:, None]
+    qdd = -(rate**2) * q
+    channels = {name: np.zeros(t.size) for name in SLIDER.inputs}
+    return Motion("t01", t, q, qd, qdd, qd * 0.0, {**channels, "force_motor": MASS * qdd[:, 0]})
+
+
+def parameters(**values: float) -> np.ndarray:
+    chosen = {"mass": MASS, **values}
+    return np.array([chosen.get(p.name.partition(".")[0], 0.0) for p in SLIDER.parameters])
+
+
+def test_a_constant_force_that_is_wrong_drifts_with_the_square_of_time():
+    """An offset c makes the carriage leave by c t² / 2 m."""
+    found = find_drift(SLIDER, [motion()], [parameters(offset=0.4)], [True])["carriage"]
+    assert [h.horizon_s for h in found.horizons] == list(HORIZONS_S) and not found.reason
+    for h in found.horizons:
+        known = 0.4 * h.horizon_s**2 / (2.0 * MASS)
+        assert h.median == pytest.approx(known, rel=0.01)
+        assert h.quantile_90 == pytest.approx(known, rel=0.02)
+    right = find_drift(SLIDER, [motion()], [parameters()], [True])["carriage"]
+    assert max(h.median for h in right.horizons) < 1e-5
+
+
+def test_only_judged_trials_count():
+    trials, wrong = [motion(), motion()], parameters(offset=0.4)
+    found = find_drift(SLIDER, trials, [parameters(), wrong], [True, False])["carriage"]
+    assert max(h.median for h in found.horizons) < 1e-5
+    assert find_drift(SLIDER, trials, [wrong, wrong], [False, False])["carriage"].horizons
+
+
+def test_where_it_means_nothing_there_is_none_and_a_reason():
+    def reason(trial: Motion, **values: float) -> tuple[int, str]:
+        found = find_drift(SLIDER, [trial], [parameters(**values)], [True])["carriage"]
+        return len(found.horizons), found.reason
+
+    held = replace(motion(), q=motion().q * 0.0, qd=motion().qd * 0.0)
+    assert reason(held) == (0, "In 0 windows of 0.1 s the axis moves: too few.")
+    count, why = reason(motion(), viscous=-5e4)
+    assert count == 0 and "runs away" in why
+    count, why = reason(motion(), offset=20.0)
+    assert count == 2 and why == "In 2 s the model drifts further than the axis moves."
+    count, why = reason(motion(seconds=1.2))
+    assert count == 2 and why == "In 0 windows of 2 s the axis moves: too few."
+
+
+def test_nothing_is_said_of_a_motion_that_a_machine_prescribes():
+    damper = compile_model(Model(registry.device("magnetic_damper")))
+    found = find_drift(damper, [], [], [])
+    assert all("prescribes" in entry.reason and not entry.horizons for entry in found.values())
+
+
+def test_the_true_model_stays_close_to_an_independent_simulator(tmp_path):
+    """And drifts away where a number is wrong: twice as far where a mass is wrong by 5 %."""
+    trials, recipe, truth = record_trials(tmp_path, "axis", 21)
+    system = system_of(recipe)
+    right = np.array([truth[p.name] for p in system.parameters])
+    wrong = right * np.where([p.name == "mass" for p in system.parameters], 1.05, 1.0)
+    judged = [True] * len(trials.motions)
+    near, far = (
+        find_drift(system, trials.motions, [p] * len(judged), judged)["carriage"].horizons
+        for p in (right, wrong)
+    )
+    for h, w in zip(near, far, strict=True):
+        assert h.median < 0.01 * h.displacement
+        assert w.median > 2.0 * h.median
+    again = find_drift(system, trials.motions, [right] * len(judged), judged)["carriage"]
+    assert again.horizons == near
