@@ -24,6 +24,8 @@ HORIZONS_S = (0.1, 0.5, 2.0)
 """A reversal, a movement, several movements of a hand."""
 _STARTS = 100
 """Over all trials together; neighbours overlap, so that more would hardly say more."""
+_STARTS_OF_ROBOT = 20
+"""A robot's light joints stop and start a hundred times more slowly to integrate: 0.3 s a start."""
 _LEAST = 10
 """Windows in which an axis moves, for quantiles that mean anything."""
 _MARGIN_S = 0.2
@@ -67,7 +69,8 @@ def find_drift(
         return {axis: AxisDrift(unit=unit, horizons=(), reason=why) for axis, unit in axes}
     chosen = [k for k, counts in enumerate(judged) if counts] or range(len(motions))
     usable = [max(motions[k].t[-1] - motions[k].t[0] - 2.0 * _MARGIN_S, 0.0) for k in chosen]
-    spacing = sum(usable) / _STARTS
+    robot = system.model.device.robot is not None
+    spacing = sum(usable) / (_STARTS_OF_ROBOT if robot else _STARTS)
     windows = [
         window
         for k, length in zip(chosen, usable, strict=True)
