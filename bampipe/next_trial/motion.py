@@ -25,6 +25,7 @@ Array = NDArray[np.float64]
 _SPEED, _RANGE, _TURN, _DRIFT = 0.2, 0.15, 0.1, 0.05
 """How far people are off: speed and range of a trial, each turn and the slow drift of the middle,
 the last two as shares of the range."""
+TRAJECTORY_HZ = 100.0
 HASTY = -1
 """Number of the version of somebody who covers half the range at twice the speed."""
 _STEPS = 4
@@ -53,13 +54,19 @@ class Rehearsal:
         """One version of a design, recorded; 0 is followed exactly, `HASTY` hardly at all."""
         rng = np.random.default_rng([self.seed, 1 + version])
         given = design if version == 0 else _as_followed(design, self.seen, rng, version == HASTY)
-        return self._observe(*self._path(given, rng, exact=version == 0), given, rng)
+        t = np.arange(int(design.seconds * self.sensors.rate_hz)) / self.sensors.rate_hz
+        return self._observe(*self._path(given, t, rng, exact=version == 0), given, rng)
+
+    def trajectory(self, design: Primitive) -> tuple[Array, Array]:
+        """Times (T,), s, and positions (T, n_q) of a design that is followed exactly."""
+        t = np.arange(int(design.seconds * TRAJECTORY_HZ)) / TRAJECTORY_HZ
+        rng = np.random.default_rng([self.seed, 1])
+        return t, self._path(design, t, rng, exact=True)[0]
 
     def _path(
-        self, design: Primitive, rng: np.random.Generator, exact: bool
+        self, design: Primitive, t: Array, rng: np.random.Generator, exact: bool
     ) -> tuple[Array, Array, Array]:
-        """Position, velocity and acceleration along a design, each (T, n_q)."""
-        t = np.arange(int(design.seconds * self.sensors.rate_hz)) / self.sensors.rate_hz
+        """Position, velocity and acceleration along a design at times ``t``, each (T, n_q)."""
         n = len(self.system.coordinates)
         q, qd, qdd = np.tile(design.pose, (t.size, 1)), np.zeros((t.size, n)), np.zeros((t.size, n))
         for axis, stroke in design.strokes.items():

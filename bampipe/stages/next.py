@@ -49,7 +49,11 @@ INPUTS = (
     "models/{model}/validate.json?",
     "models/{model}/diagnose.json?",
 )
-OUTPUTS = ("models/{model}/next.json", "models/{model}/protocol*.pdf")
+OUTPUTS = (
+    "models/{model}/next.json",
+    "models/{model}/protocol*.pdf",
+    "models/{model}/trajectory*.csv",
+)
 
 Array = NDArray[np.float64]
 
@@ -195,6 +199,12 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         sensitivity=table,
         plan=plan,
     )
+    if model.device.robot is not None:
+        # A controller follows positions, where a person follows a sentence.
+        t, q = rehearsal.trajectory(tried[0].design)
+        head = ",".join(["t", *system.coordinates])
+        path = out / f"models/{config.model}/trajectory.csv"
+        np.savetxt(path, np.column_stack([t, q]), "%.6f", ",", header=head, comments="")
     if plan is not None:
         # typst is slow to import: only here
         from bampipe.report.protocol import protocol_sheet
