@@ -17,9 +17,8 @@ Array = NDArray[np.float64]
 _VERSIONS = (1, 2, 3, 4, HASTY)
 """As followed by different people."""
 _WORK = 2.5e7
-"""Samples times parameters of all designs that are tried exactly: those of a robot with 80 numbers
-take
-seconds each, and some are left out."""
+"""Samples times parameters of all designs that are tried exactly: of a robot with 80 numbers each
+takes seconds, and some are left out."""
 _FEWEST = 12
 _FINALISTS, _OF_FEW = 5, 2
 _VARIED = 2

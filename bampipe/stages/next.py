@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -104,14 +104,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         )
     p = identified(run, config.model, system)
     found = run.read(IdentifyResult, config.model)
-    purpose = config.purpose
-    kinds = ("auto", "precision", "decision", "sensitivity")
-    names = list(found.parameters)
-    if purpose not in (*kinds, *names):
-        raise InputError(
-            f"nothing is called {purpose!r} that a trial could be for",
-            remedy=choose_from(purpose, [*kinds, *names]),
-        )
+    purpose, parameter = _split(config.purpose, list(found.parameters))
     diagnosed = None
     if run.exists(DiagnoseResult.file(config.model)):
         diagnosed = run.read(DiagnoseResult, config.model)
@@ -132,7 +125,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     rehearsal = Rehearsal(system, p, trials.sensors, trials.kinematics, seen, config.seed)
     precision = Precision.of_trials(system, fitted, trials.band, p, found, noise)
     contest, blindness = None, None
-    asked = find_ambiguity(diagnosed) if diagnosed else None
+    asked = find_ambiguity(diagnosed) if diagnosed and purpose in ("auto", "decision") else None
     if asked is not None and diagnosed is not None:
         values = {name: v for row in diagnosed.ranking for name, v in row.parameters.items()}
         contest = make_contest(trials, recipe, p, asked, values, floor)
@@ -142,14 +135,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
             where=str(run.path(DiagnoseResult.file(config.model))),
             remedy="ask for precision, sensitivity, or a parameter by name",
         )
-    chosen: Purpose
-    if purpose == "auto":
-        nothing = diagnosed is not None and all(
-            axis.verdict == "nothing_missing" for axis in diagnosed.axes.values()
-        )
-        chosen = "decision" if contest else "sensitivity" if nothing else "precision"
-    else:
-        chosen = purpose if purpose in kinds else "precision"  # type: ignore[assignment]
+    chosen = _settle(diagnosed, contest is not None) if purpose == "auto" else purpose
     if chosen == "sensitivity":
         progress(0.1, "what these trials would have shown of each effect")
         error, spread = _errors(diagnosed, evidence)
@@ -157,7 +143,6 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         blindness = find_blindness(evidence, recipe, error, floor, spread, limit)
     at_hand = contest.sums(fitted) if contest else None
     forecast = Forecast(rehearsal, precision, contest, at_hand)
-    parameter = purpose if purpose in names else ""
     worth = _worth(chosen, parameter, forecast, blindness)
     axes = seen.movable
     if not axes:
@@ -199,6 +184,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         sensitivity=table,
         plan=plan,
     )
+    result.write(out)
     if model.device.robot is not None:
         # A controller follows positions, where a person follows a sentence.
         t, q = rehearsal.trajectory(tried[0].design)
@@ -211,8 +197,28 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
 
         sheet = protocol_sheet(plan, run.read(IngestResult).session_id, config.model)
         (out / f"models/{config.model}/protocol.pdf").write_bytes(sheet)
-    result.write(out)
     return _summary(result)
+
+
+def _split(asked: str, names: Sequence[str]) -> tuple[Purpose | Literal["auto"], str]:
+    """The purpose that ``asked`` means, and the parameter where it is one of ``names``."""
+    if asked in names:
+        return "precision", asked
+    for purpose in ("auto", *get_args(Purpose)):
+        if asked == purpose:
+            return purpose, ""
+    raise InputError(
+        f"nothing is called {asked!r} that a trial could be for",
+        remedy=choose_from(asked, ["auto", *get_args(Purpose), *names]),
+    )
+
+
+def _settle(diagnosed: DiagnoseResult | None, is_open: bool) -> Purpose:
+    """What a trial is for where nobody says: what the diagnosis left open, or would not show."""
+    if is_open:
+        return "decision"
+    verdicts = [axis.verdict for axis in diagnosed.axes.values()] if diagnosed else [""]
+    return "sensitivity" if set(verdicts) == {"nothing_missing"} else "precision"
 
 
 def _floor(

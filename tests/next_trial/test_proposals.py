@@ -75,6 +75,10 @@ def test_what_is_undecided_is_decided_after_the_proposed_trial(tmp_path):
     again = diagnose(after)
     assert again["selected"] == ["quadratic_drag:joint"]
     assert again["axes"]["joint"]["verdict"] == "missing"
+    # Who asks for a parameter gets its forecast, whatever is open.
+    narrow, _ = propose(run, purpose="viscous.joint", seconds=8.0)
+    assert narrow.proposals[0].confusion == ()
+    assert narrow.expected.startswith("Expected: `viscous.joint` from ±")
 
 
 def test_bad_requests_are_refused_in_one_line(tmp_path):
