@@ -72,7 +72,7 @@ class Detectable(Record):
     smallest: Size | None = Field(description="null where they do not excite it")
     typical: float = Field(description="Size at which the effect is clearly there")
     unit: str
-    axis: str = Field(description="Where it shows first")
+    axis: str = Field(description="Where it shows first; empty where it shows nowhere")
     with_proposal: Size | None = Field(
         default=None, description="The same once the first proposal has been recorded"
     )

@@ -290,7 +290,7 @@ def _sensitivity(blindness: Blindness, best: Tried) -> dict[str, Detectable]:
             smallest=found.factor * found.typical if np.isfinite(found.factor) else None,
             typical=found.typical,
             unit=found.parameter.unit,
-            axis=axes[found.axis],
+            axis=axes[found.axis] if np.isfinite(found.factor) else "",
             with_proposal=factor * found.typical if np.isfinite(factor) else None,
         )
         for found, factor in zip(blindness.found, after, strict=True)

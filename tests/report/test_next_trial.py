@@ -40,7 +40,7 @@ FOUND = {
         },
         "force_bias:x": {
             "parameter": "force_bias.x.bias", "smallest": None, "typical": 1.0, "unit": "N",
-            "axis": "yaw",
+            "axis": "",
         },
     },
 }  # fmt: skip
@@ -66,7 +66,7 @@ def test_the_section_says_what_to_do_and_what_went_unseen():
     assert sd.rows == (("`coulomb.yaw`", "0.010", "0.0050", "0.0060", "N·m"),)
     # What no trial shows stands first, with a dash.
     assert [row[0] for row in sensitivity.rows] == ["`force_bias:x`", "`stribeck:yaw`"]
-    assert sensitivity.rows[0][3] == "–"
+    assert sensitivity.rows[0][1:4:2] == ("–", "–")
     assert sensitivity.rows[1][3:6] == ("2.0", "0.50", "1.0")
 
 

@@ -82,7 +82,7 @@ def _sensitivity(table: Mapping[str, Detectable]) -> Table:
     rows = tuple(
         (
             f"`{name}`",
-            entry.axis,
+            entry.axis or "–",
             f"`{entry.parameter.rpartition('.')[2]}`",
             wording.significant(entry.smallest, 2),
             wording.significant(entry.with_proposal, 2),
