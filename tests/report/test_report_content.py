@@ -14,11 +14,14 @@ import pytest
 import synthetic_run
 from made_results import write_result
 
+from bampipe.data.store import write_parquet
 from bampipe.errors import InputError
 from bampipe.report import style
 from bampipe.report.build import Report, build
 from bampipe.report.results import Results
+from bampipe.report.sections import identification, validation
 from bampipe.results.draft import DraftResult
+from bampipe.results.validate import ValidateResult
 
 
 def quiet(fraction: float, message: str) -> None:
@@ -223,6 +226,40 @@ def test_all_figures_of_the_paper(full: Report) -> None:
     } <= full.figures.keys()  # fmt: skip
     for place in ("Fig. 3", "Fig. 4", "Fig. 6", "Fig. 7", "Fig. 9", "Table I", "Table VI"):
         assert f"the paper's {place}" in text_of(full.html)
+
+
+def test_what_did_not_run_along_the_data_has_no_picture_of_its_convergence(
+    full_run: Path, tmp_path: Path
+) -> None:
+    root = tmp_path / "run"
+    shutil.copytree(full_run, root)
+    results = Results(root)
+    path = root / "models" / results.model / "trace.parquet"
+    trace = pd.read_parquet(path)
+    for rows, expected in ((trace, True), (trace.groupby("trial_id").tail(1), False)):
+        write_parquet(path, rows.reset_index(drop=True))
+        blocks = identification.section(Results(root)).blocks
+        assert ("convergence" in [getattr(b, "name", "") for b in blocks]) is expected
+
+
+def test_the_drift_of_a_model_is_a_table_and_its_absence_a_sentence(
+    full_run: Path, tmp_path: Path
+) -> None:
+    root = tmp_path / "run"
+    shutil.copytree(full_run, root)
+    results = Results(root)
+    validated = results.read(ValidateResult)
+    assert validated is not None
+    why = "In 0.5 s the model drifts further than the axis moves."
+    step = {"horizon_s": 0.1, "median": 0.0012, "quantile_90": 0.0034, "displacement": 0.2}
+    drift = {"unit": "rad", "horizons": [step | {"windows": 40}], "reason": why}
+    content = validated.model_dump(mode="json") | {"free_run": {"drift": {"yaw": drift}}}
+    path = root / "models" / results.model / "validate.json"
+    path.write_text(json.dumps(content))
+    blocks = validation.section(Results(root)).blocks
+    table = next(b for b in blocks if getattr(b, "caption", "").startswith("Drift"))
+    assert table.rows == (("yaw", "0.0012", "0.0034", "0.20", "rad"),)
+    assert any(f"yaw: {why}" in getattr(b, "items", ()) for b in blocks)
 
 
 def test_figures_are_vectors_in_the_palette(full: Report) -> None:

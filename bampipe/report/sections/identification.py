@@ -48,7 +48,8 @@ def section(results: Results) -> Section:
     if identified.state_3sigma:
         blocks.append(_bounds(results, identified.state_3sigma))
     trace = results.table(results.model_file("trace.parquet"))
-    if trace is not None and len(trace):
+    # Least squares leaves a row a trial at most: nothing converges along the data.
+    if trace is not None and len(trace) > trace["trial_id"].nunique():
         blocks.append(_convergence(results, identified, trace))
     motion = _motion(results)
     if motion is not None:
