@@ -141,7 +141,8 @@ def weigh(fewer: FittedSet, name: str, scores: Mapping[str, Score]) -> list[Cont
     names = [name, *(n for n in scores if n != name)]
     items = candidates_of(fewer.recipe, names)
     known = [scores[n] for n in names]
-    gained = Scorer(fewer.evidence).gain_by_sample(items[0], known[0])
+    scorer = Scorer(fewer.evidence)
+    gained = scorer.gain_by_sample(items[0], known[0])
     second = largest_second(fewer.evidence, gained)
     without_second = score_without(fewer.evidence, items, known, second)
     without_trial: dict[str, Score] = {}
@@ -149,11 +150,13 @@ def weigh(fewer: FittedSet, name: str, scores: Mapping[str, Score]) -> list[Cont
         trial = largest_trial(fewer.evidence, gained)
         without_trial = score_without(fewer.evidence, items, known, trial)
     axis = int(np.argmax(scores[name].gain))
+    # See `ranking.rank`: scores and models are judged on other terms.
+    unit = fewer.evidence.held_out_rmse[axis] / max(scorer.before.error[axis], 1e-300)
     contenders = [
         Contender(
             n,
             axis,
-            float(scores[n].error[axis]),
+            float(unit * scores[n].error[axis]),
             scores[n].total,
             without_trial[n].total if n in without_trial else None,
             without_second[n].total if n in without_second else 0.0,

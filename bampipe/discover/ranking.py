@@ -6,17 +6,15 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.discover.candidates import Scorer
 from bampipe.discover.findings import Ranked
 from bampipe.discover.search import Search
 from bampipe.physics.parameter import Parameter
 from bampipe.physics.recipe import Recipe
 
-Array = NDArray[np.float64]
 
-
-def rank(search: Search, selected: Sequence[str], before: Array) -> list[Ranked]:
+def rank(search: Search, selected: Sequence[str]) -> list[Ranked]:
     """Selected effects with their groups, then the others by their score beyond chance.
 
     Selected effects are held against the model that they were added to, others against the model
@@ -33,20 +31,26 @@ def rank(search: Search, selected: Sequence[str], before: Array) -> list[Ranked]
     for name in [*order, *others]:
         if name not in search.first:
             continue
-        score, error = search.first[name], before
+        score, evidence = search.first[name], search.initial
         excess, p_value = search.level.excess(score), search.level.p_value(score)
         if name in selected and name in search.additions:
             found = search.additions[name]
-            score, error, excess, p_value = found.score, found.before, found.excess, found.p_value
+            score, evidence, excess, p_value = (
+                found.score, found.evidence, found.excess, found.p_value,
+            )  # fmt: skip
         axis = int(np.argmax(excess))
+        before = float(evidence.held_out_rmse[axis])
+        # Candidates are scored with a little of the trial that is left out, models are judged
+        # without it: what the two have in common is the ratio.
+        ratio = float(score.error[axis] / max(Scorer(evidence).before.error[axis], 1e-300))
         group = next(({g, *r} - {name} for g, r in search.groups.items() if name in (g, *r)), set())
         own = [q.name for q in _own_parameters(search.recipe, name)]
         rows.append(
             Ranked(
                 name,
                 axis,
-                float(error[axis]),
-                float(score.error[axis]),
+                before,
+                before * ratio,
                 p_value,
                 float(excess.sum()),
                 dict(zip(own, [float(v) for v in score.values], strict=True)),

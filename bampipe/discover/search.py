@@ -35,13 +35,14 @@ class Addition:
     Attributes:
         score: against the model that it was added to.
         p_value: chance that a candidate scores so high where nothing is missing.
-        excess: gain beyond chance, by axis; before: held-out error of that model, by axis.
+        excess: gain beyond chance, by axis.
+        evidence: that model, fitted.
     """
 
     score: Score
     p_value: float
     excess: Array
-    before: Array
+    evidence: Evidence
 
 
 @dataclass(frozen=True)
@@ -127,9 +128,7 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
         if not chosen.winner:
             continue
         score = scores[chosen.winner]
-        addition = Addition(
-            score, known.p_value(score), known.excess(score), current.evidence.held_out_rmse
-        )
+        addition = Addition(score, known.p_value(score), known.excess(score), current.evidence)
         wider = extend_set(bench, current, score)
         for earlier in wider.added[:-1]:
             # What resembles the missing effect may come first: it takes a little of several others.

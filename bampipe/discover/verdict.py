@@ -86,7 +86,7 @@ def conclude(search: Search, s: Settings) -> Diagnosis:
             )
         )
     kept = [n for n in search.selected if n not in weak]
-    ranking = rank(search, kept, before)
+    ranking = rank(search, kept)
     groups = {n: search.groups[n] for n in kept}
     contests = {n: _listed(search.contests.get(n, ()), odds[n], s) for n in kept}
     return Diagnosis(

@@ -70,8 +70,12 @@ class RankedEffect(Record):
 
     effect: str
     axis: str
-    held_out_rmse_before: Size
-    held_out_rmse_after: Size
+    held_out_rmse_before: Size = Field(
+        description="Of the model diagnosed; for an effect found, of the one it was added to"
+    )
+    held_out_rmse_after: Size = Field(
+        description="That, times the ratio of the cross-validated errors with and without it"
+    )
     unit: str
     p_value: Share
     score: float
