@@ -272,6 +272,31 @@ def test_a_region_of_a_map_marks_its_samples_and_a_view_shows_in_maps(
     assert canvas.screenshot() != everything
 
 
+def test_a_strip_of_a_map_is_marked_by_keyboard(opened: Opened, page_file: Path) -> None:
+    page = opened(page_file)
+    canvas = figure(page, "residual yaw by velocity").locator(".canvas")
+
+    def marked_velocities() -> pd.Series:
+        found = csv_of(page, "residual yaw by velocity")
+        return found["velocity"][found["marked"] == 1]
+
+    canvas.focus()
+    for _ in range(5):
+        page.keyboard.press("ArrowRight")
+    near = marked_velocities()
+    canvas.focus()
+    page.keyboard.press("ArrowRight")
+    far = marked_velocities()
+    assert len(near) > 5 and far.mean() > near.mean()
+    canvas.focus()
+    page.keyboard.press("Shift+ArrowRight")
+    wide = marked_velocities()
+    assert len(wide) > len(far) and np.ptp(wide) > np.ptp(far)
+    canvas.focus()
+    page.keyboard.press("Escape")
+    assert not page.locator("#marked").is_visible()
+
+
 def test_a_worst_window_is_one_choice_away(opened: Opened, page_file: Path) -> None:
     page = opened(page_file)
     page.get_by_role("button", name="Next worst window").click()

@@ -48,10 +48,11 @@ class ResidualMap {
       yLabel: axisOf(axis).unit,
       height: 210,
       rectangle: true,
-      label: `Residual of ${axis} against ${variable}, which carries ${percent} % of its variance`,
+      label: `Residual of ${axis} against ${variable}, which carries ${percent} % of its variance; arrow keys mark a strip of it, with Shift they widen and narrow it`,
       select: (x0, x1, y0, y1) => this.mark(x0, x1, y0, y1),
       reset: () => setMark(null),
       hover: (x, y) => this.hover(x, y),
+      keys: (event) => this.keys(event),
       table: () => this.table(),
     });
   }
@@ -95,6 +96,7 @@ class ResidualMap {
     const [low, high] = residual.length ? rangeOf(residual, 0.002) : [0, 0];
     const yRange = rangeOf([low, high, ...edges]);
     const xRange = rangeOf(xs.length ? xs : drawn.flatMap((one) => one.center));
+    this.range = xRange;
     this.figure.show({ x: xRange, lines: [], behind, xRange, yRange });
     this.figure.drawKey();
   }
@@ -110,6 +112,24 @@ class ResidualMap {
     const unit = variablesOf(this.axis).find((one) => one.variable === this.variable)?.unit;
     const words = `${this.variable} of ${this.axis} ${within(x0, x1, unit)}, residual ${within(y0, y1, axisOf(this.axis).unit)}`;
     setMark({ rows: new Set(rows), spans: spansOf(rows, samples.channel.on), words });
+  }
+
+  /** Mark a strip by keyboard, at first a tenth of the map: arrows move it by half its width. */
+  keys(event) {
+    const sign = { ArrowLeft: -1, ArrowRight: 1 }[event.key];
+    if (event.ctrlKey || event.metaKey || event.altKey || (!sign && event.key !== "Escape")) return;
+    event.preventDefault();
+    if (!sign) {
+      this.strip = null;
+      return setMark(null);
+    }
+    const [low, high] = this.range;
+    const first = { middle: sign > 0 ? low : high, width: 0.1 * (high - low) };
+    let { middle, width } = this.strip ?? first;
+    if (event.shiftKey) width *= sign > 0 ? 1.5 : 1 / 1.5;
+    else middle = Math.min(high, Math.max(low, middle + (sign * width) / 2));
+    this.strip = { middle, width };
+    this.mark(middle - width / 2, middle + width / 2, -Infinity, Infinity);
   }
 
   hover(x, y) {
