@@ -15,30 +15,23 @@ import json
 import sys
 import tempfile
 import time
-import tomllib
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import independent
 import numpy as np
+import pandas as pd
 from independent.sensors import Conditions
 
+import bampipe
 from bampipe.data.run_folder import RunFolder
-from bampipe.discover.chance import system_of
-from bampipe.discover.diagnosis import diagnose
-from bampipe.discover.drafts.search import draft
-from bampipe.discover.settings import Settings
-from bampipe.physics import registry
-from bampipe.physics.recipe import Recipe
-from bampipe.progress import silent
-from bampipe.results.standing import FLOOR_WRONG
-from bampipe.stages import filter as filter_stage
-from bampipe.stages import ingest
-from bampipe.trials.measured import MeasuredTrials, read_measured_trials
-from bampipe.trials.noise_floor import find_noise_floor
-from bampipe.trials.residuals import Evidence
+from bampipe.declarations.model_file import identified, load_model
+from bampipe.physics import compile_model
+from bampipe.results.diagnose import DiagnoseResult
+from bampipe.trials.measured import read_measured_trials
+from bampipe.trials.residuals import gather_evidence
 
 CASES = (
     "bam:detent:yaw", "bam:detent:extension", "bam:rough_patch:pitch", "bam:winding_cable:yaw",
@@ -52,7 +45,6 @@ CONDITIONS = {
     "joint": Conditions(creep=True, trials=5, seconds=12.0),
     "axis": Conditions(creep=True, trials=5, seconds=6.0),
 }
-BUILT_IN = {"bam": "bam", "axis": "slider"}
 
 Law = Callable[[dict[str, float], np.ndarray, np.ndarray, np.ndarray, float], np.ndarray]
 
@@ -66,20 +58,28 @@ def _relaxed(law: dict[str, float], q: np.ndarray, step: float) -> np.ndarray:
 
 # The forces of benchmarks/independent/friction.py, written again for a motion that was measured.
 FORCES: dict[str, Law] = {
-    "detent": lambda law, q, v, t, h: -law["detent"] * (q - law["detent_at"]) / law["detent_width"]
+    "detent": lambda law, q, v, s, h: -law["detent"] * (q - law["detent_at"]) / law["detent_width"]
     * np.exp(0.5 - 0.5 * ((q - law["detent_at"]) / law["detent_width"]) ** 2),
-    "rough_patch": lambda law, q, v, t, h: -law["rough"]
-    * np.exp(-(((q - law["rough_at"]) / law["rough_width"]) ** 2)) * np.sign(v),
-    "winding_cable": lambda law, q, v, t, h: _relaxed(law, q, h),
-    "slack_spring": lambda law, q, v, t, h: -law["slack_spring"] * np.sign(q - law["slack_at"])
+    "rough_patch": lambda law, q, v, s, h: -law["rough"]
+    * np.exp(-(((q - law["rough_at"]) / law["rough_width"]) ** 2)) * s,
+    "winding_cable": lambda law, q, v, s, h: _relaxed(law, q, h),
+    "slack_spring": lambda law, q, v, s, h: -law["slack_spring"] * np.sign(q - law["slack_at"])
     * np.maximum(np.abs(q - law["slack_at"]) - law["slack"], 0.0),
-    "speed_band": lambda law, q, v, t, h: -law["band"]
-    * np.exp(-(((np.abs(v) - law["band_at"]) / law["band_width"]) ** 2)) * np.sign(v),
-    "tightening": lambda law, q, v, t, h: -law["tightening"] * (q - law["tightening_from"])
-    * np.sign(v),
-    "imbalance": lambda law, q, v, t, h: law["cogging"]
+    "speed_band": lambda law, q, v, s, h: -law["band"]
+    * np.exp(-(((np.abs(v) - law["band_at"]) / law["band_width"]) ** 2)) * s,
+    "tightening": lambda law, q, v, s, h: -law["tightening"] * (q - law["tightening_from"])
+    * s,
+    "imbalance": lambda law, q, v, s, h: law["cogging"]
     * np.sin(law["cogging_wavenumber"] * q + law["cogging_phase"]),
 }  # fmt: skip
+
+
+PIPELINE = """schema = "bampipe.pipeline/1"
+name = "drafts"
+stages = ["ingest", "filter", "identify", "validate"]
+[settings.identify]
+method = "least-squares"
+"""
 
 
 @dataclass(frozen=True)
@@ -88,9 +88,10 @@ class Outcome:
 
     Attributes:
         case: machine, effect and axis; strength, seed: of the session.
-        verdict: of the diagnosis on the axis; named: effects of the library that were added.
-        drafted: formulas added; p_value: of the first.
-        before, after: error over noise floor on the axis without and with all of them.
+        verdict: of the diagnosis on the axis, or on all axes where nothing is hidden.
+        named: effects of the library that were added; drafted: formulas that were.
+        p_value: of the first formula; NaN where none was looked for.
+        before, after: error over noise floor on the axis without and with what was added.
         curve: error of what was added as a share of the hidden force, what the device's own
             parameters can do left out; NaN where the force is not known.
         seconds: of the draft alone.
@@ -109,70 +110,54 @@ class Outcome:
     seconds: float
 
 
-def read_trials(folder: Path, machine: str, seed: int, effects: dict[str, float]) -> tuple[
-    MeasuredTrials, Recipe, dict[str, Any]
-]:  # fmt: skip
-    """Record a session and filter it; its trials, the bare device, and the truth."""
-    truth = independent.record(machine, folder / machine, seed, effects, CONDITIONS[machine])
-    run = RunFolder(folder / "run")
-    for stage in ("ingest", "filter"):
-        run.path(stage).mkdir(parents=True)
-    ingest.execute(run, run.root, ingest.Config(session=str(folder / machine)), silent)
-    filter_stage.execute(run, run.root, filter_stage.Config(), silent)
-    device = (
-        registry.device(BUILT_IN[machine])
-        if machine in BUILT_IN
-        else registry.device_from(tomllib.loads(independent.MACHINES[machine].DEVICE))
-    )
-    recipe = Recipe(device.declaration, (), ())
-    trials = read_measured_trials(run, system_of(recipe), every_input=True)
-    return replace(trials, motions=tuple(trials.motions)), recipe, truth
-
-
 def run_case(case: str, strength: float, seed: int, replicates: int) -> Outcome:
-    """Record one session, add what has a name, draft the rest, and hold it against the truth."""
+    """Record one session, take one turn of the loop, and hold what was added against the truth."""
     machine, _, effect = case.partition(":")
     hidden = {} if effect == "nothing" else {effect: strength}
     with tempfile.TemporaryDirectory() as folder:
-        trials, recipe, truth = read_trials(Path(folder), machine, seed, hidden)
-    settings = Settings(replicates=replicates, jobs=1, seed=seed)
-    start = system_of(recipe).prior
-    found = diagnose(trials, recipe, start, settings)
-    names = system_of(recipe).coordinates
-    axis = names.index(effect.partition(":")[2]) if hidden else 0
-    bare = found.initial
-    verdict = found.axes[axis].verdict if hidden else "/".join(a.verdict for a in found.axes)
-    begun = time.perf_counter()
-    # Where nothing is hidden a draft is asked for all the same: on every axis, to see how often
-    # chance gives one.
-    unnamed = [
-        i
-        for i, a in enumerate(found.axes)
-        if not hidden or (a.remains and a.standing not in FLOOR_WRONG)
-    ]
-    drafts = draft(trials, recipe, bare.p, unnamed, settings, "a benchmark") if unnamed else []
-    seconds = time.perf_counter() - begun
-    worth = np.exp(-settings.draft_worth)
-    beaten = [d for d in drafts if d.terms and d.after >= worth * found.axes[d.axis].rmse_after]
-    named, terms = found.selected, [t for d in drafts for t in d.terms]
-    evidence = found.evidence if named else bare
-    if terms and not (named and beaten):
-        named, evidence = (), drafts[-1].evidence
-    else:
-        terms = []
-    floor = find_noise_floor(evidence, trials.sensors, trials.kinematics, seed, 2)
-    return Outcome(
-        case, strength, seed, verdict, named, tuple(t.canonical for t in terms),
-        min((d.chance[0].p_value for d in drafts), default=float("nan")),
-        float(bare.held_out_rmse[axis] / floor.level[axis]),
-        float(evidence.held_out_rmse[axis] / floor.level[axis]),
-        curve_error(bare, evidence, axis, effect, truth) if hidden else float("nan"), seconds,
-    )  # fmt: skip
+        root = Path(folder)
+        truth = independent.record(machine, root / machine, seed, hidden, CONDITIONS[machine])
+        (root / "drafts.toml").write_text(PIPELINE)
+        run = bampipe.run_session(
+            root / machine, runs=root / "runs", pipeline=str(root / "drafts.toml")
+        )
+        found = bampipe.diagnose(run, "base", replicates=replicates, jobs=1)
+        axes = found["axes"]
+        axis = effect.partition(":")[2] if hidden else next(iter(axes))
+        named, drafted = tuple(found["selected"]), ()
+        p_value, seconds = float("nan"), 0.0
+        if diagnosis_of(run).unnamed_axes:
+            begun = time.perf_counter()
+            written = bampipe.draft(run, "base", jobs=1)
+            seconds = time.perf_counter() - begun
+            p_value = min(a["chance"][0]["p_value"] for a in written["axes"].values())
+            drafted = tuple(written["selected"])
+        added = drafted or named
+        rungs = bampipe.extend(run, added, "base").ladder if added else run.ladder
+        first, last = rungs.loc["base"], rungs.iloc[-1]
+        off = float("nan")
+        if hidden and added:
+            child = rungs.index[-1]
+            off = curve_error(RunFolder(run.root), child, axis, effect, truth)
+        return Outcome(
+            case, strength, seed,
+            axes[axis]["verdict"] if hidden else "/".join(a["verdict"] for a in axes.values()),
+            () if drafted else named, drafted, p_value, over_floor(first, axis),
+            over_floor(last, axis), off, seconds,
+        )  # fmt: skip
 
 
-def curve_error(
-    bare: Evidence, evidence: Evidence, axis: int, effect: str, truth: dict[str, Any]
-) -> float:
+def diagnosis_of(run: bampipe.Run) -> DiagnoseResult:
+    """The diagnosis of the bare device."""
+    return RunFolder(run.root).read(DiagnoseResult, "base")
+
+
+def over_floor(rung: pd.Series, axis: str) -> float:
+    """Held-out error of a rung of the ladder over its noise floor."""
+    return float(rung[f"held_out_rmse.{axis}"] / rung[f"noise_floor.{axis}"])
+
+
+def curve_error(run: RunFolder, model: str, axis: str, effect: str, truth: dict[str, Any]) -> float:
     """Error of what was added as a share of the hidden force, along the measured motion.
 
     Both are low-passed; what the device's own parameters can do as well is left out of both.
@@ -181,19 +166,27 @@ def curve_error(
     if name not in FORCES:
         return float("nan")
     law = truth["hidden_laws"][effect]
+    system = compile_model(load_model(run, model))
+    p = identified(run, model, system)
+    bare = compile_model(load_model(run, "base"))
+    trials = read_measured_trials(run, bare, every_input=True)
+    evidence = gather_evidence(
+        bare, trials.motions, trials.band, identified(run, "base", bare), trials.folds
+    )
+    number = bare.coordinates.index(axis)
+    width = bare.model.device.coordinates[number].sign_width
     wanted, given, slopes = [], [], []
-    for k, motion in enumerate(bare.motions):
-        used = bare.used[k][:, axis]
-        step = float(np.median(np.diff(motion.t)))
-        force = FORCES[name](law, motion.q[:, axis], motion.qd[:, axis], motion.t, step)
-        system = evidence.system
+    for k, motion in enumerate(trials.motions):
+        used = evidence.used[k][:, number]
+        step, rate = float(np.median(np.diff(motion.t))), motion.qd[:, number]
+        force = FORCES[name](law, motion.q[:, number], rate, np.tanh(rate / width), step)
         u = motion.inputs(system.inputs)
-        z = system.memory(motion.q, motion.qd, motion.qdd, u, evidence.p, motion.t)
-        added = system.contribution(motion.q, motion.qd, motion.qdd, z, u, evidence.p)[:, axis]
-        both = bare.band.thin(np.column_stack([force, added]), [axis, axis])[used]
+        z = system.memory(motion.q, motion.qd, motion.qdd, u, p, motion.t)
+        added = system.contribution(motion.q, motion.qd, motion.qdd, z, u, p)[:, number]
+        both = trials.band.thin(np.column_stack([force, added]), [number, number])[used]
         wanted.append(both[:, 0])
         given.append(both[:, 1])
-        slopes.append(bare.jacobian[k][used, axis])
+        slopes.append(evidence.jacobian[k][used, number])
     columns = np.concatenate(slopes)
     columns = columns[:, np.any(columns != 0.0, axis=0)]
 
@@ -231,8 +224,8 @@ def table(outcomes: Sequence[Outcome]) -> str:
     clean = [o for o in outcomes if o.case.endswith(":nothing")]
     if clean:
         lines.append(
-            f"\n{len(clean)} sessions with nothing hidden, a draft asked for on every axis: "
-            f"{sum(bool(o.drafted) for o in clean)} drafted."
+            f"\n{len(clean)} sessions with nothing hidden: a formula drafted in "
+            f"{sum(bool(o.drafted) for o in clean)}."
         )
     return "\n".join(lines)
 

@@ -86,7 +86,7 @@ class Settings:
     ripple_share: float = 0.5
     direction_likeness: float = 0.6
     draft_replicates: int = 6
-    draft_significance: float = 0.05
+    draft_significance: float = 0.01
     draft_worth: float = 0.03
     jobs: int = 2
     seed: int = 0

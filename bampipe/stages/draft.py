@@ -64,7 +64,7 @@ class Config:
 
     model: str = "base"
     replicates: Annotated[int, Field(ge=4)] = 6
-    significance: Annotated[float, Field(gt=0, lt=1)] = 0.05
+    significance: Annotated[float, Field(gt=0, lt=1)] = 0.01
     jobs: Count = 0
     seed: Count = 0
     curve: bool = False

@@ -374,7 +374,7 @@ class Form:
         by_kind = {
             "place": (low - 0.25 * width, low + 1.25 * width, unit),
             "length": (0.003 * width, 2.0 * width, unit),
-            "wavenumber": (np.pi / width, 1e4 * np.pi / width, f"1/{unit}"),
+            "wavenumber": (0.4 * np.pi / width, 1e4 * np.pi / width, f"1/{unit}"),
             "time": (2.0 * self.times.low, 2.0 * self.times.high, "s"),
         }
         return {name: by_kind[kind] for name, kind in self.shape.searched.items()}

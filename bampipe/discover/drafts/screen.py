@@ -45,6 +45,7 @@ _WAVES_APART = 0.4
 """Between neighbouring wavenumbers, in waves on the range: they still resemble each other."""
 _KNOTS = (8, 16, 32, 64)
 """Points of the curves that bound what a formula could do."""
+_PARTS_OF_A_WAVE = (0.25, 0.4, 0.6, 0.8)
 _MOST_WAVES, _MOST_WAVES_IN_TIME = 30.0, 300.0
 _REFINED = 12
 """Forms whose searched constants are refined, the best on the grid."""
@@ -53,6 +54,9 @@ _TRIES = 90
 _NEGLIGIBLE = 1e-9
 _RANGE = (0.002, 0.998)
 """Quantiles of a coordinate between which it is said to vary."""
+_LEFT, _MARGIN = (0.005, 0.995), 0.03
+"""Shares of the squared residual between which a curve is put, and what is added at either end, of
+the range."""
 _OWN_WEIGHT = 0.05
 """As in `candidates`: that a trial keeps in the fit that it is left out of."""
 
@@ -169,7 +173,25 @@ class Screen:
         """The range of each coordinate that varies."""
         names = [c.words for c in coordinates(self.evidence.system.model.device, self.axis)]
         ends = {n: np.quantile(np.concatenate(self.signals[n]), _RANGE) for n in names}
+        if self._curves:
+            # The few points of a curve belong where something is left.
+            ends = {n: self._where_left(n, *span) for n, span in ends.items()}
         return {n: Span(float(a), float(b)) for n, (a, b) in ends.items() if b - a > 1e-9}
+
+    def _where_left(self, name: str, low: float, high: float) -> Array:
+        """The part of the range of a coordinate that holds nearly all of what is left."""
+        at = np.concatenate(
+            [
+                self.signals[name][i][kept, 0][rows]
+                for i, ((_, kept), rows) in enumerate(zip(self._sampling, self._rows, strict=True))
+            ]
+        )
+        order = np.argsort(at, kind="stable")
+        mass = np.cumsum(self._left[order] ** 2)
+        share = np.searchsorted(mass / max(float(mass[-1]), 1e-300), _LEFT)
+        margin = _MARGIN * (high - low)
+        ends = at[order][np.minimum(share, len(at) - 1)] + np.array([-margin, margin])
+        return np.asarray(np.clip(ends, low, high))
 
     @cached_property
     def scales(self) -> dict[str, float]:
@@ -259,7 +281,8 @@ class Screen:
             most = _MOST_WAVES
             if form.coordinate.quantity == "time":
                 most = span.width * self.evidence.band.cutoff_hz[self.axis]
-            waves = np.arange(1.0, max(min(most, _MOST_WAVES_IN_TIME), 2.0), _WAVES_APART)
+            many = np.arange(1.0, max(min(most, _MOST_WAVES_IN_TIME), 2.0), _WAVES_APART)
+            waves = np.concatenate([_PARTS_OF_A_WAVE, many])
             points = 2.0 * np.pi * waves[None] / span.width
         else:
             return {}

@@ -67,7 +67,7 @@ class Term:
         """Its name as a model has it."""
         return f"{self.name}:{self.form.axis.name}" if self.form.is_own else self.name
 
-    def curve(self, count: int = 61) -> tuple[Array, Array, Array]:
+    def curve(self, count: int = 121) -> tuple[Array, Array, Array]:
         """Coordinate, torque and its standard deviation along the range travelled, (count,) each.
 
         At full speed or acceleration where the term is in proportion to these, and in the positive

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.ticker import NullFormatter
 
 from bampipe.report import style, wording
 from bampipe.report.document import Block, Figure, Formulas, Paragraph, Section, Subheading, Table
@@ -84,7 +85,15 @@ def _curve(panel: Axes, name: str, effect: DraftedEffect, left: ResidualMap | No
         low, high = -np.array(left.high), -np.array(left.low)
         panel.fill_between(centre, low, high, color=style.VERMILLION, alpha=0.2, lw=0)
         mean = -np.array(left.mean)
-        panel.plot(centre, mean, color=style.VERMILLION, marker=".", ms=3.0, lw=0.8, label="left")
+        panel.plot(
+            centre,
+            mean,
+            color=style.VERMILLION,
+            marker=".",
+            ms=3.0,
+            lw=0.8,
+            label="left by the model",
+        )
     panel.fill_between(x, curve.low, curve.high, color=style.BLUE, alpha=0.25, lw=0)
     panel.plot(x, curve.mean, color=style.BLUE, label="draft")
     panel.axhline(0.0, color=style.INK, lw=0.5)
@@ -99,6 +108,7 @@ def _length(panel: Axes, entry: AxisDraft) -> None:
     panel.plot(counts, errors, color=style.INK, marker="o", ms=3.5, lw=0.8)
     panel.axhline(entry.noise_floor, color=style.BLUE, lw=0.8)
     panel.set_yscale("log")
+    panel.yaxis.set_minor_formatter(NullFormatter())
     panel.set_xticks(sorted(set(counts)))
     panel.set_xlabel("constants")
     panel.set_ylabel(style.label("held-out error", wording.unit(entry.unit)))
@@ -109,11 +119,14 @@ def _chance(panel: Axes, entry: AxisDraft) -> None:
         replays = np.full(len(chance.gains), float(number))
         panel.plot(replays, chance.gains, "o", color=style.BLUE, ms=3.0, alpha=0.6)
         panel.plot([number], [chance.gain], "D", color=style.VERMILLION, ms=4.0)
+    first = entry.chance[0]
+    for words, value in (("measured", first.gain), ("replays", max(first.gains))):
+        panel.annotate(words, (0.0, value), (6, 0), textcoords="offset points", va="center")
     panel.set_yscale("symlog", linthresh=10.0)
     names = ["first formula", "second"][: len(entry.chance)]
     panel.set_xticks(range(len(names)), names)
-    panel.set_xlim(-0.5, len(names) - 0.5)
-    panel.set_ylabel("gain (◆ measured, ● replays)")
+    panel.set_xlim(-0.5, len(names) - 0.2)
+    panel.set_ylabel("gain")
 
 
 def _nearest(entry: AxisDraft) -> Table:
