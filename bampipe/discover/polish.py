@@ -49,20 +49,24 @@ class FittedSet:
 
     @cached_property
     def slope_by_force(self) -> Array:
-        """Root mean square slope of the first trial's residual by its force, by axis, (n_q,)."""
+        """Geometric mean slope of the first trial's residual by its force, by axis, (n_q,).
+
+        As a gain in log likelihood takes it off: what friction in proportion to the load makes of
+        a push and of a pull must not cancel.
+        """
         evidence = self.evidence
         system, motion = evidence.system, evidence.motions[0]
         u = motion.inputs(system.inputs)
         plain, _ = residual_and_memory(system, motion, u, evidence.p)
-        total = np.zeros(plain.shape[1])
+        square = np.zeros(plain.shape)
         for name in system.model.device.forces:
             column = system.inputs.index(name)
             step = 1e-3 * max(float(np.abs(u[:, column]).max()), 1e-9)
             moved = u.copy()
             moved[:, column] += step
             changed, _ = residual_and_memory(system, motion, moved, evidence.p)
-            total += np.mean(np.square((changed - plain) / step), axis=0)
-        return np.asarray(np.sqrt(np.maximum(total, 1e-30)))
+            square += np.square((changed - plain) / step)
+        return np.asarray(np.exp(0.5 * np.mean(np.log(np.maximum(square, 1e-6)), axis=0)))
 
 
 def extend_set(bench: Bench, known: FittedSet, score: Score) -> FittedSet:

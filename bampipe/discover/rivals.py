@@ -82,7 +82,14 @@ def choose(
     if not firm:
         return Choice("", (), transient)
     rivals = firm[: s.most_rivals]
-    best = rivals[0]
+    constants = {item.name: sum(not q.fixed for q in item.own) for item in items}
+
+    def simplest(names: Sequence[str]) -> str:
+        """Of those that explain as much as the first, the one with the fewest constants."""
+        least = rest[names[0]].total - max(s.score_sd, s.swap * abs(rest[names[0]].total))
+        return min((n for n in names if rest[n].total >= least), key=lambda n: constants[n])
+
+    best = simplest(rivals)
     if len(rivals) == 1:
         return Choice(best, (), transient)
     misfit = {}
@@ -114,6 +121,10 @@ def choose(
     if best in alike:
         alike = (winner, *[n for n in alike if n != best])
         winner = best
+    plain = simplest([winner, *alike])
+    if plain != winner:
+        alike = (winner, *[n for n in alike if n != plain])
+        winner = plain
     return Choice(winner, alike[:2], transient)
 
 

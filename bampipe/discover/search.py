@@ -27,6 +27,9 @@ from bampipe.trials.residuals import Evidence
 
 Array = NDArray[np.float64]
 
+_SHRUNK = 0.4
+"""Error over noise floor below which the floor is not merely rough."""
+
 
 @dataclass(frozen=True)
 class Addition:
@@ -139,7 +142,9 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
         timed = bench.retimed(wider.evidence)
         if timed is not bench:
             wider = replace(wider, evidence=timed.fit(wider.recipe, wider.evidence.p))
-        sound = _sound_level(timed, current, wider, known, [n for n in bench.names if n not in out])
+        rest = [n for n in bench.names if n not in out]
+        promised = score.gain / Scorer(current.evidence).independent
+        sound = _sound_level(timed, current, wider, promised, known, rest)
         if sound is None:
             # It resembles what is missing in these trials, but no mechanism could have it.
             dropped.add(chosen.winner)
@@ -181,7 +186,12 @@ def _rivals(first: Mapping[str, Score], name: str, alike: Sequence[str], s: Sett
 
 
 def _sound_level(
-    bench: Bench, before: FittedSet, after: FittedSet, known: Level, names: Sequence[str]
+    bench: Bench,
+    before: FittedSet,
+    after: FittedSet,
+    promised: Array,
+    known: Level,
+    names: Sequence[str],
 ) -> tuple[dict[str, Score], Level] | None:
     """Scores of ``names`` against a model with one effect more, and their chance level.
 
@@ -189,7 +199,7 @@ def _sound_level(
     a chance level of its own. None if no mechanism could have the effect; the trials that the fit
     has not seen are asked first, for replays cost more.
     """
-    if not _carries_over(before, after, bench.settings):
+    if not _carries_over(before, after, promised, bench.settings):
         return None
     evidence = after.evidence
     scores = bench.scores(after.recipe, evidence.p, names)
@@ -198,40 +208,54 @@ def _sound_level(
         level = bench.level(after.recipe, evidence, asked, (FLOOR_SEED,))
     except Runaway:
         return None
-    if not _keeps_the_floor(evidence, level.replicates, known.replicates):
+    error_before = Scorer(before.evidence).before.error
+    if not _keeps_the_floor(evidence, level.replicates, error_before, known.replicates):
         return None
     return scores, level
 
 
 def _keeps_the_floor(
-    evidence: Evidence, replays: Sequence[Replicate], before: Sequence[Replicate]
+    evidence: Evidence,
+    replays: Sequence[Replicate],
+    error_before: Array,
+    before: Sequence[Replicate],
 ) -> bool:
-    """Whether an effect buys nothing by raising the noise floor.
+    """Whether an effect buys nothing by raising the noise floor or by falling far below it.
 
-    The replays of a model with a wrong effect can be so wild that any error is below their floor:
-    such a floor is no better than none, unless it was like that without the effect.
+    What leaves a small part of the sensors' noise makes both sides of the equation small. And the
+    replays of a model with a wrong effect can be so wild that any error is below their floor: such
+    a floor is no better than none, unless it was like that without the effect.
     """
     error = Scorer(evidence).before.error
     after, earlier = (NoiseFloor.of_errors([r.error for r in some]) for some in (replays, before))
-    return not any(
+    ratio = error / np.maximum(after.level, 1e-300)
+    shrunk = (ratio < _SHRUNK) & (error_before / np.maximum(earlier.level, 1e-300) > _SHRUNK)
+    raised = [
         standing(float(error[i]), float(after.level[i])) == "floor_implausible"
         and after.level[i] > 2.0 * earlier.level[i]
         for i in range(len(error))
-    )
+    ]
+    return not (shrunk.any() or any(raised))
 
 
-def _carries_over(before: FittedSet, after: FittedSet, s: Settings) -> bool:
+def _carries_over(before: FittedSet, after: FittedSet, promised: Array, s: Settings) -> bool:
     """Whether some axis errs less, by what is worth it, on trials that the fit has not seen at all.
 
-    They choose no effect, but one that does nothing for them is none. The worst second of each does
-    not count.
+    They choose no effect, but one that does nothing for them is none, nor is one that keeps next to
+    nothing of the drop in log error that its score has ``promised``, by axis. It must stand with
+    the worst second of each and without.
     """
 
-    def error(known: FittedSet, axis: int) -> float:
-        return float(error_without_second(known.evidence, axis)[1] / known.slope_by_force[axis])
+    def errors(known: FittedSet, axis: int) -> Array:
+        least = error_without_second(known.evidence, axis)[1]
+        both = np.array([known.evidence.held_out_rmse[axis], least])
+        return np.asarray(both / known.slope_by_force[axis])
 
-    axes = range(len(before.error))
-    return any(np.log(error(before, i) / error(after, i)) > s.worth for i in axes)
+    return any(
+        float(np.min(np.log(errors(before, axis) / errors(after, axis))))
+        > max(s.worth, s.carried * promised[axis])
+        for axis in range(len(before.error))
+    )
 
 
 def _weigh(

@@ -24,6 +24,8 @@ class Settings:
         worth_at_floor: the same on an axis whose error is already at its noise floor: no replay
             is perfect, and changes of direction blurred by sampling invite
             spurious effects, up to a tenth of the error on a linear axis.
+        carried: least share of the drop of log error by its score that an effect must show on
+            trials that its fit has not seen at all.
         share: least share of what exceeds the floor on one axis, in the mean square, that an effect
             must remove in its turn: on a measured machine something always remains, and many
             effects take a little of it.
@@ -65,6 +67,7 @@ class Settings:
     significance: float = 0.01
     worth: float = 0.03
     worth_at_floor: float = 0.16
+    carried: float = 0.25
     share: float = 0.15
     predictable: float = 0.05
     surely: float = 2.0
