@@ -76,7 +76,7 @@ FORCES: dict[str, Law] = {
 
 PIPELINE = """schema = "bampipe.pipeline/1"
 name = "drafts"
-stages = ["ingest", "filter", "identify", "validate"]
+stages = ["ingest", "filter", "identify", "validate", "compare"]
 [settings.identify]
 method = "least-squares"
 """
