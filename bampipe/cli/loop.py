@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -48,8 +49,7 @@ def diagnose(
     one_stage("diagnose", root, options, model=chosen)
     if not options.json:
         say_what_came(root, chosen, is_diagnosed=True)
-    after = RunFolder(root).read(DiagnoseResult, chosen).next
-    advise(options.quiet, options.json, after.replace("RUN", places.next_to(root, options.runs)))
+    _advise_next(RunFolder(root).read(DiagnoseResult, chosen).next, root, options)
 
 
 @with_stage_options
@@ -76,8 +76,13 @@ def draft(
     root = places.find_run(run, options.runs)
     chosen = model or models.counting_model(root)
     one_stage("draft", root, options, model=chosen, more={"curve": True} if curve else {})
-    after = RunFolder(root).read(DraftResult, chosen).next
-    advise(options.quiet, options.json, after.replace("RUN", places.next_to(root, options.runs)))
+    _advise_next(RunFolder(root).read(DraftResult, chosen).next, root, options)
+
+
+def _advise_next(command: str, root: Path, options: StageOptions) -> None:
+    """Print the command that a result of the run folder ``root`` says comes next."""
+    run = places.next_to(root, options.runs)
+    advise(options.quiet, options.json, command.replace("RUN", run))
 
 
 def extend(

@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from bampipe.discover.ranges import MachineScale, SearchRange
+from bampipe.discover.ranges import MachineScale, SearchRange, between
 from bampipe.discover.settings import Settings
 from bampipe.estimate.normal_equations import NormalEquations
 from bampipe.physics import Model, System, compile_model
@@ -195,6 +195,15 @@ class Scorer:
         error = self.folds.error(e.sums, steps)
         return Score("", error, np.zeros(0), np.zeros(len(e.free)), np.zeros(len(error)))
 
+    @cached_property
+    def held_out_scale(self) -> Array:
+        """What turns an error of a `Score` into one on the terms of the model's own, by axis.
+
+        Candidates are scored with a little of the trial that is left out, models are judged without
+        it: what the two have in common is the ratio.
+        """
+        return np.asarray(self.evidence.held_out_rmse / np.maximum(self.before.error, 1e-300))
+
     def _cost_before(self, item: Candidate) -> float:
         """Cost of the model as it is, fitted to the trials that ``item`` is fitted to."""
         e, folds = self.evidence, self._folds(item)
@@ -321,7 +330,7 @@ class Scorer:
                 and second
                 and _column_similarity(first[1], second[1]) < _SIMILAR
             ):
-                middle = _middle(grid[i], grid[i + 1])
+                middle = between(grid[i], grid[i + 1])
                 grid.insert(i + 1, middle)
                 known.insert(i + 1, cost(middle))
             else:
@@ -332,13 +341,13 @@ class Scorer:
         ends = [grid[max(j - 1, 0)], grid[min(j + 1, len(grid) - 1)]]
         for _ in range(_REFINE):
             for side in (0, 1):
-                middle = _middle(x, ends[side])
+                middle = between(x, ends[side])
                 found = cost(middle)
                 if found is not None and found[0] < best:
                     ends[1 - side], x, best = x, middle, found[0]
                     break
             else:
-                ends = [_middle(x, ends[0]), _middle(x, ends[1])]
+                ends = [between(x, ends[0]), between(x, ends[1])]
         return float(x), float(best)
 
     def _problem(self, item: Candidate, searched: Array) -> _Joint | None:
@@ -522,7 +531,3 @@ def _column_similarity(a: Array, b: Array) -> float:
     """Cosine between two sets of columns: one where they span the same, zero where nothing."""
     first, second = np.linalg.qr(a)[0], np.linalg.qr(b)[0]
     return float(np.linalg.norm(first.T @ second) / np.sqrt(a.shape[1]))
-
-
-def _middle(a: float, b: float) -> float:
-    return float(np.sqrt(a * b)) if a > 0.0 and b > 0.0 else 0.5 * (a + b)

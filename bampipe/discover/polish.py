@@ -45,7 +45,12 @@ class FittedSet:
 
         What only makes both sides of the equation small, noise included, explains nothing.
         """
-        return Scorer(self.evidence).before.error / self.slope_by_force
+        return self.scorer.before.error / self.slope_by_force
+
+    @cached_property
+    def scorer(self) -> Scorer:
+        """Scores candidates against it."""
+        return Scorer(self.evidence)
 
     @cached_property
     def slope_by_force(self) -> Array:
@@ -145,7 +150,7 @@ def weigh(fewer: FittedSet, name: str, scores: Mapping[str, Score]) -> list[Cont
     names = [name, *(n for n in scores if n != name)]
     items = candidates_of(fewer.recipe, names)
     known = [scores[n] for n in names]
-    scorer = Scorer(fewer.evidence)
+    scorer = fewer.scorer
     gained = scorer.gain_by_sample(items[0], known[0])
     second = largest_second(fewer.evidence, gained)
     without_second = score_without(fewer.evidence, items, known, second)
@@ -154,13 +159,11 @@ def weigh(fewer: FittedSet, name: str, scores: Mapping[str, Score]) -> list[Cont
         trial = largest_trial(fewer.evidence, gained)
         without_trial = score_without(fewer.evidence, items, known, trial)
     axis = int(np.argmax(scores[name].gain))
-    # See `ranking.rank`: scores and models are judged on other terms.
-    unit = fewer.evidence.held_out_rmse[axis] / max(scorer.before.error[axis], 1e-300)
     contenders = [
         Contender(
             n,
             axis,
-            float(unit * scores[n].error[axis]),
+            float(scorer.held_out_scale[axis] * scores[n].error[axis]),
             scores[n].total,
             without_trial[n].total if n in without_trial else None,
             without_second[n].total if n in without_second else 0.0,

@@ -45,9 +45,14 @@ class SearchRange:
 
     def within(self, share: float) -> float:
         """The value that lies a share of the way from the lower to the upper end."""
-        if self.low > 0.0 and self.high > 0.0:
-            return float(self.low ** (1.0 - share) * self.high**share)
-        return float(self.low + share * (self.high - self.low))
+        return between(self.low, self.high, share)
+
+
+def between(low: float, high: float, share: float = 0.5) -> float:
+    """The value a share of the way from ``low`` to ``high``, by ratios where both are positive."""
+    if low > 0.0 and high > 0.0:
+        return float(low ** (1.0 - share) * high**share)
+    return float(low + share * (high - low))
 
 
 @dataclass(frozen=True)

@@ -27,30 +27,27 @@ def rank(search: Search, selected: Sequence[str]) -> list[Ranked]:
         (n for n in search.first if n not in order),
         key=lambda n: -float(search.level.excess(search.first[n]).sum()),
     )
+    initial = Scorer(search.initial)
     rows = []
     for name in [*order, *others]:
         if name not in search.first:
             continue
-        score, evidence = search.first[name], search.initial
+        score, scorer = search.first[name], initial
         excess, p_value = search.level.excess(score), search.level.p_value(score)
         if name in selected and name in search.additions:
             found = search.additions[name]
-            score, evidence, excess, p_value = (
-                found.score, found.evidence, found.excess, found.p_value,
+            score, scorer, excess, p_value = (
+                found.score, found.scorer, found.excess, found.p_value,
             )  # fmt: skip
         axis = int(np.argmax(excess))
-        before = float(evidence.held_out_rmse[axis])
-        # Candidates are scored with a little of the trial that is left out, models are judged
-        # without it: what the two have in common is the ratio.
-        ratio = float(score.error[axis] / max(Scorer(evidence).before.error[axis], 1e-300))
         group = next(({g, *r} - {name} for g, r in search.groups.items() if name in (g, *r)), set())
         own = [q.name for q in _own_parameters(search.recipe, name)]
         rows.append(
             Ranked(
                 name,
                 axis,
-                before,
-                before * ratio,
+                float(scorer.evidence.held_out_rmse[axis]),
+                float(scorer.held_out_scale[axis] * score.error[axis]),
                 p_value,
                 float(excess.sum()),
                 dict(zip(own, [float(v) for v in score.values], strict=True)),

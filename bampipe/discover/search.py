@@ -39,13 +39,13 @@ class Addition:
         score: against the model that it was added to.
         p_value: chance that a candidate scores so high where nothing is missing.
         excess: gain beyond chance, by axis.
-        evidence: that model, fitted.
+        scorer: of that model, fitted.
     """
 
     score: Score
     p_value: float
     excess: Array
-    evidence: Evidence
+    scorer: Scorer
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
         if not chosen.winner:
             continue
         score = scores[chosen.winner]
-        addition = Addition(score, known.p_value(score), known.excess(score), current.evidence)
+        addition = Addition(score, known.p_value(score), known.excess(score), current.scorer)
         wider = extend_set(bench, current, score)
         for earlier in wider.added[:-1]:
             # What resembles the missing effect may come first: it takes a little of several others.
@@ -143,7 +143,7 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
         if timed is not bench:
             wider = replace(wider, evidence=timed.fit(wider.recipe, wider.evidence.p))
         rest = [n for n in bench.names if n not in out]
-        promised = score.gain / Scorer(current.evidence).independent
+        promised = score.gain / current.scorer.independent
         sound = _sound_level(timed, current, wider, promised, known, rest)
         if sound is None:
             # It resembles what is missing in these trials, but no mechanism could have it.
@@ -203,12 +203,12 @@ def _sound_level(
         return None
     evidence = after.evidence
     scores = bench.scores(after.recipe, evidence.p, names)
-    asked = bench.gaining(scores, Scorer(evidence))
+    asked = bench.gaining(scores, after.scorer)
     try:
         level = bench.level(after.recipe, evidence, asked, (FLOOR_SEED,))
     except Runaway:
         return None
-    error_before = Scorer(before.evidence).before.error
+    error_before = before.scorer.before.error
     if not _keeps_the_floor(evidence, level.replicates, error_before, known.replicates):
         return None
     return scores, level

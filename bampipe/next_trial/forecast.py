@@ -30,7 +30,7 @@ class Forecast:
     Attributes:
         rehearsal: the fitted model that designs are tried with.
         precision: what is known of its parameters.
-        contest: effects to be told apart, if there are any; at_hand: its sums over the trials.
+        contest: effects to distinguish, if there are any; at_hand: its sums over the trials.
     """
 
     rehearsal: Rehearsal

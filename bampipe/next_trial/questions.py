@@ -1,4 +1,4 @@
-"""What the next trial is for: effects to be told apart, effects that these trials do not show."""
+"""What the next trial is for: effects to distinguish, effects that these trials do not show."""
 
 from __future__ import annotations
 

@@ -10,8 +10,8 @@ from bampipe.results.record import Names, Record, Result, Share, Size
 from bampipe.schema import Count
 
 Purpose = Literal["precision", "decision", "sensitivity"]
-"""What a trial is for: smaller uncertainties, one effect told from others, effects shown that the
-trials at hand would not have shown."""
+"""What a trial is for: smaller uncertainties, one effect distinguished from others, effects shown
+that the trials at hand would not have shown."""
 
 
 class Move(Record):

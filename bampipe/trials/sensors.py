@@ -132,7 +132,7 @@ def _typical_noise(records: Sequence[RecordNoise], stated: float | None) -> floa
     """Noise of a channel, the same in every trial, however much its signal adds in some.
 
     Noise over several samples counts where it is clearly more than that of neighbouring ones, and
-    what is stated does not speak for the latter: a fast signal is told from it in no other way.
+    what is stated does not speak for the latter: nothing else distinguishes a fast signal from it.
     """
     white = _lower_quartile([record.white_sd for record in records])
     slow = _lower_quartile([record.slow_sd for record in records])
