@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bampipe.discover.candidates import Score, Scorer
 from bampipe.discover.chance import (
     Pool,
     PrepareTask,
@@ -22,6 +21,7 @@ from bampipe.discover.chance import (
     run_scores,
 )
 from bampipe.discover.level import Level
+from bampipe.discover.scorer import Score, Scorer
 from bampipe.discover.settings import Settings
 from bampipe.estimate.least_squares import fit
 from bampipe.physics.recipe import Recipe
@@ -145,12 +145,12 @@ class Bench:
             replay,
             asked,
             len(self.names),
-            scorer.before.error,
-            np.maximum(scorer.independent, 1.0),
+            scorer.base_error,
+            np.maximum(scorer.independent_samples, 1.0),
             self.settings,
         )
 
     def gaining(self, scores: Mapping[str, Score], scorer: Scorer) -> list[str]:
         """Candidates whose gain could be worth having: what chance gives only lowers it."""
         least = self.settings.worth
-        return [n for n, s in scores.items() if np.any(s.gain / scorer.independent > least)]
+        return [n for n, s in scores.items() if np.any(s.gain / scorer.independent_samples > least)]

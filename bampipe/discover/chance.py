@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bampipe.discover.candidates import Candidate, Score, Scorer, candidate, candidate_model
+from bampipe.discover.candidates import Candidate, build_candidate_model, compile_candidate
+from bampipe.discover.scorer import Score, Scorer
 from bampipe.discover.shape import explainable_share
 from bampipe.physics import System, compile_model
 from bampipe.physics.recipe import Recipe
@@ -102,9 +103,9 @@ def candidates_of(recipe: Recipe, names: Sequence[str]) -> list[Candidate]:
     device, extra = recipe.model().device, [effect_from(e) for e in recipe.extra]
     out = []
     for name in names:
-        model = candidate_model(device, name, extra, recipe.effects)
+        model = build_candidate_model(device, name, extra, recipe.effects)
         if model.key not in _candidates:
-            _candidates[model.key] = candidate(model)
+            _candidates[model.key] = compile_candidate(model)
         out.append(_candidates[model.key])
     return out
 
@@ -169,8 +170,8 @@ def run_replicate(task: ReplicateTask) -> Replicate:
     share = np.array([explainable_share(evidence, a) for a in axes]) if task.share else np.zeros(0)
     scores = {name: score for name, score in found.items() if score is not None}
     # Refits without each trial are dear where the model is not linear: for the floor alone.
-    unseen = evidence.held_out_rmse if task.share or evidence.is_linear else scorer.before.error
-    return Replicate(scorer.before.error, unseen, evidence.p, scores, share)
+    unseen = evidence.held_out_rmse if task.share or evidence.is_linear else scorer.base_error
+    return Replicate(scorer.base_error, unseen, evidence.p, scores, share)
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.discover.bench import Bench
-from bampipe.discover.candidates import library
+from bampipe.discover.candidates import list_candidates
 from bampipe.discover.chance import Progress, workers
 from bampipe.discover.findings import Diagnosis
 from bampipe.discover.other_band import judge_in_other_band
@@ -57,7 +57,7 @@ def diagnose(
         raise ValueError("a diagnosis needs at least two trials: one is held out")
     device, extra = recipe.model().device, [effect_from(e) for e in recipe.extra]
     with workers(trials, settings.jobs) as pool:
-        bench = Bench(trials, settings, pool, tuple(library(device, recipe.effects, extra)))
+        bench = Bench(trials, settings, pool, tuple(list_candidates(device, recipe.effects, extra)))
         searched = search(bench, recipe, start, progress)
         found = conclude(searched, settings)
     progress(0.95, "holding the final model against its floor in another band")

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bampipe.discover.candidates import Candidate, Score, Scorer
+from bampipe.discover.candidates import Candidate
+from bampipe.discover.scorer import Score, Scorer
 from bampipe.trials.residuals import Evidence
 
 Array = NDArray[np.float64]

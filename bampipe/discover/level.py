@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import t as student
 
-from bampipe.discover.candidates import Score
 from bampipe.discover.chance import Replicate
+from bampipe.discover.scorer import Score
 from bampipe.discover.settings import Settings
 
 Array = NDArray[np.float64]

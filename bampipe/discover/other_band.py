@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bampipe.discover.candidates import Scorer
+from bampipe.discover.scorer import Scorer
 from bampipe.estimate.low_pass import Band
 from bampipe.estimate.simulation import Runaway
 from bampipe.results.standing import Standing, standing
@@ -61,7 +61,7 @@ def judge_in_other_band(
         return (None,) * count
     band = Band(known.rate_hz, tuple(cutoffs), known.margin_s)
     measured = gather_evidence(evidence.system, trials.motions, band, evidence.p, trials.folds)
-    error = Scorer(measured).before.error
+    error = Scorer(measured).base_error
     try:
         replays = [
             replay_evidence(
@@ -72,7 +72,7 @@ def judge_in_other_band(
         ]  # fmt: skip
     except Runaway:
         return (None,) * count
-    floor = NoiseFloor.of_errors([Scorer(replay).before.error for replay in replays])
+    floor = NoiseFloor.of_errors([Scorer(replay).base_error for replay in replays])
     return tuple(
         None
         if cutoff == was

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.discover.bench import Bench
-from bampipe.discover.candidates import Score, Scorer
 from bampipe.discover.chance import candidates_of
 from bampipe.discover.findings import Contender
 from bampipe.discover.influence import largest_second, largest_trial, score_without
+from bampipe.discover.scorer import Score, Scorer
 from bampipe.discover.settings import Settings
 from bampipe.discover.start import with_effect, without_effect
 from bampipe.physics.recipe import Recipe
@@ -45,7 +45,7 @@ class FittedSet:
 
         What only makes both sides of the equation small, noise included, explains nothing.
         """
-        return self.scorer.before.error / self.slope_by_force
+        return self.scorer.base_error / self.slope_by_force
 
     @cached_property
     def scorer(self) -> Scorer:

@@ -80,7 +80,7 @@ class MachineScale:
         """The sizes of the trials of ``evidence``."""
         system, q, qd, load = evidence.system, [], [], []
         for trial, motion in enumerate(evidence.motions):
-            u, z = motion.inputs(system.inputs), evidence.unfiltered(trial)[1]
+            u, z = motion.inputs(system.inputs), evidence.fitted[trial].memory
             applied = system.applied(motion.q, motion.qd, motion.qdd, z, u, evidence.p)
             q += [motion.q.min(axis=0), motion.q.max(axis=0)]
             qd.append(np.abs(motion.qd).max(axis=0))

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from bampipe.discover.candidates import Scorer
 from bampipe.discover.findings import Ranked
+from bampipe.discover.scorer import Scorer
 from bampipe.discover.search import Search
 from bampipe.physics.parameter import Parameter
 from bampipe.physics.recipe import Recipe

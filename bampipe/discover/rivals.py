@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bampipe.discover.bench import Bench
-from bampipe.discover.candidates import Score, Scorer
 from bampipe.discover.chance import Progress, Replicate, candidates_of
 from bampipe.discover.influence import Stretch, largest_second, score_without
 from bampipe.discover.level import Level
+from bampipe.discover.scorer import Score, Scorer
 from bampipe.discover.settings import Settings
 from bampipe.discover.start import with_effect
 from bampipe.estimate.simulation import Runaway
@@ -74,7 +74,7 @@ def choose(
         return (
             score is not None
             and level.p_value(score) < s.significance
-            and bool(np.any(score.gain / scorer.independent > 0.5 * s.worth))
+            and bool(np.any(score.gain / scorer.independent_samples > 0.5 * s.worth))
         )
 
     firm = sorted((n for n in close if stands(n)), key=lambda n: -rest[n].total)
@@ -82,7 +82,7 @@ def choose(
     if not firm:
         return Choice("", (), transient)
     rivals = firm[: s.most_rivals]
-    constants = {item.name: sum(not q.fixed for q in item.own) for item in items}
+    constants = {item.name: sum(not q.fixed for q in item.parameters) for item in items}
 
     def simplest(names: Sequence[str]) -> str:
         """Of those that explain as much as the first, the one with the fewest constants."""

@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.discover.bench import Bench
-from bampipe.discover.candidates import Score, Scorer
 from bampipe.discover.chance import Progress, Replicate
 from bampipe.discover.findings import Contender, Step
 from bampipe.discover.influence import Stretch, error_without_second
 from bampipe.discover.level import Level
 from bampipe.discover.polish import FittedSet, extend_set, is_superfluous, polish, reduce_set
 from bampipe.discover.rivals import choose
+from bampipe.discover.scorer import Score, Scorer
 from bampipe.discover.settings import Settings
 from bampipe.estimate.simulation import Runaway
 from bampipe.physics.recipe import Recipe
@@ -143,7 +143,7 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
         if timed is not bench:
             wider = replace(wider, evidence=timed.fit(wider.recipe, wider.evidence.p))
         rest = [n for n in bench.names if n not in out]
-        promised = score.gain / current.scorer.independent
+        promised = score.gain / current.scorer.independent_samples
         sound = _sound_level(timed, current, wider, promised, known, rest)
         if sound is None:
             # It resembles what is missing in these trials, but no mechanism could have it.
@@ -208,7 +208,7 @@ def _sound_level(
         level = bench.level(after.recipe, evidence, asked, (FLOOR_SEED,))
     except Runaway:
         return None
-    error_before = before.scorer.before.error
+    error_before = before.scorer.base_error
     if not _keeps_the_floor(evidence, level.replicates, error_before, known.replicates):
         return None
     return scores, level
@@ -226,7 +226,7 @@ def _keeps_the_floor(
     replays of a model with a wrong effect can be so wild that any error is below their floor: such
     a floor is no better than none, unless it was like that without the effect.
     """
-    error = Scorer(evidence).before.error
+    error = Scorer(evidence).base_error
     after, earlier = (NoiseFloor.of_errors([r.error for r in some]) for some in (replays, before))
     ratio = error / np.maximum(after.level, 1e-300)
     shrunk = (ratio < _SHRUNK) & (error_before / np.maximum(earlier.level, 1e-300) > _SHRUNK)
@@ -278,7 +278,7 @@ def _weigh(
 
     # Trials that the session holds out may be above their floor where the fitted ones are not.
     replayed = level.replicates
-    error, replays = scorer.before.error, np.array([r.error for r in replayed])
+    error, replays = scorer.base_error, np.array([r.error for r in replayed])
     above = error > ceiling(replays)
     if HELD_OUT in evidence.folds.groups:
         above |= evidence.held_out_rmse > ceiling(np.array([r.held_out_rmse for r in replayed]))
@@ -286,7 +286,7 @@ def _weigh(
     found, likely = [], {}
     for name, score in scores.items():
         excess = level.excess(score)
-        gain = excess / scorer.independent
+        gain = excess / scorer.independent_samples
         removed = error**2 * (1.0 - np.exp(-2.0 * gain))
         share = removed / np.maximum(
             error**2 - replays.mean(axis=0) ** 2, np.maximum(removed, 1e-30)

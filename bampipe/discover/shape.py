@@ -78,7 +78,7 @@ def variables(evidence: Evidence, axis: int) -> tuple[Variable, ...]:
     for index, motion in enumerate(evidence.motions):
         kept = band.kept(len(motion.t))
         u = motion.inputs(system.inputs)
-        memory = evidence.unfiltered(index)[1]
+        memory = evidence.fitted[index].memory
         load = system.applied(motion.q, motion.qd, motion.qdd, memory, u, evidence.p)[:, axis]
         since, distance = _since_reversal(motion, axis)
         put("position", unit, motion.q[kept, axis])

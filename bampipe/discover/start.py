@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bampipe.discover.candidates import Score, Scorer, candidate, candidate_model
+from bampipe.discover.candidates import build_candidate_model, compile_candidate
 from bampipe.discover.chance import fit_trials, system_of
+from bampipe.discover.scorer import Score, Scorer
 from bampipe.physics.recipe import Recipe
 from bampipe.physics.registry import device_from, effect_from
 from bampipe.trials.measured import MeasuredTrials
@@ -58,8 +59,8 @@ def search_start(trials: MeasuredTrials, recipe: Recipe) -> Array:
     extra = [effect_from(e) for e in recipe.extra]
     for count, name in enumerate(recipe.effects, start=1):
         wider = replace(recipe, effects=recipe.effects[:count])
-        model = candidate_model(device, name, extra, recipe.effects[: count - 1])
-        score = Scorer(evidence).score(candidate(model))
+        model = build_candidate_model(device, name, extra, recipe.effects[: count - 1])
+        score = Scorer(evidence).score(compile_candidate(model))
         if score is None:
             prior = np.array([q.prior for q in system_of(wider).parameters])
             prior[: len(evidence.p)] = evidence.p

@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from bampipe.discover.candidates import Scorer
 from bampipe.discover.chance import candidates_of
 from bampipe.discover.findings import AxisFinding, Contender, Diagnosis
 from bampipe.discover.influence import Stretch, error_without_second
 from bampipe.discover.ranking import rank
+from bampipe.discover.scorer import Scorer
 from bampipe.discover.search import Search
 from bampipe.discover.settings import Settings
 from bampipe.discover.shape import explainable_share
@@ -122,7 +122,7 @@ def _odds(scores: Mapping[str, float], s: Settings) -> dict[str, float]:
 
 def _odds_of_likely(search: Search, axis: int, s: Settings) -> dict[str, float]:
     """Odds of candidates that would lower the error of an axis but do not beat chance."""
-    count = Scorer(search.evidence).independent[axis]
+    count = Scorer(search.evidence).independent_samples[axis]
     here = {n: (p, gain[axis]) for n, (p, gain) in search.likely.items() if gain[axis] > s.worth}
     if not here:
         return {}
@@ -156,7 +156,7 @@ def _reach(search: Search, name: str, worth: float) -> set[int]:
     acts = range(len(item.coordinates)) if item.moves_sensors else item.touched
     if name not in search.first:
         return set()
-    drop = search.level.excess(search.first[name]) / Scorer(search.initial).independent
+    drop = search.level.excess(search.first[name]) / Scorer(search.initial).independent_samples
     return {axis for axis in acts if drop[axis] > worth}
 
 

@@ -109,7 +109,7 @@ def _parts(system: System) -> Iterator[_Part]:
 def _residual(evidence: Evidence, p: Array) -> Array:
     """Return the residual over all trials, low-passed and thinned, (K, n_q)."""
     trials = range(len(evidence.motions))
-    return np.concatenate([evidence.band.thin(evidence.unfiltered_at(k, p)[0]) for k in trials])
+    return np.concatenate([evidence.band.thin(evidence.unfiltered_residual(k, p)) for k in trials])
 
 
 def _curves(

@@ -10,13 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from bampipe.discover.candidates import Candidate, added_residual
+from bampipe.discover.candidates import Candidate
+from bampipe.discover.columns import added_residual
 from bampipe.discover.settings import Settings
 from bampipe.estimate.least_squares import stacked_residual
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import System
 from bampipe.trials.motion import Motion
-from bampipe.trials.residuals import problem_of, residual_and_memory
+from bampipe.trials.residuals import ModelOnTrial, problem_of
 
 Array = NDArray[np.float64]
 
@@ -46,7 +47,7 @@ class Rival:
     @property
     def free(self) -> list[int]:
         """Places of its parameters that are fitted."""
-        return [i for i, q in enumerate(self.item.own) if not q.fixed] if self.item else []
+        return [i for i, q in enumerate(self.item.parameters) if not q.fixed] if self.item else []
 
 
 @dataclass(frozen=True)
@@ -118,35 +119,32 @@ class Contest:
 
     def _sums_of(self, motion: Motion) -> Sums:
         problem = problem_of(self.system, [motion], self.band, timing=self.timing_s > 0.0)
-        base = stacked_residual(problem, 0, np.append(self.p, 0.0))
-        u = motion.inputs(self.system.inputs)
-        unfiltered = residual_and_memory(self.system, motion, u, self.p)
-        columns = [base.slope]
+        stacked = stacked_residual(problem, 0, np.append(self.p, 0.0))
+        base = ModelOnTrial(self.system, motion, self.p)
+        columns = [stacked.slope]
         n = len(self.system.coordinates)
         for rival in self.rivals:
-            rows = self._added_by(rival, motion, unfiltered)
+            rows = self._added_by(rival, base)
             thin = self.band.thin(np.concatenate(rows, axis=1)).reshape(-1, len(rows), n)
-            columns.append(thin.transpose(0, 2, 1) * base.used[:, :, None])
+            columns.append(thin.transpose(0, 2, 1) * stacked.used[:, :, None])
         joined = np.concatenate(columns, axis=2)
-        return Sums(np.einsum("tap,taq->apq", joined, joined), base.used.sum(axis=0).astype(float))
+        squares = np.einsum("tap,taq->apq", joined, joined)
+        return Sums(squares, stacked.used.sum(axis=0).astype(float))
 
-    def _added_by(
-        self, rival: Rival, motion: Motion, unfiltered: tuple[Array, Array]
-    ) -> list[Array]:
+    def _added_by(self, rival: Rival, base: ModelOnTrial) -> list[Array]:
         """What a rival adds to the residual, and the slopes of that by its parameters, (T, n_q)."""
         if rival.item is None:
-            return [np.zeros_like(unfiltered[0])]
+            return [np.zeros(base.motion.q.shape)]
         system, count = rival.item.system, len(rival.values)
         p = np.append(self.p[: len(system.parameters) - count], rival.values)
-        known = self.system, self.p, unfiltered
-        here = added_residual(rival.item, motion, p, *known)
+        here = added_residual(rival.item, p, base)
         rows = [here]
         for i in rival.free if self.refits else ():
-            q, moved = rival.item.own[i], p.copy()
+            q, moved = rival.item.parameters[i], p.copy()
             step = _STEP * max(abs(rival.values[i]), _STEP * q.sd)
             step = -step if rival.values[i] + step > q.upper else step
             moved[len(p) - count + i] += step
-            rows.append((added_residual(rival.item, motion, moved, *known) - here) / step)
+            rows.append((added_residual(rival.item, moved, base) - here) / step)
         return rows
 
     def _places(self, squares: Array) -> list[tuple[int, list[int]]]:

@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bampipe.discover.candidates import Scorer, library
+from bampipe.discover.candidates import list_candidates
 from bampipe.discover.chance import candidates_of, fit_trials, system_of
+from bampipe.discover.scorer import Scorer
 from bampipe.discover.settings import Settings
 from bampipe.next_trial.discrimination import Contest, Rival, Sums
 from bampipe.next_trial.sensitivity import Bar, Visibility, refine, typical_rival, weigh_visibility
@@ -164,8 +165,8 @@ def find_blindness(
         timing_s: by how much the inputs may be sampled late or early; 0 where that is not fitted.
     """
     device, extra = recipe.model().device, [effect_from(e) for e in recipe.extra]
-    scale = Scorer(evidence).scale
-    items = candidates_of(recipe, library(device, recipe.effects, extra))
+    scale = Scorer(evidence).machine_scale
+    items = candidates_of(recipe, list_candidates(device, recipe.effects, extra))
     rivals = [rival for item in items if (rival := typical_rival(item, scale)) is not None]
     contest = Contest(
         evidence.system, evidence.p, tuple(rivals), evidence.band, error, False, timing_s

@@ -45,7 +45,7 @@ class Visibility:
     def parameter(self) -> Parameter:
         """The strength that is meant."""
         assert self.rival.item is not None
-        return self.rival.item.own[_strengths(self.rival.item)[0]]
+        return self.rival.item.parameters[_strengths(self.rival.item)[0]]
 
     @property
     def typical(self) -> float:
@@ -60,7 +60,7 @@ class Visibility:
 
 
 def _strengths(item: Candidate) -> list[int]:
-    return [i for i, q in enumerate(item.own) if q.strength and not q.fixed]
+    return [i for i, q in enumerate(item.parameters) if q.strength and not q.fixed]
 
 
 def typical_rival(item: Candidate, scale: MachineScale) -> Rival | None:
@@ -72,7 +72,7 @@ def typical_rival(item: Candidate, scale: MachineScale) -> Rival | None:
     if not strengths:
         return None
     effect, values = item.system.model.effects[-1], []
-    for i, q in enumerate(item.own):
+    for i, q in enumerate(item.parameters):
         value = q.prior if q.typical is None else q.typical
         if i in strengths:
             value = value or q.sd
@@ -161,12 +161,12 @@ def refine(contest: Contest, motions: Sequence[Motion], found: Visibility, bar: 
     """The same with the effect at the strength found: it may not be linear in its strength."""
     item = found.rival.item
     assert item is not None
-    if len(item.linear) == len(_strengths(item)) or not 1e-3 < found.factor < 1e3:
+    if len(item.linear_indices) == len(_strengths(item)) or not 1e-3 < found.factor < 1e3:
         return found
     values = found.rival.values.copy()
     strengths = _strengths(item)
     for _ in range(3):
-        own = [item.own[i] for i in strengths]
+        own = [item.parameters[i] for i in strengths]
         scaled = [found.rival.values[i] * found.factor for i in strengths]
         values[strengths] = np.clip(scaled, [q.lower for q in own], [q.upper for q in own])
         probe = replace(contest, rivals=(replace(found.rival, values=values),))

@@ -242,7 +242,7 @@ def _compare(evidence: Evidence, number: int, p: Array) -> _Compared:
     applied = system.applied(motion.q, motion.qd, motion.qdd, z, u, p)
     force = [system.inputs.index(name) for name in system.model.device.forces]
     rows = band.kept(len(motion.t))
-    residual = band.thin(evidence.unfiltered_at(number, p)[0])
+    residual = band.thin(evidence.unfiltered_residual(number, p))
     push = np.linalg.pinv(system.input_map(motion.q[rows], u[rows], p))
     return _Compared(
         trial_id=motion.trial_id,
@@ -251,7 +251,7 @@ def _compare(evidence: Evidence, number: int, p: Array) -> _Compared:
         measured=band.thin(applied),
         residual=residual,
         residual_held_out=evidence.held_out_residual(number),
-        residual_without_friction=band.thin(evidence.unfiltered_at(number, frictionless)[0]),
+        residual_without_friction=band.thin(evidence.unfiltered_residual(number, frictionless)),
         force=band.thin_input(u[:, force]),
         force_residual=np.einsum("tfq,tq->tf", push, residual),
         judged=folds.judged[number] and not folds.nothing_held_out,

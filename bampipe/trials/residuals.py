@@ -8,7 +8,7 @@ goes through one low-pass before anything is fitted, and is thinned to what that
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -127,6 +127,35 @@ def residual_and_memory(
 
 
 @dataclass(frozen=True)
+class ModelOnTrial:
+    """A model with given parameters on one trial, computed when it is first asked for.
+
+    Attributes:
+        system: the model; motion: the trial.
+        p: its parameters, (n_p,).
+    """
+
+    system: System
+    motion: Motion
+    p: Array
+
+    @cached_property
+    def _residual_and_memory(self) -> tuple[Array, Array]:
+        u = self.motion.inputs(self.system.inputs)
+        return residual_and_memory(self.system, self.motion, u, self.p)
+
+    @property
+    def residual(self) -> Array:
+        """The residual before the low-pass, (T, n_q), N.m or N."""
+        return self._residual_and_memory[0]
+
+    @property
+    def memory(self) -> Array:
+        """Internal states, (T, n_z)."""
+        return self._residual_and_memory[1]
+
+
+@dataclass(frozen=True)
 class Evidence:
     """Residuals of one model on the trials of one session, linearised at its least-squares fit.
 
@@ -134,6 +163,7 @@ class Evidence:
         system: the model.
         p: parameters at which it is linearised, (n_p,).
         motions: the trials.
+        fitted: the model with these parameters on each of them.
         band: the low-pass.
         folds: which trials were fitted, and which are left out together.
         residual: low-passed and thinned, by trial, each (K, n_q), N.m or N.
@@ -149,6 +179,7 @@ class Evidence:
     system: System
     p: Array
     motions: Sequence[Motion]
+    fitted: tuple[ModelOnTrial, ...]
     band: Band
     folds: Folds
     residual: tuple[Array, ...]
@@ -159,9 +190,6 @@ class Evidence:
     upper: Array
     precision: Array
     known: Array
-    _unfiltered: dict[int, tuple[Array, Array]] = field(
-        default_factory=dict, repr=False, compare=False
-    )
 
     @cached_property
     def sums(self) -> NormalEquations:
@@ -227,8 +255,8 @@ class Evidence:
             if self.is_linear or not step.any():
                 found = self.residual[trial] + self.jacobian[trial] @ step
             else:
-                whole, _ = self.unfiltered_at(trial, self.held_out_parameters(trial))
-                found = self.band.thin(whole) * self.used[trial]
+                unfiltered = self.unfiltered_residual(trial, self.held_out_parameters(trial))
+                found = self.band.thin(unfiltered) * self.used[trial]
             self._held_out[trial] = found
         return self._held_out[trial]
 
@@ -242,16 +270,9 @@ class Evidence:
         p[list(self.free)] += self.held_out_steps[trial]
         return p
 
-    def unfiltered(self, trial: int) -> tuple[Array, Array]:
-        """Residual (T, n_q) of a trial before the low-pass, and internal states (T, n_z)."""
-        if trial not in self._unfiltered:
-            self._unfiltered[trial] = self.unfiltered_at(trial, self.p)
-        return self._unfiltered[trial]
-
-    def unfiltered_at(self, trial: int, p: Array) -> tuple[Array, Array]:
-        """The same with the parameters ``p``, (n_p,)."""
-        u = self.motions[trial].inputs(self.system.inputs)
-        return residual_and_memory(self.system, self.motions[trial], u, p)
+    def unfiltered_residual(self, trial: int, p: Array) -> Array:
+        """The residual of a trial with parameters ``p``, (n_p,), before the low-pass, (T, n_q)."""
+        return ModelOnTrial(self.system, self.motions[trial], p).residual
 
 
 def gather_evidence(
@@ -286,6 +307,7 @@ def gather_evidence(
         system,
         found.p[:-1],
         motions,
+        tuple(ModelOnTrial(system, motion, found.p[:-1]) for motion in motions),
         band,
         folds,
         tuple(stacked[k].residual for k in order),

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from independent_runs import device_of, record_trials
 
-from bampipe.discover.candidates import Scorer, candidate, candidate_model
+from bampipe.discover.candidates import build_candidate_model, compile_candidate
 from bampipe.discover.chance import fit_trials, system_of
+from bampipe.discover.scorer import Scorer
 from bampipe.discover.start import search_start
 from bampipe.physics import registry
 from bampipe.physics.recipe import Recipe
@@ -27,17 +28,19 @@ def test_what_acts_on_what_an_effect_leaves_is_scored_with_it(trials, first, sec
     recipe = Recipe(DAMPER.declaration, (first,), ())
     evidence = fit_trials(trials, recipe, search_start(trials, recipe))
     scorer = Scorer(evidence)
-    joint = scorer.score(candidate(candidate_model(DAMPER, second, (), recipe.effects)))
+    joint = scorer.score(
+        compile_candidate(build_candidate_model(DAMPER, second, (), recipe.effects))
+    )
     noise = 1.0  # of the simulated load cell, N
-    assert scorer.before.error[0] > 8.0 * noise
+    assert scorer.base_error[0] > 8.0 * noise
     assert joint.error[0] < 2.0 * noise
-    alone = scorer.score(candidate(candidate_model(DAMPER, second)))
+    alone = scorer.score(compile_candidate(build_candidate_model(DAMPER, second)))
     assert alone.error[0] > 1.5 * joint.error[0]
 
 
 def test_only_effects_that_meet_are_taken_together():
     def names(candidate_name, *present, device="slider"):
-        model = candidate_model(registry.device(device), candidate_name, (), present)
+        model = build_candidate_model(registry.device(device), candidate_name, (), present)
         return [e.name for e in model.effects]
 
     assert names("load_dependent_friction:carriage", "actuator_lag:motor") == [
@@ -74,13 +77,14 @@ def test_the_right_effect_explains_most_and_has_the_true_size(
     scorer = Scorer(fit_trials(trials, recipe, system_of(recipe).prior))
     device = device_of(machine)
     scores = {
-        name: scorer.score(candidate(candidate_model(device, name))) for name in (effect, *rivals)
+        name: scorer.score(compile_candidate(build_candidate_model(device, name)))
+        for name in (effect, *rivals)
     }
     right = scores.pop(effect)
     axis = int(np.argmax(right.gain))
-    assert right.error[axis] < 0.35 * scorer.before.error[axis]
+    assert right.error[axis] < 0.35 * scorer.base_error[axis]
     assert all(right.total > 1.2 * score.total for score in scores.values() if score)
-    own = candidate(candidate_model(device, effect)).own
-    for parameter, value in zip(own, right.values, strict=True):
+    parameters = compile_candidate(build_candidate_model(device, effect)).parameters
+    for parameter, value in zip(parameters, right.values, strict=True):
         if parameter.name in truth:
             assert value == pytest.approx(truth[parameter.name], rel=0.12), parameter.name

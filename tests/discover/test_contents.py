@@ -9,7 +9,7 @@ import pytest
 from sessions import BAND, KINEMATICS, SENSORS, folds, made
 
 from bampipe.discover import chance
-from bampipe.discover.candidates import Scorer
+from bampipe.discover.scorer import Scorer
 from bampipe.discover.search import _keeps_the_floor
 from bampipe.physics import registry
 from bampipe.physics.recipe import Recipe
@@ -67,7 +67,7 @@ def test_an_effect_that_only_raises_the_floor_is_not_added():
     trials = made(bam_with_force(1.0), {}, trials=2, seconds=4.0)
     system = chance.system_of(bam_with_force(1.0))
     evidence = gather_evidence(system, trials.motions, BAND, system.prior, folds(2))
-    error = Scorer(evidence).before.error
+    error = Scorer(evidence).base_error
 
     def replays(factor: float) -> list[chance.Replicate]:
         none = np.zeros(0)

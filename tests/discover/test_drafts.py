@@ -127,9 +127,9 @@ def test_columns_of_the_first_pass_are_those_of_the_compiled_effect(clean):
             name: np.array([_between(low, high)]) for name, (low, high, _) in form.limits().items()
         }
         columns = screen.columns(form, searched)[:, :, 0]
-        names = [p.name.rpartition(".")[2] for p in item.own]
+        names = [p.name.rpartition(".")[2] for p in item.parameters]
         for strength, column in zip(form.shape.strengths, columns, strict=True):
-            p = np.concatenate([evidence.p, [q.prior for q in item.own]])
+            p = np.concatenate([evidence.p, [q.prior for q in item.parameters]])
             for name, value in searched.items():
                 p[len(evidence.p) + names.index(name)] = value[0]
             p[len(evidence.p) + names.index(strength)] = 1.0

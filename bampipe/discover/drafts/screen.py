@@ -145,7 +145,7 @@ class Screen:
             motion = evidence.motions[k]
             q, qd, qdd = motion.q[rows], motion.qd[rows], motion.qdd[rows]
             u = motion.inputs(system.inputs)[rows]
-            z = evidence.unfiltered(k)[1][rows]
+            z = evidence.fitted[k].memory[rows]
             load = np.abs(system.applied(q, qd, qdd, z, u, evidence.p)[:, axis])
             width = device.coordinates[axis].sign_width
             values = {

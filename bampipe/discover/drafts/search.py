@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from scipy.stats import t as student
 
 from bampipe.discover.bench import Bench
-from bampipe.discover.candidates import Score, Scorer
 from bampipe.discover.chance import Progress, fit_trials, open_trials, system_of, workers
 from bampipe.discover.drafts.forms import Form
 from bampipe.discover.drafts.screen import Screen, Screened, screen
+from bampipe.discover.scorer import Score, Scorer
 from bampipe.discover.settings import Settings
 from bampipe.discover.start import with_effect
 from bampipe.estimate.least_squares import fit
@@ -185,7 +185,7 @@ def run_replay(task: ReplayTask) -> tuple[float, float]:
         system, replays, trials.band, task.p, trials.folds, most_iterations=_STEPS_OF_A_REPLAY
     )
     found = screen(evidence, task.axis, task.curves)
-    error = float(Scorer(evidence).before.error[task.axis])
+    error = float(Scorer(evidence).base_error[task.axis])
     return (found[0].gain if found else 0.0), error
 
 
@@ -280,7 +280,7 @@ class AxisSearch:
                 break
             current, recipe, p = chosen
             evidence = self._bench.fit(recipe, p)
-            if Scorer(evidence).before.error[axis] < s.surely * chances[-1].floor:
+            if Scorer(evidence).base_error[axis] < s.surely * chances[-1].floor:
                 break  # what is left is for a diagnosis of the model with the draft
         terms = self._terms(evidence, current)
         bound = None
@@ -325,7 +325,7 @@ class AxisSearch:
         """Chance of a gain, by Student's t: the best of all forms on each replay is one draw."""
         count = len(gains)
         # No replay is perfect: its log error is off by this, as a log likelihood.
-        off = self._settings.replay_error * float(Scorer(evidence).independent[self._axis])
+        off = self._settings.replay_error * float(Scorer(evidence).independent_samples[self._axis])
         spread = np.hypot(np.std(gains, ddof=1) * np.sqrt(1.0 + 1.0 / count), off)
         return float(student.sf((gain - np.mean(gains)) / spread, count - 1))
 

@@ -1,0 +1,85 @@
+"""What a candidate adds to the residual of a fitted model: columns of a linear problem."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.discover.candidates import Candidate
+from bampipe.trials.motion import Motion
+from bampipe.trials.residuals import Evidence, ModelOnTrial
+
+Array = NDArray[np.float64]
+
+
+def added_columns(
+    evidence: Evidence, item: Candidate, searched: Array
+) -> tuple[list[Array], list[Array]]:
+    """What a candidate adds at given values of its searched parameters, low-passed, by trial.
+
+    Returns:
+        Columns of its linear strengths, each (K, n_q, m), and where it has none of those the
+        change of the residual, each (K, n_q).
+    """
+    e, system = evidence, item.system
+    count = len(system.parameters) - len(item.parameters)
+    p = np.concatenate([e.p[:count], [q.prior for q in item.parameters]])
+    p[[count + i for i in item.searched_indices]] = searched
+    p[[count + i for i in item.linear_indices]] = 0.0
+    axes = list(range(len(system.coordinates)) if system.moves_sensors else system.touched)
+    columns, changes = [], []
+    for base, used in zip(e.fitted, e.used, strict=True):
+        z = None if item.replaces_motion else _states(item, base.motion, p)
+        rows = [
+            added_residual(item, p_probed, base, z)
+            for p_probed in _probes(p, count, item.linear_indices)
+        ]
+        thin = np.zeros((len(used), len(rows), used.shape[1]))
+        for r, values in enumerate(rows):
+            thin[:, r, axes] = e.band.thin(values[:, axes], axes) * used[:, axes]
+        if item.linear_indices:
+            columns.append(thin.transpose(0, 2, 1))
+            changes.append(np.zeros(used.shape))
+        else:
+            columns.append(np.zeros((*used.shape, 0)))
+            changes.append(thin[:, 0])
+    return columns, changes
+
+
+def _probes(p: Array, count: int, linear: Sequence[int]) -> list[Array]:
+    """``p`` with each of the ``linear`` strengths, numbered from ``count``, at one; or as it is."""
+    probes = [p.copy() for _ in linear or (None,)]
+    for probe, i in zip(probes, linear, strict=False):
+        probe[count + i] = 1.0
+    return probes
+
+
+def added_residual(item: Candidate, p: Array, base: ModelOnTrial, z: Array | None = None) -> Array:
+    """What a candidate adds to the residual of a model along a motion, (T, n_q), N.m or N.
+
+    Args:
+        item: the candidate.
+        p: parameters of its system, its own last.
+        base: the model without it on a trial.
+        z: internal states (T, n_z) of the candidate's system, where they are known already.
+    """
+    system, motion = item.system, base.motion
+    at = motion.q, motion.qd, motion.qdd
+    u = motion.inputs(system.inputs)
+    if item.replaces_motion:
+        true = system.true_motion(*at, u, p)
+        u_base = motion.inputs(base.system.inputs)
+        return base.system.residual(*true, base.memory, u_base, base.p) - base.residual
+    if z is None:
+        z = _states(item, motion, p)
+    if item.is_joint:
+        return system.applied(*at, z, u, p) - system.required(*at, z, u, p) - base.residual
+    return system.contribution(*at, z, u, p)
+
+
+def _states(item: Candidate, motion: Motion, p: Array) -> Array:
+    system = item.system
+    u = motion.inputs(system.inputs)
+    return system.memory(motion.q, motion.qd, motion.qdd, u, p, motion.t)

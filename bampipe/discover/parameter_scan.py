@@ -1,0 +1,112 @@
+"""The best values of parameters in which a residual is nonlinear, looked for on a grid."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.discover.ranges import SearchRange, between
+
+Array = NDArray[np.float64]
+
+Cost = Callable[[Array], tuple[float, Array] | None]
+"""cost(values) -> cost of the fit with the searched parameters at ``values``, and the columns
+(n, m) that they make; None where they change nothing."""
+
+_GRID = 7
+_LARGEST_RATIO = 3.0
+"""Of neighbours on the grid of a searched parameter."""
+_REFINE = 3
+_STARTS = (0.5, 0.8)
+"""Shares of their ranges at which several searched parameters start, one after the other: a sharp
+resonance is missed between the points of a grid, one that is damped well shows from afar."""
+_SIMILAR = 0.7
+_DENSEST = 48
+
+
+def scan_parameters(
+    cost: Cost, ranges: Sequence[SearchRange], hopeless: float, has_columns: bool
+) -> tuple[list[float], float] | None:
+    """Best values of the searched parameters, and their cost; None if one never matters.
+
+    Each is scanned over its range, finely enough that neighbours on the grid resemble each other,
+    and narrowed around the best; several are taken in turn, from `_STARTS`.
+
+    Args:
+        cost: of the fit; ranges: of the parameters.
+        hopeless: a cost above this after a scan ends the search.
+        has_columns: whether columns can be compared.
+    """
+    starts = _STARTS if len(ranges) > 1 else _STARTS[:1]
+    found = [_scan_in_turn(cost, ranges, share, hopeless, has_columns) for share in starts]
+    return found[int(np.argmin([each[1] if each is not None else np.inf for each in found]))]
+
+
+def _scan_in_turn(
+    cost: Cost, ranges: Sequence[SearchRange], start: float, hopeless: float, has_columns: bool
+) -> tuple[list[float], float] | None:
+    """The same, with every one at a share ``start`` of its range to begin with."""
+    at, least = [r.within(start) for r in ranges], -np.inf
+    for _ in range(min(len(ranges), 2)):
+        for k in range(len(ranges)):
+            found = _scan_one(cost, at, k, ranges, has_columns)
+            if found is None:
+                return None
+            at[k], least = found
+            if least > hopeless:
+                return at, least
+    return at, least
+
+
+def _scan_one(
+    cost: Cost, at: Sequence[float], k: int, ranges: Sequence[SearchRange], has_columns: bool
+) -> tuple[float, float] | None:
+    """Best value of parameter ``k``, the others held, and its cost; None if it never matters."""
+
+    def cost_of(value: float) -> tuple[float, Array] | None:
+        return cost(np.array([*at[:k], value, *at[k + 1 :]]))
+
+    low, high = ranges[k].low, ranges[k].high
+    count = _GRID if len(ranges) == 1 else _GRID - 2
+    if ranges[k].by_ratio:
+        count = max(count, min(int(np.log(high / low) / np.log(_LARGEST_RATIO)) + 2, 2 * _GRID))
+        grid = list(np.geomspace(low, high, count))
+    else:
+        grid = list(np.linspace(low, high, count))
+    if at[k] not in grid:
+        # Where the others were searched from must not be lost between two points.
+        grid = sorted([*grid, at[k]])
+    known = [cost_of(value) for value in grid]
+    if all(found is None for found in known):
+        return None
+    i = 0
+    while i + 1 < len(grid) and len(grid) < _DENSEST:
+        first, second = known[i], known[i + 1]
+        if has_columns and first and second and _similarity(first[1], second[1]) < _SIMILAR:
+            middle = between(grid[i], grid[i + 1])
+            grid.insert(i + 1, middle)
+            known.insert(i + 1, cost_of(middle))
+        else:
+            i += 1
+    costs = [found[0] if found else np.inf for found in known]
+    j = int(np.argmin(costs))
+    least, best = costs[j], grid[j]
+    ends = [grid[max(j - 1, 0)], grid[min(j + 1, len(grid) - 1)]]
+    for _ in range(_REFINE):
+        for side in (0, 1):
+            middle = between(best, ends[side])
+            found = cost_of(middle)
+            if found is not None and found[0] < least:
+                ends[1 - side], best, least = best, middle, found[0]
+                break
+        else:
+            ends = [between(best, ends[0]), between(best, ends[1])]
+    return float(best), float(least)
+
+
+def _similarity(a: Array, b: Array) -> float:
+    """Cosine between two sets of columns: one where they span the same, zero where nothing."""
+    first, second = np.linalg.qr(a)[0], np.linalg.qr(b)[0]
+    return float(np.linalg.norm(first.T @ second) / np.sqrt(a.shape[1]))

@@ -1,0 +1,288 @@
+"""Scores of candidates: each refitted together with the model's parameters, on trials left out.
+
+For fixed shape parameters an effect adds columns to a linear problem; the sums of products that
+this needs are stored by trial and axis, so that leaving a trial out costs nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.discover.candidates import Candidate
+from bampipe.discover.columns import added_columns
+from bampipe.discover.parameter_scan import scan_parameters
+from bampipe.discover.ranges import MachineScale
+from bampipe.discover.settings import Settings
+from bampipe.estimate.normal_equations import NormalEquations
+from bampipe.trials.folds import Folds
+from bampipe.trials.residuals import Evidence
+
+Array = NDArray[np.float64]
+
+_SHARES = (1.0, 0.9, 0.8, 0.65, 0.5, 0.35, 0.2, 0.1, 0.05)
+"""Shares of the least-squares strength tried where an effect weakens what the force does."""
+_HELD_OUT_WEIGHT = 0.05
+"""Weight that a trial keeps when it is left out to score candidates. Where it alone holds what
+determines a parameter, as one wide motion among narrow ones does, leaving it out altogether would
+compare extrapolations; of what several trials determine it keeps a few hundredths of a degree of
+freedom."""
+_DIVERGED = 1e30
+"""An internal state that is too stiff to be integrated at the sampling rate ends above this."""
+
+
+@dataclass(frozen=True)
+class Score:
+    """How well the model explains the trials with one effect added.
+
+    Attributes:
+        name: the effect.
+        error: root mean square of the residual on trials left out, by axis, (n_q,), N.m or N.
+        values: fitted parameters of the effect, in the order of `Candidate.parameters`.
+        shift: change of the model's own free parameters that goes with it.
+        gain: log likelihood ratio of the measured force on trials left out, by axis, (n_q,), in
+            units of independent samples: positive where the effect helps. An effect that weakens
+            what the force does, such as friction in proportion to it, makes both sides of the
+            equation small, noise included; the slope of the residual by the force takes that off.
+    """
+
+    name: str
+    error: Array
+    values: Array
+    shift: Array
+    gain: Array
+
+    @property
+    def total(self) -> float:
+        """Gain over all axes."""
+        return float(self.gain.sum())
+
+
+@dataclass(frozen=True)
+class _JointProblem:
+    """The linear problem of a model with a candidate of given shape.
+
+    Attributes:
+        sums: its sums of products.
+        added, change: what the candidate adds to the columns and to the residual, by trial,
+            (K, n_q, m) and (K, n_q).
+        columns: what it adds, (n, m), for comparing shapes.
+    """
+
+    sums: NormalEquations
+    added: Sequence[Array]
+    change: Sequence[Array]
+    columns: Array
+
+
+class Scorer:
+    """Scores candidates against one evidence."""
+
+    def __init__(self, evidence: Evidence) -> None:
+        self.evidence = evidence
+        # The trials that a session holds out choose no model.
+        self.folds = evidence.folds.among_fitted()
+
+    def _folds_for(self, item: Candidate) -> Folds:
+        """What brakes do is part of the model with an effect of theirs, and fitted then."""
+        return self.folds.with_all_fitted() if item.system.braked else self.folds
+
+    @cached_property
+    def independent_samples(self) -> Array:
+        """Number of independent samples that count in the error, by axis, (n_q,)."""
+        judged = [k for k, counts in enumerate(self.folds.judged) if counts]
+        count = self.evidence.sums.count[judged].sum(axis=0)
+        return np.asarray(count * self.evidence.band.independent_share)
+
+    @cached_property
+    def machine_scale(self) -> MachineScale:
+        """What sizes the trials have."""
+        return MachineScale.of_trials(self.evidence)
+
+    @cached_property
+    def base_error(self) -> Array:
+        """Error of the model as it is, as that of a `Score`, by axis, (n_q,), N.m or N."""
+        e = self.evidence
+        steps = self.folds.solve(e.sums, e.weight, e.lower, e.upper, _HELD_OUT_WEIGHT)
+        return self.folds.error(e.sums, steps)
+
+    @cached_property
+    def held_out_scale(self) -> Array:
+        """What turns an error of a `Score` into one on the terms of the model's own, by axis.
+
+        Candidates are scored with a little of the trial that is left out, models are judged without
+        it: what the two have in common is the ratio.
+        """
+        return np.asarray(self.evidence.held_out_rmse / np.maximum(self.base_error, 1e-300))
+
+    def _cost_before(self, item: Candidate) -> float:
+        """Cost of the model as it is, fitted to the trials that ``item`` is fitted to."""
+        e, folds = self.evidence, self._folds_for(item)
+        steps = e.sums.subset(folds.fitted_trials).solve(e.weight, e.lower, e.upper)
+        return self._cost(e.sums, steps, folds)
+
+    def _cost(self, sums: NormalEquations, values: Array, folds: Folds) -> float:
+        """Cost of a fit: sum over axes of n log(mean square)."""
+        left = sums.subset(folds.fitted_trials).mean_square(values)
+        return float(np.sum(self.independent_samples * np.log(np.maximum(left, 1e-30))))
+
+    def score(self, item: Candidate) -> Score | None:
+        """Refit with ``item`` added; None where it does nothing in these trials."""
+        effect = item.system.model.effects[-1]
+        ranges = [
+            self.machine_scale.range_of(effect, item.parameters[i]) for i in item.searched_indices
+        ]
+        hopeless = self._cost_before(item) - Settings().worth_searching
+        found = scan_parameters(
+            lambda values: self._fit_cost(item, values),
+            ranges,
+            hopeless,
+            has_columns=bool(item.linear_indices),
+        )
+        if found is None:
+            return None
+        values, cost = found
+        if ranges and cost > hopeless:
+            return self._score_at_zero(item)
+        best = self._score_with(item, np.array(values))
+        # An error of exactly zero, on an axis that nothing drives, is no explanation.
+        return best if best is not None and np.isfinite(best.gain).all() else None
+
+    def score_at(self, item: Candidate, values: Array) -> Score | None:
+        """Refit with ``item`` added, its searched parameters held at those of ``values``."""
+        found = self._score_with(item, values[list(item.searched_indices)])
+        return found if found is not None and np.isfinite(found.gain).all() else None
+
+    def gain_by_sample(self, item: Candidate, score: Score) -> list[Array]:
+        """Gain in log likelihood that each sample contributes, by trial, each (K,).
+
+        That of the fit; zero in trials that the session holds out, for they choose no model.
+        """
+        problem = self._join(item, score.values[list(item.searched_indices)])
+        if problem is None:
+            return [np.zeros(len(r)) for r in self.evidence.residual]
+        values, weight = self._fit(item, problem.sums)
+        e, count = self.evidence, len(self.evidence.free)
+        rows = zip(
+            self.folds.judged, e.residual, e.jacobian, problem.change, problem.added, strict=True
+        )
+        return [
+            0.5
+            * (np.square(r) - np.square(r + moved + x @ values[:count] + new @ values[count:]))
+            @ weight
+            * judged
+            for judged, r, x, moved, new in rows
+        ]
+
+    def _score_at_zero(self, item: Candidate) -> Score:
+        """The score of an effect that these trials do not ask for: strength zero."""
+        values = np.array([0.0 if p.strength else p.prior for p in item.parameters])
+        nothing = np.zeros(len(self.base_error))
+        return Score(item.name, self.base_error, values, nothing[:0], nothing)
+
+    def _join(self, item: Candidate, searched: Array) -> _JointProblem | None:
+        columns, change = added_columns(self.evidence, item, searched)
+        if all(not c.any() for c in columns) and all(not c.any() for c in change):
+            return None
+        if not all((np.abs(c) < _DIVERGED).all() for c in (*columns, *change)):
+            return None
+        e = self.evidence
+        shape = np.concatenate(columns if item.linear_indices else change)
+        flat = shape.reshape(-1, shape.shape[-1]) if item.linear_indices else shape
+        sums = e.sums.bordered(e.jacobian, columns, change, e.residual)
+        return _JointProblem(sums, columns, change, flat)
+
+    def _bounds(self, item: Candidate) -> tuple[Array, Array]:
+        """Bounds of the changes of the base parameters and of the linear strengths."""
+        strengths = [item.parameters[i] for i in item.linear_indices]
+        return (
+            np.append(self.evidence.lower, [q.lower for q in strengths]),
+            np.append(self.evidence.upper, [q.upper for q in strengths]),
+        )
+
+    def _fit_cost(self, item: Candidate, searched: Array) -> tuple[float, Array] | None:
+        """Cost of the joint fit, and the columns."""
+        problem = self._join(item, searched)
+        if problem is None:
+            return None
+        values, _ = self._fit(item, problem.sums)
+        return self._cost(problem.sums, values, self._folds_for(item)), problem.columns
+
+    def _fit(self, item: Candidate, sums: NormalEquations) -> tuple[Array, Array]:
+        """Coefficients of the joint fit, reweighted once by what each axis is left with."""
+        weight, bounds = self.evidence.weight, self._bounds(item)
+        fitted = sums.subset(self._folds_for(item).fitted_trials)
+        for _ in range(2):
+            values = fitted.solve(weight, *bounds)
+            weight = 1.0 / np.maximum(fitted.mean_square(values), 1e-24)
+        return values, weight
+
+    def _score_with(self, item: Candidate, searched: Array) -> Score | None:
+        """The score with given values of the searched parameters."""
+        problem = self._join(item, searched)
+        if problem is None:
+            return None
+        sums = problem.sums
+        solution, weight = self._fit(item, sums)
+        folds, (lower, upper) = self._folds_for(item), self._bounds(item)
+        values = np.array([p.prior for p in item.parameters])
+        values[list(item.searched_indices)] = searched
+        start = len(self.evidence.free)
+        values[list(item.linear_indices)] = solution[start:]
+
+        def error_within(lower: Array, upper: Array) -> Array:
+            steps = folds.solve(sums, weight, lower, upper, _HELD_OUT_WEIGHT)
+            return folds.error(sums, steps)
+
+        if not item.system.driven:
+            error = error_within(lower, upper)
+            gain = self.independent_samples * np.log(self.base_error / error)
+            return Score(item.name, error, values, solution[:start], gain)
+        best = None
+        for share in _SHARES if item.linear_indices else (1.0,):
+            weaker = values.copy()
+            weaker[list(item.linear_indices)] *= share
+            # Equal bounds hold the strengths at this share while the base parameters adapt.
+            low, high = lower.copy(), upper.copy()
+            if item.linear_indices:
+                low[start:] = high[start:] = weaker[list(item.linear_indices)]
+            error = error_within(low, high)
+            gain = np.log(self.base_error / error) + self._sensitivity(item, weaker)
+            if (
+                best is None
+                or self.independent_samples @ gain > self.independent_samples @ best.gain
+            ):
+                fitted = sums.subset(folds.fitted_trials)
+                shift = fitted.solve(weight, low, high)[:start]
+                best = Score(item.name, error, weaker, shift, gain)
+        assert best is not None
+        # Both sides of the equation made small explain nothing, however small the error becomes.
+        if self.independent_samples @ best.gain < Settings().worth_searching:
+            return self._score_at_zero(item)
+        return replace(best, gain=self.independent_samples * best.gain)
+
+    def _sensitivity(self, item: Candidate, values: Array) -> Array:
+        """Mean of log |d residual / d force| with the effect over without it, by axis, (n_q,)."""
+        e, system = self.evidence, item.system
+        p = np.concatenate([e.p[: len(system.parameters) - len(values)], values])
+        total = np.zeros(len(system.coordinates))
+        for motion, used in zip(e.motions, e.used, strict=True):
+            kept = e.band.kept(len(motion.t))
+            u = motion.inputs(system.inputs)
+            z = system.memory(motion.q, motion.qd, motion.qdd, u, p, motion.t)
+            at = motion.q[kept], motion.qd[kept], motion.qdd[kept], z[kept]
+            plain = system.input_map(at[0], u[kept], p)
+            here, slope = system.contribution(*at, u[kept], p), plain.copy()
+            for j, force in enumerate(system.model.device.forces):
+                moved, column = u[kept].copy(), system.inputs.index(force)
+                step = 1e-6 * max(float(np.abs(moved[:, column]).max()), 1e-6)
+                moved[:, column] += step
+                slope[:, :, j] += (system.contribution(*at, moved, p) - here) / step
+            bare = np.linalg.norm(plain, axis=2)
+            share = np.linalg.norm(slope, axis=2) / np.where(bare > 0.0, bare, 1.0)
+            total += np.sum(np.where(bare > 0.0, np.log(np.maximum(share, 1e-3)), 0.0) * used, 0)
+        return np.asarray(total / np.maximum(self.evidence.sums.count.sum(axis=0), 1.0))
