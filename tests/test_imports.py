@@ -42,18 +42,18 @@ LAWS = {
     "estimate": law("numpy scipy numba llvmlite filterpy", "compiled errors model_functions"),
     "discover": law(
         "numpy scipy sklearn joblib threadpoolctl numba",
-        "errors physics estimate results trials workers",
+        "errors lists physics estimate results trials workers",
     ),
     "results": law("pydantic", "errors files schema"),
-    "data": law("numpy scipy pandas pyarrow h5py pydantic", "errors schema files results"),
+    "data": law("numpy scipy pandas pyarrow h5py pydantic", "errors lists schema files results"),
     "trials": law("numpy scipy pandas pyarrow numba", "errors files results physics estimate data"),
-    "setup": law("numpy", "errors results physics estimate trials"),
+    "setup": law("numpy", "errors lists results physics estimate trials"),
     "identification": law(
         "numpy scipy pandas pyarrow numba pydantic",
-        "schema errors results progress physics estimate data trials discover",
+        "schema errors lists results progress physics estimate data trials discover",
     ),
     "next_trial": law(
-        "numpy scipy", "errors results physics estimate trials identification discover"
+        "numpy scipy", "errors lists results physics estimate trials identification discover"
     ),
     "declarations": law("numpy pydantic", "errors files schema stages.base results physics data"),
     "simulator": law(
@@ -71,7 +71,7 @@ LAWS = {
         "identification setup discover next_trial report",
     ),
     "report": law(
-        "numpy matplotlib typst pandas pyarrow bampipe", "declarations errors files results"
+        "numpy matplotlib typst pandas pyarrow bampipe", "declarations errors lists files results"
     ),
     "run": law(
         "pydantic dask distributed filelock fsspec bampipe",

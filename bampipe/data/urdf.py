@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from bampipe.errors import InputError, did_you_mean
 from bampipe.files import read_bytes
+from bampipe.lists import join_names
 
 Array = NDArray[np.float64]
 
@@ -218,7 +219,7 @@ def _chain(
         turn, offset, before, fixed_between = np.eye(3), np.zeros(3), name, False
     notes = []
     if held:
-        notes.append(f"held at zero beside the chain: {_listed(held)}")
+        notes.append(f"held at zero beside the chain: {join_names(held, _MANY)}")
     return Chain(found, limits, base, tip, tuple(notes))
 
 
@@ -341,7 +342,7 @@ def _only_root(bodies: Mapping[str, _Body], above: Mapping[str, _Joint], where: 
     roots = [name for name in bodies if name not in above]
     if len(roots) != 1:
         raise InputError(
-            f"{len(roots)} links have nothing above them: {_listed(roots)}",
+            f"{len(roots)} links have nothing above them: {join_names(roots, _MANY)}",
             where=where,
             remedy="name the one that stands still: base = ...",
         )
@@ -371,7 +372,7 @@ def _only_end(base: str, joints: list[_Joint], above: Mapping[str, _Joint], wher
     if ends:
         others = [above[longest].child, *ends]
         raise InputError(
-            f"the joints branch; chains end at {_listed(others)}",
+            f"the joints branch; chains end at {join_names(others, _MANY)}",
             where=where,
             remedy='choose one: base = "..." and tip = "..." in [robot]',
         )
@@ -397,11 +398,6 @@ def _path(base: str, tip: str, above: Mapping[str, _Joint], where: str) -> list[
         if len(found) > len(above):
             raise InputError(f"the joints above {tip!r} form a loop", where=where)
     return found[::-1]
-
-
-def _listed(names: list[str]) -> str:
-    more = f" and {len(names) - _MANY} more" if len(names) > _MANY else ""
-    return ", ".join(names[:_MANY]) + more
 
 
 def urdf_text(

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from bampipe.discover.description import describe
 from bampipe.discover.findings import AxisFinding, Contender, Diagnosis
 from bampipe.discover.influence import Stretch
+from bampipe.lists import join_names
 from bampipe.results.standing import FLOOR_WRONG, STANDINGS_IN_WORDS
 
 
@@ -24,7 +27,7 @@ def _parts(axis: str, i: int, found: Diagnosis, unit: str) -> list[str]:
             f"{name}: no verdict can be trusted, for its held-out error of {a.rmse_after:.3g} "
             f"{unit} is {STANDINGS_IN_WORDS[a.standing]} ({a.noise_floor:.3g} {unit})."
         ]
-        return parts + ([f"Weighed: {_and(a.effects)}."] if a.effects else [])
+        return parts + ([f"Weighed: {join_names(a.effects)}."] if a.effects else [])
     parts = [f"{name}: {_verdict(a, found, unit)}."]
     parts += _rivals(a, found, unit)
     parts += _transients(i, found)
@@ -61,18 +64,17 @@ def _verdict(a: AxisFinding, found: Diagnosis, unit: str) -> str:
         f"{ratio:.2f} times the noise floor"
     )
     stands = f"held-out error {a.rmse_after:.3g} {unit}, {ratio:.1f} times the noise floor"
-    it = "it" if len(a.effects) == 1 else "them"
     if a.verdict == "missing":
-        return f"{_and(a.effects)} {'is' if it == 'it' else 'are'} missing; adding {it} {falls}"
+        it = "it" if len(a.effects) == 1 else "them"
+        return f"{_missing(a.effects)}; adding {it} {falls}"
     if a.verdict == "undecided" and a.effects:
         sure = [n for n in a.effects if n not in a.odds]
-        also = f"{_and(sure)} {'is' if len(sure) == 1 else 'are'} missing, and " if sure else ""
-        return (
-            f"{also}these trials cannot tell {_odds(a, ' from ')}; adding {_and(a.effects)} {falls}"
-        )
+        also = f"{_missing(sure)}, and " if sure else ""
+        adding = f"adding {join_names(a.effects)} {falls}"
+        return f"{also}these trials cannot tell {_odds(a, ' from ')}; {adding}"
     if a.verdict == "undecided" and a.explained > 0.0:
         return (
-            f"{_and(tuple(a.odds))} would take the held-out error from {a.rmse_before:.3g} to "
+            f"{join_names(a.odds)} would take the held-out error from {a.rmse_before:.3g} to "
             f"{a.rmse_after:.3g} {unit} only, {100 * a.explained:.0f} % of what exceeds the noise "
             "floor in the mean square: likely, but not the effect that is missing"
         )
@@ -81,7 +83,7 @@ def _verdict(a: AxisFinding, found: Diagnosis, unit: str) -> str:
     if a.verdict == "unknown_effect":
         error = a.rmse_before
         near = (
-            f"; {_and(tuple(a.odds))} would take {100 * a.explained:.0f} % of what exceeds the "
+            f"; {join_names(a.odds)} would take {100 * a.explained:.0f} % of what exceeds the "
             f"noise floor in the mean square, and leave {a.rmse_after:.3g} {unit}"
             if a.odds
             else ""
@@ -97,6 +99,10 @@ def _verdict(a: AxisFinding, found: Diagnosis, unit: str) -> str:
     )
 
 
+def _missing(names: Sequence[str]) -> str:
+    return f"{join_names(names)} {'is' if len(names) == 1 else 'are'} missing"
+
+
 def _rivals(a: AxisFinding, found: Diagnosis, unit: str) -> list[str]:
     """The effects that come close to one found on this axis, with what they would leave."""
     said = []
@@ -105,7 +111,7 @@ def _rivals(a: AxisFinding, found: Diagnosis, unit: str) -> list[str]:
         rivals = [c for c in contest[1:] if c.effect not in a.odds]
         if rivals:
             mine = contest[0]
-            listed = _and([f"{c.effect} ({_left(c, unit)})" for c in rivals])
+            listed = join_names(f"{c.effect} ({_left(c, unit)})" for c in rivals)
             said.append(f"Close to {name} ({_left(mine, unit)}) comes {listed}.")
     return said
 
@@ -141,7 +147,3 @@ def _when(second: Stretch) -> str:
 
 def _odds(a: AxisFinding, between: str) -> str:
     return between.join(f"{name} (odds {100 * share:.0f} %)" for name, share in a.odds.items())
-
-
-def _and(names: tuple[str, ...] | list[str]) -> str:
-    return ", ".join(names[:-1]) + " and " + names[-1] if len(names) > 1 else "".join(names)

@@ -49,7 +49,7 @@ _REASONS = {
 
 _NOT_A_SPREAD = (
     "the spread of the parameters is not positive definite any more: priors far too wide, or"
-    " parameters that cannot be told apart"
+    " parameters that cannot be distinguished"
 )
 
 

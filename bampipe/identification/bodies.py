@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from bampipe.estimate.possible_bodies import is_possible, nearest_possible
 from bampipe.identification.least_squares_estimate import UnbiasedFit
+from bampipe.lists import join_names
 from bampipe.physics import System
 from bampipe.physics.base_parameters import base_parameters
 from bampipe.physics.newton_euler import INERTIAL
@@ -56,7 +57,7 @@ def make_possible(system: System, squares: UnbiasedFit) -> tuple[UnbiasedFit, li
         p[free[inside]], squares.problem.lower[inside], squares.problem.upper[inside]
     )
     note = (
-        f"No body has the inertial numbers that fit {_listed(wrong)} best: the nearest possible"
+        f"No body has the inertial numbers that fit {join_names(wrong)} best: the nearest possible"
         " ones are given."
     )
     return replace(squares, p=p), [note]
@@ -141,9 +142,5 @@ def summarise_bases(system: System, found: tuple[BaseEstimate, ...] | None) -> l
         f" show {len(shown)}; of the others the drawing stands."
     ]
     if silent:
-        lines.append(f"Of the bodies of {_listed(silent)} the trials say next to nothing.")
+        lines.append(f"Of the bodies of {join_names(silent)} the trials say next to nothing.")
     return lines
-
-
-def _listed(names: list[str]) -> str:
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"

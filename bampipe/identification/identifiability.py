@@ -18,6 +18,7 @@ from bampipe.estimate.identifiability import (
 )
 from bampipe.estimate.least_squares import Problem, residual_and_slopes
 from bampipe.identification.sensor_noise import Noise
+from bampipe.lists import join_names
 from bampipe.physics import System
 from bampipe.physics.structure import DeterminableNumber, structure
 from bampipe.results.identify import (
@@ -253,14 +254,14 @@ def _number(
 
 def _together(members: Sequence[str], combinations: Sequence[str]) -> str:
     return (
-        f"{_listed(members)} enter the equations only as {_listed(combinations)}: no motion "
+        f"{join_names(members)} enter the equations only as {join_names(combinations)}: no motion "
         "tells the parts apart."
     )
 
 
 def _moving(weak: Weak, names: Sequence[str], value: Array, covariance: Array) -> str:
     """Say which parameters move together, and for a pair how well sum and difference are known."""
-    members = _listed([f"`{names[i]}`" for i in weak.members])
+    members = join_names([f"`{names[i]}`" for i in weak.members])
     pair = list(weak.members)
     start = f"{members} move together here"
     if (
@@ -314,7 +315,7 @@ def _leaning(numbers: Sequence[DeviceNumber]) -> list[str]:
     for number in numbers:
         moved = {name: size for name, size in number.moves_percent.items() if abs(size) >= _MOVES}
         if moved:
-            shown = _listed([f"`{name}` by {size:+.1f} %" for name, size in moved.items()])
+            shown = join_names([f"`{name}` by {size:+.1f} %" for name, size in moved.items()])
             sentences.append(f"An error of 1 % in {number.name} would move {shown}.")
         if number.partner is not None and abs(number.correlation) > _CLOSE:
             sentences.append(
@@ -322,7 +323,3 @@ def _leaning(numbers: Sequence[DeviceNumber]) -> list[str]:
                 f"together (correlation {number.correlation:+.2f})."
             )
     return sentences
-
-
-def _listed(items: Sequence[str]) -> str:
-    return items[0] if len(items) == 1 else f"{', '.join(items[:-1])} and {items[-1]}"

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from dataclasses import dataclass
 
-from bampipe.results.next import Detectable, ExpectedConfusion, Proposal, Purpose
+from bampipe.lists import join_names
+from bampipe.results.next import Detectable, Proposal, Purpose
 
 _SHOWN = 3
 """Parameters or effects that a sentence names."""
@@ -12,67 +14,91 @@ _SURE = 0.01
 """Chance below which its exact size means nothing."""
 
 
-def say_why(
-    purpose: Purpose, parameter: str, best: Proposal, table: Mapping[str, Detectable]
-) -> str:
-    """Say why a trial is proposed."""
-    if purpose == "decision":
-        pair = _hardest(best)
-        return (
-            f"These trials do not tell {pair.between[0]} from {pair.between[1]}: the chance of"
-            f" confusing them is {_chance(pair.before)}."
-        )
-    if purpose == "sensitivity":
-        hidden, never = _hidden(table), _never(table)
-        if hidden:
-            why = f"These trials would not have shown {_listed(hidden, table)}."
-        else:
-            every = "every other effect" if never else "every effect"
-            why = f"These trials would have shown {every} of the library at its typical size."
-        if never:
-            one = "one effect stays" if len(never) == 1 else f"{len(never)} effects stay"
-            why += f" In trials like these {one} out of sight at any size ({_some(never)})."
-        return why
-    if parameter:
-        return f"Of the motions tried, this one says most of `{parameter}`."
-    return "Of the motions tried, this one adds most to what is known of all parameters together."
+@dataclass(frozen=True)
+class Reasons:
+    """Why a trial is proposed, and what it is expected to give, a sentence or two each."""
+
+    why: str
+    expected: str
 
 
-def say_expected(
+def explain_proposal(
     purpose: Purpose, parameter: str, best: Proposal, table: Mapping[str, Detectable]
-) -> str:
-    """Say what a trial is expected to give."""
+) -> Reasons:
+    """Say why a trial is proposed and what it is expected to give.
+
+    Args:
+        purpose: of the trial; parameter: the one that it is for, "" for all.
+        best: the proposal; table: by effect, from which size on trials show it.
+    """
     if purpose == "decision":
-        pair = _hardest(best)
-        return (
-            f"The chance of confusing them is expected to fall from {_chance(pair.before)} to"
-            f" {_chance(pair.after)}."
-        )
+        return _decision(best)
     if purpose == "sensitivity":
-        shown = [
-            f"{name} from {entry.with_proposal:.2g} {entry.unit} on".replace("  ", " ")
-            for name, entry in table.items()
-            if name in _hidden(table)
-            and entry.with_proposal is not None
-            and (entry.smallest is None or entry.with_proposal < 0.8 * entry.smallest)
-        ]
-        if shown:
-            return f"It would show {_joined(shown[:_SHOWN])} with 90 % probability."
-    falls = {name: sd.after / sd.before for name, sd in best.sd.items() if sd.before > 0.0}
-    names = [parameter] if parameter else sorted(falls, key=lambda name: falls[name])[:_SHOWN]
-    return (
-        "Expected: "
-        + "; ".join(
-            f"`{name}` from ± {best.sd[name].before:.2g} to ± {best.sd[name].after:.2g}"
-            f" {best.sd[name].unit}".rstrip()
-            for name in names
-        )
-        + "."
+        return Reasons(_unseen(table), _detected(table) or _narrowed(parameter, best))
+    most = (
+        f"says most of `{parameter}`"
+        if parameter
+        else "adds most to what is known of all parameters together"
+    )
+    return Reasons(f"Of the motions tried, this one {most}.", _narrowed(parameter, best))
+
+
+def _decision(best: Proposal) -> Reasons:
+    pair = max(best.confusion, key=lambda pair: pair.weight * pair.before)
+    before, after = _chance(pair.before), _chance(pair.after)
+    return Reasons(
+        f"These trials do not distinguish {pair.between[0]} from {pair.between[1]}: the chance of"
+        f" confusing them is {before}.",
+        f"The chance of confusing them is expected to fall from {before} to {after}.",
     )
 
 
-def _hardest(best: Proposal) -> ExpectedConfusion:
-    return max(best.confusion, key=lambda pair: pair.weight * pair.before)
+def _unseen(table: Mapping[str, Detectable]) -> str:
+    """Which effects the trials at hand would not have shown."""
+    hidden, never = _hidden(table), _never(table)
+    if hidden:
+        sizes = [_size(name, table[name]) for name in hidden]
+        why = f"These trials would not have shown {join_names(sizes, _SHOWN)}."
+    else:
+        every = "every other effect" if never else "every effect"
+        why = f"These trials would have shown {every} of the library at its typical size."
+    if never:
+        one = "one effect stays" if len(never) == 1 else f"{len(never)} effects stay"
+        names = join_names(never, _SHOWN)
+        why += f" In trials like these {one} out of sight at any size ({names})."
+    return why
+
+
+def _size(name: str, entry: Detectable) -> str:
+    """An effect, and the size at which trials do not show it."""
+    if entry.smallest is None:
+        return f"{name} at any size"
+    return f"{name} below {entry.smallest:.2g} {entry.unit}".rstrip()
+
+
+def _detected(table: Mapping[str, Detectable]) -> str:
+    """Which of those effects the proposed trial would show; "" where it shows none."""
+    hidden = _hidden(table)
+    shown = [
+        f"{name} from {entry.with_proposal:.2g} {entry.unit} on".replace("  ", " ")
+        for name, entry in table.items()
+        if name in hidden
+        and entry.with_proposal is not None
+        and (entry.smallest is None or entry.with_proposal < 0.8 * entry.smallest)
+    ]
+    return f"It would show {join_names(shown[:_SHOWN])} with 90 % probability." if shown else ""
+
+
+def _narrowed(parameter: str, best: Proposal) -> str:
+    """By how much the uncertainty of parameters falls."""
+    falls = {name: sd.after / sd.before for name, sd in best.sd.items() if sd.before > 0.0}
+    names = [parameter] if parameter else sorted(falls, key=lambda name: falls[name])[:_SHOWN]
+    parts = [
+        f"`{name}` from ± {best.sd[name].before:.2g} to ± {best.sd[name].after:.2g}"
+        f" {best.sd[name].unit}".rstrip()
+        for name in names
+    ]
+    return f"Expected: {'; '.join(parts)}."
 
 
 def _chance(value: float) -> str:
@@ -96,22 +122,3 @@ def _never(table: Mapping[str, Detectable]) -> list[str]:
         for name, entry in table.items()
         if entry.smallest is None and entry.with_proposal is None
     ]
-
-
-def _listed(names: list[str], table: Mapping[str, Detectable]) -> str:
-    parts = []
-    for name in names[:_SHOWN]:
-        entry = table[name]
-        size = "at any size" if entry.smallest is None else f"below {entry.smallest:.2g}"
-        parts.append(f"{name} {size} {entry.unit if entry.smallest else ''}".rstrip())
-    return _some(parts, len(names) - len(parts))
-
-
-def _some(names: Sequence[str], more: int = 0) -> str:
-    more += max(len(names) - _SHOWN, 0)
-    shown = list(names[:_SHOWN])
-    return f"{', '.join(shown)} and {more} more" if more else _joined(shown)
-
-
-def _joined(parts: Sequence[str]) -> str:
-    return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 
+from bampipe.lists import join_names
 from bampipe.next_trial.primitives import GENTLE, PEAK, Envelope, Primitive, Stroke
 from bampipe.physics.device import Device
 
@@ -27,19 +27,20 @@ def describe(design: Primitive, seen: Envelope, device: Device) -> str:
         text = f"Move {names[0]} {pace} back and forth {ends[0]}, {times[0]}"
     elif len(set(times)) == 1:
         each = ", ".join(f"{name} {end}" for name, end in zip(names, ends, strict=True))
-        text = f"Move {_joined(names)} {pace} back and forth at once, {each}, {times[0]}"
+        text = f"Move {join_names(names)} {pace} back and forth at once, {each}, {times[0]}"
     else:
         each = ", ".join(
             f"{name} {end}, {time}" for name, end, time in zip(names, ends, times, strict=True)
         )
-        text = f"Move {_joined(names)} back and forth at once, {each}"
+        text = f"Move {join_names(names)} back and forth at once, {each}"
     text += f", for {design.seconds:.3g} s"
     if beside:
-        about = _joined([_about(design.strokes[i], axes[i].unit) for i in beside])
-        text += f"; meanwhile keep {_joined([axes[i].name for i in beside])} moving gently, {about}"
+        about = join_names(_about(design.strokes[i], axes[i].unit) for i in beside)
+        others = join_names(axes[i].name for i in beside)
+        text += f"; meanwhile keep {others} moving gently, {about}"
     still = [i for i in range(len(axes)) if i not in design.strokes]
     if still:
-        text += f"; leave {_joined([axes[i].name for i in still])} alone"
+        text += f"; leave {join_names(axes[i].name for i in still)} alone"
     if design.field:
         share = "half as strong as" if design.field < 1.0 else "as"
         text += f"; with the brakes on, {share} in the viscous trials"
@@ -89,7 +90,3 @@ def _times(stroke: Stroke) -> str:
     if stroke.rest_s:
         text += f", with a rest of {stroke.rest_s:.2g} s at each end"
     return text
-
-
-def _joined(parts: Sequence[str]) -> str:
-    return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"

@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 
+from bampipe.lists import join_names
 from bampipe.report import style, wording
 from bampipe.report.build import Report
 from bampipe.report.document import Block, Callout, Document, Figure, Paragraph, Section, Table
@@ -53,7 +54,7 @@ def _dated(trends: TrendsResult) -> list[SessionVerdict]:
 def _subtitle(trends: TrendsResult) -> str:
     devices = sorted({one.device for one in trends.sessions})
     parts = [wording.count(len(trends.sessions), "session")]
-    parts.append(f"device{'s' if len(devices) > 1 else ''} {wording.listing(devices)}")
+    parts.append(f"device{'s' if len(devices) > 1 else ''} {join_names(devices)}")
     days = sorted({one.recorded[:10] for one in _dated(trends)})
     if days:
         parts.append(days[0] if len(days) == 1 else f"recorded {days[0]} to {days[-1]}")

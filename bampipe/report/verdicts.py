@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 
+from bampipe.lists import join_names
 from bampipe.report import wording
 from bampipe.report.document import Callout
 from bampipe.report.results import Results
@@ -67,8 +68,8 @@ def _explained(results: Results, validated: ValidateResult | None) -> Callout:
     if validated is not None and (wrong := _wrong_floors(results, validated)):
         return Callout(
             "attention",
-            f"No verdict on {wording.listing(wrong)}: the noise floor is wrong",
-            f"The held-out error is {wording.listing(f'{a}: {w}' for a, w in wrong.items())}. "
+            f"No verdict on {join_names(wrong)}: the noise floor is wrong",
+            f"The held-out error is {join_names(f'{a}: {w}' for a, w in wrong.items())}. "
             "Look at the noise and resolution of the sensors, under Data.",
         )
     diagnosis = results.read(DiagnoseResult)
@@ -99,7 +100,7 @@ def _explained(results: Results, validated: ValidateResult | None) -> Callout:
         )
     return Callout(
         "attention",
-        f"The model leaves something unexplained on {wording.listing(high)}",
+        f"The model leaves something unexplained on {join_names(high)}",
         f"On trials that the parameters never saw, the error is {_ratios(high)}. "
         f"`bampipe diagnose {results.root.name}` says which effect is missing.",
     )
@@ -116,7 +117,7 @@ def _wrong_floors(results: Results, validated: ValidateResult) -> dict[str, str]
 
 def _ratios(ratios: dict[str, float]) -> str:
     parts = (f"{axis} {wording.plain(ratio, 2)} ×" for axis, ratio in ratios.items())
-    return f"{wording.listing(parts)} the noise floor"
+    return f"{join_names(parts)} the noise floor"
 
 
 def _diagnosed(results: Results, diagnosis: DiagnoseResult) -> Callout:
@@ -126,25 +127,25 @@ def _diagnosed(results: Results, diagnosis: DiagnoseResult) -> Callout:
         verdict: [axis for axis in found if found[axis] == verdict] for verdict in VERDICTS_IN_WORDS
     }
     effects = results.effects(results.model)
-    with_effects = f" with {wording.listing(f'`{name}`' for name in effects)}" if effects else ""
+    with_effects = f" with {join_names(f'`{name}`' for name in effects)}" if effects else ""
     sentence = wording.sentence(diagnosis.sentence)
     if by_verdict["missing"]:
-        what = wording.listing(f"`{name}`" for name in diagnosis.selected) or "an effect"
-        where = wording.listing(by_verdict["missing"])
+        what = join_names(f"`{name}`" for name in diagnosis.selected) or "an effect"
+        where = join_names(by_verdict["missing"])
         return Callout("attention", f"The model{with_effects} lacks {what} ({where})", sentence)
     if by_verdict["unknown_effect"]:
-        where = wording.listing(by_verdict["unknown_effect"])
+        where = join_names(by_verdict["unknown_effect"])
         return Callout(
             "unknown",
             f"Something that no known effect explains acts on {where}",
             sentence,
         )
     if by_verdict["undecided"]:
-        where = wording.listing(by_verdict["undecided"])
+        where = join_names(by_verdict["undecided"])
         wrong = [axis for axis in found if axes[axis].standing in FLOOR_WRONG]
         title = f"Undecided on {where}: the error is above its floor, and no effect is sure"
         if wrong:
-            title = f"No verdict on {wording.listing(wrong)}: the noise floor is wrong"
+            title = f"No verdict on {join_names(wrong)}: the noise floor is wrong"
         return Callout("attention", title, sentence)
     title = f"The model{with_effects} explains this session: nothing is missing"
     return Callout("good", title, sentence)

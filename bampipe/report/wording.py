@@ -114,14 +114,6 @@ def words(name: str) -> str:
     return name.replace("_", " ")
 
 
-def listing(items: Iterable[str]) -> str:
-    """Return ``a, b and c``."""
-    found = list(items)
-    if len(found) < 2:
-        return "".join(found)
-    return f"{', '.join(found[:-1])} and {found[-1]}"
-
-
 def count(number: int, noun: str) -> str:
     """Return ``1 trial``, ``2 trials``."""
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"

@@ -54,5 +54,5 @@ def compare_forecast(
         if len(found) == 1 and not alike & set(pair.between):
             said.append(f"{forecast_text}; it is {next(iter(found))}.")
         else:
-            said.append(f"{forecast_text}; they are still not told apart.")
+            said.append(f"{forecast_text}; the trials still do not distinguish them.")
     return tuple(said)

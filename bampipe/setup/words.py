@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
+from bampipe.lists import join_names
 from bampipe.physics import System
 from bampipe.results.ingest import IngestResult
 from bampipe.setup.candidates import FACTORS, Candidate
@@ -18,7 +18,7 @@ def describe_candidate(candidate: Candidate, session: IngestResult) -> str:
     if candidate.kind == "zero":
         return _zero(candidate, session)
     if candidate.kind == "exchange":
-        return f"{listing(candidate.signals)} are exchanged: exchange their columns"
+        return f"{join_names(candidate.signals)} are exchanged: exchange their columns"
     return _sign(candidate, session) if candidate.kind == "sign" else _scale(candidate, session)
 
 
@@ -53,20 +53,15 @@ def number(value: float) -> str:
     return f"{value:.0f}" if 1000.0 <= abs(value) < 1e6 else f"{value:.3g}"
 
 
-def listing(names: Sequence[str]) -> str:
-    """Names as a sentence has them."""
-    return " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
-
-
 def _sign(candidate: Candidate, session: IngestResult) -> str:
     names = candidate.signals
     if len(names) > 1:
         if names[0] in session.force.columns:
             return (
-                f"{listing(names)} all have the wrong sign, as forces on the hand taken for those"
-                f" of the hand have: negate {_force_entry(session)}"
+                f"{join_names(names)} all have the wrong sign, as forces on the hand taken for"
+                f" those of the hand have: negate {_force_entry(session)}"
             )
-        return f"{listing(names)} have the wrong sign: negate their columns"
+        return f"{join_names(names)} have the wrong sign: negate their columns"
     name = names[0]
     if name in session.axes:
         counts = session.axes[name].counts_per_unit
@@ -87,7 +82,7 @@ def describe_size(candidate: Candidate) -> str:
     if factor > 1.0:
         off = f"{number(factor)} times too little"
     verb = "read" if len(candidate.signals) > 1 else "reads"
-    return f"{listing(candidate.signals)} {verb} about {off}"
+    return f"{join_names(candidate.signals)} {verb} about {off}"
 
 
 def _scale(candidate: Candidate, session: IngestResult) -> str:

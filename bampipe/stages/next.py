@@ -28,7 +28,7 @@ from bampipe.next_trial.questions import (
     find_blindness,
     make_contest,
 )
-from bampipe.next_trial.reasons import say_expected, say_why
+from bampipe.next_trial.reasons import explain_proposal
 from bampipe.physics import compile_model
 from bampipe.progress import Progress
 from bampipe.results.diagnose import DiagnoseResult
@@ -172,14 +172,15 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
             if entry.after > goal.sd[precision.names.index(name)]:
                 tried += rank(_worth("precision", name, forecast, None), False, 0.92)[:1]
         plan = record_plan(forecast, goal, plan_trials(forecast, tried, goal))
+    reasons = explain_proposal(chosen, parameter, best, table)
     result = NextResult(
         model=config.model,
         purpose=chosen,
         parameter=parameter,
         trials=tuple(dict.fromkeys(trial_of_block(m.trial_id) for m in trials.motions)),
         sentence=best.sentence,
-        why=say_why(chosen, parameter, best, table),
-        expected=say_expected(chosen, parameter, best, table),
+        why=reasons.why,
+        expected=reasons.expected,
         proposals=proposals,
         sensitivity=table,
         plan=plan,

@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from bampipe.lists import join_names
 from bampipe.report import wording
 
 
@@ -76,8 +77,8 @@ def test_scale(values: list[float], base: str, shown: tuple[float, str]) -> None
 def test_names_in_words() -> None:
     assert wording.parameter("viscous.yaw") == "Viscous damping, yaw"
     assert wording.parameter("gravity_compensator_lag.time") == "Gravity compensator lag, time"
-    assert wording.listing(["a", "b", "c"]) == "a, b and c"
-    assert wording.listing(["a"]) == "a"
+    assert join_names(["a", "b", "c"]) == "a, b and c"
+    assert join_names(["a"]) == "a"
     assert wording.count(1, "trial") == "1 trial"
     assert wording.count(2, "trial") == "2 trials"
     assert wording.sentence("fell by 0.2 N.m. Done") == "fell by 0.2 N·m. Done"

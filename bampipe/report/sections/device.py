@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
+from bampipe.lists import join_names
 from bampipe.report import wording
 from bampipe.report.document import Block, Paragraph, Section, Table
 from bampipe.report.results import Results
@@ -22,8 +23,8 @@ def section(results: Results) -> Section | None:
     if known and known.numbers:
         blocks.append(_numbers(known.numbers))
     for group in together:
-        members = wording.listing(f"`{name}`" for name in group.members)
-        sums = wording.listing(f"`{name}`" for name in group.combinations)
+        members = join_names(f"`{name}`" for name in group.members)
+        sums = join_names(f"`{name}`" for name in group.combinations)
         blocks.append(
             Paragraph(
                 f"{members} enter the equations only as {sums}. No motion, however rich, tells the "

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 
+from bampipe.lists import join_names
 from bampipe.report import style, wording
 from bampipe.report.document import (
     Block,
@@ -86,7 +87,7 @@ def _found(results: Results, term: ModelTerm) -> str:
 
 
 def _variables(curves: Sequence[TermCurve]) -> str:
-    return wording.listing(dict.fromkeys(curve.variable for curve in curves))
+    return join_names(dict.fromkeys(curve.variable for curve in curves))
 
 
 def _curves(name: str, curves: Sequence[TermCurve], caption: str) -> Figure:
@@ -141,7 +142,7 @@ def _pictures(results: Results, term: ModelTerm, name: str) -> list[Figure]:
     others = term.curves[1:]
     pictures = [Figure(f"effect-{name}", whole, style.svg(figure))]
     if others:
-        axes = wording.listing(curve.axis for curve in others)
+        axes = join_names(curve.axis for curve in others)
         more = f"What `{term.name}` contributes on {axes}, as above."
         pictures.append(_curves(f"effect-{name}-more", others, more))
     return pictures
@@ -172,7 +173,7 @@ def _window(results: Results, term: ModelTerm) -> _Window | None:
     before, after = (_stretch(results, model, window) for model in (rung.parent, rung.model))
     if before is None or after is None:
         return None
-    added = wording.listing(f"`{name}`" for name in _names(rung.added))
+    added = join_names(f"`{name}`" for name in _names(rung.added))
     return _Window(window, added, before, after)
 
 
@@ -244,7 +245,7 @@ def _rivals(results: Results, effect: str) -> str:
         ]
         sure = "" if diagnosis.groups.get(effect) else " It fits better beyond chance."
         return (
-            f"In its place {wording.listing(shown)} on held-out trials of {own.axis}, against "
+            f"In its place {join_names(shown)} on held-out trials of {own.axis}, against "
             f"{wording.significant(own.held_out_rmse)} {unit}.{sure}"
         )
     return "It was not found by a diagnosis of this run: none has weighed it against others."

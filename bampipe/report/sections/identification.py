@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from bampipe.lists import join_names
 from bampipe.report import style, verdicts, wording
 from bampipe.report.document import Block, Bullets, Figure, Paragraph, Section, Table
 from bampipe.report.results import Results
@@ -99,7 +100,7 @@ def _parameters(results: Results, identified: IdentifyResult) -> Table:
     if bounded:
         note += " Bound: the least SD that these sensors allow on these trials (Cramér-Rao)."
     if others:
-        tried = wording.listing(METHODS_IN_WORDS[method] for method in others)
+        tried = join_names(METHODS_IN_WORDS[method] for method in others)
         note += f" For comparison, {tried}."
     if any(parameters[name].at_bound for name in names):
         note += " * At the limit of its range: the data ask for a value beyond it."

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from bampipe.lists import join_names
 from bampipe.report import style, verdicts, wording
 from bampipe.report.document import Block, Bullets, Figure, Section, Table
 from bampipe.report.results import Results
@@ -164,9 +165,7 @@ def _caption(rungs: Sequence[Rung], axes: Sequence[str]) -> str:
             verb = "falls" if change <= -1.0 else "rises" if change >= 1.0 else ""
             size = wording.plain(abs(change), 0)
             parts.append(f"{axis} {verb} by {size} %" if verb else f"{axis} stays as it is")
-    return (
-        f"Error on held-out trials by version, against the noise floor: {wording.listing(parts)}."
-    )
+    return f"Error on held-out trials by version, against the noise floor: {join_names(parts)}."
 
 
 def _values(found: Iterable[float | None]) -> np.ndarray:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from bampipe.lists import join_names
 from bampipe.report import verdicts, wording
 from bampipe.report.document import Block, Paragraph, Section, Table
 from bampipe.report.results import Results
@@ -45,16 +46,14 @@ def _done(results: Results) -> str:
         if (used["kind"] == kind).any()
     ]
     seconds = float(used["duration_s"].sum())
-    parts = [
-        f"{wording.listing(kinds) or 'No trial'} ({wording.plain(seconds, 0)} s) could be used"
-    ]
+    parts = [f"{join_names(kinds) or 'No trial'} ({wording.plain(seconds, 0)} s) could be used"]
     aside = len(trials) - len(used)
     parts[0] += f"; {wording.count(aside, 'trial')} set aside." if aside else "."
     identified = results.read(IdentifyResult)
     if identified is not None:
         names = len(identified.parameters)
         effects = results.effects(results.model)
-        added = f", with {wording.listing(f'`{name}`' for name in effects)}" if effects else ""
+        added = f", with {join_names(f'`{name}`' for name in effects)}" if effects else ""
         parts.append(
             f"{wording.count(names, 'parameter')} of model `{results.model}`{added} were identified"
             f" by {METHODS_IN_WORDS[identified.method]}."

@@ -6,6 +6,7 @@ import json
 import math
 from typing import Any
 
+from bampipe.lists import join_names
 from bampipe.report import verdicts, wording
 from bampipe.report.document import Block, Paragraph, Section, Table
 from bampipe.report.results import Results
@@ -38,7 +39,7 @@ def section(results: Results) -> Section:
 def _sampling(session: IngestResult) -> str:
     text = f"Sampled at {wording.plain(session.sample_rate_hz, 0)} Hz."
     if session.force.noise_sd:
-        each = wording.listing(
+        each = join_names(
             f"{name} {wording.significant(sd, 2)}" for name, sd in session.force.noise_sd.items()
         )
         text += f" Noise of a sample: {each} {wording.unit(session.force.unit)}."

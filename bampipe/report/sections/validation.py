@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from bampipe.lists import join_names
 from bampipe.report import style, verdicts, wording
 from bampipe.report.document import Block, Bullets, Figure, Paragraph, Section, Table
 from bampipe.report.results import Results
@@ -59,7 +60,7 @@ def _by_axis(results: Results, validated: ValidateResult) -> Table:
                 wording.unit(entry.unit),
             )
         )
-    each = wording.listing(
+    each = join_names(
         f"{axis} at {wording.significant(hz, 2)} Hz" for axis, hz in validated.cutoff_hz.items()
     )
     return Table(
@@ -107,7 +108,7 @@ def _at_the_handle(validated: ValidateResult, pusher: str) -> str:
         for name, entry in validated.forces.items()
     )
     place = "At the handle" if pusher == "hand" else f"Of the {pusher}"
-    return f"{place} the error is {wording.listing(shown)} (RMSE)."
+    return f"{place} the error is {join_names(shown)} (RMSE)."
 
 
 def _drift(results: Results, drift: Mapping[str, AxisDrift]) -> list[Block]:

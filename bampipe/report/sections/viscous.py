@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 import pandas as pd
 
+from bampipe.lists import join_names
 from bampipe.report import style, wording
 from bampipe.report.document import Block, Figure, Paragraph, Section, Table
 from bampipe.report.results import Results
@@ -45,11 +46,11 @@ def _words(directions: Mapping[str, Damping]) -> str:
     parts = []
     if right:
         parts.append(
-            f"Along {wording.listing(right)} what the brakes rendered does not differ from the "
+            f"Along {join_names(right)} what the brakes rendered does not differ from the "
             "command by more than chance."
         )
     if wrong:
-        parts.append(f"Along {wording.listing(wrong)} it does differ (p < 0.05).")
+        parts.append(f"Along {join_names(wrong)} it does differ (p < 0.05).")
     if any(directions[name].felt_differs for name in tested):
         parts.append(
             "A hand feels more: the device's own viscous friction comes on top of the field."
