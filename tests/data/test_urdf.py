@@ -96,7 +96,7 @@ def test_joints_beside_the_chain_are_held_and_named(tmp_path: Path) -> None:
     [
         (
             (*ARM, link("left"), joint("other", "upper", "left")),
-            "the joints branch; chains end at lower, left",
+            "the joints branch; chains end at lower and left",
             'choose one: base = "..." and tip = "..." in [robot]',
         ),
         (
