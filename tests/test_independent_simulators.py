@@ -6,6 +6,7 @@ import independent
 import numpy as np
 import pandas as pd
 import pytest
+from independent import arm
 from independent.sensors import HARD, Conditions
 
 from bampipe.physics import Model, registry
@@ -70,3 +71,26 @@ def test_conditions_change_the_recording_and_not_the_machine(tmp_path, day):
     hard = independent.record("joint", tmp_path / "hard", 7, conditions=HARD[day])
     assert content(tmp_path / "bare") != content(tmp_path / "hard")
     assert truth["parameters"] == hard["parameters"]
+
+
+@pytest.mark.parametrize("kinds", ["ZYYX", "ZZzZ", "zYXYZ", "ZYZYZYZ"])
+def test_the_arm_carries_what_pinocchio_says(kinds):
+    pin = pytest.importorskip("pinocchio")
+    specimen = arm.build(kinds, 8)
+    model = pin.buildModelFromXML(arm.urdf(specimen))
+    q, qd, qdd = np.random.default_rng(0).normal(size=(3, 6, len(kinds)))
+    data = model.createData()
+    expected = [pin.rnea(model, data, *sample) for sample in zip(q, qd, qdd, strict=True)]
+    np.testing.assert_allclose(specimen.rigid(q, qd, qdd), expected, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("effect", arm.EFFECTS)
+def test_every_effect_of_the_arm_changes_its_log(tmp_path, effect):
+    target = "shoulder-elbow" if effect == "friction_of_sum" else "shoulder"
+    for name, effects in (("bare", {}), ("hidden", {f"{effect}:{target}": 1.0})):
+        arm.record_logs(tmp_path / name, 8, "ZYY", effects, trials=1, seconds=4.0)
+    bare, hidden = (pd.read_csv(tmp_path / name / "log_01.csv") for name in ("bare", "hidden"))
+    assert np.isfinite(hidden.to_numpy()).all()
+    positions = [column for column in bare if not column.startswith("tau")]
+    pd.testing.assert_frame_equal(bare[positions], hidden[positions])
+    assert not np.allclose(bare["tau_2 [Nm]"], hidden["tau_2 [Nm]"])

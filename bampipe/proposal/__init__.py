@@ -19,13 +19,13 @@ from bampipe.proposal.device import (
     ChosenDevice,
     find_device,
     new_device,
-    robot_columns,
+    with_motors,
 )
 from bampipe.proposal.encoders import encoders_table
 from bampipe.proposal.inputs import input_tables
 from bampipe.proposal.matching import Matcher
 from bampipe.proposal.notes import Notes, quoted
-from bampipe.proposal.robot import check_against_drawing
+from bampipe.proposal.robot import LEAST_AT_JOINT, RobotColumns, find_robot_columns
 from bampipe.proposal.trials import trials_tables
 
 SESSION = "session.toml"
@@ -74,16 +74,13 @@ def propose(folder: Path, device: str = "") -> Proposal:
     if chosen is None:
         chosen = new_device(folder, match, notes)
     elif chosen.device.robot is not None:
-        match.joints = robot_columns(chosen.device, found)
-        _check_robot(chosen, notes)
+        columns = find_robot_columns(chosen.device, chosen.device.robot, found, clock.t, notes)
+        chosen = _with_guessed_motors(folder, chosen, columns)
+        match.joints = columns.columns
+        match.turned = columns.turned
+        _check_robot(chosen, columns, notes)
     encoders, axes = encoders_table(chosen.device, match, notes)
     inputs = input_tables(chosen, axes, match, notes)
-    if chosen.device.robot is not None:
-        joints = zip(chosen.device.coordinates, chosen.device.forces, strict=False)
-        drives = {c.name: match.joints[f] for c, f in joints if f in match.joints}
-        notes.check += check_against_drawing(
-            chosen.device, chosen.device.robot, axes, drives, match.t
-        )
     lines = [
         *_head(folder, chosen.name, clock.rate),
         *clock.lines,
@@ -113,19 +110,36 @@ def _head(folder: Path, device: str, rate: str) -> list[str]:
     ]
 
 
-def _check_robot(chosen: ChosenDevice, notes: Notes) -> None:
+def _with_guessed_motors(folder: Path, chosen: ChosenDevice, columns: RobotColumns) -> ChosenDevice:
+    """A new device file with the torque constants or reductions that the drawing suggests."""
+    sizes = [abs(drive.share) for drive in columns.drives.values()]
+    if not chosen.text or not all(drive.is_sure for drive in columns.drives.values()) or not sizes:
+        return chosen
+    joints = [c.name for c in chosen.device.coordinates]
+    if chosen.device.force_unit == "A":
+        constants = {j: (1.0, 1.0 / size) for j, size in zip(joints, sizes, strict=True)}
+        return with_motors(folder, chosen, constants)
+    if all(size < LEAST_AT_JOINT for size in sizes):
+        gears = {j: (1.0 / size, None) for j, size in zip(joints, sizes, strict=True)}
+        return with_motors(folder, chosen, gears)
+    return chosen
+
+
+def _check_robot(chosen: ChosenDevice, columns: RobotColumns, notes: Notes) -> None:
     """What a look at the columns does not show of a robot."""
     robot = chosen.device.robot
     assert robot is not None
-    notes.check.append(
-        f"positions and torques are those of the joints, {', '.join(j.name for j in robot.joints)}:"
-        " if they are of motors, give [robot.motors] and the reductions"
-    )
-    if chosen.device.force_unit == "A":
+    if not columns.drives:
+        joints = ", ".join(j.name for j in robot.joints)
         notes.check.append(
-            f"{chosen.name}: torque_constant 1.0 is not yours yet: all forces and inertias scale"
-            " with it"
+            f"positions and torques are those of the joints, {joints}: if they are of motors, give"
+            " [robot.motors] and the reductions"
         )
+        if chosen.device.force_unit == "A" and chosen.text:
+            notes.check.append(
+                f"{chosen.name}: torque_constant 1.0 is not yours yet: all forces and inertias"
+                " scale with it"
+            )
     notes.check += [f"no body has this: {line}" for line in robot.impossible]
 
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import re
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -71,41 +70,38 @@ def _robot(folder: Path, found: Survey) -> ChosenDevice | None:
     urdfs = sorted(folder.glob("*.urdf"))
     if len(urdfs) != 1:
         return None
-    text = f'schema = "bampipe.device/1"\nname = "{urdfs[0].stem}"\n\n'
-    text += f'[robot]\nurdf = "{urdfs[0].name}"\n'
-    device = _complete(folder, text)
-    drives = [c for c in found.of("force") if not c.is_constant]
-    if not drives and found.of("current"):
-        text += "".join(
-            f"\n[robot.motors.{c.name}]\nturns = {{ {c.name} = 1.0 }}\ntorque_constant = 1.0\n"
-            for c in device.coordinates
-        )
-        device = _complete(folder, text)
-    return ChosenDevice(DEVICE, device, text, robot_columns(device, found))
+    text = (
+        f'schema = "bampipe.device/1"\nname = "{urdfs[0].stem}"\n\n'
+        f'[robot]\nurdf = "{urdfs[0].name}"\n'
+    )
+    chosen = ChosenDevice(DEVICE, _complete(folder, text), text)
+    by_torque = any(not c.is_constant for c in found.of("force"))
+    if by_torque or not found.of("current"):
+        return chosen
+    return with_motors(folder, chosen, {c.name: (1.0, 1.0) for c in chosen.device.coordinates})
+
+
+def with_motors(
+    folder: Path, chosen: ChosenDevice, motors: Mapping[str, tuple[float, float | None]]
+) -> ChosenDevice:
+    """A new device file of a robot with a table for each motor.
+
+    Args:
+        folder: of the logs; chosen: the robot.
+        motors: by joint, turns for one of the joint and, where currents are logged, N.m/A.
+    """
+    text = chosen.text.partition("\n[robot.motors")[0]
+    for joint, (turns, constant) in motors.items():
+        text += f"\n[robot.motors.{joint}]\nturns = {{ {joint} = {turns:.3g} }}"
+        text += "" if turns == 1.0 else "  # guess: by the drawn bodies; put in that of the gear"
+        if constant is not None:
+            text += f"\ntorque_constant = {constant:.3g}  # guess: N.m/A, gears included"
+        text += "\n"
+    return replace(chosen, text=text, device=_complete(folder, text))
 
 
 def _complete(folder: Path, text: str) -> Device:
     return registry.device_from(complete_device(tomllib.loads(text), folder, DEVICE), DEVICE)
-
-
-def robot_columns(device: Device, found: Survey) -> dict[str, SurveyedColumn]:
-    """Columns of positions and drives that come in the order of a robot's joints.
-
-    A group of as many columns as there are joints, whose names differ by a number only; of several
-    such groups of a kind, the first.
-    """
-    joints = [c.name for c in device.coordinates]
-    columns: dict[str, SurveyedColumn] = {}
-    for roles, names in ((("position",), joints), (("force", "current"), list(device.forces))):
-        groups: dict[str, list[SurveyedColumn]] = {}
-        for column in found.of(*roles):
-            groups.setdefault(re.sub(r"\d+", "#", column.name), []).append(column)
-        for group in groups.values():
-            if len(group) == len(names):
-                ordered = sorted(group, key=lambda c: [int(n) for n in re.findall(r"\d+", c.name)])
-                columns |= dict(zip(names, ordered, strict=True))
-                break
-    return columns
 
 
 def _device_file(folder: Path, wanted: str) -> ChosenDevice:

@@ -102,14 +102,18 @@ def _channels_table(
             lines.append(f"{name} = {entry(UNKNOWN, si)}{note}")
             continue
         match.used.add(column.name)
-        lines.append(f"{name} = {_channel(name, si, column, why, notes)}")
+        turned = name in match.turned
+        lines.append(f"{name} = {_channel(name, si, column, why, turned, notes)}")
     return [*lines, ""]
 
 
-def _channel(name: str, si: str, column: SurveyedColumn, why: str, notes: Notes) -> str:
+def _channel(
+    name: str, si: str, column: SurveyedColumn, why: str, turned: bool, notes: Notes
+) -> str:
     """Column and unit of one input; its register or its scale, where the unit does not do."""
     bits = guesses.signed_register(column.values)
     register = f", wrap_bits = {bits}, signed = true" if bits else ""
+    register += ", scale = -1.0" if turned else ""
     known = column.conversion
     if known is not None and known.si == si:
         table = entry(column.name, bare(column.unit), register)

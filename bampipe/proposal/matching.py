@@ -30,24 +30,28 @@ class Matcher:
         found: the columns.
         t: (T,) time stamps of the first log, s.
         used: names of the columns that have a meaning already; grows as tables are proposed.
-        joints: columns that belong to a robot's joints and drives by their order.
+        joints: columns of a robot's joints and drives, by name of joint or input; of what stands
+            there no other column is thought.
+        turned: inputs that are logged with the other sign.
     """
 
     found: Survey
     t: np.ndarray
     used: set[str]
     joints: Mapping[str, SurveyedColumn] = field(default_factory=dict)
+    turned: frozenset[str] = frozenset()
 
     def named(self, name: str, *roles: str) -> SurveyedColumn | None:
         """The column that has the words of ``name``, of one of the roles."""
+        if name in self.joints:
+            return self.joints[name]
         wanted, numbers = set(words(name)), set(_numbers(name))
         for column in self.found.of(*roles):
             counted = set(_numbers(column.name))
             alike = wanted <= set(words(column.name)) and (numbers <= counted or not counted)
             if column.name == name or alike:
                 return column
-        ordered = self.joints.get(name)
-        return ordered if ordered is not None and ordered.role in roles else None
+        return None
 
     def position(self, axis: str, axes: int) -> tuple[SurveyedColumn | None, list[str]]:
         """The measured position of an axis; and all that it was chosen from, if several.
@@ -92,6 +96,8 @@ class Matcher:
 
     def _input(self, name: str, si: str, axes: tuple[SurveyedColumn, ...]) -> Match:
         role = _INPUT_ROLE.get(si, "")
+        if name in self.joints:
+            return self.joints[name], ""
         free = [c for c in self.found.columns if c.name not in self.used]
         exact = next((c for c in free if c.name == name), None)
         named = exact or self.named(name, role) or self.named(name.removeprefix("force_"), role)

@@ -1,120 +1,272 @@
-"""Whether the columns of a robot's log agree with its drawing: sign and size of the drives."""
+"""The columns of a robot's log held against its drawing: order, units, signs and sizes."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import savgol_filter
 
-from bampipe.data.survey import SurveyedColumn
+from bampipe.data.survey import Survey, SurveyedColumn
 from bampipe.physics.device import Device
 from bampipe.physics.newton_euler import Algebra, joint_forces
 from bampipe.physics.robot import Robot, gravity_vector
+from bampipe.proposal.joints import Group, pair_joints
+from bampipe.proposal.notes import Notes
 from bampipe.proposal.positions import position_in_si, scale_to
 
 Array = NDArray[np.float64]
 
 _SMOOTHED_S = 0.1
 """Stretch of a record over which a parabola gives velocity and acceleration."""
+_MOST_ROWS = 4000
 _SURE = 5.0
 """Standard errors from which on the sign of a drive is known."""
-_ALIKE = 3.0
-"""Ratio of drive and drawing up to which they are taken to be of the same side."""
+LEAST_AT_JOINT = 1.0 / 3.0
+"""Share of what the drawing requires below which a torque is that of a motor."""
 _BEYOND = 1.5
 """Times its range that a joint must travel for the position to be another's."""
+_BETTER = 0.5
+"""Of what one order of the joints leaves unexplained: another one must leave less."""
+_OTHER_UNITS = {"rad": ("deg", np.pi / 180.0), "m": ("mm", 1e-3)}
 
 
-def check_against_drawing(
-    device: Device,
-    robot: Robot,
-    positions: Mapping[str, SurveyedColumn],
-    drives: Mapping[str, SurveyedColumn],
-    t: Array,
-) -> list[str]:
-    """Return what weight and inertia of the drawn bodies say of the columns, a sentence each.
+@dataclass(frozen=True)
+class Drive:
+    """How the drive of a joint goes with what its motion requires by the drawing.
 
-    The drive of each joint is regressed on what its motion requires by the drawing, friction and
-    an offset. A share near one is right; a negative one is a sign the wrong way round.
+    Attributes:
+        share: of the drive, for one of what is required; 1 where both are of the joint.
+        error: its standard error by the scatter alone; the drawing has another.
+        left: part of the drive's variance that drawing, drive's inertia and friction leave.
+    """
+
+    share: float
+    error: float
+    left: float
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether the sign is known."""
+        return abs(self.share) > _SURE * self.error
+
+
+@dataclass(frozen=True)
+class RobotColumns:
+    """What a robot's log was found to hold.
+
+    Attributes:
+        columns: by name of joint or input.
+        drives: by name of input, where drawing and log can be compared.
+    """
+
+    columns: Mapping[str, SurveyedColumn]
+    drives: Mapping[str, Drive]
+
+    @property
+    def turned(self) -> frozenset[str]:
+        """Inputs that are surely logged with the other sign."""
+        return frozenset(n for n, drive in self.drives.items() if drive.is_sure and drive.share < 0)
+
+
+def find_robot_columns(
+    device: Device, robot: Robot, found: Survey, t: Array, notes: Notes
+) -> RobotColumns:
+    """Pair columns with joints and drives, and hold them against the drawing.
 
     Args:
-        device, robot: the robot; positions: column of each joint's position; drives: of what
-            drives it. Joints without either are left out.
-        t: (T,) time, s.
+        device, robot: the robot; found: the log; t: (T,) time, s.
+        notes: what is guessed is noted, and how sure it is.
     """
-    joints = [c.name for c in device.coordinates]
-    if set(positions) != set(joints):
-        return []
-    q = np.column_stack([position_in_si(positions[c.name], t, c.unit) for c in device.coordinates])
-    if not np.isfinite(q).all() or len(q) < 50:
-        return []
-    beyond = _beyond_range(device, q)
+    pairing = pair_joints(device, found)
+    positions = next(iter(pairing.positions), None)
+    drives = next(iter(pairing.drives), None)
+    for what, chosen, others in (
+        ("positions", positions, pairing.positions[1:]),
+        ("drives", drives, pairing.drives[1:]),
+    ):
+        if chosen is not None and others:
+            listed = "; ".join(str(other) for other in others)
+            notes.check.append(f"of several {what}, {chosen} are taken, not {listed}")
+    columns: dict[str, SurveyedColumn] = {}
+    if positions is not None:
+        other_unit = _in_unit_of_range(device, positions)
+        if other_unit is not None and drives is not None:
+            judged = _judge(device, robot, other_unit, drives, t)
+            positions = other_unit if judged and _left(judged) < _BETTER else positions
+        columns |= dict(zip(_joints(device), positions.columns, strict=True))
+    if drives is not None:
+        columns |= dict(zip(device.forces, drives.columns, strict=True))
+    if positions is None or drives is None:
+        return RobotColumns(columns, {})
+    beyond = _beyond_range(device, positions)
     if beyond:
-        return beyond
+        notes.check += beyond
+        return RobotColumns(columns, {})
+    judged = _judge(device, robot, positions, drives, t)
+    if not judged:
+        return RobotColumns(columns, {})
+    if not (positions.named or drives.named):
+        other = _in_alphabetical_order(device, positions), _in_alphabetical_order(device, drives)
+        turned = _judge(device, robot, *other, t)
+        if turned and _left(turned) < _BETTER * _left(judged):
+            judged = turned
+            columns |= dict(zip(_joints(device), other[0].columns, strict=True))
+            columns |= dict(zip(device.forces, other[1].columns, strict=True))
+            notes.check.append(
+                "columns stand in the alphabetical order of the joints' names, since weight and"
+                f" inertia as drawn explain {1.0 - _left(turned):.0%} of the drives that way,"
+                f" {max(1.0 - _left(judged), 0.0):.0%} in the order of the chain"
+            )
+    by_input = dict(zip(device.forces, judged, strict=True))
+    notes.check += _sentences(device, columns, by_input)
+    return RobotColumns(columns, by_input)
+
+
+def _joints(device: Device) -> list[str]:
+    return [c.name for c in device.coordinates]
+
+
+def _in_alphabetical_order(device: Device, group: Group) -> Group:
+    """Columns as ROS publishes joints: the first column is the first name of the alphabet."""
+    names = _joints(device)
+    order = [sorted(names).index(name) for name in names]
+    return replace(group, columns=tuple(group.columns[k] for k in order))
+
+
+def _in_unit_of_range(device: Device, group: Group) -> Group | None:
+    """The positions in degrees or millimetres where they state no unit and only these fit."""
+    found = []
+    for c, column in zip(device.coordinates, group.columns, strict=True):
+        name, scale = _OTHER_UNITS[c.unit]
+        most = _BEYOND * _range(device, c.name)
+        span = float(np.ptp(np.nan_to_num(column.values)))
+        if column.unit or span <= most or span * scale > most:
+            found.append(column)
+        else:
+            found.append(replace(column, unit=name))
+    # One controller gives all angles alike: what is so for one is so for all.
+    angles = {c.unit for c in device.coordinates}
+    for si in angles:
+        name, _ = _OTHER_UNITS[si]
+        own = [k for k, c in enumerate(device.coordinates) if c.unit == si]
+        if any(found[k].unit == name and not group.columns[k].unit for k in own):
+            for k in own:
+                found[k] = replace(found[k], unit=found[k].unit or name)
+    changed = any(new is not old for new, old in zip(found, group.columns, strict=True))
+    return replace(group, columns=tuple(found)) if changed else None
+
+
+def _range(device: Device, joint: str) -> float:
+    low, high = device.limits.get(joint, (-np.inf, np.inf))
+    return high - low
+
+
+def _beyond_range(device: Device, positions: Group) -> list[str]:
+    found = []
+    for c, column in zip(device.coordinates, positions.columns, strict=True):
+        span = float(np.ptp(np.nan_to_num(column.values))) * scale_to(c.unit, column)
+        width = _range(device, c.name)
+        if span > _BEYOND * width:
+            found.append(
+                f"{column.name} travels {span:.3g} {c.unit}, and the range of {c.name} is"
+                f" {width:.3g}: a position of the motor, which turns {span / width:.3g} times for"
+                " one of the joint or more? give counts_per_unit, and [robot.motors]"
+            )
+    return found
+
+
+def _judge(device: Device, robot: Robot, positions: Group, drives: Group, t: Array) -> list[Drive]:
+    """How each drive goes with the drawing; none where drives are not one a joint."""
+    turned = [list(motor.turns) for motor in robot.motors.values()]
+    names = _joints(device)
+    if turned and turned != [[name] for name in names]:
+        return []
+    ratio = np.array([abs(m.turns[n]) for m, n in zip(robot.motors.values(), names, strict=False)])
+    ratio = ratio if turned else np.ones(len(names))
+    # An angle that wraps is followed by what is measured already: nothing else of it is used.
+    q = np.column_stack(
+        [
+            position_in_si(column, t, c.unit)
+            for c, column in zip(device.coordinates, positions.columns, strict=True)
+        ]
+    )
     step = float(np.median(np.diff(t)))
-    window = max(5, 2 * round(0.5 * _SMOOTHED_S / step) + 1)
-    if not step > 0.0 or window >= len(q):
+    window = max(5, 2 * round(0.5 * _SMOOTHED_S / step) + 1) if step > 0.0 else len(q)
+    if not np.isfinite(q).all() or window >= len(q):
         return []
     smooth = [savgol_filter(q, window, 2, deriv=k, delta=step, axis=0) for k in range(3)]
-    rows = slice(None, None, max(1, len(q) // 4000))
+    rows = slice(None, None, max(1, len(q) // _MOST_ROWS))
     position, rate, change = (list(part[rows].T) for part in smooth)
     bodies = [list(joint.inertial) for joint in robot.joints]
     forces = joint_forces(
         Algebra.numbers(), robot.links, bodies, position, rate, change, gravity_vector(robot)
     )
     found = []
-    for k, joint in enumerate(joints):
-        if joint in drives:
-            required = np.broadcast_to(forces[k], rate[k].shape)
-            values = np.nan_to_num(drives[joint].values)[rows] * scale_to(
-                device.force_unit, drives[joint]
-            )
-            share = _share(required, rate[k], change[k], values)
-            found += _sentence(joint, drives[joint].name, *share)
+    for k, column in enumerate(drives.columns):
+        required = np.broadcast_to(forces[k], rate[k].shape) / ratio[k]
+        values = np.nan_to_num(column.values)[rows] * scale_to(device.force_unit, column)
+        found.append(_compare(required, rate[k], change[k], values))
     return found
 
 
-def _beyond_range(device: Device, q: Array) -> list[str]:
-    found = []
-    for k, c in enumerate(device.coordinates):
-        low, high = device.limits.get(c.name, (-np.inf, np.inf))
-        if np.ptp(q[:, k]) > _BEYOND * (high - low):
-            found.append(
-                f"{c.name} travels {np.ptp(q[:, k]):.3g} {c.unit}, and its range is"
-                f" {high - low:.3g}: a position of the motor? give counts_per_unit, its turns for"
-                " one of the joint"
-            )
-    return found
-
-
-def _share(required: Array, rate: Array, change: Array, drive: Array) -> tuple[float, float]:
-    """How much of the drive goes with one of what is required, and its standard error.
-
-    The inertia of the drive itself, of which a drawing says nothing, takes part.
-    """
+def _compare(required: Array, rate: Array, change: Array, drive: Array) -> Drive:
+    """Regress a drive on what the drawing requires, its own inertia, friction and an offset."""
     sign = np.tanh(rate / max(0.02 * float(np.abs(rate).max()), 1e-9))
     columns = np.column_stack([required, change, rate, sign, np.ones_like(rate)])
     size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
     values, _, rank, _ = np.linalg.lstsq(columns / size, drive, rcond=1e-9)
+    rest = drive - columns / size @ values
+    left = float(np.var(rest) / max(np.var(drive), 1e-300))
     if rank < columns.shape[1]:
-        return 0.0, np.inf
-    left = drive - columns / size @ values
+        return Drive(0.0, np.inf, left)
     inverse = np.linalg.inv((columns / size).T @ (columns / size))
     # Neighbouring samples err alike: about one in ten counts.
-    error = np.sqrt(10.0 * np.mean(left**2) * inverse[0, 0])
-    return float(values[0] / size[0]), float(error / size[0])
+    error = np.sqrt(10.0 * np.mean(rest**2) * inverse[0, 0])
+    return Drive(float(values[0] / size[0]), float(error / size[0]), left)
 
 
-def _sentence(joint: str, column: str, share: float, error: float) -> list[str]:
-    if not abs(share) > _SURE * error:
-        return [f"{column}: too little weight and inertia act on {joint} to tell its sign"]
-    shown = f"{share:.2g} ± {error:.1g} times what the drawing requires"
-    if share < 0.0:
-        return [f"{column} is {shown}: turn its sign, or that of {joint}"]
-    if not 1.0 / _ALIKE < share < _ALIKE:
-        return [
-            f"{column} is {shown}: another unit, or the torque of a motor with a reduction of about"
-            f" {1.0 / share:.3g}"
-        ]
-    return []
+def _left(drives: Sequence[Drive]) -> float:
+    return float(np.mean([drive.left for drive in drives]))
+
+
+def _sentences(
+    device: Device, columns: Mapping[str, SurveyedColumn], drives: Mapping[str, Drive]
+) -> list[str]:
+    """What weight and inertia of the drawn bodies say of the drives, a sentence each."""
+    lines, agreed = [], []
+    for c, (name, drive) in zip(device.coordinates, drives.items(), strict=True):
+        column = columns[name].name
+        if not drive.is_sure:
+            lines.append(
+                f"{column}: too little weight and inertia act on {c.name} to tell its sign"
+            )
+            continue
+        size = f"{drive.share:.2g} ± {drive.error:.1g}"
+        shown = f"{column} is {size} times what the drawing requires"
+        if drive.share < 0.0:
+            lines.append(f"{shown}: its sign is turned; or that of {c.name} is the wrong one")
+        elif device.force_unit == "A":
+            agreed.append(f"{c.name} {1.0 / drive.share:.3g} N.m/A")
+        elif not LEAST_AT_JOINT < drive.share < 1.0 / LEAST_AT_JOINT:
+            lines.append(
+                f"{shown}: another unit, or the torque of a motor with a reduction of about"
+                f" {1.0 / drive.share:.3g}"
+            )
+        else:
+            agreed.append(f"{c.name} {drive.share:.2f}")
+    if agreed and device.force_unit == "A":
+        lines.append(
+            f"torque constants by weight and inertia as drawn, and no better than these:"
+            f" {', '.join(agreed)}; put in those of the data sheet, gears included"
+        )
+    elif agreed:
+        lines.append(
+            f"signs and sizes of the drives agree with weight and inertia as drawn (1 is perfect):"
+            f" {', '.join(agreed)}"
+        )
+    explained = max(0.0, 1.0 - _left(list(drives.values())))
+    lines.append(f"drawing, drives' inertia and friction explain {explained:.1%} of the drives")
+    return lines

@@ -3,7 +3,8 @@
 Equations of motion, integrators, friction, sensors and session files are written here from the
 physics, with numpy, numba and scipy alone, so that benchmarks and tests hold the product against
 something that cannot share its mistakes. ``record(machine, folder, seed, effects, conditions)``
-writes one session folder and, beside it, ``<folder>.truth.json``.
+writes one session folder and, beside it, ``<folder>.truth.json``. `independent.arm` writes
+what a lab has of a robot before it knows bampipe: a URDF and logs.
 """
 
 from __future__ import annotations

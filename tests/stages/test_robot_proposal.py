@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from independent import arm
 
 from bampipe.data.device_file import read_device_file
 from bampipe.data.session import read_session
@@ -78,6 +79,7 @@ def test_joints_are_paired_with_columns_in_their_order(tmp_path: Path) -> None:
         "torque_elbow": "tau2",
     }
     assert about(proposal, "tau1") == about(proposal, "tau2") == []
+    assert any("agree with weight and inertia" in line for line in proposal.check)
     assert proposal.fill_in == []
 
 
@@ -85,11 +87,62 @@ def test_signs_and_reductions_are_tested_against_weight_and_inertia(tmp_path: Pa
     write_log(tmp_path, gains=(-1.0, 0.01))
     proposal = proposed(tmp_path)
     (sign,), (size,) = about(proposal, "tau1"), about(proposal, "tau2")
-    assert "turn its sign, or that of shoulder" in sign
+    assert "its sign is turned; or that of shoulder is the wrong one" in sign
     assert "the torque of a motor with a reduction of about" in size
     assert float(size.rpartition(" ")[2]) == pytest.approx(100.0, rel=0.1)
 
 
 def test_a_position_beyond_the_range_is_that_of_a_motor(tmp_path: Path) -> None:
     write_log(tmp_path, swing=8.0)
-    assert any("a position of the motor?" in line for line in proposed(tmp_path).check)
+    assert any("a position of the motor," in line for line in proposed(tmp_path).check)
+
+
+NAMES = ("base_yaw", "shoulder", "elbow", "forearm", "wrist_pitch", "wrist_yaw", "flange")
+
+
+def paired(folder: Path) -> tuple[dict[str, str], dict[str, str], Proposal]:
+    """Columns of positions and of drives by joint, as proposed for a log of the simulator."""
+    proposal = proposed(folder)
+    session = read_session(folder)
+    drives = {c.name.partition("_")[2]: c.column for c in session.channels}
+    return {e.axis: e.column for e in session.encoders}, drives, proposal
+
+
+def test_columns_with_the_names_of_joints_go_to_these_joints(tmp_path: Path) -> None:
+    # Speeds of the joints differ little: what follows the motion of one fits others, too.
+    arm.record_logs(tmp_path / "log", 3, "ZYZYZYZ", style="joint_states", turned=["elbow"])
+    positions, drives, proposal = paired(tmp_path / "log")
+    assert positions == {name: f"/joint_states/{name}/position" for name in NAMES}
+    assert drives == {name: f"/joint_states/{name}/effort" for name in NAMES}
+    turned = {c.name for c in read_session(tmp_path / "log").channels if c.scale < 0.0}
+    assert turned == {"torque_elbow"}
+    assert proposal.fill_in == []
+
+
+def test_numbers_without_names_may_count_joints_in_alphabetical_order(tmp_path: Path) -> None:
+    arm.record_logs(tmp_path / "log", 4, "ZYYX", style="indexed")
+    positions, drives, proposal = paired(tmp_path / "log")
+    order = {name: place for place, name in enumerate(sorted(NAMES[:4]))}
+    assert positions == {name: f"position[{place}]" for name, place in order.items()}
+    assert drives == {name: f"effort[{place}]" for name, place in order.items()}
+    assert any("alphabetical order" in line for line in proposal.check)
+
+
+def test_degrees_and_millimetres_of_numbered_joints(tmp_path: Path) -> None:
+    arm.record_logs(tmp_path / "log", 5, "ZYyX", style="numbered", turned=["shoulder"])
+    positions, drives, _ = paired(tmp_path / "log")
+    units = ("deg", "deg", "mm", "deg")
+    assert list(positions.values()) == [f"q_{k} [{u}]" for k, u in enumerate(units, 1)]
+    units = ("Nm", "Nm", "N", "Nm")
+    assert list(drives.values()) == [f"tau_{k} [{u}]" for k, u in enumerate(units, 1)]
+
+
+def test_torque_constants_are_proposed_by_the_drawing(tmp_path: Path) -> None:
+    truth = arm.record_logs(tmp_path / "log", 6, "ZYYX", style="controller", drawing_error=0.02)
+    positions, drives, _ = paired(tmp_path / "log")
+    assert list(positions.values()) == [f"actual_q_{k}" for k in range(4)]
+    assert list(drives.values()) == [f"actual_current_{k}" for k in range(4)]
+    device = registry.device_from(read_device_file(tmp_path / "log/device.toml"))
+    assert device.robot is not None
+    constants = [motor.torque_constant for motor in device.robot.motors.values()]
+    np.testing.assert_allclose(constants, truth["constants"], rtol=0.1)
