@@ -37,11 +37,11 @@ def describe(evidence: Evidence, axis: int) -> str:
         if vibration is not None and vibration.share > max(most.share, _LIMITS.variable_share):
             return (
                 f"a vibration of {vibration.amplitude:.2g} {unit} at {vibration.frequency:.3g} Hz "
-                "in time, whatever the arm does"
+                "in time, whatever the machine does"
             )
     if most.share < _LIMITS.variable_share:
         return (
-            "scattered over all motions; it follows nothing that the arm does "
+            "scattered over all motions; it follows nothing that the machine does "
             f"({most.variable} carries {100 * most.share:.0f} %)"
         )
     carries = f"{most.variable} carries {100 * most.share:.0f} % of the residual's variance"
@@ -72,10 +72,8 @@ def _bumps(most: Map, torque_unit: str) -> str:
     if len(places) == 2:
         form = "opposite bumps of" if narrow else "a change of sign,"
     inside = most.center[strong]
-    return (
-        f"{form} {' and '.join(words for _, words in places)} (between {inside.min():.3g} and "
-        f"{inside.max():.3g} {most.unit})"
-    )
+    between = f"{inside.min():.3g} and {inside.max():.3g} {most.unit}".strip()
+    return f"{form} {' and '.join(words for _, words in places)} (between {between})"
 
 
 def _ripple(evidence: Evidence, axis: int, variable: Variable) -> _Sine | None:

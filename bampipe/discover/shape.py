@@ -93,7 +93,8 @@ def variables(evidence: Evidence, axis: int) -> tuple[Variable, ...]:
                 put(f"{other.name} position", other.unit, motion.q[kept, k])
                 put(f"{other.name} velocity", f"{other.unit}/s", motion.qd[kept, k])
         for k, name in enumerate(system.memory_names):
-            put(name, "", memory[kept, k])
+            effect, _, state = name.rpartition(".")
+            put(f"{state} of {effect}", "", memory[kept, k])
         put("time", "s", motion.t[kept])
         put("trial", "", np.full(len(kept), float(index)))
     return tuple(Variable(name, u, tuple(v)) for name, (u, v) in columns.items())
@@ -191,6 +192,6 @@ def worst_windows(evidence: Evidence, count: int = 10, width_s: float = 0.5) -> 
 def _doing(motion: Motion, rows: NDArray[np.int64], axis: int, unit: str) -> str:
     q, qd = motion.q[rows, axis], motion.qd[rows, axis]
     moved = "reversing" if np.any(qd > 0) and np.any(qd < 0) else (
-        "moving up" if qd.mean() > 0 else "moving down"
+        "moving forwards" if qd.mean() > 0 else "moving backwards"
     )  # fmt: skip
     return f"{moved} near {q.mean():.2f} {unit} at up to {np.abs(qd).max():.2f} {unit}/s"

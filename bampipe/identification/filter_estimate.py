@@ -294,6 +294,7 @@ def _repeat_until_settled(
     model is nonlinear, that leaves its mark on the answer. A start this wide of an answer adds a
     hundredth to what is known of it.
     """
+    first = found.passes
     for _ in range(_REPEATS):
         finer = settings.longest_step < found.settings.longest_step
         value, slope = model.to_physical(found.theta)
@@ -305,7 +306,8 @@ def _repeat_until_settled(
         if again.log_likelihood < found.log_likelihood and not finer:
             break
         stays = np.all(np.abs(again.theta - found.theta) < sd)
-        found = replace(again, restarts=found.restarts, repeats=found.repeats + 1)
+        repeats = found.repeats + 1
+        found = replace(again, restarts=found.restarts, repeats=repeats, first=first)
         if stays:
             break
     return found

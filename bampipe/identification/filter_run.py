@@ -87,6 +87,7 @@ class FilterRun:
         order: indices of ``trials`` in the session.
         restarts: attempts that failed before.
         repeats: how often it was begun again around its own answer.
+        first: passes before that, of the run from the real start; empty where there is one run.
     """
 
     search: FilterOutcome
@@ -97,16 +98,17 @@ class FilterRun:
     order: tuple[int, ...]
     restarts: int
     repeats: int = 0
+    first: tuple[Stored, ...] = ()
 
     @property
     def passes(self) -> tuple[Stored, ...]:
-        """All passes over trials, the search first."""
-        return (*self.search.trials, *self.trials)
+        """All passes over trials of the first run and of the last, the search of each first."""
+        return (*self.first, *self.search.trials, *self.trials)
 
     @property
     def steps(self) -> tuple[int, ...]:
         """Places in the session of the trials of `passes`."""
-        return (0, *self.order)
+        return (0, *self.order) * (2 if self.first else 1)
 
     @property
     def log_likelihood(self) -> float:

@@ -45,7 +45,10 @@ def state_3sigma(system: System, trials: Sequence[Stored]) -> dict[str, StateBou
 def convergence(
     names: Sequence[str], model: FilterModel, found: FilterRun, covariance: Array
 ) -> Convergence:
-    """Say from when on every estimate stays within 2 % or 3 sd of its final value."""
+    """Say from when on every estimate stays within 2 % or 3 sd of its final value.
+
+    Time counts from the real start. Whether they have converged is asked of the last run.
+    """
     nx = model.n_states
     value, slope = model.to_physical(np.concatenate([p.mean[:, nx:] for p in found.passes]))
     elapsed = np.concatenate(_elapsed(found.passes))
@@ -57,7 +60,9 @@ def convergence(
         late = np.flatnonzero(outside[:, place])
         settled[name] = float(elapsed[late[-1]]) if late.size else 0.0
     total = float(elapsed[-1])
-    converged = max(settled.values(), default=0.0) < 0.9 * total
+    began = float(elapsed[sum(p.t.size for p in found.first) - 1]) if found.first else 0.0
+    late_s = max(settled.values(), default=0.0) - began
+    converged = late_s < 0.9 * (total - began)
     return Convergence(settled_s=settled, total_s=total, converged=converged)
 
 
@@ -145,20 +150,25 @@ def tabulate_trace(
 ) -> pd.DataFrame:
     """Return how the parameters converged, trial by trial, the search first.
 
+    The column ``run`` is 0 from the real start on, 1 in the last run around the answer.
+
     Args:
         names: of the filter's parameters, of which the first ``len(names)`` are stored.
         model: the filter's; motions: the trials; rows: most rows a trial.
         found: the passes.
     """
     frames = []
-    for step, trial, elapsed in zip(found.steps, found.passes, _elapsed(found.passes), strict=True):
+    passes = zip(found.steps, found.passes, _elapsed(found.passes), strict=True)
+    for place, (step, trial, elapsed) in enumerate(passes):
         keep = _thinned(trial.t.size, rows)
         value, slope = model.to_physical(trial.mean[keep, model.n_states :])
         value = np.clip(value, model.lower, model.upper)
         variance = np.diagonal(trial.covariance[keep], axis1=1, axis2=2)[:, model.n_states :]
-        frame = pd.DataFrame({"t_total": elapsed[keep], "trial_id": motions[step].trial_id})
-        for place, name in enumerate(names):
-            frame[name] = value[:, place]
-            frame[f"{name}_sd"] = slope[:, place] * np.sqrt(variance[:, place])
+        run = int(bool(found.first) and place >= len(found.first))
+        columns = {"t_total": elapsed[keep], "trial_id": motions[step].trial_id, "run": run}
+        frame = pd.DataFrame(columns)
+        for k, name in enumerate(names):
+            frame[name] = value[:, k]
+            frame[f"{name}_sd"] = slope[:, k] * np.sqrt(variance[:, k])
         frames.append(frame)
     return pd.concat(frames, ignore_index=True)

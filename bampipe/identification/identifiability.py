@@ -90,6 +90,9 @@ def assess_identifiability(
         for w in weak_directions(own)
         if set(w.members) & set(own_words) and not set(w.members) & drawn
     ]
+    groups = [set(group.members) for group in known.together]
+    separable = [i for i in own_words if not any(names[i] in group for group in groups)]
+    parted = [w for w in weak if not any({names[i] for i in w.members} <= g for g in groups)]
     growth = growth_without([part[:n, :n] for part in joint])[:, estimated]
     numbers = tuple(
         _number(number, total, n, n + j, names, value, estimated)
@@ -121,8 +124,8 @@ def assess_identifiability(
         trials=trials,
         sentences=(
             *(_together(group.members, group.combinations) for group in known.together),
-            *(_moving(w, names, value, covariance) for w in weak),
-            *_unsaid([names[i] for i in own_words], sd[own_words], assumed[own_words]),
+            *(_moving(w, names, value, covariance) for w in parted),
+            *_unsaid([names[i] for i in separable], sd[separable], assumed[separable]),
             *_limits([names[i] for i in estimated], at_bound),
             *_idle(trials),
             *_leaning(numbers),
@@ -254,14 +257,14 @@ def _number(
 
 def _together(members: Sequence[str], combinations: Sequence[str]) -> str:
     return (
-        f"{join_names(members)} enter the equations only as {join_names(combinations)}: no motion "
-        "tells the parts apart."
+        f"{join_names(_quoted(members))} enter the equations only as "
+        f"{join_names(_quoted(combinations))}: no motion tells the parts apart."
     )
 
 
 def _moving(weak: Weak, names: Sequence[str], value: Array, covariance: Array) -> str:
     """Say which parameters move together, and for a pair how well sum and difference are known."""
-    members = join_names([f"`{names[i]}`" for i in weak.members])
+    members = join_names(_quoted([names[i] for i in weak.members]))
     pair = list(weak.members)
     start = f"{members} move together here"
     if (
@@ -316,10 +319,14 @@ def _leaning(numbers: Sequence[DeviceNumber]) -> list[str]:
         moved = {name: size for name, size in number.moves_percent.items() if abs(size) >= _MOVES}
         if moved:
             shown = join_names([f"`{name}` by {size:+.1f} %" for name, size in moved.items()])
-            sentences.append(f"An error of 1 % in {number.name} would move {shown}.")
+            sentences.append(f"An error of 1 % in `{number.name}` would move {shown}.")
         if number.partner is not None and abs(number.correlation) > _CLOSE:
             sentences.append(
-                f"Were {number.name} estimated too, it and `{number.partner}` would move "
+                f"Were `{number.name}` estimated too, it and `{number.partner}` would move "
                 f"together (correlation {number.correlation:+.2f})."
             )
     return sentences
+
+
+def _quoted(names: Sequence[str]) -> list[str]:
+    return [f"`{name}`" for name in names]

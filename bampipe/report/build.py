@@ -7,7 +7,7 @@ import importlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from bampipe.report import page, style, typeset, wording
+from bampipe.report import page, style, typeset
 from bampipe.report.document import Block, Callout, Document, Figure, Section
 from bampipe.report.explorer.page import explorer_page
 from bampipe.report.results import Results
@@ -98,7 +98,7 @@ def _setup(results: Results) -> tuple[Block, ...]:
         text += " Nothing below counts before the session file is corrected."
         blocks.append(Callout("attention", f"Set-up: {mistake.sentence}", text))
     if setup.warnings:
-        text = " ".join(f"{wording.sentence(line)}." for line in setup.warnings)
+        text = " ".join(f"{line}." for line in setup.warnings)
         blocks.append(Callout("note", "Doubtful set-up", text))
     return tuple(blocks)
 

@@ -10,6 +10,8 @@ import re
 from dataclasses import dataclass
 from typing import Literal
 
+from bampipe.report.wording import prose
+
 Span = tuple[Literal["plain", "strong", "code", "link"], str]
 """Kind and text; of a link its words and its target, with a line break between."""
 
@@ -25,16 +27,16 @@ def spans(text: str) -> list[Span]:
     end = 0
     for match in _MARK.finditer(text):
         if match.start() > end:
-            found.append(("plain", text[end : match.start()]))
+            found.append(("plain", prose(text[end : match.start()])))
         if match["strong"] is not None:
-            found.append(("strong", match["strong"]))
+            found.append(("strong", prose(match["strong"])))
         elif match["code"] is not None:
             found.append(("code", match["code"]))
         else:
             found.append(("link", f"{match['words']}\n{match['page']}"))
         end = match.end()
     if end < len(text):
-        found.append(("plain", text[end:]))
+        found.append(("plain", prose(text[end:])))
     return found
 
 

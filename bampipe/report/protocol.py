@@ -23,7 +23,7 @@ def protocol_sheet(plan: Plan, session: str, model: str) -> bytes:
     rows = tuple(
         (
             f"{trial.times} times" if trial.times > 1 else "once",
-            wording.sentence(trial.sentence),
+            trial.sentence,
             "",
         )
         for trial in plan.trials
@@ -39,7 +39,7 @@ def protocol_sheet(plan: Plan, session: str, model: str) -> bytes:
         )
         for name, entry in plan.sd.items()
     )
-    blocks: list[Block] = [Paragraph(wording.sentence(plan.sentence)), trials]
+    blocks: list[Block] = [Paragraph(plan.sentence), trials]
     if reached:
         blocks.append(
             Table(

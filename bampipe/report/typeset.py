@@ -9,6 +9,7 @@ import tempfile
 from collections.abc import Iterator
 from itertools import count
 from pathlib import Path
+from typing import Any
 
 import typst
 
@@ -31,6 +32,12 @@ from bampipe.report.document import (
 _TEMPLATE = Path(__file__).parent / "templates" / "report.typ"
 _NORMAL_SIZE, _SMALL_SIZE = 9.0, 8.0
 _MANY_COLUMNS = 7
+_MANY_ROWS = 8
+_PAGE_END_PT = 782.0
+"""Where the text of a page ends, points from its upper edge: A4 less the margin of the template."""
+_HOLE_PT = 85.0
+"""White above the end of a page, 3 cm, from which a page looks unfinished."""
+_PASSES = 24
 
 
 def pdf(document: Document, recorded: int) -> bytes:
@@ -57,25 +64,68 @@ def pdf(document: Document, recorded: int) -> bytes:
             for block in section.blocks:
                 if isinstance(block, Figure):
                     (root / f"figures/{block.name}.svg").write_text(block.svg, encoding="utf-8")
-        (root / "document.json").write_text(json.dumps(content(document)), encoding="utf-8")
         source = root / _TEMPLATE.name
         shutil.copyfile(_TEMPLATE, source)
-        compiler = typst.Compiler(source, root=root, ignore_system_fonts=True)
+        compiler = _lay_out(content(document), source)
         printed = compiler.compile(format="pdf", timestamp=int(stamp))
         assert isinstance(printed, bytes)  # a list of pages comes for other formats
         return printed
 
 
-def content(document: Document) -> dict[str, object]:
+def _lay_out(shown: dict[str, Any], source: Path) -> typst.Compiler:
+    """Return a compiler of what is ``shown``, without holes above figures and tables.
+
+    Pages fill from the first, and what is made loose on one moves all that comes later: each pass
+    mends the first hole that is left.
+    """
+    blocks = [block for section in shown["sections"] for block in section["blocks"]]
+    compiler = typst.Compiler(source, root=source.parent, ignore_system_fonts=True)
+    for _ in range(_PASSES):
+        (source.parent / "document.json").write_text(json.dumps(shown), encoding="utf-8")
+        edges = json.loads(compiler.query("<edge>", field="value"))
+        found = first_below_a_hole(blocks, edges)
+        if found is None:
+            break
+        found["loose"] = True
+    return compiler
+
+
+def first_below_a_hole(
+    blocks: list[dict[str, Any]], edges: list[dict[str, Any]]
+) -> dict[str, Any] | None:
+    """Return the first block that went to a new page and left a hole on the one before.
+
+    Args:
+        blocks: those of `content`, in order.
+        edges: what the template reports of them: block, edge ("start" or "end"), page, y in points.
+    """
+    starts = {edge["block"]: edge for edge in edges if edge["edge"] == "start"}
+    ends = {edge["block"]: edge for edge in edges if edge["edge"] == "end"}
+    page, filled = 1, _PAGE_END_PT
+    for block in blocks:
+        start, end = starts.get(block["id"]), ends.get(block["id"])
+        hole = _PAGE_END_PT - filled > _HOLE_PT
+        if start and not block["loose"] and start["page"] > page and hole:
+            return block
+        floats = block["kind"] == "figure" and block["loose"]
+        if end and not floats:
+            page, filled = end["page"], end["y"]
+    return None
+
+
+def content(document: Document) -> dict[str, Any]:
     """Return what the template reads: figures and tables numbered, text split into spans."""
-    numbers = numbering()
+    numbers, ids = numbering(), count()
     return {
         "title": document.title,
         "subtitle": document.subtitle,
         "sections": [
             {
                 "title": section.title,
-                "blocks": [_block(block, next_number(numbers, block)) for block in section.blocks],
+                "blocks": [
+                    {"id": next(ids), **_block(block, next_number(numbers, block))}
+                    for block in section.blocks
+                ],
             }
             for section in document.sections
         ],
@@ -92,7 +142,7 @@ def next_number(numbers: dict[type, Iterator[str]], block: Block) -> str:
     return next(numbers[type(block)]) if type(block) in numbers else ""
 
 
-def _block(block: Block, number: str) -> dict[str, object]:
+def _block(block: Block, number: str) -> dict[str, Any]:
     match block:
         case Paragraph(text):
             return {"kind": "text", "text": _spans(text)}
@@ -120,6 +170,7 @@ def _block(block: Block, number: str) -> dict[str, object]:
                 "widths": list(block.widths or (0.0,) * len(block.head)),
                 "note": _spans(block.note),
                 "size": _NORMAL_SIZE if len(block.head) < _MANY_COLUMNS else _SMALL_SIZE,
+                "loose": len(block.rows) > _MANY_ROWS,
             }
         case Figure(name, caption, _):
             return {
@@ -128,6 +179,7 @@ def _block(block: Block, number: str) -> dict[str, object]:
                 "name": name,
                 "caption": _spans(caption),
                 "alt": caption,
+                "loose": False,
             }
 
 

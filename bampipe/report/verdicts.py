@@ -60,7 +60,7 @@ def overall(results: Results) -> Callout:
 
 def _failures(failed: Sequence[str]) -> str:
     """Return the checks that failed, as sentences behind others."""
-    sentences = (wording.sentence(f"{one[:1].upper()}{one[1:]}".rstrip(".")) for one in failed)
+    sentences = (f"{one[:1].upper()}{one[1:]}".rstrip(".") for one in failed)
     return "".join(f" {one}." for one in sentences)
 
 
@@ -128,7 +128,7 @@ def _diagnosed(results: Results, diagnosis: DiagnoseResult) -> Callout:
     }
     effects = results.effects(results.model)
     with_effects = f" with {join_names(f'`{name}`' for name in effects)}" if effects else ""
-    sentence = wording.sentence(diagnosis.sentence)
+    sentence = diagnosis.sentence
     if by_verdict["missing"]:
         what = join_names(f"`{name}`" for name in diagnosis.selected) or "an effect"
         where = join_names(by_verdict["missing"])

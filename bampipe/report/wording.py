@@ -10,6 +10,9 @@ _POWERS = {"2": "²", "3": "³"}
 _PREFIXES = ((1e-6, "µ"), (1e-3, "m"), (1.0, ""), (1e3, "k"), (1e6, "M"))
 _PREFIXED = ("rad", "m", "N", "Pa")
 """Units that take a prefix when they lead; kg already has one."""
+_UNIT = re.compile(r"\b(?:(?:k?N|kg)(?:\.(?:m2?|s2?))+(?:/[A-Za-z]+2?)?|(?:rad|m)/s2)\b")
+_MINUS = re.compile(r"(?<![\w.)\]-])-(?=[\d.])")
+_POWER = re.compile(r"(?<![\w.])(\d+(?:\.\d+)?)e([+-]\d+)\b")
 
 
 def unit(text: str) -> str:
@@ -21,9 +24,14 @@ def unit(text: str) -> str:
     )
 
 
-def sentence(text: object) -> str:
-    """Return a stored sentence with its units as printed."""
-    return re.sub(r"\b(N|kg)\.m2?\b", lambda found: unit(found[0]), str(text))
+def prose(text: str) -> str:
+    """Return text with minus signs, powers of ten and units as printed; names stay as they are."""
+    text = _MINUS.sub("−", _POWER.sub(lambda found: f"{found[1]}·10{_raised(found[2])}", text))
+    return _UNIT.sub(lambda found: unit(found[0]), text)
+
+
+def _raised(exponent: str) -> str:
+    return "".join("⁻⁰¹²³⁴⁵⁶⁷⁸⁹"["-0123456789".index(mark)] for mark in str(int(exponent)))
 
 
 def scale(values: Iterable[float], base: str) -> tuple[float, str]:
@@ -63,8 +71,7 @@ def significant(value: float | None, digits: int = 3) -> str:
     exponent = math.floor(math.log10(abs(float(f"{value:.{digits - 1}e}"))))
     if exponent < -5 or exponent > 6:
         mantissa = plain(value / 10.0**exponent, digits - 1)
-        raised = "".join("⁻⁰¹²³⁴⁵⁶⁷⁸⁹"["-0123456789".index(mark)] for mark in str(exponent))
-        return f"{mantissa}·10{raised}"
+        return f"{mantissa}·10{_raised(str(exponent))}"
     return plain(value, max(0, digits - 1 - exponent))
 
 

@@ -194,9 +194,10 @@ class Convergence(Record):
     iterations: Count | None = Field(default=None, description="Of least squares")
     settled_s: dict[str, Size] | None = Field(
         default=None,
-        description="From when on each estimate stays within 2 % or 3 sd of its final value, s",
+        description="From when on each estimate stays within 2 % or 3 sd of its final value, s "
+        "from the start of the first run",
     )
-    total_s: Size | None = None
+    total_s: Size | None = Field(default=None, description="Of the first run and the last")
 
 
 class ParameterBound(Record):
@@ -318,5 +319,6 @@ class IdentifyResult(Result):
     )
     repeats: Count | None = Field(
         default=None,
-        description="How often the filter ran again around its answer; the tables are of the last",
+        description="How often the filter ran again around its answer; the states are of the last "
+        "run, the trace of the first and the last",
     )

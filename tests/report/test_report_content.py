@@ -113,7 +113,7 @@ def test_what_the_stages_say_of_themselves_is_passed_on(full: Report) -> None:
     assert "The force lags the encoders by 0.120 ± 0.031 ms" in words
     assert "force x 0.123 N (RMSE)" in words
     assert "A note of the validation." in words
-    assert "bampipe extend RUN stribeck:yaw --model base" in words
+    assert f"Added since, as model {synthetic_run.CHILD}" in words
     assert "At the limit of its range" in words
     assert row_of(full.html[full.html.index("RMSE by trial") :], "t02_free", "yes")[2] == "0.212"
 
@@ -174,6 +174,18 @@ def test_ladder_shows_every_version_and_what_moved(full: Report) -> None:
     assert "coulomb.yaw fell by 0.21 N·m" in text_of(full.html)
 
 
+def test_a_better_version_that_does_not_count_is_said_with_the_reason(tmp_path: Path) -> None:
+    root = synthetic_run.write_all(tmp_path / "s01")
+    path = root / "compare.json"
+    compared = json.loads(path.read_text())
+    path.write_text(json.dumps(compared | {"best": "base"}))
+    words = text_of(build(Results(root), quiet).html)
+    assert "With stribeck:yaw the error would be lower than that of base" in words.replace(
+        " ,", ","
+    )
+    assert "none has a lower error" not in words
+
+
 def test_stiffness_in_both_units_of_bandwidth(full: Report) -> None:
     table = full.html[full.html.index("Stiffness of the locked axes") :]
     assert row_of(table, "yaw")[1:] == [
@@ -197,6 +209,23 @@ def test_provenance_lists_inputs_versions_and_keys_in_order(full: Report) -> Non
     assert row_of(table, "filter")[1:] == ["1", "1bcdef012345"]
     places = [table.index(f"<code>{name}<") for name in ("ingest", "filter", "stiffness")]
     assert places == sorted(places)
+
+
+def test_settings_that_all_models_share_stand_once(full_run: Path, tmp_path: Path) -> None:
+    root = tmp_path / "run"
+    shutil.copytree(full_run, root)
+    record = json.loads((root / "run.json").read_text())
+    stages = record["stages"]
+    shared = {"seed": 3, "model": "base"}
+    stages["identify:base"]["config"] = shared
+    stages["identify:other"] = stages["identify:base"] | {"config": shared | {"model": "other"}}
+    stages["filter"]["config"] = {"band_hz": 5.0}
+    (root / "run.json").write_text(json.dumps(record))
+    table = build(Results(root), quiet).html
+    table = table[table.index("Settings of each stage") :]
+    assert row_of(table, "identify")[1] == "seed = 3"
+    assert row_of(table, "filter")[1] == "band_hz = 5.0"
+    assert "identify:other" not in table
 
 
 def test_results_older_than_their_inputs_are_named_first(
@@ -297,7 +326,7 @@ def test_pdf_text_and_pages(full: Report, tmp_path: Path) -> None:
     assert 7 <= len(pages) <= 12
     assert "Session s01" in pages[0]
     assert "nothing is missing" in pages[0]
-    assert "Provenance" in pages[-1]
+    assert "Provenance" in "".join(pages[-2:])
     assert "4.17 ± 0.13" in pages[0]
     assert "3.526 to 3.578" in done.stdout
     assert all(len(page.split()) > 40 for page in pages)

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from bampipe.lists import join_names
 from bampipe.report import wording
+from bampipe.report.document import spans
 
 
 @pytest.mark.parametrize(
@@ -81,6 +82,23 @@ def test_names_in_words() -> None:
     assert join_names(["a"]) == "a"
     assert wording.count(1, "trial") == "1 trial"
     assert wording.count(2, "trial") == "2 trials"
-    assert wording.sentence("fell by 0.2 N.m. Done") == "fell by 0.2 N·m. Done"
     assert wording.probability(0.0002) == "< 0.001"
     assert wording.percent(0.812) == "81 %"
+
+
+@pytest.mark.parametrize(
+    ("stored", "printed"),
+    [
+        ("fell by 0.2 N.m. Done", "fell by 0.2 N·m. Done"),
+        ("19 N.m.s/rad, 2 kg.m2 and 3 rad/s2", "19 N·m·s/rad, 2 kg·m² and 3 rad/s²"),
+        ("bumps of -1.1 N and +1.2 N (-0.5 to -2)", "bumps of −1.1 N and +1.2 N (−0.5 to −2)"),
+        ("0.0018 ± 1.6e-05 N.m", "0.0018 ± 1.6·10⁻⁵ N·m"),
+        ("trial t-01 of 2026-10-03, I_yy - I_zz", "trial t-01 of 2026-10-03, I_yy - I_zz"),
+    ],
+)
+def test_prose_has_printed_numbers_and_leaves_names_alone(stored: str, printed: str) -> None:
+    assert wording.prose(stored) == printed
+
+
+def test_code_is_printed_as_it_is_to_be_typed() -> None:
+    assert spans("by -2 with `--set x=-2`") == [("plain", "by −2 with "), ("code", "--set x=-2")]

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from bampipe.lists import join_names
 from bampipe.report import wording
-from bampipe.report.document import Block, Paragraph, Section, Table
+from bampipe.report.document import Block, Section, Table
 from bampipe.report.results import Results
 from bampipe.results.identify import Combined, DeviceNumber, IdentifyResult
 from bampipe.results.performance import DeviceConstant, PerformanceResult
@@ -22,15 +21,6 @@ def section(results: Results) -> Section | None:
         blocks.append(_constants(results, performance.constants, together))
     if known and known.numbers:
         blocks.append(_numbers(known.numbers))
-    for group in together:
-        members = join_names(f"`{name}`" for name in group.members)
-        sums = join_names(f"`{name}`" for name in group.combinations)
-        blocks.append(
-            Paragraph(
-                f"{members} enter the equations only as {sums}. No motion, however rich, tells the "
-                "parts apart: they stand as the device file has them."
-            )
-        )
     return Section("Device", tuple(blocks)) if blocks else None
 
 

@@ -20,6 +20,7 @@ from bampipe.report.document import (
     Table,
 )
 from bampipe.report.results import Results
+from bampipe.results.compare import CompareResult
 from bampipe.results.diagnose import (
     AxisVerdict,
     DiagnoseResult,
@@ -62,15 +63,15 @@ def _model(
 ) -> list[Block]:
     axes = found.axes
     names = verdicts.ordered(results, axes)
-    sentences = tuple(wording.sentence(axes[axis].sentence) for axis in names)
+    sentences = tuple(axes[axis].sentence for axis in names)
     blocks: list[Block] = [Bullets(sentences), _verdicts(names, axes)]
     lacking = [axis for axis in names if axes[axis].verdict != "nothing_missing"]
     if found.ranking and lacking:
         blocks.append(_ranking(results, found.ranking))
-    command = found.next.startswith("bampipe ")
-    blocks.append(Paragraph(f"Next: `{found.next}`" if command else f"Next: {found.next}."))
+    if lacking:
+        blocks += _next(results, model, found)
     if found.suggested_trial is not None:
-        words = wording.sentence(found.suggested_trial.sentence)
+        words = found.suggested_trial.sentence
         blocks.append(Callout("note", "A trial that would tell more", words))
     blocks += [
         _maps(model, axis, axes[axis], found.maps[axis], (later or {}).get(axis))
@@ -80,6 +81,18 @@ def _model(
     if found.worst_windows and lacking:
         blocks.append(_windows(results, found.worst_windows))
     return blocks
+
+
+def _next(results: Results, model: str, found: DiagnoseResult) -> list[Block]:
+    """Return the command that follows; where it has been run, the model that came of it."""
+    compared = results.read(CompareResult)
+    rungs = compared.ladder if compared else ()
+    wanted = set(found.selected)
+    for rung in rungs:
+        if wanted and rung.parent == model and wanted == set((rung.added or "").split(", ")):
+            return [Paragraph(f"Added since, as model `{rung.model}`.")]
+    command = found.next.startswith("bampipe ")
+    return [Paragraph(f"Next: `{found.next}`" if command else f"Next: {found.next}.")]
 
 
 def _verdicts(names: tuple[str, ...], axes: Mapping[str, AxisVerdict]) -> Table:
@@ -114,7 +127,7 @@ def _verdicts(names: tuple[str, ...], axes: Mapping[str, AxisVerdict]) -> Table:
         "llrrrrrl",
         note="Explainable: share of the residual that any function of motion and load could "
         "predict on unseen trials; by chance: the same where nothing is missing. Errors are RMSE "
-        "on held-out trials.",
+        "on held-out trials; floor: of the model with the effects.",
     )
 
 
@@ -132,7 +145,11 @@ def _ranking(results: Results, ranking: Sequence[RankedEffect]) -> Table:
         for entry in ranking[:_RANKED]
     ]
     more = len(ranking) - len(rows)
-    note = "p: chance of such a fall in error where the effect is absent."
+    note = (
+        "Without: of the model, for an effect found of the one it was added to. With: its shape at "
+        "the best of a few values, while what is added is then fitted in full. p: chance of such a "
+        "fall in error where the effect is absent."
+    )
     if more:
         note += f" {wording.count(more, 'candidate')} further down not shown."
     return Table(
@@ -224,7 +241,7 @@ def _windows(results: Results, windows: Sequence[WorstWindow]) -> Table:
             )
         )
     return Table(
-        "Worst windows: where the prediction fails most, and what the arm was doing",
+        "Worst windows: where the prediction fails most, and what the machine was doing",
         ("Axis", "Trial", "Time (s)", "RMSE", "Doing"),
         tuple(rows),
         "lllrl",

@@ -31,7 +31,7 @@ def section(results: Results) -> Section | None:
         diagnosis = results.read(DiagnoseResult, model)
         for axis, entry in found.axes.items():
             blocks.append(Subheading(f"{axis.capitalize()}, model `{model}`"))
-            blocks.append(Paragraph(wording.sentence(entry.sentence)))
+            blocks.append(Paragraph(entry.sentence))
             effects = {name: found.effects[name] for name in entry.effects}
             if effects:
                 lines = [f"{name}: {effect.expression}" for name, effect in effects.items()]

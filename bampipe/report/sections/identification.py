@@ -231,12 +231,15 @@ def _convergence(results: Results, identified: IdentifyResult, trace: pd.DataFra
     shown = trace.iloc[keep]
     t = shown[time_column].to_numpy()
     starts = trace.loc[trace["trial_id"].ne(trace["trial_id"].shift()), time_column].to_numpy()
+    again = trace.loc[trace["run"] > 0, time_column].to_numpy() if "run" in trace else np.array([])
     for panel, (kind, unit, names) in zip(panels.flat, groups, strict=False):
         for number, name in enumerate(names):
             _trace(panel, t, shown, name, number, results)
         _design(results, panel, names)
         for start in starts[1:]:
             panel.axvline(start, color=style.FAINT, lw=0.6, ls=(0, (1, 2)), zorder=0)
+        if again.size:
+            panel.axvline(again[0], color=style.INK, lw=0.6, zorder=0)
         _settled(panel, trace, names)
         panel.set_title(textwrap.fill(kind, 26))
         panel.set_ylabel(wording.unit(unit) or "1")
@@ -252,8 +255,8 @@ def _convergence(results: Results, identified: IdentifyResult, trace: pd.DataFra
         f"Convergence of the parameters{results.in_paper('Fig. 7')}, with the filter's own 95 % "
         "bounds. Dotted verticals: a new trial starts."
     )
-    if identified.repeats:
-        caption += " The filter's last run, which starts around the answer of the one before."
+    if again.size:
+        caption += " Solid vertical: the last run begins, around the answer of the one before."
     return Figure("convergence", caption, style.svg(figure))
 
 

@@ -15,6 +15,8 @@ from bampipe.results.compare import CompareResult, Rung, Value, horizons_of
 
 TITLE = "Model versions"
 _MOST_COLUMNS = 3
+_MOST_NUMBERS = 4
+"""Versions of which each can have its number below a panel."""
 
 
 def section(results: Results) -> Section | None:
@@ -31,7 +33,7 @@ def section(results: Results) -> Section | None:
     if compared.parameters:
         blocks.append(_parameters(results, rungs, compared.parameters))
     if compared.moved:
-        blocks.append(Bullets(tuple(wording.sentence(one.sentence) for one in compared.moved)))
+        blocks.append(Bullets(tuple(one.sentence for one in compared.moved)))
     return Section(TITLE, tuple(blocks))
 
 
@@ -127,22 +129,23 @@ def _picture(results: Results, rungs: Sequence[Rung]) -> Figure:
         panel.plot(x, error, "o-", color=style.BLUE, ms=4.5, lw=1.3, label="held-out error")
         panel.plot(x, floor, "s--", color=style.VERMILLION, ms=3.0, lw=1.0, label="noise floor")
         _scale(panel, np.concatenate([error, floor]))
-        low, high = panel.get_ylim()
-        middle = np.sqrt(low * high) if panel.get_yscale() == "log" else (low + high) / 2.0
-        for place, value in zip(x, error, strict=True):
-            if np.isfinite(value):
-                panel.annotate(
-                    wording.significant(float(value), 2), (place, value),
-                    (0, -5 if value > middle else 5), textcoords="offset points", ha="center",
-                    va="top" if value > middle else "bottom", fontsize=7,
-                )  # fmt: skip
         panel.set_xlim(-0.4, len(rungs) - 0.6)
-        panel.set_xticks(x, [rungs[0].model, *(str(number) for number in x[1:])])
-        panel.set_xlabel("version")
+        panel.set_xticks(x, _ticks(rungs[0].model, error))
+        panel.set_xlabel("version, and its error")
         panel.set_title(axis)
         panel.set_ylabel(style.label("RMSE", wording.unit(results.force_unit(axis))))
     style.legend_below(figure, panels[0][0])
     return Figure("ladder", _caption(rungs, axes), style.svg(figure))
+
+
+def _ticks(first: str, error: np.ndarray) -> list[str]:
+    """Return each version with its error below, of many versions the first and last alone."""
+    names = [first, *(str(number) for number in range(1, len(error)))]
+    shown = range(len(error)) if len(error) <= _MOST_NUMBERS else (0, len(error) - 1)
+    return [
+        f"{name}\n{wording.significant(float(value), 2)}" if number in shown else name
+        for number, (name, value) in enumerate(zip(names, error, strict=True))
+    ]
 
 
 def _scale(panel: Any, values: np.ndarray) -> None:
@@ -152,7 +155,7 @@ def _scale(panel: Any, values: np.ndarray) -> None:
         panel.set_yscale("log")
         panel.set_ylim(known.min() / 1.6, known.max() * 1.6)
     else:
-        panel.set_ylim(0.0, 1.22 * known.max(initial=0.0) or 1.0)
+        panel.set_ylim(0.0, 1.1 * known.max(initial=0.0) or 1.0)
 
 
 def _caption(rungs: Sequence[Rung], axes: Sequence[str]) -> str:

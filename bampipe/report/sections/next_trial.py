@@ -20,8 +20,8 @@ def section(results: Results) -> Section | None:
     if found is None:
         return None
     blocks: list[Block] = [
-        Callout("note", "The next trial", wording.sentence(found.sentence)),
-        Paragraph(wording.sentence(f"{found.why} {found.expected}")),
+        Callout("note", "The next trial", found.sentence),
+        Paragraph(f"{found.why} {found.expected}"),
     ]
     identified = results.read(IdentifyResult)
     came = compare_forecast(found, identified, None) if identified is not None else ()

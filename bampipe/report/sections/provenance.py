@@ -88,14 +88,27 @@ def _in_order(stages: Mapping[str, StepRecord]) -> list[tuple[str, StepRecord]]:
 
 
 def _settings(stages: Mapping[str, StepRecord]) -> Table | None:
-    rows = []
+    models: dict[tuple[str, str], list[str]] = {}
     for name, made in _in_order(stages):
-        shown = ", ".join(f"{key} = {_value(value)}" for key, value in made.config.items())
+        stage, _, model = name.partition(":")
+        config = {key: value for key, value in made.config.items() if key != "model"}
+        shown = ", ".join(f"{key} = {_value(value)}" for key, value in config.items())
         if shown:
-            rows.append((f"`{name}`", shown))
-    if not rows:
+            models.setdefault((stage, shown), []).append(model)
+    if not models:
         return None
-    return Table("Settings of each stage", ("Stage", "Settings"), tuple(rows), "ll", (0.0, 1.0))
+    alike = {stage: sum(stage == other for other, _ in models) == 1 for stage, _ in models}
+    rows = tuple(
+        (f"`{stage}`" if alike[stage] else ", ".join(f"`{stage}:{name}`" for name in names), shown)
+        for (stage, shown), names in models.items()
+    )
+    return Table(
+        "Settings of each stage, for all models where none is named",
+        ("Stage", "Settings"),
+        rows,
+        "ll",
+        (0.4, 1.0),
+    )
 
 
 def _value(value: object) -> str:

@@ -74,7 +74,7 @@ def _ladder(results: Results) -> str:
     number = [rung.model for rung in compared.ladder].index(results.model)
     last = compared.ladder[number]
     if last is first:
-        return f"Of {len(compared.ladder)} models none has a lower error than `{first.model}`."
+        return _unconfirmed(results, compared)
     changes = []
     for axis in verdicts.ordered(results, first.held_out_rmse):
         before, after = first.held_out_rmse[axis], last.held_out_rmse.get(axis)
@@ -87,6 +87,21 @@ def _ladder(results: Results) -> str:
     return (
         f"From model `{first.model}` to version {number} (`{last.model}`), the best confirmed one, "
         f"the error on held-out trials went: {'; '.join(changes)}."
+    )
+
+
+def _unconfirmed(results: Results, compared: CompareResult) -> str:
+    """Say why no later version counts, which may have a lower error all the same."""
+    first = compared.ladder[0]
+    better = [rung for rung in compared.ladder if rung.improves_on(first)]
+    if not better:
+        return f"Of {len(compared.ladder)} models none has a lower error than `{first.model}`."
+    validated = results.read(ValidateResult, better[-1].model)
+    refused = validated is not None and validated.is_refused
+    why = "its parameters are refused" if refused else "the version it builds on is not confirmed"
+    return (
+        f"With `{better[-1].added}` the error would be lower than that of `{first.model}`, but that"
+        f" version does not count: {why}."
     )
 
 

@@ -1,0 +1,56 @@
+"""The report in print: pages without holes."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from bampipe.report.document import Block, Document, Figure, Paragraph, Section, Table
+from bampipe.report.typeset import first_below_a_hole, pdf
+
+_POINT = 1.0 / 72.0
+
+
+def drawing(height_cm: float) -> Figure:
+    size = f'width="480pt" height="{height_cm / 2.54 / _POINT:.0f}pt"'
+    svg = f'<svg xmlns="http://www.w3.org/2000/svg" {size}><rect width="9" height="9"/></svg>'
+    return Figure(f"high-{height_cm:g}", "A drawing.", svg)
+
+
+def lines(count: int) -> list[Block]:
+    return [Paragraph("One line of text.")] * count
+
+
+def pages(*blocks: Block) -> int:
+    printed = pdf(Document("Title", "subtitle", (Section("Section", blocks),)), 0)
+    return len(re.findall(rb"/Type\s*/Page\b", printed))
+
+
+def test_text_runs_on_below_a_figure_that_goes_to_the_next_page() -> None:
+    # On A4 they fill a page and three quarters; three pages with a hole on the first.
+    assert pages(*lines(20), drawing(14.0), *lines(20)) == 2
+
+
+def test_a_table_that_leaves_a_hole_is_broken() -> None:
+    row = ("A name", "several words " * 70)
+    table = Table("Caption", ("Name", "What"), (row,) * 6, "ll", (0.0, 1.0))
+    assert pages(*lines(20), table, *lines(14)) == 2  # 3 with a hole
+
+
+def edge(block: int, side: str, page: int, y: float) -> dict[str, object]:
+    return {"block": block, "edge": side, "page": page, "y": y}
+
+
+@pytest.mark.parametrize(
+    ("text_ends", "figure_page", "expected"),
+    [(400.0, 2, 1), (760.0, 2, None), (400.0, 1, None)],
+    ids=["hole", "a full page", "on the same page"],
+)
+def test_the_first_block_below_a_hole(
+    text_ends: float, figure_page: int, expected: int | None
+) -> None:
+    blocks = [{"id": 0, "kind": "text"}, {"id": 1, "kind": "figure", "loose": False}]
+    edges = [edge(0, "end", 1, text_ends), edge(1, "start", figure_page, 65.0)]
+    found = first_below_a_hole(blocks, edges)
+    assert (found and found["id"]) == expected
