@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 import bampipe
+from bampipe.run import hashing
 from bampipe.stages import base
 
 PACKAGE = Path(bampipe.__file__).parent
@@ -165,6 +166,25 @@ def _attributes_of_numba(path: Path) -> set[str]:
         and isinstance(node.value, ast.Name)
         and node.value.id == "numba"
     }
+
+
+def test_a_change_in_whatever_stages_import_reruns_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    before = {stage: hashing.digest_code(stage) for stage in ("filter", "next")}
+    for name in sorted(room for room in LAWS["stages"] if room.startswith("bampipe.")):
+        # Of all stages but its own, only that with the protocol sheet uses the report.
+        stages = ["next"] if name == "bampipe.report" else list(before)
+        path = PACKAGE.joinpath(*name.split(".")[1:])
+        changed = path if path.is_dir() else path.with_suffix(".py")
+        monkeypatch.setattr(
+            hashing,
+            "_digest_tree",
+            lambda part, changed=changed, original=hashing._digest_tree.__wrapped__: (
+                "changed" if part == changed else original(part)
+            ),
+        )
+        for stage in stages:
+            assert hashing.digest_code(stage) != before[stage], (name, stage)
+        monkeypatch.undo()
 
 
 def test_no_stage_imports_another() -> None:

@@ -56,11 +56,9 @@ _timed_trials: MeasuredTrials | None = None
 """The same with the timing that was asked for last."""
 
 
-def _enter(trials: MeasuredTrials) -> None:
+def _open(trials: MeasuredTrials | None) -> None:
     global _open_trials, _timed_trials
     _open_trials = _timed_trials = trials
-    _systems.clear()
-    _candidates.clear()
 
 
 def open_trials(late_s: float | None = None) -> MeasuredTrials:
@@ -82,15 +80,23 @@ def open_trials(late_s: float | None = None) -> MeasuredTrials:
 
 _systems: dict[str, System] = {}
 _candidates: dict[str, Candidate] = {}
-"""Of the open trials, by `Model.key`: of two devices of one name and other contents it differs."""
+"""By `Model.key`: of two devices of one name and other contents it differs."""
+_MOST_MODELS = 500
+"""In either, in a process that lives long; a diagnosis compiles a few hundred."""
 
 
 def system_of(recipe: Recipe) -> System:
-    """The compiled model of a recipe, built once a process while its trials are open."""
+    """The compiled model of a recipe, built once a process for each content."""
     model = recipe.model()
     if model.key not in _systems:
+        _make_room(_systems)
         _systems[model.key] = compile_model(model)
     return _systems[model.key]
+
+
+def _make_room(built: dict[str, Any]) -> None:
+    if len(built) >= _MOST_MODELS:
+        built.clear()
 
 
 def fit_trials(trials: MeasuredTrials, recipe: Recipe, start: Array) -> Evidence:
@@ -105,6 +111,7 @@ def candidates_of(recipe: Recipe, names: Sequence[str]) -> list[Candidate]:
     for name in names:
         model = build_candidate_model(device, name, extra, recipe.effects)
         if model.key not in _candidates:
+            _make_room(_candidates)
             _candidates[model.key] = compile_candidate(model)
         out.append(_candidates[model.key])
     return out
@@ -205,9 +212,12 @@ Pool = Callable[[Callable[[Any], Any], Sequence[Any]], Iterator[Any]]
 @contextmanager
 def workers(trials: MeasuredTrials, jobs: int) -> Iterator[Pool]:
     """A `map` over worker processes that share ``trials``; over none if jobs is 1."""
-    _enter(trials)
-    if jobs <= 1:
-        yield lambda function, tasks: map(function, tasks)
-        return
-    with process_pool(jobs, _enter, trials) as pool:
-        yield lambda function, tasks: pool.map(function, tasks)
+    _open(trials)
+    try:
+        if jobs <= 1:
+            yield lambda function, tasks: map(function, tasks)
+            return
+        with process_pool(jobs, _open, trials) as pool:
+            yield lambda function, tasks: pool.map(function, tasks)
+    finally:
+        _open(None)

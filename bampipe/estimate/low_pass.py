@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import lru_cache
 
 import numpy as np
 from numba import float64, int64, void
@@ -57,7 +57,7 @@ def _run(values, section, start, kept, y, out):  # type: ignore[no-untyped-def]
                 out[i, first + j] = y[kept[i], j]
 
 
-@cache
+@lru_cache(maxsize=64)
 def _design(cutoff_hz: float, rate_hz: float) -> tuple[Array, Array]:
     section = np.asarray(butter(2, cutoff_hz, fs=rate_hz, output="sos"))
     return section[0].copy(), np.asarray(sosfilt_zi(section))[0].copy()

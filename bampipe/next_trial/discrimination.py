@@ -120,7 +120,7 @@ class Contest:
     def _sums_of(self, motion: Motion) -> Sums:
         problem = problem_of(self.system, [motion], self.band, timing=self.timing_s > 0.0)
         stacked = stacked_residual(problem, 0, np.append(self.p, 0.0))
-        base = ModelOnTrial(self.system, motion, self.p)
+        base = ModelOnTrial(self.system, self.p, [motion])
         columns = [stacked.slope]
         n = len(self.system.coordinates)
         for rival in self.rivals:

@@ -45,10 +45,15 @@ SHARED_CODE = (
     "data",
     "declarations",
     "trials",
+    "setup",
     "identification",
     "discover",
+    "next_trial",
 )
-"""Sub-packages every stage may call; a change in one of them reruns every stage."""
+"""Sub-packages that stages call, beside the single files; a change in one reruns every stage."""
+
+PRINTING = ("report", "next")
+"""Stages that call the report, too."""
 
 ABSENT = "absent"
 
@@ -168,10 +173,8 @@ def digest_code(stage: str) -> str:
     """
     package = Path(bampipe.__file__).parent
     parts = [package / name for name in SHARED_CODE]
-    parts += [
-        package / f"{name}.py" for name in ("compiled", "errors", "files", "schema", "stages/base")
-    ]
-    if stage == "report":
+    parts += [*sorted(package.glob("*.py")), package / "stages/base.py"]
+    if stage in PRINTING:
         parts.append(package / "report")
     spec = importlib.util.find_spec(f"bampipe.stages.{stage}")
     if spec is not None and spec.origin is not None:

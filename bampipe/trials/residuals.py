@@ -131,18 +131,25 @@ class ModelOnTrial:
     """A model with given parameters on one trial, computed when it is first asked for.
 
     Attributes:
-        system: the model; motion: the trial.
-        p: its parameters, (n_p,).
+        system: the model; p: its parameters, (n_p,).
+        motions: the trials; trial: the number of the one.
     """
 
     system: System
-    motion: Motion
     p: Array
+    motions: Sequence[Motion]
+    trial: int = 0
+
+    @property
+    def motion(self) -> Motion:
+        """The trial, fetched anew: of many, not all are in memory."""
+        return self.motions[self.trial]
 
     @cached_property
     def _residual_and_memory(self) -> tuple[Array, Array]:
-        u = self.motion.inputs(self.system.inputs)
-        return residual_and_memory(self.system, self.motion, u, self.p)
+        motion = self.motion
+        u = motion.inputs(self.system.inputs)
+        return residual_and_memory(self.system, motion, u, self.p)
 
     @property
     def residual(self) -> Array:
@@ -272,7 +279,7 @@ class Evidence:
 
     def unfiltered_residual(self, trial: int, p: Array) -> Array:
         """The residual of a trial with parameters ``p``, (n_p,), before the low-pass, (T, n_q)."""
-        return ModelOnTrial(self.system, self.motions[trial], p).residual
+        return ModelOnTrial(self.system, p, self.motions, trial).residual
 
 
 def gather_evidence(
@@ -307,7 +314,7 @@ def gather_evidence(
         system,
         found.p[:-1],
         motions,
-        tuple(ModelOnTrial(system, motion, found.p[:-1]) for motion in motions),
+        tuple(ModelOnTrial(system, found.p[:-1], motions, k) for k in range(len(motions))),
         band,
         folds,
         tuple(stacked[k].residual for k in order),

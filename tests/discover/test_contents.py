@@ -47,6 +47,19 @@ def test_two_devices_of_one_name_have_their_own_candidates():
     assert column_size(bam_with_force(1.0), trials) == once
 
 
+def test_trials_are_held_no_longer_than_they_are_open(monkeypatch):
+    recipe = bam_with_force(1.0)
+    trials = made(recipe, {}, trials=2, seconds=4.0)
+    with chance.workers(trials, 1):
+        assert chance.open_trials() is trials
+    with pytest.raises(RuntimeError, match="no trials are open"):
+        chance.open_trials()
+    monkeypatch.setattr(chance, "_MOST_MODELS", 3)
+    for number in range(5):
+        chance.candidates_of(recipe, [f"force_gain:{'xyz'[number % 3]}", "force_bias:x"])
+        assert len(chance._candidates) <= 3
+
+
 @pytest.mark.parametrize(
     ("error", "floor", "sd", "expected"),
     [
