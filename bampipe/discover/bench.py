@@ -31,9 +31,8 @@ from bampipe.trials.residuals import Evidence, problem_of
 
 Array = NDArray[np.float64]
 
-_STEPS_OF_TIMING, _SURE = 4, 3.0
-"""Most Gauss-Newton steps of a fit that starts at the right parameters, and standard deviations by
-which the timing must differ to be changed."""
+_STEPS_OF_TIMING = 4
+"""Most Gauss-Newton steps of a fit that starts at the right parameters."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +75,8 @@ class Bench:
         )
         step, sd = float(found.p[-1]), float(np.sqrt(found.covariance[-1, -1]))
         late_s = trials.late_s + step
-        if abs(step) < _SURE * sd or abs(late_s) + 2.0 * sd > trials.limit_s:
+        s = self.settings
+        if abs(step) < s.timing_sd * sd or abs(late_s) + s.limit_sd * sd > trials.limit_s:
             return self
         return replace(self, trials=open_trials(late_s))
 

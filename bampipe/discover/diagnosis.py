@@ -61,5 +61,5 @@ def diagnose(
         searched = search(bench, recipe, start, progress)
         found = conclude(searched, settings)
     progress(0.95, "holding the final model against its floor in another band")
-    other = judge_in_other_band(searched.trials, found.evidence, settings.seed)
+    other = judge_in_other_band(searched.trials, found.evidence, settings)
     return replace(found, other_band=other)

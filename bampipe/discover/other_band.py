@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bampipe.discover.scorer import Scorer
+from bampipe.discover.settings import Settings
 from bampipe.estimate.low_pass import Band
 from bampipe.estimate.simulation import Runaway
 from bampipe.results.standing import Standing, standing
@@ -17,8 +18,6 @@ from bampipe.trials.band import LEAST_HZ
 from bampipe.trials.measured import MeasuredTrials
 from bampipe.trials.noise_floor import FLOOR_SEED, NoiseFloor, replay_evidence
 from bampipe.trials.residuals import Evidence, gather_evidence
-
-_REPLAYS = 3
 
 
 @dataclass(frozen=True)
@@ -38,13 +37,13 @@ class AxisInBand:
 
 
 def judge_in_other_band(
-    trials: MeasuredTrials, evidence: Evidence, seed: int
+    trials: MeasuredTrials, evidence: Evidence, settings: Settings
 ) -> tuple[AxisInBand | None, ...]:
-    """Hold the final model against its floor in a band twice as wide, else half as wide.
+    """Hold the final model against its floor in a wider band, else in a narrower one.
 
     Args:
         trials: the measured trials; evidence: the final model, fitted.
-        seed: of the replays.
+        settings: of the diagnosis.
 
     Returns:
         By axis; None where neither band lies between the least one and the motion's bandwidth, or
@@ -52,9 +51,9 @@ def judge_in_other_band(
     """
     known, count = trials.band, len(evidence.system.coordinates)
     motion_hz = [trials.kinematics.axes[name].bandwidth_hz for name in evidence.system.coordinates]
-    cutoffs = []
+    cutoffs, ratio = [], settings.other_band_ratio
     for cutoff, most in zip(known.cutoff_hz, motion_hz, strict=True):
-        wider, narrower = 2.0 * cutoff, 0.5 * cutoff
+        wider, narrower = ratio * cutoff, cutoff / ratio
         fits = wider <= min(most, 0.2 * known.rate_hz)
         cutoffs.append(wider if fits else narrower if narrower >= LEAST_HZ else cutoff)
     if np.allclose(cutoffs, known.cutoff_hz):
@@ -66,9 +65,9 @@ def judge_in_other_band(
         replays = [
             replay_evidence(
                 evidence.system, measured.p, trials.motions, trials.sensors, trials.kinematics,
-                band, trials.folds, (seed, FLOOR_SEED, k),
+                band, trials.folds, (settings.seed, FLOOR_SEED, k),
             )
-            for k in range(_REPLAYS)
+            for k in range(settings.other_band_replicates)
         ]  # fmt: skip
     except Runaway:
         return (None,) * count

@@ -69,12 +69,14 @@ def choose(
     second = largest_second(evidence, scorer.gain_by_sample(items[0], known[0]))
     rest = score_without(evidence, items, known, second)
 
+    least = s.worth_without_second * s.worth
+
     def stands(name: str) -> bool:
         score = rest.get(name)
         return (
             score is not None
             and level.p_value(score) < s.significance
-            and bool(np.any(score.gain / scorer.independent_samples > 0.5 * s.worth))
+            and bool(np.any(score.gain / scorer.independent_samples > least))
         )
 
     firm = sorted((n for n in close if stands(n)), key=lambda n: -rest[n].total)

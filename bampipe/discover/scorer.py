@@ -26,11 +26,6 @@ Array = NDArray[np.float64]
 
 _SHARES = (1.0, 0.9, 0.8, 0.65, 0.5, 0.35, 0.2, 0.1, 0.05)
 """Shares of the least-squares strength tried where an effect weakens what the force does."""
-_HELD_OUT_WEIGHT = 0.05
-"""Weight that a trial keeps when it is left out to score candidates. Where it alone holds what
-determines a parameter, as one wide motion among narrow ones does, leaving it out altogether would
-compare extrapolations; of what several trials determine it keeps a few hundredths of a degree of
-freedom."""
 _DIVERGED = 1e30
 """An internal state that is too stiff to be integrated at the sampling rate ends above this."""
 
@@ -107,7 +102,7 @@ class Scorer:
     def base_error(self) -> Array:
         """Error of the model as it is, as that of a `Score`, by axis, (n_q,), N.m or N."""
         e = self.evidence
-        steps = self.folds.solve(e.sums, e.weight, e.lower, e.upper, _HELD_OUT_WEIGHT)
+        steps = self.folds.solve(e.sums, e.weight, e.lower, e.upper, Settings().held_out_weight)
         return self.folds.error(e.sums, steps)
 
     @cached_property
@@ -235,7 +230,7 @@ class Scorer:
         values[list(item.linear_indices)] = solution[start:]
 
         def error_within(lower: Array, upper: Array) -> Array:
-            steps = folds.solve(sums, weight, lower, upper, _HELD_OUT_WEIGHT)
+            steps = folds.solve(sums, weight, lower, upper, Settings().held_out_weight)
             return folds.error(sums, steps)
 
         if not item.system.driven:

@@ -27,9 +27,6 @@ from bampipe.trials.residuals import Evidence
 
 Array = NDArray[np.float64]
 
-_SHRUNK = 0.4
-"""Error over noise floor below which the floor is not merely rough."""
-
 
 @dataclass(frozen=True)
 class Addition:
@@ -209,7 +206,8 @@ def _sound_level(
     except Runaway:
         return None
     error_before = before.scorer.base_error
-    if not _keeps_the_floor(evidence, level.replicates, error_before, known.replicates):
+    s = bench.settings
+    if not _keeps_the_floor(evidence, level.replicates, error_before, known.replicates, s):
         return None
     return scores, level
 
@@ -219,6 +217,7 @@ def _keeps_the_floor(
     replays: Sequence[Replicate],
     error_before: Array,
     before: Sequence[Replicate],
+    s: Settings,
 ) -> bool:
     """Whether an effect buys nothing by raising the noise floor or by falling far below it.
 
@@ -229,10 +228,10 @@ def _keeps_the_floor(
     error = Scorer(evidence).base_error
     after, earlier = (NoiseFloor.of_errors([r.error for r in some]) for some in (replays, before))
     ratio = error / np.maximum(after.level, 1e-300)
-    shrunk = (ratio < _SHRUNK) & (error_before / np.maximum(earlier.level, 1e-300) > _SHRUNK)
+    shrunk = (ratio < s.shrunken) & (error_before / np.maximum(earlier.level, 1e-300) > s.shrunken)
     raised = [
         standing(float(error[i]), float(after.level[i])) == "floor_implausible"
-        and after.level[i] > 2.0 * earlier.level[i]
+        and after.level[i] > s.raised * earlier.level[i]
         for i in range(len(error))
     ]
     return not (shrunk.any() or any(raised))
@@ -274,7 +273,8 @@ def _weigh(
     level.ask(scores, bench.gaining(scores, scorer))
 
     def ceiling(errors: Array) -> Array:
-        return np.asarray(AT_FLOOR * errors.mean(axis=0) + 2.0 * errors.std(axis=0, ddof=1))
+        scatter = errors.std(axis=0, ddof=1)
+        return np.asarray(AT_FLOOR * errors.mean(axis=0) + s.above_floor_sd * scatter)
 
     # Trials that the session holds out may be above their floor where the fitted ones are not.
     replayed = level.replicates

@@ -29,6 +29,19 @@ class Settings:
         share: least share of what exceeds the floor on one axis, in the mean square, that an effect
             must remove in its turn: on a measured machine something always remains, and many
             effects take a little of it.
+        above_floor_sd: standard deviations of replays by which an error must exceed the floor times
+            `AT_FLOOR` for its axis to count as above it.
+        shrunken: error over floor that an effect must not fall below: what leaves a small part of
+            the sensors' noise makes both sides of the equation small; raised: nor may it raise the
+            floor by this factor where the error then is implausibly far below it.
+        worth_without_second: share of ``worth`` that must be left of an effect without the second
+            that speaks most for it.
+        held_out_weight: weight that a trial keeps when it is left out to score candidates. Where it
+            alone holds what determines a parameter, as one wide motion among narrow ones does,
+            leaving it out altogether would compare extrapolations; of what several trials determine
+            it keeps a few hundredths of a degree of freedom.
+        timing_sd: standard deviations by which a model with more effects must find another timing
+            of the inputs for that to be taken; limit_sd: and by which it must lie within the limit.
         predictable: least share of the residual of an axis above its floor that a flexible
             regressor must predict, beyond chance, for it to lack something.
         surely: error over floor beyond which it lacks something, predictable or not.
@@ -47,6 +60,8 @@ class Settings:
             one; rival_margin: or up to so much more than that of the best.
         score_error: relative error of a replayed score, and score_sd: its least scatter, in log
             likelihood, both because no replay is perfect.
+        other_band_replicates: replays in another band; other_band_ratio: of its cut-off to that of
+            the session, or the inverse.
         variable_share: least share of a residual's variance that a variable carries to be named.
         ripple_share: least share of that which a sine carries to be called a ripple.
         direction_likeness: correlation of the residual in both directions from which on it is
@@ -54,6 +69,7 @@ class Settings:
         draft_replicates: replays on which a formula is searched as on the measurement, twice as
             many more where the decision is close; draft_significance: chance of a formula where
             nothing is missing.
+        draft_close: as ``close``, for a formula.
         draft_worth: least drop of log error on held-out trials for each constant of a formula.
         jobs: worker processes.
         seed: of all noise.
@@ -69,6 +85,13 @@ class Settings:
     worth_at_floor: float = 0.16
     carried: float = 0.25
     share: float = 0.15
+    above_floor_sd: float = 2.0
+    shrunken: float = 0.4
+    raised: float = 2.0
+    worth_without_second: float = 0.5
+    held_out_weight: float = 0.05
+    timing_sd: float = 3.0
+    limit_sd: float = 2.0
     predictable: float = 0.05
     surely: float = 2.0
     explained: float = 0.5
@@ -85,11 +108,14 @@ class Settings:
     rival_margin: float = 1.0
     score_error: float = 0.1
     score_sd: float = 2.0
+    other_band_replicates: int = 3
+    other_band_ratio: float = 2.0
     variable_share: float = 0.2
     ripple_share: float = 0.5
     direction_likeness: float = 0.6
     draft_replicates: int = 6
     draft_significance: float = 0.01
+    draft_close: float = 6.0
     draft_worth: float = 0.03
     jobs: int = 2
     seed: int = 0

@@ -14,6 +14,8 @@ AT_FLOOR = 1.2
 """Error over floor up to which a model leaves no more than its sensors do. No replay is perfect:
 clean axes stand at up to 1.08 floors, at up to 1.16 where friction truly stops the arm; the weakest
 effects that are found start at 1.18 (benchmarks/thresholds.py, docs/benchmarks.md)."""
+FLOOR_SDS = 3.0
+"""Standard deviations of the floor over replays that are allowed for."""
 IMPLAUSIBLE = 0.7
 """Error over floor below which the floor is wrong: sensors noisier than the data, or a replay that
 does not resemble the machine."""
@@ -35,10 +37,10 @@ def standing(error: float, floor: float | None, floor_sd: float = 0.0) -> Standi
     Args:
         error: held-out error of one axis.
         floor: its noise floor in the same unit, None where there is none.
-        floor_sd: scatter of the floor over replays; three of them are allowed for.
+        floor_sd: scatter of the floor over replays; `FLOOR_SDS` of it are allowed for.
     """
     if floor is None or not math.isfinite(floor) or not math.isfinite(error) or floor <= 0.0:
         return "floor_missing"
-    if error < IMPLAUSIBLE * floor - 3.0 * floor_sd:
+    if error < IMPLAUSIBLE * floor - FLOOR_SDS * floor_sd:
         return "floor_implausible"
-    return "at_floor" if error <= AT_FLOOR * floor + 3.0 * floor_sd else "above_floor"
+    return "at_floor" if error <= AT_FLOOR * floor + FLOOR_SDS * floor_sd else "above_floor"

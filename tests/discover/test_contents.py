@@ -11,6 +11,7 @@ from sessions import BAND, KINEMATICS, SENSORS, folds, made
 from bampipe.discover import chance
 from bampipe.discover.scorer import Scorer
 from bampipe.discover.search import _keeps_the_floor
+from bampipe.discover.settings import Settings
 from bampipe.physics import registry
 from bampipe.physics.recipe import Recipe
 from bampipe.results.standing import standing
@@ -86,12 +87,12 @@ def test_an_effect_that_only_raises_the_floor_is_not_added():
         none = np.zeros(0)
         return [chance.Replicate(factor * error, factor * error, evidence.p, {}, none)] * 2
 
-    assert _keeps_the_floor(evidence, replays(1.0), error, replays(1.0))
-    assert not _keeps_the_floor(evidence, replays(100.0), error, replays(1.0))
-    assert _keeps_the_floor(evidence, replays(2.0), error, replays(1.9))
+    assert _keeps_the_floor(evidence, replays(1.0), error, replays(1.0), Settings())
+    assert not _keeps_the_floor(evidence, replays(100.0), error, replays(1.0), Settings())
+    assert _keeps_the_floor(evidence, replays(2.0), error, replays(1.9), Settings())
     # A fifth of the noise is left: both sides of the equation were made small.
-    assert not _keeps_the_floor(evidence, replays(5.0), 8.0 * error, replays(5.0))
-    assert _keeps_the_floor(evidence, replays(5.0), error, replays(5.0))
+    assert not _keeps_the_floor(evidence, replays(5.0), 8.0 * error, replays(5.0), Settings())
+    assert _keeps_the_floor(evidence, replays(5.0), error, replays(5.0), Settings())
 
 
 def test_the_filters_of_a_session_keep_the_order_of_its_model():

@@ -26,6 +26,7 @@ from bampipe.discover.drafts.forms import (
     forms,
     hats,
 )
+from bampipe.discover.settings import Settings
 from bampipe.estimate.low_pass import low_pass_at
 from bampipe.trials.folds import HELD_OUT
 from bampipe.trials.residuals import Evidence
@@ -57,8 +58,6 @@ _RANGE = (0.002, 0.998)
 _LEFT, _MARGIN = (0.005, 0.995), 0.03
 """Shares of the squared residual between which a curve is put, and what is added at either end, of
 the range."""
-_OWN_WEIGHT = 0.05
-"""As in `candidates`: that a trial keeps in the fit that it is left out of."""
 
 
 @dataclass(frozen=True)
@@ -366,7 +365,7 @@ class Screen:
         z = columns / size
         for group in np.unique(self._group):
             own = self._group == group
-            weight = np.where(own, _OWN_WEIGHT, 1.0)[:, None] * z
+            weight = np.where(own, Settings().held_out_weight, 1.0)[:, None] * z
             normal = weight.T @ z + _NEGLIGIBLE * np.eye(z.shape[1])
             step = np.linalg.solve(normal, weight.T @ self._residual)
             total += float(np.sum((self._residual[own] - z[own] @ step) ** 2))

@@ -32,9 +32,6 @@ _FITTED = (6, 3)
 """Forms refitted with the model, best of the first pass first: of the first term, of the next."""
 _NO_MORE_THAN = 0.5
 """A form is refitted if its gain comes up to this share of the best one's."""
-_CLOSE = 6.0
-"""Where the p-value is within this factor of the significance, on either side, more replays are
-made: on both, or the second look would be another chance of a false alarm."""
 _SEED = 11
 """First number, after the user's, of the seeds of these replays."""
 _STEPS_OF_A_REPLAY = 4
@@ -303,8 +300,8 @@ class AxisSearch:
         gain = screened[0].gain if screened else 0.0
         found = self._replays(recipe, evidence, 0, s.draft_replicates)
         p_value = self._p_value(gain, evidence, [g for g, _ in found])
-        low, high = s.draft_significance / _CLOSE, s.draft_significance * _CLOSE
-        if low < p_value < high:
+        low, high = s.draft_significance / s.draft_close, s.draft_significance * s.draft_close
+        if low < p_value < high:  # on either side, or it would be another chance of a false alarm
             more = 2 * s.draft_replicates
             found += self._replays(recipe, evidence, s.draft_replicates, more)
             p_value = self._p_value(gain, evidence, [g for g, _ in found])
