@@ -157,6 +157,11 @@ def test_every_command_takes_the_best_confirmed_model(
     ]
     row = of_run(root).tables["sessions"][0]
     assert row["counting_model"] == better
+    monkeypatch.setattr("bampipe.declarations.export.export_model", lambda run, name, form: name)
+    code, out, err = command("export", "s1")
+    assert (code, out.strip()) == (0, better) and f"model {better} of s1" in err
+    code, out, _ = command("export", "s1", "--model", "base")
+    assert (code, out.strip()) == (0, "base")
 
 
 def test_a_damaged_file_of_accepted_values_is_named(tmp_path: Path) -> None:

@@ -16,7 +16,9 @@ from bampipe.run import models
 def export(
     run: RunArgument = None,
     form: Annotated[str, typer.Option("--as", help="json, urdf, python or c.")] = "json",
-    model: Annotated[str, typer.Option(help="The model that is written.")] = models.BASE,
+    model: Annotated[
+        str, typer.Option(help="Model that is written; the best confirmed one if omitted.")
+    ] = "",
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="File to write; printed if omitted.")
     ] = None,
@@ -40,9 +42,11 @@ def export(
             remedy=f"--as {', '.join(FORMS)}",
         )
     root = places.find_run(run, runs)
-    text = export_model(RunFolder(root), model, chosen)
+    counting = model or models.counting_model(root)
+    text = export_model(RunFolder(root), counting, chosen)
     if out is None:
         show.say(text.rstrip())
+        show.note(f"model {counting} of {root.name}")
         return
     write_text(out, text)
-    show.say(f"{out}: model {model} of {root.name}")
+    show.say(f"{out}: model {counting} of {root.name}")

@@ -221,7 +221,6 @@ def _ladder(rungs: Sequence[Rung]) -> None:
 
     if horizons := horizons_of(rungs):
         _drift(rungs, horizons)
-    say("")
 
 
 def _free_runs(rungs: Sequence[Rung]) -> None:
@@ -257,6 +256,8 @@ def _drift(rungs: Sequence[Rung], horizons: Sequence[float]) -> None:
         body.append(cells)
     say("")
     say(f"drift: distance from the measured position after {within} s left to itself, median")
+    if any("–" in cell for row in body for cell in row):
+        say("–: runs away, drifts further than the axis itself moves, or the axis hardly moves")
     table(["model", *(f"{axis}, {unit}" for axis, unit in units.items())], body)
 
 

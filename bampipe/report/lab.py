@@ -260,6 +260,7 @@ def _errors(folder: Path, trends: TrendsResult) -> Section | None:
     if frame.empty:
         return None
     order = [one.session for one in trends.sessions]
+    counting = {one.session: one.model for one in trends.sessions}
     sessions = [name for name in order if name in set(frame["session_id"])]
     axes = list(dict.fromkeys(frame["axis"]))
     columns = min(_COLUMNS, len(axes))
@@ -268,12 +269,14 @@ def _errors(folder: Path, trends: TrendsResult) -> Section | None:
     for panel, axis in zip(panels.ravel(), axes, strict=False):
         here = frame[frame["axis"] == axis]
         base = here[here["model"] == "base"].set_index("session_id")["error_over_floor"]
-        others = here[here["model"] != "base"].groupby("session_id")["error_over_floor"].min()
+        counts = here["model"] == here["session_id"].map(counting)
+        extended = here[counts & (here["model"] != "base")].set_index("session_id")
+        others = extended["error_over_floor"]
         place = {name: number for number, name in enumerate(sessions)}
         panel.axhspan(0.0, AT_FLOOR, color=style.GREEN, alpha=0.12, lw=0)
         for values, colour, mark, name in (
             (base, style.BLUE, "o", "base model"),
-            (others, style.VERMILLION, "D", "best extended model"),
+            (others, style.VERMILLION, "D", "model that counts, where extended"),
         ):
             x = [place[session] for session in values.index]
             panel.plot(x, values.to_numpy(), mark, ms=3.6, color=colour, label=name)

@@ -24,7 +24,7 @@ from bampipe.data.readers import read_trial
 from bampipe.data.run_folder import INGESTED, MOVING, RunFolder
 from bampipe.data.session import SECONDS, Session, TrialEntry, inside, read_session
 from bampipe.data.store import ParquetAppender, write_parquet
-from bampipe.errors import InputError
+from bampipe.errors import InputError, did_you_mean
 from bampipe.files import digest_content, digest_file, toml_text
 from bampipe.physics import registry
 from bampipe.physics.device import Device
@@ -87,9 +87,11 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
             if entry.kind in MOVING:
                 _measure_noise(noise, trial)
         if all(row["status"] == "set_aside" for row in rows):
+            first, *others = _reasons(rows, str(session.root))
             raise InputError(
-                f"none of the {total} trials is sound; the first: {rows[0]['reason']}",
-                where=str(session.root),
+                f"none of the {total} trials is sound; {first.what}",
+                where=first.where,
+                others=others,
             )
     trials = _trials_table(rows)
     write_parquet(out / "ingest/trials.parquet", trials)
@@ -106,6 +108,20 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     notes += _impossible(device)
     notes += [f"{place}: its source still says `fill in`" for place in description.placeholders]
     return _summary(session, rows) | {"notes": notes}
+
+
+def _reasons(rows: list[dict[str, object]], where: str) -> list[InputError]:
+    """Return why trials were set aside: each reason once, with the first file it holds for."""
+    files: dict[str, list[str]] = {}
+    for row in rows:
+        reason = str(row["reason"]).removeprefix(f"{row['file']}: ")
+        files.setdefault(reason, []).append(str(row["file"]))
+    return [
+        InputError(
+            f"{names[0]}{f' and {len(names) - 1} more' if names[1:] else ''}: {reason}", where=where
+        )
+        for reason, names in files.items()
+    ]
 
 
 def _impossible(device: Device) -> list[str]:
@@ -130,26 +146,33 @@ def _match(session: Session, device: Device) -> None:
     """Hold the session's channels to the device's axes and inputs.
 
     Raises:
-        InputError: an axis or an input is missing, of another name or of another unit.
+        InputError: an axis or an input is missing, of another name or of another unit; all of it.
     """
+    found = list(_mismatches(session, device))
+    if found:
+        first, *others = found
+        raise InputError(first.what, where=first.where, remedy=first.remedy, others=others)
+
+
+def _mismatches(session: Session, device: Device) -> Iterator[InputError]:
     where = f"{session.root / 'session.toml'}"
     encoders = {encoder.axis: encoder for encoder in session.encoders}
     axes = {coordinate.name: coordinate.unit for coordinate in device.coordinates}
     for axis in encoders:
         if axis not in axes:
-            raise InputError(
-                f"device '{device.name}' has no axis '{axis}'",
+            yield InputError(
+                f"device '{device.name}' has no axis '{axis}'{did_you_mean(axis, axes)}",
                 where=f"{where}: encoders.{axis}",
                 remedy=f"its axes are {', '.join(axes)}",
             )
     for axis, unit in axes.items():
         if axis not in encoders:
-            raise InputError(
+            yield InputError(
                 f"no encoder for axis '{axis}' of device '{device.name}'",
                 where=f"{where}: encoders",
             )
-        if encoders[axis].unit != unit:
-            raise InputError(
+        elif encoders[axis].unit != unit:
+            yield InputError(
                 f"a unit of {encoders[axis].unit}, but device '{device.name}' has this axis"
                 f" in {unit}",
                 where=f"{where}: encoders.{axis}.unit",
@@ -158,7 +181,7 @@ def _match(session: Session, device: Device) -> None:
     given |= set(session.force.names) if session.force else set()
     for name in (*device.forces, *device.channels):
         if name not in given:
-            raise InputError(
+            yield InputError(
                 f"no channel for input '{name}' of device '{device.name}'",
                 where=f"{where}: force",
                 remedy=f"these are given: {', '.join(sorted(given)) or 'none'}",
@@ -168,13 +191,13 @@ def _match(session: Session, device: Device) -> None:
     for channel in session.channels:
         expected = wanted.get(channel.name, channel.unit)
         if not _alike(channel.unit, expected):
-            raise InputError(
+            yield InputError(
                 f"a unit of {channel.unit or 'a pure number'}, but device '{device.name}' takes"
                 f" {expected or 'a pure number'}",
                 where=f"{where}: channels.{channel.name}.unit",
             )
     if session.force and not session.force.volts and session.force.unit != device.force_unit:
-        raise InputError(
+        yield InputError(
             f"found \"{session.force.unit}\", but device '{device.name}' takes {device.force_unit}",
             where=f"{where}: force.unit",
         )

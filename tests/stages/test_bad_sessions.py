@@ -335,7 +335,7 @@ REFUSED: dict[str, tuple[Damage, str]] = {
     ),
     "no trial is sound": (
         lambda made: [made.files.update({f"trials/t0{n}.csv": ""}) for n in (1, 2, 3)] and None,
-        "none of the 3 trials is sound; the first: trials/t01.csv: the file is empty",
+        "none of the 3 trials is sound; trials/t01.csv",
     ),
 }
 
@@ -679,6 +679,35 @@ def test_session_refused(name, tmp_path):
     line = str(caught.value)
     assert "\n" not in line and "session" in line
     assert not [path for path in (tmp_path / "out").rglob("*") if path.is_file()]
+
+
+def test_all_that_a_session_has_wrong_for_its_device_is_said_at_once(tmp_path):
+    damage = both(
+        drop("encoders.pitch"),
+        both(
+            put("brakes.columns", ["brake_yaw", "brake_extension"]),
+            both(put("brakes.unit", "N.m, N"), put("force.components", ["x", "y", "q"])),
+        ),
+    )
+    with pytest.raises(InputError) as caught:
+        run_ingest(Made(), tmp_path, damage)
+    said = caught.value.lines()
+    assert len(said) == 2
+    assert "no encoder for axis 'pitch'" in said[0]
+    assert "no channel for input 'force_z'" in said[1]
+
+
+def test_each_reason_for_having_no_sound_trial_is_said_once(tmp_path):
+    def damage(made):
+        made.files.update({"trials/t01.csv": "", "trials/t02.csv": b"\xfe\xff"})
+        put("trials.2.file", "trials/t99.csv")(made)
+
+    with pytest.raises(InputError) as caught:
+        run_ingest(Made(), tmp_path, damage)
+    said = caught.value.lines()
+    assert len(said) == 3
+    assert "none of the 3 trials is sound; trials/t01.csv: the file is empty" in said[0]
+    assert "trials/t99.csv: no such file" in said[2]
 
 
 @pytest.mark.parametrize("name", ASIDE)

@@ -110,6 +110,9 @@ def _drift(results: Results, rungs: Sequence[Rung]) -> Table:
         ("Version", *units),
         tuple(rows),
         "l" + "r" * len(axes),
+        note="–: runs away, drifts further than the axis itself moves, or the axis hardly moves."
+        if any("–" in cell for row in rows for cell in row)
+        else "",
     )
 
 
