@@ -119,7 +119,7 @@ class Effect(Declaration):
     )
     input: Expressions | None = Field(
         default=None,
-        description="True force from the measured one (f, f_rate, f_curvature; g for the other"
+        description="True force from the measured one (f, f_rate, to f_sixth; g for the other"
         " of a pair); per channel where the scope is device",
     )
     offset: Expressions | None = Field(

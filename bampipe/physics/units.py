@@ -333,8 +333,8 @@ def _effect_symbols(item: BoundEffect, device: Device, check: _Check) -> dict[st
             }
     if item.effect.scope in ("force_component", "force_pair"):
         for letter in "fg"[: 1 + (item.effect.scope == "force_pair")]:
-            for order, suffix in enumerate(("", "_rate", "_curvature")):
-                symbols[letter + suffix] = symbols[derivative(device.forces[0], order)]
+            for order in range(len(INPUT_ORDERS)):
+                symbols[derivative(letter, order)] = symbols[derivative(device.forces[0], order)]
     if item.effect.scope == "channel":
         symbols["f"] = symbols[item.target]
     if any(key.endswith(f".{EACH}") for key in item.effect.expressions):

@@ -186,8 +186,8 @@ class Vocabulary:
                 symbols[f"middle_{letter}"] = sp.Float(middle)
         elif item.effect.scope in ("force_component", "force_pair"):
             for letter, force in zip("fg", self.targeted(item), strict=False):
-                for k, suffix in enumerate(("", "_rate", "_curvature")):
-                    symbols[letter + suffix] = self.channel[derivative(force, k)]
+                for k in range(len(INPUT_ORDERS)):
+                    symbols[derivative(letter, k)] = self.channel[derivative(force, k)]
         elif item.effect.scope == "channel":
             symbols["f"] = self.channel[item.target]
         symbols |= {s.name: self.z[item.prefix, s.name] for s in item.effect.states}

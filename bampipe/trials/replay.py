@@ -1,8 +1,9 @@
 """The fitted model in place of the machine: recordings that contain nothing the model lacks.
 
 Noise floors, chance levels and the bias of least squares come from here. The model is driven along
-nearly the measured motion by the measured force plus an arm; on a test bench, which prescribes the
-motion, it keeps that and takes the force it needs. What it does is read by the same sensors and
+nearly the measured motion by the measured force plus an arm. Where something stiff gives the
+motion, a test bench or the position controllers of a robot, it keeps that and takes the force it
+needs: no spring that the model lacks carries it away. What it does is read by the same sensors and
 goes through the same filters.
 """
 
@@ -56,7 +57,7 @@ def replay_recording(
         Runaway: the simulated motion grows without bounds.
     """
     u = motion.inputs(system.inputs)
-    if system.model.device.prescribed:
+    if _is_given_motion(system):
         force = _required_force(system, p, motion, u)
         return read_by_sensors(system, motion, motion.q, force, sensors, rng)
     q, qd = _reference(system, p, motion, u, sensors.rate_hz)
@@ -74,6 +75,12 @@ def replay_recording(
     seen = system.encoder_readings(x, total, p)[:, : len(system.coordinates)]
     force = total[:, [at[f] for f in forces]]
     return read_by_sensors(system, motion, seen, force, sensors, rng)
+
+
+def _is_given_motion(system: System) -> bool:
+    """Whether something stiff gives the motion, and the force is what that takes."""
+    device = system.model.device
+    return device.prescribed or (device.robot is not None and not system.undriven)
 
 
 def _required_force(system: System, p: Array, motion: Motion, u: Array) -> Array:

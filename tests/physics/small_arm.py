@@ -16,7 +16,7 @@ ARM = {
                      "mass": 0.5, "center": [0.0, 0.0, 0.1]},
         }
     },
-    "inputs": {"force": ["a", "b", "c"], "force_unit": "N.m"},
+    "inputs": {"force": ["a", "b", "c"], "force_unit": "N.m", "drive": True},
     "applied": {"one": "a", "two": "b", "rail": "c"},
     "friction": {
         name: {"viscous": {"unit": "", "prior": 0.3, "sd": 1.0},

@@ -1,0 +1,45 @@
+"""What an arm of the independent simulator hides is named, from URDF and logs alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from independent import arm
+
+import bampipe
+from bampipe.data.run_folder import RunFolder
+from bampipe.files import read_json
+from bampipe.proposal import propose, write_proposal
+
+
+def run_arm(root: Path, seed: int, kinds: str, effects: dict[str, float]) -> RunFolder:
+    """Record an arm, let `init` propose the session, and run it up to validate."""
+    folder = root / "arm"
+    arm.record_logs(folder, seed, kinds, effects, style="joint_states", seconds=8.0)
+    proposal = propose(folder)
+    assert proposal.fill_in == []
+    write_proposal(folder, proposal)
+    bampipe.run_session(folder, runs=root / "runs", last="validate")
+    return RunFolder(root / "runs" / "arm")
+
+
+@pytest.mark.slow
+def test_a_spring_that_the_model_lacks_carries_no_replay_away(tmp_path: Path) -> None:
+    run = run_arm(tmp_path, 31, "ZY", {"return_spring:base_yaw": 4.0})
+    axes = read_json(run.path("models/base/validate.json"))["axes"]
+    for axis, entry in axes.items():
+        over = entry["held_out_rmse"] / entry["noise_floor"]
+        assert over > 50.0 if axis == "base_yaw" else 0.8 < over < 1.25
+
+
+@pytest.mark.slow
+def test_a_drive_that_is_late_is_named(tmp_path: Path) -> None:
+    run = run_arm(tmp_path, 32, "ZY", {"actuator_delay:shoulder": 1.0})
+    bampipe.diagnose(run.root)
+    found = read_json(run.path("models/base/diagnose.json"))
+    assert found["selected"] == ["drive_delay:torque_shoulder"]
+    best = found["ranking"][0]
+    truth = read_json(tmp_path / "arm.truth.json")["effects"]["actuator_delay:shoulder"]["delay"]
+    fitted = best["parameters"]["drive_delay.torque_shoulder.delay"]
+    assert fitted == pytest.approx(truth, rel=0.1)
