@@ -13,6 +13,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -24,6 +25,7 @@ from bampipe.discover.chance import Progress, workers
 from bampipe.discover.findings import Diagnosis
 from bampipe.discover.other_band import judge_in_other_band
 from bampipe.discover.search import search
+from bampipe.discover.sentences import axis_sentences
 from bampipe.discover.settings import Settings
 from bampipe.discover.verdict import conclude
 from bampipe.physics.recipe import Recipe
@@ -61,5 +63,11 @@ def diagnose(
         searched = search(bench, recipe, start, progress)
         found = conclude(searched, settings)
     progress(0.95, "holding the final model against its floor in another band")
-    other = judge_in_other_band(searched.trials, found.evidence, settings)
-    return replace(found, other_band=other)
+    bands = judge_in_other_band(searched.trials, found.evidence, settings)
+    found = _with_each_axis(found, "other_band", bands)
+    return _with_each_axis(found, "sentence", axis_sentences(found))
+
+
+def _with_each_axis(found: Diagnosis, field: str, values: Sequence[object]) -> Diagnosis:
+    axes = [a.model_copy(update={field: v}) for a, v in zip(found.axes, values, strict=True)]
+    return replace(found, axes=tuple(axes))

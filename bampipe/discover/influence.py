@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from bampipe.discover.candidates import Candidate
 from bampipe.discover.scorer import Score, Scorer
+from bampipe.results.diagnose import Stretch
 from bampipe.trials.residuals import Evidence
 
 Array = NDArray[np.float64]
@@ -19,24 +20,22 @@ SECOND_S = 1.0
 
 
 @dataclass(frozen=True)
-class Stretch:
+class SampleRange:
     """Samples of one trial that belong together.
 
     Attributes:
         trial: its number.
         first, last: rows of the thinned residual, the last one excluded.
-        trial_id: its name; t_start, t_end: s from its beginning.
+        stretch: the same in words: name of the trial, and from when to when.
     """
 
     trial: int
     first: int
     last: int
-    trial_id: str
-    t_start: float
-    t_end: float
+    stretch: Stretch
 
 
-def largest_second(evidence: Evidence, by_sample: Sequence[Array]) -> Stretch:
+def largest_second(evidence: Evidence, by_sample: Sequence[Array]) -> SampleRange:
     """The second in which ``by_sample``, by trial, each (K,), adds up to most."""
     length = max(1, round(SECOND_S * evidence.band.rate_hz / evidence.band.step))
     best, at = -np.inf, (0, 0)
@@ -49,28 +48,29 @@ def largest_second(evidence: Evidence, by_sample: Sequence[Array]) -> Stretch:
             best, at = float(sums[row]), (trial, row)
     trial, row = at
     last = min(row + length, len(by_sample[trial]))
-    return _stretch(evidence, trial, row, last)
+    return _range_of(evidence, trial, row, last)
 
 
-def largest_trial(evidence: Evidence, by_sample: Sequence[Array]) -> Stretch:
+def largest_trial(evidence: Evidence, by_sample: Sequence[Array]) -> SampleRange:
     """The trial in which ``by_sample``, by trial, each (K,), adds up to most."""
     trial = int(np.argmax([values.sum() for values in by_sample]))
-    return _stretch(evidence, trial, 0, len(by_sample[trial]))
+    return _range_of(evidence, trial, 0, len(by_sample[trial]))
 
 
-def _stretch(evidence: Evidence, trial: int, first: int, last: int) -> Stretch:
+def _range_of(evidence: Evidence, trial: int, first: int, last: int) -> SampleRange:
     motion = evidence.motions[trial]
     t = motion.t[evidence.band.kept(len(motion.t))]
-    return Stretch(trial, first, last, motion.trial_id, float(t[first]), float(t[last - 1]))
+    stretch = Stretch(trial_id=motion.trial_id, t_start=t[first], t_end=t[last - 1])
+    return SampleRange(trial, first, last, stretch)
 
 
-def without(evidence: Evidence, stretch: Stretch) -> Evidence:
-    """The evidence as if the samples of ``stretch`` had not been recorded; the fit stays."""
+def leave_out(evidence: Evidence, samples: SampleRange) -> Evidence:
+    """The evidence as if ``samples`` had not been recorded; the fit stays."""
 
     def cleared(parts: Sequence[NDArray[Any]]) -> tuple[NDArray[Any], ...]:
-        emptied = parts[stretch.trial].copy()
-        emptied[stretch.first : stretch.last] = 0
-        return (*parts[: stretch.trial], emptied, *parts[stretch.trial + 1 :])
+        emptied = parts[samples.trial].copy()
+        emptied[samples.first : samples.last] = 0
+        return (*parts[: samples.trial], emptied, *parts[samples.trial + 1 :])
 
     return replace(
         evidence,
@@ -80,7 +80,7 @@ def without(evidence: Evidence, stretch: Stretch) -> Evidence:
     )
 
 
-def error_without_second(evidence: Evidence, axis: int) -> tuple[Stretch, float]:
+def error_without_second(evidence: Evidence, axis: int) -> tuple[SampleRange, float]:
     """The second with the largest held-out residual of an axis, and the error but for it."""
     judged = [k for k, counts in enumerate(evidence.folds.judged) if counts]
     squares = [
@@ -97,16 +97,16 @@ def error_without_second(evidence: Evidence, axis: int) -> tuple[Stretch, float]
 
 
 def score_without(
-    evidence: Evidence, items: Sequence[Candidate], scores: Sequence[Score], stretch: Stretch
+    evidence: Evidence, items: Sequence[Candidate], scores: Sequence[Score], samples: SampleRange
 ) -> dict[str, Score]:
-    """Score candidates as if ``stretch`` had not been recorded, their shapes held.
+    """Score candidates as if ``samples`` had not been recorded, their shapes held.
 
     Args:
         evidence: of the model without any of them.
         items: candidates; scores: theirs, in the same order.
-        stretch: what is left out.
+        samples: what is left out.
     """
-    scorer = Scorer(without(evidence, stretch))
+    scorer = Scorer(leave_out(evidence, samples))
     found = {
         item.name: scorer.score_at(item, score.values)
         for item, score in zip(items, scores, strict=True)

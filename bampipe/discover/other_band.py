@@ -5,40 +5,23 @@ A low-pass may hide what acts above it, and lets in what the sensors do not reso
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from bampipe.discover.scorer import Scorer
 from bampipe.discover.settings import Settings
 from bampipe.estimate.low_pass import Band
 from bampipe.estimate.simulation import Runaway
-from bampipe.results.standing import Standing, standing
+from bampipe.results.diagnose import OtherBand
+from bampipe.results.standing import standing
 from bampipe.trials.band import LEAST_HZ
 from bampipe.trials.measured import MeasuredTrials
 from bampipe.trials.noise_floor import FLOOR_SEED, NoiseFloor, replay_evidence
 from bampipe.trials.residuals import Evidence, gather_evidence
 
 
-@dataclass(frozen=True)
-class AxisInBand:
-    """How the final model stands on one axis in another band.
-
-    Attributes:
-        cutoff_hz: of the low-pass.
-        rmse, noise_floor: cross-validated error of the model and of its replays, N.m or N.
-        standing: one against the other.
-    """
-
-    cutoff_hz: float
-    rmse: float
-    noise_floor: float
-    standing: Standing
-
-
 def judge_in_other_band(
     trials: MeasuredTrials, evidence: Evidence, settings: Settings
-) -> tuple[AxisInBand | None, ...]:
+) -> tuple[OtherBand | None, ...]:
     """Hold the final model against its floor in a wider band, else in a narrower one.
 
     Args:
@@ -75,11 +58,11 @@ def judge_in_other_band(
     return tuple(
         None
         if cutoff == was
-        else AxisInBand(
-            cutoff,
-            float(error[i]),
-            float(floor.level[i]),
-            standing(float(error[i]), float(floor.level[i]), float(floor.sd[i])),
+        else OtherBand(
+            cutoff_hz=cutoff,
+            rmse=error[i],
+            noise_floor=floor.level[i],
+            standing=standing(float(error[i]), float(floor.level[i]), float(floor.sd[i])),
         )
         for i, (cutoff, was) in enumerate(zip(cutoffs, known.cutoff_hz, strict=True))
     )

@@ -7,14 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from bampipe.discover.findings import Ranked
 from bampipe.discover.scorer import Scorer
 from bampipe.discover.search import Search
 from bampipe.physics.parameter import Parameter
 from bampipe.physics.recipe import Recipe
+from bampipe.results.diagnose import RankedEffect
 
 
-def rank(search: Search, selected: Sequence[str]) -> list[Ranked]:
+def rank(search: Search, selected: Sequence[str]) -> list[RankedEffect]:
     """Selected effects with their groups, then the others by their score beyond chance.
 
     Selected effects are held against the model that they were added to, others against the model
@@ -27,7 +27,7 @@ def rank(search: Search, selected: Sequence[str]) -> list[Ranked]:
         (n for n in search.first if n not in order),
         key=lambda n: -float(search.level.excess(search.first[n]).sum()),
     )
-    initial = Scorer(search.initial)
+    initial, system = Scorer(search.initial), search.initial.system
     rows = []
     for name in [*order, *others]:
         if name not in search.first:
@@ -43,15 +43,16 @@ def rank(search: Search, selected: Sequence[str]) -> list[Ranked]:
         group = next(({g, *r} - {name} for g, r in search.groups.items() if name in (g, *r)), set())
         own = [q.name for q in _own_parameters(search.recipe, name)]
         rows.append(
-            Ranked(
-                name,
-                axis,
-                float(scorer.evidence.held_out_rmse[axis]),
-                float(scorer.held_out_scale[axis] * score.error[axis]),
-                p_value,
-                float(excess.sum()),
-                dict(zip(own, [float(v) for v in score.values], strict=True)),
-                tuple(sorted(group)),
+            RankedEffect(
+                effect=name,
+                axis=system.coordinates[axis],
+                held_out_rmse_before=scorer.evidence.held_out_rmse[axis],
+                held_out_rmse_after=scorer.held_out_scale[axis] * score.error[axis],
+                unit=system.torque_units[axis],
+                p_value=p_value,
+                score=excess.sum(),
+                parameters=dict(zip(own, score.values, strict=True)),
+                indistinguishable_from=tuple(sorted(group)),
             )
         )
     return rows

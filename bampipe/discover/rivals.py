@@ -9,7 +9,7 @@ import numpy as np
 
 from bampipe.discover.bench import Bench
 from bampipe.discover.chance import Progress, Replicate, candidates_of
-from bampipe.discover.influence import Stretch, largest_second, score_without
+from bampipe.discover.influence import SampleRange, largest_second, score_without
 from bampipe.discover.level import Level
 from bampipe.discover.scorer import Score, Scorer
 from bampipe.discover.settings import Settings
@@ -31,7 +31,7 @@ class Choice:
 
     winner: str
     alike: tuple[str, ...]
-    transient: Mapping[str, Stretch]
+    transient: Mapping[str, SampleRange]
 
 
 def choose(

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from bampipe.discover.bench import Bench
 from bampipe.discover.chance import Progress, Replicate
-from bampipe.discover.findings import Contender, Step
-from bampipe.discover.influence import Stretch, error_without_second
+from bampipe.discover.findings import Contender
+from bampipe.discover.influence import SampleRange, error_without_second
 from bampipe.discover.level import Level
 from bampipe.discover.polish import FittedSet, extend_set, is_superfluous, polish, reduce_set
 from bampipe.discover.rivals import choose
@@ -19,6 +19,7 @@ from bampipe.discover.scorer import Score, Scorer
 from bampipe.discover.settings import Settings
 from bampipe.estimate.simulation import Runaway
 from bampipe.physics.recipe import Recipe
+from bampipe.results.diagnose import SearchStep
 from bampipe.results.standing import AT_FLOOR, standing
 from bampipe.trials.folds import HELD_OUT
 from bampipe.trials.measured import MeasuredTrials
@@ -78,8 +79,8 @@ class Search:
     main: Mapping[str, int]
     additions: Mapping[str, Addition]
     likely: Mapping[str, tuple[float, Array]]
-    transient: Mapping[str, Stretch]
-    steps: tuple[Step, ...]
+    transient: Mapping[str, SampleRange]
+    steps: tuple[SearchStep, ...]
     final: tuple[Replicate, ...]
 
     @property
@@ -114,7 +115,7 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
     groups: dict[str, tuple[str, ...]] = {}
     additions: dict[str, Addition] = {}
     dropped: set[str] = set()
-    transient: dict[str, Stretch] = {}
+    transient: dict[str, SampleRange] = {}
     steps = [_step(current)]
     known = level
     while len(current.added) + len(dropped) < s.most_effects:
@@ -168,8 +169,10 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
     )  # fmt: skip
 
 
-def _step(known: FittedSet) -> Step:
-    return Step(known.added, tuple(float(e) for e in known.evidence.held_out_rmse))
+def _step(known: FittedSet) -> SearchStep:
+    axes = known.evidence.system.coordinates
+    errors = dict(zip(axes, known.evidence.held_out_rmse, strict=True))
+    return SearchStep(effects=known.added, held_out_rmse=errors)
 
 
 def _rivals(first: Mapping[str, Score], name: str, alike: Sequence[str], s: Settings) -> list[str]:

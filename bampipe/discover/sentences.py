@@ -5,19 +5,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from bampipe.discover.description import describe
-from bampipe.discover.findings import AxisFinding, Contender, Diagnosis
-from bampipe.discover.influence import Stretch
+from bampipe.discover.findings import Contender, Diagnosis
 from bampipe.lists import join_names
+from bampipe.results.diagnose import AxisVerdict, Stretch
 from bampipe.results.standing import FLOOR_WRONG, STANDINGS_IN_WORDS
 
 
-def axis_sentences(found: Diagnosis) -> dict[str, str]:
-    """One or more sentences for each axis, by its name."""
+def axis_sentences(found: Diagnosis) -> list[str]:
+    """One or more sentences for each axis."""
     system = found.evidence.system
-    return {
-        axis: " ".join(_parts(axis, i, found, system.torque_units[i]))
+    return [
+        " ".join(_parts(axis, i, found, system.torque_units[i]))
         for i, axis in enumerate(system.coordinates)
-    }
+    ]
 
 
 def _parts(axis: str, i: int, found: Diagnosis, unit: str) -> list[str]:
@@ -30,7 +30,7 @@ def _parts(axis: str, i: int, found: Diagnosis, unit: str) -> list[str]:
         return parts + ([f"Weighed: {join_names(a.effects)}."] if a.effects else [])
     parts = [f"{name}: {_verdict(a, found, unit)}."]
     parts += _rivals(a, found, unit)
-    parts += _transients(i, found)
+    parts += _transients(axis, found)
     if a.remains:
         left = (
             "What is left no effect in the library explains; its shape"
@@ -41,13 +41,13 @@ def _parts(axis: str, i: int, found: Diagnosis, unit: str) -> list[str]:
         parts.append(f"{left}: {describe(judged, i)}.")
     elif a.standing == "above_floor":
         parts.append(_excused(a, unit))
-    return parts + _other_band(i, found)
+    return parts + _other_band(a)
 
 
-def _other_band(i: int, found: Diagnosis) -> list[str]:
+def _other_band(a: AxisVerdict) -> list[str]:
     """Where another reasonable band gives another standing, that it does."""
-    other = found.other_band[i] if found.other_band else None
-    if other is None or other.standing == found.axes[i].standing:
+    other = a.other_band
+    if other is None or other.standing == a.standing:
         return []
     ratio = other.rmse / max(other.noise_floor, 1e-30)
     return [
@@ -57,35 +57,36 @@ def _other_band(i: int, found: Diagnosis) -> list[str]:
     ]
 
 
-def _verdict(a: AxisFinding, found: Diagnosis, unit: str) -> str:
+def _verdict(a: AxisVerdict, found: Diagnosis, unit: str) -> str:
     ratio = a.rmse_after / max(a.noise_floor, 1e-30)
     falls = (
         f"takes the held-out error from {a.rmse_before:.3g} to {a.rmse_after:.3g} {unit}, "
         f"{ratio:.2f} times the noise floor"
     )
+    share = f"{100 * a.explained_by_effects:.0f} %"
+    explained = f"{share} of what exceeds the noise floor in the mean square"
     stands = f"held-out error {a.rmse_after:.3g} {unit}, {ratio:.1f} times the noise floor"
     if a.verdict == "missing":
         it = "it" if len(a.effects) == 1 else "them"
         return f"{_missing(a.effects)}; adding {it} {falls}"
     if a.verdict == "undecided" and a.effects:
-        sure = [n for n in a.effects if n not in a.odds]
+        sure = [n for n in a.effects if n not in a.likely]
         also = f"{_missing(sure)}, and " if sure else ""
         adding = f"adding {join_names(a.effects)} {falls}"
         return f"{also}these trials cannot tell {_odds(a, ' from ')}; {adding}"
-    if a.verdict == "undecided" and a.explained > 0.0:
+    if a.verdict == "undecided" and a.explained_by_effects > 0.0:
         return (
-            f"{join_names(a.odds)} would take the held-out error from {a.rmse_before:.3g} to "
-            f"{a.rmse_after:.3g} {unit} only, {100 * a.explained:.0f} % of what exceeds the noise "
-            "floor in the mean square: likely, but not the effect that is missing"
+            f"{join_names(a.likely)} would take the held-out error from {a.rmse_before:.3g} to "
+            f"{a.rmse_after:.3g} {unit} only, {explained}: likely, but not the effect that is "
+            "missing"
         )
     if a.verdict == "undecided":
         return f"{stands}; likely, but not beyond chance: {_odds(a, ', ')}"
     if a.verdict == "unknown_effect":
         error = a.rmse_before
         near = (
-            f"; {join_names(a.odds)} would take {100 * a.explained:.0f} % of what exceeds the "
-            f"noise floor in the mean square, and leave {a.rmse_after:.3g} {unit}"
-            if a.odds
+            f"; {join_names(a.likely)} would take {explained}, and leave {a.rmse_after:.3g} {unit}"
+            if a.likely
             else ""
         )
         return (
@@ -103,12 +104,12 @@ def _missing(names: Sequence[str]) -> str:
     return f"{join_names(names)} {'is' if len(names) == 1 else 'are'} missing"
 
 
-def _rivals(a: AxisFinding, found: Diagnosis, unit: str) -> list[str]:
+def _rivals(a: AxisVerdict, found: Diagnosis, unit: str) -> list[str]:
     """The effects that come close to one found on this axis, with what they would leave."""
     said = []
     for name in a.effects:
         contest = found.contests.get(name, ())
-        rivals = [c for c in contest[1:] if c.effect not in a.odds]
+        rivals = [c for c in contest[1:] if c.effect not in a.likely]
         if rivals:
             mine = contest[0]
             listed = join_names(f"{c.effect} ({_left(c, unit)})" for c in rivals)
@@ -120,23 +121,21 @@ def _left(c: Contender, unit: str) -> str:
     return f"leaves {c.held_out_rmse:.3g} {unit}"
 
 
-def _transients(i: int, found: Diagnosis) -> list[str]:
-    said = []
-    for name, (axis, second) in found.transient.items():
-        if axis == i:
-            said.append(
-                f"Only {_when(second)} speaks for {name}: it counts once another trial shows it."
-            )
-    return said
+def _transients(axis: str, found: Diagnosis) -> list[str]:
+    return [
+        f"Only {_when(one.second)} speaks for {one.effect}: it counts once another trial shows it."
+        for one in found.transients
+        if one.axis == axis
+    ]
 
 
-def _excused(a: AxisFinding, unit: str) -> str:
+def _excused(a: AxisVerdict, unit: str) -> str:
     """Why an error above its floor does not mean that something is missing."""
-    worst = a.rmse_after - a.rmse_without_second
+    worst = a.rmse_after - a.rmse_without_worst_second
     if worst > 0.1 * a.rmse_after:
         return (
             f"Without {_when(a.worst_second)}, the worst second, the error is "
-            f"{a.rmse_without_second:.3g} {unit}."
+            f"{a.rmse_without_worst_second:.3g} {unit}."
         )
     return "What exceeds the noise floor follows nothing that the arm does."
 
@@ -145,5 +144,5 @@ def _when(second: Stretch) -> str:
     return f"{second.t_start:.1f} to {second.t_end:.1f} s of trial {second.trial_id}"
 
 
-def _odds(a: AxisFinding, between: str) -> str:
-    return between.join(f"{name} (odds {100 * share:.0f} %)" for name, share in a.odds.items())
+def _odds(a: AxisVerdict, between: str) -> str:
+    return between.join(f"{name} (odds {100 * share:.0f} %)" for name, share in a.likely.items())

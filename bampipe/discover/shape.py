@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bampipe.results.diagnose import WorstWindow
 from bampipe.trials.motion import Motion
 from bampipe.trials.residuals import Evidence
 
@@ -51,18 +53,6 @@ class Map:
     high: Array
     count: Array
     share: float
-
-
-@dataclass(frozen=True)
-class Window:
-    """A stretch of a trial where the model fails."""
-
-    axis: str
-    trial_id: str
-    t_start: float
-    t_end: float
-    rmse: float
-    doing: str
 
 
 def variables(evidence: Evidence, axis: int) -> tuple[Variable, ...]:
@@ -166,12 +156,12 @@ def explainable_share(evidence: Evidence, axis: int, seed: int = 0) -> float:
     return max(0.0, 1.0 - left / max(total, 1e-30))
 
 
-def worst_windows(evidence: Evidence, count: int = 10, width_s: float = 0.5) -> list[Window]:
+def worst_windows(evidence: Evidence, count: int = 10, width_s: float = 0.5) -> list[WorstWindow]:
     """The stretches with the largest residual relative to the axis' own, over all axes."""
     band, system = evidence.band, evidence.system
     length = max(2, int(width_s * band.rate_hz / band.step))
     typical = evidence.rmse()
-    found: list[tuple[float, Window]] = []
+    found: list[tuple[float, dict[str, Any]]] = []
     for k, motion in enumerate(evidence.motions):
         kept = band.kept(len(motion.t))
         for start in range(0, len(kept) - length + 1, length):
@@ -183,10 +173,18 @@ def worst_windows(evidence: Evidence, count: int = 10, width_s: float = 0.5) -> 
                 rmse = float(np.sqrt(np.sum(evidence.residual[k][rows, axis] ** 2) / n))
                 t = motion.t[kept[rows]]
                 doing = _doing(motion, kept[rows], axis, system.coordinate_units[axis])
-                window = Window(name, motion.trial_id, float(t[0]), float(t[-1]), rmse, doing)
+                window = {
+                    "axis": name,
+                    "trial_id": motion.trial_id,
+                    "t_start": t[0],
+                    "t_end": t[-1],
+                    "rmse": rmse,
+                    "unit": system.torque_units[axis],
+                    "doing": doing,
+                }
                 found.append((rmse / max(typical[axis], 1e-12), window))
     found.sort(key=lambda pair: -pair[0])
-    return [window for _, window in found[:count]]
+    return [WorstWindow(**window) for _, window in found[:count]]
 
 
 def _doing(motion: Motion, rows: NDArray[np.int64], axis: int, unit: str) -> str:

@@ -8,14 +8,14 @@ from dataclasses import replace
 import numpy as np
 
 from bampipe.discover.chance import candidates_of
-from bampipe.discover.findings import AxisFinding, Contender, Diagnosis
-from bampipe.discover.influence import Stretch, error_without_second
+from bampipe.discover.findings import Contender, Diagnosis
+from bampipe.discover.influence import error_without_second
 from bampipe.discover.ranking import rank
 from bampipe.discover.scorer import Scorer
 from bampipe.discover.search import Search
 from bampipe.discover.settings import Settings
 from bampipe.discover.shape import explainable_share
-from bampipe.results.diagnose import Verdict
+from bampipe.results.diagnose import AxisVerdict, TransientCandidate, Verdict
 from bampipe.results.standing import FLOOR_WRONG, standing
 from bampipe.trials.noise_floor import NoiseFloor
 
@@ -67,22 +67,25 @@ def conclude(search: Search, s: Settings) -> Diagnosis:
         else:
             verdict = "nothing_missing"
         findings.append(
-            AxisFinding(
-                verdict,
-                float(before[axis]),
-                float(after[axis]),
-                level,
-                scatter,
-                against_floor,
-                worst,
-                but_for_it,
-                given,
-                share,
-                by_chance,
-                tuple(n for n in here if n not in weak),
-                lacking,
-                explained,
-                at,
+            AxisVerdict(
+                verdict=verdict,
+                effects=tuple(n for n in here if n not in weak),
+                likely=at,
+                rmse_before=before[axis],
+                rmse_after=after[axis],
+                noise_floor=level,
+                noise_floor_sd=scatter,
+                standing=against_floor,
+                worst_second=worst.stretch,
+                rmse_without_worst_second=but_for_it,
+                other_band=None,
+                unit=evidence.system.torque_units[axis],
+                explainable_share=given,
+                explainable_after=share,
+                explainable_chance=by_chance,
+                remains=lacking,
+                explained_by_effects=explained,
+                sentence="",
             )
         )
     kept = [n for n in search.selected if n not in weak]
@@ -91,17 +94,20 @@ def conclude(search: Search, s: Settings) -> Diagnosis:
     contests = {n: _listed(search.contests.get(n, ()), odds[n], s) for n in kept}
     return Diagnosis(
         tuple(findings), tuple(ranking), tuple(kept), groups, contests, search.steps,
-        _transient(search), evidence, search.initial,
+        _transients(search), evidence, search.initial,
     )  # fmt: skip
 
 
-def _transient(search: Search) -> dict[str, tuple[int, Stretch]]:
+def _transients(search: Search) -> tuple[TransientCandidate, ...]:
     """Candidates that only one second speaks for, with the axis where they help most."""
-    return {
-        name: (int(np.argmax(search.first[name].gain)), second)
+    axes = search.initial.system.coordinates
+    return tuple(
+        TransientCandidate(
+            effect=name, axis=axes[np.argmax(search.first[name].gain)], second=second.stretch
+        )
         for name, second in search.transient.items()
         if name in search.first and name not in search.selected
-    }
+    )
 
 
 def _odds_of_group(search: Search, name: str, s: Settings) -> dict[str, float]:

@@ -8,19 +8,13 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
+from bampipe.results.diagnose import SearchStep
 from bampipe.results.record import Names, Record, Result, Size
 from bampipe.results.standing import Standing
 from bampipe.results.validate import AxisDrift, FreeRunError
 
 NOTICEABLE = 0.01
 """Least fall of the held-out error that confirms a model; a superfluous effect has less."""
-
-
-class SearchStep(Record):
-    """A set of effects on the way from the parent, as the diagnosis of the parent fitted it."""
-
-    effects: Names = Field(description="Beyond those of the parent")
-    held_out_rmse: dict[str, Size] = Field(description="By axis")
 
 
 class Rung(Record):

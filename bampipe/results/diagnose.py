@@ -99,10 +99,10 @@ class Contender(Record):
     odds: Share = Field(description="That it is this one, of those that fit alike; 0 if it is not")
 
 
-class Step(Record):
+class SearchStep(Record):
     """One step of the search over sets of effects."""
 
-    effects: Names = Field(description="In the model then")
+    effects: Names = Field(description="In the model then, beyond those of the model diagnosed")
     held_out_rmse: dict[str, Size] = Field(description="By axis")
 
 
@@ -174,7 +174,9 @@ class DiagnoseResult(Result):
     contests: dict[str, tuple[Contender, ...]] = Field(
         description="By effect found: itself, then the rivals that come close to it"
     )
-    steps: tuple[Step, ...] = Field(description="The sets of effects that the search went through")
+    steps: tuple[SearchStep, ...] = Field(
+        description="Sets of effects that the search went through"
+    )
     transients: tuple[TransientCandidate, ...]
     suggested_trial: SuggestedTrial | None
     maps: dict[str, dict[str, ResidualMap]] = Field(description="By axis, then variable")

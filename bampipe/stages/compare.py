@@ -12,8 +12,8 @@ from bampipe.data.run_folder import RunFolder
 from bampipe.declarations.model import ModelFile, read_model_file
 from bampipe.errors import InputError
 from bampipe.progress import Progress
-from bampipe.results.compare import CompareResult, Moved, Rung, SearchStep, Value
-from bampipe.results.diagnose import DiagnoseResult
+from bampipe.results.compare import CompareResult, Moved, Rung, Value
+from bampipe.results.diagnose import DiagnoseResult, SearchStep
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.validate import ValidateResult
 from bampipe.schema import STRICT, Positive
@@ -112,7 +112,7 @@ def _search_steps(run: RunFolder, parent: str, added: list[str]) -> tuple[Search
     for step in run.read(DiagnoseResult, parent).steps:
         larger = len(step.effects) > (len(steps[-1].effects) if steps else 0)
         if larger and set(step.effects) < set(added):
-            steps.append(SearchStep(effects=step.effects, held_out_rmse=step.held_out_rmse))
+            steps.append(step)
     return tuple(steps)
 
 

@@ -18,8 +18,6 @@ from bampipe.data.store import write_parquet
 from bampipe.declarations.model_file import IDENTIFIED_MODEL, identified, load_model, read_recipe
 from bampipe.discover.diagnosis import diagnose
 from bampipe.discover.findings import Diagnosis
-from bampipe.discover.influence import Stretch as FoundStretch
-from bampipe.discover.sentences import axis_sentences
 from bampipe.discover.settings import Settings
 from bampipe.discover.shape import residual_map, variables, worst_windows
 from bampipe.errors import InputError
@@ -35,17 +33,11 @@ from bampipe.physics.effect import effect_from
 from bampipe.physics.recipe import Recipe
 from bampipe.progress import Progress
 from bampipe.results.diagnose import (
-    AxisVerdict,
     Contender,
     DiagnoseResult,
-    OtherBand,
     RankedEffect,
     ResidualMap,
-    Step,
-    Stretch,
     SuggestedTrial,
-    TransientCandidate,
-    WorstWindow,
 )
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.setup import SetupResult
@@ -171,75 +163,24 @@ def _summary(result: dict[str, Any]) -> dict[str, object]:
 
 def _result(found: Diagnosis, recipe: Recipe, model: str) -> DiagnoseResult:
     names = found.evidence.system.coordinates
-    units = found.evidence.system.torque_units
-    sentences = axis_sentences(found)
-    axes = {
-        axis: AxisVerdict(
-            verdict=a.verdict,
-            explainable_share=a.explainable_share,
-            explainable_after=a.explainable_after,
-            explainable_chance=a.explainable_chance,
-            rmse_before=a.rmse_before,
-            rmse_after=a.rmse_after,
-            noise_floor=a.noise_floor,
-            noise_floor_sd=a.floor_sd,
-            standing=a.standing,
-            worst_second=_stretch(a.worst_second),
-            rmse_without_worst_second=a.rmse_without_second,
-            other_band=OtherBand(**vars(found.other_band[i])) if found.other_band[i] else None,
-            unit=units[i],
-            effects=a.effects,
-            likely=dict(a.odds),
-            remains=a.remains,
-            explained_by_effects=a.explained,
-            sentence=sentences[axis],
-        )
-        for i, (axis, a) in enumerate(zip(names, found.axes, strict=True))
-    }
-    ranking = tuple(
-        RankedEffect(
-            effect=r.effect,
-            axis=names[r.axis],
-            held_out_rmse_before=r.held_out_rmse_before,
-            held_out_rmse_after=r.held_out_rmse_after,
-            unit=units[r.axis],
-            p_value=r.p_value,
-            score=r.score,
-            parameters=dict(r.values),
-            indistinguishable_from=r.indistinguishable_from,
-        )
-        for r in found.ranking
-    )
     contests = {
         effect: tuple(Contender(**vars(c) | {"axis": names[c.axis]}) for c in contest)
         for effect, contest in found.contests.items()
     }
     return DiagnoseResult(
         model=model,
-        axes=axes,
-        ranking=ranking,
-        descriptions=_descriptions(ranking[:_DESCRIBED], recipe),
+        axes=dict(zip(names, found.axes, strict=True)),
+        ranking=found.ranking,
+        descriptions=_descriptions(found.ranking[:_DESCRIBED], recipe),
         selected=found.selected,
         groups=dict(found.groups),
         contests=contests,
-        steps=tuple(
-            Step(
-                effects=step.effects,
-                held_out_rmse=dict(zip(names, step.held_out_rmse, strict=True)),
-            )
-            for step in found.steps
-        ),
-        transients=tuple(
-            TransientCandidate(effect=effect, axis=names[axis], second=_stretch(second))
-            for effect, (axis, second) in found.transient.items()
-        ),
+        steps=found.steps,
+        transients=found.transients,
         suggested_trial=None,
         maps=_maps(found),
-        worst_windows=tuple(
-            WorstWindow(**vars(w), unit=units[names.index(w.axis)])
-            for w in worst_windows(found.initial)
-        ),
-        sentence=" ".join(sentences.values()),
+        worst_windows=tuple(worst_windows(found.initial)),
+        sentence=" ".join(a.sentence for a in found.axes),
         next=_next(found, model),
     )
 
@@ -248,10 +189,6 @@ def _descriptions(ranking: Sequence[RankedEffect], recipe: Recipe) -> dict[str, 
     own = {effect.name: effect for effect in map(effect_from, recipe.extra)}
     names = {entry.effect.partition(":")[0] for entry in ranking}
     return {name: effect_text(own.get(name) or registry.effect(name)) for name in sorted(names)}
-
-
-def _stretch(found: FoundStretch) -> Stretch:
-    return Stretch(trial_id=found.trial_id, t_start=found.t_start, t_end=found.t_end)
 
 
 def _maps(found: Diagnosis) -> dict[str, dict[str, ResidualMap]]:
@@ -297,7 +234,7 @@ def _with_suggestion(
         return result
     system, p = found.initial.system, found.initial.p
     floor = np.array([axis.noise_floor for axis in found.axes])
-    values = {name: value for row in found.ranking for name, value in row.values.items()}
+    values = {name: value for row in found.ranking for name, value in row.parameters.items()}
     contest = make_contest(trials, recipe, p, asked, values, floor)
     if contest is None:
         return result
@@ -345,7 +282,7 @@ def _with_suggestion(
 
 def _next(found: Diagnosis, model: str) -> str:
     by_axis = dict(zip(found.evidence.system.coordinates, found.axes, strict=True))
-    undecided = [axis for axis, a in by_axis.items() if a.verdict == "undecided" and a.odds]
+    undecided = [axis for axis, a in by_axis.items() if a.verdict == "undecided" and a.likely]
     if undecided:
         return f"bampipe next RUN --model {model}"
     if found.selected:

@@ -56,7 +56,7 @@ def test_a_stribeck_effect_is_named_and_adding_it_reaches_the_floor():
     assert found.ranking[0].effect == "stribeck:yaw"
     assert found.ranking[0].p_value < 0.01
     yaw = found.axes[0]
-    assert yaw.rmse_after < 1.15 * yaw.noise_floor + 2 * yaw.floor_sd
+    assert yaw.rmse_after < 1.15 * yaw.noise_floor + 2 * yaw.noise_floor_sd
     excess = yaw.rmse_before**2 - yaw.noise_floor**2
     left = max(yaw.rmse_after**2 - yaw.noise_floor**2, 0.0)
     assert left < 0.3 * excess
@@ -88,7 +88,7 @@ def test_an_effect_outside_the_library_is_unknown_until_its_file_is_given():
     assert "position" in words and "bump" in words
     with_file = run(session, bam([], [SNAG]))
     assert with_file.selected == ("snag:yaw",)
-    values = with_file.ranking[0].values
+    values = with_file.ranking[0].parameters
     assert values["snag.yaw.place"] == pytest.approx(0.22, abs=0.02)
     assert with_file.axes[0].rmse_after < 1.2 * with_file.axes[0].noise_floor
 

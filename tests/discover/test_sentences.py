@@ -9,32 +9,37 @@ from types import SimpleNamespace
 import pytest
 
 from bampipe.discover import sentences
-from bampipe.discover.findings import AxisFinding, Contender, Diagnosis
-from bampipe.discover.influence import Stretch
+from bampipe.discover.findings import Contender, Diagnosis
+from bampipe.results.diagnose import AxisVerdict, Stretch, TransientCandidate
 from bampipe.results.standing import standing
 
-SECOND = Stretch(0, 10, 60, "t3", 4.0, 5.0)
+SECOND = Stretch(trial_id="t3", t_start=4.0, t_end=5.0)
 SHAPE = "a bump"
 
 
 def finding(verdict, before, after, floor, **more):
     """An axis with these numbers."""
-    known = {"rmse_without_second": after, "worst_second": SECOND} | more
-    return AxisFinding(
-        verdict, before, after, floor, 0.0, standing(after, floor),
-        explainable_share=0.3, explainable_after=0.1, explainable_chance=0.05, **known,
+    known = {
+        "effects": (), "likely": {}, "remains": False, "explained_by_effects": 0.0,
+        "rmse_without_worst_second": after,
+    } | more  # fmt: skip
+    return AxisVerdict(
+        verdict=verdict, rmse_before=before, rmse_after=after, noise_floor=floor,
+        noise_floor_sd=0.0, standing=standing(after, floor), worst_second=SECOND,
+        other_band=None, unit="N.m", explainable_share=0.3, explainable_after=0.1,
+        explainable_chance=0.05, sentence="", **known,
     )  # fmt: skip
 
 
-def say(monkeypatch, axis, contests=None, transient=None):
+def say(monkeypatch, axis, contests=None, transients=()):
     """The sentence of one axis called joint, in N.m."""
     monkeypatch.setattr(sentences, "describe", lambda evidence, axis: SHAPE)
     system = SimpleNamespace(coordinates=("joint",), torque_units=("N.m",))
     evidence = SimpleNamespace(system=system)
     found = Diagnosis(
-        (axis,), (), axis.effects, {}, contests or {}, (), transient or {}, evidence, evidence
+        (axis,), (), axis.effects, {}, contests or {}, (), transients, evidence, evidence
     )
-    return sentences.axis_sentences(found)["joint"]
+    return sentences.axis_sentences(found)[0]
 
 
 def numbers(sentence):
@@ -42,52 +47,69 @@ def numbers(sentence):
     return [float(x) for x in re.findall(r"(?<![\w.])\d+(?:\.\d+)?(?:e-?\d+)?", sentence)]
 
 
+def number_of_case(axis):
+    return f"{axis.verdict}-{axis.rmse_after}-{axis.explained_by_effects}"
+
+
 CASES = [
     finding(verdict, before, after, floor, **more)
     for (before, after, floor), (verdict, more) in itertools.product(
         [(1.0, 0.1, 0.1), (1.0, 0.5, 0.1), (0.226, 0.13, 0.122), (90.0, 1.14, 1.0)],
         [
-            ("missing", {"effects": ("stribeck:joint",), "explained": 0.9}),
-            ("missing", {"effects": ("a:joint", "b:joint"), "explained": 0.6, "remains": True}),
+            ("missing", {"effects": ("stribeck:joint",), "explained_by_effects": 0.9}),
+            (
+                "missing",
+                {"effects": ("a:joint", "b:joint"), "explained_by_effects": 0.6, "remains": True},
+            ),
             (
                 "undecided",
-                {"effects": ("a:joint",), "odds": {"a:joint": 0.6, "b:joint": 0.4}},
+                {"effects": ("a:joint",), "likely": {"a:joint": 0.6, "b:joint": 0.4}},
             ),
-            ("undecided", {"odds": {"a:joint": 1.0}, "explained": 0.4, "remains": True}),
-            ("undecided", {"odds": {"a:joint": 0.7}, "remains": True}),
+            (
+                "undecided",
+                {"likely": {"a:joint": 1.0}, "explained_by_effects": 0.4, "remains": True},
+            ),
+            ("undecided", {"likely": {"a:joint": 0.7}, "remains": True}),
             ("unknown_effect", {"remains": True}),
-            ("unknown_effect", {"odds": {"a:joint": 1.0}, "explained": 0.2, "remains": True}),
+            (
+                "unknown_effect",
+                {"likely": {"a:joint": 1.0}, "explained_by_effects": 0.2, "remains": True},
+            ),
             ("nothing_missing", {}),
         ],
     )
 ]
 
 
-@pytest.mark.parametrize("axis", CASES, ids=lambda a: f"{a.verdict}-{a.rmse_after}-{a.explained}")
+@pytest.mark.parametrize(
+    "axis", CASES, ids=lambda a: f"{a.verdict}-{a.rmse_after}-{a.explained_by_effects}"
+)
 def test_every_number_in_a_sentence_stands_in_the_table(monkeypatch, axis):
     said = say(monkeypatch, axis)
     ratios = [error / axis.noise_floor for error in (axis.rmse_before, axis.rmse_after)]
-    shares = [100 * axis.explained, *(100 * odds for odds in axis.odds.values())]
+    shares = [100 * axis.explained_by_effects, *(100 * odds for odds in axis.likely.values())]
     known = [axis.rmse_before, axis.rmse_after, axis.noise_floor, *ratios, *shares]
     for number in numbers(said):
         assert any(number == pytest.approx(value, rel=0.02, abs=0.051) for value in known), said
 
 
-@pytest.mark.parametrize("axis", CASES, ids=lambda a: f"{a.verdict}-{a.rmse_after}-{a.explained}")
+@pytest.mark.parametrize(
+    "axis", CASES, ids=lambda a: f"{a.verdict}-{a.rmse_after}-{a.explained_by_effects}"
+)
 def test_no_effect_explains_it_never_stands_beside_one_that_does(monkeypatch, axis):
     said = say(monkeypatch, axis)
     if axis.verdict == "unknown_effect":
         assert "no effect in the library explains" in said
-        assert axis.explained < 0.35
+        assert axis.explained_by_effects < 0.35
     elif not axis.remains:
         assert "no effect in the library" not in said
-    for effect in (*axis.effects, *axis.odds):
+    for effect in (*axis.effects, *axis.likely):
         assert effect in said
     assert (SHAPE in said) == axis.remains
 
 
 def test_rivals_are_listed_with_what_they_would_leave(monkeypatch):
-    axis = finding("missing", 1.0, 0.1, 0.1, effects=("a:joint",), explained=1.0)
+    axis = finding("missing", 1.0, 0.1, 0.1, effects=("a:joint",), explained_by_effects=1.0)
     contest = (
         Contender("a:joint", 0, 0.1, 456.5, 400.0, 430.0, 1.0),
         Contender("b:joint", 0, 0.12, 454.3, 440.0, 431.0, 0.0),
@@ -97,14 +119,15 @@ def test_rivals_are_listed_with_what_they_would_leave(monkeypatch):
 
 
 def test_an_error_above_its_floor_for_one_second_says_which(monkeypatch):
-    axis = finding("nothing_missing", 1.0, 1.0, 0.5, rmse_without_second=0.55)
+    axis = finding("nothing_missing", 1.0, 1.0, 0.5, rmse_without_worst_second=0.55)
     said = say(monkeypatch, axis)
     assert "4.0 to 5.0 s of trial t3" in said and "0.55 N.m" in said
 
 
 def test_a_candidate_that_one_second_speaks_for_is_not_called_missing(monkeypatch):
     axis = finding("nothing_missing", 0.1, 0.1, 0.1)
-    said = say(monkeypatch, axis, transient={"drive_sag:joint": (0, SECOND)})
+    only = TransientCandidate(effect="drive_sag:joint", axis="joint", second=SECOND)
+    said = say(monkeypatch, axis, transients=(only,))
     assert "Only 4.0 to 5.0 s of trial t3 speaks for drive_sag:joint" in said
     assert "drive_sag:joint is missing" not in said
 
