@@ -37,12 +37,29 @@ _RUNS_AWAY = 0.1
 _MAX_STEP_S = 1e-3
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Window:
-    """One start: error, displacement and whether the axis moves, each (horizons, n_q).
+    """One start, and how far the model has run from it.
 
-    NaN where the trial ends before the horizon; errors are infinite where the motion runs away.
+    Attributes:
+        motion: the trial, inputs u (T, n_u) and dt in s beside it; p: (n_p,) its parameters.
+        start: sample at which the model is let go; last: the last sample that counts.
+        at: sample up to which it has run; state: (nx,) there, None where the motion ran away.
     """
+
+    motion: Motion
+    u: Array
+    dt: float
+    p: Array
+    start: int
+    last: int
+    at: int
+    state: Array | None
+
+
+@dataclass(frozen=True)
+class _Reach:
+    """A window at one horizon: error (infinite if run away), displacement, is it a move: (n_q,)."""
 
     error: Array
     displacement: Array
@@ -76,7 +93,17 @@ def find_drift(
         for k, length in zip(chosen, usable, strict=True)
         for window in _windows(system, motions[k], parameters[k], length, spacing)
     ]
-    return {axis: _drift(windows, i, unit) for i, (axis, unit) in enumerate(axes)}
+    found = {axis: AxisDrift(unit=unit, horizons=()) for axis, unit in axes}
+    for horizon in HORIZONS_S:
+        if all(entry.reason for entry in found.values()):
+            break  # the longest runs, which cost most, would say nothing of any axis
+        reached = [r for window in windows if (r := _advance(system, window, horizon)) is not None]
+        for i, (axis, _) in enumerate(axes):
+            if not found[axis].reason:
+                found[axis] = found[axis].model_copy(
+                    update=_drift(reached, i, horizon, found[axis])
+                )
+    return found
 
 
 def _windows(
@@ -84,67 +111,61 @@ def _windows(
 ) -> list[_Window]:
     """Return the windows of one trial; ``length`` and ``spacing`` of the starts, s."""
     p = np.ascontiguousarray(parameters[: len(system.parameters)])
-    u, n = motion.inputs(system.inputs), motion.q.shape[1]
+    u = motion.inputs(system.inputs)
     dt = float(motion.t[1] - motion.t[0])
     q, qd, _ = system.true_motion(motion.q, motion.qd, motion.qdd, u, p)
     states = np.hstack([q, qd, system.memory(motion.q, motion.qd, motion.qdd, u, p, motion.t)])
-    ahead = [round(horizon / dt) for horizon in HORIZONS_S]
-    range_of = np.ptp(motion.q, axis=0)
-    width = np.array([c.sign_width for c in system.model.device.coordinates])
     last = len(motion.t) - 1 - round(_MARGIN_S / dt)
-    found = []
-    for number in range(int(length / spacing) if spacing > 0.0 else 0):
-        start = round((_MARGIN_S + (number + 0.5) * spacing) / dt)
-        steps = [k for k in ahead if start + k <= last]
-        if not steps:
-            continue
-        error = np.full((len(ahead), n), np.nan)
-        displacement, moves = error.copy(), np.zeros((len(ahead), n), dtype=np.bool_)
-        stop = start + steps[-1] + 1
+    count = int(length / spacing) if spacing > 0.0 else 0
+    starts = (round((_MARGIN_S + (number + 0.5) * spacing) / dt) for number in range(count))
+    return [_Window(motion, u, dt, p, k, last, k, states[k]) for k in starts]
+
+
+def _advance(system: System, window: _Window, horizon: float) -> _Reach | None:
+    """Let the model run on to the horizon, s; None where the trial ends before it."""
+    end = window.start + round(horizon / window.dt)
+    if end > window.last:
+        return None
+    if window.state is not None:
+        width = np.array([c.sign_width for c in system.model.device.coordinates])
         try:
-            x = simulate(
-                system.derivative, states[start], u[start:stop], p, dt,
+            window.state = simulate(
+                system.derivative, window.state, window.u[window.at : end + 1], window.p, window.dt,
                 width=width, n_noise=len(system.noise), max_step=_MAX_STEP_S,
-            )  # fmt: skip
+            )[-1]  # fmt: skip
         except Runaway:
-            x = None
-        reading = np.empty(2 * n)
-        for place, k in enumerate(steps):
-            measured = motion.q[start : start + k + 1]
-            displacement[place] = np.abs(measured[-1] - measured[0])
-            moves[place] = np.ptp(measured, axis=0) > _MOVES * range_of
-            error[place] = np.inf
-            if x is not None:
-                system.measure(x[k], u[start + k], p, reading)
-                error[place] = np.abs(reading[:n] - measured[-1])
-        found.append(_Window(error, displacement, moves))
-    return found
+            window.state = None
+    window.at = end
+    motion = window.motion
+    measured = motion.q[window.start : end + 1]
+    error = np.full(motion.q.shape[1], np.inf)
+    if window.state is not None:
+        reading = np.empty(2 * error.size)
+        system.measure(window.state, window.u[end], window.p, reading)
+        error = np.abs(reading[: error.size] - measured[-1])
+    moves = np.ptp(measured, axis=0) > _MOVES * np.ptp(motion.q, axis=0)
+    return _Reach(error, np.abs(measured[-1] - measured[0]), moves)
 
 
-def _drift(windows: Sequence[_Window], axis: int, unit: str) -> AxisDrift:
-    """Return what the windows say of one axis, up to the horizon where it says nothing."""
-    horizons: list[Drift] = []
-    for place, horizon in enumerate(HORIZONS_S):
-        used = [w for w in windows if w.moves[place, axis]]
-        error = np.array([w.error[place, axis] for w in used])
-        if len(used) < _LEAST:
-            reason = f"In {len(used)} windows of {horizon:g} s the axis moves: too few."
-            return AxisDrift(unit=unit, horizons=tuple(horizons), reason=reason)
-        if np.mean(np.isinf(error)) > _RUNS_AWAY:
-            reason = f"Within {horizon:g} s the simulated motion runs away."
-            return AxisDrift(unit=unit, horizons=tuple(horizons), reason=reason)
-        median, most = np.quantile(error, [0.5, 0.9], method="inverted_cdf")
-        displacement = float(np.median([w.displacement[place, axis] for w in used]))
-        if median > displacement or not np.isfinite(most):
-            reason = f"In {horizon:g} s the model drifts further than the axis moves."
-            return AxisDrift(unit=unit, horizons=tuple(horizons), reason=reason)
-        horizons.append(
-            Drift(
-                horizon_s=horizon,
-                median=median,
-                quantile_90=most,
-                displacement=displacement,
-                windows=len(used),
-            )
-        )
-    return AxisDrift(unit=unit, horizons=tuple(horizons))
+def _drift(
+    reached: Sequence[_Reach], axis: int, horizon: float, shorter: AxisDrift
+) -> dict[str, object]:
+    """Return what a horizon, s, adds to what shorter ones say of one axis, or why it is absent."""
+    used = [r for r in reached if r.moves[axis]]
+    error = np.array([r.error[axis] for r in used])
+    if len(used) < _LEAST:
+        return {"reason": f"In {len(used)} windows of {horizon:g} s the axis moves: too few."}
+    if np.mean(np.isinf(error)) > _RUNS_AWAY:
+        return {"reason": f"Within {horizon:g} s the simulated motion runs away."}
+    median, most = np.quantile(error, [0.5, 0.9], method="inverted_cdf")
+    displacement = float(np.median([r.displacement[axis] for r in used]))
+    if median > displacement or not np.isfinite(most):
+        return {"reason": f"In {horizon:g} s the model drifts further than the axis moves."}
+    drift = Drift(
+        horizon_s=horizon,
+        median=median,
+        quantile_90=most,
+        displacement=displacement,
+        windows=len(used),
+    )
+    return {"horizons": (*shorter.horizons, drift)}
