@@ -102,7 +102,7 @@ def _equations(model: Model, values: Mapping[str, float]) -> tuple[str, tuple[st
                 lambda f, rate=rate: isinstance(f, sp.tanh) and f.args[0].free_symbols == {rate},
                 lambda f, rate=rate: sign(rate),
             )
-        written = str(_Notation().doprint(plain.xreplace(names)))
+        written = _without_double_signs(str(_Notation().doprint(plain.xreplace(names))))
         return re.sub(r"(?<=[\w)]) (?=\d)", " · ", written)  # else two numbers would read as one
 
     lines = []
@@ -120,6 +120,14 @@ def _equations(model: Model, values: Mapping[str, float]) -> tuple[str, tuple[st
         lines.append(f"Q[{a}] = {text(applied + other)}")
     lines += [f"d {z}/dt = {text(rate)}" for z, rate in zip(e.z_names, e.rates, strict=True)]
     return text(e.potential), tuple(lines)
+
+
+def _without_double_signs(text: str) -> str:
+    """Return a sum in which a negative number that was put in has one sign."""
+    negative = r"\(-([\d.]+)\)(?!\^)"
+    text = re.sub(rf"(^|\()-{negative}", r"\1\2", text)
+    text = re.sub(rf"- {negative}", r"+ \1", text)
+    return re.sub(rf"\+ {negative}", r"- \1", text)
 
 
 def _number(value: float) -> str:

@@ -40,6 +40,11 @@ def spans(text: str) -> list[Span]:
     return found
 
 
+def plain_text(text: str) -> str:
+    """Return ``text`` as printed, without its marks."""
+    return "".join(body.partition("\n")[0] for _, body in spans(text))
+
+
 @dataclass(frozen=True)
 class Paragraph:
     """A paragraph."""

@@ -53,7 +53,8 @@ def page(document: Document, beside: str = "") -> str:
     )
 
 
-def _rich(text: str) -> str:
+def _rich(text: str, *, breaking: bool = False) -> str:
+    """Return HTML for text with marks; ``breaking``: names may break behind their marks."""
     parts = []
     for kind, body in spans(text):
         if kind == "link":
@@ -61,6 +62,8 @@ def _rich(text: str) -> str:
             parts.append(f'<a href="{html.escape(target)}">{html.escape(words)}</a>')
             continue
         safe = html.escape(body)
+        if breaking and kind == "code":
+            safe = re.sub(r"(?<=[._+:])", "<wbr>", safe)
         parts.append(f"<{_TAGS[kind]}>{safe}</{_TAGS[kind]}>" if kind in _TAGS else safe)
     return "".join(parts)
 
@@ -100,7 +103,8 @@ def _table(table: Table, number: str) -> str:
     rows = "\n".join(
         "<tr>"
         + "".join(
-            f'<td class="{look}">{_rich(cell)}</td>' for look, cell in zip(looks, row, strict=True)
+            f'<td class="{look}">{_rich(cell, breaking=True)}</td>'
+            for look, cell in zip(looks, row, strict=True)
         )
         + "</tr>"
         for row in table.rows

@@ -121,6 +121,11 @@ def words(name: str) -> str:
     return name.replace("_", " ")
 
 
+def trial_state(status: str) -> str:
+    """Return the state of a trial, as ingest has it, in words."""
+    return "sound" if status == "ok" else words(status)
+
+
 def count(number: int, noun: str) -> str:
     """Return ``1 trial``, ``2 trials``."""
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"

@@ -70,7 +70,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         for key, found in run.read(IdentifyResult, name).parameters.items():
             value = Value(estimate=found.estimate, sd=found.sd, unit=found.unit)
             parameters.setdefault(key, {})[name] = value
-    moved = _moved(parameters, models, order, config.sigmas)
+    moved = _moved(parameters, models, confirmed, config.sigmas)
     return CompareResult(
         best=best, ladder=tuple(ladder.values()), parameters=parameters, moved=tuple(moved)
     ).write(out)
@@ -119,12 +119,12 @@ def _search_steps(run: RunFolder, parent: str, added: list[str]) -> tuple[Search
 def _moved(
     parameters: Mapping[str, Mapping[str, Value]],
     models: Mapping[str, ModelFile],
-    order: list[str],
+    confirmed: list[str],
     sigmas: float,
 ) -> list[Moved]:
-    """Parameters that changed from parent to child by more than their uncertainty."""
+    """Parameters that a confirmed model changed by more than their uncertainty."""
     moved = []
-    for model in order:
+    for model in confirmed:
         parent = models[model].parent
         for name, by_model in parameters.items():
             if parent not in by_model or model not in by_model:

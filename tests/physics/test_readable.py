@@ -6,7 +6,7 @@ import sympy as sp
 
 from bampipe.errors import InputError
 from bampipe.physics import Model, compile_model, registry
-from bampipe.physics.readable import describe_equations
+from bampipe.physics.readable import describe_equations, model_equations
 
 BAM = registry.device("bam")
 
@@ -86,3 +86,10 @@ def test_a_wrong_device_is_an_input_error():
     )
     with pytest.raises(InputError, match="did you mean 'mass'"):
         describe_equations(rail)
+
+
+def test_a_negative_number_put_in_has_one_sign():
+    numbers = {"viscous.carriage": -2.5, "offset": -0.25, "coulomb.carriage": 3.0, "mass": 50.0}
+    lines = model_equations(Model(registry.device("slider")), numbers)
+    applied = next(line for line in lines if line.startswith("Q["))
+    assert "(-" not in applied and "0.25" in applied and "+ 2.5 s'" in applied

@@ -33,7 +33,7 @@ def text_of(page: str) -> str:
     """Return the words of a page without its drawings and marks."""
     body = page[page.index("<main>") :]
     body = re.sub(r"<svg.*?</svg>", " ", body, flags=re.DOTALL)
-    body = re.sub(r"<[^>]+>", " ", body)
+    body = re.sub(r"<[^>]+>", " ", body.replace("<wbr>", ""))
     return re.sub(r"\s+", " ", html.unescape(body))
 
 

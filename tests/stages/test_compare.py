@@ -70,3 +70,15 @@ def test_a_damaged_ladder_is_as_none(tmp_path: Path) -> None:
     compared(tmp_path)
     (tmp_path / CompareResult.FILE).write_text("{")
     assert models.counting_model(tmp_path) == "base"
+
+
+@pytest.mark.parametrize("refused", [False, True])
+def test_only_a_confirmed_model_shows_that_another_was_biased(
+    tmp_path: Path, refused: bool
+) -> None:
+    for name, parent, mass in (("base", "", 2.0), ("base+a.yaw", "base", 3.0)):
+        add(tmp_path, name, parent, refused and bool(parent), yaw=0.2 if parent else 0.5)
+        entry = {"estimate": mass, "sd": 0.1, "unit": "kg"}
+        write_result(tmp_path, IdentifyResult, model=name, parameters={"mass": entry})
+    said = ["mass moved from 2 to 3 kg: without the effect it was biased."]
+    assert [one.sentence for one in compared(tmp_path).moved] == ([] if refused else said)

@@ -320,7 +320,7 @@ def _trial_errors(results: Results) -> Content:
             for axis in axes
         ]
         seconds = float(row["duration_s"])
-        state = wording.words(str(row["status"]))
+        state = wording.trial_state(str(row["status"]))
         rows.append(
             [name, str(row["kind"]), state, seconds if np.isfinite(seconds) else None, *errors]
         )

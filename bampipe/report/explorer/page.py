@@ -8,6 +8,7 @@ from pathlib import Path
 from string import Template
 
 from bampipe.report import verdicts
+from bampipe.report.document import plain_text
 from bampipe.report.explorer.content import content_of
 from bampipe.report.explorer.packing import Packer
 from bampipe.report.results import Results
@@ -27,7 +28,8 @@ def explorer_page(results: Results, subtitle: str) -> str:
     packer = Packer()
     content = content_of(results, packer)
     verdict = verdicts.overall(results)
-    content["verdict"] = {"tone": verdict.tone, "title": verdict.title, "text": verdict.text}
+    title, text = plain_text(verdict.title), plain_text(verdict.text)
+    content["verdict"] = {"tone": verdict.tone, "title": title, "text": text}
     content["session"] = results.session.session_id
     return assemble_page(content, packer, subtitle)
 

@@ -120,7 +120,8 @@ def _parameters(results: Results, identified: IdentifyResult) -> Table:
         ),
         tuple(rows),
         "llrrr" + "r" * (len(others) + bounded + calibrated) + "l",
-        note=note,
+        (1.1, 1.0) + (0.0,) * (4 + len(others) + bounded + calibrated),
+        note,
     )
 
 

@@ -13,8 +13,6 @@ from bampipe.report.results import Results
 from bampipe.results.filter import FilterResult
 from bampipe.results.ingest import IngestResult
 
-_STATES = {"ok": "sound", "repaired": "repaired", "set_aside": "**set aside**"}
-
 
 def section(results: Results) -> Section:
     """Return the section."""
@@ -55,7 +53,7 @@ def _trials(results: Results) -> Table:
                 _kind(row),
                 _duration(row["duration_s"]),
                 str(int(row["n_samples"])) if row["n_samples"] else "–",
-                _STATES.get(str(row["status"]), str(row["status"])),
+                _emphasised(str(row["status"])),
                 _remarks(row),
             )
         )
@@ -66,6 +64,11 @@ def _trials(results: Results) -> Table:
         "llrrll",
         (0.0, 0.0, 0.0, 0.0, 0.0, 1.0),
     )
+
+
+def _emphasised(status: str) -> str:
+    state = wording.trial_state(status)
+    return f"**{state}**" if status == "set_aside" else state
 
 
 def _kind(row: dict[Any, Any]) -> str:
