@@ -84,7 +84,7 @@ def test_parameters_are_the_stored_ones_rounded_to_their_uncertainty(full: Repor
         cells = next(
             row
             for row in re.findall(r"<tr>(.*?)</tr>", full.html, flags=re.DOTALL)
-            if f"<code>{name}</code>" in row
+            if f"<code>{name}</code>" in row.replace("<wbr>", "")
         )
         shown = [text_of(f"<main>{cell}").strip() for cell in re.findall(r"<td.*?</td>", cells)]
         estimate, spread = float(shown[2].removesuffix(" *")), float(shown[3])
