@@ -58,7 +58,11 @@ def show_one(text: str, device_name: str, json: bool) -> None:
         effect = registry.effect(name)
     targets = effect.targets(device)
     if not targets:
-        raise InputError(f"device {device_name!r} cannot have effect {effect.name!r}")
+        wanted = "a robot" if effect.robot else "one that can"
+        raise InputError(
+            f"device {device_name!r} cannot have effect {effect.name!r}",
+            remedy=f"name {wanted}: bampipe effects {name} --device DEVICE.toml",
+        )
     if target and target not in targets:
         raise InputError(
             f"effect {effect.name!r} has no target {target!r} on device {device_name!r}",

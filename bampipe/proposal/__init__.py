@@ -77,7 +77,7 @@ def propose(folder: Path, device: str = "") -> Proposal:
         columns = find_robot_columns(chosen.device, chosen.device.robot, found, clock.t, notes)
         chosen = _with_guessed_motors(folder, chosen, columns)
         match.joints = columns.columns
-        match.turned = columns.turned
+        match.turned, match.gears = columns.turned, columns.gears
         _check_robot(chosen, columns, notes)
     encoders, axes = encoders_table(chosen.device, match, notes)
     inputs = input_tables(chosen, axes, match, notes)
@@ -116,10 +116,14 @@ def _with_guessed_motors(folder: Path, chosen: ChosenDevice, columns: RobotColum
     if not chosen.text or not all(drive.is_sure for drive in columns.drives.values()) or not sizes:
         return chosen
     joints = [c.name for c in chosen.device.coordinates]
+    turns = [columns.gears.get(joint, 1.0) for joint in joints]
+    of_motor = [size * ratio for size, ratio in zip(sizes, turns, strict=True)]
     if chosen.device.force_unit == "A":
-        constants = {j: (1.0, 1.0 / size) for j, size in zip(joints, sizes, strict=True)}
-        return with_motors(folder, chosen, constants)
-    if all(size < LEAST_AT_JOINT for size in sizes):
+        found = zip(joints, turns, of_motor, strict=True)
+        return with_motors(folder, chosen, {j: (n, 1.0 / size) for j, n, size in found})
+    if columns.gears and all(LEAST_AT_JOINT < size < 1.0 / LEAST_AT_JOINT for size in of_motor):
+        return with_motors(folder, chosen, {j: (columns.gears.get(j, 1.0), None) for j in joints})
+    if not columns.gears and all(size < LEAST_AT_JOINT for size in sizes):
         gears = {j: (1.0 / size, None) for j, size in zip(joints, sizes, strict=True)}
         return with_motors(folder, chosen, gears)
     return chosen

@@ -95,7 +95,8 @@ def with_motors(
         text += f"\n[robot.motors.{joint}]\nturns = {{ {joint} = {turns:.3g} }}"
         text += "" if turns == 1.0 else "  # guess: by the drawn bodies; put in that of the gear"
         if constant is not None:
-            text += f"\ntorque_constant = {constant:.3g}  # guess: N.m/A, gears included"
+            gears = ", gears included" if turns == 1.0 else ""
+            text += f"\ntorque_constant = {constant:.3g}  # guess: N.m/A{gears}"
         text += "\n"
     return replace(chosen, text=text, device=_complete(folder, text))
 

@@ -57,6 +57,15 @@ def _encoder(
         return _integrated(axis, column, notes)
     if in_counts(column):
         return _counted(axis, column, notes)
+    if axis.name in match.gears:
+        turns = match.gears[axis.name]
+        said = spelled(column.unit, _POSITION_UNITS) or guesses.likely_unit(
+            axis.unit, column.values
+        )
+        gear = f", gear_ratio = {turns:.4g}"
+        return entry(column.name, said or axis.unit, gear) + notes.guess(
+            f"{column.name} is the position of the motor of {axis.name}, in {said or axis.unit}"
+        )
     velocity = _velocity_beside(axis, alone, match, notes)
     known = column.conversion
     if known is not None and known.si == axis.unit:

@@ -33,6 +33,7 @@ class Matcher:
         joints: columns of a robot's joints and drives, by name of joint or input; of what stands
             there no other column is thought.
         turned: inputs that are logged with the other sign.
+        gears: joints whose position is that of a motor, which turns so often for one of theirs.
     """
 
     found: Survey
@@ -40,6 +41,7 @@ class Matcher:
     used: set[str]
     joints: Mapping[str, SurveyedColumn] = field(default_factory=dict)
     turned: frozenset[str] = frozenset()
+    gears: Mapping[str, float] = field(default_factory=dict)
 
     def named(self, name: str, *roles: str) -> SurveyedColumn | None:
         """The column that has the words of ``name``, of one of the roles."""

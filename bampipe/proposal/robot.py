@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import least_squares
 from scipy.signal import savgol_filter
 
 from bampipe.data.survey import Survey, SurveyedColumn
@@ -30,6 +31,13 @@ _BEYOND = 1.5
 """Times its range that a joint must travel for the position to be another's."""
 _BETTER = 0.5
 """Of what one order of the joints leaves unexplained: another one must leave less."""
+_FEW_ROWS = 1000
+_MARGINS = (1.05, 1.4, 2.0)
+"""Of its range over what a motor travels: how much of its range a joint is thought to use."""
+_DRAWN = 0.05
+"""Weight of the size of the drawn bodies beside the shape of the drives."""
+_MOST_LEFT = 0.05
+"""Of the drives' variance: what a drawing with the right reductions leaves at most."""
 _OTHER_UNITS = {"rad": ("deg", np.pi / 180.0), "m": ("mm", 1e-3)}
 
 
@@ -60,10 +68,12 @@ class RobotColumns:
     Attributes:
         columns: by name of joint or input.
         drives: by name of input, where drawing and log can be compared.
+        gears: by joint whose position is that of a motor, its turns for one of the joint.
     """
 
     columns: Mapping[str, SurveyedColumn]
     drives: Mapping[str, Drive]
+    gears: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def turned(self) -> frozenset[str]:
@@ -101,12 +111,20 @@ def find_robot_columns(
         columns |= dict(zip(device.forces, drives.columns, strict=True))
     if positions is None or drives is None:
         return RobotColumns(columns, {})
-    beyond = _beyond_range(device, positions)
-    if beyond:
-        notes.check += beyond
-        return RobotColumns(columns, {})
     judged = _judge(device, robot, positions, drives, t)
-    if not judged:
+    beyond = _beyond_range(device, positions, of_joint=bool(judged) and _fits(judged))
+    if judged and not robot.motors and not _fits(judged):
+        # Hundreds without a unit are degrees, or radians of a motor.
+        geared = [
+            (group, fitted)
+            for group in (positions, _in_si(device, pairing.positions[0]))
+            if (fitted := _find_gears(device, robot, group, drives, t)) is not None
+        ]
+        if geared:
+            group, (ratio, by_motor) = min(geared, key=lambda item: _left(item[1][1]))
+            return _geared(device, columns, group, ratio, by_motor, notes)
+    notes.check += beyond
+    if not judged or (beyond and not _fits(judged)):
         return RobotColumns(columns, {})
     if not (positions.named or drives.named):
         other = _in_alphabetical_order(device, positions), _in_alphabetical_order(device, drives)
@@ -123,6 +141,36 @@ def find_robot_columns(
     by_input = dict(zip(device.forces, judged, strict=True))
     notes.check += _sentences(device, columns, by_input)
     return RobotColumns(columns, by_input)
+
+
+def _geared(
+    device: Device,
+    columns: Mapping[str, SurveyedColumn],
+    positions: Group,
+    ratio: Array,
+    judged: Sequence[Drive],
+    notes: Notes,
+) -> RobotColumns:
+    """The columns of a log on the side of the motors."""
+    joints = _joints(device)
+    found = {**columns, **dict(zip(joints, positions.columns, strict=True))}
+    gears = {j: float(r) for j, r in zip(joints, ratio, strict=True) if r != 1.0}
+    listed = ", ".join(f"{joint} {turns:.3g}" for joint, turns in gears.items())
+    notes.check.append(
+        "positions are those of motors, by weight and inertia as drawn with these turns for one of"
+        f" the joint: {listed}; put in those of the gears"
+    )
+    explained = max(0.0, 1.0 - _left(judged))
+    notes.check.append(
+        f"drawing, drives' inertia and friction explain {explained:.1%} of the drives"
+    )
+    return RobotColumns(found, dict(zip(device.forces, judged, strict=True)), gears)
+
+
+def _in_si(device: Device, group: Group) -> Group:
+    """The positions in rad or m where they state no unit."""
+    pairs = zip(device.coordinates, group.columns, strict=True)
+    return replace(group, columns=tuple(replace(p, unit=p.unit or c.unit) for c, p in pairs))
 
 
 def _joints(device: Device) -> list[str]:
@@ -164,16 +212,21 @@ def _range(device: Device, joint: str) -> float:
     return high - low
 
 
-def _beyond_range(device: Device, positions: Group) -> list[str]:
+def _beyond_range(device: Device, positions: Group, of_joint: bool) -> list[str]:
     found = []
     for c, column in zip(device.coordinates, positions.columns, strict=True):
         span = float(np.ptp(np.nan_to_num(column.values))) * scale_to(c.unit, column)
         width = _range(device, c.name)
         if span > _BEYOND * width:
+            why = "weight and inertia as drawn agree with that: is the range of the drawing right?"
+            if not of_joint:
+                why = (
+                    f"a position of the motor, which turns {span / width:.3g} times for one of the"
+                    " joint or more? give gear_ratio, and [robot.motors]"
+                )
             found.append(
                 f"{column.name} travels {span:.3g} {c.unit}, and the range of {c.name} is"
-                f" {width:.3g}: a position of the motor, which turns {span / width:.3g} times for"
-                " one of the joint or more? give counts_per_unit, and [robot.motors]"
+                f" {width:.3g}: {why}"
             )
     return found
 
@@ -186,19 +239,32 @@ def _judge(device: Device, robot: Robot, positions: Group, drives: Group, t: Arr
         return []
     ratio = np.array([abs(m.turns[n]) for m, n in zip(robot.motors.values(), names, strict=False)])
     ratio = ratio if turned else np.ones(len(names))
-    # An angle that wraps is followed by what is measured already: nothing else of it is used.
-    q = np.column_stack(
-        [
-            position_in_si(column, t, c.unit)
-            for c, column in zip(device.coordinates, positions.columns, strict=True)
-        ]
-    )
+    q = _positions(device, positions, t)
+    return _judge_along(device, robot, q, drives, ratio, t)
+
+
+def _positions(device: Device, group: Group, t: Array) -> Array:
+    """Positions (T, n) in SI, wherever their encoders sit."""
+    columns = zip(device.coordinates, group.columns, strict=True)
+    return np.column_stack([position_in_si(column, t, c.unit) for c, column in columns])
+
+
+def _judge_along(
+    device: Device,
+    robot: Robot,
+    q: Array,
+    drives: Group,
+    ratio: Array,
+    t: Array,
+    most_rows: int = _MOST_ROWS,
+) -> list[Drive]:
+    """How drives go with positions (T, n) of the joints; ``ratio``: turns of the motors (n,)."""
     step = float(np.median(np.diff(t)))
     window = max(5, 2 * round(0.5 * _SMOOTHED_S / step) + 1) if step > 0.0 else len(q)
     if not np.isfinite(q).all() or window >= len(q):
         return []
     smooth = [savgol_filter(q, window, 2, deriv=k, delta=step, axis=0) for k in range(3)]
-    rows = slice(None, None, max(1, len(q) // _MOST_ROWS))
+    rows = slice(None, None, max(1, len(q) // most_rows))
     position, rate, change = (list(part[rows].T) for part in smooth)
     bodies = [list(joint.inertial) for joint in robot.joints]
     forces = joint_forces(
@@ -210,6 +276,47 @@ def _judge(device: Device, robot: Robot, positions: Group, drives: Group, t: Arr
         values = np.nan_to_num(column.values)[rows] * scale_to(device.force_unit, column)
         found.append(_compare(required, rate[k], change[k], values))
     return found
+
+
+def _find_gears(
+    device: Device, robot: Robot, positions: Group, drives: Group, t: Array
+) -> tuple[Array, list[Drive]] | None:
+    """Turns of each motor for one of its joint (n,), by positions on the side of the motors.
+
+    Weight goes with the sine of the joint's angle, so only the right reductions let the drawing
+    explain the drives. Returns them with what they make of the drives; None where none do well.
+    """
+    q = _positions(device, positions, t)
+    span = np.ptp(q, axis=0)
+    least = span / np.array([_range(device, c.name) for c in device.coordinates])
+    moved, at_joint = least > _BEYOND, np.ones(len(least))
+    if not moved.any() or not _judge_along(device, robot, q, drives, at_joint, t, _FEW_ROWS):
+        return None
+    in_torque = device.force_unit == "N.m"
+
+    def ratios(x: Array) -> Array:
+        ratio = np.ones(len(least))
+        ratio[moved] = np.exp(x)
+        return ratio
+
+    def misfit(x: Array) -> Array:
+        ratio = ratios(x)
+        judged = _judge_along(device, robot, q / ratio, drives, at_joint, t, _FEW_ROWS)
+        left = np.sqrt([max(drive.left, 1e-12) for drive in judged])
+        if not in_torque:
+            return np.asarray(left)
+        # A torque of the motor is that of the joint over the reduction, as well as it is drawn.
+        size = np.array([max(abs(drive.share), 1e-9) for drive in judged])
+        return np.concatenate([left, _DRAWN * np.log(size[moved] * ratio[moved])])
+
+    found = [
+        least_squares(misfit, np.log(factor * least[moved]), diff_step=1e-3, max_nfev=40)
+        for factor in _MARGINS
+    ]
+    best = min(found, key=lambda solution: float(solution.cost))
+    ratio = ratios(best.x)
+    judged = _judge_along(device, robot, q / ratio, drives, at_joint, t)
+    return (ratio, judged) if _fits(judged) else None
 
 
 def _compare(required: Array, rate: Array, change: Array, drive: Array) -> Drive:
@@ -226,6 +333,11 @@ def _compare(required: Array, rate: Array, change: Array, drive: Array) -> Drive
     # Neighbouring samples err alike: about one in ten counts.
     error = np.sqrt(10.0 * np.mean(rest**2) * inverse[0, 0])
     return Drive(float(values[0] / size[0]), float(error / size[0]), left)
+
+
+def _fits(drives: Sequence[Drive]) -> bool:
+    """Whether drawing and log are of the same joints."""
+    return _left(drives) < _MOST_LEFT
 
 
 def _left(drives: Sequence[Drive]) -> float:

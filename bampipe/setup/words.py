@@ -65,7 +65,7 @@ def _sign(candidate: Candidate, session: IngestResult) -> str:
     name = names[0]
     if name in session.axes:
         counts = session.axes[name].counts_per_unit
-        fix = "negate counts_per_unit" if counts else "counts_per_unit = -1"
+        fix = "negate counts_per_unit" if counts else "negate gear_ratio, 1 where left out"
         return f"the encoder of {name} counts the other way: {fix}"
     if name in session.force.columns:
         row = " in its row" if len(session.force.columns) > 1 else ""
@@ -106,7 +106,7 @@ def _scale_fix(name: str, candidate: Candidate, session: IngestResult) -> str:
             right = number(stated / factor)
             return f"counts_per_unit of {name} should be about {right}, not {number(stated)}"
         unit = _unit_meant(candidate, encoder.raw_unit, encoder.unit)
-        return f'unit = "{unit}"' if unit else f"counts_per_unit = {number(1.0 / factor)}"
+        return f'unit = "{unit}"' if unit else f"gear_ratio = {number(1.0 / factor)}"
     if name in session.force.columns:
         unit = _unit_meant(candidate, session.force.raw_unit, session.force.unit)
         if unit:

@@ -92,8 +92,20 @@ def test_signs_and_reductions_are_tested_against_weight_and_inertia(tmp_path: Pa
     assert float(size.rpartition(" ")[2]) == pytest.approx(100.0, rel=0.1)
 
 
-def test_a_position_beyond_the_range_is_that_of_a_motor(tmp_path: Path) -> None:
+def test_a_position_beyond_the_range_that_the_drives_agree_with_is_said(tmp_path: Path) -> None:
     write_log(tmp_path, swing=8.0)
+    assert any("is the range of the drawing right?" in line for line in proposed(tmp_path).check)
+
+
+def test_a_position_beyond_the_range_that_nothing_explains_may_be_that_of_a_motor(
+    tmp_path: Path,
+) -> None:
+    write_log(tmp_path)
+    table = pd.read_csv(tmp_path / "log.csv")
+    rng = np.random.default_rng(0)
+    table[["q1", "q2"]] *= 50.0
+    table[["tau1", "tau2"]] = rng.normal(size=(len(table), 2))
+    table.to_csv(tmp_path / "log.csv", index=False)
     assert any("a position of the motor," in line for line in proposed(tmp_path).check)
 
 
@@ -146,3 +158,32 @@ def test_torque_constants_are_proposed_by_the_drawing(tmp_path: Path) -> None:
     assert device.robot is not None
     constants = [motor.torque_constant for motor in device.robot.motors.values()]
     np.testing.assert_allclose(constants, truth["constants"], rtol=0.1)
+
+
+def test_reductions_of_a_log_from_the_motors_side_follow_from_the_drawing(tmp_path: Path) -> None:
+    truth = arm.record_logs(
+        tmp_path / "log", 7, "ZYYX", style="motor", drawing_error=0.03, turned=["elbow"]
+    )
+    _, _, proposal = paired(tmp_path / "log")
+    session = read_session(tmp_path / "log")
+    gears = [encoder.gear_ratio for encoder in session.encoders]
+    np.testing.assert_allclose(gears, truth["ratio"], rtol=0.05)
+    device = registry.device_from(read_device_file(tmp_path / "log/device.toml"))
+    assert device.robot is not None
+    turns = [next(iter(motor.turns.values())) for motor in device.robot.motors.values()]
+    np.testing.assert_allclose(turns, gears, rtol=0.01)
+    assert {c.name for c in session.channels if c.scale < 0.0} == {"torque_elbow"}
+    assert proposal.fill_in == []
+
+
+def test_radians_of_a_motor_are_not_taken_for_degrees_of_its_joint(tmp_path: Path) -> None:
+    truth = arm.record_logs(tmp_path / "log", 9, "ZYY", style="motor", drawing_error=0.03)
+    for path in (tmp_path / "log").glob("*.csv"):
+        table = pd.read_csv(path)
+        for column in [name for name in table if "deg" in name]:
+            table[column.replace("_deg", "")] = np.deg2rad(table.pop(column))
+        table.to_csv(path, index=False)
+    paired(tmp_path / "log")
+    encoders = read_session(tmp_path / "log").encoders
+    assert [encoder.stated_unit for encoder in encoders] == ["rad"] * 3
+    np.testing.assert_allclose([e.gear_ratio for e in encoders], truth["ratio"], rtol=0.05)

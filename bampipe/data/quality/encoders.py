@@ -50,7 +50,7 @@ def unwrap(table: TrialTable, encoder: Encoder) -> None:
     if encoder.counts:
         periods = [(2.0**bits, f"at {bits} bits") for bits in (16, 24, 32)]
     elif encoder.unit == "rad":
-        periods = [(2 * np.pi / encoder.scale, "at a full turn")]
+        periods = [(2 * np.pi / encoder.raw_scale, "at a full turn")]
     else:
         return
     values = table.columns[encoder.column]

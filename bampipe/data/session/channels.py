@@ -117,6 +117,11 @@ class Encoder(NamedDeclaration):
     counts_per_unit: Number | None = Field(
         default=None, description="Counts in one unit, negative to turn the axis round"
     )
+    gear_ratio: Number = Field(
+        default=1.0,
+        description="Of a position on the side of the motor: what it travels for one of the axis,"
+        " negative where it turns the other way round",
+    )
     zero: Number = Field(default=0.0, alias="zero_counts", description="Raw reading at position 0")
     stated_unit: Literal[
         "rad", "deg", "mrad", "rev", "m", "mm", "cm", "um", "in",
@@ -167,6 +172,11 @@ class Encoder(NamedDeclaration):
     @property
     def scale(self) -> float:
         """rad or m for one raw unit: SI value = (raw - zero) * scale."""
+        return self.raw_scale / self.gear_ratio
+
+    @property
+    def raw_scale(self) -> float:
+        """rad or m, where the encoder sits, for one raw unit."""
         return _unit(self.stated_unit).scale / (self.counts_per_unit or 1.0)
 
     @property
@@ -174,7 +184,7 @@ class Encoder(NamedDeclaration):
         """Smallest step, rad or m; None where only the data can tell."""
         if self.counts:
             return abs(self.scale)
-        return None if self.stated_resolution is None else self.stated_resolution * self.scale
+        return None if self.stated_resolution is None else abs(self.stated_resolution * self.scale)
 
     @property
     def raw_unit(self) -> str:
@@ -183,6 +193,8 @@ class Encoder(NamedDeclaration):
 
     def cross_faults(self) -> Iterator[InputError]:
         unit = self.stated_unit
+        if self.gear_ratio == 0.0:
+            yield InputError("found 0, expected the turns of the motor", where="gear_ratio")
         if self.integrate:
             for key in ("counts_per_unit", "zero_counts", "resolution", "velocity"):
                 field = {"zero_counts": "zero", "resolution": "stated_resolution"}.get(key, key)
