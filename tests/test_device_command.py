@@ -7,8 +7,10 @@ import re
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
+from independent import arm
 from jsonschema import Draft202012Validator
 
 from bampipe.physics import registry
@@ -149,3 +151,35 @@ def test_the_schema_knows_what_the_program_knows() -> None:
 @pytest.mark.parametrize("name", registry.effect_names())
 def test_the_schema_of_effects_takes_the_built_in_ones(name: str) -> None:
     Draft202012Validator(json_schema(Effect)).validate(registry.effect(name).declaration)
+
+
+def test_a_robot_is_drawn_where_its_joints_are(tmp_path: Path, command: Command) -> None:
+    folder = tmp_path / "arm"
+    arm.record_logs(folder, 3, "ZYyX", trials=1, seconds=4.0)
+    device = folder / "device.toml"
+    device.write_text('name = "arm"\n[robot]\nurdf = "arm.urdf"\n')
+    picture = tmp_path / "arm.svg"
+    code, out, _ = command("device", "check", str(device), "--picture", str(picture))
+    assert code == 0 and f"wrote {picture}" in out
+    root = ElementTree.parse(picture).getroot()
+    tag = "{http://www.w3.org/2000/svg}"
+    words = [text.text for text in root.iter(f"{tag}text")]
+    assert all(words.count(name) == 2 for name in ("base_yaw", "shoulder", "elbow", "forearm"))
+    # A square a view for the joint that slides, and the sheet itself.
+    assert len(list(root.iter(f"{tag}rect"))) == 3
+    assert len(list(root.iter(f"{tag}title"))) == 8
+
+
+@pytest.mark.parametrize(
+    ("device", "picture", "said"),
+    [
+        ("slider", "rail.svg", "only robots are drawn"),
+        ("sample_runs/robot_arm/device.toml", "arm.png", "ends in .svg"),
+    ],
+)
+def test_only_robots_are_drawn_and_only_as_svg(
+    tmp_path: Path, command: Command, device: str, picture: str, said: str
+) -> None:
+    path = tmp_path / picture
+    (fault,) = faults(command("device", "check", device, "--picture", str(path)))
+    assert said in fault and not path.exists()

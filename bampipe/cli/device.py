@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from bampipe.cli import show
 from bampipe.cli.options import JsonOption
+from bampipe.errors import InputError
 
 SUMMARY = "The devices there are, their equations of motion, and device files checked."
 app = typer.Typer(
@@ -19,6 +20,12 @@ app = typer.Typer(
 )
 
 FaultsOnlyOption = Annotated[bool, typer.Option("--quiet", "-q", help="Faults only.")]
+
+
+PictureOption = Annotated[
+    Path | None,
+    typer.Option(help="Of a robot: draw its joints and bodies into this SVG file.", metavar="FILE"),
+]
 
 
 def summary_of(command: Callable[..., None]) -> str:
@@ -94,6 +101,7 @@ def show_(
 
 def check(
     file: Annotated[str, typer.Argument(help="A device file, or the name of a built-in device.")],
+    picture: PictureOption = None,
     json: JsonOption = False,
     quiet: FaultsOnlyOption = False,
 ) -> None:
@@ -102,11 +110,15 @@ def check(
     Names, units, expressions and the derivation are checked. Exit 2 with one line a fault.
 
     Example: bampipe device check rail.toml
+
+    Example: bampipe device check arm/device.toml --picture arm.svg
     """
     from bampipe.declarations.files import device_faults, read_device
 
     declaration, where = read_device(file)
     equations, faults = device_faults(declaration, where)
+    if picture is not None and not faults:
+        _draw(declaration, where, picture)
     if json:
         show.as_json({"file": where, "equations": equations.splitlines(), "faults": faults})
         if faults:
@@ -118,8 +130,28 @@ def check(
         report_faults(faults)
     if not quiet:
         show.say(f"{where}: names, units and equations fit together")
+        if picture is not None:
+            show.say(f"wrote {picture}")
         show.say("")
         show.say(f"next: {_after(file)}")
+
+
+def _draw(declaration: Mapping[str, Any], where: str, path: Path) -> None:
+    """Write the picture of a robot.
+
+    Raises:
+        InputError: the device is no robot, or the file is not to be written.
+    """
+    from bampipe.declarations.robot_picture import draw_robot
+    from bampipe.files import write_text
+    from bampipe.physics import registry
+
+    robot = registry.device_from(declaration, where).robot
+    if robot is None:
+        raise InputError("only robots are drawn", where=where, remedy="leave --picture out")
+    if path.suffix.lower() != ".svg":
+        raise InputError("expected a file name that ends in .svg", where=str(path))
+    write_text(path, draw_robot(robot))
 
 
 COMMANDS: dict[str, Callable[..., None]] = {"list": list_, "show": show_, "check": check}

@@ -87,6 +87,11 @@ class Joint(NamedDeclaration):
         return tuple(float(m) for m in np.linalg.eigvalsh(_matrix(self.inertia)))
 
     @property
+    def impossible(self) -> list[str]:
+        """What no body can have among its drawn numbers, one sentence each."""
+        return list(_impossible(self))
+
+    @property
     def size(self) -> float:
         """Distance from the joint at which the body's mass would have its inertia, m."""
         if not self.mass > 0.0:
@@ -237,7 +242,7 @@ class Robot(Declaration):
     @property
     def impossible(self) -> list[str]:
         """What no body can have among the drawn numbers, one sentence each."""
-        return [line for joint in self.joints for line in _impossible(joint)]
+        return [line for joint in self.joints for line in joint.impossible]
 
 
 class Payload(Declaration):
