@@ -58,6 +58,9 @@ class RecordedChannel(Record):
     offset: float = 0.0
     raw_unit: str = Field(default="", description="Unit of the column, where it is not rescaled")
     scale_sd: Size = Field(default=0.0, description="Standard uncertainty of scale, as a share")
+    second_encoder_of: str = Field(
+        default="", description="Axis of which it reads the position on the gear's other side"
+    )
 
 
 class IngestResult(Result):

@@ -85,8 +85,27 @@ class AxisStiffness(Record):
     trials: dict[str, LockedTrial]
 
 
+class GearStiffness(Record):
+    """Stiffness of a gear with an encoder on either side, over the free trials."""
+
+    stiffness: Positive | None = Field(
+        description="Null where the encoders do not move apart with the load"
+    )
+    sd: Size | None = Field(description="Standard uncertainty, by the scatter of stretches")
+    unit: str = Field(description="Of the stiffness: N.m/rad or N/m")
+    play: float | None = Field(
+        description="Gap that the gear crosses where the load changes sign, rad or m; null where"
+        " it never does"
+    )
+    play_sd: Size | None
+    play_unit: str
+    side: Literal["motor", "load"] = Field(description="Where the second encoder sits")
+    explained: float = Field(description="Share of the difference's variance, up to 1")
+    channel: str = Field(description="Of the second encoder")
+
+
 class StiffnessResult(Result):
-    """Stiffness of the axes that were locked and loaded."""
+    """Stiffness of the axes that were locked and loaded, and of gears with two encoders."""
 
     FILE: ClassVar[str] = "stiffness/stiffness.json"
     STAGE: ClassVar[str] = "stiffness"
@@ -97,4 +116,7 @@ class StiffnessResult(Result):
     )
     axes: dict[str, AxisStiffness] = Field(
         description="One entry for each axis with a locked trial; none where there is no such trial"
+    )
+    gears: dict[str, GearStiffness] = Field(
+        default={}, description="By axis with a second encoder; see channels.second_encoder_of"
     )

@@ -395,6 +395,7 @@ def _description(
                 offset=channel.offset,
                 raw_unit=channel.raw_unit,
                 scale_sd=channel.scale_sd,
+                second_encoder_of=channel.second_encoder_of,
             )
             for channel in session.channels
         },

@@ -1,4 +1,4 @@
-"""Stage stiffness: transmission stiffness of every axis that was locked and loaded (Fig. 3)."""
+"""Stage stiffness: of axes that were locked and loaded (Fig. 3), of gears with two encoders."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from bampipe.data.store import ParquetAppender, read_parquet
 from bampipe.declarations.model_file import load_device
 from bampipe.errors import InputError
 from bampipe.estimate.differentiation import uniform_grid
+from bampipe.estimate.gear_windup import Windup, find_windup
 from bampipe.estimate.hysteresis import Branch, Cycle, Hysteresis, hysteresis
 from bampipe.physics import Model, System, compile_model
 from bampipe.progress import Progress
@@ -24,6 +25,7 @@ from bampipe.results.ingest import IngestResult
 from bampipe.results.stiffness import (
     AxisStiffness,
     Bandwidth,
+    GearStiffness,
     LockedTrial,
     LoopCycle,
     StiffnessResult,
@@ -32,9 +34,16 @@ from bampipe.schema import STRICT, Positive
 from bampipe.trials.motion import Motion
 from bampipe.trials.signals import Signals, calibration_changes
 
-SUMMARY = "Stiffness, loop width and bandwidth of the locked axes"
+SUMMARY = "Stiffness, loop width and bandwidth of locked axes; gears with two encoders"
 INPUTS = (*INGESTED, "ingest/device.toml?")
 OUTPUTS = ("stiffness/stiffness.json", "stiffness/loops.parquet")
+
+_FEWEST = 100
+"""Samples of a trial from which the wind-up of a gear is seen."""
+_SMOOTHED_S = 0.05
+"""Over which the velocity is averaged, whose sign the drive's friction follows."""
+_SURE = 3.0
+"""Standard uncertainties from which on compliance and play are more than nothing."""
 
 Array = NDArray[np.float64]
 
@@ -93,7 +102,8 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
             notes.append(f"{row.trial_id}: {result}")
         else:
             loops.setdefault(axis, []).append(result)
-    if locked.empty:
+    gears = _gears(samples, trials, system, session, notes)
+    if locked.empty and not gears:
         notes.append("No locked trials in this session: no stiffness to report.")
     axes = {
         axis: _axis(axis, loops[axis], system, config, notes)
@@ -101,8 +111,69 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         if axis in loops
     }
     _write_loops(out / "stiffness/loops.parquet", loops)
-    headline = _headline(axes) if axes else notes[-1]
-    return StiffnessResult(axes=axes, notes=tuple(notes), headline=headline).write(out)
+    headline = "; ".join([*_describe_axes(axes), *_describe_gears(gears)]) or notes[-1]
+    return StiffnessResult(axes=axes, notes=tuple(notes), headline=headline, gears=gears).write(out)
+
+
+def _gears(
+    samples: Path, trials: pd.DataFrame, system: System, session: IngestResult, notes: list[str]
+) -> dict[str, GearStiffness]:
+    """Stiffness of every gear with an encoder on either side, from the free trials."""
+    second = {c.second_encoder_of: n for n, c in session.channels.items() if c.second_encoder_of}
+    free = trials[(trials["kind"] == "free") & (trials["status"] != "set_aside")]
+    if not second or free.empty:
+        return {}
+    apart: dict[str, list[tuple[Array, Array, Array]]] = {axis: [] for axis in second}
+    for trial_id in free["trial_id"]:
+        frame = read_parquet(samples, trial=str(trial_id))
+        frame = frame[frame.drop(columns="trial_id").notna().all(axis=1)]
+        if len(frame) < _FEWEST:
+            continue
+        q = frame[[f"q_{name}" for name in system.coordinates]].to_numpy(dtype=np.float64)
+        u = np.column_stack([frame.get(name, 0.0 * frame["t"]) for name in system.inputs])
+        still, p = np.zeros_like(q), system.prior
+        z = system.memory(q, still, still, u, p, frame["t"].to_numpy())
+        load = system.applied(q, still, still, z, u, p)
+        for axis, channel in second.items():
+            number = system.coordinates.index(axis)
+            rate = np.gradient(q[:, number], frame["t"].to_numpy())
+            width = max(3, round(_SMOOTHED_S * session.sample_rate_hz))
+            smooth = np.convolve(rate, np.full(width, 1.0 / width), "same")
+            difference = frame[channel].to_numpy(dtype=np.float64) - q[:, number]
+            apart[axis].append((difference, load[:, number], smooth))
+    found = {}
+    for axis, parts in apart.items():
+        if not parts:
+            continue
+        try:
+            windup = find_windup(*map(list, zip(*parts, strict=True)))
+        except InputError as error:
+            notes.append(f"{axis}: {error}")
+            continue
+        found[axis] = _gear(axis, second[axis], windup, system, notes)
+    return found
+
+
+def _gear(
+    axis: str, channel: str, windup: Windup, system: System, notes: list[str]
+) -> GearStiffness:
+    number = system.coordinates.index(axis)
+    unit = system.coordinate_units[number]
+    size = abs(windup.compliance)
+    sure = size > _SURE * windup.compliance_sd
+    if not sure:
+        notes.append(f"{axis}: its two encoders do not move apart with the load.")
+    return GearStiffness(
+        stiffness=1.0 / size if sure else None,
+        sd=windup.compliance_sd / size**2 if sure else None,
+        unit=f"{system.torque_units[number]}/{unit}",
+        play=None if windup.play is None else windup.play * np.sign(windup.compliance),
+        play_sd=windup.play_sd,
+        play_unit=unit,
+        side="motor" if windup.compliance > 0.0 else "load",
+        explained=windup.explained,
+        channel=channel,
+    )
 
 
 def _loops_of(
@@ -341,10 +412,23 @@ def _side(branch: Branch) -> str:
     return "rising" if branch.direction > 0 else "falling"
 
 
-def _headline(axes: Mapping[str, AxisStiffness]) -> str:
-    """Return one sentence with the stiffness of every axis."""
-    return "; ".join(
+def _describe_axes(axes: Mapping[str, AxisStiffness]) -> list[str]:
+    """The stiffness of every axis that was locked."""
+    return [
         f"{axis} {entry.stiffness:.4g} ± {entry.sd:.2g} {entry.unit} "
         f"({entry.bandwidth_rad_s:.3g} rad/s, {entry.bandwidth_hz:.3g} Hz)"
         for axis, entry in axes.items()
-    )
+    ]
+
+
+def _describe_gears(gears: Mapping[str, GearStiffness]) -> list[str]:
+    """The stiffness of every gear with two encoders."""
+    found = []
+    for axis, gear in gears.items():
+        words = "stiffer than its encoders show"
+        if gear.stiffness is not None and gear.sd is not None:
+            words = f"{gear.stiffness:.4g} ± {gear.sd:.2g} {gear.unit}"
+        if gear.play is not None and gear.play_sd is not None and gear.play > _SURE * gear.play_sd:
+            words += f", play {gear.play:.2g} ± {gear.play_sd:.1g} {gear.play_unit}"
+        found.append(f"gear of {axis} {words}")
+    return found

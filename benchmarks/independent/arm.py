@@ -210,6 +210,7 @@ def hide(arm: Arm, effects: Mapping[str, float], rng: np.random.Generator) -> No
             "stribeck": {"force": 0.6 * dry * size, "speed": 0.08},
             "friction_of_sum": {"viscous": 0.6 * wet * size, "coulomb": 0.6 * dry * size},
             "load_dependent_friction": {"coefficient": 0.08 * size},
+            "gear_windup": {"stiffness": 2e3 * dry / size, "play": 1e-3 * size},
         }[name]
 
 
@@ -240,10 +241,23 @@ def draw_motion(arm: Arm, rng: np.random.Generator, seconds: float) -> Any:
     return motion
 
 
+def wind(arm: Arm, motion: tuple[Array, Array, Array]) -> Array:
+    """How far motors lead their joints, in joint angles, (T, n): what elastic gears and play do."""
+    carried = arm.rigid(*motion)
+    found = np.zeros_like(carried)
+    for full, v in arm.hidden.items():
+        name, _, at = full.partition(":")
+        if name == "gear_windup":
+            load = carried[:, arm.names.index(at)]
+            closed = np.tanh(load / (0.01 * np.abs(load).max()))
+            found[:, arm.names.index(at)] = load / v["stiffness"] + 0.5 * v["play"] * closed
+    return found
+
+
 def measure(
     arm: Arm, rng: np.random.Generator, seconds: float, rate_hz: float, noise: float
-) -> tuple[Array, Array, Array]:
-    """Time (T,), positions (T, n) as encoders read them, and drives (T, n) as they are logged."""
+) -> tuple[Array, Array, Array, Array]:
+    """Time (T,), positions (T, n) of joints and motors, drives (T, n): as they are logged."""
     motion = draw_motion(arm, rng, seconds)
     t = np.arange(round(seconds * rate_hz)) / rate_hz
     drive = arm.required(*motion(t))
@@ -257,7 +271,9 @@ def measure(
         if name == "drive_offset":
             drive[:, arm.names.index(at)] += v["bias"]
     drive += noise * arm.coulomb * rng.standard_normal(drive.shape)
-    return t, np.floor(motion(t)[0] / COUNT) * COUNT, drive
+    q = motion(t)[0]
+    motor = q + wind(arm, motion(t))
+    return t, np.floor(q / COUNT) * COUNT, np.floor(motor / COUNT) * COUNT, drive
 
 
 def urdf(arm: Arm, rng: np.random.Generator | None = None, error: float = 0.0) -> str:
@@ -380,8 +396,11 @@ def record_logs(
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "arm.urdf").write_text(urdf(arm, rng, drawing_error))
     for number in range(trials):
-        t, q, drive = measure(arm, rng, seconds, rate_hz, noise)
-        table = pd.DataFrame(headed(arm, style, t, q, sign * drive, constants))
+        t, q, motor, drive = measure(arm, rng, seconds, rate_hz, noise)
+        columns = headed(arm, style, t, q, sign * drive, constants)
+        if any(full.startswith("gear_windup") for full in arm.hidden):
+            columns |= {f"motor_side_{j}_rad": motor[:, k] for k, j in enumerate(arm.names)}
+        table = pd.DataFrame(columns)
         table.to_csv(folder / f"log_{number + 1:02d}.csv", index=False, float_format="%.14g")
     truth = {
         "machine": "arm",

@@ -429,6 +429,11 @@ class Channel(NamedDeclaration):
     signed: bool = Field(
         default=False, description="Whether a register of wrap_bits holds negative numbers"
     )
+    second_encoder_of: str = Field(
+        default="",
+        description="Axis of which it reads the position on the other side of the gear, in the"
+        " axis' unit: how far both move apart shows the gear's stiffness and play",
+    )
 
     @property
     def _raw(self) -> units.RecordedUnit:

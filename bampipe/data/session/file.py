@@ -252,6 +252,21 @@ class Session(Declaration):
                         where=f"encoders.{encoder.axis}.also_reads",
                         remedy=f"the axes are {', '.join(axes)}",
                     )
+        units = {encoder.axis: encoder.unit for encoder in self.encoders}
+        for channel in self.channels:
+            axis = channel.second_encoder_of
+            if axis and axis not in axes:
+                yield InputError(
+                    f"no axis '{axis}'{did_you_mean(axis, axes)}",
+                    where=f"channels.{channel.name}.second_encoder_of",
+                    remedy=f"the axes are {', '.join(axes)}",
+                )
+            elif axis and channel.unit != units[axis]:
+                yield InputError(
+                    f"a unit of {channel.unit or 'a pure number'}, expected one of {units[axis]}",
+                    where=f"channels.{channel.name}.unit",
+                    remedy=f"that is the unit of {axis}; give the scale that leads to it",
+                )
         for column, times in Counter(columns).items():
             if times > 1:
                 yield InputError(

@@ -11,7 +11,7 @@ import pandas as pd
 from bampipe.report import style, verdicts, wording
 from bampipe.report.document import Block, Bullets, Figure, Paragraph, Section, Table
 from bampipe.report.results import Results
-from bampipe.results.stiffness import AxisStiffness, StiffnessResult
+from bampipe.results.stiffness import AxisStiffness, GearStiffness, StiffnessResult
 
 TITLE = "Stiffness"
 
@@ -27,9 +27,10 @@ def section(results: Results) -> Section | None:
             TITLE, (Paragraph(f"The locked trials have not been used: {command} does it."),)
         )
     axes, notes = found.axes, found.notes
-    if not axes:
+    if not axes and not found.gears:
         return Section(TITLE, (Paragraph(" ".join(notes) or "There are no locked trials."),))
-    blocks: list[Block] = [_table(results, axes)]
+    blocks: list[Block] = [_table(results, axes)] if axes else []
+    blocks += [_gears(results, found.gears)] if found.gears else []
     loops = results.table("stiffness/loops.parquet")
     if loops is not None and len(loops):
         blocks.append(_loops(results, axes, loops))
@@ -80,6 +81,30 @@ def _table(results: Results, axes: Mapping[str, AxisStiffness]) -> Table:
         "lrrrrrr",
         (0.0, 1.3, 0.0, 1.0, 1.0, 1.0, 0.5),
         note,
+    )
+
+
+def _gears(results: Results, gears: Mapping[str, GearStiffness]) -> Table:
+    rows = []
+    for axis in verdicts.ordered(results, gears):
+        gear = gears[axis]
+        stiffness = "not seen"
+        if gear.stiffness is not None and gear.sd is not None:
+            factor, unit = wording.scale([gear.stiffness], gear.unit)
+            stiffness = f"{wording.with_sd(factor * gear.stiffness, factor * gear.sd)} {unit}"
+        play = "not crossed"
+        if gear.play is not None and gear.play_sd is not None:
+            factor, unit = wording.scale([abs(gear.play)], gear.play_unit)
+            play = f"{wording.with_sd(factor * gear.play, factor * gear.play_sd)} {unit}"
+        rows.append((axis, stiffness, play, f"{100.0 * gear.explained:.0f} %", gear.side))
+    return Table(
+        "Gears with an encoder on either side",
+        ("Axis", "Stiffness", "Play", "Explained", "Second encoder"),
+        tuple(rows),
+        "lrrrl",
+        (0.0, 1.3, 1.3, 0.8, 1.0),
+        "By how far the encoders move apart with the load of the drive, its own friction and"
+        " inertia taken off. Explained: share of the difference's variance.",
     )
 
 

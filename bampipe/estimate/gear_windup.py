@@ -1,0 +1,95 @@
+"""Wind-up and play of a gear, from the difference of the encoders on its two sides."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.errors import InputError
+
+Array = NDArray[np.float64]
+
+_BLOCKS = 20
+"""Stretches of the record that err independently: their scatter gives the uncertainties."""
+_EITHER_SIGN = 0.05
+"""Share of the samples with load of either sign from which on the play is crossed."""
+_CLOSING = 0.02
+"""Of the largest load: a gap is closed at a few times this share of it."""
+_TURNING = 0.01
+"""Of the largest velocity: dry friction is all there at a few times this share of it."""
+
+
+@dataclass(frozen=True)
+class Windup:
+    """How the two sides of a gear move apart.
+
+    Attributes:
+        compliance, compliance_sd: rad/(N.m) or m/N; positive where the second encoder leads with
+            the load of the drive, as on the motor's side.
+        play, play_sd: rad or m; None where the load never changes sign.
+        explained: share of the difference's variance that both explain.
+    """
+
+    compliance: float
+    compliance_sd: float
+    play: float | None
+    play_sd: float | None
+    explained: float
+
+
+def find_windup(
+    difference: Sequence[Array], load: Sequence[Array], rate: Sequence[Array]
+) -> Windup:
+    """Regress the difference of two encoders on the drive's load.
+
+    The inertia and friction of the drive itself do not pass the gear: terms with acceleration,
+    velocity and its sign take them off. Each trial has its own offset, since the zeros of two
+    encoders differ.
+
+    Args:
+        difference: by trial, (T,), second reading minus first, rad or m.
+        load: generalised force of the drive; rate: velocity of the axis at the same samples, which
+            are evenly spaced.
+
+    Raises:
+        InputError: there is no load that changes.
+    """
+    largest = max(float(np.abs(x).max(initial=0.0)) for x in load)
+    if not largest > 0.0 or max(float(np.ptp(x)) for x in load) < 1e-9 * largest:
+        raise InputError("the drive's load never changes")
+    fastest = max(float(np.abs(v).max(initial=0.0)) for v in rate) or 1.0
+    every = np.concatenate(load)
+    crossed = min(np.mean(every > 0.0), np.mean(every < 0.0)) > _EITHER_SIGN
+    columns, target = [], []
+    for d, x, v in zip(difference, load, rate, strict=True):
+        parts = [x, np.gradient(v), v, np.tanh(v / (_TURNING * fastest))]
+        if crossed:
+            parts.append(0.5 * np.tanh(x / (_CLOSING * largest)))
+        columns.append(np.column_stack([part - part.mean() for part in parts]))
+        target.append(d - d.mean())
+    table, wanted = np.vstack(columns), np.concatenate(target)
+    size = np.maximum(np.linalg.norm(table, axis=0), 1e-300)
+    table = table / size
+    inverse = np.linalg.pinv(table.T @ table)
+    found = inverse @ (table.T @ wanted)
+    left = wanted - table @ found
+    scores = [
+        part.T @ rest
+        for part, rest in zip(
+            np.array_split(table, _BLOCKS), np.array_split(left, _BLOCKS), strict=True
+        )
+    ]
+    covariance = inverse @ sum(np.outer(s, s) for s in scores) @ inverse
+    sd = np.sqrt(np.diag(covariance) * _BLOCKS / (_BLOCKS - len(found)))
+    values, errors = found / size, sd / size
+    play = len(values) - 1
+    return Windup(
+        float(values[0]),
+        float(errors[0]),
+        float(values[play]) if crossed else None,
+        float(errors[play]) if crossed else None,
+        float(1.0 - np.var(left) / max(float(np.var(wanted)), 1e-300)),
+    )
