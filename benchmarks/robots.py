@@ -47,7 +47,8 @@ def write_session(
         joints: names; rate: Hz; device: text of the device file.
         trials: time (T,), positions (T, n) and inputs (T, m) by name.
         units: of a joint's position, where it is not rad; held_out: trials for judging only.
-        inputs: names of the input columns; ``torque_<joint>`` where empty.
+        inputs: names of the input columns; ``torque_<joint>`` where empty. ``second_<joint>`` is
+            the joint's encoder on the other side of the gear.
     """
     inputs = inputs or [f"torque_{joint}" for joint in joints]
     (folder / "device.toml").write_text(device)
@@ -59,7 +60,9 @@ def write_session(
         unit = (units or {}).get(joint, "rad")
         lines += [f"[encoders.{joint}]", f'column = "{joint}"', f'unit = "{unit}"']
     for name in inputs:
-        lines += [f"[channels.{name}]", f'column = "{name}"', 'unit = "N.m"']
+        lines += [f"[channels.{name}]", f'column = "{name}"']
+        axis = name.partition("second_")[2]
+        lines += ['unit = "rad"', f'second_encoder_of = "{axis}"'] if axis else ['unit = "N.m"']
     for name, (t, q, torque) in trials.items():
         table = np.column_stack([t, q, torque])
         frame = pd.DataFrame(table, columns=["t", *joints, *inputs])
@@ -110,8 +113,11 @@ def kuka_kr300(source: Path, folder: Path) -> None:
         # The drawing stands upright where the encoders count from; its base is upside down.
         q = np.deg2rad(record.act_pos_mot_deg.T + zero)
         t = np.asarray(record.time_cont, dtype=float)
-        trials[name] = t - t[0], q, record.act_torque_abs_nm.T
-    write_session(folder, joints, 250.0, trials, "\n".join(lines) + "\n", held_out="BC")
+        second = np.deg2rad(record.act_pos_se_deg.T[:, :3] + zero[:3])
+        trials[name] = t - t[0], q, np.hstack([record.act_torque_abs_nm.T, second])
+    inputs = [*(f"torque_{joint}" for joint in joints), *(f"second_{j}" for j in joints[:3])]
+    device = "\n".join(lines) + "\n"
+    write_session(folder, joints, 250.0, trials, device, held_out="BC", inputs=inputs)
 
 
 def dfki_double_pendulum(source: Path, folder: Path) -> None:
@@ -190,6 +196,9 @@ def main() -> None:
         band = ["--set", f"filter.band_hz={BAND_HZ[name]}"]
         seconds = bampipe("run", str(folder), *common, *band, "--until", "validate")
         print(f"{name}: {errors(runs / name, 'base')} % ({seconds:.0f} s)", flush=True)
+        gears = json.loads((runs / name / "stiffness/stiffness.json").read_text())["headline"]
+        if "gear of" in gears:
+            print(f"  {gears}", flush=True)
         if given.diagnose:
             seconds = bampipe("diagnose", str(runs / name), *common)
             found = json.loads((runs / name / "models/base/diagnose.json").read_text())

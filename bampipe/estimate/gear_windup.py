@@ -30,29 +30,40 @@ class Windup:
         compliance, compliance_sd: rad/(N.m) or m/N; positive where the second encoder leads with
             the load of the drive, as on the motor's side.
         play, play_sd: rad or m; None where the load never changes sign.
-        explained: share of the difference's variance that both explain.
+        late_s, late_sd: by how much the second encoder is read after the first; viscous friction of
+            the drive adds a little.
+        explained: by compliance and play, of the difference's variance that timing and the drive's
+            own losses leave.
     """
 
     compliance: float
     compliance_sd: float
     play: float | None
     play_sd: float | None
+    late_s: float
+    late_sd: float
     explained: float
 
 
 def find_windup(
-    difference: Sequence[Array], load: Sequence[Array], rate: Sequence[Array]
+    difference: Sequence[Array],
+    load: Sequence[Array],
+    rate: Sequence[Array],
+    rotor_known: bool = False,
 ) -> Windup:
     """Regress the difference of two encoders on the drive's load.
 
     The inertia and friction of the drive itself do not pass the gear: terms with acceleration,
-    velocity and its sign take them off. Each trial has its own offset, since the zeros of two
+    velocity and its sign take them off. An encoder that is read late, too, adds a difference in
+    proportion to the velocity. Each trial has its own offset, since the zeros of two
     encoders differ.
 
     Args:
         difference: by trial, (T,), second reading minus first, rad or m.
         load: generalised force of the drive; rate: velocity of the axis at the same samples, which
             are evenly spaced.
+        rotor_known: whether ``load`` is without what the drive's inertia takes; else that is
+            estimated, which leaves little of an axis that carries no weight.
 
     Raises:
         InputError: there is no load that changes.
@@ -65,7 +76,10 @@ def find_windup(
     crossed = min(np.mean(every > 0.0), np.mean(every < 0.0)) > _EITHER_SIGN
     columns, target = [], []
     for d, x, v in zip(difference, load, rate, strict=True):
-        parts = [x, np.gradient(v), v, np.tanh(v / (_TURNING * fastest))]
+        parts = [v, np.tanh(v / (_TURNING * fastest))]
+        parts += [] if rotor_known else [np.gradient(v)]
+        own = len(parts)
+        parts.append(x)
         if crossed:
             parts.append(0.5 * np.tanh(x / (_CLOSING * largest)))
         columns.append(np.column_stack([part - part.mean() for part in parts]))
@@ -86,10 +100,13 @@ def find_windup(
     sd = np.sqrt(np.diag(covariance) * _BLOCKS / (_BLOCKS - len(found)))
     values, errors = found / size, sd / size
     play = len(values) - 1
+    rest = wanted - table[:, :own] @ np.linalg.lstsq(table[:, :own], wanted, rcond=None)[0]
     return Windup(
-        float(values[0]),
-        float(errors[0]),
+        float(values[own]),
+        float(errors[own]),
         float(values[play]) if crossed else None,
         float(errors[play]) if crossed else None,
-        float(1.0 - np.var(left) / max(float(np.var(wanted)), 1e-300)),
+        -float(values[0]),
+        float(errors[0]),
+        float(1.0 - np.var(left) / max(float(np.var(rest)), 1e-300)),
     )

@@ -240,6 +240,16 @@ class Robot(Declaration):
         return tuple(found)
 
     @property
+    def rotors_at_joints(self) -> dict[str, float]:
+        """Inertia of the rotor that alone drives a joint, there, kg.m2 or kg, where it is given."""
+        alone = {next(iter(m.turns)): m for m in self.motors.values() if len(m.turns) == 1}
+        return {
+            joint: motor.rotor_inertia * motor.turns[joint] ** 2
+            for joint, motor in alone.items()
+            if motor.rotor_inertia is not None
+        }
+
+    @property
     def impossible(self) -> list[str]:
         """What no body can have among the drawn numbers, one sentence each."""
         return [line for joint in self.joints for line in joint.impossible]

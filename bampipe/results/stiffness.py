@@ -100,7 +100,12 @@ class GearStiffness(Record):
     play_sd: Size | None
     play_unit: str
     side: Literal["motor", "load"] = Field(description="Where the second encoder sits")
-    explained: float = Field(description="Share of the difference's variance, up to 1")
+    late_s: float = Field(description="By how much the second encoder is read after the first, s")
+    late_sd: Size
+    explained: float = Field(
+        description="By stiffness and play, of what timing and the drive's own losses leave of the"
+        " difference's variance, up to 1"
+    )
     channel: str = Field(description="Of the second encoder")
 
 

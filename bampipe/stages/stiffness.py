@@ -123,6 +123,8 @@ def _gears(
     free = trials[(trials["kind"] == "free") & (trials["status"] != "set_aside")]
     if not second or free.empty:
         return {}
+    robot = system.model.device.robot
+    rotors = robot.rotors_at_joints if robot is not None else {}
     apart: dict[str, list[tuple[Array, Array, Array]]] = {axis: [] for axis in second}
     for trial_id in free["trial_id"]:
         frame = read_parquet(samples, trial=str(trial_id))
@@ -132,21 +134,31 @@ def _gears(
         q = frame[[f"q_{name}" for name in system.coordinates]].to_numpy(dtype=np.float64)
         u = np.column_stack([frame.get(name, 0.0 * frame["t"]) for name in system.inputs])
         still, p = np.zeros_like(q), system.prior
-        z = system.memory(q, still, still, u, p, frame["t"].to_numpy())
+        t = frame["t"].to_numpy(dtype=np.float64)
+        z = system.memory(q, still, still, u, p, t)
         load = system.applied(q, still, still, z, u, p)
         for axis, channel in second.items():
             number = system.coordinates.index(axis)
-            rate = np.gradient(q[:, number], frame["t"].to_numpy())
+            rate = np.gradient(q[:, number], t)
             width = max(3, round(_SMOOTHED_S * session.sample_rate_hz))
             smooth = np.convolve(rate, np.full(width, 1.0 / width), "same")
             difference = frame[channel].to_numpy(dtype=np.float64) - q[:, number]
-            apart[axis].append((difference, load[:, number], smooth))
+            carried = load[:, number]
+            if axis in rotors:
+                change = np.convolve(np.gradient(smooth, t), np.full(width, 1.0 / width), "same")
+                carried = carried - rotors[axis] * change
+            apart[axis].append((difference, carried, smooth))
     found = {}
     for axis, parts in apart.items():
         if not parts:
             continue
         try:
-            windup = find_windup(*map(list, zip(*parts, strict=True)))
+            windup = find_windup(
+                [difference for difference, _, _ in parts],
+                [load for _, load, _ in parts],
+                [rate for _, _, rate in parts],
+                rotor_known=axis in rotors,
+            )
         except InputError as error:
             notes.append(f"{axis}: {error}")
             continue
@@ -170,6 +182,8 @@ def _gear(
         play=None if windup.play is None else windup.play * np.sign(windup.compliance),
         play_sd=windup.play_sd,
         play_unit=unit,
+        late_s=windup.late_s,
+        late_sd=windup.late_sd,
         side="motor" if windup.compliance > 0.0 else "load",
         explained=windup.explained,
         channel=channel,
@@ -430,5 +444,8 @@ def _describe_gears(gears: Mapping[str, GearStiffness]) -> list[str]:
             words = f"{gear.stiffness:.4g} ± {gear.sd:.2g} {gear.unit}"
         if gear.play is not None and gear.play_sd is not None and gear.play > _SURE * gear.play_sd:
             words += f", play {gear.play:.2g} ± {gear.play_sd:.1g} {gear.play_unit}"
+        if abs(gear.late_s) > _SURE * gear.late_sd:
+            when = "after" if gear.late_s > 0.0 else "before"
+            words += f", second encoder read {1e3 * abs(gear.late_s):.2g} ms {when} the first"
         found.append(f"gear of {axis} {words}")
     return found

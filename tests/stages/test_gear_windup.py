@@ -54,7 +54,7 @@ def test_wind_up_and_play_of_a_gear_are_those_of_the_truth(tmp_path: Path) -> No
     assert section is not None
     (table,) = (block for block in section.blocks if isinstance(block, Table))
     assert [row[0] for row in table.rows] == ["base_yaw", "elbow"]
-    assert table.rows[0][1] == "not seen" and table.rows[1][4] == "motor"
+    assert table.rows[0][1] == "not seen" and table.rows[1][5] == "motor"
 
 
 def test_a_second_encoder_is_of_an_axis_and_in_its_unit(tmp_path: Path) -> None:

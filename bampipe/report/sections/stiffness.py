@@ -96,15 +96,18 @@ def _gears(results: Results, gears: Mapping[str, GearStiffness]) -> Table:
         if gear.play is not None and gear.play_sd is not None:
             factor, unit = wording.scale([abs(gear.play)], gear.play_unit)
             play = f"{wording.with_sd(factor * gear.play, factor * gear.play_sd)} {unit}"
-        rows.append((axis, stiffness, play, f"{100.0 * gear.explained:.0f} %", gear.side))
+        late = wording.with_sd(1e3 * gear.late_s, 1e3 * gear.late_sd)
+        explained = f"{100.0 * gear.explained:.0f} %"
+        rows.append((axis, stiffness, play, explained, f"{late} ms", gear.side))
     return Table(
         "Gears with an encoder on either side",
-        ("Axis", "Stiffness", "Play", "Explained", "Second encoder"),
+        ("Axis", "Stiffness", "Play", "Explained", "Read late by", "Second encoder"),
         tuple(rows),
-        "lrrrl",
-        (0.0, 1.3, 1.3, 0.8, 1.0),
+        "lrrrrl",
+        (0.0, 1.3, 1.3, 0.8, 1.0, 1.0),
         "By how far the encoders move apart with the load of the drive, its own friction and"
-        " inertia taken off. Explained: share of the difference's variance.",
+        " inertia taken off. Explained: share of what these and timing leave of the difference's"
+        " variance.",
     )
 
 
