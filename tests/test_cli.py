@@ -17,6 +17,7 @@ from made_results import filled, write_result
 
 import bampipe
 from bampipe.cli import places, show
+from bampipe.cli.loop import suggest_after_loop
 from bampipe.errors import InputError
 from bampipe.results.compare import CompareResult
 from bampipe.results.diagnose import DiagnoseResult
@@ -503,6 +504,24 @@ def test_an_effect_is_not_added_twice(ingested: Path, command: Command) -> None:
     extended = ("--model", "base+stribeck.yaw")
     error = one_line_error(*command("extend", ingested, "stribeck:yaw", *extended))
     assert "has stribeck:yaw already" in error
+
+
+@pytest.mark.parametrize(
+    ("verdict", "selected", "after"),
+    [
+        ("unknown_effect", (), "bampipe draft s01 --model base"),
+        ("undecided", (), "bampipe draft s01 --model base"),
+        ("nothing_missing", (), "bampipe report s01 --open"),
+        ("missing", ("stribeck:yaw",), "bampipe report s01 --open"),
+    ],
+)
+def test_after_the_loop_comes_what_its_last_diagnosis_says(
+    ingested: Path, verdict: str, selected: tuple[str, ...], after: str
+) -> None:
+    assert suggest_after_loop(ingested, "base", "s01") == "bampipe diagnose s01"
+    axes, command = {"yaw": {"verdict": verdict}}, "bampipe draft RUN --model base"
+    write_result(ingested, DiagnoseResult, axes=axes, selected=selected, next=command)
+    assert suggest_after_loop(ingested, "base", "s01") == after
 
 
 @pytest.mark.parametrize(

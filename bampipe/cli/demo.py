@@ -64,4 +64,5 @@ def demonstrate(runs: Path, force: bool, listen: Listener, tell: Callable[[str],
     hidden = ", ".join(truth.configuration["effects"])
     found = ", ".join(models.read(root, last).effects) or "nothing"
     tell(f"4. Found: {found}. What was hidden: {hidden}.")
-    tell(f"   The story with its figures: {places.next_to(root, runs)}: {root}/report/report.pdf")
+    tell(f"   In print: {root}/report/report.pdf")
+    tell(f"next: bampipe report {places.next_to(root, runs)} --open")

@@ -90,6 +90,8 @@ def refresh(runs: Path, several: bool, quiet: bool) -> None:
     if not quiet and several:
         show.say("")
         table(found)
+        show.say("")
+        show.say(f"next: open {found.folder / 'report.html'}, which links every session")
 
 
 def table(found: Lab) -> None:
@@ -115,7 +117,7 @@ def table(found: Lab) -> None:
     for line in _trend_lines(found.content.series):
         show.say(line)
     fewest = found.content.fewest_sessions
-    if len(sessions) < fewest:
+    if found.content.series and not any(chart.has_limits for chart in found.content.series):
         show.say(f"no control limits yet: they need {fewest} sessions of a device")
     for line in found.skipped:
         show.say(f"left out: {line}")
@@ -138,4 +140,4 @@ def advice(found: Lab) -> str:
     for one in found.content.sessions:
         if one.remedy:
             return one.remedy
-    return f"open {found.folder / 'report.pdf'}"
+    return f"open {found.folder / 'report.html'}"

@@ -158,7 +158,29 @@ def extend(
         return
     show.say(f"{root}: {last}")
     show.summary(ladder)
-    advise(quiet, json, f"bampipe diagnose {places.next_to(root, runs)}")
+    name = places.next_to(root, runs)
+    advise(
+        quiet, json, suggest_after_loop(root, last, name) if auto else f"bampipe diagnose {name}"
+    )
+
+
+def suggest_after_loop(root: Path, model: str, name: str) -> str:
+    """Return what to do after the loop has ended with ``model``, as its diagnosis has it.
+
+    Args:
+        root: the run folder; name: how to call it in a command.
+    """
+    from bampipe.results.diagnose import DiagnoseResult
+
+    run = RunFolder(root)
+    if not run.exists(DiagnoseResult.file(model)):  # stopped after many rounds
+        return f"bampipe diagnose {name}"
+    found = run.read(DiagnoseResult, model)
+    lacking = any(axis.verdict != "nothing_missing" for axis in found.axes.values())
+    # What a diagnosis selects and the loop has not added makes no better model.
+    if found.selected or not lacking:
+        return f"bampipe report {name} --open"
+    return found.next.replace("RUN", name)
 
 
 def _is_effect(argument: str) -> bool:

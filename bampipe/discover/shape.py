@@ -157,7 +157,10 @@ def explainable_share(evidence: Evidence, axis: int, seed: int = 0) -> float:
 
 
 def worst_windows(evidence: Evidence, count: int = 10, width_s: float = 0.5) -> list[WorstWindow]:
-    """The stretches with the largest residual relative to the axis' own, over all axes."""
+    """The stretches with the largest residual relative to the axis' own, over all axes.
+
+    There are ``count``, and the worst of each axis that is not among them.
+    """
     band, system = evidence.band, evidence.system
     length = max(2, int(width_s * band.rate_hz / band.step))
     typical = evidence.rmse()
@@ -184,7 +187,12 @@ def worst_windows(evidence: Evidence, count: int = 10, width_s: float = 0.5) -> 
                 }
                 found.append((rmse / max(typical[axis], 1e-12), window))
     found.sort(key=lambda pair: -pair[0])
-    return [WorstWindow(**window) for _, window in found[:count]]
+    windows = [WorstWindow(**window) for _, window in found]
+    listed = windows[:count]
+    for other in windows[count:]:
+        if all(other.axis != one.axis for one in listed):
+            listed.append(other)
+    return listed
 
 
 def _doing(motion: Motion, rows: NDArray[np.int64], axis: int, unit: str) -> str:

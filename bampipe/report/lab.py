@@ -81,6 +81,7 @@ def _summary(trends: TrendsResult, pages: Mapping[str, str]) -> Section:
         (
             _linked(one.session, pages),
             one.recorded[:16].replace("T", " ") or "–",
+            f"`{one.model}`",
             f"{wording.significant(one.worst[0])} ({one.worst[1]})" if one.worst else "–",
             ", ".join(moved.parameter for moved in one.moved) or "–",
             one.verdict,
@@ -93,14 +94,15 @@ def _summary(trends: TrendsResult, pages: Mapping[str, str]) -> Section:
             (
                 "Session",
                 "Recorded (UTC)",
+                "Model that counts",
                 "Error / floor, worst axis",
                 "Beyond its limits",
                 "Verdict",
             ),
             tuple(rows),
-            "llrll",
-            (0.0, 0.0, 0.0, 1.0, 1.0),
-            "Error on unseen trials by the base model, over what sensors and filters leave.",
+            "lllrll",
+            (0.0, 0.0, 1.2, 0.0, 1.0, 0.8),
+            "Error of that model on unseen trials, over what sensors and filters leave.",
         )
     )
     return Section("Summary", tuple(blocks))
@@ -138,10 +140,9 @@ def _charts(trends: TrendsResult) -> list[Section]:
         title = "Parameters over time" + (f", {device}" if len(devices) > 1 else "")
         blocks: list[Block] = [
             Paragraph(
-                "Each point is a session's estimate with two standard deviations. The line is the "
-                "median, the band the control limits: from the scatter between neighbouring "
-                "sessions and each session's own uncertainty, so wide that a session of an "
-                "unchanged device leaves them once in 370 times."
+                "Each point is a session's estimate with two standard deviations, by the base "
+                "model: that of later versions differs from session to session. The line is the "
+                f"median.{_band_in_words(charts, trends.fewest_sessions)}"
             )
         ]
         blocks.append(_chart_table(charts))
@@ -153,6 +154,16 @@ def _charts(trends: TrendsResult) -> list[Section]:
     return sections
 
 
+def _band_in_words(charts: list[ControlChart], fewest: int) -> str:
+    if not any(chart.has_limits for chart in charts):
+        return f" Control limits need {fewest} sessions of this device."
+    return (
+        " The band is the control limits: from the scatter between neighbouring sessions and each "
+        "session's own uncertainty, so wide that a session of an unchanged device leaves them once "
+        "in 370 times. Sessions beyond them are named."
+    )
+
+
 def _picture(charts: list[ControlChart], name: str) -> Figure:
     rows = -(-len(charts) // _COLUMNS)
     figure, panels = style.panels(rows, _COLUMNS, 1.75 * rows + 0.25)
@@ -160,7 +171,7 @@ def _picture(charts: list[ControlChart], name: str) -> Figure:
         _panel(panel, chart)
     for panel in panels.ravel()[len(charts) :]:
         panel.set_axis_off()
-    caption = "Control charts of the base model's parameters; sessions beyond the limits are named."
+    caption = "Parameters of the base model and stiffnesses, session by session."
     return Figure(name, caption, style.svg(figure))
 
 
@@ -173,7 +184,7 @@ def _panel(panel: Axes, chart: ControlChart) -> None:
     y, error = y * scale, error * scale
     panel.axhline(chart.centre * scale, color=style.FAINT, lw=0.9)
     shown = [y - error, y + error]
-    if points[0].lower is not None:
+    if chart.has_limits:
         low = scale * np.array([point.lower for point in points], dtype=float)
         high = scale * np.array([point.upper for point in points], dtype=float)
         edges = np.concatenate([[-0.5], np.repeat(x[1:] - 0.5, 2), [len(x) - 0.5]])

@@ -51,6 +51,11 @@ class ControlChart(Record):
     )
     points: tuple[ChartPoint, ...]
 
+    @property
+    def has_limits(self) -> bool:
+        """Whether there are sessions enough for control limits."""
+        return self.points[0].lower is not None
+
 
 class MovedParameter(Record):
     """A parameter beyond its control limits."""

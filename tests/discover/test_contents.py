@@ -12,6 +12,7 @@ from bampipe.discover import chance
 from bampipe.discover.scorer import Scorer
 from bampipe.discover.search import _keeps_the_floor
 from bampipe.discover.settings import Settings
+from bampipe.discover.shape import worst_windows
 from bampipe.physics import registry
 from bampipe.physics.recipe import Recipe
 from bampipe.results.standing import standing
@@ -93,6 +94,17 @@ def test_an_effect_that_only_raises_the_floor_is_not_added():
     # A fifth of the noise is left: both sides of the equation were made small.
     assert not _keeps_the_floor(evidence, replays(5.0), 8.0 * error, replays(5.0), Settings())
     assert _keeps_the_floor(evidence, replays(5.0), error, replays(5.0), Settings())
+
+
+def test_every_axis_has_its_worst_window():
+    trials = made(bam_with_force(1.0), {}, trials=2, seconds=4.0)
+    system = chance.system_of(bam_with_force(1.0))
+    evidence = gather_evidence(system, trials.motions, BAND, system.prior, folds(2))
+    found = worst_windows(evidence, count=1)
+    assert sorted(window.axis for window in found) == sorted(system.coordinates)
+    for window in found:
+        alike = [w.rmse for w in worst_windows(evidence, count=1000) if w.axis == window.axis]
+        assert window.rmse == max(alike) and len(alike) > 3
 
 
 def test_the_filters_of_a_session_keep_the_order_of_its_model():

@@ -14,6 +14,7 @@ from conftest import misfits
 from made_results import write_result
 from made_runs import Made
 
+from bampipe.cli import lab as lab_command
 from bampipe.data import lab_tables
 from bampipe.errors import InputError
 from bampipe.files import digest_file
@@ -264,6 +265,28 @@ def test_the_report_says_what_the_trends_say(tmp_path: Path) -> None:
     assert "t2.csv, row 7" in page
     assert (tmp_path / "lab/report.pdf").read_bytes().startswith(b"%PDF")
     assert (tmp_path / "lab/figures/charts-1.svg").is_file()
+
+
+@pytest.mark.parametrize(("sessions", "limits"), [(9, True), (3, False)])
+def test_words_about_limits_are_true_of_the_charts(
+    tmp_path: Path, sessions: int, limits: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = collect(make_lab(tmp_path, sessions=sessions), tmp_path / "lab")
+    page = (tmp_path / "lab/report.html").read_text(encoding="utf-8")
+    assert all(chart.has_limits is limits for chart in found.content.series)
+    assert ("The band is the control limits" in page) is limits
+    assert ("Control limits need 6 sessions of this device" in page) is not limits
+    lab_command.table(found)
+    assert ("no control limits yet" in capsys.readouterr().out) is not limits
+
+
+def test_after_several_sessions_the_page_that_links_them_comes_next(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    runs = make_lab(tmp_path, sessions=3)
+    lab_command.refresh(runs, several=True, quiet=False)
+    said = capsys.readouterr().out.splitlines()[-1]
+    assert said == f"next: open {tmp_path / 'lab/report.html'}, which links every session"
 
 
 def test_the_page_links_the_pages_of_every_session(tmp_path: Path) -> None:

@@ -115,15 +115,11 @@ def _curve(panel: Axes, curve: TermCurve) -> None:
 
 def _pictures(results: Results, term: ModelTerm, name: str) -> list[Figure]:
     """Draw the curves of an effect and, where it is known, the worst window without and with it."""
-    words = (
-        f"What `{term.name}` contributes: the force that it takes, with its 95 % band, against "
-        f"{_variables(term.curves)}, which it follows most, over the trials that it was learned "
-        "from."
-    )
     found = _window(results, term)
     if found is None:
+        words = _contribution(term, term.curves)
         return [_curves(f"effect-{name}", term.curves, words)] if term.curves else []
-    first = term.curves[0]
+    first = next(curve for curve in term.curves if curve.axis == found.window.axis)
     figure, panels = style.beside(2, 2.7)
     _curve(panels[0], first)
     unit = wording.unit(results.force_unit(found.window.axis))
@@ -135,17 +131,25 @@ def _pictures(results: Results, term: ModelTerm, name: str) -> list[Figure]:
         if errors[1] < errors[0]
         else f"the residual does not fall ({size[0]} and {size[1]} {unit} RMSE)"
     )
+    left = _contribution(term, [first]).replace("What", "Left: what", 1)
     whole = (
-        f"{words.replace('What', 'Left: what', 1)} Right: the worst window of {found.window.axis} "
-        f"without {found.added} ({found.window.doing}), where {change}."
+        f"{left} Right: the worst window of {found.window.axis} without {found.added} "
+        f"({found.window.doing}), where {change}."
     )
-    others = term.curves[1:]
+    others = [curve for curve in term.curves if curve is not first]
     pictures = [Figure(f"effect-{name}", whole, style.svg(figure))]
     if others:
         axes = join_names(curve.axis for curve in others)
-        more = f"What `{term.name}` contributes on {axes}, as above."
+        more = f"{_contribution(term, others).rstrip('.')}, on {axes}."
         pictures.append(_curves(f"effect-{name}-more", others, more))
     return pictures
+
+
+def _contribution(term: ModelTerm, curves: Sequence[TermCurve]) -> str:
+    return (
+        f"What `{term.name}` contributes: the force that it takes, with its 95 % band, against "
+        f"{_variables(curves)}, which it follows most, over the trials that it was learned from."
+    )
 
 
 @dataclass(frozen=True)
@@ -164,10 +168,11 @@ def _window(results: Results, term: ModelTerm) -> _Window | None:
     rungs = compared.ladder if compared else ()
     rung = next((one for one in rungs if _adds(one.added, term.name)), None)
     diagnosis = results.read(DiagnoseResult, rung.parent) if rung and rung.parent else None
-    axes = [curve.axis for curve in term.curves[:1]]
+    axes = [curve.axis for curve in term.curves]
     if rung is None or rung.parent is None or diagnosis is None:
         return None
-    window = next((w for w in diagnosis.worst_windows if w.axis in axes), None)
+    windows = (w for axis in axes for w in diagnosis.worst_windows if w.axis == axis)
+    window = next(windows, None)
     if window is None:
         return None
     before, after = (_stretch(results, model, window) for model in (rung.parent, rung.model))
