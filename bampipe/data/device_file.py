@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from bampipe.data.urdf import Limits, read_chain
+from bampipe.data.urdf import DriveLimits, read_chain
 from bampipe.errors import InputError
 from bampipe.files import read_toml
 
@@ -48,7 +48,7 @@ def complete_device(table: dict[str, Any], folder: Path, where: str) -> dict[str
     if not isinstance(robot, Mapping):
         return table
     robot = dict(robot)
-    limits: Mapping[str, Limits] = {}
+    limits: Mapping[str, DriveLimits] = {}
     source = ""
     name = robot.get("urdf")
     if isinstance(name, str) and "joints" not in robot:
@@ -80,7 +80,7 @@ def complete_device(table: dict[str, Any], folder: Path, where: str) -> dict[str
     motors = robot.get("motors", {})
     if not _well_formed(motors, kinds):  # the check of its fields says what is wrong
         motors = {}
-    filled = _filled(kinds, {joint: limits.get(joint, Limits()) for joint in joints}, motors)
+    filled = _filled(kinds, {joint: limits.get(joint, DriveLimits()) for joint in joints}, motors)
     if source and not table.get("source"):
         filled["source"] = source
     return {**filled, **table, "robot": robot}
@@ -136,7 +136,9 @@ def _well_formed(motors: object, joints: Mapping[str, str]) -> bool:
 
 
 def _filled(
-    kinds: Mapping[str, str], limits: Mapping[str, Limits], motors: Mapping[str, Mapping[str, Any]]
+    kinds: Mapping[str, str],
+    limits: Mapping[str, DriveLimits],
+    motors: Mapping[str, Mapping[str, Any]],
 ) -> dict[str, Any]:
     """What the device file of a robot holds where it does not say otherwise.
 
@@ -230,7 +232,7 @@ def _constant(motor: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _rotor_parameter(
-    motor: Mapping[str, Any], name: str, limits: Limits, turns: float, unit: str
+    motor: Mapping[str, Any], name: str, limits: DriveLimits, turns: float, unit: str
 ) -> dict[str, Any]:
     """Inertia of a rotor: of the data sheet where it is given, else a guess."""
     about = f"inertia of the rotor of {name}, seen from where its torque is"
@@ -246,7 +248,7 @@ def _rotor_parameter(
     }  # fmt: skip
 
 
-def _friction(kind: str, limits: Limits) -> dict[str, Any]:
+def _friction(kind: str, limits: DriveLimits) -> dict[str, Any]:
     effort, velocity = _scale(limits)
     length, torque, _ = _UNITS[kind]
     size = _FRICTION_SHARE * effort
@@ -266,13 +268,13 @@ def _friction(kind: str, limits: Limits) -> dict[str, Any]:
     }
 
 
-def _rotor(limits: Limits) -> float:
+def _rotor(limits: DriveLimits) -> float:
     """Inertia of a drive as seen from its joint, before any data."""
     effort, velocity = _scale(limits)
     return _ACCELERATING_S * effort / velocity
 
 
-def _scale(limits: Limits) -> tuple[float, float]:
+def _scale(limits: DriveLimits) -> tuple[float, float]:
     """Largest effort and velocity of a joint."""
     return limits.effort or _EFFORT, limits.velocity or _VELOCITY
 

@@ -33,7 +33,7 @@ _MANY = 8
 
 
 @dataclass(frozen=True)
-class Limits:
+class DriveLimits:
     """What a URDF says of a joint's drive; 0 where it says nothing.
 
     Attributes:
@@ -62,7 +62,7 @@ class Chain:
     """
 
     joints: Mapping[str, dict[str, Any]]
-    limits: Mapping[str, Limits]
+    limits: Mapping[str, DriveLimits]
     base: str
     tip: str
     notes: tuple[str, ...]
@@ -109,7 +109,7 @@ class _Joint:
     offset: Array
     angles: tuple[float, float, float]
     axis: list[float]
-    limits: Limits
+    limits: DriveLimits
 
 
 def read_chain(
@@ -192,7 +192,7 @@ def _chain(
         return own + sum(bodies_below(joint.child) for joint in below.get(link, ()))
 
     found: dict[str, dict[str, Any]] = {}
-    limits: dict[str, Limits] = {}
+    limits: dict[str, DriveLimits] = {}
     turn, offset, before = np.eye(3), np.zeros(3), ""
     fixed_between = False
     for joint in path_up:
@@ -320,7 +320,7 @@ def _joint(entry: ElementTree.Element, where: str) -> _Joint:
         return _numbers(entry.find(tag), key, "0", 1, place)[0]
 
     bounded = kind != "continuous"
-    limits = Limits(
+    limits = DriveLimits(
         number("limit", "lower") if bounded else 0.0,
         number("limit", "upper") if bounded else 0.0,
         number("limit", "effort"),
@@ -403,7 +403,7 @@ def _path(base: str, tip: str, above: Mapping[str, _Joint], where: str) -> list[
 def urdf_text(
     name: str,
     joints: Mapping[str, Mapping[str, Any]],
-    limits: Mapping[str, Limits],
+    limits: Mapping[str, DriveLimits],
     comment: str = "",
 ) -> str:
     """A URDF of joints and bodies, one link a joint, without shapes.

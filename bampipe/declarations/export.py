@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.data.run_folder import RunFolder
-from bampipe.data.urdf import Limits, urdf_text
+from bampipe.data.urdf import DriveLimits, urdf_text
 from bampipe.declarations.model_file import identified, load_model
 from bampipe.errors import InputError
 from bampipe.files import json_text
@@ -84,7 +84,7 @@ def _urdf(run: RunFolder, system: System, p: Array) -> str:
         assert numbers.size == INERTIAL
         joints[joint.name] = {**_BARE, **declared, **_body(numbers)}
         lower, upper = device.limits.get(joint.name, (0.0, 0.0))
-        limits[joint.name] = Limits(
+        limits[joint.name] = DriveLimits(
             lower,
             upper,
             joint.effort,

@@ -96,7 +96,7 @@ def _vibration(evidence: Evidence, axis: int) -> _Sine | None:
     for k, motion in enumerate(evidence.motions):
         use = evidence.used[k][:, axis] > 0
         if use.sum() > 2 * BINS:
-            t = motion.t[band.kept(len(motion.t))][use]
+            t = motion.t[band.thinned_rows(len(motion.t))][use]
             found.append(_best_sine(t, evidence.residual[k][use, axis], grid))
     if not found:
         return None
@@ -126,7 +126,7 @@ def _by_direction(evidence: Evidence, axis: int, variable: Variable) -> str:
     """Whether the residual keeps its sign when the motion turns round, as friction does not."""
     r = np.concatenate([x[:, axis] for x in evidence.residual])
     v = np.concatenate(variable.values)
-    kept = [evidence.band.kept(len(m.t)) for m in evidence.motions]
+    kept = [evidence.band.thinned_rows(len(m.t)) for m in evidence.motions]
     rate = np.concatenate([m.qd[k, axis] for m, k in zip(evidence.motions, kept, strict=True)])
     edges = np.unique(np.quantile(v, np.linspace(0.0, 1.0, 3 * BINS + 1)))
     which = np.clip(np.searchsorted(edges, v, side="right") - 1, 0, len(edges) - 2)

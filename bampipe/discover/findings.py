@@ -5,31 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from bampipe.results.diagnose import AxisVerdict, RankedEffect, SearchStep, TransientCandidate
+from bampipe.results.diagnose import (
+    AxisVerdict,
+    Contender,
+    RankedEffect,
+    SearchStep,
+    TransientCandidate,
+)
 from bampipe.trials.residuals import Evidence
-
-
-@dataclass(frozen=True)
-class Contender:
-    """An effect that contends for a place in the model, all others found being in it.
-
-    Attributes:
-        effect: canonical name.
-        axis: where the effect found helps most.
-        held_out_rmse: error there with this effect, N.m or N.
-        score: gain in log likelihood over all axes; score_without_trial, score_without_second:
-            without the trial and without the second that speak most for the effect found; None
-            with two trials.
-        odds: that it is this one, of those that fit alike.
-    """
-
-    effect: str
-    axis: int
-    held_out_rmse: float
-    score: float
-    score_without_trial: float | None
-    score_without_second: float
-    odds: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -59,7 +59,7 @@ def largest_trial(evidence: Evidence, by_sample: Sequence[Array]) -> SampleRange
 
 def _range_of(evidence: Evidence, trial: int, first: int, last: int) -> SampleRange:
     motion = evidence.motions[trial]
-    t = motion.t[evidence.band.kept(len(motion.t))]
+    t = motion.t[evidence.band.thinned_rows(len(motion.t))]
     stretch = Stretch(trial_id=motion.trial_id, t_start=t[first], t_end=t[last - 1])
     return SampleRange(trial, first, last, stretch)
 

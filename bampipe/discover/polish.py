@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 
 from bampipe.discover.bench import Bench
 from bampipe.discover.chance import candidates_of
-from bampipe.discover.findings import Contender
 from bampipe.discover.influence import largest_second, largest_trial, score_without
 from bampipe.discover.scorer import Score, Scorer
 from bampipe.discover.settings import Settings
 from bampipe.discover.start import with_effect, without_effect
 from bampipe.physics.recipe import Recipe
+from bampipe.results.diagnose import Contender
 from bampipe.trials.residuals import Evidence, residual_and_memory
 
 Array = NDArray[np.float64]
@@ -161,12 +161,13 @@ def weigh(fewer: FittedSet, name: str, scores: Mapping[str, Score]) -> list[Cont
     axis = int(np.argmax(scores[name].gain))
     contenders = [
         Contender(
-            n,
-            axis,
-            float(scorer.held_out_scale[axis] * scores[n].error[axis]),
-            scores[n].total,
-            without_trial[n].total if n in without_trial else None,
-            without_second[n].total if n in without_second else 0.0,
+            effect=n,
+            axis=fewer.evidence.system.coordinates[axis],
+            held_out_rmse=scorer.held_out_scale[axis] * scores[n].error[axis],
+            score=scores[n].total,
+            score_without_trial=without_trial[n].total if n in without_trial else None,
+            score_without_second=without_second[n].total if n in without_second else 0.0,
+            odds=0.0,
         )
         for n in names
     ]

@@ -266,7 +266,7 @@ class Scorer:
         p = np.concatenate([e.p[: len(system.parameters) - len(values)], values])
         total = np.zeros(len(system.coordinates))
         for motion, used in zip(e.motions, e.used, strict=True):
-            kept = e.band.kept(len(motion.t))
+            kept = e.band.thinned_rows(len(motion.t))
             u = motion.inputs(system.inputs)
             z = system.memory(motion.q, motion.qd, motion.qdd, u, p, motion.t)
             at = motion.q[kept], motion.qd[kept], motion.qdd[kept], z[kept]

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from bampipe.discover.bench import Bench
 from bampipe.discover.chance import Progress, Replicate
-from bampipe.discover.findings import Contender
 from bampipe.discover.influence import SampleRange, error_without_second
 from bampipe.discover.level import Level
 from bampipe.discover.polish import FittedSet, extend_set, is_superfluous, polish, reduce_set
@@ -19,7 +18,7 @@ from bampipe.discover.scorer import Score, Scorer
 from bampipe.discover.settings import Settings
 from bampipe.estimate.simulation import Runaway
 from bampipe.physics.recipe import Recipe
-from bampipe.results.diagnose import SearchStep
+from bampipe.results.diagnose import Contender, SearchStep
 from bampipe.results.standing import AT_FLOOR, standing
 from bampipe.trials.folds import HELD_OUT
 from bampipe.trials.measured import MeasuredTrials
@@ -161,7 +160,8 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
         steps.append(_step(found))
     progress(0.85, "replaying the final model for its noise floor")
     final = bench.floor_replicas(found.recipe, found.evidence.p)
-    main = {name: contest[0].axis for name, contest in contests.items() if contest}
+    axes = initial.system.coordinates
+    main = {name: axes.index(c[0].axis) for name, c in contests.items() if c}
     return Search(
         bench.trials, base, initial, level, first, found,
         {name: groups.get(name, ()) for name in found.added},

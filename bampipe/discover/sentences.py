@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from bampipe.discover.description import describe
-from bampipe.discover.findings import Contender, Diagnosis
+from bampipe.discover.findings import Diagnosis
 from bampipe.lists import join_names
-from bampipe.results.diagnose import AxisVerdict, Stretch
+from bampipe.results.diagnose import AxisVerdict, Contender, Stretch
 from bampipe.results.standing import FLOOR_WRONG, STANDINGS_IN_WORDS
 
 

@@ -66,7 +66,7 @@ def variables(evidence: Evidence, axis: int) -> tuple[Variable, ...]:
         columns.setdefault(name, (in_unit, []))[1].append(values)
 
     for index, motion in enumerate(evidence.motions):
-        kept = band.kept(len(motion.t))
+        kept = band.thinned_rows(len(motion.t))
         u = motion.inputs(system.inputs)
         memory = evidence.fitted[index].memory
         load = system.applied(motion.q, motion.qd, motion.qdd, memory, u, evidence.p)[:, axis]
@@ -166,7 +166,7 @@ def worst_windows(evidence: Evidence, count: int = 10, width_s: float = 0.5) -> 
     typical = evidence.rmse()
     found: list[tuple[float, dict[str, Any]]] = []
     for k, motion in enumerate(evidence.motions):
-        kept = band.kept(len(motion.t))
+        kept = band.thinned_rows(len(motion.t))
         for start in range(0, len(kept) - length + 1, length):
             rows = slice(start, start + length)
             for axis, name in enumerate(system.coordinates):

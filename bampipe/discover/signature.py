@@ -68,13 +68,15 @@ def signature(device: Device, effect: Effect, target: str) -> Signature | None:
     bare = compile_model(Model(device))
     full = compile_model(Model(device, (name,), (effect,)))
     for braked in (False, True):
-        found = _along(device, bare, full, braked)
+        found = _compute_signature(device, bare, full, braked)
         if found is not None:
             return found
     return None
 
 
-def _along(device: Device, bare: System, full: System, braked: bool) -> Signature | None:
+def _compute_signature(
+    device: Device, bare: System, full: System, braked: bool
+) -> Signature | None:
     t = np.arange(0.0, DURATION_S, 1.0 / RATE_HZ)
     motion = [_motion(c, device.limits.get(c.name), n, t) for n, c in enumerate(device.coordinates)]
     q, qd, qdd = (np.column_stack([part[order] for part in motion]) for order in range(3))

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 
 import numpy as np
 
 from bampipe.discover.chance import candidates_of
-from bampipe.discover.findings import Contender, Diagnosis
+from bampipe.discover.findings import Diagnosis
 from bampipe.discover.influence import error_without_second
 from bampipe.discover.ranking import rank
 from bampipe.discover.scorer import Scorer
 from bampipe.discover.search import Search
 from bampipe.discover.settings import Settings
 from bampipe.discover.shape import explainable_share
-from bampipe.results.diagnose import AxisVerdict, TransientCandidate, Verdict
+from bampipe.results.diagnose import AxisVerdict, Contender, TransientCandidate, Verdict
 from bampipe.results.standing import FLOOR_WRONG, standing
 from bampipe.trials.noise_floor import NoiseFloor
 
@@ -153,7 +152,7 @@ def _listed(
         return any(theirs >= s.rival_score * ours for theirs, ours in pairs)
 
     shown = [c for c in contest if c.effect in odds or is_close(c)]
-    return tuple(replace(c, odds=odds.get(c.effect, 0.0)) for c in shown)
+    return tuple(c.model_copy(update={"odds": odds.get(c.effect, 0.0)}) for c in shown)
 
 
 def _reach(search: Search, name: str, worth: float) -> set[int]:

@@ -16,7 +16,7 @@ _SD_OF_MEDIAN = 1.4826
 
 
 @dataclass(frozen=True)
-class Stretch:
+class RemovedStretch:
     """A stretch of a trial and what the fit would be without it.
 
     Attributes:
@@ -31,7 +31,9 @@ class Stretch:
     typical: Array
 
 
-def find_worst_stretch(problem: Problem, found: LeastSquares, length_s: float = 1.0) -> Stretch:
+def find_worst_stretch(
+    problem: Problem, found: LeastSquares, length_s: float = 1.0
+) -> RemovedStretch:
     """Return the stretch without which some parameter would move most.
 
     To first order: the inverse of all information times the score of the stretch (Cook 1977).
@@ -58,7 +60,7 @@ def find_worst_stretch(problem: Problem, found: LeastSquares, length_s: float = 
         moves = np.nan_to_num(np.concatenate(scores) @ inverse / sd, posinf=0.0, neginf=0.0)
     worst = int(np.argmax(np.abs(moves).max(axis=1)))
     trial, start = places[worst]
-    return Stretch(
+    return RemovedStretch(
         trial,
         band.margin_s + start * band.step / band.rate_hz,
         moves[worst],

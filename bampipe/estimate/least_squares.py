@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from bampipe.errors import InputError
 from bampipe.estimate.bounded import descend
 from bampipe.estimate.low_pass import Band
-from bampipe.estimate.standstill import moving
+from bampipe.estimate.standstill import find_moving_samples
 
 Array = NDArray[np.float64]
 
@@ -60,7 +60,7 @@ class Problem:
         linear: whether the residual is linear in all of them.
         constant: (n_free,) by which of them its slope is the same wherever it is taken.
         band: the low-pass.
-        resting: by trial, (T, n_q) whether an axis stands still; see `resting`.
+        standstill: by trial, (T, n_q) whether an axis stands still; see `find_standstill`.
         precision: (n_free,) of what is known of the parameters beforehand, one over its variance,
             zero where nothing is; known: (n_free,) that.
     """
@@ -74,7 +74,7 @@ class Problem:
     linear: bool
     constant: NDArray[np.bool_]
     band: Band
-    resting: Sequence[NDArray[np.bool_]]
+    standstill: Sequence[NDArray[np.bool_]]
     precision: Array
     known: Array
 
@@ -143,7 +143,7 @@ def stacked_residual(
     columns = np.concatenate([base[:, :, None], slopes], axis=2).reshape(count, -1)
     axes = np.repeat(np.arange(n_q, dtype=np.int64), 1 + n_free)
     thin = problem.band.thin(columns, axes).reshape(-1, n_q, 1 + n_free)
-    used = moving(problem.resting[trial], problem.band)
+    used = find_moving_samples(problem.standstill[trial], problem.band)
     thin *= used[:, :, None]
     slope = np.ascontiguousarray(thin[:, :, 1:])
     if elsewhere is not None:

@@ -127,7 +127,7 @@ class Band:
         spacing = self.step * 2.0 * np.array(self.cutoff_hz) / self.rate_hz
         return np.minimum(1.0, spacing)
 
-    def kept(self, count: int) -> NDArray[np.int64]:
+    def thinned_rows(self, count: int) -> NDArray[np.int64]:
         """Indices of the samples that thinning keeps of ``count``."""
         margin = int(self.margin_s * self.rate_hz)
         return np.arange(margin, count - margin, self.step, dtype=np.int64)
@@ -140,7 +140,7 @@ class Band:
             axes: the axis whose cut-off each column has, (k,); by default column i has that of
                 axis i modulo n_q.
         """
-        kept, cutoffs = self.kept(len(values)), np.array(self.cutoff_hz)
+        kept, cutoffs = self.thinned_rows(len(values)), np.array(self.cutoff_hz)
         which = np.arange(values.shape[1]) % cutoffs.size if axes is None else np.asarray(axes)
         by_column = cutoffs[which]
         distinct = np.unique(by_column)

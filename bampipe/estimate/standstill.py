@@ -23,7 +23,7 @@ _REACH = 0.02
 """Share that a rest may have in a low-passed sample before the sample is left out."""
 
 
-def resting(
+def find_standstill(
     qd: Array, qd_sd: Array, rate_hz: float, braked: NDArray[np.bool_] | None = None
 ) -> NDArray[np.bool_]:
     """Tell where an axis stands still.
@@ -50,11 +50,11 @@ def resting(
     return still
 
 
-def moving(rest: NDArray[np.bool_], band: Band) -> NDArray[np.bool_]:
+def find_moving_samples(rest: NDArray[np.bool_], band: Band) -> NDArray[np.bool_]:
     """Tell which low-passed, thinned samples no rest reaches into.
 
     Args:
-        rest: (T, n_q) from `resting`; band: the low-pass.
+        rest: (T, n_q) from `find_standstill`; band: the low-pass.
 
     Returns:
         (K, n_q).

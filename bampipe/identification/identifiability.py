@@ -164,7 +164,7 @@ def find_information(
     if further is not None:
         moved = system.true_motion(motion.q, motion.qd, motion.qdd, u, own)
         slope = np.concatenate([slope, further(*moved, z, u, own)], axis=2)
-    slope *= ~problem.resting[trial][:, :, None]
+    slope *= ~problem.standstill[trial][:, :, None]
     push = system.input_map(motion.q, u, own) * noise.process_sd[noise.is_force]
     inertia = np.diagonal(system.mass_matrix(motion.q, own), axis1=1, axis2=2).mean(axis=0)
     damping = np.array(

@@ -30,7 +30,7 @@ from bampipe.physics.newton_euler import (
 )
 from bampipe.physics.robot import gravity_vector
 from bampipe.physics.roles import compensation, delays
-from bampipe.physics.signals import Signals, order_of_action
+from bampipe.physics.signals import ActingInputs, order_of_action
 from bampipe.physics.time_limit import OutOfTime, time_limit
 from bampipe.physics.vocabulary import Vocabulary, constant_symbol
 
@@ -71,7 +71,7 @@ def _derive(model: Model, named_constants: bool) -> Equations:
     forces = [d.channel[f] for f in device.forces]
     input_map = [[sp.diff(e, f) for f in forces] for e in raw_applied]
 
-    signals = Signals(d, model.effects, raw_applied, side)
+    signals = ActingInputs(d, model.effects, raw_applied, side)
     applied = [signals.put_in(e) for e in raw_applied]
 
     noise = [*device.forces, *device.process_noise]
@@ -89,7 +89,7 @@ def _derive(model: Model, named_constants: bool) -> Equations:
     # An offset is differentiated twice. It cannot follow the rates, so what a motor's back EMF
     # takes off is left out of its load; nor states, so a lagging force counts as logged; and a
     # delayed force is delayed to two orders less in it.
-    prompt = Signals(d, [e for e in model.effects if not e.effect.states], raw_applied, side)
+    prompt = ActingInputs(d, [e for e in model.effects if not e.effect.states], raw_applied, side)
     lost = [
         d.channel[derivative(f, k)] for f in device.forces for k in (LAST_ORDER - 1, LAST_ORDER)
     ]
@@ -108,10 +108,10 @@ def _derive(model: Model, named_constants: bool) -> Equations:
         measures = item.effect.kind == "measurement"
         symbols = d.effect_symbols(item, still if measures else delivered, side)
         for key, tree in item.effect.expressions.items():
-            place = item.place(key)
+            place = item.target_of(key)
             if item.effect.kind == "input":
                 continue
-            value = d.own(item, tree, symbols, key)
+            value = d.rebuild_for(item, tree, symbols, key)
             label = f"effect {item.name!r}: {key}"
             if key == "kinetic":
                 energies.append((label, tree, value, sp.S.Zero))
@@ -127,8 +127,8 @@ def _derive(model: Model, named_constants: bool) -> Equations:
                 if item.effect.acting_link:
                     delivered[axes.index(place)] += value
         for state in item.effect.states if item.effect.kind != "input" else ():
-            rate = d.own(item, state.rate, symbols, f"states.{state.name}.rate")
-            first = d.own(item, state.initial, symbols, f"states.{state.name}.initial")
+            rate = d.rebuild_for(item, state.rate, symbols, f"states.{state.name}.rate")
+            first = d.rebuild_for(item, state.initial, symbols, f"states.{state.name}.initial")
             z = d.z[item.prefix, state.name]
             of_states[z] = signals.put_in(rate), signals.put_in_initial(first)
     other = [signals.put_in(e) for e in other]

@@ -344,7 +344,7 @@ class BoundEffect:
         """Prefix of its parameters' names: ``stribeck.yaw``."""
         return self.name.replace(":", ".")
 
-    def place(self, key: str) -> str:
+    def target_of(self, key: str) -> str:
         """The axis, force or channel that the expression ``key`` acts on."""
         place = key.partition(".")[2]
         if self.effect.scope == "axis_pair" and place:

@@ -31,9 +31,11 @@ def compensation(d: Vocabulary, potential: Any) -> list[Any]:
     raw_applied, side = d.table(device.applied, "applied"), d.table(device.side_load, "side_load")
     for item in (e for e in d.model.effects if e.effect.kind == "torque"):
         for key, tree in item.effect.expressions.items():
-            place = d.axes.index(item.place(key))
+            place = d.axes.index(item.target_of(key))
             if balanced[place] and expression.names(tree) & own:
-                found[place] += d.own(item, tree, d.effect_symbols(item, raw_applied, side), key)
+                found[place] += d.rebuild_for(
+                    item, tree, d.effect_symbols(item, raw_applied, side), key
+                )
     return found
 
 

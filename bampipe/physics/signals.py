@@ -22,12 +22,12 @@ def order_of_action(effects: Iterable[BoundEffect]) -> list[BoundEffect]:
     all weights; among those alike, names decide.
     """
 
-    def place(item: BoundEffect) -> tuple[int, bool, str]:
+    def order_key(item: BoundEffect) -> tuple[int, bool, str]:
         link = item.effect.acting_link
         last = any(name == "dry" or name.startswith("weight_") for name in item.effect.names)
         return (_ORDER[link] if link else len(_ORDER), last, item.name)
 
-    return sorted(effects, key=place)
+    return sorted(effects, key=order_key)
 
 
 def follows(item: BoundEffect, earlier: BoundEffect, device: Device) -> bool:
@@ -50,7 +50,7 @@ def follows(item: BoundEffect, earlier: BoundEffect, device: Device) -> bool:
     return by_load or bool(item.effect.names & changed)
 
 
-class Signals:
+class ActingInputs:
     """The inputs that act, as expressions of the logged ones, and the internal states between.
 
     Attributes:
@@ -89,11 +89,11 @@ class Signals:
                 if place == EACH:
                     for k in range(len(INPUT_ORDERS)):
                         symbols[derivative("f", k)] = d.channel[derivative(name, k)]
-                found[d.channel[name]] = self.put_in(d.own(item, tree, symbols, key))
+                found[d.channel[name]] = self.put_in(d.rebuild_for(item, tree, symbols, key))
         for state in item.effect.states:
             z = d.z[item.prefix, state.name]
-            rate = d.own(item, state.rate, symbols, f"states.{state.name}.rate")
-            initial = d.own(item, state.initial, symbols, f"states.{state.name}.initial")
+            rate = d.rebuild_for(item, state.rate, symbols, f"states.{state.name}.rate")
+            initial = d.rebuild_for(item, state.initial, symbols, f"states.{state.name}.initial")
             self.rates[z], self.initial[z] = self.put_in(rate), self.put_in_initial(initial)
         self.acting |= found
 

@@ -376,7 +376,7 @@ def check_effect(effect: Effect, device: Device, target: str = "") -> list[str]:
         "potential": lambda _: _UNITS["J"],
     }
     for key, tree in effect.expressions.items():
-        check.expression(tree, symbols, key, wanted[key.partition(".")[0]](item.place(key)))
+        check.expression(tree, symbols, key, wanted[key.partition(".")[0]](item.target_of(key)))
     for state in effect.states:
         own = symbols[state.name]
         rate = None if own is None else own / _UNITS["s"]

@@ -208,5 +208,5 @@ class Vocabulary:
             if i != j and a + b == item.target
         )
 
-    def own(self, item: BoundEffect, tree: ast.expr, symbols: Symbols, what: str) -> Any:
+    def rebuild_for(self, item: BoundEffect, tree: ast.expr, symbols: Symbols, what: str) -> Any:
         return self.rebuild(tree, symbols, f"effect {item.name!r}: {what}")

@@ -32,7 +32,7 @@ SESSION = "session.toml"
 
 
 @dataclass(frozen=True)
-class Proposal:
+class ProposedSession:
     """What to write, and what a person has to look at.
 
     Attributes:
@@ -50,7 +50,7 @@ class Proposal:
     passed: list[str]
 
 
-def propose(folder: Path, device: str = "") -> Proposal:
+def propose(folder: Path, device: str = "") -> ProposedSession:
     """Propose a session file for the logs in ``folder``; writes nothing.
 
     Args:
@@ -89,7 +89,7 @@ def propose(folder: Path, device: str = "") -> Proposal:
         *_not_used(match),
         *trials_tables(chosen.device, axes, match, notes),
     ]
-    return Proposal(
+    return ProposedSession(
         session="\n".join(lines) + "\n",
         device=chosen.text,
         fill_in=notes.fill_in,
@@ -152,7 +152,7 @@ def _not_used(match: Matcher) -> list[str]:
     return [f"# not used: {', '.join(left)}", ""] if left else []
 
 
-def write_proposal(folder: Path, proposal: Proposal) -> list[Path]:
+def write_proposal(folder: Path, proposal: ProposedSession) -> list[Path]:
     """Write what was proposed; returns the files written.
 
     Raises:

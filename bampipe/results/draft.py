@@ -12,7 +12,7 @@ from bampipe.schema import Count
 DraftVerdict = Literal["drafted", "nothing_beyond_chance", "no_lower_error"]
 
 
-class Constant(Record):
+class FittedConstant(Record):
     """A number of a formula, as fitted together with all parameters of the model."""
 
     value: float
@@ -40,7 +40,7 @@ class DraftedEffect(Record):
     axis: str
     expression: str
     acts_as: Literal["force", "friction", "damping", "inertia"]
-    constants: dict[str, Constant]
+    constants: dict[str, FittedConstant]
     summary: str
     looks_like: str
     sentence: str

@@ -13,8 +13,8 @@ from bampipe.results.ingest import IngestResult
 from bampipe.results.setup import AxisSetup, PossibleMistake, SetupMistake, SetupResult
 from bampipe.setup.placeholders import Placeholder, find_placeholders
 from bampipe.setup.plausibility import LEAST_MOVING, Plausibility
-from bampipe.setup.search import Finding, Search, shorten, spoilt_axes
-from bampipe.setup.words import describe_candidate, describe_evidence, describe_size
+from bampipe.setup.search import CorrectionSearch, Finding, shorten, spoilt_axes
+from bampipe.setup.words import describe_correction, describe_evidence, describe_size
 from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion
 from bampipe.trials.signals import Change, Signals
@@ -37,7 +37,7 @@ def inspect_setup(
     _require_scale(system, short)
     signals = Signals.of_session(system, session)
     placeholders = find_placeholders(system, session)
-    search = Search(system, short, band, folds, signals)
+    search = CorrectionSearch(system, short, band, folds, signals)
     held = search.judge(Change.none(len(signals.names)))
     findings = search.find_mistakes(held, tuple(n for p in placeholders for n in p.signals))
     mistakes = tuple(_record(system, session, found, placeholders) for found in findings)
@@ -83,20 +83,20 @@ def _axis(
 def _record(
     system: System, session: IngestResult, found: Finding, placeholders: Sequence[Placeholder]
 ) -> SetupMistake:
-    candidate, axes = found.candidate, spoilt_axes(found)
-    sentence = describe_candidate(candidate, session)
-    left = [p for p in placeholders if set(candidate.signals) <= set(p.signals)]
-    if candidate.kind == "scale" and left:
-        sentence = f"{left[0].sentence}, a placeholder: {describe_size(candidate)}"
+    correction, axes = found.correction, spoilt_axes(found)
+    sentence = describe_correction(correction, session)
+    left = [p for p in placeholders if set(correction.signals) <= set(p.signals)]
+    if correction.kind == "scale" and left:
+        sentence = f"{left[0].sentence}, a placeholder: {describe_size(correction)}"
 
     def errors(of: Plausibility) -> dict[str, float]:
         return dict(zip(system.coordinates, 100.0 * of.error, strict=True))
 
     return SetupMistake(
-        kind=candidate.kind,
-        signals=candidate.signals,
-        factor=candidate.factor,
-        offset=candidate.offset,
+        kind=correction.kind,
+        signals=correction.signals,
+        factor=correction.factor,
+        offset=correction.offset,
         axes=tuple(system.coordinates[i] for i in axes),
         sentence=sentence,
         evidence=describe_evidence(system, axes, found.before, found.after),
@@ -104,7 +104,7 @@ def _record(
         error_after=errors(found.after),
         alternatives=tuple(
             PossibleMistake(
-                kind=rival.kind, signals=rival.signals, sentence=describe_candidate(rival, session)
+                kind=rival.kind, signals=rival.signals, sentence=describe_correction(rival, session)
             )
             for rival in found.rivals
         ),

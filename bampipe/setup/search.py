@@ -12,16 +12,16 @@ from numpy.typing import NDArray
 
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import System
-from bampipe.setup.candidates import (
-    Candidate,
-    clock_candidates,
-    exchange_candidates,
+from bampipe.setup.corrections import (
+    Correction,
+    clock_corrections,
+    exchange_corrections,
     groups_of_like,
     quarter_turns,
     scaled,
     shifted,
-    sign_candidates,
-    unit_candidates,
+    sign_corrections,
+    unit_corrections,
 )
 from bampipe.setup.plausibility import Plausibility, judge_setup
 from bampipe.trials.folds import Folds
@@ -69,20 +69,20 @@ class Finding:
     """One mistake with the two set-ups it lies between.
 
     Attributes:
-        candidate: that sets it right; rivals: others that do so as well.
+        correction: that sets it right; rivals: others that do so as well.
         before, after: what the set-ups explain.
         gain: of the score.
     """
 
-    candidate: Candidate
-    rivals: tuple[Candidate, ...]
+    correction: Correction
+    rivals: tuple[Correction, ...]
     before: Plausibility
     after: Plausibility
     gain: float
 
 
 @dataclass
-class Search:
+class CorrectionSearch:
     """Tries set-ups on a part of the trials; all on a small part, the best of them on more.
 
     Attributes:
@@ -129,13 +129,13 @@ class Search:
             changed = [change.of_motion(motion, self.signals) for motion in motions]
         return judge_setup(self.system, changed, change.of_band(self.band), folds, steps)
 
-    def screen(self, candidate: Candidate, change: Change) -> float:
-        """Score and cost of a candidate on top of ``change``; infinite where it makes no sense."""
-        if not _is_gross(candidate, self.motions, self.signals):
+    def screen(self, correction: Correction, change: Change) -> float:
+        """Score and cost of a correction on top of ``change``; infinite where it makes no sense."""
+        if not _is_gross(correction, self.motions, self.signals):
             return math.inf
         self.tested += 1
-        found = self._judge(candidate.change.after(change), *self.screened, _SCREENING_STEPS)
-        return math.inf if found is None else found.score(RANKED_ERROR) + candidate.cost
+        found = self._judge(correction.change.after(change), *self.screened, _SCREENING_STEPS)
+        return math.inf if found is None else found.score(RANKED_ERROR) + correction.cost
 
     def find_mistakes(
         self, stated: Plausibility | None, placeholders: Sequence[str]
@@ -153,7 +153,7 @@ class Search:
             if step is None:
                 break
             found.append(step)
-            change, now = step.candidate.change.after(change), step.after
+            change, now = step.correction.change.after(change), step.after
         return tuple(f for f in found if now is None or self._is_explained(f, now))
 
     def _is_suspicious(self, now: Plausibility | None, placeholders: Sequence[str]) -> bool:
@@ -178,19 +178,19 @@ class Search:
             best = self._choose(before, tried, placeholders)
         return best
 
-    def _discrete(self) -> Iterator[Candidate]:
-        yield from sign_candidates(self.signals)
-        yield from clock_candidates(self.signals)
-        for candidate in unit_candidates(self.signals):
-            if self.has_few_axes or len(candidate.signals) > 1:
-                yield candidate
+    def _discrete(self) -> Iterator[Correction]:
+        yield from sign_corrections(self.signals)
+        yield from clock_corrections(self.signals)
+        for correction in unit_corrections(self.signals):
+            if self.has_few_axes or len(correction.signals) > 1:
+                yield correction
         if self.has_few_axes:
-            yield from exchange_candidates(self.signals)
+            yield from exchange_corrections(self.signals)
             yield from quarter_turns(self.signals)
 
-    def _continuous(self, change: Change) -> list[Candidate]:
+    def _continuous(self, change: Change) -> list[Correction]:
         """Scales and zeros of any size: the best families on a grid, then refined."""
-        families: list[tuple[Callable[[float], Candidate], Array]] = []
+        families: list[tuple[Callable[[float], Correction], Array]] = []
         for names in groups_of_like(self.signals):
             families.append((partial(_scaled_by_power, self.signals, names), _DECADES))
         for place, axis in enumerate(self.signals.axes):
@@ -211,11 +211,11 @@ class Search:
         self,
         change: Change,
         least: float,
-        family: Callable[[float], Candidate],
+        family: Callable[[float], Correction],
         grid: Array,
         best: float,
-    ) -> Candidate:
-        """The best candidate of a family near ``best``, where it scores ``least``."""
+    ) -> Correction:
+        """The best correction of a family near ``best``, where it scores ``least``."""
         step = float(grid[1] - grid[0])
         for _ in range(_HALVINGS):
             step *= 0.5
@@ -226,40 +226,40 @@ class Search:
         return family(best)
 
     def _try_best(
-        self, change: Change, candidates: Iterable[Candidate]
-    ) -> list[tuple[Candidate, Plausibility]]:
-        """Screen all candidates; return the best with what they explain of all trials."""
-        screened = [(self.screen(candidate, change), candidate) for candidate in candidates]
+        self, change: Change, corrections: Iterable[Correction]
+    ) -> list[tuple[Correction, Plausibility]]:
+        """Screen all corrections; return the best with what they explain of all trials."""
+        screened = [(self.screen(correction, change), correction) for correction in corrections]
         screened.sort(key=lambda one: one[0])
         tried = []
-        for score, candidate in screened[:_SHORTLIST]:
+        for score, correction in screened[:_SHORTLIST]:
             if math.isfinite(score):
-                found = self.judge(candidate.change.after(change))
+                found = self.judge(correction.change.after(change))
                 if found is not None:
-                    tried.append((candidate, found))
+                    tried.append((correction, found))
         return tried
 
     def _choose(
         self,
         before: Plausibility,
-        tried: Sequence[tuple[Candidate, Plausibility]],
+        tried: Sequence[tuple[Correction, Plausibility]],
         placeholders: Sequence[str],
     ) -> Finding | None:
         ranked = sorted(tried, key=lambda one: one[1].score(RANKED_ERROR) + one[0].cost)
-        for candidate, after in ranked:
-            gain = before.score(JUDGED_ERROR) - after.score(JUDGED_ERROR) - candidate.cost
-            hinted = candidate.kind == "scale" and set(candidate.signals) <= set(placeholders)
+        for correction, after in ranked:
+            gain = before.score(JUDGED_ERROR) - after.score(JUDGED_ERROR) - correction.cost
+            hinted = correction.kind == "scale" and set(correction.signals) <= set(placeholders)
             if gain < (LEAST_GAIN_PLACEHOLDER if hinted else LEAST_GAIN):
                 continue
-            own = after.score(RANKED_ERROR) + candidate.cost
+            own = after.score(RANKED_ERROR) + correction.cost
             rivals = tuple(
                 other
                 for other, found in ranked
-                if other is not candidate
-                and (other.kind, other.signals) != (candidate.kind, candidate.signals)
+                if other is not correction
+                and (other.kind, other.signals) != (correction.kind, correction.signals)
                 and found.score(RANKED_ERROR) + other.cost < own + ALIKE
             )
-            return Finding(candidate, _distinct(rivals), before, after, gain)
+            return Finding(correction, _distinct(rivals), before, after, gain)
         return None
 
 
@@ -289,11 +289,11 @@ def _middle(motion: Motion, most: int) -> Motion:
     )
 
 
-def _scaled_by_power(signals: Signals, names: tuple[str, ...], power: float) -> Candidate:
+def _scaled_by_power(signals: Signals, names: tuple[str, ...], power: float) -> Correction:
     return scaled(signals, names, 10.0**power, 3.0)
 
 
-def _shifted_by(signals: Signals, axis: str, offset: float) -> Candidate:
+def _shifted_by(signals: Signals, axis: str, offset: float) -> Correction:
     return shifted(signals, axis, offset, 3.0)
 
 
@@ -310,22 +310,22 @@ def _nothing_explained(system: System) -> Plausibility:
     return Plausibility(np.full(n, 1e3), np.ones(n), system.prior, objections)
 
 
-def _is_gross(candidate: Candidate, motions: Sequence[Motion], signals: Signals) -> bool:
+def _is_gross(correction: Correction, motions: Sequence[Motion], signals: Signals) -> bool:
     """Whether a scale or zero is off by more than what an effect would explain."""
-    if candidate.kind == "scale":
-        return abs(math.log(candidate.factor)) > math.log(LEAST_FACTOR)
-    if candidate.kind != "zero":
+    if correction.kind == "scale":
+        return abs(math.log(correction.factor)) > math.log(LEAST_FACTOR)
+    if correction.kind != "zero":
         return True
-    place = signals.places(candidate.signals)[0]
+    place = signals.places(correction.signals)[0]
     if signals.units[place] == "rad":
-        return abs(candidate.offset) > LEAST_TURN
+        return abs(correction.offset) > LEAST_TURN
     travel = max(float(np.ptp(motion.q[:, place])) for motion in motions)
-    return abs(candidate.offset) > LEAST_SHIFT * travel
+    return abs(correction.offset) > LEAST_SHIFT * travel
 
 
-def _distinct(candidates: Sequence[Candidate]) -> tuple[Candidate, ...]:
+def _distinct(corrections: Sequence[Correction]) -> tuple[Correction, ...]:
     """The first of each kind and signals."""
-    found: dict[tuple[str, tuple[str, ...]], Candidate] = {}
-    for candidate in candidates:
-        found.setdefault((candidate.kind, candidate.signals), candidate)
+    found: dict[tuple[str, tuple[str, ...]], Correction] = {}
+    for correction in corrections:
+        found.setdefault((correction.kind, correction.signals), correction)
     return tuple(found.values())

@@ -7,19 +7,19 @@ import math
 from bampipe.lists import join_names
 from bampipe.physics import System
 from bampipe.results.ingest import IngestResult
-from bampipe.setup.candidates import FACTORS, Candidate
+from bampipe.setup.corrections import FACTORS, Correction
 from bampipe.setup.plausibility import Plausibility, distance_from_prior
 
 
-def describe_candidate(candidate: Candidate, session: IngestResult) -> str:
+def describe_correction(correction: Correction, session: IngestResult) -> str:
     """One sentence without a full stop: the mistake, a colon, what to write in session.toml."""
-    if candidate.kind == "clock":
-        return _clock(candidate, session)
-    if candidate.kind == "zero":
-        return _zero(candidate, session)
-    if candidate.kind == "exchange":
-        return f"{join_names(candidate.signals)} are exchanged: exchange their columns"
-    return _sign(candidate, session) if candidate.kind == "sign" else _scale(candidate, session)
+    if correction.kind == "clock":
+        return _clock(correction, session)
+    if correction.kind == "zero":
+        return _zero(correction, session)
+    if correction.kind == "exchange":
+        return f"{join_names(correction.signals)} are exchanged: exchange their columns"
+    return _sign(correction, session) if correction.kind == "sign" else _scale(correction, session)
 
 
 def describe_evidence(
@@ -53,8 +53,8 @@ def number(value: float) -> str:
     return f"{value:.0f}" if 1000.0 <= abs(value) < 1e6 else f"{value:.3g}"
 
 
-def _sign(candidate: Candidate, session: IngestResult) -> str:
-    names = candidate.signals
+def _sign(correction: Correction, session: IngestResult) -> str:
+    names = correction.signals
     if len(names) > 1:
         if names[0] in session.force.columns:
             return (
@@ -75,63 +75,63 @@ def _sign(candidate: Candidate, session: IngestResult) -> str:
     return f"{name} has the wrong sign: negate its column"
 
 
-def describe_size(candidate: Candidate) -> str:
+def describe_size(correction: Correction) -> str:
     """By how much signals read too much or too little."""
-    factor = candidate.factor
+    factor = correction.factor
     off = f"{number(1.0 / factor)} times too much"
     if factor > 1.0:
         off = f"{number(factor)} times too little"
-    verb = "read" if len(candidate.signals) > 1 else "reads"
-    return f"{join_names(candidate.signals)} {verb} about {off}"
+    verb = "read" if len(correction.signals) > 1 else "reads"
+    return f"{join_names(correction.signals)} {verb} about {off}"
 
 
-def _scale(candidate: Candidate, session: IngestResult) -> str:
-    fixes = dict.fromkeys(_scale_fix(name, candidate, session) for name in candidate.signals)
-    unit = _si(candidate, session)
+def _scale(correction: Correction, session: IngestResult) -> str:
+    fixes = dict.fromkeys(_scale_fix(name, correction, session) for name in correction.signals)
+    unit = _si(correction, session)
     like = ""
-    if candidate.unit and unit:
-        meant, stated = candidate.unit, unit
-        if not _is_stated_as_si(candidate, unit):
+    if correction.unit and unit:
+        meant, stated = correction.unit, unit
+        if not _is_stated_as_si(correction, unit):
             meant, stated = stated, meant
         like = f", as {meant} read as {stated}"
-    return f"{describe_size(candidate)}{like}: {'; '.join(fixes)}"
+    return f"{describe_size(correction)}{like}: {'; '.join(fixes)}"
 
 
-def _scale_fix(name: str, candidate: Candidate, session: IngestResult) -> str:
-    factor = candidate.factor
+def _scale_fix(name: str, correction: Correction, session: IngestResult) -> str:
+    factor = correction.factor
     if name in session.axes:
         encoder = session.axes[name]
         if encoder.counts_per_unit:
             stated = encoder.counts_per_unit
             right = number(stated / factor)
             return f"counts_per_unit of {name} should be about {right}, not {number(stated)}"
-        unit = _unit_meant(candidate, encoder.raw_unit, encoder.unit)
+        unit = _unit_meant(correction, encoder.raw_unit, encoder.unit)
         return f'unit = "{unit}"' if unit else f"gear_ratio = {number(1.0 / factor)}"
     if name in session.force.columns:
-        unit = _unit_meant(candidate, session.force.raw_unit, session.force.unit)
+        unit = _unit_meant(correction, session.force.raw_unit, session.force.unit)
         if unit:
             return f'unit = "{unit}" of [force]'
-        row = " of its row" if len(candidate.signals) < len(session.force.columns) else ""
+        row = " of its row" if len(correction.signals) < len(session.force.columns) else ""
         return f"multiply {_force_entry(session)}{row} by {number(factor)}"
     return f"multiply scale of channels.{name} by {number(factor)}"
 
 
-def _unit_meant(candidate: Candidate, stated: str, si: str) -> str:
+def _unit_meant(correction: Correction, stated: str, si: str) -> str:
     """The unit to write in place of ``stated``, "" where no unit explains the factor."""
-    if not candidate.unit:
+    if not correction.unit:
         return ""
-    if stated == si and _is_stated_as_si(candidate, si):
-        return candidate.unit
-    return si if stated == candidate.unit and not _is_stated_as_si(candidate, si) else ""
+    if stated == si and _is_stated_as_si(correction, si):
+        return correction.unit
+    return si if stated == correction.unit and not _is_stated_as_si(correction, si) else ""
 
 
-def _is_stated_as_si(candidate: Candidate, si: str) -> bool:
-    """Whether readings in ``candidate.unit`` were taken for ``si``, not the other way round."""
-    return math.isclose(candidate.factor, dict(FACTORS[si])[candidate.unit])
+def _is_stated_as_si(correction: Correction, si: str) -> bool:
+    """Whether readings in ``correction.unit`` were taken for ``si``, not the other way round."""
+    return math.isclose(correction.factor, dict(FACTORS[si])[correction.unit])
 
 
-def _si(candidate: Candidate, session: IngestResult) -> str:
-    name = candidate.signals[0]
+def _si(correction: Correction, session: IngestResult) -> str:
+    name = correction.signals[0]
     if name in session.axes:
         return session.axes[name].unit
     if name in session.channels:
@@ -144,17 +144,17 @@ def _force_entry(session: IngestResult) -> str:
     return "calibration_n_per_v" if session.force.raw_unit == "V" else "the columns of [force]"
 
 
-def _zero(candidate: Candidate, session: IngestResult) -> str:
-    axis = candidate.signals[0]
+def _zero(correction: Correction, session: IngestResult) -> str:
+    axis = correction.signals[0]
     encoder = session.axes[axis]
-    off = candidate.offset
+    off = correction.offset
     size = f"{math.degrees(off):.3g}°" if encoder.unit == "rad" else f"{off:.3g} m"
     zero = encoder.zero - off / encoder.scale
     return f"the zero of {axis} is off by {size}: zero_counts should be about {zero:.6g}"
 
 
-def _clock(candidate: Candidate, session: IngestResult) -> str:
-    factor = candidate.factor
+def _clock(correction: Correction, session: IngestResult) -> str:
+    factor = correction.factor
     how = f"{1.0 / factor:.4g} times too slowly" if factor < 1.0 else f"{factor:.4g} times too fast"
     return (
         f"the clock runs {how}: correct the unit of the time column, and sample_rate_hz, which"

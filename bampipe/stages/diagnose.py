@@ -33,7 +33,6 @@ from bampipe.physics.effect import effect_from
 from bampipe.physics.recipe import Recipe
 from bampipe.progress import Progress
 from bampipe.results.diagnose import (
-    Contender,
     DiagnoseResult,
     RankedEffect,
     ResidualMap,
@@ -163,10 +162,6 @@ def _summary(result: dict[str, Any]) -> dict[str, object]:
 
 def _result(found: Diagnosis, recipe: Recipe, model: str) -> DiagnoseResult:
     names = found.evidence.system.coordinates
-    contests = {
-        effect: tuple(Contender(**vars(c) | {"axis": names[c.axis]}) for c in contest)
-        for effect, contest in found.contests.items()
-    }
     return DiagnoseResult(
         model=model,
         axes=dict(zip(names, found.axes, strict=True)),
@@ -174,7 +169,7 @@ def _result(found: Diagnosis, recipe: Recipe, model: str) -> DiagnoseResult:
         descriptions=_descriptions(found.ranking[:_DESCRIBED], recipe),
         selected=found.selected,
         groups=dict(found.groups),
-        contests=contests,
+        contests=dict(found.contests),
         steps=found.steps,
         transients=found.transients,
         suggested_trial=None,
@@ -214,7 +209,7 @@ def _map_variables(found: Diagnosis) -> pd.DataFrame:
     """Return map_variables.parquet: the variables of every axis' maps, sample by sample."""
     evidence = found.initial
     motions, band = evidence.motions, evidence.band
-    rows = [band.kept(len(motion.t)) for motion in motions]
+    rows = [band.thinned_rows(len(motion.t)) for motion in motions]
     columns: dict[str, object] = {
         "trial_id": np.repeat([motion.trial_id for motion in motions], [len(k) for k in rows]),
         "t": np.concatenate([motion.t[k] for motion, k in zip(motions, rows, strict=True)]),

@@ -15,8 +15,7 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
 from bampipe.declarations.model_file import IDENTIFIED_MODEL, identified, load_model, read_recipe
 from bampipe.discover.drafts.effect_file import declare, write_toml
-from bampipe.discover.drafts.search import AxisDraft as FoundDraft
-from bampipe.discover.drafts.search import Term, draft
+from bampipe.discover.drafts.search import FoundDraft, Term, draft
 from bampipe.discover.settings import Settings
 from bampipe.errors import InputError
 from bampipe.files import write_text
@@ -26,14 +25,12 @@ from bampipe.progress import Progress
 from bampipe.results.diagnose import AxisVerdict, DiagnoseResult
 from bampipe.results.draft import (
     AxisDraft,
-    ChanceOfDraft,
-    Constant,
-    CurveBound,
     DraftCurve,
     DraftedEffect,
     DraftOption,
     DraftResult,
     DraftVerdict,
+    FittedConstant,
     NearestEffect,
 )
 from bampipe.results.identify import IdentifyResult
@@ -157,7 +154,7 @@ def _effect(term: Term, file: str, system: System) -> DraftedEffect:
     units |= {name: of for name, (_, _, of) in form.limits().items()}
     at, mean, sd = term.curve()
     constants = {
-        name: Constant(
+        name: FittedConstant(
             value=value,
             low=value - 1.96 * term.sd[name],
             high=value + 1.96 * term.sd[name],
@@ -241,32 +238,18 @@ def _axis(
         )
         for option in found.options
     )
-    chances = tuple(
-        ChanceOfDraft(gain=c.gain, gains=c.gains, p_value=min(c.p_value, 1.0)) for c in found.chance
-    )
     return AxisDraft(
         verdict=verdict,
         effects=names,
-        chance=chances,
+        chance=found.chance,
         options=options,
         rmse_before=found.before,
         rmse_after=found.after if names else found.before,
-        noise_floor=found.chance[-1].floor,
+        noise_floor=found.noise_floor,
         unit=unit,
-        bound=_bound(found),
+        bound=found.bound,
         nearest=_nearest(axis, found, diagnosis, unit) if names else (),
         sentence=_sentence(found, [effects[name] for name in names], diagnosis.axes[axis], axis),
-    )
-
-
-def _bound(found: FoundDraft) -> CurveBound | None:
-    if found.bound is None:
-        return None
-    return CurveBound(
-        variable=found.bound.form.coordinate.words,
-        acts_as=found.bound.form.factor,
-        points=found.bound.points,
-        held_out_rmse=found.bound.held_out_rmse,
     )
 
 
@@ -308,10 +291,10 @@ def _sentence(
         return f"{name}: no draft, for no formula lowers the held-out error enough; {by_chance}."
     if not effects:
         return f"{name}: no draft, for chance would have given as good a formula; {by_chance}."
-    floor = found.chance[-1].floor
+    ratio = found.after / max(found.noise_floor, 1e-30)
     return (
         f"{name}: {' '.join(effect.sentence for effect in effects)} The held-out error falls from "
-        f"{found.before:.3g} to {found.after:.3g} {unit}, {found.after / max(floor, 1e-30):.2f} "
+        f"{found.before:.3g} to {found.after:.3g} {unit}, {ratio:.2f} "
         f"times the noise floor{_beside_curve(found, unit)}; {by_chance}."
     )
 
@@ -321,6 +304,6 @@ def _beside_curve(found: FoundDraft, unit: str) -> str:
     if found.bound is None or found.bound.held_out_rmse > found.after:
         return ""
     return (
-        f" (a free curve along {found.bound.form.coordinate.words} leaves "
+        f" (a free curve along {found.bound.variable} leaves "
         f"{found.bound.held_out_rmse:.3g} {unit})"
     )

@@ -241,7 +241,7 @@ def _compare(evidence: Evidence, number: int, p: Array) -> _Compared:
     z = system.memory(motion.q, motion.qd, motion.qdd, u, p, motion.t)
     applied = system.applied(motion.q, motion.qd, motion.qdd, z, u, p)
     force = [system.inputs.index(name) for name in system.model.device.forces]
-    rows = band.kept(len(motion.t))
+    rows = band.thinned_rows(len(motion.t))
     residual = band.thin(evidence.unfiltered_residual(number, p))
     push = np.linalg.pinv(system.input_map(motion.q[rows], u[rows], p))
     return _Compared(

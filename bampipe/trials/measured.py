@@ -79,7 +79,7 @@ def cut_blocks(motion: Motion, band: Band) -> list[Motion]:
         The blocks; the motion alone where it is too short for `FEWEST_BLOCKS`.
     """
     slowest = min(band.cutoff_hz)
-    kept = band.kept(len(motion.t))
+    kept = band.thinned_rows(len(motion.t))
     length_s = max(SHORTEST_BLOCK_S, BLOCK_PERIODS / slowest)
     count = min(int(len(kept) * band.step / band.rate_hz / length_s), MOST_BLOCKS)
     if count < FEWEST_BLOCKS:

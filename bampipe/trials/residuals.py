@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from bampipe.estimate.least_squares import Problem, fit, stacked_residual
 from bampipe.estimate.low_pass import Band
 from bampipe.estimate.normal_equations import NormalEquations
-from bampipe.estimate.standstill import resting
+from bampipe.estimate.standstill import find_standstill
 from bampipe.physics import System
 from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion
@@ -97,7 +97,7 @@ def problem_of(
             [not timing and not system.moves_sensors and system.constant[i] for i in free]
         ),
         band=band,
-        resting=[_standstill(motion, system, band) for motion in motions],
+        standstill=[_standstill(motion, system, band) for motion in motions],
         precision=np.array(precision),
         known=np.array(known),
     )
@@ -110,7 +110,7 @@ def _standstill(motion: Motion, system: System, band: Band) -> NDArray[np.bool_]
     braked = [
         name in system.inputs and bool(u[:, system.inputs.index(name)].any()) for name in brakes
     ]
-    return resting(motion.qd, motion.qd_sd, band.rate_hz, np.array(braked))
+    return find_standstill(motion.qd, motion.qd_sd, band.rate_hz, np.array(braked))
 
 
 def residual_and_memory(

@@ -15,7 +15,7 @@ def test_thinning_equals_the_library_filter_away_from_the_ends():
     band = Band(RATE, (8.0, 8.0))
     values = np.random.default_rng(0).normal(size=(3000, 2))
     sections = butter(2, 8.0, fs=RATE, output="sos")
-    expected = sosfiltfilt(sections, values, axis=0)[band.kept(3000)]
+    expected = sosfiltfilt(sections, values, axis=0)[band.thinned_rows(3000)]
     inner = slice(8, -8)
     assert np.allclose(band.thin(values)[inner], expected[inner], atol=1e-6)
 
@@ -25,7 +25,7 @@ def test_each_axis_has_its_own_cut_off():
     both = Band(RATE, (8.0, 20.0)).thin(values)
     for column, cutoff in enumerate((8.0, 20.0)):
         alone = butter(2, cutoff, fs=RATE, output="sos")
-        rows = Band(RATE, (8.0, 20.0)).kept(3000)
+        rows = Band(RATE, (8.0, 20.0)).thinned_rows(3000)
         expected = sosfiltfilt(alone, values[:, column])[rows]
         assert np.allclose(both[60:-60, column], expected[60:-60], atol=1e-6)
 
@@ -77,7 +77,7 @@ def test_standstill_is_left_out_and_quick_reversals_stay():
     channels = {name: np.zeros(2000) for name in system.inputs}
     motion = Motion("t01", t, qd, qd, 0.0 * qd, np.full_like(qd, 1e-3), channels)
     used = gather_evidence(system, [motion], BAND, system.prior, folds(1)).used[0]
-    rows = t[BAND.kept(2000)]
+    rows = t[BAND.thinned_rows(2000)]
     assert used[:, 0].all() and used[:, 2].all()
     assert not used[(rows > 3.1) & (rows < 3.9), 1].any()
     assert used[rows < 2.7, 1].all()

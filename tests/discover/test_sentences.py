@@ -9,8 +9,8 @@ from types import SimpleNamespace
 import pytest
 
 from bampipe.discover import sentences
-from bampipe.discover.findings import Contender, Diagnosis
-from bampipe.results.diagnose import AxisVerdict, Stretch, TransientCandidate
+from bampipe.discover.findings import Diagnosis
+from bampipe.results.diagnose import AxisVerdict, Contender, Stretch, TransientCandidate
 from bampipe.results.standing import standing
 
 SECOND = Stretch(trial_id="t3", t_start=4.0, t_end=5.0)
@@ -40,6 +40,14 @@ def say(monkeypatch, axis, contests=None, transients=()):
         (axis,), (), axis.effects, {}, contests or {}, (), transients, evidence, evidence
     )
     return sentences.axis_sentences(found)[0]
+
+
+def contender(effect, held_out_rmse, score, without_trial, without_second, odds):
+    """An effect on the joint, with its scores."""
+    return Contender(
+        effect=effect, axis="joint", held_out_rmse=held_out_rmse, score=score,
+        score_without_trial=without_trial, score_without_second=without_second, odds=odds,
+    )  # fmt: skip
 
 
 def numbers(sentence):
@@ -111,8 +119,8 @@ def test_no_effect_explains_it_never_stands_beside_one_that_does(monkeypatch, ax
 def test_rivals_are_listed_with_what_they_would_leave(monkeypatch):
     axis = finding("missing", 1.0, 0.1, 0.1, effects=("a:joint",), explained_by_effects=1.0)
     contest = (
-        Contender("a:joint", 0, 0.1, 456.5, 400.0, 430.0, 1.0),
-        Contender("b:joint", 0, 0.12, 454.3, 440.0, 431.0, 0.0),
+        contender("a:joint", 0.1, 456.5, 400.0, 430.0, 1.0),
+        contender("b:joint", 0.12, 454.3, 440.0, 431.0, 0.0),
     )
     said = say(monkeypatch, axis, contests={"a:joint": contest})
     assert "b:joint (leaves 0.12 N.m)" in said

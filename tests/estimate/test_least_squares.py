@@ -13,7 +13,7 @@ from bampipe.estimate.butterworth import zero_phase
 from bampipe.estimate.influence import find_worst_stretch
 from bampipe.estimate.least_squares import Problem, fit, stacked_residual
 from bampipe.estimate.low_pass import Band
-from bampipe.estimate.standstill import resting
+from bampipe.estimate.standstill import find_standstill
 
 BOUNDS = (np.array([0.0, 0.0, 0.01]), np.array([np.inf, np.inf, np.inf]))
 
@@ -40,7 +40,7 @@ def problem(count: int = 3, truth: np.ndarray = TRUTH, **changes: object) -> Pro
         "linear": True,
         "constant": np.zeros(3, dtype=bool),
         "band": Band(RATE, (8.0,)),
-        "resting": [np.zeros((len(m[0]), 1), dtype=bool) for m in motions],
+        "standstill": [np.zeros((len(m[0]), 1), dtype=bool) for m in motions],
     } | changes
     nothing = np.zeros(len(standard["free"]))  # type: ignore[arg-type]
     return Problem(**({"precision": nothing, "known": nothing} | standard))  # type: ignore[arg-type]
@@ -135,7 +135,7 @@ def test_rest_is_told_from_a_change_of_direction() -> None:
     t = np.arange(0.0, 4.0, 1.0 / RATE)
     qd = np.sin(2 * np.pi * t)[:, None]
     qd[1000:1200] = 0.0
-    still = resting(qd, np.full_like(qd, 1e-3), RATE)
+    still = find_standstill(qd, np.full_like(qd, 1e-3), RATE)
     assert still[1001:1199].all()
     assert not still[:990].any()
 
@@ -143,7 +143,7 @@ def test_rest_is_told_from_a_change_of_direction() -> None:
 def test_a_brake_may_hold_an_axis_at_every_change_of_direction() -> None:
     t = np.arange(0.0, 2.0, 1.0 / RATE)
     qd = np.stack(2 * [np.sin(2 * np.pi * t)], axis=1)
-    still = resting(qd, np.full_like(qd, 1e-2), RATE, np.array([False, True]))
+    still = find_standstill(qd, np.full_like(qd, 1e-2), RATE, np.array([False, True]))
     assert not still[:, 0].any()
     np.testing.assert_array_equal(still[:, 1], np.abs(qd[:, 1]) < 0.1)
     assert 0.04 < still[:, 1].mean() < 0.09
@@ -156,7 +156,7 @@ def test_samples_at_rest_do_not_count() -> None:
     spoiled = np.zeros((4000, 1))
     spoiled[1200:1800] = 50.0
     found = fit(
-        problem(1, residual=lambda k, p: inner.residual(k, p) + spoiled, resting=[mask]), TRUTH
+        problem(1, residual=lambda k, p: inner.residual(k, p) + spoiled, standstill=[mask]), TRUTH
     )
     np.testing.assert_allclose(found.p, TRUTH, rtol=2e-2)
 
@@ -166,7 +166,7 @@ def test_too_short_a_record_is_refused() -> None:
     short = problem(
         1,
         residual=lambda k, p: inner.residual(k, p)[:220],
-        resting=[np.zeros((220, 1), dtype=bool)],
+        standstill=[np.zeros((220, 1), dtype=bool)],
     )
     with pytest.raises(ValueError, match="fewer samples"):
         fit(short, TRUTH)
@@ -203,7 +203,7 @@ def test_axes_that_count_unequally_and_disagree_are_weighed_to_rest() -> None:
         1,
         residual=lambda trial, p: force - p[0] * x,
         free=np.array([0]), lower=np.zeros(1), upper=np.full(1, 9.0), step=np.ones(1),
-        band=Band(RATE, (8.0, 8.0)), resting=[rest],
+        band=Band(RATE, (8.0, 8.0)), standstill=[rest],
     )  # fmt: skip
     found = fit(shared, np.array([5.0]))
     assert found.converged
@@ -212,7 +212,7 @@ def test_axes_that_count_unequally_and_disagree_are_weighed_to_rest() -> None:
 
 def test_the_second_with_a_transient_is_found() -> None:
     inner = problem(3)
-    bump = np.zeros(inner.resting[1].shape)
+    bump = np.zeros(inner.standstill[1].shape)
     first = int(4.5 * RATE)
     bump[first : first + int(0.3 * RATE)] = 30.0
     hit = problem(3, residual=lambda k, p: inner.residual(k, p) + (k == 1) * bump)

@@ -250,7 +250,7 @@ def test_units_are_consistent(case):
         what = key.partition(".")[0]
         wanted = expected.get(what)
         if what == "torque":
-            wanted = dimension(BAM.coordinate(bound.place(key)).torque_unit)
+            wanted = dimension(BAM.coordinate(bound.target_of(key)).torque_unit)
         elif what == "offset":
             wanted = known["q"]
         assert check.of(tree) in (wanted, ANY), key

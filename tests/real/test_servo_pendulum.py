@@ -15,7 +15,7 @@ from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import read_parquet
 from bampipe.estimate.least_squares import fit
 from bampipe.estimate.low_pass import Band
-from bampipe.estimate.standstill import moving
+from bampipe.estimate.standstill import find_moving_samples
 from bampipe.physics import Model, compile_model, registry
 from bampipe.trials.reading import free_trials, read_motion
 from bampipe.trials.residuals import problem_of
@@ -154,8 +154,10 @@ def held_out_error(runs: tuple[Path, Path], *effects: str) -> float:
         problems.append(problem_of(system, motions, BAND))
     found = fit(problems[0], np.append(system.prior, 0.0))
     errors = []
-    for k, resting in enumerate(problems[1].resting):
-        errors.append(BAND.thin(problems[1].residual(k, found.p))[moving(resting, BAND)])
+    for k, resting in enumerate(problems[1].standstill):
+        errors.append(
+            BAND.thin(problems[1].residual(k, found.p))[find_moving_samples(resting, BAND)]
+        )
     return float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))
 
 

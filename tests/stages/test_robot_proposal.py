@@ -12,7 +12,7 @@ from independent import arm
 from bampipe.data.device_file import read_device_file
 from bampipe.data.session import read_session
 from bampipe.physics import Model, compile_model, registry
-from bampipe.proposal import Proposal, propose, write_proposal
+from bampipe.proposal import ProposedSession, propose, write_proposal
 
 URDF = """<?xml version="1.0"?><robot name="arm">
 <link name="base"/>
@@ -57,13 +57,13 @@ def write_log(folder: Path, gains: tuple[float, float] = (1.0, 1.0), swing: floa
     )
 
 
-def proposed(folder: Path) -> Proposal:
+def proposed(folder: Path) -> ProposedSession:
     proposal = propose(folder)
     write_proposal(folder, proposal)
     return proposal
 
 
-def about(proposal: Proposal, column: str) -> list[str]:
+def about(proposal: ProposedSession, column: str) -> list[str]:
     return [
         line for line in proposal.check if line.startswith(f"{column} is ") and "drawing" in line
     ]
@@ -112,7 +112,7 @@ def test_a_position_beyond_the_range_that_nothing_explains_may_be_that_of_a_moto
 NAMES = ("base_yaw", "shoulder", "elbow", "forearm", "wrist_pitch", "wrist_yaw", "flange")
 
 
-def paired(folder: Path) -> tuple[dict[str, str], dict[str, str], Proposal]:
+def paired(folder: Path) -> tuple[dict[str, str], dict[str, str], ProposedSession]:
     """Columns of positions and of drives by joint, as proposed for a log of the simulator."""
     proposal = proposed(folder)
     session = read_session(folder)

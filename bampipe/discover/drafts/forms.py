@@ -36,7 +36,7 @@ _NEAR = 2
 
 
 @dataclass(frozen=True)
-class Coordinate:
+class Quantity:
     """A quantity that a residual may follow.
 
     Attributes:
@@ -266,24 +266,24 @@ _SEES = {
 _ACTS = {FORCE: "A force", FRICTION: "Friction", DAMPING: "Damping", INERTIA: "Inertia"}
 
 
-def coordinates(device: Device, axis: int) -> tuple[Coordinate, ...]:
+def coordinates(device: Device, axis: int) -> tuple[Quantity, ...]:
     """What the residual of ``axis`` may follow."""
     own = device.coordinates[axis]
     found = [
-        Coordinate("position", "position", "q", "position", axis, own.unit),
-        Coordinate("speed", "speed", "abs(qd)", "speed", axis, f"{own.unit}/s"),
-        Coordinate("velocity", "velocity", "qd", "velocity", axis, f"{own.unit}/s"),
-        Coordinate("direction", "direction", "sgn(qd)", "direction", axis, ""),
-        Coordinate("load", "load", "load", "load", axis, own.torque_unit),
-        Coordinate("time", "time", "t", "time", axis, "s"),
+        Quantity("position", "position", "q", "position", axis, own.unit),
+        Quantity("speed", "speed", "abs(qd)", "speed", axis, f"{own.unit}/s"),
+        Quantity("velocity", "velocity", "qd", "velocity", axis, f"{own.unit}/s"),
+        Quantity("direction", "direction", "sgn(qd)", "direction", axis, ""),
+        Quantity("load", "load", "load", "load", axis, own.torque_unit),
+        Quantity("time", "time", "t", "time", axis, "s"),
     ]
     for k, other in enumerate(device.coordinates):
         if 0 < abs(k - axis) <= _NEAR:
             n, u = other.name, other.unit
             found += [
-                Coordinate(f"{n} position", f"{n}_position", n, "position", k, u),
-                Coordinate(f"{n} speed", f"{n}_speed", f"abs(qd_{n})", "speed", k, f"{u}/s"),
-                Coordinate(f"{n} velocity", f"{n}_velocity", f"qd_{n}", "velocity", k, f"{u}/s"),
+                Quantity(f"{n} position", f"{n}_position", n, "position", k, u),
+                Quantity(f"{n} speed", f"{n}_speed", f"abs(qd_{n})", "speed", k, f"{u}/s"),
+                Quantity(f"{n} velocity", f"{n}_velocity", f"qd_{n}", "velocity", k, f"{u}/s"),
             ]
     return tuple(found)
 
@@ -303,7 +303,7 @@ class Form:
     number: int
     factor: Factor
     shape: Shape
-    coordinate: Coordinate
+    coordinate: Quantity
     span: Span
     times: Span
     scale: float

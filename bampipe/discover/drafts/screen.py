@@ -123,7 +123,7 @@ class Screen:
         every = max(d for d in fits if d * _FINER <= band.step or d == 1)
         found = []
         for k in self.trials:
-            kept = band.kept(len(self.evidence.motions[k].t))
+            kept = band.thinned_rows(len(self.evidence.motions[k].t))
             first = int(kept[0]) % every if len(kept) else 0
             found.append((slice(first, None, every), (kept - first) // every))
         return found

@@ -20,6 +20,7 @@ from bampipe.discover.settings import Settings
 from bampipe.discover.start import with_effect
 from bampipe.estimate.least_squares import fit
 from bampipe.physics.recipe import Recipe
+from bampipe.results.draft import ChanceOfDraft, CurveBound
 from bampipe.trials.measured import MeasuredTrials
 from bampipe.trials.replay import replay_motions
 from bampipe.trials.residuals import Evidence, gather_evidence, problem_of
@@ -107,43 +108,14 @@ class Option:
 
 
 @dataclass(frozen=True)
-class Chance:
-    """What the same search finds on replays of a model, which lack nothing.
-
-    Attributes:
-        gain: of the best form on the measured trials; gains: on each replay.
-        p_value: chance of such a gain.
-        floor: median error of the replays on the axis, N.m or N.
-    """
-
-    gain: float
-    gains: tuple[float, ...]
-    p_value: float
-    floor: float
-
-
-@dataclass(frozen=True)
-class Bound:
-    """The held-out error that a free curve leaves, where a formula acts as ``form`` does.
-
-    Attributes:
-        form: whose coordinate and factor it has; points: of the curve.
-        held_out_rmse: N.m or N.
-    """
-
-    form: Form
-    points: int
-    held_out_rmse: float
-
-
-@dataclass(frozen=True)
-class AxisDraft:
+class FoundDraft:
     """What a search for a formula on one axis came to.
 
     Attributes:
         axis: its number.
         terms: found, at most `MOST_TERMS`.
         chance: of the first term, and of the next where one was looked for.
+        noise_floor: median error of the replays that gave the last of these, N.m or N.
         options: error against number of constants, shortest first; the model as given first.
         before, after: held-out error without and with the terms, N.m or N.
         bound: what no formula in the first term's coordinate could do better; None without terms.
@@ -152,11 +124,12 @@ class AxisDraft:
 
     axis: int
     terms: tuple[Term, ...]
-    chance: tuple[Chance, ...]
+    chance: tuple[ChanceOfDraft, ...]
+    noise_floor: float
     options: tuple[Option, ...]
     before: float
     after: float
-    bound: Bound | None
+    bound: CurveBound | None
     recipe: Recipe
     evidence: Evidence
 
@@ -217,7 +190,7 @@ def draft(
     source: str,
     curves: bool = False,
     progress: Progress = lambda fraction, message: None,
-) -> list[AxisDraft]:
+) -> list[FoundDraft]:
     """Search a formula for what a model leaves on each of some axes, one after the other.
 
     Args:
@@ -228,7 +201,7 @@ def draft(
         curves: whether a curve through points will do, where prediction is all that is wanted.
         progress: called with a fraction and a message.
     """
-    found: list[AxisDraft] = []
+    found: list[FoundDraft] = []
     with workers(trials, settings.jobs) as pool:
         bench = Bench(trials, settings, pool, ())
         known = recipe
@@ -255,7 +228,7 @@ class AxisSearch:
     def _settings(self) -> Settings:
         return self._bench.settings
 
-    def run(self, recipe: Recipe, start: Array, progress: Progress) -> AxisDraft:
+    def run(self, recipe: Recipe, start: Array, progress: Progress) -> FoundDraft:
         """Add terms to a model as long as one beats chance and is worth its constants."""
         axis, s = self._axis, self._settings
         evidence = self._bench.fit(recipe, start)
@@ -266,8 +239,9 @@ class AxisSearch:
             progress(0.05 + 0.4 * number, "holding every form against the residual")
             screened = screen(evidence, axis, self._curves)
             progress(0.15 + 0.4 * number, "searching replays for as good a formula")
-            chances.append(self._chance(recipe, evidence, screened))
-            if chances[-1].p_value > s.draft_significance:
+            chance, floor = self._chance(recipe, evidence, screened)
+            chances.append(chance)
+            if chance.p_value > s.draft_significance:
                 break
             progress(0.3 + 0.4 * number, "fitting the best forms with the model")
             wider = self._fitted(recipe, evidence, current, screened, _FITTED[number])
@@ -277,15 +251,21 @@ class AxisSearch:
                 break
             current, recipe, p = chosen
             evidence = self._bench.fit(recipe, p)
-            if Scorer(evidence).base_error[axis] < s.surely * chances[-1].floor:
+            if Scorer(evidence).base_error[axis] < s.surely * floor:
                 break  # what is left is for a diagnosis of the model with the draft
         terms = self._terms(evidence, current)
         bound = None
         if terms:
-            points, share = Screen(bare, axis).curve_bound(terms[0].form)
-            bound = Bound(terms[0].form, points, share * float(before[axis]))
-        return AxisDraft(
-            axis, terms, tuple(chances), self._listed(options, current), float(before[axis]),
+            form = terms[0].form
+            points, share = Screen(bare, axis).curve_bound(form)
+            bound = CurveBound(
+                variable=form.coordinate.words,
+                acts_as=form.factor,
+                points=points,
+                held_out_rmse=share * before[axis],
+            )
+        return FoundDraft(
+            axis, terms, tuple(chances), floor, self._listed(options, current), float(before[axis]),
             float(current.held_out_rmse[axis]), bound, recipe, evidence,
         )  # fmt: skip
 
@@ -294,8 +274,14 @@ class AxisSearch:
         error = float(option.held_out_rmse[self._axis])
         return float(np.log(error)) + self._settings.draft_worth * option.constants
 
-    def _chance(self, recipe: Recipe, evidence: Evidence, screened: Sequence[Screened]) -> Chance:
-        """Hold the best form's gain against what the same search finds on replays."""
+    def _chance(
+        self, recipe: Recipe, evidence: Evidence, screened: Sequence[Screened]
+    ) -> tuple[ChanceOfDraft, float]:
+        """Hold the best form's gain against what the same search finds on replays.
+
+        Returns:
+            Its chance, and the median error of the replays on the axis, N.m or N.
+        """
         s = self._settings
         gain = screened[0].gain if screened else 0.0
         found = self._replays(recipe, evidence, 0, s.draft_replicates)
@@ -306,7 +292,8 @@ class AxisSearch:
             found += self._replays(recipe, evidence, s.draft_replicates, more)
             p_value = self._p_value(gain, evidence, [g for g, _ in found])
         floor = float(np.median([error for _, error in found]))
-        return Chance(gain, tuple(g for g, _ in found), p_value, floor)
+        gains = tuple(g for g, _ in found)
+        return ChanceOfDraft(gain=gain, gains=gains, p_value=p_value), floor
 
     def _replays(
         self, recipe: Recipe, evidence: Evidence, first: int, count: int

@@ -29,7 +29,7 @@ USUAL = ("deg", "mm", "mN", "kN", "mA", "mV", "mN.m", "kN.m", "kgf")
 
 
 @dataclass(frozen=True)
-class Candidate:
+class Correction:
     """One mistake, as the change of the signals that sets it right.
 
     Attributes:
@@ -51,20 +51,20 @@ class Candidate:
 
 def scaled(
     signals: Signals, names: Sequence[str], factor: float, cost: float, unit: str = ""
-) -> Candidate:
+) -> Correction:
     """Signals ``names`` read 1/``factor`` times what they should."""
     gain = np.eye(len(signals.names))
     for place in signals.places(names):
         gain[place, place] = factor
     none = np.zeros(len(signals.names))
-    return Candidate("scale", tuple(names), Change(gain, none), cost, factor, unit=unit)
+    return Correction("scale", tuple(names), Change(gain, none), cost, factor, unit=unit)
 
 
-def shifted(signals: Signals, axis: str, offset: float, cost: float) -> Candidate:
+def shifted(signals: Signals, axis: str, offset: float, cost: float) -> Correction:
     """The zero of ``axis`` is off: ``offset`` must be added, rad or m."""
     change = Change.none(len(signals.names))
     change.offset[signals.places([axis])] = offset
-    return Candidate("zero", (axis,), change, cost, offset=offset)
+    return Correction("zero", (axis,), change, cost, offset=offset)
 
 
 def groups_of_like(signals: Signals) -> tuple[tuple[str, ...], ...]:
@@ -77,7 +77,7 @@ def groups_of_like(signals: Signals) -> tuple[tuple[str, ...], ...]:
     return tuple(dict.fromkeys([*alone, *(g for g in (*together, signals.forces) if len(g) > 1)]))
 
 
-def sign_candidates(signals: Signals) -> Iterator[Candidate]:
+def sign_corrections(signals: Signals) -> Iterator[Correction]:
     """Reversed encoders, forces, channels and brake commands."""
     groups: list[tuple[str, ...]] = [
         (name,) for name in (*signals.axes, *signals.forces, *signals.channels)
@@ -87,10 +87,10 @@ def sign_candidates(signals: Signals) -> Iterator[Candidate]:
     groups += [(name,) for name in signals.brakes]
     for names in groups:
         change = scaled(signals, names, -1.0, 0.0).change
-        yield Candidate("sign", tuple(names), change, 0.0 if len(names) == 1 else 1.0, -1.0)
+        yield Correction("sign", tuple(names), change, 0.0 if len(names) == 1 else 1.0, -1.0)
 
 
-def exchange_candidates(signals: Signals) -> Iterator[Candidate]:
+def exchange_corrections(signals: Signals) -> Iterator[Correction]:
     """Columns that stand for each other: as raw readings, or with all that belongs to them."""
     count = len(signals.names)
     inverse = np.linalg.inv(signals.gain)
@@ -108,17 +108,17 @@ def exchange_candidates(signals: Signals) -> Iterator[Candidate]:
             if not np.allclose(raw, swap) or changes[0].offset.any():
                 changes.append(Change(swap, np.zeros(count)))
             for change in changes:
-                yield Candidate("exchange", tuple(names), change, 0.5 if len(names) == 2 else 2.0)
+                yield Correction("exchange", tuple(names), change, 0.5 if len(names) == 2 else 2.0)
 
 
-def clock_candidates(signals: Signals) -> Iterator[Candidate]:
+def clock_corrections(signals: Signals) -> Iterator[Correction]:
     """Time stamps in another unit than stated, the stated rate as well."""
     for factor in CLOCKS:
         none = Change.none(len(signals.names))
-        yield Candidate("clock", (), Change(none.gain, none.offset, factor), 2.0, factor)
+        yield Correction("clock", (), Change(none.gain, none.offset, factor), 2.0, factor)
 
 
-def unit_candidates(signals: Signals) -> Iterator[Candidate]:
+def unit_corrections(signals: Signals) -> Iterator[Correction]:
     """Units taken for others, and factors of gains and counters."""
     for names in groups_of_like(signals):
         place = signals.places(names)[0]
@@ -135,7 +135,7 @@ def unit_candidates(signals: Signals) -> Iterator[Candidate]:
             yield scaled(signals, names, 1.0 / factor, cost)
 
 
-def quarter_turns(signals: Signals) -> Iterator[Candidate]:
+def quarter_turns(signals: Signals) -> Iterator[Correction]:
     """A rotary axis counted from another of its four main directions."""
     for axis, unit in zip(signals.axes, signals.units, strict=False):
         if unit == "rad":
