@@ -248,15 +248,7 @@ class Effect(Declaration):
         if self.scope == "force_component":
             return device.components
         if self.scope == "force_pair":
-            names = device.components
-            # The drives of a robot may share a gear with their neighbours, not with all others.
-            near = len(names) if device.robot is None else 1
-            return tuple(
-                a + b
-                for i, a in enumerate(names)
-                for j, b in enumerate(names)
-                if 0 < abs(i - j) <= near
-            )
+            return tuple(force_pairs(device))
         return ("",) if self._fits(device) else ()
 
     def pairs(self, device: Device) -> dict[str, tuple[str, str]]:
@@ -305,6 +297,21 @@ class Effect(Declaration):
             places |= {EACH}
             known |= {derivative("f", k) for k in range(len(INPUT_ORDERS))}
         return keys <= places and self.names <= known
+
+
+def force_pairs(device: Device) -> dict[str, tuple[str, str]]:
+    """A force channel and one that may leak into it, by what follows the colon.
+
+    The drives of a robot may share a gear with their neighbours, not with all others.
+    """
+    names, forces = device.components, device.forces
+    between, near = ("", len(names)) if device.robot is None else ("-", 1)
+    return {
+        f"{a}{between}{b}": (forces[i], forces[j])
+        for i, a in enumerate(names)
+        for j, b in enumerate(names)
+        if 0 < abs(i - j) <= near
+    }
 
 
 def _neighbours(device: Device) -> dict[str, tuple[str, str]]:

@@ -11,7 +11,7 @@ import sympy as sp
 from bampipe.errors import InputError
 from bampipe.physics import expression
 from bampipe.physics.device import INPUT_ORDERS, LAST_ORDER, derivative
-from bampipe.physics.effect import PAIR, BoundEffect
+from bampipe.physics.effect import PAIR, BoundEffect, force_pairs
 from bampipe.physics.model import Model
 from bampipe.physics.time_limit import OutOfTime
 
@@ -200,13 +200,7 @@ class Vocabulary:
         forces = self.model.device.forces
         if item.effect.scope == "force_component":
             return (forces[self.model.device.components.index(item.target)],)
-        short = self.model.device.components
-        return next(
-            (forces[i], forces[j])
-            for i, a in enumerate(short)
-            for j, b in enumerate(short)
-            if i != j and a + b == item.target
-        )
+        return force_pairs(self.model.device)[item.target]
 
     def rebuild_for(self, item: BoundEffect, tree: ast.expr, symbols: Symbols, what: str) -> Any:
         return self.rebuild(tree, symbols, f"effect {item.name!r}: {what}")

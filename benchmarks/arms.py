@@ -1,0 +1,98 @@
+"""Arms of the independent simulator, taken from URDF and logs as a newcomer would take them.
+
+    python benchmarks/arms.py [--case NAME ...] [--seeds N] [--out DIR]
+
+Each case hides something in an arm, lets `bampipe init` propose the session, runs and diagnoses it.
+A row a case: whether every column went to its joint with its sign, what was named, the held-out
+error over its floor before and after, and the seconds of each command.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+import time
+import tomllib
+from pathlib import Path
+
+from independent import arm
+
+CASES: dict[str, tuple[int, str, str, dict[str, float]]] = {
+    "nothing": (211, "ZYYX", "joint_states", {}),
+    "late drive": (212, "ZYYX", "joint_states", {"actuator_delay:elbow": 1.0}),
+    "offset": (213, "ZYYX", "joint_states", {"drive_offset:shoulder": 1.0}),
+    "cable and spring": (
+        214, "ZYYX", "joint_states", {"cable:base_yaw": 1.0, "return_spring:forearm": 1.0}
+    ),
+    "friction with load": (215, "ZYY", "joint_states", {"load_dependent_friction:shoulder": 1.0}),
+    "counterbalance": (216, "ZYY", "joint_states", {"counterbalance:shoulder": 1.0}),
+    "coupled wrist": (217, "ZYYXY", "joint_states", {"friction_of_sum:forearm-wrist_pitch": 1.0}),
+    "Stribeck, a slide": (218, "ZYx", "numbered", {"stribeck:shoulder": 1.0}),
+    "spring, seven joints": (219, "ZYZYZYZ", "joint_states", {"return_spring:wrist_yaw": 1.0}),
+}  # fmt: skip
+"""By name: seed, axes of the joints, headers, what is hidden."""
+
+
+def bampipe(*arguments: str) -> float:
+    """Run a command; its seconds."""
+    start = time.monotonic()
+    command = [sys.executable, "-m", "bampipe", *arguments, "--quiet"]
+    if subprocess.run(command, stdout=subprocess.DEVNULL).returncode > 1:  # 1: a gate failed
+        raise SystemExit(f"failed: {' '.join(command)}")
+    return time.monotonic() - start
+
+
+def is_paired(folder: Path, names: list[str], turned: list[str]) -> bool:
+    """Whether every column went to its joint, and every drive got its sign."""
+    session = tomllib.loads((folder / "session.toml").read_text())
+    drives = {name.partition("_")[2]: c for name, c in session["channels"].items()}
+    for number, name in enumerate(names, 1):
+        for what, column in (("position", session["encoders"][name]), ("drive", drives[name])):
+            said = column["column"]
+            if name not in said and f"_{number} " not in said:
+                return False
+            if what == "drive" and (column.get("scale", 1.0) < 0.0) != (name in turned):
+                return False
+    return True
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--case", action="append", choices=CASES)
+    parser.add_argument("--seeds", type=int, default=1, help="of each case, counted from its own")
+    parser.add_argument("--out", type=Path, default=Path(tempfile.mkdtemp()))
+    given = parser.parse_args()
+    print("| hidden | init | named | over the floor | run, s | diagnose, s |\n|-|-|-|-|-|-|")
+    for case in given.case or CASES:
+        first, kinds, style, effects = CASES[case]
+        for seed in range(first, first + 100 * given.seeds, 100):
+            folder = given.out / f"{case.replace(' ', '_').replace(',', '')}_{seed}"
+            turned = ["shoulder"] if seed % 2 else []
+            arm.record_logs(folder, seed, kinds, effects, style=style, turned=turned)
+            runs = ["--runs", str(given.out / "runs")]
+            bampipe("init", str(folder))
+            names = list(arm.NAMES[: len(kinds)])
+            paired = "right" if is_paired(folder, names, turned) else "wrong"
+            to_run = bampipe("run", str(folder), *runs)
+            run = given.out / "runs" / folder.name
+            to_diagnose = bampipe("diagnose", str(run), *runs)
+            found = json.loads((run / "models/base/diagnose.json").read_text())
+            worst = {
+                axis: (entry["rmse_before"] / entry["noise_floor"],
+                       entry["rmse_after"] / entry["noise_floor"])
+                for axis, entry in found["axes"].items()
+            }  # fmt: skip
+            axis = max(worst, key=lambda name: worst[name][0])
+            print(
+                f"| {', '.join(effects) or case} | {paired} | {', '.join(found['selected']) or '–'}"
+                f" | {axis} {worst[axis][0]:.2f} to {worst[axis][1]:.2f}"
+                f" | {to_run:.0f} | {to_diagnose:.0f} |",
+                flush=True,
+            )
+
+
+if __name__ == "__main__":
+    main()
