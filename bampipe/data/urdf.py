@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -30,6 +31,26 @@ _UNLIMITED = 1e6
 """Effort and velocity of a joint of which none is known: a URDF has some, and 0 is a limit."""
 _MANY = 8
 """Most names that a message lists."""
+
+
+class Branches(InputError):
+    """The joints of a URDF branch.
+
+    Attributes:
+        stem: last link before they do; empty where they do at the base.
+    """
+
+    def __init__(
+        self,
+        what: str,
+        *,
+        where: str = "",
+        remedy: str = "",
+        others: Sequence[InputError] = (),
+        stem: str = "",
+    ) -> None:
+        super().__init__(what, where=where, remedy=remedy, others=others)
+        self.stem = stem
 
 
 @dataclass(frozen=True)
@@ -371,10 +392,13 @@ def _only_end(base: str, joints: list[_Joint], above: Mapping[str, _Joint], wher
         raise InputError(f"no joint moves below {base!r}", where=where)
     if ends:
         others = [above[longest].child, *ends]
-        raise InputError(
+        levels = zip(*(chains[link] for link in others), strict=False)
+        common = [level[0] for level in takewhile(lambda level: len(set(level)) == 1, levels)]
+        raise Branches(
             f"the joints branch; chains end at {join_names(others, _MANY)}",
             where=where,
             remedy='choose one: base = "..." and tip = "..." in [robot]',
+            stem=next((j.child for j in joints if common and j.name == common[-1]), ""),
         )
     return longest
 

@@ -73,6 +73,11 @@ def propose(folder: Path, device: str = "") -> ProposedSession:
     match = Matcher(found, clock.t, set(clock.columns))
     if chosen is None:
         chosen = new_device(folder, match, notes)
+        several = len([c for c in found.of("position") if not c.is_constant])
+        if several > 1:
+            notes.check.append(
+                f"{several} columns are positions: of a robot? put its URDF beside the logs"
+            )
     elif chosen.device.robot is not None:
         columns = find_robot_columns(chosen.device, chosen.device.robot, found, clock.t, notes)
         chosen = _with_guessed_motors(folder, chosen, columns)
@@ -133,6 +138,8 @@ def _check_robot(chosen: ChosenDevice, columns: RobotColumns, notes: Notes) -> N
     """What a look at the columns does not show of a robot."""
     robot = chosen.device.robot
     assert robot is not None
+    if "tip =" in chosen.text:
+        notes.check.append(f"{chosen.name}: the robot ends at {robot.tip}; joints branch behind it")
     if not columns.drives:
         joints = ", ".join(j.name for j in robot.joints)
         notes.check.append(

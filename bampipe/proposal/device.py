@@ -12,6 +12,7 @@ import numpy as np
 from bampipe.data import guesses
 from bampipe.data.device_file import complete_device, read_device_file
 from bampipe.data.survey import Survey, SurveyedColumn, words
+from bampipe.data.urdf import Branches
 from bampipe.errors import InputError
 from bampipe.files import read_toml
 from bampipe.physics import registry
@@ -62,19 +63,34 @@ def find_device(folder: Path, found: Survey, wanted: str) -> ChosenDevice | None
 
 
 def _robot(folder: Path, found: Survey) -> ChosenDevice | None:
-    """The robot of the only URDF in the folder, its drives logged as torque or as current.
+    """The robot of the URDF in the folder, its drives logged as torque or as current.
+
+    Where joints branch, as fingers do, it ends before them.
 
     Raises:
-        InputError: the URDF cannot be used.
+        InputError: the URDF cannot be used, or there are several.
     """
     urdfs = sorted(folder.glob("*.urdf"))
-    if len(urdfs) != 1:
+    if not urdfs:
         return None
+    if len(urdfs) > 1:
+        raise InputError(
+            f"{len(urdfs)} URDF files: {', '.join(path.name for path in urdfs)}",
+            where=str(folder),
+            remedy="leave the one of the logs",
+        )
     text = (
         f'schema = "bampipe.device/1"\nname = "{urdfs[0].stem}"\n\n'
         f'[robot]\nurdf = "{urdfs[0].name}"\n'
     )
-    chosen = ChosenDevice(DEVICE, _complete(folder, text), text)
+    try:
+        device = _complete(folder, text)
+    except Branches as error:
+        if not error.stem:
+            raise
+        text += f'tip = "{error.stem}"  # guess: the joints branch behind it\n'
+        device = _complete(folder, text)
+    chosen = ChosenDevice(DEVICE, device, text)
     by_torque = any(not c.is_constant for c in found.of("force"))
     if by_torque or not found.of("current"):
         return chosen

@@ -11,6 +11,7 @@ from independent import arm
 
 from bampipe.data.device_file import read_device_file
 from bampipe.data.session import read_session
+from bampipe.errors import InputError
 from bampipe.physics import Model, compile_model, registry
 from bampipe.proposal import ProposedSession, propose, write_proposal
 
@@ -187,3 +188,31 @@ def test_radians_of_a_motor_are_not_taken_for_degrees_of_its_joint(tmp_path: Pat
     encoders = read_session(tmp_path / "log").encoders
     assert [encoder.stated_unit for encoder in encoders] == ["rad"] * 3
     np.testing.assert_allclose([e.gear_ratio for e in encoders], truth["ratio"], rtol=0.05)
+
+
+FINGERS = """<link name="left"/><link name="right"/>
+<joint name="finger_left" type="prismatic"><parent link="lower"/><child link="left"/></joint>
+<joint name="finger_right" type="prismatic"><parent link="lower"/><child link="right"/></joint>
+</robot>"""
+
+
+def test_a_robot_with_fingers_ends_before_them(tmp_path: Path) -> None:
+    write_log(tmp_path)
+    (tmp_path / "arm.urdf").write_text(URDF.replace("</robot>", FINGERS))
+    proposal = proposed(tmp_path)
+    assert any("the robot ends at lower" in line for line in proposal.check)
+    device = registry.device_from(read_device_file(tmp_path / "device.toml"))
+    assert [c.name for c in device.coordinates] == ["shoulder", "elbow"]
+
+
+def test_of_several_urdf_files_none_is_guessed(tmp_path: Path) -> None:
+    write_log(tmp_path)
+    (tmp_path / "other.urdf").write_text(URDF)
+    with pytest.raises(InputError, match=r"2 URDF files: arm.urdf, other.urdf"):
+        propose(tmp_path)
+
+
+def test_several_positions_without_a_urdf_may_be_those_of_joints(tmp_path: Path) -> None:
+    write_log(tmp_path)
+    (tmp_path / "arm.urdf").unlink()
+    assert any("put its URDF beside the logs" in line for line in propose(tmp_path).check)
