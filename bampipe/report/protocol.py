@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from bampipe.report import typeset, wording
 from bampipe.report.document import Block, Bullets, Document, Paragraph, Section, Table
+from bampipe.report.sections.next_trial import confusion_table, sd_table
 from bampipe.results.next import Plan
 
 _BEFORE = (
@@ -29,36 +30,13 @@ def protocol_sheet(plan: Plan, session: str, model: str) -> bytes:
         for trial in plan.trials
     )
     trials = Table("Trials", ("", "What to do", "Files"), rows, "lll", (0.0, 3.0, 1.0))
-    reached = tuple(
-        (
-            f"`{name}`",
-            wording.significant(entry.before, 2),
-            wording.significant(entry.after, 2),
-            wording.significant(entry.asked, 2),
-            wording.unit(entry.unit),
-        )
-        for name, entry in plan.sd.items()
-    )
     blocks: list[Block] = [Paragraph(plan.sentence), trials]
-    if reached:
-        blocks.append(
-            Table(
-                "Standard deviations",
-                ("Parameter", "now", "expected", "asked", "Unit"),
-                reached,
-                "lrrrl",
-            )
-        )
+    if plan.sd:
+        entries = {name: (entry, entry.asked) for name, entry in plan.sd.items()}
+        blocks.append(sd_table("Standard deviations", "asked", entries))
     if plan.confusion:
-        pairs = tuple(
-            (
-                " or ".join(f"`{name}`" for name in pair.between),
-                wording.percent(pair.before),
-                wording.percent(pair.after),
-            )
-            for pair in plan.confusion
-        )
-        blocks.append(Table("Chance of confusion", ("Effects", "now", "expected"), pairs, "lrr"))
+        heads = ("Effects", "now", "expected")
+        blocks.append(confusion_table("Chance of confusion", heads, plan.confusion))
     document = Document(
         f"Trials to record: {session}",
         f"Model {model}, {wording.plain(plan.seconds, 0)} s in all",

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from bampipe.report import wording
 from bampipe.report.document import Block, Bullets, Callout, Paragraph, Section, Table
 from bampipe.report.results import Results
 from bampipe.results.forecast import compare_forecast
 from bampipe.results.identify import IdentifyResult
-from bampipe.results.next import Detectable, ExpectedConfusion, ExpectedSd, NextResult
+from bampipe.results.next import (
+    Detectable,
+    ExpectedConfusion,
+    ExpectedSd,
+    NextResult,
+    PlannedConfusion,
+    PlannedSd,
+)
 
 TITLE = "What to record next"
 
@@ -29,15 +36,29 @@ def section(results: Results) -> Section | None:
         blocks.append(Bullets(tuple(line.replace("RUN", results.root.name) for line in came)))
     best = found.proposals[0]
     if best.confusion:
-        blocks.append(_confusion(best.confusion))
+        heads = ("Effects", "with the trials at hand", "with the next one")
+        blocks.append(
+            confusion_table("Chance of taking one effect for the other", heads, best.confusion)
+        )
     if best.sd:
-        blocks.append(_sd(best.sd))
+        blocks.append(
+            sd_table(
+                "Standard deviation of each parameter, now and once the trial has been recorded",
+                "in nine of ten",
+                {name: (entry, entry.after_at_worst) for name, entry in best.sd.items()},
+                "In nine of ten: of the ways in which people follow such a sentence, nine are "
+                "better.",
+            )
+        )
     if found.sensitivity:
         blocks.append(_sensitivity(found.sensitivity))
     return Section(TITLE, tuple(blocks))
 
 
-def _confusion(pairs: tuple[ExpectedConfusion, ...]) -> Table:
+def confusion_table(
+    title: str, heads: tuple[str, ...], pairs: Sequence[ExpectedConfusion | PlannedConfusion]
+) -> Table:
+    """Return the chance of taking one effect for another, without and with new trials."""
     rows = tuple(
         (
             " or ".join(f"`{name}`" for name in pair.between),
@@ -46,32 +67,31 @@ def _confusion(pairs: tuple[ExpectedConfusion, ...]) -> Table:
         )
         for pair in pairs
     )
-    return Table(
-        "Chance of taking one effect for the other",
-        ("Effects", "with the trials at hand", "with the next one"),
-        rows,
-        "lrr",
-    )
+    return Table(title, heads, rows, "lrr")
 
 
-def _sd(entries: Mapping[str, ExpectedSd]) -> Table:
+def sd_table(
+    title: str,
+    third: str,
+    entries: Mapping[str, tuple[ExpectedSd | PlannedSd, float]],
+    note: str = "",
+) -> Table:
+    """Return the standard deviations of parameters, without and with new trials.
+
+    Args:
+        title: of the table; third: head of the column beside the two; note: below it.
+        entries: by parameter, with the number of that column.
+    """
     rows = tuple(
         (
             f"`{name}`",
-            wording.significant(entry.before, 2),
-            wording.significant(entry.after, 2),
-            wording.significant(entry.after_at_worst, 2),
+            *(wording.significant(value, 2) for value in (entry.before, entry.after, more)),
             wording.unit(entry.unit),
         )
-        for name, entry in entries.items()
+        for name, (entry, more) in entries.items()
     )
-    return Table(
-        "Standard deviation of each parameter, now and once the trial has been recorded",
-        ("Parameter", "now", "expected", "in nine of ten", "Unit"),
-        rows,
-        "lrrrl",
-        note="In nine of ten: of the ways in which people follow such a sentence, nine are better.",
-    )
+    heads = ("Parameter", "now", "expected", third, "Unit")
+    return Table(title, heads, rows, "lrrrl", note=note)
 
 
 def _sensitivity(table: Mapping[str, Detectable]) -> Table:
