@@ -50,9 +50,9 @@ def test_following_judges_the_model_that_it_starts_from(
     monkeypatch.setattr(loop.LoopOptions, "run", lambda _, *steps: ran.append(steps))
     monkeypatch.setattr(loop, "_diagnosis", lambda *_: found)
     options = loop.LoopOptions(tmp_path, pipeline.load(), False, True, unheard)
-    told: list[str] = []
-    assert loop.follow(options, "base", told.append) == "base"
-    assert told == ["base, joint: unknown effect"]
+    lines: list[str] = []
+    assert loop.follow(options, "base", lines.append) == "base"
+    assert lines == ["base, joint: unknown effect"]
     assert ran[0] == ("identify", "validate", "base") and ran[-1] == ("compare", "compare", "")
 
 

@@ -72,7 +72,7 @@ class Made:
         write_result(root, StiffnessResult, axes=axes)
         self._model(root, "base", [], self.parameters, self.error)
         if self.verdicts is not None:
-            told = {
+            verdicts = {
                 axis: {
                     "verdict": verdict,
                     "effects": list(effects),
@@ -82,7 +82,7 @@ class Made:
                 }
                 for axis, (verdict, effects) in self.verdicts.items()
             }
-            write_result(root, DiagnoseResult, model="base", axes=told)
+            write_result(root, DiagnoseResult, model="base", axes=verdicts)
         if self.child is not None:
             effect, parameters = self.child
             name = f"base+{effect.replace(':', '.')}"

@@ -332,9 +332,9 @@ def test_innovations_of_the_right_model_pass_and_those_of_a_late_force_do_not(
     late = simulated_run(tmp_path / "late", late=10)
     content = identified(late)
     assert any(note.startswith("The force acts 1 ms or more ") for note in content["notes"])
-    told = content["innovations"]
-    assert not told["yaw"]["inputs"]["independent"]
-    assert "Not independent of the inputs" in told["yaw"]["sentence"]
+    innovations = content["innovations"]
+    assert not innovations["yaw"]["inputs"]["independent"]
+    assert "Not independent of the inputs" in innovations["yaw"]["sentence"]
 
 
 def test_starts_five_times_off_either_way_do_not_matter(

@@ -127,10 +127,10 @@ def test_alarm_when_a_sensor_changes(run: RunFolder, begun: tuple) -> None:
     frame = samples(run, "t00")
     frame.loc[frame["t"] > 6.0, "force_x"] *= 1.2
     values = frame.to_numpy(dtype=float)
-    calm = int(np.searchsorted(values[:, 0], 6.0))
-    monitor.push(tuple(frame.columns), values[:calm])
+    first_rows = int(np.searchsorted(values[:, 0], 6.0))
+    monitor.push(tuple(frame.columns), values[:first_rows])
     assert monitor.alarms == 0
-    monitor.push(tuple(frame.columns), values[calm:])
+    monitor.push(tuple(frame.columns), values[first_rows:])
     assert monitor.alarms > 0
 
 
