@@ -162,6 +162,9 @@ def test_every_command_takes_the_best_confirmed_model(
     assert (code, out.strip()) == (0, better) and f"model {better} of s1" in err
     code, out, _ = command("export", "s1", "--model", "base")
     assert (code, out.strip()) == (0, "base")
+    for name in ("accept", "export"):
+        code, _, err = command(name, "s1", "--model", "bas")
+        assert code == 2 and "no model 'bas'; did you mean 'base'?" in err
 
 
 def test_a_damaged_file_of_accepted_values_is_named(tmp_path: Path) -> None:
@@ -188,7 +191,7 @@ def test_accept_refuses_what_failed(
     assert code == 0 and "accepted/bam.json" in out
     assert json.loads((tmp_path / "accepted/bam.json").read_text())["session"] == "s1"
     code, _, err = command("accept", "s1", "--force", "--model", "base+snag")
-    assert code == 2 and "models/base+snag/identify.json is missing" in err
+    assert code == 2 and "no model 'base+snag'" in err
 
 
 def test_the_summary_is_a_table_that_no_text_breaks(tmp_path: Path) -> None:

@@ -38,7 +38,7 @@ def accept(
     Example: bampipe accept 2026-10-03_s01
     """
     root = places.find_run(run, runs)
-    chosen = model or models.counting_model(root)
+    chosen = models.choose_model(root, model)
     path = accepted.accept(root, chosen, folder or accepted.accepted_folder(root.parent), force)
     show.say(f"{path}: the values of {root.name}, model {chosen}")
     for doubt in accepted.doubts(RunFolder(root), chosen):

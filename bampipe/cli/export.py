@@ -42,7 +42,7 @@ def export(
             remedy=f"--as {', '.join(FORMS)}",
         )
     root = places.find_run(run, runs)
-    counting = model or models.counting_model(root)
+    counting = models.choose_model(root, model)
     text = export_model(RunFolder(root), counting, chosen)
     if out is None:
         show.say(text.rstrip())

@@ -45,7 +45,7 @@ def diagnose(
     from bampipe.results.diagnose import DiagnoseResult
 
     root = places.find_run(run, options.runs)
-    chosen = model or models.counting_model(root)
+    chosen = models.choose_model(root, model)
     one_stage("diagnose", root, options, model=chosen)
     if not options.json:
         say_what_came(root, chosen, is_diagnosed=True)
@@ -74,7 +74,7 @@ def draft(
     from bampipe.results.draft import DraftResult
 
     root = places.find_run(run, options.runs)
-    chosen = model or models.counting_model(root)
+    chosen = models.choose_model(root, model)
     one_stage("draft", root, options, model=chosen, more={"curve": True} if curve else {})
     _advise_next(RunFolder(root).read(DraftResult, chosen).next, root, options)
 
@@ -144,7 +144,7 @@ def extend(
         raise InputError("no effect named", remedy="`bampipe effects` lists them; or use --auto")
     root = places.find_run(first, runs)
     pipeline = whole_pipeline(root, "")
-    parent = model or models.counting_model(root)
+    parent = models.choose_model(root, model)
     with show.Watcher(quiet or json) as watcher:
         options = loop.LoopOptions(root, pipeline, force, not no_wait, watcher)
         if auto:

@@ -120,7 +120,7 @@ def _prepare(
         start = None
     else:
         folder = RunFolder(places.find_run(run or None, runs))
-        chosen = model or models.counting_model(folder.root)
+        chosen = models.choose_model(folder.root, model)
         remark(f"model {chosen} of {folder.root}")
         system, start = monitor_start.start_from_run(folder, chosen, options)
     stream = monitor_start.open_stream(samples, system, session, strict, remark)

@@ -33,6 +33,9 @@ _TEMPLATE = Path(__file__).parent / "templates" / "report.typ"
 _NORMAL_SIZE, _SMALL_SIZE = 9.0, 8.0
 _MANY_COLUMNS = 7
 _MANY_ROWS = 8
+"""Rows beyond which a table may break wherever it stands."""
+_FEW_ROWS = 3
+"""Rows up to which a table stays in one piece, hole or not."""
 _PAGE_END_PT = 782.0
 """Where the text of a page ends, points from its upper edge: A4 less the margin of the template."""
 _HOLE_PT = 85.0
@@ -105,7 +108,8 @@ def first_below_a_hole(
     for block in blocks:
         start, end = starts.get(block["id"]), ends.get(block["id"])
         hole = _PAGE_END_PT - filled > _HOLE_PT
-        if start and not block["loose"] and start["page"] > page and hole:
+        whole = block["kind"] == "table" and len(block["rows"]) <= _FEW_ROWS
+        if start and not (block["loose"] or whole) and start["page"] > page and hole:
             return block
         floats = block["kind"] == "figure" and block["loose"]
         if end and not floats:

@@ -39,6 +39,17 @@ def read(root: Path, name: str) -> ModelFile:
     return read_model_file(root / "models" / name / "model.toml")
 
 
+def choose_model(root: Path, name: str) -> str:
+    """Return ``name``, else the model that counts.
+
+    Raises:
+        InputError: there is no such model.
+    """
+    if name:
+        read(root, name)
+    return name or counting_model(root)
+
+
 def counting_model(root: Path) -> str:
     """Return the model that counts where a command names none: the best confirmed one.
 

@@ -186,6 +186,23 @@ def test_a_better_version_that_does_not_count_is_said_with_the_reason(tmp_path: 
     assert "none has a lower error" not in words
 
 
+def test_a_note_names_few_parameters_and_an_axis_at_rest_has_no_error(tmp_path: Path) -> None:
+    root = synthetic_run.write_all(tmp_path / "s01")
+    folder = root / "models" / synthetic_run.CHILD
+    identified = json.loads((folder / "identify.json").read_text())
+    entries = identified["parameters"]
+    bodies = [f"mass.body_{number}" for number in range(20)]
+    for found in (entries, *(method["parameters"] for method in identified["methods"].values())):
+        found |= dict.fromkeys(bodies, found["mass"])
+    (folder / "identify.json").write_text(json.dumps(identified))
+    validated = json.loads((folder / "validate.json").read_text())
+    validated["trials"]["t02_free"]["yaw"]["held_out_rmse"] = 0.0
+    (folder / "validate.json").write_text(json.dumps(validated))
+    page = build(Results(root), quiet).html
+    assert "other parameters under Identification." in page
+    assert row_of(page[page.index("RMSE by trial") :], "t02_free", "yes")[2] == "–"
+
+
 def test_stiffness_in_both_units_of_bandwidth(full: Report) -> None:
     table = full.html[full.html.index("Stiffness of the locked axes") :]
     assert row_of(table, "yaw")[1:] == [

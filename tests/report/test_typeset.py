@@ -38,6 +38,13 @@ def test_a_table_that_leaves_a_hole_is_broken() -> None:
     assert pages(*lines(20), table, *lines(14)) == 2  # 3 with a hole
 
 
+@pytest.mark.parametrize(("rows", "breaks"), [(3, False), (4, True)])
+def test_a_table_of_few_rows_stays_in_one_piece(rows: int, breaks: bool) -> None:
+    table = {"id": 1, "kind": "table", "loose": False, "rows": [[]] * rows}
+    edges = [edge(0, "end", 1, 500.0), edge(1, "start", 2, 65.0), edge(1, "end", 2, 200.0)]
+    assert (first_below_a_hole([{"id": 0, "kind": "text"}, table], edges) is table) is breaks
+
+
 def edge(block: int, side: str, page: int, y: float) -> dict[str, object]:
     return {"block": block, "edge": side, "page": page, "y": y}
 

@@ -40,6 +40,8 @@ def section(results: Results) -> Section | None:
     friction = [term for term in terms.terms if term.name.startswith("friction:") and term.curves]
     effects = [term for term in terms.terms if not term.name.startswith("friction:")]
     blocks: list[Block] = []
+    if not effects:
+        blocks.append(Paragraph(f"Model `{results.model}` is the device alone, without effects."))
     if friction:
         curves = [curve for term in friction for curve in term.curves[:1]]
         caption = (
@@ -50,7 +52,7 @@ def section(results: Results) -> Section | None:
     for term in effects:
         blocks += _effect(results, term)
     blocks += _weighed(results, {term.name for term in effects})
-    return Section(TITLE, tuple(blocks)) if blocks else None
+    return Section(TITLE, tuple(blocks))
 
 
 def _effect(results: Results, term: ModelTerm) -> list[Block]:

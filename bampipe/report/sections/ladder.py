@@ -146,7 +146,7 @@ def _ticks(first: str, error: np.ndarray) -> list[str]:
     names = [first, *(str(number) for number in range(1, len(error)))]
     shown = range(len(error)) if len(error) <= _MOST_NUMBERS else (0, len(error) - 1)
     return [
-        f"{name}\n{wording.significant(float(value), 2)}" if number in shown else name
+        f"{name}\n{wording.significant(float(value))}" if number in shown else name
         for number, (name, value) in enumerate(zip(names, error, strict=True))
     ]
 

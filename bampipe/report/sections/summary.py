@@ -15,6 +15,8 @@ from bampipe.results.setup import SetupResult
 from bampipe.results.stiffness import AxisStiffness, StiffnessResult
 from bampipe.results.validate import AxisError, ValidateResult
 
+_MOST_OTHERS = 12
+"""Parameters of no axis that a note can name."""
 _TERMS = (
     "Held-out: each trial predicted with parameters that never saw it. RMSE: root mean square of "
     "measured minus predicted force. Noise floor: the error that sensor noise, quantisation and "
@@ -184,5 +186,7 @@ def _stiffness(entry: AxisStiffness | None) -> str:
 def _others(results: Results, parameters: Mapping[str, ParameterEstimate]) -> str:
     named = results.in_order(parameters)
     others = [name for name in named if not name.startswith(("viscous.", "coulomb."))]
+    if len(others) > _MOST_OTHERS:  # a robot's bodies
+        return f"{wording.count(len(others), 'other parameter')} under Identification."
     shown = [f"{wording.parameter(name)}: {_estimate(parameters[name])}" for name in others]
     return "; ".join(shown) + "." if shown else ""

@@ -88,8 +88,10 @@ def _by_trial(results: Results, validated: ValidateResult) -> Table:
     rows = []
     for name, trial in validated.trials.items():
         key = "held_out_rmse" if trial.held_out else "rmse"
+        # Zero: the axis rested, no sample counts.
         cells = (
-            wording.significant(getattr(trial.axes.get(axis), key, None)) for axis in results.axes
+            wording.significant(getattr(trial.axes.get(axis), key, None) or None)
+            for axis in results.axes
         )
         rows.append((name, "yes" if trial.held_out else "no", *cells))
     units = (f"{axis} ({wording.unit(results.force_unit(axis))})" for axis in results.axes)
@@ -257,7 +259,9 @@ def _friction(results: Results, frame: pd.DataFrame, velocity: dict[str, np.ndar
         force = wording.unit(results.force_unit(axis))
         top.set_title(axis)
         top.set_xlabel(style.label("velocity", unit))
-        top.set_ylabel(style.label(f"{_noun(results, axis)} error", force))
+        quantity = style.label(f"{_noun(results, axis)} error", force)
+        new = column == 0 or quantity != panels[0, 0].get_ylabel()
+        top.set_ylabel(quantity if new else "")
         style.limits(top, [np.quantile(error, [0.001, 0.999]), error[one]])
         shown = t[one] - t[one][0]
         bottom.plot(shown, measured[one], color=style.INK, lw=1.4, label="measured")
@@ -265,7 +269,7 @@ def _friction(results: Results, frame: pd.DataFrame, velocity: dict[str, np.ndar
                     label="predicted without friction")  # fmt: skip
         bottom.axhline(0.0, color=style.INK, lw=0.5)
         bottom.set_xlabel("time (s)")
-        bottom.set_ylabel(style.label(_noun(results, axis), force))
+        bottom.set_ylabel(style.label(_noun(results, axis), force) if new else "")
     panels[0, 0].plot([], [], "o", ms=3.5, color=style.BLUE, label="whole trial")
     top_handles, top_names = panels[0, 0].get_legend_handles_labels()
     more_handles, more_names = panels[1, 0].get_legend_handles_labels()
