@@ -115,7 +115,8 @@ def _channel(
     register = f", wrap_bits = {bits}, signed = true" if bits else ""
     register += ", scale = -1.0" if turned else ""
     known = column.conversion
-    if known is not None and known.si == si:
+    slides = known is not None and (known.si, si) == ("N", "N.m")  # the drive of a sliding joint
+    if known is not None and (known.si == si or slides):
         table = entry(column.name, bare(column.unit), register)
         if column.stated and not why and not bits:
             return table

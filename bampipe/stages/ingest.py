@@ -190,6 +190,8 @@ def _mismatches(session: Session, device: Device) -> Iterator[InputError]:
     wanted |= device.controller.channels if device.controller else {}
     for channel in session.channels:
         expected = wanted.get(channel.name, channel.unit)
+        if device.robot is not None and (channel.unit, expected) == ("N", "N.m"):
+            continue  # the drive of a joint that slides: its force, along the joint
         if not _alike(channel.unit, expected):
             yield InputError(
                 f"a unit of {channel.unit or 'a pure number'}, but device '{device.name}' takes"

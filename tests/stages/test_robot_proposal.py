@@ -9,6 +9,7 @@ import pandas as pd
 import pytest
 from independent import arm
 
+import bampipe
 from bampipe.data.device_file import read_device_file
 from bampipe.data.session import read_session
 from bampipe.errors import InputError
@@ -148,6 +149,8 @@ def test_degrees_and_millimetres_of_numbered_joints(tmp_path: Path) -> None:
     assert list(positions.values()) == [f"q_{k} [{u}]" for k, u in enumerate(units, 1)]
     units = ("Nm", "Nm", "N", "Nm")
     assert list(drives.values()) == [f"tau_{k} [{u}]" for k, u in enumerate(units, 1)]
+    assert [c.unit for c in read_session(tmp_path / "log").channels] == ["N.m", "N.m", "N", "N.m"]
+    bampipe.run_session(tmp_path / "log", runs=tmp_path / "runs", last="ingest")
 
 
 def test_torque_constants_are_proposed_by_the_drawing(tmp_path: Path) -> None:
