@@ -15,7 +15,7 @@ import io
 import pstats
 import sys
 import time
-from contextlib import redirect_stdout
+from contextlib import redirect_stdout, suppress
 from pathlib import Path
 
 SHARE = 0.02
@@ -28,7 +28,7 @@ def profile(run: str) -> pstats.Stats:
 
     sys.argv = ["bampipe", "diagnose", run, "--force", "--quiet", "--set", "jobs=1"]
     profiler = cProfile.Profile(time.process_time)
-    with redirect_stdout(io.StringIO()):
+    with redirect_stdout(io.StringIO()), suppress(SystemExit):
         profiler.runcall(main)
     return pstats.Stats(profiler)
 

@@ -16,6 +16,9 @@ Array = NDArray[np.float64]
 
 BINS = 16
 _LEAST = 12
+_TREES = 8
+_LEAF = 3
+"""Of the flexible regressor: trees, and the fewest samples that one of their leaves averages."""
 
 
 @dataclass(frozen=True)
@@ -132,12 +135,14 @@ def explainable_share(evidence: Evidence, axis: int, seed: int = 0) -> float:
     """Share of the residual's variance that a flexible regressor predicts on unseen trials.
 
     Extremely randomised trees (Geurts, Ernst and Wehenkel 2006) on the variables of the residual
-    maps, each trial predicted from the others. Zero where it predicts nothing.
+    maps, each trial predicted from the others, at samples far enough apart to be independent. Zero
+    where it predicts nothing.
     """
     from sklearn.ensemble import ExtraTreesRegressor
 
     chosen = [v for v in variables(evidence, axis) if v.name not in ("trial", "time")]
-    use = [u[:, axis] > 0 for u in evidence.used]
+    apart = max(1, int(1.0 / evidence.band.independent_share[axis]))
+    use = [np.flatnonzero(u[:, axis] > 0)[::apart] for u in evidence.used]
     x = [
         np.column_stack([v.values[k] for v in chosen])[use[k]] for k in range(len(evidence.motions))
     ]
@@ -148,8 +153,9 @@ def explainable_share(evidence: Evidence, axis: int, seed: int = 0) -> float:
         if not others or not len(y[k]):
             continue  # an axis that rests through a trial says nothing there
         trees = ExtraTreesRegressor(
-            n_estimators=16, min_samples_leaf=5, max_features=1.0, random_state=seed, n_jobs=1
-        )
+            n_estimators=_TREES, min_samples_leaf=_LEAF, max_features=1.0, random_state=seed,
+            n_jobs=1,
+        )  # fmt: skip
         trees.fit(np.concatenate([x[i] for i in others]), np.concatenate([y[i] for i in others]))
         left += float(np.sum((y[k] - trees.predict(x[k])) ** 2))
         total += float(np.sum(y[k] ** 2))
