@@ -29,16 +29,15 @@ def added_columns(
     p[[count + i for i in item.searched_indices]] = searched
     p[[count + i for i in item.linear_indices]] = 0.0
     axes = list(range(len(system.coordinates)) if system.moves_sensors else system.touched)
+    rows = [
+        np.concatenate([r[:, axes] for r in _added_rows(item, p, count, base)], axis=1)
+        for base in e.fitted
+    ]
+    probes = max(1, len(item.linear_indices))
     columns, changes = [], []
-    for base, used in zip(e.fitted, e.used, strict=True):
-        z = None if item.replaces_motion else _states(item, base.motion, p)
-        rows = [
-            added_residual(item, p_probed, base, z)
-            for p_probed in _probes(p, count, item.linear_indices)
-        ]
-        thin = np.zeros((len(used), len(rows), used.shape[1]))
-        for r, values in enumerate(rows):
-            thin[:, r, axes] = e.band.thin(values[:, axes], axes) * used[:, axes]
+    for values, used in zip(e.band.thin_trials(rows, axes * probes), e.used, strict=True):
+        thin = np.zeros((len(used), probes, used.shape[1]))
+        thin[:, :, axes] = values.reshape(len(used), probes, len(axes)) * used[:, None, axes]
         if item.linear_indices:
             columns.append(thin.transpose(0, 2, 1))
             changes.append(np.zeros(used.shape))
@@ -46,6 +45,12 @@ def added_columns(
             columns.append(np.zeros((*used.shape, 0)))
             changes.append(thin[:, 0])
     return columns, changes
+
+
+def _added_rows(item: Candidate, p: Array, count: int, base: ModelOnTrial) -> list[Array]:
+    """`added_residual` on one trial, for each of `_probes`."""
+    z = None if item.replaces_motion else _states(item, base.motion, p)
+    return [added_residual(item, probe, base, z) for probe in _probes(p, count, item.linear_indices)]
 
 
 def _probes(p: Array, count: int, linear: Sequence[int]) -> list[Array]:

@@ -24,6 +24,9 @@ _STARTS = (0.5, 0.8)
 resonance is missed between the points of a grid, one that is damped well shows from afar."""
 _SIMILAR = 0.7
 _DENSEST = 48
+_FAR = 3.0
+"""Cost above a hopeless one from which on narrowing a grid is in vain: its columns resemble each
+other, so that between two of them a fit gains at most a little more than at the better one."""
 
 
 def scan_parameters(
@@ -51,7 +54,7 @@ def _scan_in_turn(
     at, least = [r.within(start) for r in ranges], -np.inf
     for _ in range(min(len(ranges), 2)):
         for k in range(len(ranges)):
-            found = _scan_one(cost, at, k, ranges, has_columns)
+            found = _scan_one(cost, at, k, ranges, hopeless, has_columns)
             if found is None:
                 return None
             at[k], least = found
@@ -61,7 +64,12 @@ def _scan_in_turn(
 
 
 def _scan_one(
-    cost: Cost, at: Sequence[float], k: int, ranges: Sequence[SearchRange], has_columns: bool
+    cost: Cost,
+    at: Sequence[float],
+    k: int,
+    ranges: Sequence[SearchRange],
+    hopeless: float,
+    has_columns: bool,
 ) -> tuple[float, float] | None:
     """Best value of parameter ``k``, the others held, and its cost; None if it never matters."""
 
@@ -93,6 +101,8 @@ def _scan_one(
     costs = [found[0] if found else np.inf for found in known]
     j = int(np.argmin(costs))
     least, best = costs[j], grid[j]
+    if has_columns and least > hopeless + _FAR:
+        return float(best), float(least)
     ends = [grid[max(j - 1, 0)], grid[min(j + 1, len(grid) - 1)]]
     for _ in range(_REFINE):
         for side in (0, 1):

@@ -152,6 +152,21 @@ class Band:
             out[:, chosen] = low_pass_at(values[:, chosen], float(cutoff), self.rate_hz, kept)
         return out
 
+    def thin_trials(self, trials: Sequence[Array], axes: Sequence[int]) -> list[Array]:
+        """`thin` for the same columns, each (T, k), of several trials.
+
+        Those of trials of one length go through the filter side by side.
+        """
+        by_length: dict[int, list[int]] = {}
+        for index, values in enumerate(trials):
+            by_length.setdefault(len(values), []).append(index)
+        found: dict[int, Array] = {}
+        for indices in by_length.values():
+            beside = np.concatenate([trials[i] for i in indices], axis=1)
+            parts = np.split(self.thin(beside, [*axes] * len(indices)), len(indices), axis=1)
+            found |= dict(zip(indices, parts, strict=True))
+        return [found[index] for index in range(len(trials))]
+
     def thin_input(self, values: Array) -> Array:
         """`thin` for columns (T, k) that belong to no axis: with the highest cut-off."""
         widest = int(np.argmax(self.cutoff_hz))

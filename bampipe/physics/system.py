@@ -170,8 +170,9 @@ class System:
             return q, qd, qdd
         n = len(self.coordinates)
         columns = self._arrays.true_motion(q.T, qd.T, qdd.T, u.T, p)
-        stacked = _stack(columns, len(q))
-        return stacked[:, :n], stacked[:, n : 2 * n], stacked[:, 2 * n :]
+        # Three arrays, not views of one: the compiled residual takes contiguous ones.
+        a, b, c = (_stack(columns[k * n : (k + 1) * n], len(q)) for k in range(3))
+        return a, b, c
 
     def required(self, q: Array, qd: Array, qdd: Array, z: Array, u: Array, p: Array) -> Array:
         """Generalised force that the user must supply for this motion.
