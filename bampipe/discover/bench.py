@@ -116,10 +116,14 @@ class Bench:
         ]
         return list(self.pool(run_replicate, tasks))
 
-    def floor_replicas(self, recipe: Recipe, p: Array) -> list[Replicate]:
-        """Replays that give the noise floor of a model, those that `validate` makes of it."""
-        count = floor_replays(self.trials.motions)
-        return self.replicas(recipe, p, count, (), (FLOOR_SEED,), share=True)
+    def floor_replicas(self, recipe: Recipe, evidence: Evidence, p: Array) -> list[Replicate]:
+        """Replays that give the noise floor of a fitted model, those that `validate` makes of it.
+
+        Args:
+            recipe: the model; evidence: its fit; p: parameters that are replayed, (n_p,).
+        """
+        count, again = floor_replays(self.trials.motions), (recipe, evidence.p)
+        return self.replicas(recipe, p, count, (), (FLOOR_SEED,), share=True, analysed=again)
 
     def scores(self, recipe: Recipe, p: Array, names: Sequence[str]) -> dict[str, Score]:
         """Scores of candidates against a model on the measured trials."""
@@ -132,13 +136,19 @@ class Bench:
         # In the order of the names, whatever the number of jobs: ties in the ranking keep it.
         return {name: merged[name] for name in names if name in merged}
 
-    def level(
-        self, recipe: Recipe, evidence: Evidence, asked: Sequence[str], seed: tuple[int, ...]
-    ) -> Level:
-        """Chance level of candidates against a fitted model; ``asked`` are learned at once."""
+    def level(self, recipe: Recipe, evidence: Evidence, p: Array, asked: Sequence[str]) -> Level:
+        """Chance level of candidates against a fitted model, on the replays of its noise floor.
+
+        Args:
+            recipe: the model; evidence: its fit; p: parameters that are replayed, (n_p,).
+            asked: candidates that are learned at once.
+        """
+        again = (recipe, evidence.p)
 
         def replay(names: Sequence[str], first: int, count: int) -> list[Replicate]:
-            return self.replicas(recipe, evidence.p, count, names, seed, first=first)
+            return self.replicas(
+                recipe, p, count, names, (FLOOR_SEED,), analysed=again, first=first
+            )
 
         scorer = Scorer(evidence)
         return Level(

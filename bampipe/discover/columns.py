@@ -50,7 +50,9 @@ def added_columns(
 def _added_rows(item: Candidate, p: Array, count: int, base: ModelOnTrial) -> list[Array]:
     """`added_residual` on one trial, for each of `_probes`."""
     z = None if item.replaces_motion else _states(item, base.motion, p)
-    return [added_residual(item, probe, base, z) for probe in _probes(p, count, item.linear_indices)]
+    return [
+        added_residual(item, probe, base, z) for probe in _probes(p, count, item.linear_indices)
+    ]
 
 
 def _probes(p: Array, count: int, linear: Sequence[int]) -> list[Array]:

@@ -63,7 +63,8 @@ def diagnose(
         searched = search(bench, recipe, start, progress)
         found = conclude(searched, settings)
     progress(0.95, "holding the final model against its floor in another band")
-    bands = judge_in_other_band(searched.trials, found.evidence, settings)
+    final = searched.found
+    bands = judge_in_other_band(searched.trials, final.evidence, final.replayed, settings)
     found = _with_each_axis(found, "other_band", bands)
     return _with_each_axis(found, "sentence", axis_sentences(found))
 

@@ -6,6 +6,7 @@ A low-pass may hide what acts above it, and lets in what the sensors do not reso
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bampipe.discover.scorer import Scorer
 from bampipe.discover.settings import Settings
@@ -18,14 +19,17 @@ from bampipe.trials.measured import MeasuredTrials
 from bampipe.trials.noise_floor import FLOOR_SEED, NoiseFloor, replay_evidence
 from bampipe.trials.residuals import Evidence, gather_evidence
 
+Array = NDArray[np.float64]
+
 
 def judge_in_other_band(
-    trials: MeasuredTrials, evidence: Evidence, settings: Settings
+    trials: MeasuredTrials, evidence: Evidence, p: Array, settings: Settings
 ) -> tuple[OtherBand | None, ...]:
     """Hold the final model against its floor in a wider band, else in a narrower one.
 
     Args:
         trials: the measured trials; evidence: the final model, fitted.
+        p: parameters (n_p,) with which it is replayed.
         settings: of the diagnosis.
 
     Returns:
@@ -47,7 +51,7 @@ def judge_in_other_band(
     try:
         replays = [
             replay_evidence(
-                evidence.system, measured.p, trials.motions, trials.sensors, trials.kinematics,
+                evidence.system, p, measured.p, trials.motions, trials.sensors, trials.kinematics,
                 band, trials.folds, (settings.seed, FLOOR_SEED, k),
             )
             for k in range(settings.other_band_replicates)

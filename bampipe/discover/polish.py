@@ -21,6 +21,8 @@ from bampipe.discover.settings import Settings
 from bampipe.discover.start import with_effect, without_effect
 from bampipe.physics.recipe import Recipe
 from bampipe.results.diagnose import Contender
+from bampipe.trials.measured import MeasuredTrials
+from bampipe.trials.noise_floor import parameters_to_replay
 from bampipe.trials.residuals import Evidence, residual_and_memory
 
 Array = NDArray[np.float64]
@@ -33,11 +35,15 @@ class FittedSet:
     Attributes:
         recipe: the model; added: the effects that the model as given lacks, in order.
         evidence: its fit.
+        trials: that it was fitted to.
+        published: parameters (n_p,) of the mechanism, where they have been identified.
     """
 
     recipe: Recipe
     added: tuple[str, ...]
     evidence: Evidence
+    trials: MeasuredTrials
+    published: Array | None = None
 
     @cached_property
     def error(self) -> Array:
@@ -46,6 +52,14 @@ class FittedSet:
         What only makes both sides of the equation small, noise included, explains nothing.
         """
         return self.scorer.base_error / self.slope_by_force
+
+    @cached_property
+    def replayed(self) -> Array:
+        """Parameters (n_p,) with which the model is replayed."""
+        trials = self.trials
+        return parameters_to_replay(
+            self.evidence, trials.sensors, trials.kinematics, self.published
+        )
 
     @cached_property
     def scorer(self) -> Scorer:
@@ -78,14 +92,15 @@ def extend_set(bench: Bench, known: FittedSet, score: Score) -> FittedSet:
     """Fit the set with one effect more, from where it was scored."""
     wider = replace(known.recipe, effects=(*known.recipe.effects, score.name))
     fitted = bench.fit(wider, with_effect(wider, known.evidence, score))
-    return FittedSet(wider, (*known.added, score.name), fitted)
+    return FittedSet(wider, (*known.added, score.name), fitted, bench.trials)
 
 
 def reduce_set(bench: Bench, known: FittedSet, name: str) -> FittedSet:
     """Fit the set without one of its effects."""
     fewer = replace(known.recipe, effects=tuple(e for e in known.recipe.effects if e != name))
     fitted = bench.fit(fewer, without_effect(fewer, known.evidence))
-    return FittedSet(fewer, tuple(n for n in known.added if n != name), fitted)
+    kept = tuple(n for n in known.added if n != name)
+    return FittedSet(fewer, kept, fitted, bench.trials)
 
 
 def is_superfluous(known: FittedSet, without: FittedSet, s: Settings) -> bool:

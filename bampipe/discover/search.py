@@ -22,7 +22,7 @@ from bampipe.results.diagnose import Contender, SearchStep
 from bampipe.results.standing import AT_FLOOR, standing
 from bampipe.trials.folds import HELD_OUT
 from bampipe.trials.measured import MeasuredTrials
-from bampipe.trials.noise_floor import FLOOR_SEED, NoiseFloor
+from bampipe.trials.noise_floor import NoiseFloor
 from bampipe.trials.residuals import Evidence
 
 Array = NDArray[np.float64]
@@ -109,8 +109,9 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
     progress(0.05, "scoring every candidate on the measured trials")
     first = bench.scores(base, initial.p, bench.names)
     progress(0.15, "replaying the model for chance levels")
-    level = bench.level(base, initial, bench.gaining(first, Scorer(initial)), (FLOOR_SEED,))
-    current, scores = FittedSet(base, (), initial), dict(first)
+    current, scores = FittedSet(base, (), initial, bench.trials, start), dict(first)
+    asked = bench.gaining(first, current.scorer)
+    level = bench.level(base, initial, current.replayed, asked)
     groups: dict[str, tuple[str, ...]] = {}
     additions: dict[str, Addition] = {}
     dropped: set[str] = set()
@@ -138,7 +139,8 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
         out = {*wider.added, *current.added, *dropped, *transient}
         timed = bench.retimed(wider.evidence)
         if timed is not bench:
-            wider = replace(wider, evidence=timed.fit(wider.recipe, wider.evidence.p))
+            fitted = timed.fit(wider.recipe, wider.evidence.p)
+            wider = replace(wider, evidence=fitted, trials=timed.trials)
         rest = [n for n in bench.names if n not in out]
         promised = score.gain / current.scorer.independent_samples
         sound = _sound_level(timed, current, wider, promised, known, rest)
@@ -159,7 +161,7 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
     if found.added != current.added:
         steps.append(_step(found))
     progress(0.85, "replaying the final model for its noise floor")
-    final = bench.floor_replicas(found.recipe, found.evidence.p)
+    final = bench.floor_replicas(found.recipe, found.evidence, found.replayed)
     axes = initial.system.coordinates
     main = {name: axes.index(c[0].axis) for name, c in contests.items() if c}
     return Search(
@@ -205,7 +207,7 @@ def _sound_level(
     scores = bench.scores(after.recipe, evidence.p, names)
     asked = bench.gaining(scores, after.scorer)
     try:
-        level = bench.level(after.recipe, evidence, asked, (FLOOR_SEED,))
+        level = bench.level(after.recipe, evidence, after.replayed, asked)
     except Runaway:
         return None
     error_before = before.scorer.base_error

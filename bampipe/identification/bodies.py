@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.estimate.possible_bodies import is_possible, nearest_possible
-from bampipe.identification.least_squares_estimate import UnbiasedFit
 from bampipe.lists import join_names
 from bampipe.physics import System
 from bampipe.physics.base_parameters import base_parameters
 from bampipe.physics.newton_euler import INERTIAL
 from bampipe.physics.robot import Robot
 from bampipe.results.identify import BaseEstimate
+from bampipe.trials.bias import UnbiasedFit
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]

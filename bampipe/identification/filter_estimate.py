@@ -40,10 +40,11 @@ from bampipe.identification.filter_tables import (
     tabulate_trace,
 )
 from bampipe.identification.innovations import innovation_tests
-from bampipe.identification.least_squares_estimate import UnbiasedFit, bias_details
+from bampipe.identification.least_squares_estimate import bias_details
 from bampipe.identification.sensor_noise import Noise, noise_levels, tune_noise, untuned_settings
 from bampipe.physics import System
 from bampipe.progress import Progress
+from bampipe.trials.bias import UnbiasedFit
 from bampipe.trials.cache import TrialCache
 from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from bampipe.errors import InputError
 from bampipe.identification.estimates import Estimate
-from bampipe.identification.least_squares_estimate import UnbiasedFit
 from bampipe.physics import System
 from bampipe.results.identify import METHODS_IN_WORDS, Method, MethodTried, MethodValue
+from bampipe.trials.bias import UnbiasedFit
 from bampipe.trials.folds import Folds
 
 Array = NDArray[np.float64]

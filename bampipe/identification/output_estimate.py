@@ -13,9 +13,9 @@ from bampipe.estimate.output_error import OutputError, Segment, fit_output
 from bampipe.estimate.simulation import simulate
 from bampipe.estimate.unscented import Trial
 from bampipe.identification.estimates import Estimate, estimate_of_fit, trace_row
-from bampipe.identification.least_squares_estimate import UnbiasedFit
 from bampipe.physics import System
 from bampipe.progress import Progress
+from bampipe.trials.bias import UnbiasedFit
 from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion
 

@@ -28,11 +28,7 @@ from bampipe.identification.filter_choice import FilterChoice
 from bampipe.identification.filter_estimate import estimate_by_filter
 from bampipe.identification.filter_run import MotionLost, load_filter_trial
 from bampipe.identification.identifiability import assess_identifiability
-from bampipe.identification.least_squares_estimate import (
-    UnbiasedFit,
-    estimate_by_least_squares,
-    remove_bias,
-)
+from bampipe.identification.least_squares_estimate import estimate_by_least_squares
 from bampipe.identification.method_choice import (
     choose,
     describe_methods,
@@ -46,6 +42,7 @@ from bampipe.physics import System, compile_model
 from bampipe.progress import Progress
 from bampipe.results.ingest import IngestResult
 from bampipe.schema import STRICT, Positive
+from bampipe.trials.bias import UnbiasedFit, remove_bias
 from bampipe.trials.folds import Folds
 from bampipe.trials.measured import read_measured_trials
 from bampipe.trials.reading import (

@@ -40,6 +40,7 @@ from bampipe.trials.noise_floor import (
     NoiseFloor,
     find_noise_floor,
     floor_replays,
+    parameters_to_replay,
     replay_evidence,
 )
 from bampipe.trials.reading import held_out_trials, read_motions, require_sound_motions
@@ -146,8 +147,9 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
 
         report(0)
         try:
+            replayed = parameters_to_replay(evidence, trials.sensors, trials.kinematics, p)
             floor = find_noise_floor(
-                evidence, trials.sensors, trials.kinematics, config.seed, count, report
+                evidence, replayed, trials.sensors, trials.kinematics, config.seed, count, report
             )
         except InputError as error:
             notes.append(f"No noise floor: simulating the fitted model failed ({error}).")
@@ -218,7 +220,7 @@ def _expected_ratio(evidence: Evidence, trials: MeasuredTrials, p: Array, seed: 
     nothing = np.ones(len(evidence.system.coordinates))
     try:
         again = replay_evidence(
-            evidence.system, p, evidence.motions, trials.sensors, trials.kinematics,
+            evidence.system, p, evidence.p, evidence.motions, trials.sensors, trials.kinematics,
             evidence.band, evidence.folds, (seed, _EXPECTED_SEED),
         )  # fmt: skip
     except InputError:

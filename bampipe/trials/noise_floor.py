@@ -11,13 +11,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bampipe.estimate.least_squares import fit
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import System
+from bampipe.trials.bias import remove_bias
 from bampipe.trials.folds import Folds
 from bampipe.trials.kinematics import Kinematics
 from bampipe.trials.motion import Motion
 from bampipe.trials.replay import replay_motions
-from bampipe.trials.residuals import Evidence, gather_evidence
+from bampipe.trials.residuals import Evidence, gather_evidence, problem_of
 from bampipe.trials.sensors import Sensors
 
 Array = NDArray[np.float64]
@@ -25,6 +27,9 @@ Array = NDArray[np.float64]
 FLOOR_SEED = 0
 """First number, after the user's, of the seeds of replays of the model as it is: the same replays
 serve as noise floor in every stage."""
+_LIKELY = 1.5
+"""Error of published parameters over that of the fit below which they may be the mechanism's: what
+filtering does to its readings the fit takes on, they do not."""
 _SD_OF_DEVIATION = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation."""
 ENOUGH_SAMPLES, MOST_REPLAYS = 250_000, 6
@@ -64,6 +69,7 @@ def floor_replays(motions: Sequence[Motion]) -> int:
 def replay_evidence(
     system: System,
     p: Array,
+    start: Array,
     motions: Sequence[Motion],
     sensors: Sensors,
     kinematics: Kinematics,
@@ -71,13 +77,45 @@ def replay_evidence(
     folds: Folds,
     seed: Sequence[int],
 ) -> Evidence:
-    """Replay all trials by a model at ``p`` and fit it to them as it was to the measurement."""
+    """Replay all trials by a model at ``p`` and fit it to them, from ``start`` on."""
     replays = replay_motions(system, p, motions, sensors, kinematics, seed)
-    return gather_evidence(system, replays, band, p, folds)
+    return gather_evidence(system, replays, band, start, folds)
+
+
+def parameters_to_replay(
+    evidence: Evidence, sensors: Sensors, kinematics: Kinematics, published: Array | None = None
+) -> Array:
+    """Return the parameters (n_p,) of the mechanism whose replays are fitted as the trials are.
+
+    The fit itself where it is linear: filters hardly move it. Of a friction that falls within
+    millimetres a second they make a sharper one, whose replays are rougher than the machine.
+
+    Args:
+        evidence: the model, fitted; sensors, kinematics: of the session.
+        published: parameters (n_p,) without that bias, where they are known.
+    """
+    system, p = evidence.system, evidence.p
+    if evidence.is_linear:
+        return p
+    if published is not None:
+        error = gather_evidence(
+            system, evidence.motions, evidence.band, published, evidence.folds, most_iterations=0
+        ).rmse()
+        if np.all(error < _LIKELY * evidence.rmse()):
+            return published
+    motions = [evidence.motions[k] for k in evidence.folds.fitted_trials]
+    problem = problem_of(system, motions, evidence.band, timing=False)
+    found = remove_bias(
+        sensors, kinematics, system, motions, problem, fit(problem, np.append(p, 0.0))
+    )
+    free = problem.free
+    inside = (problem.lower < found.p[free]) & (found.p[free] < problem.upper)
+    return found.p[:-1] if inside.all() else p
 
 
 def find_noise_floor(
     evidence: Evidence,
+    p: Array,
     sensors: Sensors,
     kinematics: Kinematics,
     seed: int,
@@ -90,7 +128,8 @@ def find_noise_floor(
     near the measured one; the replay goes through the same sensors, filters and fits.
 
     Args:
-        evidence: the model, fitted; sensors, kinematics: of the session.
+        evidence: the model, fitted; p: `parameters_to_replay`.
+        sensors, kinematics: of the session.
         seed: the user's; count: of replays; progress: called with how many are done.
 
     Raises:
@@ -99,7 +138,7 @@ def find_noise_floor(
     errors = []
     for k in range(count):
         found = replay_evidence(
-            evidence.system, evidence.p, evidence.motions, sensors, kinematics,
+            evidence.system, p, evidence.p, evidence.motions, sensors, kinematics,
             evidence.band, evidence.folds, (seed, FLOOR_SEED, k),
         )  # fmt: skip
         errors.append(found.held_out_rmse)
