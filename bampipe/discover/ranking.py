@@ -18,8 +18,11 @@ def rank(search: Search, selected: Sequence[str]) -> list[RankedEffect]:
     """Selected effects with their groups, then the others by their score beyond chance.
 
     Selected effects are held against the model that they were added to, others against the model
-    as given: what a second effect does may not show before the first is there.
+    as given: what a second effect does may not show before the first is there. The parameters of
+    selected ones are those of the final model, free of the bias that filters give a fit.
     """
+    names = (q.name for q in search.evidence.system.parameters)
+    final = dict(zip(names, search.found.replayed, strict=True))
     order: list[str] = []
     for name in selected:
         order += [n for n in (name, *search.groups.get(name, ())) if n not in order]
@@ -42,6 +45,7 @@ def rank(search: Search, selected: Sequence[str]) -> list[RankedEffect]:
         axis = int(np.argmax(excess))
         group = next(({g, *r} - {name} for g, r in search.groups.items() if name in (g, *r)), set())
         own = [q.name for q in _own_parameters(search.recipe, name)]
+        scored = dict(zip(own, score.values, strict=True))
         rows.append(
             RankedEffect(
                 effect=name,
@@ -51,7 +55,7 @@ def rank(search: Search, selected: Sequence[str]) -> list[RankedEffect]:
                 unit=system.torque_units[axis],
                 p_value=p_value,
                 score=excess.sum(),
-                parameters=dict(zip(own, score.values, strict=True)),
+                parameters={n: final.get(n, value) for n, value in scored.items()},
                 indistinguishable_from=tuple(sorted(group)),
             )
         )

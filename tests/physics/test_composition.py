@@ -133,7 +133,7 @@ def test_a_reading_is_corrected_before_it_lags_and_the_gears_carry_what_is_deliv
     torque = lagged(asked, 0.031)
     np.testing.assert_allclose(applied, torque, atol=0.01)
     delivered = torque / (1.0 + 0.002 * np.abs(torque))
-    sign = np.tanh(at[2][:, 0] / 2.5e-4)
+    sign = np.tanh(at[2][:, 0] / system.model.device.coordinates[0].sign_width)
     expected = torque - delivered + 0.2 * np.abs(delivered) * sign
     np.testing.assert_allclose(needed, expected, atol=0.01)
 
