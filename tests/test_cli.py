@@ -499,6 +499,10 @@ def test_extend_needs_an_effect(command: Command) -> None:
 def test_an_effect_is_not_added_twice(ingested: Path, command: Command) -> None:
     folder = ingested / "models" / "base+stribeck.yaw"
     folder.mkdir(parents=True)
+    (folder.parent / "base").mkdir()
+    (folder.parent / "base" / "model.toml").write_text(
+        'schema = "bampipe.model/1"\nname = "base"\ndevice = "bam"\neffects = []\n'
+    )
     text = 'schema = "bampipe.model/1"\nname = "base+stribeck.yaw"\nparent = "base"\n'
     (folder / "model.toml").write_text(text + 'device = "bam"\neffects = ["stribeck:yaw"]\n')
     extended = ("--model", "base+stribeck.yaw")

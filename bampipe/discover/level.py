@@ -58,6 +58,17 @@ class Level:
             self._gains[name] = gains if known is None else np.concatenate([known, gains])
         return replicates
 
+    def carry_over(self, known: Level, names: Sequence[str], moved: NDArray[np.bool_]) -> None:
+        """Take over what another level knows of candidates.
+
+        Args:
+            known: of a model that leaves the same on the axes they act on.
+            names: candidates; moved: axes on which it does not, (n_q,).
+        """
+        for name in names:
+            if name in known._gains:
+                self._gains[name] = np.where(moved, 0.0, known._gains[name])
+
     def ask(self, scores: Mapping[str, Score], names: Sequence[str]) -> None:
         """Replay for those of ``names`` whose chance level is not known, again where it is close.
 

@@ -173,6 +173,15 @@ class Scorer:
             for judged, r, x, moved, new in rows
         ]
 
+    def carry_over(self, score: Score, moved: NDArray[np.bool_]) -> Score:
+        """A score against a model that leaves the same but on the axes ``moved``, (n_q,)."""
+        return replace(
+            score,
+            error=np.where(moved, self.base_error, score.error),
+            gain=np.where(moved, 0.0, score.gain),
+            shift=np.zeros(len(self.evidence.free)),
+        )
+
     def _score_at_zero(self, item: Candidate) -> Score:
         """The score of an effect that these trials do not ask for: strength zero."""
         values = np.array([0.0 if p.strength else p.prior for p in item.parameters])

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.discover.bench import Bench
-from bampipe.discover.chance import Progress, Replicate
+from bampipe.discover.chance import Progress, Replicate, candidates_of
 from bampipe.discover.influence import SampleRange, error_without_second
 from bampipe.discover.level import Level
 from bampipe.discover.polish import FittedSet, extend_set, is_superfluous, polish, reduce_set
@@ -143,7 +143,7 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
             wider = replace(wider, evidence=fitted, trials=timed.trials)
         rest = [n for n in bench.names if n not in out]
         promised = score.gain / current.scorer.independent_samples
-        sound = _sound_level(timed, current, wider, promised, known, rest)
+        sound = _sound_level(timed, current, wider, promised, known, scores, rest)
         if sound is None:
             # It resembles what is missing in these trials, but no mechanism could have it.
             dropped.add(chosen.winner)
@@ -193,28 +193,57 @@ def _sound_level(
     after: FittedSet,
     promised: Array,
     known: Level,
+    known_scores: Mapping[str, Score],
     names: Sequence[str],
 ) -> tuple[dict[str, Score], Level] | None:
     """Scores of ``names`` against a model with one effect more, and their chance level.
 
     What a model with the first effects leaves by chance may look like another one: every model has
     a chance level of its own. None if no mechanism could have the effect; the trials that the fit
-    has not seen are asked first, for replays cost more.
+    has not seen are asked first, for replays cost more. What was known of a candidate that acts on
+    axes which the effect left as they were still holds.
     """
     if not _carries_over(before, after, promised, bench.settings):
         return None
     evidence = after.evidence
-    scores = bench.scores(after.recipe, evidence.p, names)
-    asked = bench.gaining(scores, after.scorer)
+    s, error_before = bench.settings, before.scorer.base_error
+    moved = np.abs(np.log(after.scorer.base_error / error_before)) > s.unmoved
+    holds = _unmoved_candidates(before, after, moved, [n for n in names if n in known_scores])
+    anew = bench.scores(after.recipe, evidence.p, [n for n in names if n not in holds])
+    held = {n: after.scorer.carry_over(known_scores[n], moved) for n in holds}
+    scores = {n: held[n] if n in held else anew[n] for n in names if n in held or n in anew}
     try:
-        level = bench.level(after.recipe, evidence, after.replayed, asked)
+        level = bench.level(
+            after.recipe, evidence, after.replayed, bench.gaining(anew, after.scorer)
+        )
     except Runaway:
         return None
-    error_before = before.scorer.base_error
-    s = bench.settings
+    level.carry_over(known, holds, moved)
     if not _keeps_the_floor(evidence, level.replicates, error_before, known.replicates, s):
         return None
     return scores, level
+
+
+def _unmoved_candidates(
+    before: FittedSet, after: FittedSet, moved: NDArray[np.bool_], names: Sequence[str]
+) -> list[str]:
+    """Those of ``names`` that are the same beside one effect more, and act where it moved nothing.
+
+    Args:
+        before, after: the model without and with it.
+        moved: axes whose error it changed, (n_q,).
+        names: candidates.
+    """
+    if after.trials is not before.trials:
+        return []
+    pairs = zip(
+        candidates_of(before.recipe, names), candidates_of(after.recipe, names), strict=True
+    )
+    return [
+        item.name
+        for earlier, item in pairs
+        if item is earlier and not item.replaces_motion and not moved[[*item.system.touched]].any()
+    ]
 
 
 def _keeps_the_floor(

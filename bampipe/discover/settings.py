@@ -24,6 +24,8 @@ class Settings:
         worth_at_floor: the same on an axis whose error is already at its noise floor: no replay
             is perfect, and changes of direction blurred by sampling invite
             spurious effects, up to a tenth of the error on a linear axis.
+        unmoved: change of log error on an axis up to which an effect has left it as it was: what is
+            known of candidates that act on such axes alone is not found anew.
         carried: least share of the drop of log error by its score that an effect must show on
             trials that its fit has not seen at all.
         share: least share of what exceeds the floor on one axis, in the mean square, that an effect
@@ -83,6 +85,7 @@ class Settings:
     significance: float = 0.01
     worth: float = 0.03
     worth_at_floor: float = 0.16
+    unmoved: float = 0.01
     carried: float = 0.25
     share: float = 0.15
     above_floor_sd: float = 2.0

@@ -27,7 +27,7 @@ from bampipe.schema import (
 )
 
 KINDS: Mapping[str, tuple[Literal["rad", "m"], str, float]] = MappingProxyType(
-    {"rotary": ("rad", "N.m", 2.5e-4), "linear": ("m", "N", 6e-5)}
+    {"rotary": ("rad", "N.m", 1e-3), "linear": ("m", "N", 2.5e-4)}
 )
 """By kind of coordinate: its unit, that of its generalised force, usual width of a sign."""
 

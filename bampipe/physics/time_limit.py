@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-_POLL_S = 0.1
+_POLL_S, _AGAIN_S = 0.1, 2.0
 
 
 class OutOfTime(BaseException):
@@ -34,12 +34,14 @@ def time_limit(seconds: float) -> Iterator[None]:
 
     def watch() -> None:
         nonlocal raised
-        while not done.wait(_POLL_S):
+        pause = _POLL_S
+        while not done.wait(pause):
             with lock:
                 if not done.is_set() and clock() - start > seconds:
                     raised = True
                     interrupt(OutOfTime)
-                    return
+                    # Again, should a finalizer that ran just then have swallowed it.
+                    pause = _AGAIN_S
 
     watcher = threading.Thread(target=watch, name="time limit", daemon=True)
     watcher.start()

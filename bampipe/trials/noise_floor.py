@@ -95,7 +95,8 @@ def parameters_to_replay(
         published: parameters (n_p,) without that bias, where they are known.
     """
     system, p = evidence.system, evidence.p
-    if evidence.is_linear:
+    # What leads a robot's replay along its path is no controller: its bias is not the machine's.
+    if evidence.is_linear or system.model.device.robot is not None:
         return p
     if published is not None:
         error = gather_evidence(

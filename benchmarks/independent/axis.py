@@ -22,7 +22,7 @@ from independent.single_axis import STEP, Specimen, draw_moves, move
 
 RATE_HZ, NEWTON_PER_VOLT = 1000.0, 35.0
 COUNT, NOISE = 1e-7, 0.5
-SIGN_WIDTH = 6e-5
+SIGN_WIDTH = 2.5e-4
 LAWS = {
     "stribeck": {"stribeck": 10.0, "stribeck_speed": 0.012},
     "presliding": {"dahl": 16.0, "dahl_distance": 4e-4},

@@ -50,7 +50,7 @@ FIELD = 40.0
 """Cartesian damping that the brakes render in viscous trials, N.s/m."""
 MIDDLE, REACH = np.array([0.0, 0.0, 1.1]), np.array([1.2, 0.7, 0.38])
 HASTE = np.array([12.0, 12.0, 5.0])
-SIGN_WIDTHS = np.array([2.5e-4, 2.5e-4, 6e-5])
+SIGN_WIDTHS = np.array([5e-4, 5e-4, 1.25e-4])
 
 MACHINE = np.dtype(
     [

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 
 import pytest
 
@@ -108,6 +109,15 @@ def test_the_time_limit_counts_one_thread_only() -> None:
     with time_limit(0.5):
         time.sleep(0.8)
     other.join()
+
+
+def test_a_finalizer_that_swallows_the_time_limit_does_not_lift_it() -> None:
+    with pytest.raises(OutOfTime), time_limit(0.2):
+        with suppress(OutOfTime):
+            while True:
+                pass
+        while True:
+            pass
 
 
 def test_the_time_limit_holds_in_any_thread() -> None:
