@@ -11,14 +11,12 @@ from __future__ import annotations
 
 import argparse
 import json
-import subprocess
-import sys
 import tempfile
-import time
 import tomllib
 from pathlib import Path
 
 from independent import arm
+from robots import bampipe
 
 CASES: dict[str, tuple[int, str, str, dict[str, float]]] = {
     "nothing": (211, "ZYYX", "joint_states", {}),
@@ -34,15 +32,6 @@ CASES: dict[str, tuple[int, str, str, dict[str, float]]] = {
     "spring, seven joints": (219, "ZYZYZYZ", "joint_states", {"return_spring:wrist_yaw": 1.0}),
 }  # fmt: skip
 """By name: seed, axes of the joints, headers, what is hidden."""
-
-
-def bampipe(*arguments: str) -> float:
-    """Run a command; its seconds."""
-    start = time.monotonic()
-    command = [sys.executable, "-m", "bampipe", *arguments, "--quiet"]
-    if subprocess.run(command, stdout=subprocess.DEVNULL).returncode > 1:  # 1: a gate failed
-        raise SystemExit(f"failed: {' '.join(command)}")
-    return time.monotonic() - start
 
 
 def is_paired(folder: Path, names: list[str], turned: list[str]) -> bool:

@@ -206,12 +206,12 @@ def _sound_level(
     if not _carries_over(before, after, promised, bench.settings):
         return None
     evidence = after.evidence
-    s, error_before = bench.settings, before.scorer.base_error
-    moved = np.abs(np.log(after.scorer.base_error / error_before)) > s.unmoved
+    s, error, error_before = bench.settings, after.scorer.base_error, before.scorer.base_error
+    moved = np.abs(np.log(error / error_before)) > s.unmoved
     holds = _unmoved_candidates(before, after, moved, [n for n in names if n in known_scores])
     anew = bench.scores(after.recipe, evidence.p, [n for n in names if n not in holds])
-    held = {n: after.scorer.carry_over(known_scores[n], moved) for n in holds}
-    scores = {n: held[n] if n in held else anew[n] for n in names if n in held or n in anew}
+    found = anew | {n: after.scorer.carry_over(known_scores[n], moved) for n in holds}
+    scores = {n: found[n] for n in names if n in found}
     try:
         level = bench.level(
             after.recipe, evidence, after.replayed, bench.gaining(anew, after.scorer)
@@ -219,7 +219,7 @@ def _sound_level(
     except Runaway:
         return None
     level.carry_over(known, holds, moved)
-    if not _keeps_the_floor(evidence, level.replicates, error_before, known.replicates, s):
+    if not _keeps_the_floor(error, level.replicates, error_before, known.replicates, s):
         return None
     return scores, level
 
@@ -247,7 +247,7 @@ def _unmoved_candidates(
 
 
 def _keeps_the_floor(
-    evidence: Evidence,
+    error: Array,
     replays: Sequence[Replicate],
     error_before: Array,
     before: Sequence[Replicate],
@@ -259,7 +259,6 @@ def _keeps_the_floor(
     replays of a model with a wrong effect can be so wild that any error is below their floor: such
     a floor is no better than none, unless it was like that without the effect.
     """
-    error = Scorer(evidence).base_error
     after, earlier = (NoiseFloor.of_errors([r.error for r in some]) for some in (replays, before))
     ratio = error / np.maximum(after.level, 1e-300)
     shrunk = (ratio < s.shrunken) & (error_before / np.maximum(earlier.level, 1e-300) > s.shrunken)

@@ -26,7 +26,7 @@ class Group:
 
     Attributes:
         columns: in the order of the joints.
-        named: whether joints were told by their names; else by their order.
+        named: whether joints were identified by name; else by order.
     """
 
     columns: tuple[SurveyedColumn, ...]

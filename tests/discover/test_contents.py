@@ -88,12 +88,12 @@ def test_an_effect_that_only_raises_the_floor_is_not_added():
         none = np.zeros(0)
         return [chance.Replicate(factor * error, factor * error, evidence.p, {}, none)] * 2
 
-    assert _keeps_the_floor(evidence, replays(1.0), error, replays(1.0), Settings())
-    assert not _keeps_the_floor(evidence, replays(100.0), error, replays(1.0), Settings())
-    assert _keeps_the_floor(evidence, replays(2.0), error, replays(1.9), Settings())
+    assert _keeps_the_floor(error, replays(1.0), error, replays(1.0), Settings())
+    assert not _keeps_the_floor(error, replays(100.0), error, replays(1.0), Settings())
+    assert _keeps_the_floor(error, replays(2.0), error, replays(1.9), Settings())
     # A fifth of the noise is left: both sides of the equation were made small.
-    assert not _keeps_the_floor(evidence, replays(5.0), 8.0 * error, replays(5.0), Settings())
-    assert _keeps_the_floor(evidence, replays(5.0), error, replays(5.0), Settings())
+    assert not _keeps_the_floor(error, replays(5.0), 8.0 * error, replays(5.0), Settings())
+    assert _keeps_the_floor(error, replays(5.0), error, replays(5.0), Settings())
 
 
 def test_every_axis_has_its_worst_window():
