@@ -23,7 +23,7 @@ from typing import Any
 import independent
 import numpy as np
 import pandas as pd
-from independent.sensors import Conditions
+from independent.sensors import Conditions, hold_back
 
 import bampipe
 from bampipe.data.run_folder import RunFolder
@@ -36,7 +36,8 @@ from bampipe.trials.residuals import gather_evidence
 CASES = (
     "bam:detent:yaw", "bam:detent:extension", "bam:rough_patch:pitch", "bam:winding_cable:yaw",
     "bam:hum:yaw", "bam:slack_spring:yaw", "bam:slack_spring:pitch", "bam:speed_band:yaw",
-    "bam:speed_band:extension", "bam:tightening:pitch", "bam:imbalance:yaw", "joint:detent:joint",
+    "bam:speed_band:extension", "bam:tightening:pitch", "bam:imbalance:yaw",
+    "bam:sensor_hysteresis:x", "bam:sensor_hysteresis:z", "joint:detent:joint",
     "joint:winding_cable:joint", "joint:slack_spring:joint", "joint:speed_band:joint",
     "axis:rough_patch:carriage", "axis:detent:carriage",
 )  # fmt: skip
@@ -72,6 +73,17 @@ FORCES: dict[str, Law] = {
     "imbalance": lambda law, q, v, s, h: law["cogging"]
     * np.sin(law["cogging_wavenumber"] * q + law["cogging_phase"]),
 }  # fmt: skip
+
+
+AXIS_OF_FORCE = {"x": "yaw", "y": "pitch", "z": "extension"}
+"""Of the arm: where an error of a force component acts."""
+
+
+def reading_error(law: dict[str, float], read: np.ndarray) -> np.ndarray:
+    """What a sensor with hysteresis adds to a force, from what it reads."""
+    # The inverse of a spring that slips, in line with another, is one of these as well.
+    slope = law["height"] / law["width"]
+    return law["height"] * hold_back(read, (1.0 + slope) * law["width"])
 
 
 PIPELINE = """schema = "bampipe.pipeline/1"
@@ -124,6 +136,7 @@ def run_case(case: str, strength: float, seed: int, replicates: int) -> Outcome:
         found = bampipe.diagnose(run, "base", replicates=replicates, jobs=1)
         axes = found["axes"]
         axis = effect.partition(":")[2] if hidden else next(iter(axes))
+        axis = AXIS_OF_FORCE.get(axis, axis)
         named, drafted = tuple(found["selected"]), ()
         p_value, seconds = float("nan"), 0.0
         if diagnosis_of(run).unnamed_axes:
@@ -163,7 +176,7 @@ def curve_error(run: RunFolder, model: str, axis: str, effect: str, truth: dict[
     Both are low-passed; what the device's own parameters can do as well is left out of both.
     """
     name = effect.partition(":")[0]
-    if name not in FORCES:
+    if effect not in truth["hidden_laws"]:
         return float("nan")
     law = truth["hidden_laws"][effect]
     system = compile_model(load_model(run, model))
@@ -179,8 +192,13 @@ def curve_error(run: RunFolder, model: str, axis: str, effect: str, truth: dict[
     for k, motion in enumerate(trials.motions):
         used = evidence.used[k][:, number]
         step, rate = float(np.median(np.diff(motion.t))), motion.qd[:, number]
-        force = FORCES[name](law, motion.q[:, number], rate, np.tanh(rate / width), step)
         u = motion.inputs(system.inputs)
+        if name in FORCES:
+            force = FORCES[name](law, motion.q[:, number], rate, np.tanh(rate / width), step)
+        else:
+            component = tuple(AXIS_OF_FORCE).index(effect.partition(":")[2])
+            error = reading_error(law, motion.channels[bare.model.device.forces[component]])
+            force = -bare.input_map(motion.q)[:, number, component] * error
         z = system.memory(motion.q, motion.qd, motion.qdd, u, p, motion.t)
         added = system.contribution(motion.q, motion.qd, motion.qdd, z, u, p)[:, number]
         both = trials.band.thin(np.column_stack([force, added]), [number, number])[used]

@@ -9,6 +9,7 @@ from pydantic import Field
 from bampipe.results.record import Names, Record, Result, Share, Size
 from bampipe.schema import Count
 
+ActsAs = Literal["force", "friction", "damping", "inertia", "reading"]
 DraftVerdict = Literal["drafted", "nothing_beyond_chance", "no_lower_error"]
 
 
@@ -39,7 +40,7 @@ class DraftedEffect(Record):
     file: str = Field(description="Relative to the run folder")
     axis: str
     expression: str
-    acts_as: Literal["force", "friction", "damping", "inertia"]
+    acts_as: ActsAs
     constants: dict[str, FittedConstant]
     summary: str
     looks_like: str
@@ -75,7 +76,7 @@ class CurveBound(Record):
     """What a free curve leaves: no formula of the same quantity could do much better."""
 
     variable: str
-    acts_as: Literal["force", "friction", "damping", "inertia"]
+    acts_as: ActsAs
     points: Count
     held_out_rmse: Size
 

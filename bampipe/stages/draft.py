@@ -148,8 +148,7 @@ def _source(session: IngestResult) -> str:
 
 
 def _effect(term: Term, file: str, system: System) -> DraftedEffect:
-    form = term.form
-    unit = form.axis.torque_unit
+    form, unit = term.form, term.form.unit
     units = {name: unit for name in form.shape.strengths}
     units |= {name: of for name, (_, _, of) in form.limits().items()}
     at, mean, sd = term.curve()

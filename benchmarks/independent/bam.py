@@ -20,6 +20,7 @@ from independent.person import follow
 from independent.sensors import (
     GOOD,
     Conditions,
+    hold_back,
     read_force,
     sample_steps,
     tell_truth,
@@ -95,7 +96,7 @@ LAWS = {
 
 OUTSIDE = (
     "detent", "rough_patch", "winding_cable", "hum", "slack_spring", "speed_band", "tightening",
-    "imbalance",
+    "imbalance", "sensor_hysteresis",
 )  # fmt: skip
 EFFECTS = (
     *(f"{name}:{axis}" for name in LAWS if name not in OUTSIDE for axis in AXES),
@@ -111,6 +112,7 @@ UNKNOWN = (
     "detent:yaw", "detent:pitch", "detent:extension", "rough_patch:yaw", "rough_patch:pitch",
     "rough_patch:extension", "winding_cable:yaw", "winding_cable:extension", "hum:yaw",
     "slack_spring:yaw", "speed_band:extension", "tightening:pitch", "imbalance:yaw",
+    "sensor_hysteresis:x",
 )  # fmt: skip
 
 
@@ -316,6 +318,7 @@ class _Specimen:
         machine["remanence_decay"], machine["loose_axis"] = 1.0, -1.0
         self.machine = machine[0]
         self.bias, self.drift, self.mix = np.zeros(3), np.zeros(3), np.eye(3)
+        self.hysteresis, self.hysteresis_width = np.zeros(3), np.ones(3)
         self.delay, self.scale, self.compliance = 0.0, np.ones(3), np.zeros(3)
         self.truth = {"mass": float(self.machine["mass"])}
         self.hidden_laws: dict[str, dict[str, float]] = {}
@@ -358,6 +361,13 @@ class _Specimen:
             self.bias[component] = self.truth[f"{name}.{at}.bias"] = size * sign
         elif name == "force_drift":
             self.drift[component] = self.truth[f"{name}.{at}.rate"] = 0.12 * size * sign
+        elif name == "sensor_hysteresis":
+            self.hysteresis[component] = 0.8 * size
+            self.hysteresis_width[component] = 4.0 * rng.uniform(0.85, 1.15)
+            self.hidden_laws[full] = {
+                "height": float(self.hysteresis[component]),
+                "width": float(self.hysteresis_width[component]),
+            }
         elif name == "force_gain":
             self.mix[component, component] = 1.0 + 0.06 * size * sign
         elif name == "force_crosstalk":
@@ -389,6 +399,8 @@ class _Specimen:
         ]
         late = np.column_stack([np.interp(t - self.delay, t, f) for f in force.T])
         true = late @ self.mix.T + self.bias + self.drift * t[:, None]
+        for i in np.flatnonzero(self.hysteresis):
+            true[:, i] += self.hysteresis[i] * hold_back(late[:, i], self.hysteresis_width[i])
         read = read_force(rng, t, true, NOISE, c)
         return counts, np.round(np.linalg.solve(CALIBRATION, read.T).T + ZERO_V, 6)
 

@@ -83,6 +83,18 @@ def sample_steps(
     return np.unique(chosen)
 
 
+def hold_back(force: np.ndarray, width: float) -> np.ndarray:
+    """What a sensor of unit hysteresis adds to ``force`` (T,), between -1 and 1.
+
+    It follows the force like a spring that slips once it is ``width`` away from where it rested.
+    """
+    found = np.zeros(len(force))
+    for k in range(1, len(force)):
+        moved = found[k - 1] + (force[k] - force[k - 1]) / width
+        found[k] = min(max(moved, -1.0), 1.0)
+    return found
+
+
 def read_force(
     rng: np.random.Generator, t: np.ndarray, force: np.ndarray, noise: float, conditions: Conditions
 ) -> np.ndarray:

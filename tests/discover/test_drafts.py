@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import tomllib
 from dataclasses import replace
@@ -43,6 +44,13 @@ def clean(tmp_path_factory):
     trials, recipe, _ = record_trials(tmp_path_factory.mktemp("clean"), "bam", 6)
     start = system_of(recipe).prior
     return trials, recipe, fit_trials(trials, recipe, start)
+
+
+@pytest.fixture(scope="module")
+def damper(tmp_path_factory):
+    """The bare device and its fit to trials in which a coil is commanded."""
+    trials, recipe, _ = record_trials(tmp_path_factory.mktemp("damper"), "damper", 6)
+    return recipe, fit_trials(trials, recipe, system_of(recipe).prior)
 
 
 def test_the_draft_is_the_curve_that_was_hidden(detent):
@@ -111,35 +119,39 @@ def test_nothing_is_drafted_where_nothing_is_missing(clean):
     assert found.chance[0].p_value > 0.05
 
 
-def test_columns_of_the_first_pass_are_those_of_the_compiled_effect(clean):
+def test_columns_of_the_first_pass_are_those_of_the_compiled_effect(clean, damper):
     """Every shape and factor once: the grammar's text and its columns must say the same."""
-    _, recipe, evidence = clean
-    screen = Screen(evidence, 0)
     seen = set()
-    for form in screen.forms():
-        if (form.shape.name, form.factor) in seen:
-            continue
-        seen.add((form.shape.name, form.factor))
-        declaration = form.declaration("a test")
-        wider = replace(recipe, extra=(declaration,))
-        item = candidates_of(wider, (form.canonical,))[0]
-        searched = {
-            name: np.array([_between(low, high)]) for name, (low, high, _) in form.limits().items()
-        }
-        columns = screen.columns(form, searched)[:, :, 0]
-        names = [p.name.rpartition(".")[2] for p in item.parameters]
-        for strength, column in zip(form.shape.strengths, columns, strict=True):
-            p = np.concatenate([evidence.p, [q.prior for q in item.parameters]])
-            for name, value in searched.items():
-                p[len(evidence.p) + names.index(name)] = value[0]
-            p[len(evidence.p) + names.index(strength)] = 1.0
-            exact = np.concatenate([
-                _low_passed(evidence, item.system, k, p)[evidence.used[k][:, 0]]
-                for k in range(len(evidence.motions))
-            ])  # fmt: skip
-            off = np.linalg.norm(column - exact) / np.linalg.norm(exact)
-            # Made at a lower rate: a sharp edge at a reversal costs several per cent.
-            assert off < 0.1, (form.canonical, strength)
+    for recipe, evidence in (clean[1:], damper):
+        screen = Screen(evidence, 0)
+        for form in screen.forms():
+            if (form.shape.name, form.factor) not in seen:
+                seen.add((form.shape.name, form.factor))
+                _hold_columns_against_effect(recipe, evidence, screen, form)
+
+
+def _hold_columns_against_effect(recipe, evidence, screen, form):
+    declaration = form.declaration("a test")
+    wider = replace(recipe, extra=(declaration,))
+    item = candidates_of(wider, (form.canonical,))[0]
+    searched = {
+        name: np.array([_between(low, high) * (2.0 if name == "longer" else 1.0)])
+        for name, (low, high, _) in form.limits().items()
+    }
+    columns = screen.columns(form, searched)[:, :, 0]
+    names = [p.name.rpartition(".")[2] for p in item.parameters]
+    for strength, column in zip(form.shape.strengths, columns, strict=True):
+        p = np.concatenate([evidence.p, [q.prior for q in item.parameters]])
+        for name, value in searched.items():
+            p[len(evidence.p) + names.index(name)] = value[0]
+        p[len(evidence.p) + names.index(strength)] = 1.0
+        exact = np.concatenate([
+            _low_passed(evidence, item.system, k, p)[evidence.used[k][:, 0]]
+            for k in range(len(evidence.motions))
+        ])  # fmt: skip
+        off = np.linalg.norm(column - exact) / np.linalg.norm(exact)
+        # Made at a lower rate: a sharp edge at a reversal costs several per cent.
+        assert off < 0.1, (form.canonical, strength)
 
 
 def _between(low, high):
@@ -152,6 +164,23 @@ def _low_passed(evidence, system, trial, p):
     z = system.memory(motion.q, motion.qd, motion.qdd, u, p, motion.t)
     whole = system.contribution(motion.q, motion.qd, motion.qdd, z, u, p)
     return evidence.band.thin(whole)[:, 0]
+
+
+def test_hysteresis_of_a_force_sensor_is_found(tmp_path):
+    trials, recipe, _ = record_trials(tmp_path, "bam", 7, "sensor_hysteresis:x")
+    evidence = fit_trials(trials, recipe, system_of(recipe).prior)
+    one, two, *others = sorted(
+        Screen(evidence, 0).search()[:8], key=lambda found: "hyst" not in found.form.name
+    )
+    best = min(one, two, key=lambda found: found.form.constants)
+    assert best.form.canonical == "hysteresis_of_reading:x"
+    assert best.gain > 0.97 * max(one.gain, two.gain)
+    assert all(other.gain < 0.3 * best.gain for other in others)
+    truth = json.loads((tmp_path / "bam.truth.json").read_text(encoding="utf-8"))
+    hidden = truth["hidden_laws"]["sensor_hysteresis:x"]
+    assert best.values["height"] == pytest.approx(hidden["height"], rel=0.03)
+    # By what is read, which is more than the force by the height where the width is reached.
+    assert best.values["width"] == pytest.approx(sum(hidden.values()), rel=0.1)
 
 
 def test_every_form_is_an_effect_file(clean):

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
+from bampipe.estimate.play import drag_along
 from bampipe.physics.device import Coordinate as Axis
 from bampipe.physics.device import Device
 
@@ -24,12 +25,14 @@ FORCE: Final = "force"
 FRICTION: Final = "friction"
 DAMPING: Final = "damping"
 INERTIA: Final = "inertia"
-Factor = Literal["force", "friction", "damping", "inertia"]
+READING: Final = "reading"
+Factor = Literal["force", "friction", "damping", "inertia", "reading"]
 FACTORS: Mapping[Factor, str] = {
     FORCE: "{shape}",
     FRICTION: "({shape})*sgn({rate})",
     DAMPING: "({shape})*{rate}/top_speed",
     INERTIA: "({shape})*{rate}**2/(2*top_acceleration)",
+    READING: "f - ({shape})",
 }
 _NEAR = 2
 """Axes whose motion may matter, in the order of the coordinates; see `effect.pairs`."""
@@ -43,9 +46,11 @@ class Quantity:
         words: what it is, such as ``position``, ``extension speed``.
         name: the same as part of a name.
         text: in an expression of an effect.
-        quantity: of the motion: ``position``, ``speed``, ``velocity``, ``load``, ``time``.
-        axis: number of the coordinate that it is of.
+        quantity: ``position``, ``speed``, ``velocity``, ``direction``, ``load``, ``time``,
+            ``command`` (of a brake or of an input that is no force), ``reading`` (of a force).
+        axis: number of the coordinate that it is of; of the axis itself where of no other.
         unit: SI.
+        channel: of a command or a reading, where it is logged.
     """
 
     words: str
@@ -54,6 +59,7 @@ class Quantity:
     quantity: str
     axis: int
     unit: str
+    channel: str = ""
 
 
 @dataclass(frozen=True)
@@ -85,10 +91,10 @@ class Shape:
             ``wavenumber``.
         fixed: constants that scale it and are not estimated: ``middle``, ``reach`` of the span.
         columns: value by strength: of x (T, 1), the searched constants (G,) and the fixed ones,
-            each (T, G); with a state, of x along a trial and its ``interval``, s.
+            each (T, G); with states, of x along a trial and its ``interval``, s.
         words: what it does, of ``{x}``.
-        state: where it has memory, its name, rate and value at the start; the state has the unit
-            of the coordinate.
+        states: where it has memory, rate and value at the start by name; states have the unit of
+            the coordinate.
         drawn: of a shape with memory, its curve for motion that is quicker than what it remembers.
     """
 
@@ -99,7 +105,7 @@ class Shape:
     fixed: tuple[str, ...]
     columns: Callable[..., tuple[Array, ...]]
     words: str
-    state: tuple[str, str, str] | None = None
+    states: Mapping[str, tuple[str, str]] = field(default_factory=dict)
     drawn: Callable[..., tuple[Array, ...]] | None = None
 
 
@@ -108,6 +114,27 @@ def _lagged(x: Array, c: Mapping[str, Any], first: float) -> Array:
     keeps = np.exp(-c["interval"] / np.atleast_1d(c["lag"]))
     found = [lfilter([0.5 * (1 - a), 0.5 * (1 - a)], [1.0, -a], x[:, 0] - first) for a in keeps]
     return np.asarray(found).T + first
+
+
+def _dragged(x: Array, play: Array) -> Array:
+    """What x (T, 1) drags along with each ``play`` (G,), (T, G)."""
+    plays = np.ascontiguousarray(np.atleast_1d(play), dtype=np.float64)
+    return np.asarray(drag_along(np.ascontiguousarray(x[:, 0]), plays))
+
+
+def _held(x: Array, play: Array) -> Array:
+    """What a spring that slips after ``play`` (G,) holds of x (T, 1), between -1 and 1, (T, G)."""
+    return np.asarray((x - _dragged(x, play)) / play)
+
+
+def _rising(x: Array, play: float) -> Array:
+    """What it holds while x rises from where it turned, at its least."""
+    return np.asarray(np.clip((x - x.min()) / play - 1.0, -1.0, 1.0))
+
+
+def _slip(name: str, play: str) -> dict[str, tuple[str, str]]:
+    """The state that x drags along with a ``play``, within the time ``settling``."""
+    return {name: (f"(x - {name} - clip(x - {name}, -{play}, {play}))/settling", "x")}
 
 
 def _ratio(x: Array, c: Mapping[str, Any]) -> Array:
@@ -209,14 +236,39 @@ SHAPES = {
             "relaxing", "height*(x - rest)/reach",
             {"height": "what a quick motion over half the range builds up"}, {"lag": "time"},
             ("reach",), lambda x, c: ((x - _lagged(x, c, float(x[0, 0]))) / c["reach"],),
-            "builds up with {x} and relaxes with time", ("rest", "(x - rest)/lag", "x"),
+            "builds up with {x} and relaxes with time", {"rest": ("(x - rest)/lag", "x")},
             lambda x, c: (_ratio(x, c | {"middle": x.mean()}),),
         ),
         Shape(
             "lagging", "height*trail/reach", {"height": "what it comes to at the end of the range"},
             {"lag": "time"}, ("reach",), lambda x, c: (_lagged(x, c, 0.0) / c["reach"],),
-            "follows {x} with a lag", ("trail", "(x - trail)/lag", "0"),
+            "follows {x} with a lag", {"trail": ("(x - trail)/lag", "0")},
             lambda x, c: (x / c["reach"],),
+        ),
+        Shape(
+            "play", "height*(trail - middle)/reach", {"height": _AT_END}, {"width": "length"},
+            ("middle", "reach", "settling"),
+            lambda x, c: (_ratio(_dragged(x, c["width"]), c),),
+            "follows {x} with play, up to its width behind it", _slip("trail", "width"),
+            lambda x, c: (_ratio(np.maximum(x - c["width"], x.min() + c["width"]), c),),
+        ),
+        Shape(
+            "hysteresis", "height*clip((x - trail)/width, -1, 1)", {"height": "what it comes to"},
+            {"width": "length"}, ("settling",), lambda x, c: (_held(x, c["width"]),),
+            "builds up as {x} turns round and stays once that has changed by twice its width",
+            _slip("trail", "width"), lambda x, c: (_rising(x, c["width"]),),
+        ),
+        Shape(
+            "two_hystereses",
+            "short*clip((x - near)/width, -1, 1) + long*clip((x - far)/longer, -1, 1)",
+            {"short": "what the part of the shorter width comes to",
+             "long": "what the other part comes to"},
+            {"width": "length", "longer": "length"}, ("settling",),
+            lambda x, c: (_held(x, c["width"]), _held(x, c["longer"])),
+            "builds up in two parts as {x} turns round, each of which stays once that has changed "
+            "by twice its width",
+            _slip("near", "width") | _slip("far", "longer"),
+            lambda x, c: (_rising(x, c["width"]), _rising(x, c["longer"])),
         ),
         Shape(
             "curve",
@@ -231,8 +283,9 @@ SHAPES = {
 # What each factor may follow, by the quantity and whose it is; what the library has is not
 # drafted again: springs and stops, rippling friction, drag, friction by load or by pose.
 _CURVES = ("parabola", "cubic", "bump", "snag", "step")
+_MEMORY = ("hysteresis", "two_hystereses")
 _GRAMMAR: Mapping[tuple[str, bool, Factor], tuple[str, ...]] = {
-    ("position", True, FORCE): (*_CURVES, "dead_zone", "ripple", "relaxing"),
+    ("position", True, FORCE): (*_CURVES, "dead_zone", "ripple", "relaxing", "play", *_MEMORY),
     ("position", True, FRICTION): ("slope", "parabola", "cubic", "bump", "step", "rise", "fall"),
     ("position", True, DAMPING): ("slope", "parabola", "bump", "step"),
     ("position", True, INERTIA): ("slope", "bump"),
@@ -250,6 +303,10 @@ _GRAMMAR: Mapping[tuple[str, bool, Factor], tuple[str, ...]] = {
     ("time", True, FORCE): ("slope", "decay", "ripple"),
     ("time", True, FRICTION): ("slope", "decay"),
     ("time", True, DAMPING): ("slope", "decay"),
+    ("command", True, FORCE): ("slope", "parabola", "step", *_MEMORY),
+    ("command", True, FRICTION): ("slope", "parabola", "rise", *_MEMORY),
+    ("command", True, DAMPING): ("slope", "parabola"),
+    ("reading", True, READING): ("parabola", "cubic", "dead_zone", *_MEMORY),
 }
 _CURVED: Mapping[tuple[str, bool, Factor], tuple[str, ...]] = {
     (quantity, own, factor): ("curve",)
@@ -262,8 +319,15 @@ _SEES = {
     FRICTION: "opposite in the two directions of motion",
     DAMPING: "in proportion to velocity",
     INERTIA: "in proportion to acceleration",
+    READING: "as an error of what the force is read to be",
 }
-_ACTS = {FORCE: "A force", FRICTION: "Friction", DAMPING: "Damping", INERTIA: "Inertia"}
+_ACTS = {
+    FORCE: "A force on the axis",
+    FRICTION: "Friction on the axis",
+    DAMPING: "Damping on the axis",
+    INERTIA: "Inertia on the axis",
+    READING: "An error of the sensor",
+}
 
 
 def coordinates(device: Device, axis: int) -> tuple[Quantity, ...]:
@@ -277,6 +341,14 @@ def coordinates(device: Device, axis: int) -> tuple[Quantity, ...]:
         Quantity("load", "load", "load", "load", axis, own.torque_unit),
         Quantity("time", "time", "t", "time", axis, "s"),
     ]
+    if own.name in device.brakes:
+        brake, unit = device.brakes[own.name], own.torque_unit
+        found.append(Quantity("brake command", "brake", "brake", "command", axis, unit, brake))
+    for name, unit in device.channels.items():
+        found.append(Quantity(name, name, name, "command", axis, unit, name))
+    for name, channel in zip(device.components, device.forces, strict=True):
+        words, unit = f"{name} reading", device.force_unit
+        found.append(Quantity(words, "reading", "f", "reading", axis, unit, channel))
     for k, other in enumerate(device.coordinates):
         if 0 < abs(k - axis) <= _NEAR:
             n, u = other.name, other.unit
@@ -311,6 +383,8 @@ class Form:
     @property
     def name(self) -> str:
         """Name of the effect: ``bump_by_position``, ``slope_by_extension_position_on_yaw``."""
+        if self.factor == READING:
+            return f"{self.shape.name}_of_reading"
         head = "" if self.factor == FORCE else f"{self.factor}_"
         tail = "" if self.is_own else f"_on_{self.axis.name}"
         return f"{head}{self.shape.name}_by_{self.coordinate.name}{tail}"
@@ -318,12 +392,29 @@ class Form:
     @property
     def is_own(self) -> bool:
         """Whether it speaks of its own axis only, so that its file fits any axis."""
-        return self.coordinate.axis == self.number
+        return self.coordinate.axis == self.number and self.factor != READING
+
+    @property
+    def target(self) -> str:
+        """Axis or force component that its file is placed on; empty where it names its axes."""
+        if self.factor == READING:
+            return self.coordinate.words.removesuffix(" reading")
+        return self.axis.name if self.is_own else ""
 
     @property
     def canonical(self) -> str:
         """Its name as a model has it."""
-        return f"{self.name}:{self.axis.name}" if self.is_own else self.name
+        return f"{self.name}:{self.target}" if self.target else self.name
+
+    @property
+    def unit(self) -> str:
+        """Of its strengths."""
+        return self.coordinate.unit if self.factor == READING else self.axis.torque_unit
+
+    @property
+    def lever(self) -> str:
+        """Name of the signal that its shape is multiplied by."""
+        return f"{READING} {self.target}" if self.factor == READING else self.factor
 
     @property
     def constants(self) -> int:
@@ -344,7 +435,7 @@ class Form:
     def summary(self) -> str:
         """What it is, in one sentence."""
         words = self.shape.words.format(x=self.coordinate.words)
-        return f"{_ACTS[self.factor]} on the axis that {words}"
+        return f"{_ACTS[self.factor]} that {words}"
 
     @property
     def looks_like(self) -> str:
@@ -360,8 +451,10 @@ class Form:
             "reach": 0.5 * self.span.width,
             "start": self.span.low,
             "spacing": self.span.width / (KNOTS - 1),
+            "settling": 0.5 * self.times.low,
         }
-        found = {name: (rounded(known[name]), unit) for name in self.shape.fixed}
+        units = {"settling": "s"}
+        found = {n: (rounded(known[n]), units.get(n, unit)) for n in self.shape.fixed}
         if self.factor == DAMPING:
             found["top_speed"] = (rounded(self.scale), f"{self.axis.unit}/s")
         if self.factor == INERTIA:
@@ -381,11 +474,10 @@ class Form:
 
     def entries(self) -> dict[str, dict[str, Any]]:
         """The parameters of its effect file, the estimates still unknown."""
-        unit = self.axis.torque_unit
         found: dict[str, dict[str, Any]] = {}
         for name, words in self.shape.strengths.items():
             found[name] = {
-                "unit": unit, "prior": 0.0, "sd": 1.0, "strength": True, "description": words,
+                "unit": self.unit, "prior": 0.0, "sd": 1.0, "strength": True, "description": words,
             }  # fmt: skip
         for name, (low, high, of) in self.limits().items():
             low, high = rounded(low), rounded(high)
@@ -420,13 +512,15 @@ class Form:
         acts: dict[str, Any] = {"kind": "torque", "torque": self.expression}
         if self.factor == INERTIA:
             acts = {"kind": "energy", "kinetic": self.expression}
+        elif self.factor == READING:
+            acts = {"kind": "input", "input": self.expression}
         elif not self.is_own:
             acts["torque"] = {self.axis.name: self.expression}
         return {
             "schema": "bampipe.effect/1",
             "name": name or self.name,
             "summary": self.summary,
-            "scope": "axis" if self.is_own else "device",
+            "scope": self._scope,
             "looks_like": self.looks_like,
             "source": source,
             **acts,
@@ -434,14 +528,21 @@ class Form:
             **self._states(),
         }
 
+    @property
+    def _scope(self) -> str:
+        if self.factor == READING:
+            return "force_component"
+        return "axis" if self.is_own else "device"
+
     def _states(self) -> dict[str, Any]:
-        if self.shape.state is None:
-            return {}
-        name, rate, initial = self.shape.state
         unit: dict[str, Any] = {"unit": self.coordinate.unit}
         held = {self.axis.kind: unit} if self.is_own else unit
-        texts = {"rate": self._of_coordinate(rate), "initial": self._of_coordinate(initial)}
-        return {"states": {name: texts | held}}
+        states = {
+            name: {"rate": self._of_coordinate(rate), "initial": self._of_coordinate(initial)}
+            | held
+            for name, (rate, initial) in self.shape.states.items()
+        }
+        return {"states": states} if states else {}
 
 
 KINDS_IN_WORDS = {

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,7 @@ from bampipe.discover.drafts.forms import (
     FORCE,
     FRICTION,
     INERTIA,
+    READING,
     Form,
     Span,
     coordinates,
@@ -33,7 +35,7 @@ from bampipe.trials.residuals import Evidence
 
 Array = NDArray[np.float64]
 
-_FINER = 3
+_FINER = 5
 """Times the thinned rate at which columns are made, at least."""
 _LENGTHS = (0.02, 0.6, 6)
 """Of the range, from, to, how many."""
@@ -153,6 +155,9 @@ class Screen:
                 DAMPING: qd[:, axis],
                 INERTIA: qdd[:, axis],
             }
+            pulls = system.input_map(q, u, evidence.p)[:, axis]
+            for name, pull in zip(device.components, pulls.T, strict=True):
+                values[f"{READING} {name}"] = -pull
             for c in coordinates(device, axis):
                 by_quantity = {
                     "position": q[:, c.axis],
@@ -162,7 +167,8 @@ class Screen:
                     "load": load,
                     "time": motion.t[rows],
                 }
-                values[c.words] = by_quantity[c.quantity]
+                logged = motion.channels.get(c.channel, np.zeros(len(motion.t)))[rows]
+                values[c.words] = logged if c.channel else by_quantity[c.quantity]
             for name, column in values.items():
                 found.setdefault(name, []).append(column[:, None])
         return found
@@ -204,7 +210,9 @@ class Screen:
     def forms(self) -> list[Form]:
         """Every form that these trials can hold the residual against."""
         device = self.evidence.system.model.device
-        return list(forms(device, self.axis, self.spans, self._times, self.scales, self._curves))
+        found = forms(device, self.axis, self.spans, self._times, self.scales, self._curves)
+        # Not the readings of forces that have no lever on the axis.
+        return [f for f in found if any(np.any(lever) for lever in self.signals[f.lever])]
 
     @cached_property
     def _times(self) -> Span:
@@ -227,7 +235,7 @@ class Screen:
         by_trial = []
         for i, (_, kept) in enumerate(self._sampling):
             x = self.signals[form.coordinate.words][i]
-            factor = self.signals[form.factor][i] / form.scale
+            factor = self.signals[form.lever][i] / form.scale
             values = np.stack(np.broadcast_arrays(*shape(x)))
             acting = values * factor
             if form.factor == INERTIA:
@@ -274,6 +282,8 @@ class Screen:
             points = _places(span, _PLACES_APART * span.width)[None]
         elif names == ("width",):
             points = lengths[None]
+        elif names == ("width", "longer"):
+            points = np.array(list(combinations(lengths, 2))).T
         elif names == ("lag",):
             points = np.geomspace(4.0 * self._times.low, self._times.high, _LAGS)[None]
         elif names == ("wavenumber",):

@@ -63,7 +63,7 @@ class Term:
     @property
     def canonical(self) -> str:
         """Its name as a model has it."""
-        return f"{self.name}:{self.form.axis.name}" if self.form.is_own else self.name
+        return self.name + self.form.canonical.removeprefix(self.form.name)
 
     def curve(self, count: int = 121) -> tuple[Array, Array, Array]:
         """Coordinate, torque and its standard deviation along the range travelled, (count,) each.
@@ -363,7 +363,7 @@ class AxisSearch:
         place = {int(i): k for k, i in enumerate(problem.free)}
         terms = []
         for form, name in option.terms:
-            prefix = f"{name}.{form.axis.name}" if form.is_own else name
+            prefix = f"{name}.{form.target}" if form.target else name
             shape = form.shape
             short = [*shape.strengths, *shape.searched]
             index = [evidence.system.index(f"{prefix}.{constant}") for constant in short]

@@ -18,6 +18,7 @@ _AS_DRAWN = {
     "friction": ", in the positive direction of motion",
     "damping": ", at the highest speed",
     "inertia": ", at the highest acceleration",
+    "reading": ", as what the reading has too much",
 }
 
 

@@ -1,0 +1,26 @@
+"""The play operator: what a point does that a loose coupling drags along.
+
+After Krasnosel'skii and Pokrovskii 1989, Systems with Hysteresis. What it leaves of its input is
+the stop operator: an ideal spring that slips.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.compiled import njit
+
+Array = NDArray[np.float64]
+
+
+@njit("float64[:, ::1](float64[::1], float64[::1])", cache=True)
+def drag_along(x: Array, play: Array) -> Array:
+    """Where each point is that stays within ``play`` (G,) of ``x`` (T,), (T, G); at x first."""
+    out = np.empty((x.shape[0], play.shape[0]))
+    for g in range(play.shape[0]):
+        at = x[0]
+        for t in range(x.shape[0]):
+            at = min(max(at, x[t] - play[g]), x[t] + play[g])
+            out[t, g] = at
+    return out
