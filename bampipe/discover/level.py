@@ -19,7 +19,8 @@ class Level:
     """Mean and scatter of candidates' scores on replays of one model, found as needed.
 
     A candidate that gains nothing on the measured trials needs no chance level; most gain nothing.
-    Where a decision is close, more replays are made of those candidates.
+    A few replays tell chance from what stands far above it; where the best candidates do not, more
+    are made, and more again of those whose decision is close.
     """
 
     def __init__(
@@ -45,10 +46,13 @@ class Level:
         # No replay is perfect: its log error is off by this, as a log likelihood.
         self._error = settings.replay_error * float(independent.mean())
         self._gains: dict[str, Array] = {}
-        self.replicates = self._learn(asked, 0, settings.replicates)
+        self.replicates: list[Replicate] = []
+        self._learn(asked, 0, min(settings.first_replicates, settings.replicates))
 
-    def _learn(self, names: Sequence[str], first: int, count: int) -> list[Replicate]:
+    def _learn(self, names: Sequence[str], first: int, count: int) -> None:
         replicates = self._replay(names, first, count)
+        if first == len(self.replicates):
+            self.replicates += replicates
         nothing = np.zeros(len(replicates[0].error))
         for name in names:
             gains = np.array(
@@ -56,7 +60,13 @@ class Level:
             )
             known = self._gains.get(name)
             self._gains[name] = gains if known is None else np.concatenate([known, gains])
-        return replicates
+
+    def _complete(self, names: Sequence[str], count: int) -> None:
+        """Replay until each of ``names`` has been scored on ``count`` replays."""
+        for first in sorted({len(self._gains.get(name, ())) for name in names}):
+            if first < count:
+                short = [name for name in names if len(self._gains.get(name, ())) == first]
+                self._learn(short, first, count - first)
 
     def carry_over(self, known: Level, names: Sequence[str], moved: NDArray[np.bool_]) -> None:
         """Take over what another level knows of candidates.
@@ -76,17 +86,27 @@ class Level:
         on both, or the second look would be another chance of a false alarm.
         """
         s = self._settings
-        unknown = [name for name in names if name not in self._gains]
-        if unknown:
-            self._learn(unknown, 0, s.replicates)
+        self._complete(names, len(self.replicates))
+        if not self._is_clear(scores, names):
+            self._complete(names, s.replicates)
         low, high = s.significance / s.close, s.significance * s.close
         close = [
             name
             for name in names
             if len(self._gains[name]) == s.replicates and low < self.p_value(scores[name]) < high
         ]
-        if close and s.most_replicates > s.replicates:
-            self._learn(close, s.replicates, s.most_replicates - s.replicates)
+        self._complete(close, s.most_replicates)
+
+    def _is_clear(self, scores: Mapping[str, Score], names: Sequence[str]) -> bool:
+        """Whether the best of ``names``, and what comes near it, beat chance beyond doubt.
+
+        The others wait: once the best is part of the model they are weighed anew.
+        """
+        s = self._settings
+        excess = {name: float(self.excess(scores[name]).sum()) for name in names}
+        near = s.rival_share * max(excess.values(), default=0.0)
+        contending = [name for name in names if excess[name] >= near]
+        return all(self.p_value(scores[n]) < s.significance / s.close for n in contending)
 
     def p_value(self, score: Score) -> float:
         """Chance that any candidate scores this high with nothing missing (Bonferroni).

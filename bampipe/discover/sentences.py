@@ -122,10 +122,14 @@ def _left(c: Contender, unit: str) -> str:
 
 
 def _transients(axis: str, found: Diagnosis) -> list[str]:
+    by_second: dict[Stretch, list[str]] = {}
+    for one in found.transients:
+        if one.axis == axis:
+            by_second.setdefault(one.second, []).append(one.effect)
     return [
-        f"Only {_when(one.second)} speaks for {one.effect}: it counts once another trial shows it."
-        for one in found.transients
-        if one.axis == axis
+        f"Only {_when(second)} speaks for {join_names(effects)}: "
+        f"{'it counts' if len(effects) == 1 else 'they count'} once another trial shows it."
+        for second, effects in by_second.items()
     ]
 
 

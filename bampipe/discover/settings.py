@@ -15,8 +15,9 @@ class Settings:
     """How carefully to look.
 
     Attributes:
-        replicates: replays of the model for the chance level; most_replicates: where a decision
-            is close, that is a p-value within a factor ``close`` of ``significance``.
+        first_replicates: replays of the model for the chance level, enough where the best
+            candidates stand far above it; replicates: else; most_replicates: where a decision is
+            close, that is a p-value within a factor ``close`` of ``significance``.
         rival_replicates: replays of each rival when candidates come close.
         most_effects: the most effects tried, those dropped again among them.
         significance: chance of a false alarm in a session that is accepted.
@@ -77,6 +78,7 @@ class Settings:
         seed: of all noise.
     """
 
+    first_replicates: int = 4
     replicates: int = 10
     most_replicates: int = 30
     close: float = 30.0

@@ -49,6 +49,8 @@ from bampipe.trials.measured import MeasuredTrials, read_measured_trials
 _DESCRIBED = 12
 """Effects of the ranking whose formulas are stored with it."""
 _SUGGESTED_S = 20.0
+_CONFUSED = 0.01
+"""Chance of confusing two effects below which these trials tell them apart: none has to decide."""
 _LOWERS = 0.5
 """Share of the chance of confusion that a suggested trial must leave at most."""
 
@@ -249,7 +251,7 @@ def _with_suggestion(
     weights = contest.weights()
     pair = max(weights, key=lambda pair: weights[pair] * now[pair].confusion)
     confusion = float(np.median([one[pair].confusion for one in then]))
-    if confusion > _LOWERS * now[pair].confusion:
+    if now[pair].confusion < _CONFUSED or confusion > _LOWERS * now[pair].confusion:
         return result
     left = np.median([one[pair].left for one in then], axis=0) / floor
     axis = int(np.argmax(left))
