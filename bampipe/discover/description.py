@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import gamma
 
 from bampipe.discover.settings import Settings
 from bampipe.discover.shape import BINS, Map, Variable, residual_map, variables
@@ -37,7 +38,8 @@ def describe(evidence: Evidence, axis: int) -> str:
         if vibration is not None and vibration.share > max(most.share, _LIMITS.variable_share):
             return (
                 f"a vibration of {vibration.amplitude:.2g} {unit} at {vibration.frequency:.3g} Hz "
-                "in time, whatever the machine does"
+                "in time, whatever the machine does; it carries "
+                f"{100 * vibration.share:.0f} % of the residual's variance"
             )
     if most.share < _LIMITS.variable_share:
         return (
@@ -88,24 +90,39 @@ def _ripple(evidence: Evidence, axis: int, variable: Variable) -> _Sine | None:
 
 
 def _vibration(evidence: Evidence, axis: int) -> _Sine | None:
-    """A sine in time, of any phase in each trial, whose frequency most trials agree on."""
+    """A sine in time, of any phase in each trial; None where chance may give one as strong.
+
+    Of noise, the share at one frequency is a sum of exponential variates, one a trial (Lomb 1976).
+    """
     band = evidence.band
-    longest = max(len(r) for r in evidence.residual) * band.step / band.rate_hz
-    grid = np.arange(2.0 / longest, band.cutoff_hz[axis], 0.25 / longest)
-    found = []
+    trials = []
     for k, motion in enumerate(evidence.motions):
         use = evidence.used[k][:, axis] > 0
         if use.sum() > 2 * BINS:
             t = motion.t[band.thinned_rows(len(motion.t))][use]
-            found.append(_best_sine(t, evidence.residual[k][use, axis], grid))
-    if not found:
+            trials.append((t, evidence.residual[k][use, axis]))
+    if not trials:
         return None
-    frequency = float(np.median([s.frequency for s in found]))
-    same = [s for s in found if abs(s.frequency - frequency) < 2.0 / longest]
-    if len(same) <= len(found) / 2:
-        return None
-    share = float(np.mean([s.share for s in same])) * len(same) / len(found)
-    return _Sine(share, float(np.mean([s.amplitude for s in same])), frequency)
+    longest = max(float(np.ptp(t)) for t, _ in trials)
+    count = sum(len(r) for _, r in trials)
+    left = sum(float(np.sum((r - r.mean()) ** 2)) for _, r in trials)
+    best = _Sine(0.0, 0.0, 0.0)
+    tried = np.arange(2.0 / longest, band.cutoff_hz[axis], 0.25 / longest)
+    for frequency in tried:
+        taken = sum(_sine_squares(t, r, frequency) for t, r in trials)
+        if taken > best.share * left:
+            best = _Sine(taken / left, float(np.sqrt(2.0 * taken / count)), float(frequency))
+    by_chance = gamma.isf(_LIMITS.significance / max(len(tried), 1), len(trials))
+    independent = 0.5 * count * band.independent_share[axis]
+    return best if best.share * independent > by_chance else None
+
+
+def _sine_squares(t: Array, r: Array, frequency: float) -> float:
+    """Sum of squares that the least-squares sine of one frequency takes off a residual."""
+    phase = 2.0 * np.pi * frequency * t
+    columns = np.column_stack([np.sin(phase), np.cos(phase)])
+    product = columns.T @ (r - r.mean())
+    return float(product @ np.linalg.solve(columns.T @ columns + 1e-9 * np.eye(2), product))
 
 
 def _best_sine(v: Array, r: Array, frequencies: Array) -> _Sine:

@@ -1,6 +1,7 @@
 """The diagnosis on short sessions with known truth: named, unknown, and nothing missing."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -160,3 +161,15 @@ def test_the_period_of_an_unknown_effect_is_said(effect, pattern, truth):
     said = re.match(pattern, describe(evidence, 0))
     assert said
     assert float(said[1]) == pytest.approx(truth, rel=0.03)
+
+
+def test_noise_within_the_band_is_no_vibration():
+    session = made(bam(), {}, seconds=2.0)
+    evidence = fit_trials(session, bam(), system_of(bam()).prior)
+    rng, band = np.random.default_rng(3), session.band
+    said = []
+    for _ in range(20):
+        noise = [rng.normal(size=m.q.shape) for m in session.motions]
+        noisy = replace(evidence, residual=band.thin_trials(noise, [0, 1, 2]))
+        said.append(describe(noisy, 0))
+    assert sum("vibration" in sentence for sentence in said) <= 1
