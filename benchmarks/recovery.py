@@ -6,8 +6,9 @@
 Each session hides a drawn set of effects (``--counts``) or a named one (``--hidden``, joined by
 ``+``). It is diagnosed once, or followed by ``extend --auto``, without the truth; one line a
 session, then a table. With ``--given`` the model is given the hidden effects, and what is asked is
-whether their parameters are found and their intervals hold. ``--list`` prints what each machine can
-hide.
+whether their parameters are found and their intervals hold, by each method named. ``--out`` is
+written session by session, and ``--table`` makes the table of such files, of a run that was ended
+early as well. ``--list`` prints what each machine can hide.
 """
 
 from __future__ import annotations
@@ -17,15 +18,16 @@ import json
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from independent import MACHINES, record
 from independent.sensors import GOOD, HARD, Conditions
+from pydantic import TypeAdapter
 
 import bampipe
 from bampipe.data.run_folder import RunFolder
@@ -58,7 +60,21 @@ class Case:
     seed: int
     replicates: int
     auto: bool
-    given: bool
+    given: tuple[str, ...]
+    trials: int | None = None
+    seconds: float | None = None
+
+    @property
+    def conditions(self) -> Conditions:
+        """How the session is recorded."""
+        day = replace(DAYS[self.day], creep=self.creep)
+        if self.trials is not None:
+            day = replace(day, trials=self.trials)
+        if self.seconds is not None:
+            day = replace(day, seconds=self.seconds)
+        if any(effect.startswith("brake") for effect in self.effects):
+            day = replace(day, viscous_trials=3)
+        return day
 
 
 @dataclass(frozen=True)
@@ -68,6 +84,7 @@ class Found:
     Attributes:
         kind: "device", "strength" or "shape"; bound: its Cramer-Rao bound.
         determined: whether its effect counts as identified.
+        method: asked for; published: of the method chosen.
     """
 
     name: str
@@ -77,6 +94,8 @@ class Found:
     sd: float
     bound: float
     determined: bool
+    method: str
+    published: str
 
     @property
     def z(self) -> float:
@@ -94,7 +113,7 @@ class Outcome:
         named: effects found, in order; groups: what each was said to be like.
         verdicts: of the last diagnosis, by axis.
         over_floor: held-out error over noise floor with what was found, by axis.
-        parameters: those that have a truth, where the set is right; method: that found them.
+        parameters: those that have a truth, where the set is right.
         seconds: of the diagnosis, or of the whole loop, or of the identification.
         failure: the message, if a stage refused.
     """
@@ -107,7 +126,6 @@ class Outcome:
     verdicts: tuple[str, ...] = ()
     over_floor: tuple[float, ...] = ()
     parameters: tuple[Found, ...] = ()
-    method: str = ""
     seconds: float = 0.0
     failure: str = ""
 
@@ -139,9 +157,13 @@ class Outcome:
         if self.failure:
             said = f"FAILED {self.failure}"
         elif self.case.given:
-            worst = max(self.parameters, key=lambda found: abs(found.z))
-            ratios = ", ".join(f"{r:.2f}" for r in self.over_floor)
-            said = f"{self.method} | {worst.name} {worst.z:+.1f} sd | {ratios}"
+            worst: dict[str, Found] = {}
+            for found in sorted(self.parameters, key=lambda found: abs(found.z)):
+                worst[found.method] = found
+            said = ", ".join(
+                f"{method} ({w.published}): {w.name} {w.z:+.1f} sd" for method, w in worst.items()
+            )
+            said += "".join(f" | {r:.2f}" for r in self.over_floor)
         else:
             alike = [f"{n} (or {', '.join(g)})" if g else n for n, g in
                      zip(self.named, self.groups, strict=True)]  # fmt: skip
@@ -153,13 +175,10 @@ class Outcome:
 
 def run_case(case: Case) -> Outcome:
     """Record one session and judge it, in a temporary folder."""
-    day = Conditions(**(asdict(DAYS[case.day]) | {"creep": case.creep}))
-    if any(e.startswith("brake") for e in case.effects):
-        day = Conditions(**(asdict(day) | {"viscous_trials": 3}))
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
         strengths = dict.fromkeys(case.effects, case.strength)
-        truth = record(case.machine, root / "session", case.seed, strengths, day)
+        truth = record(case.machine, root / "session", case.seed, strengths, case.conditions)
         try:
             if case.given:
                 return _identify_given(case, root, truth["parameters"])
@@ -184,7 +203,7 @@ def _search(case: Case, root: Path, truth: dict[str, Any]) -> Outcome:
     named = named if case.auto else tuple(diagnosis["selected"])
     parameters: tuple[Found, ...] = ()
     if set(named) == set(case.effects) and case.auto:
-        parameters = _hold_against(RunFolder(run.root), run.model, truth["parameters"])
+        parameters = _hold_against(RunFolder(run.root), run.model, truth["parameters"], "auto")
     return Outcome(
         case,
         tuple(truth["effects"]),
@@ -213,21 +232,37 @@ effects = {json.dumps(case.effects)}
     write_text(run.path(f"models/{RIGHT}/model.toml"), model)
     filter_stage.execute(run, run.root, filter_stage.Config(), silent)
     begun = time.process_time()
-    identify.execute(run, run.root, identify.Config(model=RIGHT), silent)
-    seconds = time.process_time() - begun
-    validate.execute(run, run.root, validate.Config(model=RIGHT, free_run=False), silent)
-    axes = run.read(ValidateResult, RIGHT).axes.values()
+    parameters: list[Found] = []
+    over_floor: tuple[float, ...] = ()
+    for method in case.given:
+        found = [p for p in parameters if p.published == method]
+        if found:  # `auto` has published that method's estimate
+            parameters += [replace(p, method=method) for p in found if p.method == "auto"]
+            continue
+        config = identify.Config(model=RIGHT, method=method)
+        try:
+            identify.execute(run, run.root, config, silent)
+        except bampipe.InputError:
+            if method == "auto":
+                raise
+            continue  # said in place of numbers: nothing to hold against the truth
+        parameters += _hold_against(run, RIGHT, truth, method)
+    if case.given == ("auto",):
+        validate.execute(run, run.root, validate.Config(model=RIGHT, free_run=False), silent)
+        axes = run.read(ValidateResult, RIGHT).axes.values()
+        over_floor = tuple(round(a.published_rmse / (a.noise_floor or np.nan), 3) for a in axes)
     return Outcome(
         case,
         hidden=case.effects,
-        over_floor=tuple(round(a.published_rmse / (a.noise_floor or np.nan), 3) for a in axes),
-        parameters=_hold_against(run, RIGHT, truth),
-        method=run.read(IdentifyResult, RIGHT).method,
-        seconds=seconds,
+        over_floor=over_floor,
+        parameters=tuple(parameters),
+        seconds=time.process_time() - begun,
     )
 
 
-def _hold_against(run: RunFolder, model: str, truth: dict[str, float]) -> tuple[Found, ...]:
+def _hold_against(
+    run: RunFolder, model: str, truth: dict[str, float], method: str
+) -> tuple[Found, ...]:
     """The parameters of a model that have a truth."""
     loaded = load_model(run, model)
     of_device = {item.name for item in loaded.device.parameters}
@@ -246,6 +281,8 @@ def _hold_against(run: RunFolder, model: str, truth: dict[str, float]) -> tuple[
                 for effect, found in result.effects.items()
                 if name.startswith(f"{effect.replace(':', '.')}.")
             ),
+            method,
+            result.method,
         )
         for name, value in truth.items()
         if name in result.parameters
@@ -310,24 +347,43 @@ def write_table(outcomes: Sequence[Outcome]) -> str:
 
 def _coverage(outcomes: Sequence[Outcome]) -> list[str]:
     """How often intervals of right models hold the truth, and how near strengths and shapes are."""
+    found = [(o.case, p) for o in outcomes for p in o.parameters]
+    if not found:
+        return []
     lines = []
-    table = [(o, p) for o in outcomes for p in o.parameters]
-    for method in sorted({o.method for o, _ in table}):
-        for kind in ("device", "strength", "shape"):
-            some = [p for o, p in table if o.method == method and p.kind == kind]
+    groupings: dict[str, Callable[[Case, Found], str]] = {
+        "kind": lambda _, p: p.kind,
+        "day": lambda case, _: case.day,
+        "machine": lambda case, _: case.machine,
+    }
+    for title, group_of in groupings.items():
+        lines += [
+            f"\n| method | {title} | parameters | within 1.96 sd | beyond 3 | beyond 4 | farthest"
+            " | near the truth | not identified |",
+            "|-|-|-|-|-|-|-|-|-|",
+        ]
+        keys = sorted({(p.method, group_of(case, p)) for case, p in found})
+        keys += [(method, "all") for method in sorted({p.method for _, p in found})]
+        for method, group in keys:
+            some = [p for c, p in found if p.method == method and group in ("all", group_of(c, p))]
             z = np.abs([p.z for p in some])
-            if not some:
-                continue
-            near = {"strength": 0.05, "shape": 0.15}.get(kind, 0.05)
-            off = np.array([abs(p.estimate / p.truth - 1.0) for p in some if p.truth != 0.0])
+            near = [
+                abs(p.estimate / p.truth - 1.0) < (0.15 if p.kind == "shape" else 0.05)
+                for p in some
+                if p.truth != 0.0
+            ]
             lines.append(
-                f"\n{method or 'loop'}, {kind}: {np.mean(z < 1.96):.1%} of {len(z)} within 1.96"
-                f" standard deviations of the truth, {int(np.sum(z > 3.0))} beyond 3,"
-                f" {int(np.sum(z > 4.0))} beyond 4, the farthest {z.max():.1f} off;"
-                f" {np.mean(off < near):.1%} within {100 * near:.0f} %;"
-                f" {sum(not p.determined for p in some)} said not to be identified."
+                f"| {method} | {group} | {len(z)} | {np.mean(z < 1.96):.1%} | {np.sum(z > 3.0)}"
+                f" | {np.sum(z > 4.0)} | {z.max():.1f} | {np.mean(near):.1%}"
+                f" | {sum(not p.determined for p in some)} |"
             )
     return lines
+
+
+def _outcomes_of(path: Path) -> list[Outcome]:
+    """The outcomes in a file that ``--out`` wrote."""
+    lines = path.read_text(encoding="utf-8").splitlines()
+    return [TypeAdapter(Outcome).validate_json(line) for line in lines]
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -342,17 +398,26 @@ def main(arguments: Sequence[str]) -> None:
     parser.add_argument("--creep", action="store_true", help="dry friction smoothed, as in bampipe")
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--first-seed", type=int, default=1)
+    parser.add_argument("--trials", type=int, help="trials a session, in place of the usual")
+    parser.add_argument("--seconds", type=float, help="length of each")
     parser.add_argument("--replicates", type=int, default=10)
-    parser.add_argument("--given", action="store_true", help="give the model the hidden effects")
+    parser.add_argument(
+        "--given", nargs="*", metavar="METHOD", help="give the model the hidden effects (auto)"
+    )
     parser.add_argument("--auto", action="store_true", help="follow the diagnosis to its end")
     parser.add_argument("--jobs", type=int, default=1)
-    parser.add_argument("--out", type=Path, help="write the outcomes as JSON")
+    parser.add_argument("--out", type=Path, help="add the outcomes as JSON, a line each")
+    parser.add_argument("--table", type=Path, nargs="+", help="the table of such files alone")
     parser.add_argument("--list", action="store_true", help="print what each machine can hide")
     options = parser.parse_args(arguments)
     if options.list:
         for name, machine in MACHINES.items():
             print(f"{name}: {' '.join(machine.EFFECTS)}\n  outside: {' '.join(machine.UNKNOWN)}")
         return
+    if options.table:
+        print(write_table([outcome for path in options.table for outcome in _outcomes_of(path)]))
+        return
+    given = () if options.given is None else tuple(options.given or ["auto"])
     cases = []
     for machine in options.machine:
         for day in options.conditions:
@@ -363,7 +428,7 @@ def main(arguments: Sequence[str]) -> None:
                 ]
                 cases += [
                     Case(machine, effects, options.strength, day, options.creep, seed,
-                         options.replicates, options.auto, options.given)
+                         options.replicates, options.auto, given, options.trials, options.seconds)
                     for effects in sets
                 ]  # fmt: skip
     outcomes = []
@@ -371,9 +436,10 @@ def main(arguments: Sequence[str]) -> None:
         for outcome in pool.map(run_case, cases):
             outcomes.append(outcome)
             print(outcome.line(), flush=True)
+            if options.out:
+                with options.out.open("a", encoding="utf-8") as log:
+                    log.write(json.dumps(asdict(outcome)) + "\n")
     print(write_table(outcomes))
-    if options.out:
-        options.out.write_text(json.dumps([asdict(o) for o in outcomes], indent=1))
 
 
 if __name__ == "__main__":

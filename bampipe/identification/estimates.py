@@ -62,6 +62,9 @@ class Estimate:
         details: by parameter, further fields of its record.
         report: further fields of the result.
         tabulate: makes the tables of the states and of the parameters along the data.
+        moved_by: from another system of the same parameters to how far its equations move the
+            estimates, (n,), nothing where they make the readings less likely; None for a method
+            that does not say.
     """
 
     method: Method
@@ -74,6 +77,7 @@ class Estimate:
     details: Sequence[dict[str, float]]
     report: dict[str, Any]
     tabulate: Callable[[], tuple[pd.DataFrame, pd.DataFrame]]
+    moved_by: Callable[[System], Array] | None = None
 
     @property
     def evidence(self) -> dict[str, Any]:

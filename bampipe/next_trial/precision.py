@@ -88,7 +88,10 @@ class Precision:
         names = [system.parameters[i].name for i in problem.free if i < len(p)]
         prior = np.array([assumed[i] if i < len(p) else problem.upper[-1] for i in problem.free])
         entries = [identified.parameters[name] for name in names]
-        lasting = [np.hypot(e.systematic_sd or 0.0, e.calibration_sd or 0.0) for e in entries]
+        lasting = [
+            np.linalg.norm([e.systematic_sd or 0, e.smoothing_sd or 0, e.calibration_sd or 0])
+            for e in entries
+        ]
         total = np.sum([of_motion(motion) for motion in motions], axis=0)
         total += np.diag(1.0 / np.maximum(prior, 1e-300) ** 2)
         formal = np.sqrt(np.diag(_covariance(total))[: len(names)])

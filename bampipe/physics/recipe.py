@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from copy import deepcopy
+from dataclasses import dataclass, replace
 from typing import Any
 
 from bampipe.physics.model import Model
@@ -23,6 +24,18 @@ class Recipe:
     device: Mapping[str, Any]
     effects: tuple[str, ...]
     extra: tuple[Mapping[str, Any], ...]
+
+    def with_sign_widths(self, factor: float) -> Recipe:
+        """Return the model whose signs of velocities are smoothed over ``factor`` times the width.
+
+        Axes that a URDF gives, and no declaration, stay as they are.
+        """
+        declaration = deepcopy(dict(self.device))
+        for coordinate in device_from(self.device).coordinates:
+            declared = declaration.get("coordinates", {}).get(coordinate.name)
+            if declared is not None:
+                declared["sign_width"] = factor * coordinate.sign_width
+        return replace(self, device=declaration)
 
     def model(self) -> Model:
         """Build the model."""

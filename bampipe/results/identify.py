@@ -36,6 +36,11 @@ class ParameterEstimate(Record):
         default=None,
         description="Part of sd by which methods that predict alike disagree beyond noise",
     )
+    smoothing_sd: Size | None = Field(
+        default=None,
+        description="Part of sd by which the smoothed sign of a velocity moves the estimate; 0 "
+        "where the machine creeps as the model does, null where the method leaves standstill out",
+    )
     calibration_sd: Size | None = Field(
         default=None,
         description="Part of sd that comes from sensors and constants known so well only; null "

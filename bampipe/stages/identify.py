@@ -38,6 +38,7 @@ from bampipe.identification.method_choice import (
 )
 from bampipe.identification.output_estimate import estimate_by_output_error
 from bampipe.identification.sensor_noise import sensor_noise
+from bampipe.identification.sign_width import describe_smoothing, with_smoothing
 from bampipe.physics import System, compile_model
 from bampipe.progress import Progress
 from bampipe.results.ingest import IngestResult
@@ -160,7 +161,8 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         with suppress(InputError):
             judged.append(judge(squares, folds, by_output_error(_MOST_SAMPLES)))
             chosen = choose(system, judged)
-    estimate = widen(system, judged, chosen, squares)
+    recipe = read_recipe(run, config.model, system.model)
+    estimate = with_smoothing(widen(system, judged, chosen, squares), recipe)
     if estimate.method == "least-squares":
         if config.remove_bias and squares.bias is None:
             notes.append(
@@ -184,7 +186,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     methods = tabulate_methods(system, estimate, judged, lost)
     moved = propagate_calibration(
         system,
-        read_recipe(run, config.model, system.model),
+        recipe,
         run.read(IngestResult),
         read_motions(run, system, fitted=True, braked=system.braked, every_input=True),
         estimate,
@@ -195,6 +197,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     notes = [
         *describe_methods(system, methods),
         *notes,
+        *describe_smoothing(system, estimate),
         *describe_calibration(estimate, moved),
         *summarise_bases(system, bases),
     ]

@@ -57,6 +57,7 @@ HARD = {
     "three short trials": Conditions(trials=3, seconds=6.0),
     "dropped samples": Conditions(dropped=0.02),
     "jitter": Conditions(jitter=0.1),
+    "100 samples a second": Conditions(rate_hz=100.0),
     "held commands": Conditions(hold=True),
 }
 """Conditions of hard days, by name."""
