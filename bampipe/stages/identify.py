@@ -156,8 +156,10 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     estimates.append(estimate_by_least_squares(system, motions, squares, folds))
     judged = [judge(squares, folds, estimate) for estimate in estimates]
     chosen = choose(system, judged) if method == "auto" else 0
-    if method == "auto" and estimates[chosen].method != "ukf":
-        # Where the filter is out of the question, a third opinion is worth its time.
+    moved_by_force = not system.model.device.prescribed
+    if method == "auto" and estimates[chosen].method != "ukf" and moved_by_force:
+        # Where the filter is out of the question, a third opinion is worth its time. On a test
+        # bench there is none: the stroke is given, whatever the force.
         with suppress(InputError):
             judged.append(judge(squares, folds, by_output_error(_MOST_SAMPLES)))
             chosen = choose(system, judged)

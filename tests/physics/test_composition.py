@@ -86,8 +86,12 @@ def forces(system, p, at):
     return (f(*true, z, u, values)[:, 0] for f in (system.applied, system.required))
 
 
-def lagged(x, time_constant):
-    """What follows ``x`` with a first-order lag, linear between samples."""
+def lagged(x, time_constant, shortest):
+    """What follows ``x`` with a first-order lag, linear between samples.
+
+    No lag is shorter than ``shortest``; a longer one is hardly changed by it.
+    """
+    time_constant = 0.5 * (time_constant + np.hypot(time_constant, 2.0 * shortest))
     a = np.exp(-1.0 / RATE / time_constant)
     ramp = 1.0 - (1.0 - a) * time_constant * RATE
     return lfilter([ramp, 1.0 - a - ramp], [1.0, -a], x, zi=[x[0] * (1.0 - ramp)])[0]
@@ -108,7 +112,7 @@ def test_the_coil_of_a_damper_saturates_with_the_current_that_has_come(order):
     }
     at = motion(system, current=current)
     _, needed = forces(system, p, at)
-    coil = lagged(current, 0.042)
+    coil = lagged(current, 0.04, 0.002)
     field = coil / np.sqrt(1.0 + (0.5 * coil) ** 2)
     speed = at[2][:, 0]
     expected = field * (400.0 * speed + 250.0 * np.tanh(speed / 2e-3))
@@ -130,7 +134,7 @@ def test_a_reading_is_corrected_before_it_lags_and_the_gears_carry_what_is_deliv
     }
     at = motion(system, force_motor=asked / 0.9 + 12.0)
     applied, needed = forces(system, p, at)
-    torque = lagged(asked, 0.031)
+    torque = lagged(asked, 0.03, 0.001)
     np.testing.assert_allclose(applied, torque, atol=0.01)
     delivered = torque / (1.0 + 0.002 * np.abs(torque))
     sign = np.tanh(at[2][:, 0] / system.model.device.coordinates[0].sign_width)
