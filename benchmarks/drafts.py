@@ -37,7 +37,7 @@ CASES = (
     "bam:detent:yaw", "bam:detent:extension", "bam:rough_patch:pitch", "bam:winding_cable:yaw",
     "bam:hum:yaw", "bam:slack_spring:yaw", "bam:slack_spring:pitch", "bam:speed_band:yaw",
     "bam:speed_band:extension", "bam:tightening:pitch", "bam:imbalance:yaw",
-    "bam:sensor_hysteresis:x", "bam:sensor_hysteresis:z", "joint:detent:joint",
+    "bam:hose:yaw", "bam:sensor_hysteresis:x", "bam:sensor_hysteresis:z", "joint:detent:joint",
     "joint:winding_cable:joint", "joint:slack_spring:joint", "joint:speed_band:joint",
     "axis:rough_patch:carriage", "axis:detent:carriage",
 )  # fmt: skip
@@ -195,6 +195,9 @@ def curve_error(run: RunFolder, model: str, axis: str, effect: str, truth: dict[
         u = motion.inputs(system.inputs)
         if name in FORCES:
             force = FORCES[name](law, motion.q[:, number], rate, np.tanh(rate / width), step)
+        elif name == "hose":
+            reach = motion.q[:, 2] - law["hose_root"]
+            force = -law["hose"] * reach * (motion.q[:, 0] - law["hose_rest"])
         else:
             component = tuple(AXIS_OF_FORCE).index(effect.partition(":")[2])
             error = reading_error(law, motion.channels[bare.model.device.forces[component]])

@@ -42,7 +42,7 @@ LAWS = {
     ),
     "estimate": law("numpy scipy numba llvmlite filterpy", "compiled errors model_functions"),
     "discover": law(
-        "numpy scipy sklearn joblib threadpoolctl numba",
+        "numpy scipy sklearn joblib threadpoolctl numba pyoperon",
         "errors lists physics estimate results trials workers",
     ),
     "results": law("pydantic", "errors files schema"),

@@ -32,6 +32,9 @@ class DraftCurve(Record):
     mean: tuple[float, ...]
     low: tuple[float, ...] = Field(description="95 % band by the constants' covariance")
     high: tuple[float, ...]
+    beside: dict[str, float] = Field(
+        description="What else the formula follows, with the value at which the curve is drawn"
+    )
 
 
 class DraftedEffect(Record):
@@ -95,7 +98,8 @@ class AxisDraft(Record):
     noise_floor: Size = Field(description="Median error of the replays that give the chance level")
     unit: str
     bound: CurveBound | None = Field(
-        description="A curve of what the first formula follows; null where nothing was drafted"
+        description="A curve of what the first formula follows; null where nothing was drafted, and"
+        " where it follows several quantities"
     )
     nearest: tuple[NearestEffect, ...]
     sentence: str

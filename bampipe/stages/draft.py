@@ -14,6 +14,7 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 
 from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
 from bampipe.declarations.model_file import IDENTIFIED_MODEL, identified, load_model, read_recipe
+from bampipe.discover.drafts import symbolic
 from bampipe.discover.drafts.effect_file import declare, write_toml
 from bampipe.discover.drafts.search import FoundDraft, Term, draft
 from bampipe.discover.settings import Settings
@@ -44,6 +45,10 @@ OUTPUTS = ("models/{model}/draft.json", "models/{model}/drafts/*.toml")
 
 _NEAREST = 3
 """Effects of the library that are held against a draft."""
+_MORE_FORMULAS = (
+    f" Formulas in several quantities were not searched: pip install 'bampipe[{symbolic.EXTRA}]'"
+    " brings pyoperon."
+)
 
 
 @checked_dataclass(frozen=True, config=STRICT)
@@ -183,6 +188,7 @@ def _effect(term: Term, file: str, system: System) -> DraftedEffect:
             mean=tuple(mean),
             low=tuple(mean - 1.96 * sd),
             high=tuple(mean + 1.96 * sd),
+            beside={quantity.words: span.high for quantity, span in form.beside},
         ),
     )
 
@@ -248,7 +254,8 @@ def _axis(
         unit=unit,
         bound=found.bound,
         nearest=_nearest(axis, found, diagnosis, unit) if names else (),
-        sentence=_sentence(found, [effects[name] for name in names], diagnosis.axes[axis], axis),
+        sentence=_sentence(found, [effects[name] for name in names], diagnosis.axes[axis], axis)
+        + (_MORE_FORMULAS if found.wants_formulas else ""),
     )
 
 

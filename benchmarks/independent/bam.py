@@ -61,6 +61,7 @@ MACHINE = np.dtype(
             "tilt_x", "tilt_z", "compensator_gain", "compensator_lag", "compensator_speed",
             "brake_lag", "field", "hand_frequency", "hand_lag", "gap", "contact", "loose_axis",
             "remanence", "remanence_decay", "hum_torque", "hum_frequency",
+            "hose", "hose_rest", "hose_root",
         )
     ]
 )  # fmt: skip
@@ -96,7 +97,7 @@ LAWS = {
 
 OUTSIDE = (
     "detent", "rough_patch", "winding_cable", "hum", "slack_spring", "speed_band", "tightening",
-    "imbalance", "sensor_hysteresis",
+    "imbalance", "sensor_hysteresis", "hose",
 )  # fmt: skip
 EFFECTS = (
     *(f"{name}:{axis}" for name in LAWS if name not in OUTSIDE for axis in AXES),
@@ -112,7 +113,7 @@ UNKNOWN = (
     "detent:yaw", "detent:pitch", "detent:extension", "rough_patch:yaw", "rough_patch:pitch",
     "rough_patch:extension", "winding_cable:yaw", "winding_cable:extension", "hum:yaw",
     "slack_spring:yaw", "speed_band:extension", "tightening:pitch", "imbalance:yaw",
-    "sensor_hysteresis:x",
+    "sensor_hysteresis:x", "hose:yaw",
 )  # fmt: skip
 
 
@@ -227,6 +228,8 @@ def _move(m, laws, wanted, wanted_rate, log_at, braked):
         carriage += h * min(max(speed, -m.compensator_speed), m.compensator_speed)
         load[1] += m.compensator_gain * DESIGN_MASS * GRAVITY * carriage * np.cos(half[1])
         load[0] += m.hum_torque * np.sin(2.0 * np.pi * m.hum_frequency * k * h)
+        # A hose along the rod pulls the turret back, the more the farther the rod is out.
+        load[0] -= m.hose * (half[2] - m.hose_root) * (half[0] - m.hose_rest)
         contact = 0.0
         for i in range(3):
             if i != loose:
@@ -361,6 +364,11 @@ class _Specimen:
             self.bias[component] = self.truth[f"{name}.{at}.bias"] = size * sign
         elif name == "force_drift":
             self.drift[component] = self.truth[f"{name}.{at}.rate"] = 0.12 * size * sign
+        elif name == "hose":
+            law = {"hose": 6.0 * size, "hose_rest": 0.1, "hose_root": 0.8 * rng.uniform(0.95, 1.05)}
+            for key, value in law.items():
+                m[key] = value
+            self.hidden_laws[full] = law
         elif name == "sensor_hysteresis":
             self.hysteresis[component] = 0.8 * size
             self.hysteresis_width[component] = 4.0 * rng.uniform(0.85, 1.15)

@@ -440,6 +440,7 @@ def test_a_draft_is_shown_with_its_curve_its_length_and_its_chance(
         "mean": [0.0, -1.5, 0.0],
         "low": [-0.1, -1.6, -0.1],
         "high": [0.1, -1.4, 0.1],
+        "beside": {"extension position": 1.3},
     }
     axis = {
         "verdict": "drafted",
@@ -475,6 +476,7 @@ def test_a_draft_is_shown_with_its_curve_its_length_and_its_chance(
     words = text_of(report.html)
     assert "Yaw: a force on the axis that has a bump at one position." in words
     assert "height*exp(-((q - place)/width)**2)" in words
+    assert "is drawn, at extension position 1.3." in words
     assert row_of(report.html, "the draft")[1] == "0.0200"
     assert row_of(report.html, "upper_stop:yaw")[1] == "0.480"
     drawn = report.figures["draft-base-yaw"]

@@ -15,8 +15,10 @@ _PLACE_IN_WIDTHS = 2.0
 _PLACE_IN_SPANS = 0.1
 _LENGTH_RATIO = 3.0
 _WAVES = 0.5
+_LEAST_REACH = 0.1
 """How far around what was found a later fit looks for a place (in widths of the shape, or in spans
-where it has none), a length (as a ratio) and a wavenumber (in waves on the range)."""
+where it has none), a length (as a ratio), a wavenumber (in waves on the range) and a number (at
+least)."""
 
 
 def declare(term: Term, source: str) -> dict[str, Any]:
@@ -49,6 +51,9 @@ def _numbers(term: Term, name: str, entry: Mapping[str, Any]) -> dict[str, float
         low, high = value - reach, value + reach
     elif kind in ("length", "time"):
         low, high = value / _LENGTH_RATIO, value * _LENGTH_RATIO
+    elif kind == "number":
+        reach = max(abs(value), _LEAST_REACH)
+        low, high = value - reach, value + reach
     else:
         reach = 2.0 * np.pi * _WAVES / span.width
         low, high = max(value - reach, 0.5 * value), value + reach

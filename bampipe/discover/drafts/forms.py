@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from bampipe.estimate.play import drag_along
+from bampipe.lists import join_names
 from bampipe.physics.device import Coordinate as Axis
 from bampipe.physics.device import Device
 
@@ -369,6 +370,7 @@ class Form:
         factor, shape, coordinate: its words.
         span: of the coordinate in the trials; times: time between samples and of a trial, s.
         scale: of the factor: the highest speed or acceleration of the axis; 1 for others.
+        beside: other quantities that it follows, ``x2``, ``x3`` in its shape, and their spans.
     """
 
     axis: Axis
@@ -379,6 +381,12 @@ class Form:
     span: Span
     times: Span
     scale: float
+    beside: tuple[tuple[Quantity, Span], ...] = ()
+
+    @property
+    def quantities(self) -> tuple[tuple[Quantity, Span], ...]:
+        """Everything that it follows, with the spans."""
+        return ((self.coordinate, self.span), *self.beside)
 
     @property
     def name(self) -> str:
@@ -387,12 +395,14 @@ class Form:
             return f"{self.shape.name}_of_reading"
         head = "" if self.factor == FORCE else f"{self.factor}_"
         tail = "" if self.is_own else f"_on_{self.axis.name}"
-        return f"{head}{self.shape.name}_by_{self.coordinate.name}{tail}"
+        by = "" if self.beside else f"_by_{self.coordinate.name}"
+        return f"{head}{self.shape.name}{by}{tail}"
 
     @property
     def is_own(self) -> bool:
         """Whether it speaks of its own axis only, so that its file fits any axis."""
-        return self.coordinate.axis == self.number and self.factor != READING
+        own = all(quantity.axis == self.number for quantity, _ in self.quantities)
+        return own and self.factor != READING
 
     @property
     def target(self) -> str:
@@ -429,32 +439,46 @@ class Form:
         return FACTORS[self.factor].format(shape=shape, rate=rate)
 
     def _of_coordinate(self, text: str) -> str:
-        return re.sub(r"\bx\b", self.coordinate.text, text)
+        def written(found: re.Match[str]) -> str:
+            quantity, _ = self.quantities[_number_of(found[0])]
+            if not self.is_own and quantity.axis == self.number:
+                # A file that names its axes has no axis of its own.
+                known = _OF_AXIS.get(quantity.text, quantity.channel or quantity.text)
+                return known.format(axis=self.axis.name)
+            return quantity.text
+
+        return re.sub(r"\bx\d*\b", written, text)
+
+    @property
+    def _words(self) -> str:
+        words = join_names([quantity.words for quantity, _ in self.quantities])
+        return self.shape.words.format(x=words)
 
     @property
     def summary(self) -> str:
         """What it is, in one sentence."""
-        words = self.shape.words.format(x=self.coordinate.words)
-        return f"{_ACTS[self.factor]} that {words}"
+        return f"{_ACTS[self.factor]} that {self._words}"
 
     @property
     def looks_like(self) -> str:
         """How it shows in a residual."""
-        words = self.shape.words.format(x=self.coordinate.words)
-        return f"residual that {words}, {_SEES[self.factor]}"
+        seen = "" if self.beside else f", {_SEES[self.factor]}"
+        return f"residual that {self._words}{seen}"
 
     def fixed(self) -> dict[str, tuple[float, str]]:
         """Constants that are not estimated, with their units."""
-        unit = self.coordinate.unit
-        known = {
-            "middle": self.span.middle,
-            "reach": 0.5 * self.span.width,
-            "start": self.span.low,
-            "spacing": self.span.width / (KNOTS - 1),
-            "settling": 0.5 * self.times.low,
-        }
-        units = {"settling": "s"}
-        found = {n: (rounded(known[n]), units.get(n, unit)) for n in self.shape.fixed}
+        found = {}
+        for name in self.shape.fixed:
+            quantity, span = self.quantities[_number_of(name)]
+            known = {
+                "middle": (span.middle, quantity.unit),
+                "reach": (0.5 * span.width, quantity.unit),
+                "start": (span.low, quantity.unit),
+                "spacing": (span.width / (KNOTS - 1), quantity.unit),
+                "settling": (0.5 * self.times.low, "s"),
+            }
+            value, unit = known[name.rstrip("0123456789")]
+            found[name] = (rounded(value), unit)
         if self.factor == DAMPING:
             found["top_speed"] = (rounded(self.scale), f"{self.axis.unit}/s")
         if self.factor == INERTIA:
@@ -469,6 +493,7 @@ class Form:
             "length": (0.003 * width, 2.0 * width, unit),
             "wavenumber": (0.4 * np.pi / width, 1e4 * np.pi / width, f"1/{unit}"),
             "time": (2.0 * self.times.low, 2.0 * self.times.high, "s"),
+            "number": (-_LARGEST, _LARGEST, ""),
         }
         return {name: by_kind[kind] for name, kind in self.shape.searched.items()}
 
@@ -545,10 +570,27 @@ class Form:
         return {"states": states} if states else {}
 
 
+_OF_AXIS = {
+    "q": "{axis}",
+    "qd": "qd_{axis}",
+    "sgn(qd)": "sgn(qd_{axis})",
+    "load": "load_{axis}",
+}
+_LARGEST = 50.0
+"""Pure number in a formula: its quantities are ratios."""
+
+
+def _number_of(name: str) -> int:
+    """Which quantity of a form a name such as ``x``, ``x2``, ``middle2`` is of, from 0."""
+    digits = name[len(name.rstrip("0123456789")) :]
+    return int(digits) - 1 if digits else 0
+
+
 KINDS_IN_WORDS = {
     "place": "where it is",
     "length": "how far it reaches",
     "time": "time in which it follows",
+    "number": "number of the formula",
     "wavenumber": "2 pi over the distance between two ripples",
 }
 

@@ -55,6 +55,9 @@ _REFINED = 12
 _TRIES = 90
 """Evaluations in refining one."""
 _NEGLIGIBLE = 1e-9
+_KNOWN = 2.0
+"""Times the residual that the force must be beyond what the model's own parameters can do: it is
+once where these scale with it, and more than three times on an arm of known inertia."""
 _RANGE = (0.002, 0.998)
 """Quantiles of a coordinate between which it is said to vary."""
 _LEFT, _MARGIN = (0.005, 0.995), 0.03
@@ -109,13 +112,25 @@ class Screen:
     @cached_property
     def _basis(self) -> Array:
         """Orthonormal columns that span what the model's own parameters can do, (n, r)."""
-        left, size, _ = np.linalg.svd(self._slopes, full_matrices=False)
-        return np.asarray(left[:, size > 1e-6 * size.max(initial=0.0)])
+        return _orthonormal(self._slopes)
 
     @cached_property
-    def _left(self) -> Array:
+    def left(self) -> Array:
         """What they leave of the residual, (n,)."""
-        return np.asarray(self._residual - self._basis @ (self._basis.T @ self._residual))
+        return np.asarray(self._residual - self.taken(self._residual))
+
+    def taken(self, values: Array) -> Array:
+        """What the model's own parameters can do of ``values`` where the residual is, (n,)."""
+        return np.asarray(self._basis @ (self._basis.T @ values))
+
+    def thinned(self, name: str) -> Array:
+        """A signal, low-passed as the residual is, (n,)."""
+        cutoff = self.evidence.band.cutoff_hz[self.axis]
+        found = [
+            low_pass_at(self.signals[name][i], cutoff, self._rate_hz, kept)[rows, 0]
+            for i, ((_, kept), rows) in enumerate(zip(self._sampling, self._rows, strict=True))
+        ]
+        return np.concatenate(found)
 
     @cached_property
     def _sampling(self) -> list[tuple[slice, NDArray[np.int64]]]:
@@ -192,7 +207,7 @@ class Screen:
             ]
         )
         order = np.argsort(at, kind="stable")
-        mass = np.cumsum(self._left[order] ** 2)
+        mass = np.cumsum(self.left[order] ** 2)
         share = np.searchsorted(mass / max(float(mass[-1]), 1e-300), _LEFT)
         margin = _MARGIN * (high - low)
         ends = at[order][np.minimum(share, len(at) - 1)] + np.array([-margin, margin])
@@ -210,12 +225,49 @@ class Screen:
     def forms(self) -> list[Form]:
         """Every form that these trials can hold the residual against."""
         device = self.evidence.system.model.device
-        found = forms(device, self.axis, self.spans, self._times, self.scales, self._curves)
-        # Not the readings of forces that have no lever on the axis.
-        return [f for f in found if any(np.any(lever) for lever in self.signals[f.lever])]
+        found = forms(device, self.axis, self.spans, self.times, self.scales, self._curves)
+        return [f for f in found if f.factor != READING or f.target in self._scaled_readings]
 
     @cached_property
-    def _times(self) -> Span:
+    def _scaled_readings(self) -> set[str]:
+        """Force components that act on the axis and whose scale the model knows.
+
+        Where all parameters may shrink with the force, an error that cancels most of the force
+        would seem to explain anything.
+        """
+        evidence, device = self.evidence, self.evidence.system.model.device
+        by_component: dict[str, list[Array]] = {name: [] for name in device.components}
+        left, slopes = [], []
+        for k in self.trials:
+            motion, used = evidence.motions[k], evidence.used[k]
+            u = motion.inputs(evidence.system.inputs)
+            pulls = evidence.system.input_map(motion.q, u, evidence.p)
+            read = motion.inputs(device.forces)
+            for c, name in enumerate(device.components):
+                acting = evidence.band.thin(pulls[:, :, c] * read[:, c, None])
+                by_component[name].append((acting / self._errors)[used])
+            left.append((evidence.residual[k] / self._errors)[used])
+            slopes.append((evidence.jacobian[k] / self._errors[:, None])[used])
+        slope = np.concatenate(slopes)
+        size = np.linalg.norm(slope, axis=0)
+        basis = _orthonormal(slope[:, size > 0.0] / size[size > 0.0])
+        error = float(np.linalg.norm(np.concatenate(left)))
+        found = set()
+        for name, parts in by_component.items():
+            acting = np.concatenate(parts)
+            beyond = float(np.linalg.norm(acting - basis @ (basis.T @ acting)))
+            if beyond > _KNOWN * error and any(map(np.any, self.signals[f"{READING} {name}"])):
+                found.add(name)
+        return found
+
+    @cached_property
+    def _errors(self) -> Array:
+        """Root mean square of the residual, by axis, (n_q,)."""
+        return np.maximum(self.evidence.rmse(), 1e-12)
+
+    @cached_property
+    def times(self) -> Span:
+        """Time between samples and of a trial, s."""
         trials = [self.evidence.motions[k].t for k in self.trials]
         return Span(float(np.median(np.diff(trials[0]))), max(float(np.ptp(t)) for t in trials))
 
@@ -234,7 +286,7 @@ class Screen:
         cutoff = self.evidence.band.cutoff_hz[self.axis]
         by_trial = []
         for i, (_, kept) in enumerate(self._sampling):
-            x = self.signals[form.coordinate.words][i]
+            x = np.hstack([self.signals[q.words][i] for q, _ in form.quantities])
             factor = self.signals[form.lever][i] / form.scale
             values = np.stack(np.broadcast_arrays(*shape(x)))
             acting = values * factor
@@ -260,7 +312,7 @@ class Screen:
         # What the model's own parameters can do as well is no explanation.
         scale = np.sqrt(np.maximum(size, 1e-30))
         normal = normal / scale[:, :, None] / scale[:, None, :] + _NEGLIGIBLE * np.eye(m)
-        moment = -np.stack([self._left @ column for column in columns], axis=1) / scale
+        moment = -np.stack([self.left @ column for column in columns], axis=1) / scale
         strengths = np.linalg.solve(normal, moment[:, :, None])[:, :, 0]
         return np.sum(strengths * moment, axis=1), strengths / scale
 
@@ -285,7 +337,7 @@ class Screen:
         elif names == ("width", "longer"):
             points = np.array(list(combinations(lengths, 2))).T
         elif names == ("lag",):
-            points = np.geomspace(4.0 * self._times.low, self._times.high, _LAGS)[None]
+            points = np.geomspace(4.0 * self.times.low, self.times.high, _LAGS)[None]
         elif names == ("wavenumber",):
             most = _MOST_WAVES
             if form.coordinate.quantity == "time":
@@ -307,10 +359,11 @@ class Screen:
             at = {name: float(values[best]) for name, values in grid.items()}
             found.append((float(explained[best]), form, at))
         found.sort(key=lambda entry: -entry[0])
-        screened = [self._refined(form, at) for _, form, at in found[:_REFINED]]
+        screened = [self.refined(form, at) for _, form, at in found[:_REFINED]]
         return sorted(screened, key=lambda s: -s.gain)
 
-    def _refined(self, form: Form, at: dict[str, float]) -> Screened:
+    def refined(self, form: Form, at: dict[str, float]) -> Screened:
+        """A form with its searched constants at their best, near ``at``."""
         limits = form.limits()
         names = list(at)
         low = np.array([limits[n][0] for n in names])
@@ -331,10 +384,16 @@ class Screen:
                 sizes.append(size / width if kind == "wavenumber" else size * width)
                 if kind in ("length", "time"):
                     sizes[-1] = 0.25 * at[name]
+                if kind == "number":
+                    sizes[-1] = 0.1 * max(abs(at[name]), 0.3)
             simplex = np.vstack([start, start + np.diag(sizes)])
             options = {"maxfev": _TRIES, "initial_simplex": simplex, "xatol": 1e-6, "fatol": 0.0}
             best = minimize(lost, start, method="Nelder-Mead", options=options).x
             at = dict(zip(names, map(float, np.clip(best, low, high)), strict=True))
+        return self.at(form, at)
+
+    def at(self, form: Form, at: dict[str, float]) -> Screened:
+        """A form with its searched constants ``at`` given values."""
         searched = {n: np.array([v]) for n, v in at.items()}
         columns = self.columns(form, searched)
         strengths = self._explained(columns)[1][0]
@@ -382,12 +441,13 @@ class Screen:
         return max(total, 1e-300)
 
 
+def _orthonormal(columns: Array) -> Array:
+    """Orthonormal columns that span those given, (n, r)."""
+    left, size, _ = np.linalg.svd(columns, full_matrices=False)
+    return np.asarray(left[:, size > 1e-6 * size.max(initial=0.0)])
+
+
 def _places(span: Span, length: float) -> Array:
     """Places along a span, near enough that none of that length is missed."""
     count = max(4, int(np.ceil(span.width / (_NEAREST * length))))
     return np.asarray(span.low + span.width * (np.arange(count) + 0.5) / count)
-
-
-def screen(evidence: Evidence, axis: int, curves: bool = False) -> Sequence[Screened]:
-    """Forms that may explain the residual of ``axis``, best first; or curves in their place."""
-    return Screen(evidence, axis, curves).search()

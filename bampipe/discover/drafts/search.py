@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,8 +13,9 @@ from scipy.stats import t as student
 
 from bampipe.discover.bench import Bench
 from bampipe.discover.chance import Progress, fit_trials, open_trials, system_of, workers
+from bampipe.discover.drafts import symbolic
 from bampipe.discover.drafts.forms import Form
-from bampipe.discover.drafts.screen import Screen, Screened, screen
+from bampipe.discover.drafts.screen import Screen, Screened
 from bampipe.discover.scorer import Score, Scorer
 from bampipe.discover.settings import Settings
 from bampipe.discover.start import with_effect
@@ -68,10 +69,12 @@ class Term:
     def curve(self, count: int = 121) -> tuple[Array, Array, Array]:
         """Coordinate, torque and its standard deviation along the range travelled, (count,) each.
 
-        At full speed or acceleration where the term is in proportion to these, and in the positive
-        direction of motion where it is friction.
+        At full speed or acceleration where the term is in proportion to these, in the positive
+        direction of motion where it is friction, and at the upper end of what else it follows.
         """
-        x = np.linspace(self.form.span.low, self.form.span.high, count)
+        x = np.linspace(self.form.span.low, self.form.span.high, count)[:, None]
+        others = [np.full((count, 1), span.high) for _, span in self.form.beside]
+        x = np.hstack([x, *others])
         values = np.array(list(self.values.values()))
         middle = self._at(x, values)
         slopes = []
@@ -81,13 +84,13 @@ class Term:
             slopes.append((self._at(x, moved) - middle) / step)
         slope = np.array(slopes)
         variance = np.einsum("kt,kl,lt->t", slope, self.covariance, slope)
-        return x, middle, np.sqrt(np.maximum(variance, 0.0))
+        return x[:, 0], middle, np.sqrt(np.maximum(variance, 0.0))
 
     def _at(self, x: Array, values: Array) -> Array:
         shape = self.form.shape
         known = dict(zip(self.values, values, strict=True))
         constants: dict[str, Any] = {n: v for n, (v, _) in self.form.fixed().items()} | known
-        columns = (shape.drawn or shape.columns)(x[:, None], constants)
+        columns = (shape.drawn or shape.columns)(x, constants)
         found = sum(known[n] * c for n, c in zip(shape.strengths, columns, strict=True))
         return np.asarray(found)[:, 0]
 
@@ -118,7 +121,9 @@ class FoundDraft:
         noise_floor: median error of the replays that gave the last of these, N.m or N.
         options: error against number of constants, shortest first; the model as given first.
         before, after: held-out error without and with the terms, N.m or N.
-        bound: what no formula in the first term's coordinate could do better; None without terms.
+        bound: what no formula in the first term's coordinate could do better; None without terms,
+            and where it follows several quantities.
+        wants_formulas: whether the structured forms left much, and pyoperon is not installed.
         recipe: the model with them; evidence: its fit.
     """
 
@@ -130,8 +135,20 @@ class FoundDraft:
     before: float
     after: float
     bound: CurveBound | None
+    wants_formulas: bool
     recipe: Recipe
     evidence: Evidence
+
+
+Search = Literal["structured", "curves", "symbolic"]
+
+
+def look(evidence: Evidence, axis: int, search: Search) -> Sequence[Screened]:
+    """Forms that may explain the residual of ``axis``, best first; symbolic ones as well."""
+    found = Screen(evidence, axis, search == "curves").search()
+    if search == "symbolic":
+        found += symbolic.search(Screen(evidence, axis))
+    return sorted(found, key=lambda one: -one.gain)
 
 
 @dataclass(frozen=True)
@@ -141,7 +158,7 @@ class ReplayTask:
     recipe: Recipe
     p: Array
     axis: int
-    curves: bool
+    search: Search
     seed: tuple[int, ...]
 
 
@@ -154,7 +171,7 @@ def run_replay(task: ReplayTask) -> tuple[float, float]:
     evidence = gather_evidence(
         system, replays, trials.band, task.p, trials.folds, most_iterations=_STEPS_OF_A_REPLAY
     )
-    found = screen(evidence, task.axis, task.curves)
+    found = look(evidence, task.axis, task.search)
     error = float(Scorer(evidence).base_error[task.axis])
     return (found[0].gain if found else 0.0), error
 
@@ -217,12 +234,31 @@ def draft(
     return found
 
 
+@dataclass(frozen=True)
+class _Stand:
+    """How far a search has come.
+
+    Attributes:
+        recipe: the model; evidence: its fit; option: the same as listed.
+        options: everything that was fitted, the model as given first.
+        chances: of each term that was looked for; floor: of the last replays, N.m or N.
+    """
+
+    recipe: Recipe
+    evidence: Evidence
+    option: Option
+    options: tuple[Option, ...]
+    chances: tuple[ChanceOfDraft, ...]
+    floor: float
+
+
 class AxisSearch:
     """The search for a formula on one axis."""
 
     def __init__(self, bench: Bench, axis: int, source: str, curves: bool) -> None:
         self._bench, self._axis = bench, axis
-        self._source, self._curves = source, curves
+        self._source = source
+        self._search: Search = "curves" if curves else "structured"
 
     @cached_property
     def _settings(self) -> Settings:
@@ -230,44 +266,78 @@ class AxisSearch:
 
     def run(self, recipe: Recipe, start: Array, progress: Progress) -> FoundDraft:
         """Add terms to a model as long as one beats chance and is worth its constants."""
-        axis, s = self._axis, self._settings
-        evidence = self._bench.fit(recipe, start)
-        bare, before = evidence, evidence.held_out_rmse
-        options = [Option((), 0, before)]
-        current, chances = options[0], []
-        for number in range(MOST_TERMS):
-            progress(0.05 + 0.4 * number, "holding every form against the residual")
-            screened = screen(evidence, axis, self._curves)
-            progress(0.15 + 0.4 * number, "searching replays for as good a formula")
-            chance, floor = self._chance(recipe, evidence, screened)
-            chances.append(chance)
-            if chance.p_value > s.draft_significance:
-                break
-            progress(0.3 + 0.4 * number, "fitting the best forms with the model")
-            wider = self._fitted(recipe, evidence, current, screened, _FITTED[number])
-            options += [option for option, _, _ in wider]
-            chosen = min(wider, key=lambda entry: self._cost(entry[0]))
-            if self._cost(chosen[0]) >= self._cost(current):
-                break
-            current, recipe, p = chosen
-            evidence = self._bench.fit(recipe, p)
-            if Scorer(evidence).base_error[axis] < s.surely * floor:
-                break  # what is left is for a diagnosis of the model with the draft
-        terms = self._terms(evidence, current)
+        axis = self._axis
+        bare = self._bench.fit(recipe, start)
+        nothing = Option((), 0, bare.held_out_rmse)
+        found = self._add_terms(_Stand(recipe, bare, nothing, (nothing,), (), 0.0), progress)
+        wanting = self._search == "structured" and self._leaves_much(found)
+        if wanting and symbolic.is_available():
+            progress(0.85, "symbolic regression")
+            found = self._breed(recipe, bare, found)
+        terms = self._terms(found.evidence, found.option)
+        before = float(bare.held_out_rmse[axis])
         bound = None
-        if terms:
+        if terms and not terms[0].form.beside:
             form = terms[0].form
             points, share = Screen(bare, axis).curve_bound(form)
             bound = CurveBound(
                 variable=form.coordinate.words,
                 acts_as=form.factor,
                 points=points,
-                held_out_rmse=share * before[axis],
+                held_out_rmse=share * before,
             )
         return FoundDraft(
-            axis, terms, tuple(chances), floor, self._listed(options, current), float(before[axis]),
-            float(current.held_out_rmse[axis]), bound, recipe, evidence,
+            axis, terms, found.chances, found.floor, self._listed(found.options, found.option),
+            before, float(found.option.held_out_rmse[axis]), bound,
+            wanting and not symbolic.is_available(), found.recipe, found.evidence,
         )  # fmt: skip
+
+    def _add_terms(self, stand: _Stand, progress: Progress) -> _Stand:
+        """Structured forms, or curves, one after the other."""
+        for number in range(MOST_TERMS):
+            progress(0.05 + 0.4 * number, "holding every form against the residual")
+            screened = look(stand.evidence, self._axis, self._search)
+            progress(0.15 + 0.4 * number, "searching replays for as good a formula")
+            chance, floor = self._chance(stand.recipe, stand.evidence, screened, self._search)
+            stand = replace(stand, chances=(*stand.chances, chance), floor=floor)
+            if chance.p_value > self._settings.draft_significance:
+                break
+            progress(0.3 + 0.4 * number, "fitting the best forms with the model")
+            wider = self._fitted(
+                stand.recipe, stand.evidence, stand.option, screened, _FITTED[number]
+            )
+            longer = self._cheaper(stand, wider)
+            if longer.option is stand.option:
+                return longer
+            stand = longer
+            if not self._leaves_much(stand):
+                break  # what is left is for a diagnosis of the model with the draft
+        return stand
+
+    def _breed(self, recipe: Recipe, bare: Evidence, structured: _Stand) -> _Stand:
+        """A formula by symbolic regression in place of the structured ones, where it is better."""
+        bred = symbolic.search(Screen(bare, self._axis))
+        if not bred:
+            return structured
+        chance, _ = self._chance(recipe, bare, bred, "symbolic")
+        if chance.p_value > self._settings.draft_significance:
+            return structured
+        wider = self._fitted(recipe, bare, structured.options[0], bred, _FITTED[1])
+        found = self._cheaper(structured, wider)
+        return found if found.option is structured.option else replace(found, chances=(chance,))
+
+    def _cheaper(self, stand: _Stand, wider: Sequence[tuple[Option, Recipe, Array]]) -> _Stand:
+        """The best of some fitted models where it costs less, and all of them as options."""
+        options = (*stand.options, *(option for option, _, _ in wider))
+        option, recipe, p = min(wider, key=lambda entry: self._cost(entry[0]))
+        if self._cost(option) >= self._cost(stand.option):
+            return replace(stand, options=options)
+        evidence = self._bench.fit(recipe, p)
+        return replace(stand, recipe=recipe, evidence=evidence, option=option, options=options)
+
+    def _leaves_much(self, stand: _Stand) -> bool:
+        error = float(Scorer(stand.evidence).base_error[self._axis])
+        return error >= self._settings.surely * stand.floor
 
     def _cost(self, option: Option) -> float:
         """Log of the held-out error plus what its constants must be worth."""
@@ -275,7 +345,11 @@ class AxisSearch:
         return float(np.log(error)) + self._settings.draft_worth * option.constants
 
     def _chance(
-        self, recipe: Recipe, evidence: Evidence, screened: Sequence[Screened]
+        self,
+        recipe: Recipe,
+        evidence: Evidence,
+        screened: Sequence[Screened],
+        search: Search,
     ) -> tuple[ChanceOfDraft, float]:
         """Hold the best form's gain against what the same search finds on replays.
 
@@ -284,23 +358,23 @@ class AxisSearch:
         """
         s = self._settings
         gain = screened[0].gain if screened else 0.0
-        found = self._replays(recipe, evidence, 0, s.draft_replicates)
+        found = self._replays(recipe, evidence, search, 0, s.draft_replicates)
         p_value = self._p_value(gain, evidence, [g for g, _ in found])
         low, high = s.draft_significance / s.draft_close, s.draft_significance * s.draft_close
         if low < p_value < high:  # on either side, or it would be another chance of a false alarm
             more = 2 * s.draft_replicates
-            found += self._replays(recipe, evidence, s.draft_replicates, more)
+            found += self._replays(recipe, evidence, search, s.draft_replicates, more)
             p_value = self._p_value(gain, evidence, [g for g, _ in found])
         floor = float(np.median([error for _, error in found]))
         gains = tuple(g for g, _ in found)
         return ChanceOfDraft(gain=gain, gains=gains, p_value=p_value), floor
 
     def _replays(
-        self, recipe: Recipe, evidence: Evidence, first: int, count: int
+        self, recipe: Recipe, evidence: Evidence, search: Search, first: int, count: int
     ) -> list[tuple[float, float]]:
         seed = (self._settings.seed, _SEED, self._axis, len(recipe.effects))
         tasks = [
-            ReplayTask(recipe, evidence.p, self._axis, self._curves, (*seed, k))
+            ReplayTask(recipe, evidence.p, self._axis, search, (*seed, k))
             for k in range(first, first + count)
         ]
         return list(self._bench.pool(run_replay, tasks))

@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import NullFormatter
 
+from bampipe.lists import join_names
 from bampipe.report import style, wording
 from bampipe.report.document import Block, Figure, Formulas, Paragraph, Section, Subheading, Table
 from bampipe.report.results import Results
@@ -55,15 +56,16 @@ def _pictures(
     count = len(effects) + 2
     figure, panels = style.panels(1, count, 2.3, width=min(style.WIDTH, 0.6 + 2.2 * count))
     for panel, (name, effect) in zip(panels.flat, effects.items(), strict=False):
-        _curve(panel, name, effect, maps.get(effect.curve.variable))
+        left = None if effect.curve.beside else maps.get(effect.curve.variable)
+        _curve(panel, name, effect, left)
     _length(panels.flat[count - 2], entry)
     _chance(panels.flat[count - 1], entry)
     if effects:
         style.legend_below(figure, panels.flat[0])
     drawn = "".join(
-        f" `{name}` is drawn{_AS_DRAWN[effect.acts_as]}."
+        f" `{name}` is drawn{_as_drawn(effect)}."
         for name, effect in effects.items()
-        if _AS_DRAWN[effect.acts_as]
+        if _as_drawn(effect)
     )
     caption = (
         f"What was drafted for {axis}, with its 95 % band, over what the model leaves (sign turned "
@@ -76,6 +78,12 @@ def _pictures(
         "and on replays that lack nothing."
     )
     return Figure(f"draft-{model}-{axis}".replace(":", "."), caption, style.svg(figure))
+
+
+def _as_drawn(effect: DraftedEffect) -> str:
+    """Where on what it depends on a formula is drawn; nothing where it follows one position."""
+    others = [f"{words} {value:.3g}" for words, value in effect.curve.beside.items()]
+    return _AS_DRAWN[effect.acts_as] + (f", at {join_names(others)}" if others else "")
 
 
 def _curve(panel: Axes, name: str, effect: DraftedEffect, left: ResidualMap | None) -> None:
