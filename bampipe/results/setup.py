@@ -32,7 +32,7 @@ class SetupMistake(PossibleMistake):
     axes: Names = Field(description="Whose equations it spoils")
     evidence: str = Field(description="What changes once it is set right")
     error_before: dict[str, Size] = Field(
-        description="Held-out error by axis, per cent of the applied force"
+        description="Error of the fit by axis, per cent of the applied force"
     )
     error_after: dict[str, Size] = Field(description="The same with it set right")
     alternatives: tuple[PossibleMistake, ...] = Field(
@@ -45,7 +45,7 @@ class AxisSetup(Record):
 
     state: Literal["sound", "mistaken", "hardly_moves"]
     error_percent: Size | None = Field(
-        description="Held-out error of the bare device fitted by least squares, per cent of the "
+        description="Error of the bare device fitted by least squares, per cent of the "
         "applied force; null where none is applied, or the axis hardly moves"
     )
     moving_share: Share = Field(description="Share of the samples in which the axis moves")

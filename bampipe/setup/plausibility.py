@@ -38,8 +38,9 @@ class Plausibility:
     """What least squares with the bare device says of one set-up.
 
     Attributes:
-        error: held-out error by axis as a share of the applied force, (n_q,); 1 where the axis
-            hardly moves, 0 where nothing is applied.
+        error: of the fit by axis as a share of the applied force, (n_q,); 1 where the axis hardly
+            moves, 0 where nothing is applied. Gross as mistakes are, they show there; a trial left
+            out would only be extrapolated to where a few slow ones determine little.
         moving: share of the samples in which each axis moves, (n_q,).
         p: parameters, (n_p,).
         objections: half the squared distance of each from its prior, in its deviations, (n_p,).
@@ -75,7 +76,7 @@ def judge_setup(
             evidence = gather_evidence(
                 system, motions, band, system.prior, folds, most_iterations=steps
             )
-            error, moving = evidence.held_out_rmse, _moving(evidence.used)
+            error, moving = evidence.rmse(), _moving(evidence.used)
             size = _applied(system, motions, band, evidence.p, evidence.used)
             sd = _standard_deviations(evidence)
         except (InputError, ValueError, np.linalg.LinAlgError):

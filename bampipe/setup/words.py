@@ -25,9 +25,9 @@ def describe_correction(correction: Correction, session: IngestResult) -> str:
 def describe_evidence(
     system: System, axes: list[int], before: Plausibility, after: Plausibility
 ) -> str:
-    """What setting it right changes: held-out errors, and parameters that were not believable."""
+    """What setting it right changes: errors, and parameters that were not believable."""
     parts = [
-        f"held-out error of {system.coordinates[i]} falls from"
+        f"error of {system.coordinates[i]} falls from"
         f" {percent(before.error[i])} to {percent(after.error[i])} of the applied force"
         for i in axes
         if after.error[i] < before.error[i] / 1.5

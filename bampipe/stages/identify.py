@@ -118,6 +118,14 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         raise InputError(
             f"the free trials are too short to identify from ({error})", where=str(run.root)
         ) from error
+    moving = sum(int(stacked.used.sum()) for stacked in raw.stacked)
+    if moving <= problem.free.size:
+        raise InputError(
+            f"of the free trials, {moving} independent samples are clear of standstill, fewer than"
+            f" the {problem.free.size} numbers to be found",
+            where=str(run.root),
+            remedy="record faster motion at a higher rate, or more of it",
+        )
     squares = UnbiasedFit(raw, raw.p, None, problem)
     if config.remove_bias:
         squares = remove_bias(sensors, kinematics, system, motions, problem, raw)

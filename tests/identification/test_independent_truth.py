@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from independent_runs import record_run
 
+import bampipe
+
 DAYS = {
     "noise five times what is stated": {"noise_factor": 5.0},
     "mains hum and coarse encoders": {"hum": 10.0, "coarse": 8.0},
@@ -39,3 +41,9 @@ def test_machines_that_lack_nothing_are_identified(tmp_path, machine, seed):
     assert max(map(abs, off.values())) < 4.0, off
     axes = run.validation("base")
     assert (axes.held_out_rmse < 1.25 * axes.noise_floor).all()
+
+
+def test_trials_without_samples_clear_of_standstill_are_refused(tmp_path):
+    """A damper shaken at up to 60 Hz and logged at 100: nothing is known of its velocity."""
+    with pytest.raises(bampipe.InputError, match="clear of standstill, fewer than the"):
+        record_run(tmp_path, "damper", 9401, trials=3, seconds=4.0, rate_hz=100.0)

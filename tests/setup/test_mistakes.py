@@ -10,6 +10,7 @@ import mistakes
 import numpy as np
 import pandas as pd
 import pytest
+from independent.sensors import Conditions
 from mistakes import MISTAKES, Case, run_case, set_text
 
 import bampipe
@@ -69,11 +70,26 @@ def test_a_missing_effect_is_no_mistake(machine: str, effect: str) -> None:
     assert found.verdict == "nothing" and found.beside == 0, found.line()
 
 
+def test_what_a_slow_trial_alone_does_not_determine_is_no_mistake(tmp_path: Path) -> None:
+    """Two slow trials of a lagging motor: from either, the other is extrapolated by 14 times."""
+    slow = Conditions(creep=True, trials=2, seconds=8.0, pace=0.4)
+    independent.record("joint", tmp_path / "session", 5102, {"actuator_lag:current": 1.0}, slow)
+    found = inspect_session(tmp_path)
+    assert found.mistakes == ()
+    assert found.axes["joint"].state == "sound"
+    assert found.axes["joint"].error_percent < 10.0
+
+
 def inspected(root: Path, *changes: Callable[[Path], None]) -> SetupResult:
     """The set-up of a joint's session, changed by ``changes`` before it is read."""
     independent.record("joint", root / "session", 31, {}, mistakes.SHORT["joint"])
     for change in changes:
         change(root / "session")
+    return inspect_session(root)
+
+
+def inspect_session(root: Path) -> SetupResult:
+    """What `filter` says of the set-up of the session in a folder."""
     (root / "short.toml").write_text(mistakes.PIPELINE)
     pipeline = str(root / "short.toml")
     run = bampipe.run_session(root / "session", runs=root / "runs", pipeline=pipeline)
