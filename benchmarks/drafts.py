@@ -2,10 +2,13 @@
 
     python benchmarks/drafts.py --cases bam:detent:yaw joint:winding_cable:joint --strengths 1 0.5
     python benchmarks/drafts.py --nothing 5
+    python benchmarks/drafts.py --forced 5
 
 Sessions of simulators that share no code with bampipe (benchmarks/independent), each with one
 effect that the library does not have, or with none. What is left without a name is drafted; the
 effects that the diagnosis names count where they leave no more. One line a session, then a table.
+With --forced, formulas are looked for on every axis of sessions with nothing hidden, whatever a
+diagnosis would say.
 """
 
 from __future__ import annotations
@@ -27,9 +30,12 @@ from independent.sensors import Conditions, hold_back
 
 import bampipe
 from bampipe.data.run_folder import RunFolder
-from bampipe.declarations.model_file import identified, load_model
+from bampipe.declarations.model_file import identified, load_model, read_recipe
+from bampipe.discover.drafts.search import draft
+from bampipe.discover.settings import Settings
 from bampipe.physics import compile_model
 from bampipe.results.diagnose import DiagnoseResult
+from bampipe.results.identify import IdentifyResult
 from bampipe.trials.measured import read_measured_trials
 from bampipe.trials.residuals import gather_evidence
 
@@ -160,6 +166,34 @@ def run_case(case: str, strength: float, seed: int, replicates: int) -> Outcome:
         )  # fmt: skip
 
 
+def force_drafts(machine: str, seed: int) -> dict[str, tuple[float, tuple[str, ...]]]:
+    """Look for formulas on a session with nothing hidden: p-value and what was drafted, by axis."""
+    with tempfile.TemporaryDirectory() as folder:
+        root = Path(folder)
+        independent.record(machine, root / machine, seed, {}, CONDITIONS[machine])
+        (root / "drafts.toml").write_text(PIPELINE)
+        run = RunFolder(
+            bampipe.run_session(
+                root / machine, runs=root / "runs", pipeline=str(root / "drafts.toml")
+            ).root
+        )
+        model = load_model(run, "base")
+        system = compile_model(model)
+        timing = run.read(IdentifyResult, "base").input_timing
+        trials = read_measured_trials(run, system, every_input=True, timing=timing)
+        found = draft(
+            trials, read_recipe(run, "base", model), identified(run, "base", system),
+            range(len(system.coordinates)), Settings(jobs=1), "a benchmark",
+        )  # fmt: skip
+        return {
+            system.coordinates[axis.axis]: (
+                axis.chance[0].p_value,
+                tuple(term.canonical for term in axis.terms),
+            )
+            for axis in found
+        }
+
+
 def diagnosis_of(run: bampipe.Run) -> DiagnoseResult:
     """The diagnosis of the bare device."""
     return RunFolder(run.root).read(DiagnoseResult, "base")
@@ -257,11 +291,14 @@ def main(arguments: Sequence[str]) -> None:
     parser.add_argument("--cases", nargs="*", default=list(CASES), help="machine:effect:axis")
     parser.add_argument("--strengths", nargs="*", type=float, default=[1.0, 0.5])
     parser.add_argument("--nothing", type=int, default=0, help="sessions with nothing hidden")
+    parser.add_argument("--forced", type=int, default=0, help="the same, whatever a diagnosis says")
     parser.add_argument("--first-seed", type=int, default=4000)
     parser.add_argument("--replicates", type=int, default=4, help="replays of the diagnosis")
     parser.add_argument("--out", type=Path, help="write the outcomes as JSON, session by session")
     options = parser.parse_args(arguments)
     machines = ("bam", "joint", "axis")
+    for k in range(options.forced):
+        print(machines[k % 3], force_drafts(machines[k % 3], options.first_seed + k), flush=True)
     plan = [(f"{machines[k % 3]}:nothing", 1.0) for k in range(options.nothing)]
     plan += [(case, strength) for strength in options.strengths for case in options.cases]
     outcomes = []

@@ -18,13 +18,14 @@ from bampipe.declarations.model_file import load_model
 from bampipe.discover.chance import candidates_of, fit_trials, system_of
 from bampipe.discover.drafts.effect_file import write_toml
 from bampipe.discover.drafts.screen import Screen
-from bampipe.discover.drafts.search import draft
+from bampipe.discover.drafts.search import FoundDraft, Option, draft
 from bampipe.discover.settings import Settings
 from bampipe.errors import InputError
-from bampipe.physics import Model
+from bampipe.physics import Model, compile_model
 from bampipe.physics.effect import effect_from
 from bampipe.progress import silent
 from bampipe.results.diagnose import DiagnoseResult
+from bampipe.results.draft import ChanceOfDraft
 from bampipe.stages import draft as draft_stage
 
 FEW = Settings(draft_replicates=4, jobs=1)
@@ -192,6 +193,22 @@ def test_every_form_is_an_effect_file(clean):
             tried, faults = effect_faults(tomllib.loads(text), form.name, device)
             assert form.canonical in tried
             assert faults == []
+
+
+def test_a_missing_library_is_named_where_one_quantity_did_not_do(detent):
+    run, _ = detent
+    folder = RunFolder(run.root)
+    system = compile_model(load_model(folder, "base"))
+    nothing = Option((), 0, np.array([0.5, 0.1, 0.1]))
+    chance = ChanceOfDraft(gain=3.0, gains=(2.0, 3.0, 4.0, 5.0), p_value=0.6)
+    found = FoundDraft(
+        0, (), (chance,), 0.02, (nothing,), 0.5, 0.5, None, True, None, None
+    )  # fmt: skip
+    diagnosis = folder.read(DiagnoseResult, "base")
+    said = draft_stage._axis(found, {}, diagnosis, system).sentence
+    assert said.endswith("pip install 'bampipe[formulas]' brings pyoperon.")
+    there = replace(found, wants_formulas=False)
+    assert "pyoperon" not in draft_stage._axis(there, {}, diagnosis, system).sentence
 
 
 def test_what_is_missing_for_a_draft_is_said(tmp_path, detent):

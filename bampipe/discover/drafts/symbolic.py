@@ -32,9 +32,15 @@ _FOLLOWED = ("position", "velocity", "direction", "command")
 anything; time has structured forms."""
 _CENTRED = "position"
 """Positions are counted from the middle of their range, all others from zero."""
+_HIGHEST = 50.0
+"""Of an exponent: beyond it a formula has no meaning, and must still be a number."""
 _FUNCTIONS: Mapping[str, Callable[[Array], Array]] = {
-    "sin": np.sin, "exp": np.exp, "tanh": np.tanh, "abs": np.abs, "square": np.square,
-}  # fmt: skip
+    "sin": np.sin,
+    "exp": lambda v: np.exp(np.minimum(v, _HIGHEST)),
+    "tanh": np.tanh,
+    "abs": np.abs,
+    "square": np.square,
+}
 _ROUNDS = 3
 """Searches, each for what is left beside what the model's own parameters take of the last one."""
 _MOST_SAMPLES = 1000
