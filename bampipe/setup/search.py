@@ -111,11 +111,7 @@ class CorrectionSearch:
         fitted = [k for k, fits in enumerate(folds.fitted) if fits]
         others = [k for k, fits in enumerate(folds.fitted) if not fits]
         chosen = [*dict.fromkeys([*fitted[:1], *fitted[-1:]]), *others[:1]]
-        part = Folds(
-            tuple(folds.groups[k] for k in chosen),
-            tuple(folds.fitted[k] for k in chosen),
-            tuple(folds.judged[k] for k in chosen),
-        )
+        part = folds.subset(chosen)
         most = _SCREENED_SAMPLES if self.has_few_axes else _SCREENED_SAMPLES // 2
         return shorten([self.motions[k] for k in chosen], most), part
 

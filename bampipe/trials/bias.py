@@ -92,7 +92,7 @@ def remove_bias(
 
     def replayed_bias(p: Array) -> Array:
         replays = replay_motions(
-            system, p[:count], motions, sensors, kinematics, (0, 0), force_noise=False
+            system, p[:count], motions, sensors, kinematics, (0, 0), force_noise=False, alone=True
         )
         again = fit(problem_of(system, replays, problem.band, timing=timing), raw.p)
         if np.any(again.residual_sd > UNLIKE * raw.residual_sd):

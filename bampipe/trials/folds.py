@@ -51,6 +51,14 @@ class Folds:
         ]
         return cls.of_groups(groups, [name in fitted for name in names])
 
+    def subset(self, trials: Sequence[int]) -> Folds:
+        """The same of some trials, given by number."""
+        return Folds(
+            tuple(self.groups[k] for k in trials),
+            tuple(self.fitted[k] for k in trials),
+            tuple(self.judged[k] for k in trials),
+        )
+
     @property
     def fitted_trials(self) -> list[int]:
         """Numbers of the trials that a fit sees."""

@@ -6,7 +6,7 @@ not filtered, their time derivatives are band-limited.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -77,22 +77,33 @@ class Kinematics:
         smooth = butterworth.smooth if self.method == "butterworth" else savitzky_golay.smooth
         return smooth(position, self.rate_hz, chosen.bandwidth_hz, chosen.noise_sd)
 
-    def input_rates(self, values: Array) -> list[Array]:
-        """Return the time derivatives (T,) of an input (T,), lowest order first."""
-        return butterworth.rates(values, self.rate_hz, self.input_cutoff_hz, LAST_ORDER)
+    def input_rates(self, values: Array, count: int = LAST_ORDER) -> list[Array]:
+        """Return the first ``count`` time derivatives (T,) of an input (T,), lowest order first."""
+        return butterworth.rates(values, self.rate_hz, self.input_cutoff_hz, count)
 
-    def observe(self, recording: Recording, smooth_inputs: Sequence[str]) -> Motion:
+    def observe(
+        self,
+        recording: Recording,
+        smooth_inputs: Sequence[str],
+        wanted: Collection[str] | None = None,
+    ) -> Motion:
         """Filter a recording the way every recording, measured or replayed, is filtered.
 
         Args:
             recording: the readings.
             smooth_inputs: the channels that have time derivatives.
+            wanted: inputs of the only model that sees the motion: of the derivatives, those that it
+                takes and one more, by which they are moved in time; all by default.
         """
         moved = [self.differentiate(axis, recording.q[:, i]) for i, axis in enumerate(self.axes)]
         channels = dict(recording.channels)
         for name in smooth_inputs:
-            rates = self.input_rates(recording.channels[name])
-            channels |= dict(zip(input_derivatives(name), rates, strict=True))
+            names = input_derivatives(name)
+            if wanted is not None:
+                taken = [k for k, rate in enumerate(names, start=1) if rate in wanted]
+                names = names[: max(taken, default=0) + 1]
+            rates = self.input_rates(recording.channels[name], len(names))
+            channels |= dict(zip(names, rates, strict=True))
         return Motion(
             recording.trial_id,
             np.arange(len(recording.q)) / self.rate_hz,

@@ -35,6 +35,8 @@ _SD_OF_DEVIATION = 1.4826
 ENOUGH_SAMPLES, MOST_REPLAYS = 250_000, 6
 """Replays are repeated until they hold so many samples, but no oftener than this: the floor of a
 session of forty thousand samples is then known to about 1 %, and longer ones need fewer."""
+LEAST_DRAWN = 50
+"""Fewest trials that stand for all of a long session: the errors of trials differ by a third."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +80,7 @@ def replay_evidence(
     seed: Sequence[int],
 ) -> Evidence:
     """Replay all trials by a model at ``p`` and fit it to them, from ``start`` on."""
-    replays = replay_motions(system, p, motions, sensors, kinematics, seed)
+    replays = replay_motions(system, p, motions, sensors, kinematics, seed, alone=True)
     return gather_evidence(system, replays, band, start, folds)
 
 
@@ -126,7 +128,9 @@ def find_noise_floor(
     """Return the held-out error that the fitted model leaves when it is the truth.
 
     Every trial is replayed by the model under the measured force and an arm that keeps the motion
-    near the measured one; the replay goes through the same sensors, filters and fits.
+    near the measured one; the replay goes through the same sensors, filters and fits. Of a longer
+    session than `ENOUGH_SAMPLES`, so many are replayed, in `LEAST_DRAWN` trials or more drawn from
+    all.
 
     Args:
         evidence: the model, fitted; p: `parameters_to_replay`.
@@ -136,12 +140,33 @@ def find_noise_floor(
     Raises:
         Runaway: the simulated motion grows without bounds.
     """
+    chosen = _choose_trials(evidence)
+    motions = [evidence.motions[number] for number in chosen]
+    folds = evidence.folds.subset(chosen)
     errors = []
     for k in range(count):
         found = replay_evidence(
-            evidence.system, p, evidence.p, evidence.motions, sensors, kinematics,
-            evidence.band, evidence.folds, (seed, FLOOR_SEED, k),
+            evidence.system, p, evidence.p, motions, sensors, kinematics,
+            evidence.band, folds, (seed, FLOOR_SEED, k),
         )  # fmt: skip
         errors.append(found.held_out_rmse)
         progress(k + 1)
     return NoiseFloor.of_errors(errors)
+
+
+def _choose_trials(evidence: Evidence) -> list[int]:
+    """Numbers of the trials that are replayed for the floor, in order.
+
+    Where the session holds trials out, these are few, and all are needed to judge by.
+    """
+    sizes = [residual.shape[0] for residual in evidence.residual]
+    everything = list(range(len(sizes)))
+    total = sum(sizes) * evidence.band.step
+    if total <= ENOUGH_SAMPLES or not all(evidence.folds.judged):
+        return everything
+    count = -(-len(sizes) * ENOUGH_SAMPLES // total)
+    drawn = np.random.default_rng(FLOOR_SEED).permutation(len(sizes))[: max(count, LEAST_DRAWN)]
+    chosen = sorted(int(number) for number in drawn)
+    folds = evidence.folds.subset(chosen)
+    groups = {folds.groups[number] for number in folds.fitted_trials}
+    return chosen if len(groups) > 1 else everything

@@ -142,13 +142,19 @@ def replay_motion(
     sensors: Sensors,
     kinematics: Kinematics,
     rng: np.random.Generator,
+    *,
+    alone: bool = False,
 ) -> Motion:
     """Replay one trial and filter it as the measured one was; arguments as `replay_recording`.
 
     Time derivatives are made of the forces alone; other channels are the measured ones.
+
+    Args:
+        alone: whether no other model is to see the replay, which may need more derivatives.
     """
     recording = replay_recording(system, p, motion, sensors, rng)
-    return kinematics.observe(recording, system.model.device.forces)
+    wanted = system.inputs if alone else None
+    return kinematics.observe(recording, system.model.device.forces, wanted)
 
 
 def replay_motions(
@@ -160,11 +166,12 @@ def replay_motions(
     seed: Sequence[int],
     *,
     force_noise: bool = True,
+    alone: bool = False,
 ) -> Sequence[Motion]:
     """Replay every trial; long sessions are stored on disk, so that few trials are in memory.
 
     Args:
-        system, p, motions, sensors, kinematics: as for `replay_motion`.
+        system, p, motions, sensors, kinematics, alone: as for `replay_motion`.
         seed: of the sensor noise; the trial's number is added.
         force_noise: whether the force sensor is noisy.
 
@@ -177,7 +184,7 @@ def replay_motions(
     def replays() -> Iterator[Motion]:
         for number, motion in enumerate(motions):
             rng = np.random.default_rng([*seed, number])
-            yield replay_motion(system, p, motion, sensors, kinematics, rng)
+            yield replay_motion(system, p, motion, sensors, kinematics, rng, alone=alone)
 
     if sum(n_samples(motion) for motion in motions) <= MOST_SAMPLES:
         return list(replays())

@@ -1,0 +1,72 @@
+"""The noise floor of long sessions, and what a replay needs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from independent_runs import record_trials
+
+from bampipe.discover.chance import system_of
+from bampipe.trials import noise_floor
+from bampipe.trials.measured import MeasuredTrials
+from bampipe.trials.noise_floor import find_noise_floor
+from bampipe.trials.replay import replay_motion
+from bampipe.trials.residuals import Evidence, gather_evidence
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory: pytest.TempPathFactory) -> tuple[MeasuredTrials, Evidence]:
+    root = tmp_path_factory.mktemp("joint")
+    trials, recipe, _ = record_trials(root, "joint", 21, trials=12, seconds=5.0)
+    # Every other trial: those between are moves with rests, whose errors are larger.
+    waves = range(0, 12, 2)
+    trials = replace(
+        trials,
+        motions=[trials.motions[number] for number in waves],
+        folds=trials.folds.subset(waves),
+    )
+    system = system_of(recipe)
+    return trials, gather_evidence(system, trials.motions, trials.band, system.prior, trials.folds)
+
+
+def test_the_floor_of_a_long_session_comes_from_trials_drawn_from_it(
+    fitted, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trials, evidence = fitted
+    replayed: list[int] = []
+
+    def counted(*arguments: Any) -> Evidence:
+        replayed.append(len(arguments[3]))
+        return replay(*arguments)
+
+    replay = noise_floor.replay_evidence
+    monkeypatch.setattr(noise_floor, "replay_evidence", counted)
+    monkeypatch.setattr(noise_floor, "LEAST_DRAWN", 2)
+    floors = []
+    for most in (10**6, 1400):
+        monkeypatch.setattr(noise_floor, "ENOUGH_SAMPLES", most)
+        floors.append(
+            find_noise_floor(evidence, evidence.p, trials.sensors, trials.kinematics, 0, 3).level
+        )
+    assert replayed == [6, 6, 6, 4, 4, 4]
+    np.testing.assert_allclose(floors[1], floors[0], rtol=0.15)
+
+
+def test_a_replay_for_one_model_has_the_same_inputs(fitted) -> None:
+    trials, evidence = fitted
+    system = evidence.system
+    logged = {name: trials.motions[0].channels[name] for name in system.inputs}
+    motion = replace(trials.motions[0], channels=logged)
+    every, own = (
+        replay_motion(
+            system, evidence.p, motion, trials.sensors, trials.kinematics,
+            np.random.default_rng(3), alone=alone,
+        )
+        for alone in (False, True)
+    )  # fmt: skip
+    np.testing.assert_array_equal(every.inputs(system.inputs), own.inputs(system.inputs))
+    np.testing.assert_array_equal(every.input_rates(system.inputs), own.input_rates(system.inputs))
+    assert len(own.channels) < len(every.channels)
