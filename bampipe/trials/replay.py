@@ -1,10 +1,10 @@
 """The fitted model in place of the machine: recordings that contain nothing the model lacks.
 
 Noise floors, chance levels and the bias of least squares come from here. The model is driven along
-nearly the measured motion by the measured force plus an arm. On a test bench, which prescribes the
-motion, it keeps that and takes the force it needs; so it does of a robot, held by its position
-controllers, where a spring that the model lacks would carry it away. What it does is read by the
-same sensors and goes through the same filters.
+nearly the measured motion by the measured force plus an arm. Where something stiff gives the
+motion, a test bench or the position controllers of a robot, it keeps that and takes the force it
+needs: a drive's torque jumps where its joint turns round, and between two samples of a log nothing
+says when. What it does is read by the same sensors and goes through the same filters.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.estimate.butterworth import zero_phase
-from bampipe.estimate.simulation import Runaway, simulate_tracking
+from bampipe.estimate.simulation import simulate_tracking
 from bampipe.files import temporary_space
 from bampipe.physics import System
 from bampipe.physics.device import derivative
@@ -37,10 +37,6 @@ UNLIKE = 3.0
 """Residual that a fit leaves of a replay, over that of the measurement, beyond which the replay is
 no likeness of the machine: sound ones leave 0.01 to 1.15 (without force noise), those of a Stribeck
 friction that its fit has sharpened up to 1.9, that of a stiff damper 77."""
-_FARTHEST = 0.1
-"""Of a joint's travel: how far the replay of a robot may be from the measured motion. Sound
-replays of simulated arms stay within 0.2 %, without a drive's delay within 0.7 %; without a spring
-that pulls, a light joint goes 1.3 times its travel."""
 FOLLOWED_HZ = 10.0
 """Highest frequency of the motion to follow where encoder and handle move apart."""
 
@@ -61,50 +57,30 @@ def replay_recording(
         Runaway: the simulated motion grows without bounds.
     """
     u = motion.inputs(system.inputs)
-    if system.model.device.prescribed:
-        return _keep_motion(system, p, motion, u, sensors, rng)
+    if _is_given_motion(system):
+        force = _required_force(system, p, motion, u)
+        return read_by_sensors(system, motion, motion.q, force, sensors, rng)
     q, qd = _reference(system, p, motion, u, sensors.rate_hz)
     start = np.concatenate([q[0], qd[0], system.initial_memory(q[0], u[0], p)])
     at = {name: i for i, name in enumerate(system.inputs)}
     forces = system.model.device.forces
     widths = np.array([c.sign_width for c in system.model.device.coordinates])
-    held = system.model.device.robot is not None and not system.undriven
-    try:
-        x, total = simulate_tracking(
-            system.derivative, start, u, p, 1.0 / sensors.rate_hz, q, qd,
-            width=widths, n_noise=len(system.noise),
-            force=[at[f] for f in forces],
-            rate=[at.get(derivative(f, 1), -1) for f in forces],
-            curvature=[at.get(derivative(f, 2), -1) for f in forces],
-        )  # fmt: skip
-    except Runaway:
-        if not held:
-            raise
-        return _keep_motion(system, p, motion, u, sensors, rng)
-    if held and _strays(x[:, : q.shape[1]], q):
-        return _keep_motion(system, p, motion, u, sensors, rng)
+    x, total = simulate_tracking(
+        system.derivative, start, u, p, 1.0 / sensors.rate_hz, q, qd,
+        width=widths, n_noise=len(system.noise),
+        force=[at[f] for f in forces],
+        rate=[at.get(derivative(f, 1), -1) for f in forces],
+        curvature=[at.get(derivative(f, 2), -1) for f in forces],
+    )  # fmt: skip
     seen = system.encoder_readings(x, total, p)[:, : len(system.coordinates)]
     force = total[:, [at[f] for f in forces]]
     return read_by_sensors(system, motion, seen, force, sensors, rng)
 
 
-def _strays(q: Array, measured: Array) -> bool:
-    """Whether a replay (T, n_q) left the measured motion: that is no likeness of a held robot."""
-    farthest = np.abs(q - measured).max(axis=0)
-    return bool(np.any(farthest > _FARTHEST * np.ptp(measured, axis=0)))
-
-
-def _keep_motion(
-    system: System,
-    p: Array,
-    motion: Motion,
-    u: Array,
-    sensors: Sensors,
-    rng: np.random.Generator,
-) -> Recording:
-    """The replay along the measured motion itself, by the force that the model needs for it."""
-    force = _required_force(system, p, motion, u)
-    return read_by_sensors(system, motion, motion.q, force, sensors, rng)
+def _is_given_motion(system: System) -> bool:
+    """Whether something stiff gives the motion, and the force is what that takes."""
+    device = system.model.device
+    return device.prescribed or (device.robot is not None and not system.undriven)
 
 
 def _required_force(system: System, p: Array, motion: Motion, u: Array) -> Array:
