@@ -16,13 +16,15 @@ from conftest import Toy
 from made_results import filled, write_result
 
 import bampipe
-from bampipe.cli import places, show
+from bampipe.cli import one_stage, places, show
 from bampipe.cli.loop import suggest_after_loop
 from bampipe.errors import InputError
 from bampipe.results.compare import CompareResult
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.ingest import IngestResult
 from bampipe.run.events import Event
+from bampipe.run.pipeline import load
+from bampipe.run.status import StepStatus
 
 Command = Callable[..., tuple[int, str, str]]
 
@@ -526,6 +528,23 @@ def test_after_the_loop_comes_what_its_last_diagnosis_says(
     axes, command = {"yaw": {"verdict": verdict}}, "bampipe draft RUN --model base"
     write_result(ingested, DiagnoseResult, axes=axes, selected=selected, next=command)
     assert suggest_after_loop(ingested, "base", "s01") == after
+
+
+def test_a_diagnosis_that_is_older_than_its_inputs_is_said(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def stands(reason: str) -> list[StepStatus]:
+        return [
+            StepStatus("identify:base", "current", "", "", 1.0),
+            StepStatus("diagnose:base", "stale" if reason else "current", reason, "", 1.0),
+        ]
+
+    for reason in ("", "settings changed", "models/base/identify.json changed"):
+        monkeypatch.setattr(one_stage, "status", lambda *_, reason=reason: stands(reason))
+        one_stage._say_if_outdated(Path("runs/s01"), load("default"), "base")
+        said = capsys.readouterr().out
+        assert ("bampipe diagnose runs/s01" in said) == ("identify.json" in said)
+        assert bool(said) == ("identify.json" in reason)
 
 
 @pytest.mark.parametrize(

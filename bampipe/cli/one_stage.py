@@ -14,6 +14,7 @@ from bampipe.run import pipeline as pipelines
 from bampipe.run.request import Outcome, Request
 from bampipe.run.runner import run_session
 from bampipe.run.settings import parse_assignment
+from bampipe.run.status import status
 from bampipe.stages import base
 
 if TYPE_CHECKING:
@@ -29,6 +30,9 @@ AFTER = {
     "validate": "diagnose",
     "compare": "report",
 }
+
+_OF_DIAGNOSIS = ("draft", "next")
+"""Stages that go by what a diagnosis found."""
 
 
 def assignments(given: Sequence[str] | None) -> dict[str, object]:
@@ -100,7 +104,20 @@ def one_stage(
         suffix = " (unchanged)" if step.state == "unchanged" else ""
         show.say(f"{root}: {step.step}{suffix}")
         show.summary(step.summary)
+    if stage in _OF_DIAGNOSIS:
+        _say_if_outdated(root, request.pipeline, model)
     return outcome
+
+
+def _say_if_outdated(root: Path, pipeline: Pipeline, model: str) -> None:
+    """Say so where a diagnosis that has just been used was made from other results."""
+    for step in status(root, pipeline):
+        # Other settings than the pipeline's do not make it wrong; other inputs do.
+        if step.step == f"diagnose:{model}" and step.state == "stale" and "/" in step.reason:
+            show.say(
+                f"note: the diagnosis of {model} is older than what it was made from"
+                f" ({step.reason}): run `bampipe diagnose {root}`, and this again."
+            )
 
 
 def plain_stage(

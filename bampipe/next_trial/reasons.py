@@ -13,6 +13,9 @@ _SHOWN = 3
 _SURE = 0.01
 """Chance below which its exact size means nothing."""
 
+_LOWERS = 0.8
+"""Share of a chance of confusion from which on a trial does not lower it."""
+
 
 @dataclass(frozen=True)
 class Reasons:
@@ -46,10 +49,16 @@ def explain_proposal(
 def _decision(best: Proposal) -> Reasons:
     pair = max(best.confusion, key=lambda pair: pair.weight * pair.before)
     before, after = _chance(pair.before), _chance(pair.after)
+    expected = (
+        f"The chance of confusing them is expected to fall from {before} to {after}."
+        if pair.after < _LOWERS * pair.before
+        else f"No trial tried tells them apart: the chance would be {after} after this one. A wider"
+        " motion, or another load, may."
+    )
     return Reasons(
         f"These trials do not distinguish {pair.between[0]} from {pair.between[1]}: the chance of"
         f" confusing them is {before}.",
-        f"The chance of confusing them is expected to fall from {before} to {after}.",
+        expected,
     )
 
 
