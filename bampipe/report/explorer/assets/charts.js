@@ -3,6 +3,7 @@
 const structure = {};
 const ladders = [];
 const LAGS_S = 1;
+const NAME_PX = 150; // room for the name of a variable in one line
 
 /** Make the figures of the axis in question anew. */
 function buildStructure() {
@@ -21,7 +22,12 @@ function buildStructure() {
   structure.causes = new Figure(host, {
     title: `residual ${axis}: correlation with motion and load`, xLabel: "", yLabel: "correlation", height: 260,
     label: `Correlation of the residual of ${axis} in view with each variable, with 95 % intervals`,
-    xTicks: () => ({ splits: structure.causes.names.map((_, k) => k), texts: structure.causes.names }),
+    xTicks: (_min, _max, width) => {
+      const { names } = structure.causes;
+      // Words below each other where they would run into the next name.
+      const narrow = width < NAME_PX * names.length;
+      return { splits: names.map((_, k) => k), texts: names.map((name) => (narrow ? name.replaceAll(" ", "\n") : name)) };
+    },
     table: () => structure.causes.found,
   });
   structure.causes.names = [];
