@@ -169,7 +169,9 @@ def _caption(rungs: Sequence[Rung], axes: Sequence[str]) -> str:
         if before and after:
             change = 100.0 * (after / before - 1.0)
             verb = "falls" if change <= -1.0 else "rises" if change >= 1.0 else ""
-            size = wording.plain(abs(change), 0)
+            # A fall by 100 % would leave nothing.
+            left = 100.0 * after / before
+            size = wording.plain(abs(change), max(0, int(np.ceil(-np.log10(left)))))
             parts.append(f"{axis} {verb} by {size} %" if verb else f"{axis} stays as it is")
     return f"Error on held-out trials by version, against the noise floor: {join_names(parts)}."
 
