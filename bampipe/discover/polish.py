@@ -178,7 +178,7 @@ def weigh(fewer: FittedSet, name: str, scores: Mapping[str, Score]) -> list[Cont
         Contender(
             effect=n,
             axis=fewer.evidence.system.coordinates[axis],
-            held_out_rmse=scorer.held_out_rmse_with(scores[n])[axis],
+            held_out_rmse=scorer.comparable_error(scores[n])[axis],
             score=scores[n].total,
             score_without_trial=without_trial[n].total if n in without_trial else None,
             score_without_second=without_second[n].total if n in without_second else 0.0,

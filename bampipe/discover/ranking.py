@@ -51,7 +51,7 @@ def rank(search: Search, selected: Sequence[str]) -> list[RankedEffect]:
                 effect=name,
                 axis=system.coordinates[axis],
                 held_out_rmse_before=scorer.evidence.held_out_rmse[axis],
-                held_out_rmse_after=scorer.held_out_rmse_with(score)[axis],
+                held_out_rmse_after=scorer.held_out_scale[axis] * score.error[axis],
                 unit=system.torque_units[axis],
                 p_value=p_value,
                 score=excess.sum(),

@@ -105,12 +105,19 @@ class Scorer:
         steps = self.folds.solve(e.sums, e.weight, e.lower, e.upper, Settings().held_out_weight)
         return self.folds.error(e.sums, steps)
 
-    def held_out_rmse_with(self, score: Score) -> Array:
-        """Error with a candidate added, by axis, on the terms of the model's own held-out error.
+    @cached_property
+    def held_out_scale(self) -> Array:
+        """What turns an error of a `Score` into one on the terms of the model's own, by axis.
 
         Candidates are scored with a little of the trial that is left out, models are judged without
-        it: what the two have in common is the ratio. It is that of the gain, so that a candidate
-        which makes both sides of the equation small can be compared with others.
+        it: what the two have in common is the ratio.
+        """
+        return np.asarray(self.evidence.held_out_rmse / np.maximum(self.base_error, 1e-300))
+
+    def comparable_error(self, score: Score) -> Array:
+        """Held-out error that goes with the gain of a candidate, by axis, N.m or N.
+
+        Of one that makes both sides of the equation small it is larger than what is left.
         """
         ratio = np.exp(-score.gain / np.maximum(self.independent_samples, 1e-300))
         return np.asarray(self.evidence.held_out_rmse * ratio)

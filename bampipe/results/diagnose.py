@@ -88,7 +88,10 @@ class Contender(Record):
 
     effect: str
     axis: str = Field(description="Where the effect found helps most")
-    held_out_rmse: Size = Field(description="There, with this effect in that place")
+    held_out_rmse: Size = Field(
+        description="There, with this effect in that place, as if it left both sides of the "
+        "equation at their size"
+    )
     score: float = Field(description="Gain in log likelihood over all axes")
     score_without_trial: float | None = Field(
         description="Without the trial that speaks most for the effect found; null with two trials"

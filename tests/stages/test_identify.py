@@ -273,7 +273,9 @@ def test_friction_that_falls_within_a_step(tmp_path: Path) -> None:
             entry = found[name]
             assert abs(entry["estimate"] - value) < 4.0 * entry["sd"], (step, name, entry)
         force = found["stribeck.extension.force"]
-        assert force["sd"] < 0.02 * force["estimate"]
+        # Smoothing the sign of the velocity matters here, and is stated apart.
+        by_noise = np.sqrt(force["sd"] ** 2 - force["smoothing_sd"] ** 2)
+        assert by_noise < 0.02 * force["estimate"]
 
 
 def test_least_squares_intervals_hold_once_its_bias_is_off(simulated: RunFolder) -> None:
