@@ -159,7 +159,7 @@ def test_what_is_no_scheduler_is_one_line(
     monkeypatch.setattr(engine, "PATIENCE_S", 3.0)
     server = Listener(answer)
     began = time.monotonic()
-    with pytest.raises(InputError, match="no Dask scheduler answers within 3 s"):
+    with pytest.raises(InputError, match="no Dask scheduler answers"):
         run_on_cluster([toy.request()], server.address, unheard)
     assert time.monotonic() - began < 8.0
     server.socket.close()
