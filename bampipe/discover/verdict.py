@@ -17,6 +17,7 @@ from bampipe.discover.shape import explainable_share
 from bampipe.results.diagnose import AxisVerdict, Contender, TransientCandidate, Verdict
 from bampipe.results.standing import FLOOR_WRONG, standing
 from bampipe.trials.noise_floor import NoiseFloor
+from bampipe.trials.residuals import Evidence
 
 
 def conclude(search: Search, s: Settings) -> Diagnosis:
@@ -28,39 +29,52 @@ def conclude(search: Search, s: Settings) -> Diagnosis:
     shares = np.array([r.share for r in search.final])
     reach = {n: _reach(search, n, s.worth) for n in search.selected}
     odds = {n: _odds_of_group(search, n, s) for n in search.selected}
+    axes = range(len(before))
+    here = [
+        tuple(n for n in search.selected if search.main[n] == axis or axis in reach[n])
+        for axis in axes
+    ]
+    excess = before**2 - np.minimum(floor.level, bare_floor) ** 2
+    left = np.maximum(after**2 - floor.level**2, 0.0)
+    explained = [
+        max(0.0, float(1.0 - left[axis] / max(excess[axis], 1e-30))) if here[axis] else 0.0
+        for axis in axes
+    ]
+    by_chance = [float(shares[:, axis].max()) for axis in axes]
+
+    def beyond_chance(evidence: Evidence) -> list[float]:
+        known = [explainable_share(evidence, axis) for axis in axes]
+        return [_share_beyond_chance(known[axis], by_chance[axis]) for axis in axes]
+
+    given = beyond_chance(search.initial)
+    share = beyond_chance(evidence) if search.selected else given
+    seconds = [error_without_second(evidence, axis) for axis in axes]
+    lacking = [
+        standing(rest, float(floor.level[axis]), float(floor.sd[axis])) == "above_floor"
+        and (rest / max(floor.level[axis], 1e-30) > s.surely or share[axis] > s.predictable)
+        for axis, (_, rest) in enumerate(seconds)
+    ]
+    fails = [lacking[axis] and explained[axis] < s.explained for axis in axes]
+    # What explains too little where it helps most was not found, whatever it does elsewhere.
+    weak = {n for n in search.selected if fails[search.main[n]]}
     findings = []
-    weak = set()
-    for axis in range(len(before)):
+    for axis in axes:
         level, scatter = float(floor.level[axis]), float(floor.sd[axis])
-        by_chance = float(shares[:, axis].max())
-        given = _share_beyond_chance(explainable_share(search.initial, axis), by_chance)
-        share = given
-        if search.selected:
-            share = _share_beyond_chance(explainable_share(evidence, axis), by_chance)
-        here = tuple(n for n in search.selected if search.main[n] == axis or axis in reach[n])
-        excess = before[axis] ** 2 - min(level, bare_floor[axis]) ** 2
-        left = max(after[axis] ** 2 - level**2, 0.0)
-        explained = max(0.0, 1.0 - left / max(excess, 1e-30)) if here else 0.0
         against_floor = standing(float(after[axis]), level, scatter)
-        worst, but_for_it = error_without_second(evidence, axis)
-        above = but_for_it / max(level, 1e-30)
-        lacking = standing(but_for_it, level, scatter) == "above_floor" and (
-            above > s.surely or share > s.predictable
-        )
+        worst, but_for_it = seconds[axis]
         verdict: Verdict
         at: dict[str, float] = {}
         if against_floor in FLOOR_WRONG:
             verdict = "undecided"
-        elif here:
+        elif here[axis]:
             verdict = "missing"
-            unsure = [n for n in here if max(odds[n].values()) < s.decided]
+            unsure = [n for n in here[axis] if max(odds[n].values()) < s.decided]
             if unsure:
                 verdict, at = "undecided", odds[unsure[0]]
-            if lacking and explained < s.explained:
-                verdict = "undecided" if explained > s.resembles else "unknown_effect"
-                at = at or {n: 1.0 for n in here}
-                weak |= {n for n in here if search.main[n] == axis}
-        elif lacking:
+            if fails[axis] or weak.issuperset(here[axis]):
+                verdict = "undecided" if explained[axis] > s.resembles else "unknown_effect"
+                at = at or {n: 1.0 for n in here[axis]}
+        elif lacking[axis]:
             at = _odds_of_likely(search, axis, s)
             verdict = "undecided" if at else "unknown_effect"
         else:
@@ -68,7 +82,7 @@ def conclude(search: Search, s: Settings) -> Diagnosis:
         findings.append(
             AxisVerdict(
                 verdict=verdict,
-                effects=tuple(n for n in here if n not in weak),
+                effects=tuple(n for n in here[axis] if n not in weak),
                 likely=at,
                 rmse_before=before[axis],
                 rmse_after=after[axis],
@@ -79,11 +93,11 @@ def conclude(search: Search, s: Settings) -> Diagnosis:
                 rmse_without_worst_second=but_for_it,
                 other_band=None,
                 unit=evidence.system.torque_units[axis],
-                explainable_share=given,
-                explainable_after=share,
-                explainable_chance=by_chance,
-                remains=lacking,
-                explained_by_effects=explained,
+                explainable_share=given[axis],
+                explainable_after=share[axis],
+                explainable_chance=by_chance[axis],
+                remains=lacking[axis],
+                explained_by_effects=explained[axis],
                 sentence="",
             )
         )

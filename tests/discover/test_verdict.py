@@ -1,0 +1,45 @@
+"""Verdicts of several axes that one effect acts on."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from bampipe.discover import verdict
+from bampipe.discover.settings import Settings
+from bampipe.results.diagnose import Stretch
+
+AXES = ("shoulder", "elbow")
+
+
+@pytest.mark.parametrize("shoulder_after", [0.95, 0.11])
+def test_an_effect_that_fails_where_it_helps_most_is_missing_nowhere(monkeypatch, shoulder_after):
+    """It acts on two joints, halves the error of the elbow, and the shoulder decides."""
+
+    def evidence(*error):
+        system = SimpleNamespace(coordinates=AXES, torque_units=("N.m", "N.m"))
+        return SimpleNamespace(held_out_rmse=np.array(error), system=system)
+
+    replay = SimpleNamespace(held_out_rmse=np.array([0.1, 0.1]), share=np.zeros(2))
+    search = SimpleNamespace(
+        initial=evidence(1.0, 1.0), evidence=evidence(shoulder_after, 0.3), selected=("gain",),
+        main={"gain": 0}, final=(replay,) * 4, level=SimpleNamespace(replicates=(replay,) * 4),
+        groups={"gain": ()}, contests={}, steps=(), first={}, transient={},
+    )  # fmt: skip
+    second = SimpleNamespace(stretch=Stretch(trial_id="t01", t_start=0.0, t_end=1.0))
+    monkeypatch.setattr(verdict, "_reach", lambda *_: {0, 1})
+    monkeypatch.setattr(verdict, "_odds_of_group", lambda *_: {"gain": 1.0})
+    monkeypatch.setattr(verdict, "explainable_share", lambda *_: 0.2)
+    monkeypatch.setattr(verdict, "rank", lambda *_: ())
+    monkeypatch.setattr(
+        verdict, "error_without_second", lambda e, axis: (second, float(e.held_out_rmse[axis]))
+    )
+    found = verdict.conclude(search, Settings())
+    shoulder, elbow = found.axes
+    if shoulder_after < 0.5:
+        assert [shoulder.verdict, elbow.verdict] == ["missing", "missing"]
+        assert found.selected == shoulder.effects == elbow.effects == ("gain",)
+    else:
+        assert [shoulder.verdict, elbow.verdict] == ["unknown_effect", "undecided"]
+        assert found.selected == shoulder.effects == elbow.effects == ()
+        assert list(elbow.likely) == ["gain"]
