@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import HealthCheck, settings
 from jsonschema import Draft202012Validator
 from numba.core import dispatcher
 
@@ -18,6 +19,9 @@ sys.path[:0] = [str(TOYS), str(ORACLES)]
 # The simulators that share no code with bampipe serve tests and benchmarks alike.
 sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
 SCHEMAS = Path(__file__).parent.parent / "schemas"
+# How fast values come says how busy the machine is, and nothing of the code under test.
+settings.register_profile("busy", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("busy")
 
 import install_toys  # noqa: E402
 
