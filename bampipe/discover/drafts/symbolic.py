@@ -82,10 +82,10 @@ class Sum:
     """A constant plus products, each a coefficient and its factors."""
 
     constant: float
-    parts: tuple[tuple[float, tuple[Factor, ...]], ...] = ()
+    parts: tuple[tuple[float, tuple[Multiplicand, ...]], ...] = ()
 
 
-Factor = Ratio | Call | Sum
+Multiplicand = Ratio | Call | Sum
 
 
 def search(screen: Screen) -> list[Screened]:
@@ -182,7 +182,7 @@ def _form(screen: Screen, known: Sequence[Quantity], whole: Sum) -> tuple[Form, 
     return form, dict(zip(shape.searched, writer.numbers, strict=True))
 
 
-def _used(value: Factor) -> set[int]:
+def _used(value: Multiplicand) -> set[int]:
     if isinstance(value, Ratio):
         return {value.number}
     if isinstance(value, Call):
@@ -231,7 +231,7 @@ def _call(name: str, inside: Sum) -> Sum:
 
 
 def _plus(a: Sum, b: Sum) -> Sum:
-    parts: dict[tuple[Factor, ...], float] = {}
+    parts: dict[tuple[Multiplicand, ...], float] = {}
     for coefficient, factors in (*a.parts, *b.parts):
         parts[factors] = parts.get(factors, 0.0) + coefficient
     largest = max((abs(c) for c in parts.values()), default=0.0)
@@ -249,7 +249,7 @@ def _times(a: Sum, b: Sum) -> Sum:
     return Sum(0.0, ((k * m, tuple(sorted((*left, *right), key=repr))),))
 
 
-def _as_product(a: Sum) -> tuple[float, tuple[Factor, ...]]:
+def _as_product(a: Sum) -> tuple[float, tuple[Multiplicand, ...]]:
     """Coefficient and factors; a sum of several parts is one factor, its first coefficient 1."""
     if len(a.parts) == 1 and a.constant == 0.0:
         return a.parts[0]
@@ -290,13 +290,13 @@ class _Writer:
             lambda x, c: tuple(value(x, c) for value in values), "follows a formula in {x}",
         )  # fmt: skip
 
-    def _product(self, factors: Sequence[Factor]) -> tuple[str, Value]:
+    def _product(self, factors: Sequence[Multiplicand]) -> tuple[str, Value]:
         texts, values = zip(*(self._factor(f) for f in factors), strict=True)
         return "*".join(texts), lambda x, c: np.prod(
             np.broadcast_arrays(*(value(x, c) for value in values)), axis=0
         )
 
-    def _factor(self, factor: Factor) -> tuple[str, Value]:
+    def _factor(self, factor: Multiplicand) -> tuple[str, Value]:
         match factor:
             case Ratio(number):
                 return self._ratio(self._place[number])
