@@ -7,6 +7,7 @@ the finished run folders elsewhere (see :mod:`bampipe.run.publish`).
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import logging
 import queue
@@ -58,7 +59,7 @@ def run_on_cluster(requests: Sequence[Request], scheduler: str, listen: Listener
         ) from error
     # What it logs of lost connections is said below, once.
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
-    client = _connect(Client, scheduler) if scheduler else Client(threads_per_worker=1)
+    client = _connect(scheduler) if scheduler else Client(threads_per_worker=1)
     outcomes: dict[int, Outcome] = {}
     lost = ""
     try:
@@ -88,14 +89,19 @@ def run_on_cluster(requests: Sequence[Request], scheduler: str, listen: Listener
     return [outcomes[number] for number in range(len(requests))]
 
 
-def _connect(kind: type[Client], scheduler: str) -> Client:
+def _connect(scheduler: str) -> Client:
     """Return a client of the scheduler at this address.
 
     Raises:
         InputError: nothing answers there, or something that is no scheduler.
     """
+    from distributed import Client
+
     try:
-        return _within(PATIENCE_S, lambda: kind(scheduler, timeout=f"{PATIENCE_S - 1.0:g}s"))
+        # A client that fails is not asked: collected at some later time, it can hold up the next.
+        kind = _within(PATIENCE_S, lambda: asyncio.run(_ask_kind(scheduler)))
+        if kind == "Scheduler":
+            return _within(PATIENCE_S, lambda: Client(scheduler, timeout=f"{PATIENCE_S:g}s"))
     except TimeoutError as error:
         raise InputError(
             f"no Dask scheduler answers within {PATIENCE_S:g} s", where=scheduler
@@ -104,6 +110,16 @@ def _connect(kind: type[Client], scheduler: str) -> Client:
     except Exception as error:
         what = str(error).partition("\n")[0] or type(error).__name__
         raise InputError(f"no Dask scheduler answers: {what}", where=scheduler) from error
+    raise InputError(f"no Dask scheduler answers: this is a {kind.lower()}", where=scheduler)
+
+
+async def _ask_kind(address: str) -> str:
+    """Return what is at this address: "Scheduler", "Worker" or "Nanny"."""
+    from distributed import rpc
+
+    async with rpc(address, timeout=PATIENCE_S) as remote:
+        found = await asyncio.wait_for(remote.identity(), PATIENCE_S)
+    return str(found["type"])
 
 
 def _within(seconds: float, call: Callable[[], Answer]) -> Answer:
