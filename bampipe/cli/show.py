@@ -22,7 +22,12 @@ LARGEST_TABLE = 40
 MOST_TRIALS = 10
 QUIET_S = 10.0
 """Off a terminal, a long step prints a line this often."""
-FIRST_COLUMNS = ("", "trial_id", "estimate", "sd", "unit", "rmse", "held_out_rmse", "noise_floor")
+FIRST_COLUMNS = (
+    *("", "trial_id", "estimate", "sd", "unit", "rmse", "held_out_rmse", "noise_floor"),
+    *("verdict", "rmse_before", "rmse_after", "explainable_share"),
+    *("effect", "axis", "held_out_rmse_before", "held_out_rmse_after", "p_value"),
+)
+"""In this order, whether a summary has just been made or is read from the run folder."""
 
 
 def number(value: object) -> str:
@@ -109,7 +114,7 @@ def _records(value: object) -> list[dict[str, Any]] | None:
     if isinstance(value, Mapping) and value:
         if not all(isinstance(item, Mapping) for item in value.values()):
             return None
-        return [{"": name, **item} for name, item in value.items()]
+        return [{"": name, **item} for name, item in sorted(value.items())]
     if isinstance(value, list) and value and all(isinstance(item, Mapping) for item in value):
         return [dict(item) for item in value]
     return None

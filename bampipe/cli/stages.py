@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 from typing import Annotated
 
 import typer
 
 from bampipe.cli import places, show
+from bampipe.cli.forecast import say_what_came
 from bampipe.cli.one_stage import advise, one_stage, plain_stage, print_settings
 from bampipe.cli.options import (
     DEFAULTS,
@@ -121,13 +123,18 @@ def next_(
             "--for", help="precision, decision, sensitivity, or a parameter; auto if omitted."
         ),
     ] = "",
-    seconds: Annotated[float, typer.Option(help="Length of the trial; 20 if omitted.")] = 0.0,
+    seconds: Annotated[
+        float, typer.Option(help="Length of the trial; 20 if omitted.", show_default=False)
+    ] = 0.0,
     plan: Annotated[
         bool, typer.Option("--plan", help="Also a set of trials, as a sheet to print.")
     ] = False,
     sd: Annotated[
         str,
-        typer.Option(metavar="SHARE", help="With --plan: of each parameter, such as 5%."),
+        typer.Option(
+            metavar="SHARE",
+            help="With --plan: largest sd of each parameter, as a share of it; 5% if omitted.",
+        ),
     ] = "",
     options: StageOptions = DEFAULTS,
 ) -> None:
@@ -139,10 +146,15 @@ def next_(
 
     Example: bampipe next 2026-10-03_s01 --plan --sd 2%
     """
+    if sd and not plan:
+        raise InputError("--sd is what a plan is to reach", remedy="give --plan with it")
     chosen = model
     if not options.list_settings and not model:
         chosen = models.counting_model(places.find_run(run, options.runs))
     more: dict[str, object] = {"sd": _share(sd)} if sd else {}
+    if not options.list_settings and not options.json:
+        # A new proposal closes those that a recorded trial has followed: say first what came.
+        say_what_came(places.find_run(run, options.runs), chosen, is_diagnosed=False)
     plain_stage("next", run, options, chosen, purpose=purpose, seconds=seconds, plan=plan, **more)
     if plan and not (options.json or options.quiet or options.list_settings):
         show.say(f"sheet: {places.find_run(run, options.runs)}/models/{chosen}/protocol.pdf")
@@ -150,10 +162,11 @@ def next_(
 
 def _share(text: str) -> float:
     """The number that ``5%`` or ``0.05`` means."""
-    try:
-        return float(text.removesuffix("%")) / (100.0 if text.endswith("%") else 1.0)
-    except ValueError as error:
-        raise InputError(f"--sd: {text!r} is not a share", remedy="write 5% or 0.05") from error
+    with contextlib.suppress(ValueError):
+        share = float(text.removesuffix("%")) / (100.0 if text.endswith("%") else 1.0)
+        if 0.0 < share < 1.0:
+            return share
+    raise InputError(f"--sd: {text!r} is not a share between 0 and 1", remedy="write 5% or 0.05")
 
 
 @with_stage_options

@@ -43,8 +43,10 @@ def describe(evidence: Evidence, axis: int) -> str:
             )
     if most.share < _LIMITS.variable_share:
         return (
-            "scattered over all motions; it follows nothing that the machine does "
-            f"({most.variable} carries {100 * most.share:.0f} %)"
+            "scattered over all motions; of all that the machine does, "
+            f"{most.variable} explains most of it, {100 * most.share:.0f} %"
+            if most.share >= 0.005
+            else "scattered over all motions; it follows nothing that the machine does"
         )
     carries = f"{most.variable} carries {100 * most.share:.0f} % of the residual's variance"
     turning = _by_direction(evidence, axis, variable)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from bampipe.discover.candidates import Candidate
 from bampipe.discover.scorer import Score, Scorer
 from bampipe.results.diagnose import Stretch
+from bampipe.trials.measured import trial_of_block
 from bampipe.trials.residuals import Evidence
 
 Array = NDArray[np.float64]
@@ -60,7 +61,7 @@ def largest_trial(evidence: Evidence, by_sample: Sequence[Array]) -> SampleRange
 def _range_of(evidence: Evidence, trial: int, first: int, last: int) -> SampleRange:
     motion = evidence.motions[trial]
     t = motion.t[evidence.band.thinned_rows(len(motion.t))]
-    stretch = Stretch(trial_id=motion.trial_id, t_start=t[first], t_end=t[last - 1])
+    stretch = Stretch(trial_id=trial_of_block(motion.trial_id), t_start=t[first], t_end=t[last - 1])
     return SampleRange(trial, first, last, stretch)
 
 

@@ -21,7 +21,8 @@ def axis_sentences(found: Diagnosis) -> list[str]:
 
 
 def _parts(axis: str, i: int, found: Diagnosis, unit: str) -> list[str]:
-    a, name = found.axes[i], axis.capitalize()
+    a = found.axes[i]
+    name = axis.capitalize() if axis.isalpha() else axis  # joint_1 is a name, not a word
     if a.standing in FLOOR_WRONG:
         parts = [
             f"{name}: no verdict can be trusted, for its held-out error of {a.rmse_after:.3g} "
@@ -29,11 +30,11 @@ def _parts(axis: str, i: int, found: Diagnosis, unit: str) -> list[str]:
         ]
         return parts + ([f"Weighed: {join_names(a.effects)}."] if a.effects else [])
     parts = [f"{name}: {_verdict(a, found, unit)}."]
-    parts += _rivals(a, found, unit)
+    parts += _rivals(axis, a, found, unit)
     parts += _transients(axis, found)
     if a.remains:
         left = (
-            "What is left no effect in the library explains; its shape"
+            "No effect in the library explains what is left; its shape"
             if a.effects
             else "Its shape"
         )
@@ -104,7 +105,7 @@ def _missing(names: Sequence[str]) -> str:
     return f"{join_names(names)} {'is' if len(names) == 1 else 'are'} missing"
 
 
-def _rivals(a: AxisVerdict, found: Diagnosis, unit: str) -> list[str]:
+def _rivals(axis: str, a: AxisVerdict, found: Diagnosis, unit: str) -> list[str]:
     """The effects that come close to one found on this axis, with what they would leave."""
     said = []
     for name in a.effects:
@@ -113,7 +114,12 @@ def _rivals(a: AxisVerdict, found: Diagnosis, unit: str) -> list[str]:
         if rivals:
             mine = contest[0]
             listed = join_names(f"{c.effect} ({_left(c, unit)})" for c in rivals)
-            said.append(f"Close to {name} ({_left(mine, unit)}) comes {listed}.")
+            where = f" on {mine.axis}" if mine.axis != axis else ""
+            verb = "comes" if len(rivals) == 1 else "come"
+            better = [c for c in rivals if c.held_out_rmse < mine.held_out_rmse]
+            better = better if all(c.score < mine.score for c in better) else []
+            over_all = "; over all axes together it explains most" if better else ""
+            said.append(f"Close to {name} ({_left(mine, unit)}{where}{over_all}) {verb} {listed}.")
     return said
 
 

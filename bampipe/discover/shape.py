@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.results.diagnose import WorstWindow
+from bampipe.trials.measured import trial_of_block
 from bampipe.trials.motion import Motion
 from bampipe.trials.residuals import Evidence
 
@@ -184,7 +185,7 @@ def worst_windows(evidence: Evidence, count: int = 10, width_s: float = 0.5) -> 
                 doing = _doing(motion, kept[rows], axis, system.coordinate_units[axis])
                 window = {
                     "axis": name,
-                    "trial_id": motion.trial_id,
+                    "trial_id": trial_of_block(motion.trial_id),
                     "t_start": t[0],
                     "t_end": t[-1],
                     "rmse": rmse,
@@ -206,4 +207,11 @@ def _doing(motion: Motion, rows: NDArray[np.int64], axis: int, unit: str) -> str
     moved = "reversing" if np.any(qd > 0) and np.any(qd < 0) else (
         "moving forwards" if qd.mean() > 0 else "moving backwards"
     )  # fmt: skip
-    return f"{moved} near {q.mean():.2f} {unit} at up to {np.abs(qd).max():.2f} {unit}/s"
+    return f"{moved} near {_size(q.mean(), unit)} at up to {_size(np.abs(qd).max(), unit)}/s"
+
+
+def _size(value: float, unit: str) -> str:
+    """A position or a speed to two decimals, in mm where metres would show too few."""
+    if unit == "m" and abs(value) < 0.1:
+        value, unit = 1e3 * value, "mm"
+    return f"{round(float(value), 2) + 0.0:.2f} {unit}"

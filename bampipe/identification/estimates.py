@@ -319,6 +319,12 @@ def _fault(name: str, entry: ParameterEstimate) -> str:
 
 
 def _describe_limit(timing: InputTiming) -> str:
+    if abs(timing.estimate) < NORMAL_95 * timing.sd:
+        return (
+            f"The timing of the force, {1e3 * timing.estimate:.2g} ± {1e3 * timing.sd:.2g} ms, lies"
+            f" at its limit of {1e3 * timing.limit:.3g} ms, half a sample, and these trials do not"
+            " determine it."
+        )
     way = "later" if timing.estimate > 0.0 else "earlier"
     return (
         f"The force acts {1e3 * timing.limit:.3g} ms or more {way} than logged, half a sample, all"

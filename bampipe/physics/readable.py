@@ -123,6 +123,8 @@ def _templates(model: Model, labels: Sequence[str]) -> dict[str, Any]:
 
     def text(expr: Any) -> str:
         plain = sp.sympify(expr).subs(quiet)
+        # A factor of 1.0 says nothing, and 2.0 no more than 2.
+        plain = plain.xreplace({f: sp.Integer(f) for f in plain.atoms(sp.Float) if f == int(f)})
         for rate in e.qd:
             plain = plain.replace(
                 lambda f, rate=rate: isinstance(f, sp.tanh) and f.args[0].free_symbols == {rate},

@@ -81,7 +81,7 @@ class Callout:
         tone: "good" (nothing to do), "attention" (something is missing), "unknown" (something
             that nothing explains) or "note" (not done yet).
         title: the verdict in a few words.
-        text: one to three sentences.
+        text: one to three sentences, or a line for each axis.
     """
 
     tone: Literal["good", "attention", "unknown", "note"]

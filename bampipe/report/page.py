@@ -80,7 +80,7 @@ def _block(block: Block, number: str) -> str:
             rows = "".join(f"<div>{html.escape(line)}</div>" for line in lines)
             return f'<div class="formulas">{rows}</div>'
         case Callout(tone, title, text):
-            rest = f"<p>{_rich(text)}</p>" if text else ""
+            rest = "".join(f"<p>{_rich(line)}</p>" for line in text.splitlines())
             return f'<div class="callout {tone}"><p class="verdict">{_rich(title)}</p>{rest}</div>'
         case Table():
             return _table(block, number)

@@ -161,7 +161,7 @@ def _block(block: Block, number: str) -> dict[str, Any]:
                 "kind": "callout",
                 "tone": tone,
                 "title": _spans(title),
-                "text": _spans(text),
+                "lines": [_spans(line) for line in text.splitlines()],
             }
         case Table():
             return {
@@ -188,9 +188,11 @@ def _block(block: Block, number: str) -> dict[str, Any]:
 
 
 def _spans(text: str) -> list[Span]:
-    """Return the spans of a text for print, where a link is its words."""
+    """Return the spans of a text for print: a link is its words, no line starts with a % sign."""
     return [
-        ("plain", body.partition("\n")[0]) if kind == "link" else (kind, body)
+        ("plain", body.partition("\n")[0])
+        if kind == "link"
+        else (kind, body if kind == "code" else body.replace(" %", "\u00a0%"))
         for kind, body in spans(text)
     ]
 

@@ -46,7 +46,7 @@ def overall(results: Results) -> Callout:
             "attention",
             "The published parameters are refused",
             f"`bampipe identify {results.root.name} --method least-squares` takes another "
-            f"estimator.{_failures(validated.failed_checks)}",
+            f"estimator.\n{_failures(validated.failed_checks)}",
         )
     found = _explained(results, validated)
     failed = validated.failed_checks if validated else ()
@@ -55,13 +55,13 @@ def overall(results: Results) -> Callout:
         return Callout("attention", f"{found.title}, but {count} failed", _failures(failed))
     if found.tone == "good" and results.outdated:
         return Callout("attention", f"{found.title}, but some results are outdated", found.text)
-    return Callout(found.tone, found.title, found.text + _failures(failed))
+    return Callout(found.tone, found.title, f"{found.text}\n{_failures(failed)}".rstrip())
 
 
 def _failures(failed: Sequence[str]) -> str:
-    """Return the checks that failed, as sentences behind others."""
+    """Return the checks that failed, a line each."""
     sentences = (f"{one[:1].upper()}{one[1:]}".rstrip(".") for one in failed)
-    return "".join(f" {one}." for one in sentences)
+    return "\n".join(f"{one}." for one in sentences)
 
 
 def _explained(results: Results, validated: ValidateResult | None) -> Callout:
@@ -128,7 +128,7 @@ def _diagnosed(results: Results, diagnosis: DiagnoseResult) -> Callout:
     }
     effects = results.effects(results.model)
     with_effects = f" with {join_names(f'`{name}`' for name in effects)}" if effects else ""
-    sentence = diagnosis.sentence
+    sentence = "\n".join(axes[axis].sentence for axis in found)
     if by_verdict["missing"]:
         what = join_names(f"`{name}`" for name in diagnosis.selected) or "an effect"
         where = join_names(by_verdict["missing"])

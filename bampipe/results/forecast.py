@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from pathlib import Path
+
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.next import NextResult
@@ -10,6 +13,52 @@ _SHOWN = 3
 """Parameters that are compared: those for which the forecast promised most."""
 _AS_FORECAST = 1.3
 """Factor within which an uncertainty came as forecast."""
+
+
+def read_forecasts(root: Path, model: str) -> tuple[NextResult, ...]:
+    """Return the forecasts of a model's trials: that of the last proposal first, then earlier ones.
+
+    Args:
+        root: the run folder; model: what was proposed for.
+    """
+    last, folder = root / NextResult.file(model), root / NextResult.EARLIER.format(model=model)
+    paths = [*([last] if last.is_file() else []), *sorted(folder.glob("*.json"))]
+    return tuple(NextResult.read(path) for path in paths)
+
+
+def find_open(forecasts: Sequence[NextResult], proposed: NextResult) -> tuple[NextResult, ...]:
+    """Return those of ``forecasts`` whose trial may still come, without the one now ``proposed``.
+
+    A forecast is open until a trial is at hand that it did not know; `bampipe run` and `bampipe
+    next` hold the two against each other before a new proposal closes it.
+    """
+    asked, found = {_proposal(proposed)}, []
+    for one in forecasts:
+        if _proposal(one) not in asked and set(proposed.trials) <= set(one.trials):
+            asked.add(_proposal(one))
+            found.append(one)
+    return tuple(found)
+
+
+def _proposal(one: NextResult) -> tuple[str, str, str]:
+    """What tells one proposal from another: what it is for, and what is to be recorded."""
+    return one.purpose, one.parameter, one.sentence
+
+
+def compare_forecasts(
+    forecasts: Sequence[NextResult], identified: IdentifyResult, diagnosed: DiagnoseResult | None
+) -> tuple[str, ...]:
+    """Say what was forecast and what came, of every forecast that a new trial has followed.
+
+    Args:
+        forecasts: as of `read_forecasts`; the others as of `compare_forecast`.
+    """
+    said: list[str] = []
+    for one in forecasts:
+        about = f"{one.parameter or one.purpose}, {one.proposals[0].seconds:g} s: "
+        lines = compare_forecast(one, identified, diagnosed)
+        said += [about + line if len(forecasts) > 1 else line for line in lines]
+    return tuple(said)
 
 
 def compare_forecast(

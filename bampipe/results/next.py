@@ -122,6 +122,8 @@ class NextResult(Result):
 
     FILE: ClassVar[str] = "models/{model}/next.json"
     STAGE: ClassVar[str] = "next"
+    EARLIER: ClassVar[str] = "models/{model}/forecasts"
+    """Folder of earlier proposals whose trial may still come, each as in FILE."""
 
     model: str
     purpose: Purpose

@@ -166,7 +166,7 @@ def _open(url: str) -> tuple[Any, str]:
         from fsspec.core import url_to_fs
     except ImportError as error:
         raise InputError(
-            "publishing needs fsspec", remedy="pip install 'bampipe[remote]'"
+            "publishing and fetching need fsspec", remedy="pip install 'bampipe[remote]'"
         ) from error
     with _driver("no such file system", url):
         system, path = url_to_fs(url)

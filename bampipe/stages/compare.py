@@ -133,7 +133,8 @@ def _moved(
             sd, change = math.hypot(old.sd, new.sd), new.estimate - old.estimate
             if abs(change) > sigmas * sd:
                 sentence = (
-                    f"{name} moved from {old.estimate:.4g} to {new.estimate:.4g} {new.unit}: "
+                    f"{name} moved from {old.estimate:.4g} ± {old.sd:.2g} to {new.estimate:.4g} ± "
+                    f"{new.sd:.2g} {new.unit}: "
                     "without the effect it was biased."
                 )
                 moved.append(

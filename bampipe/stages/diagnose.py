@@ -44,7 +44,7 @@ from bampipe.results.standing import FLOOR_WRONG
 from bampipe.results.terms import EffectText
 from bampipe.schema import STRICT, Count
 from bampipe.trials.folds import HELD_OUT
-from bampipe.trials.measured import MeasuredTrials, read_measured_trials
+from bampipe.trials.measured import MeasuredTrials, read_measured_trials, trial_of_block
 
 _DESCRIBED = 12
 """Effects of the ranking whose formulas are stored with it."""
@@ -212,8 +212,9 @@ def _map_variables(found: Diagnosis) -> pd.DataFrame:
     evidence = found.initial
     motions, band = evidence.motions, evidence.band
     rows = [band.thinned_rows(len(motion.t)) for motion in motions]
+    trials = [trial_of_block(motion.trial_id) for motion in motions]
     columns: dict[str, object] = {
-        "trial_id": np.repeat([motion.trial_id for motion in motions], [len(k) for k in rows]),
+        "trial_id": np.repeat(trials, [len(k) for k in rows]),
         "t": np.concatenate([motion.t[k] for motion, k in zip(motions, rows, strict=True)]),
     }
     for i, axis in enumerate(evidence.system.coordinates):

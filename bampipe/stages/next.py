@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Literal, get_args
@@ -14,6 +16,7 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
 from bampipe.declarations.model_file import IDENTIFIED_MODEL, identified, load_model, read_recipe
 from bampipe.errors import InputError, choose_from
+from bampipe.files import write_json
 from bampipe.identification.filter_choice import FilterChoice
 from bampipe.identification.sensor_noise import sensor_noise
 from bampipe.next_trial.choice import Tried, Worth, rank_designs
@@ -32,6 +35,7 @@ from bampipe.next_trial.reasons import explain_proposal
 from bampipe.physics import compile_model
 from bampipe.progress import Progress
 from bampipe.results.diagnose import DiagnoseResult
+from bampipe.results.forecast import find_open, read_forecasts
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.ingest import IngestResult
 from bampipe.results.next import Detectable, NextResult, Plan, Purpose
@@ -51,6 +55,7 @@ INPUTS = (
 )
 OUTPUTS = (
     "models/{model}/next.json",
+    "models/{model}/forecasts/*.json",
     "models/{model}/protocol*.pdf",
     "models/{model}/trajectory*.csv",
 )
@@ -186,6 +191,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         plan=plan,
     )
     result.write(out)
+    _write_earlier(run, out, result)
     if model.device.robot is not None:
         # A controller follows positions, where a person follows a sentence.
         t, q = rehearsal.trajectory(tried[0].design)
@@ -199,6 +205,14 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         sheet = protocol_sheet(plan, run.read(IngestResult).session_id, config.model)
         (out / f"models/{config.model}/protocol.pdf").write_bytes(sheet)
     return _summary(result)
+
+
+def _write_earlier(run: RunFolder, out: Path, result: NextResult) -> None:
+    """Write the earlier proposals whose trial may still come, each named by its content."""
+    for one in find_open(read_forecasts(run.root, result.model), result):
+        content = one.model_dump(mode="json")
+        name = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:12]
+        write_json(out / NextResult.EARLIER.format(model=result.model) / f"{name}.json", content)
 
 
 def _split(asked: str, names: Sequence[str]) -> tuple[Purpose | Literal["auto"], str]:

@@ -50,6 +50,17 @@ def contender(effect, held_out_rmse, score, without_trial, without_second, odds)
     )  # fmt: skip
 
 
+def test_a_rival_that_leaves_less_on_this_axis_says_why_it_is_none(monkeypatch):
+    axis = finding("missing", 2.0, 0.84, 0.1, effects=("a:joint",))
+    contest = (contender("a:joint", 0.84, 90.0, 50.0, 60.0, 1.0),)
+    for score, said in ((80.0, "over all axes together it explains most"), (95.0, "Close to")):
+        rival = contender("b:joint", 0.73, score, 50.0, 60.0, 0.0)
+        sentence = say(monkeypatch, axis, {"a:joint": (*contest, rival)})
+        assert said in sentence
+        assert ("over all axes" in sentence) is (score < 90.0)
+        assert "comes b:joint (leaves 0.73 N.m)" in sentence
+
+
 def numbers(sentence):
     """Every number in it."""
     return [float(x) for x in re.findall(r"(?<![\w.])\d+(?:\.\d+)?(?:e-?\d+)?", sentence)]

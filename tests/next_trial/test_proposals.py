@@ -13,7 +13,7 @@ from independent_runs import SHORT, diagnose, record_run
 
 import bampipe
 from bampipe.errors import InputError
-from bampipe.results.forecast import compare_forecast
+from bampipe.results.forecast import compare_forecast, compare_forecasts, read_forecasts
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.next import NextResult
 
@@ -128,6 +128,9 @@ def test_a_plan_reaches_what_is_asked_in_few_trials_and_says_what_came(tmp_path)
     assert easy.plan is not None
     assert easy.plan.is_enough
     assert easy.plan.trials == ()
+    # Another question leaves the first forecast as it was, until its trial has come.
+    other, _ = propose(run, purpose="viscous.joint", seconds=12.0)
+    assert read_forecasts(run.root, "base") == (other, easy)
     # The same run folder, the session with the proposed trial in it.
     independent.record(
         "joint", tmp_path / "now" / "joint", 922, {},
@@ -144,3 +147,9 @@ def test_a_plan_reaches_what_is_asked_in_few_trials_and_says_what_came(tmp_path)
     assert said.startswith("`coulomb.joint`: ±")
     assert f"± {came:.2g} came" in said
     assert compare_forecast(easy, identified.model_copy(update={"trials": easy.trials}), None) == ()
+    lines = compare_forecasts(read_forecasts(again.root, "base"), identified, None)
+    assert [line.partition(",")[0] for line in lines] == ["viscous.joint", "coulomb.joint"]
+    assert lines[1] == f"coulomb.joint, 12 s: {said}"
+    assert read_forecasts(again.root, "base") == (other, easy)
+    now, _ = propose(again, purpose="coulomb.joint", seconds=12.0)
+    assert read_forecasts(again.root, "base") == (now,)

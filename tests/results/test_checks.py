@@ -62,7 +62,11 @@ def test_a_sound_model_fails_none() -> None:
             "by the unscented filter: it lost the motion",
         ),
         ("fit", {"convergence": {"converged": False}}, "not converged"),
-        ("fit", {"input_timing": {"estimate": -9.9e-4, "sd": 1e-4}}, "input timing: -0.99 ms"),
+        (
+            "fit",
+            {"input_timing": {"estimate": -9.9e-4, "sd": 1e-4}},
+            "input timing: -0.99 ± 0.1 ms",
+        ),
         (
             "fit",
             {"innovations": {"yaw": {"sentence": "Not white", "whiteness": {"white": False}}}},

@@ -28,8 +28,9 @@ def explorer_page(results: Results, subtitle: str) -> str:
     packer = Packer()
     content = content_of(results, packer)
     verdict = verdicts.overall(results)
-    title, text = plain_text(verdict.title), plain_text(verdict.text)
-    content["verdict"] = {"tone": verdict.tone, "title": title, "text": text}
+    lines = [plain_text(line) for line in verdict.text.splitlines()]
+    title = plain_text(verdict.title)
+    content["verdict"] = {"tone": verdict.tone, "title": title, "lines": lines}
     content["session"] = results.session.session_id
     return assemble_page(content, packer, subtitle)
 

@@ -91,8 +91,8 @@ def _next(results: Results, model: str, found: DiagnoseResult) -> list[Block]:
     for rung in rungs:
         if wanted and rung.parent == model and wanted == set((rung.added or "").split(", ")):
             return [Paragraph(f"Added since, as model `{rung.model}`.")]
-    command = found.next.startswith("bampipe ")
-    return [Paragraph(f"Next: `{found.next}`" if command else f"Next: {found.next}.")]
+    what = found.next.replace("RUN", results.root.name)
+    return [Paragraph(f"Next: `{what}`" if what.startswith("bampipe ") else f"Next: {what}.")]
 
 
 def _verdicts(names: tuple[str, ...], axes: Mapping[str, AxisVerdict]) -> Table:

@@ -18,6 +18,7 @@ from bampipe.results.identify import (
     METHODS_IN_WORDS,
     BaseEstimate,
     IdentifyResult,
+    InputTiming,
     ParameterEstimate,
     StateBound,
 )
@@ -140,7 +141,7 @@ def _base_parameters(bases: Sequence[BaseEstimate]) -> Table:
                 base.combination,
                 wording.plain(base.estimate, decimals),
                 wording.significant(base.sd, 2),
-                f"{wording.significant(base.drawn, 4)} ± {wording.significant(base.drawn_sd, 2)}",
+                wording.with_sd(base.drawn, base.drawn_sd),
                 "yes" if base.shown else "no",
                 wording.unit(base.unit),
             )
@@ -175,9 +176,18 @@ def _checks(identified: IdentifyResult) -> str:
             "are right."
         )
     if timing.sd > 0.0:  # else it was not estimated
-        lag = wording.with_sd(1e3 * timing.estimate, 1e3 * timing.sd)
-        parts.append(f"The force lags the encoders by {lag} ms.")
+        parts.append(_timing(timing))
     return " ".join(parts)
+
+
+def _timing(timing: InputTiming) -> str:
+    """Return by how much the force lags the encoders, where the trials show that it does."""
+    lag = 1e3 * timing.estimate
+    if abs(timing.estimate) < _NORMAL_95 * timing.sd:
+        shown = wording.with_sd(lag, 1e3 * timing.sd)
+        return f"No delay between force and encoders is shown (the force lags by {shown} ms)."
+    verb = "lags" if lag > 0.0 else "leads"
+    return f"The force {verb} the encoders by {wording.with_sd(abs(lag), 1e3 * timing.sd)} ms."
 
 
 def _method(identified: IdentifyResult) -> str:
@@ -185,19 +195,21 @@ def _method(identified: IdentifyResult) -> str:
 
 
 def _bounds(results: Results, bounds: Mapping[str, StateBound]) -> Table:
+    # A smoother before least squares bounds no position: no column of dashes for it.
+    positions = any(bound.position is not None for bound in bounds.values())
     rows = [
         (
             axis,
-            _scaled(bounds[axis].position, results.unit(axis)),
+            *((_scaled(bounds[axis].position, results.unit(axis)),) if positions else ()),
             _scaled(bounds[axis].velocity, results.rate_unit(axis)),
         )
         for axis in verdicts.ordered(results, bounds)
     ]
     return Table(
         f"Error of the filtered state, 3σ bounds{results.in_paper('Table VI')}",
-        ("Axis", "Position", "Velocity"),
+        ("Axis", *(("Position",) if positions else ()), "Velocity"),
         tuple(rows),
-        "lrr",
+        "lrr" if positions else "lr",
     )
 
 

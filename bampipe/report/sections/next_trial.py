@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from bampipe.report import wording
 from bampipe.report.document import Block, Bullets, Callout, Paragraph, Section, Table
 from bampipe.report.results import Results
-from bampipe.results.forecast import compare_forecast
+from bampipe.results.forecast import compare_forecasts, read_forecasts
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.next import (
     Detectable,
@@ -31,7 +31,9 @@ def section(results: Results) -> Section | None:
         Paragraph(f"{found.why} {found.expected}"),
     ]
     identified = results.read(IdentifyResult)
-    came = compare_forecast(found, identified, None) if identified is not None else ()
+    came: tuple[str, ...] = ()
+    if identified is not None:
+        came = compare_forecasts(read_forecasts(results.root, results.model), identified, None)
     if came:
         blocks.append(Bullets(tuple(line.replace("RUN", results.root.name) for line in came)))
     best = found.proposals[0]

@@ -15,6 +15,7 @@ from bampipe.results.setup import SetupResult
 from bampipe.results.stiffness import AxisStiffness, StiffnessResult
 from bampipe.results.validate import AxisError, ValidateResult
 
+_NORMAL_95 = 1.959964
 _MOST_OTHERS = 12
 """Parameters of no axis that a note can name."""
 _TERMS = (
@@ -149,7 +150,13 @@ def _numbers(results: Results) -> Table | None:
         "l" + "r" * len(axes),
         (0.0, *(1.0 for _ in axes)),
         " ".join(
-            part for part in (_others(results, identified), _TERMS if validate else "") if part
+            part
+            for part in (
+                _near_zero(results, identified),
+                _others(results, identified),
+                _TERMS if validate else "",
+            )
+            if part
         ),
     )
 
@@ -181,6 +188,18 @@ def _stiffness(entry: AxisStiffness | None) -> str:
         return "–"
     factor, unit = wording.scale([entry.stiffness], entry.unit)
     return f"{wording.with_sd(factor * entry.stiffness, factor * entry.sd)} {unit}"
+
+
+def _near_zero(results: Results, parameters: Mapping[str, ParameterEstimate]) -> str:
+    """Name the strengths that these trials do not show to differ from zero."""
+    names = [
+        f"`{name}`"
+        for name in results.in_order(parameters)
+        if name.startswith(("viscous.", "coulomb."))
+        and abs(parameters[name].estimate) < _NORMAL_95 * parameters[name].sd
+    ]
+    verb = "is" if len(names) == 1 else "are"
+    return f"{join_names(names)} {verb} not shown to differ from zero." if names else ""
 
 
 def _others(results: Results, parameters: Mapping[str, ParameterEstimate]) -> str:

@@ -25,7 +25,7 @@ def section(results: Results) -> Section | None:
     known = identified.identifiability
     blocks: list[Block] = []
     if known:
-        blocks.append(Paragraph(_words(known)))
+        blocks.append(Paragraph(_words(identified, known)))
         if known.sentences:
             blocks.append(Bullets(known.sentences))
         blocks.append(_parameters(results, identified, known))
@@ -36,12 +36,17 @@ def section(results: Results) -> Section | None:
     return Section(TITLE, tuple(blocks)) if blocks else None
 
 
-def _words(known: IdentifiabilityReport) -> str:
+def _words(identified: IdentifyResult, known: IdentifiabilityReport) -> str:
     if known.weak_directions:
         return "Not everything below is known as well as its interval alone suggests."
+    if identified.base_parameters:
+        return (
+            "Of a robot's bodies motion shows combinations only (under Identification): a single "
+            "inertial number below leans on the drawing, however small its standard deviation."
+        )
     return (
-        "Each parameter is determined on its own: no two hide each other in these trials. What "
-        "remains beyond reach follows from the equations and from the numbers of the device file."
+        "No two parameters hide each other in these trials. What remains beyond reach follows from "
+        "the equations and from the numbers of the device file."
     )
 
 

@@ -109,8 +109,8 @@ def _at_the_handle(validated: ValidateResult, pusher: str) -> str:
         f"{wording.words(name)} {wording.significant(entry.rmse)} {wording.unit(entry.unit)}"
         for name, entry in validated.forces.items()
     )
-    place = "At the handle" if pusher == "hand" else f"Of the {pusher}"
-    return f"{place} the error is {join_names(shown)} (RMSE)."
+    place = "At the handle the error" if pusher == "hand" else "The error of the predicted readings"
+    return f"{place} is {join_names(shown)} (RMSE)."
 
 
 def _drift(results: Results, drift: Mapping[str, AxisDrift]) -> list[Block]:
@@ -118,6 +118,9 @@ def _drift(results: Results, drift: Mapping[str, AxisDrift]) -> list[Block]:
     axes = verdicts.ordered(results, drift)
     horizons = sorted({h.horizon_s for axis in axes for h in drift[axis].horizons})
     reasons = tuple(f"{axis}: {drift[axis].reason}" for axis in axes if drift[axis].reason)
+    everywhere = {drift[axis].reason for axis in axes}
+    if not horizons and len(everywhere) == 1 and reasons:
+        return [Paragraph(f"The model is not left to itself. {everywhere.pop()}")]
     blocks: list[Block] = []
     rows = []
     for axis in axes:
@@ -278,8 +281,7 @@ def _friction(results: Results, frame: pd.DataFrame, velocity: dict[str, np.ndar
     caption = (
         f"The friction that a model without it leaves{results.in_paper('Fig. 4')}. {places[0]}: "
         "measured minus predicted generalised force against velocity; the arrow shows the start "
-        f"of one movement. {places[1]}: that movement; without friction the prediction overshoots "
-        "zero."
+        f"of one movement. {places[1]}: that movement."
     )
     return Figure("error-without-friction", caption, style.svg(figure))
 

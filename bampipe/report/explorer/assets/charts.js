@@ -141,7 +141,7 @@ function buildParameterMap() {
   const rows = content.parameters.map(({ name, unit, values }) => ({
     cells: [name, unit || "1", ...values.map((value) => value?.estimate ?? null), ...values.map((value) => value?.sd ?? null)],
     drawn: whiskers(name, values),
-    texts: [name, unit || "1", ...values.map((value) => (value ? `${format(value.estimate)} ± ${format(value.sd, 2)}${value.at_bound ? " *" : ""}` : "–"))],
+    texts: [name, unit || "1", ...values.map((value) => (value ? `${withSd(value.estimate, value.sd)}${value.at_bound ? " *" : ""}` : "–"))],
   }));
   host.append(
     tableOf({

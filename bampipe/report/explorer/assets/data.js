@@ -195,6 +195,14 @@ function placeOf(time) {
 }
 
 /** A number as a reader wants it. */
+function withSd(value, sd) {
+  if (!(sd > 0) || !Number.isFinite(value)) return format(value);
+  const decimals = Math.max(0, 1 - Math.floor(Math.log10(Number(sd.toPrecision(2)))));
+  if (decimals > 9) return `${format(value)} ± ${format(sd, 2)}`;
+  const shown = value.toFixed(decimals);
+  return `${(Number(shown) ? shown : shown.replace("-", "")).replace("-", "−")} ± ${sd.toFixed(decimals)}`;
+}
+
 function format(value, digits = 4) {
   if (value === null || value === undefined || !Number.isFinite(value)) return "–";
   if (value === 0) return "0";

@@ -157,10 +157,10 @@ function buildControls() {
 }
 
 function showVerdict() {
-  const { tone, title, text } = content.verdict;
+  const { tone, title, lines } = content.verdict;
   const plain = (words) => words.replace(/[*`]/g, "");
   document.getElementById("verdict").append(
-    make("div", { class: `callout ${tone}` }, make("p", { class: "title" }, plain(title)), text ? make("p", {}, plain(text)) : null),
+    make("div", { class: `callout ${tone}` }, make("p", { class: "title" }, plain(title)), ...lines.map((line) => make("p", {}, plain(line)))),
   );
 }
 
