@@ -18,6 +18,12 @@ Array = NDArray[np.float64]
 _MEMORY_STEPS = (3, 12, 48)
 """Steps a sample tried in turn, until a stiff state is integrated without running away."""
 _RUNAWAY = 1e9
+_STEP_AGAINST_NEIGHBOURS = 8.0
+"""A command that changes between two samples this many times more than before and after has been
+switched. Ramps and sines change by at most twice as much from one sample to the next; noise of the
+reading makes neighbours large."""
+_STEP_SHARE = 0.02
+"""Least share of the command's range that counts as switching: not a quantised slow change."""
 
 
 class System:
@@ -68,6 +74,7 @@ class System:
         self.compensated: tuple[int, ...] = tuple(meta["compensated"])
         self.delays: tuple[str, ...] = tuple(meta["delays"])
         self.braked: bool = meta["braked"]
+        self._commands: list[int] = meta["commands"]
 
     @property
     def prior(self) -> Array:
@@ -267,7 +274,8 @@ class System:
         """Internal states along a measured motion of one trial, (T, n_z).
 
         Integrated by RK4 with inputs interpolated linearly between samples, in finer steps where
-        a state would run away.
+        a state would run away. A command or channel that is switched holds until the sample that
+        first shows its new value.
 
         Args:
             q, qd, qdd, u, p: as in `required`.
@@ -277,14 +285,32 @@ class System:
             return np.zeros((len(q), 0))
         a, b, _ = self.true_motion(q, qd, qdd, u, p)
         z0 = self.initial_memory(a[0], u[0], p)
+        switched = self._switched(u)
+        at = np.flatnonzero(switched.any(axis=1))
+        if at.size:
+            # One more row at the time of the switch, with the values before it.
+            held = np.where(switched[at], u[at - 1], u[at])
+            u = np.insert(u, at, held, axis=0)
+            a, b, t = (np.insert(x, at, x[at], axis=0) for x in (a, b, t))
         arrays = [np.ascontiguousarray(x, dtype=np.float64) for x in (a, b, u, p, t)]
-        out = np.empty((len(q), len(z0)))
+        out = np.empty((len(t), len(z0)))
         module = self._code.module("memory")
         for steps in _MEMORY_STEPS:
             module.memory(*arrays, z0, steps, out)
             if np.all(np.abs(out) < _RUNAWAY):
                 break
-        return out
+        return np.delete(out, at + np.arange(at.size), axis=0) if at.size else out
+
+    def _switched(self, u: Array) -> NDArray[np.bool_]:
+        """Where an input other than a force has been switched since the sample before, (T, n_u)."""
+        switched = np.zeros(u.shape, dtype=bool)
+        for i in self._commands if len(u) > 3 else ():
+            change = np.abs(np.diff(u[:, i]))
+            around = np.maximum(change[:-2], change[2:])
+            least = max(_STEP_SHARE * float(np.ptp(u[:, i])), 1e-300)
+            middle = change[1:-1]
+            switched[2:-1, i] = (middle > least) & (middle > _STEP_AGAINST_NEIGHBOURS * around)
+        return switched
 
 
 def _stack(columns: tuple[Any, ...], rows: int) -> Array:
@@ -336,6 +362,13 @@ def _generate(model: Model) -> tuple[dict[str, Any], dict[str, str]]:
         and not any(e.has(*forces) for e in equations.rates),
         "compensated": [i for i, e in enumerate(equations.compensation) if e != 0],
         "delays": equations.delays,
+        "commands": [
+            i
+            for i, u in enumerate(equations.u)
+            if u not in forces
+            and equations.inputs[i] != "t"
+            and any(u in e.free_symbols for e in equations.rates)
+        ],
         "braked": any(brakes & e.free_symbols for e in (*added, *equations.rates)),
     }
     sources = {

@@ -248,3 +248,42 @@ def test_a_flexible_load_is_rigid_below_its_frequency_and_left_behind_above_it()
         spring = 60.0**2 + 2j * 0.05 * 60.0 * w
         ratio = spring / (spring - w**2)
         assert mass == pytest.approx(70.0 + 25.0 * ratio.real, rel=2e-3)
+
+
+def delivered(current: np.ndarray, lag: float) -> np.ndarray:
+    """The coil's current along a log of the command, (T,), of `channel_lag`."""
+    system = compile_model(Model(registry.device("magnetic_damper"), ("channel_lag:current",)))
+    u = np.zeros((len(current), len(system.inputs)))
+    u[:, system.inputs.index("current")] = current
+    still = np.zeros((len(current), 1))
+    p = system.prior
+    p[system.index("channel_lag.current.time_constant")] = lag
+    return system.memory(still, still, still, u, p, np.arange(len(current)) / RATE)[:, 0]
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_a_switched_command_holds_until_the_sample_that_shows_it(noise: float) -> None:
+    """Within the interval before it is still the old one; a straight line would be half early."""
+    levels = np.repeat([0.5, 2.0, 0.2, 1.1], 100)
+    lag, decay = 0.03, np.exp(-1.0 / RATE / 0.03)
+    exact, z = [], levels[0]
+    for level in levels:
+        exact.append(z)
+        z = level + (z - level) * decay
+    read = levels + noise * np.random.default_rng(1).standard_normal(levels.size)
+    # The effect's time constant never quite vanishes: 0.1 % longer than stated here.
+    np.testing.assert_allclose(delivered(read, lag), exact, rtol=0.01, atol=1e-3 + 2.0 * noise)
+    before = np.flatnonzero(np.diff(levels)) + 1
+    np.testing.assert_allclose(
+        delivered(read, lag)[before], np.array(exact)[before], atol=3e-3 + 2.0 * noise
+    )
+
+
+def test_a_quantised_or_smooth_command_is_not_switched() -> None:
+    """A lagged slow sine is the sine's response, in steps of its converter or without them."""
+    t = np.arange(2000) / RATE
+    w, lag = 2.0 * np.pi, 0.03
+    sine = 1.0 + np.sin(w * t)
+    response = 1.0 + (np.sin(w * t) - w * lag * np.cos(w * t)) / (1.0 + (w * lag) ** 2)
+    for read in (sine, np.round(sine / 0.01) * 0.01):
+        np.testing.assert_allclose(delivered(read, lag)[500:], response[500:], atol=5e-3)
