@@ -21,7 +21,7 @@ from bampipe.physics import System, compile_model
 from bampipe.physics.recipe import Recipe
 from bampipe.physics.registry import effect_from
 from bampipe.trials.measured import MeasuredTrials
-from bampipe.trials.replay import replay_motions
+from bampipe.trials.replay import StandIn, replay_motions
 from bampipe.trials.residuals import Evidence, gather_evidence
 from bampipe.workers import process_pool
 
@@ -57,8 +57,9 @@ _timed_trials: MeasuredTrials | None = None
 
 
 def _open(trials: MeasuredTrials | None) -> None:
-    global _open_trials, _timed_trials
+    global _open_trials, _timed_trials, _stand_in
     _open_trials = _timed_trials = trials
+    _stand_in = None
 
 
 def open_trials(late_s: float | None = None) -> MeasuredTrials:
@@ -161,12 +162,29 @@ class ReplicateTask:
     share: bool = False
 
 
+_stand_in: StandIn | None = None
+"""What was replayed last in this process: the next replay is mostly of the same."""
+
+
+def stand_in_for(trials: MeasuredTrials, recipe: Recipe, p: Array) -> StandIn:
+    """The model of ``recipe`` with parameters ``p``, (n_p,), in place of the machine."""
+    global _stand_in
+    system, known = system_of(recipe), _stand_in
+    if (
+        known is None
+        or known.system is not system
+        or known.motions is not trials.motions
+        or not np.array_equal(known.p, p)
+    ):
+        known = _stand_in = StandIn(system, p, trials.motions, trials.sensors.rate_hz)
+    return known
+
+
 def run_replicate(task: ReplicateTask) -> Replicate:
     """Replay, filter, fit and score one replicate."""
     trials, system = open_trials(task.late_s), system_of(task.recipe)
-    replays = replay_motions(
-        system, task.p, trials.motions, trials.sensors, trials.kinematics, task.seed
-    )
+    stand_in = stand_in_for(trials, task.recipe, task.p)
+    replays = replay_motions(stand_in, trials.sensors, trials.kinematics, task.seed)
     analysed = system_of(task.analysed)
     evidence = gather_evidence(
         analysed, replays, trials.band, task.start, trials.folds, most_iterations=_STEPS_OF_A_REPLAY

@@ -17,6 +17,7 @@ from bampipe.results.standing import standing
 from bampipe.trials.band import LEAST_HZ
 from bampipe.trials.measured import MeasuredTrials
 from bampipe.trials.noise_floor import FLOOR_SEED, NoiseFloor, replay_evidence
+from bampipe.trials.replay import StandIn
 from bampipe.trials.residuals import Evidence, gather_evidence
 
 Array = NDArray[np.float64]
@@ -48,11 +49,12 @@ def judge_in_other_band(
     band = Band(known.rate_hz, tuple(cutoffs), known.margin_s)
     measured = gather_evidence(evidence.system, trials.motions, band, evidence.p, trials.folds)
     error = Scorer(measured).base_error
+    stand_in = StandIn(evidence.system, p, trials.motions, trials.sensors.rate_hz)
     try:
         replays = [
             replay_evidence(
-                evidence.system, p, measured.p, trials.motions, trials.sensors, trials.kinematics,
-                band, trials.folds, (settings.seed, FLOOR_SEED, k),
+                stand_in, measured.p, trials.sensors, trials.kinematics, band, trials.folds,
+                (settings.seed, FLOOR_SEED, k),
             )
             for k in range(settings.other_band_replicates)
         ]  # fmt: skip

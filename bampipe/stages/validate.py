@@ -44,7 +44,7 @@ from bampipe.trials.noise_floor import (
     replay_evidence,
 )
 from bampipe.trials.reading import held_out_trials, read_motions, require_sound_motions
-from bampipe.trials.replay import UNLIKE
+from bampipe.trials.replay import UNLIKE, StandIn
 from bampipe.trials.residuals import Evidence, gather_evidence
 
 SUMMARY = "Predicted against measured torque and force, on trials that the fit has not seen"
@@ -218,9 +218,10 @@ def _expected_ratio(evidence: Evidence, trials: MeasuredTrials, p: Array, seed: 
     worse it therefore looks, a replay of it shows.
     """
     nothing = np.ones(len(evidence.system.coordinates))
+    published = StandIn(evidence.system, p, evidence.motions, trials.sensors.rate_hz)
     try:
         again = replay_evidence(
-            evidence.system, p, evidence.p, evidence.motions, trials.sensors, trials.kinematics,
+            published, evidence.p, trials.sensors, trials.kinematics,
             evidence.band, evidence.folds, (seed, _EXPECTED_SEED),
         )  # fmt: skip
     except InputError:

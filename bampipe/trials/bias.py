@@ -13,7 +13,7 @@ from bampipe.estimate.least_squares import LeastSquares, Problem, fit
 from bampipe.physics import System
 from bampipe.trials.kinematics import Kinematics
 from bampipe.trials.motion import Motion
-from bampipe.trials.replay import UNLIKE, replay_motions
+from bampipe.trials.replay import UNLIKE, StandIn, replay_motions
 from bampipe.trials.residuals import problem_of
 from bampipe.trials.sensors import Sensors
 
@@ -92,8 +92,9 @@ def remove_bias(
 
     def replayed_bias(p: Array) -> Array:
         replays = replay_motions(
-            system, p[:count], motions, sensors, kinematics, (0, 0), force_noise=False, alone=True
-        )
+            StandIn(system, p[:count], motions, sensors.rate_hz), sensors, kinematics, (0, 0),
+            force_noise=False, alone=True,
+        )  # fmt: skip
         again = fit(problem_of(system, replays, problem.band, timing=timing), raw.p)
         if np.any(again.residual_sd > UNLIKE * raw.residual_sd):
             raise InputError("the replay of the model does not resemble the machine")

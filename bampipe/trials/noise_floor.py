@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 
 from bampipe.estimate.least_squares import fit
 from bampipe.estimate.low_pass import Band
-from bampipe.physics import System
 from bampipe.trials.bias import remove_bias
 from bampipe.trials.folds import Folds
 from bampipe.trials.kinematics import Kinematics
 from bampipe.trials.motion import Motion
-from bampipe.trials.replay import replay_motions
+from bampipe.trials.replay import StandIn, replay_motions
 from bampipe.trials.residuals import Evidence, gather_evidence, problem_of
 from bampipe.trials.sensors import Sensors
 
@@ -69,19 +68,17 @@ def floor_replays(motions: Sequence[Motion]) -> int:
 
 
 def replay_evidence(
-    system: System,
-    p: Array,
+    stand_in: StandIn,
     start: Array,
-    motions: Sequence[Motion],
     sensors: Sensors,
     kinematics: Kinematics,
     band: Band,
     folds: Folds,
     seed: Sequence[int],
 ) -> Evidence:
-    """Replay all trials by a model at ``p`` and fit it to them, from ``start`` on."""
-    replays = replay_motions(system, p, motions, sensors, kinematics, seed, alone=True)
-    return gather_evidence(system, replays, band, start, folds)
+    """Replay all trials by a model and fit it to them, from ``start`` on."""
+    replays = replay_motions(stand_in, sensors, kinematics, seed, alone=True)
+    return gather_evidence(stand_in.system, replays, band, start, folds)
 
 
 def parameters_to_replay(
@@ -142,13 +139,13 @@ def find_noise_floor(
     """
     chosen = _choose_trials(evidence)
     motions = [evidence.motions[number] for number in chosen]
+    stand_in = StandIn(evidence.system, p, motions, sensors.rate_hz)
     folds = evidence.folds.subset(chosen)
     errors = []
     for k in range(count):
         found = replay_evidence(
-            evidence.system, p, evidence.p, motions, sensors, kinematics,
-            evidence.band, folds, (seed, FLOOR_SEED, k),
-        )  # fmt: skip
+            stand_in, evidence.p, sensors, kinematics, evidence.band, folds, (seed, FLOOR_SEED, k)
+        )
         errors.append(found.held_out_rmse)
         progress(k + 1)
     return NoiseFloor.of_errors(errors)

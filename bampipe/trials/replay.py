@@ -14,9 +14,10 @@ import shutil
 import tempfile
 import weakref
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +30,7 @@ from bampipe.physics.device import derivative
 from bampipe.trials.cache import MOST_SAMPLES, TrialCache
 from bampipe.trials.kinematics import Kinematics
 from bampipe.trials.motion import Motion, Recording, n_samples
-from bampipe.trials.residuals import residual_and_memory
+from bampipe.trials.residuals import ModelOnTrial
 from bampipe.trials.sensors import Sensors
 
 Array = NDArray[np.float64]
@@ -51,33 +52,67 @@ FOLLOWED_HZ = 10.0
 """Highest frequency of the motion to follow where encoder and handle move apart."""
 
 
-def replay_recording(
-    system: System, p: Array, motion: Motion, sensors: Sensors, rng: np.random.Generator
-) -> Recording:
-    """Simulate one trial of a fitted model and read it with the session's sensors.
+class Course(NamedTuple):
+    """What a machine does in one trial, before any sensor reads it.
 
-    Args:
+    Attributes:
+        q: positions at the encoders, (T, n_q), rad or m.
+        force: (T, n_f), N.m or N.
+    """
+
+    q: Array
+    force: Array
+
+
+@dataclass(frozen=True)
+class StandIn:
+    """A fitted model in place of the machine, on the trials of a session.
+
+    Attributes:
         system: the model; effects of kind ``measurement`` act on what the encoders read.
         p: its parameters, (n_p,).
+        motions: the measured trials to follow.
+        rate_hz: sampling rate.
+    """
+
+    system: System
+    p: Array
+    motions: Sequence[Motion]
+    rate_hz: float
+
+    @cached_property
+    def courses(self) -> TrialCache[Course]:
+        """What it does in each trial: the same in all replays, which differ by noise alone."""
+
+        def follow(trial: int) -> Course:
+            return follow_motion(self.system, self.p, self.motions[trial], self.rate_hz)
+
+        return TrialCache(follow, len(self.motions), lambda course: len(course.q))
+
+
+def follow_motion(system: System, p: Array, motion: Motion, rate_hz: float) -> Course:
+    """Simulate one trial of a fitted model.
+
+    Args:
+        system, p, rate_hz: as of a `StandIn`.
         motion: the measured trial to follow.
-        sensors: resolution, noise and rate.
-        rng: source of the noise and of where the encoders' counts fall.
 
     Raises:
         Runaway: the simulated motion grows without bounds.
     """
     u = motion.inputs(system.inputs)
+    fitted = ModelOnTrial(system, p, [motion])
     held = system.model.device.robot is not None and not system.undriven
-    if system.model.device.prescribed or (held and _jumps(system, p, motion, u)):
-        return _keep_motion(system, p, motion, u, sensors, rng)
-    q, qd = _reference(system, p, motion, u, sensors.rate_hz)
+    if system.model.device.prescribed or (held and _jumps(fitted, u)):
+        return Course(motion.q, _required_force(fitted, u))
+    q, qd = _reference(system, p, motion, u, rate_hz)
     start = np.concatenate([q[0], qd[0], system.initial_memory(q[0], u[0], p)])
     at = {name: i for i, name in enumerate(system.inputs)}
     forces = system.model.device.forces
     widths = np.array([c.sign_width for c in system.model.device.coordinates])
     try:
         x, total = simulate_tracking(
-            system.derivative, start, u, p, 1.0 / sensors.rate_hz, q, qd,
+            system.derivative, start, u, p, 1.0 / rate_hz, q, qd,
             width=widths, n_noise=len(system.noise),
             force=[at[f] for f in forces],
             rate=[at.get(derivative(f, 1), -1) for f in forces],
@@ -86,12 +121,11 @@ def replay_recording(
     except Runaway:
         if not held:
             raise
-        return _keep_motion(system, p, motion, u, sensors, rng)
+        return Course(motion.q, _required_force(fitted, u))
     if held and _strays(x[:, : q.shape[1]], q):
-        return _keep_motion(system, p, motion, u, sensors, rng)
+        return Course(motion.q, _required_force(fitted, u))
     seen = system.encoder_readings(x, total, p)[:, : len(system.coordinates)]
-    force = total[:, [at[f] for f in forces]]
-    return read_by_sensors(system, motion, seen, force, sensors, rng)
+    return Course(seen, total[:, [at[f] for f in forces]])
 
 
 def _strays(q: Array, measured: Array) -> bool:
@@ -100,16 +134,16 @@ def _strays(q: Array, measured: Array) -> bool:
     return bool(np.any(farthest > _FARTHEST * np.ptp(measured, axis=0)))
 
 
-def _jumps(system: System, p: Array, motion: Motion, u: Array) -> bool:
+def _jumps(fitted: ModelOnTrial, u: Array) -> bool:
     """Whether the drives of a robot jump, within a sample, as friction does where a joint turns.
 
     Between two samples nothing says when they do: driven by such a log, a model would stick for as
     long as that, and be rougher than the machine.
     """
+    system, motion = fitted.system, fitted.motion
     forces = [system.inputs.index(name) for name in system.model.device.forces]
-    left, _ = residual_and_memory(system, motion, u, p)
-    given = np.einsum("tqf,tf->tq", system.input_map(motion.q, u, p), u[:, forces])
-    logged, needed = np.diff(given, axis=0), np.diff(given - left, axis=0)
+    given = np.einsum("tqf,tf->tq", system.input_map(motion.q, u, fitted.p), u[:, forces])
+    logged, needed = np.diff(given, axis=0), np.diff(given - fitted.residual, axis=0)
     turns = np.diff(np.sign(motion.qd), axis=0) != 0.0
     made = np.sum(needed * logged * turns, axis=0)
     whole = np.sum(needed**2 * turns, axis=0)
@@ -117,25 +151,12 @@ def _jumps(system: System, p: Array, motion: Motion, u: Array) -> bool:
     return bool(known.any() and np.all(made[known] > _JUMPS * whole[known]))
 
 
-def _keep_motion(
-    system: System,
-    p: Array,
-    motion: Motion,
-    u: Array,
-    sensors: Sensors,
-    rng: np.random.Generator,
-) -> Recording:
-    """The replay along the measured motion itself, by the force that the model needs for it."""
-    force = _required_force(system, p, motion, u)
-    return read_by_sensors(system, motion, motion.q, force, sensors, rng)
-
-
-def _required_force(system: System, p: Array, motion: Motion, u: Array) -> Array:
+def _required_force(fitted: ModelOnTrial, u: Array) -> Array:
     """The force that the model needs for the motion as measured, (T, n_f): none is left over."""
-    left, _ = residual_and_memory(system, motion, u, p)
-    gains = system.input_map(motion.q, u, p)
+    system = fitted.system
+    gains = system.input_map(fitted.motion.q, u, fitted.p)
     forces = [system.inputs.index(name) for name in system.model.device.forces]
-    excess = np.einsum("tfq,tq->tf", np.linalg.pinv(gains), left)
+    excess = np.einsum("tfq,tq->tf", np.linalg.pinv(gains), fitted.residual)
     return np.asarray(u[:, forces] - excess)
 
 
@@ -159,31 +180,35 @@ def read_by_sensors(
 
 
 def replay_motion(
-    system: System,
-    p: Array,
-    motion: Motion,
+    stand_in: StandIn,
+    trial: int,
     sensors: Sensors,
     kinematics: Kinematics,
     rng: np.random.Generator,
     *,
     alone: bool = False,
 ) -> Motion:
-    """Replay one trial and filter it as the measured one was; arguments as `replay_recording`.
+    """Replay one trial and filter it as the measured one was.
 
     Time derivatives are made of the forces alone; other channels are the measured ones.
 
     Args:
+        stand_in: what is replayed; trial: the number of the one.
+        sensors: resolution and noise; kinematics: the filters.
+        rng: source of the noise and of where the encoders' counts fall.
         alone: whether no other model is to see the replay, which may need more derivatives.
+
+    Raises:
+        Runaway: the simulated motion grows without bounds.
     """
-    recording = replay_recording(system, p, motion, sensors, rng)
+    system, course = stand_in.system, stand_in.courses[trial]
+    recording = read_by_sensors(system, stand_in.motions[trial], *course, sensors, rng)
     wanted = system.inputs if alone else None
     return kinematics.observe(recording, system.model.device.forces, wanted)
 
 
 def replay_motions(
-    system: System,
-    p: Array,
-    motions: Sequence[Motion],
+    stand_in: StandIn,
     sensors: Sensors,
     kinematics: Kinematics,
     seed: Sequence[int],
@@ -194,7 +219,7 @@ def replay_motions(
     """Replay every trial; long sessions are stored on disk, so that few trials are in memory.
 
     Args:
-        system, p, motions, sensors, kinematics, alone: as for `replay_motion`.
+        stand_in, sensors, kinematics, alone: as for `replay_motion`.
         seed: of the sensor noise; the trial's number is added.
         force_noise: whether the force sensor is noisy.
 
@@ -205,11 +230,11 @@ def replay_motions(
         sensors = replace(sensors, force_sd=np.zeros_like(sensors.force_sd))
 
     def replays() -> Iterator[Motion]:
-        for number, motion in enumerate(motions):
-            rng = np.random.default_rng([*seed, number])
-            yield replay_motion(system, p, motion, sensors, kinematics, rng, alone=alone)
+        for trial in range(len(stand_in.motions)):
+            rng = np.random.default_rng([*seed, trial])
+            yield replay_motion(stand_in, trial, sensors, kinematics, rng, alone=alone)
 
-    if sum(n_samples(motion) for motion in motions) <= MOST_SAMPLES:
+    if sum(n_samples(motion) for motion in stand_in.motions) <= MOST_SAMPLES:
         return list(replays())
     return store_motions(replays())
 

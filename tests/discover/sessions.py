@@ -16,7 +16,7 @@ from bampipe.trials.folds import Folds
 from bampipe.trials.kinematics import AxisFilter, Kinematics
 from bampipe.trials.measured import MeasuredTrials
 from bampipe.trials.motion import Motion
-from bampipe.trials.replay import replay_motion
+from bampipe.trials.replay import StandIn, replay_motion
 from bampipe.trials.sensors import Sensors
 
 RATE = 250.0
@@ -91,5 +91,6 @@ def made(
                 channels[f"{head}_{order}_{component}"] = np.zeros(len(t))
         wanted = Motion(f"t{trial + 1:02d}", t, q, qd, qdd, np.zeros_like(qd), channels)
         rng = np.random.default_rng([11, trial])
-        motions.append(replay_motion(system, p, wanted, SENSORS, KINEMATICS, rng))
+        stand_in = StandIn(system, p, [wanted], SENSORS.rate_hz)
+        motions.append(replay_motion(stand_in, 0, SENSORS, KINEMATICS, rng))
     return MeasuredTrials(tuple(motions), SENSORS, KINEMATICS, BAND, folds(trials))

@@ -10,10 +10,10 @@ import pytest
 from independent_runs import record_trials
 
 from bampipe.discover.chance import system_of
-from bampipe.trials import noise_floor
+from bampipe.trials import noise_floor, replay
 from bampipe.trials.measured import MeasuredTrials
 from bampipe.trials.noise_floor import find_noise_floor
-from bampipe.trials.replay import replay_motion
+from bampipe.trials.replay import StandIn, replay_motion
 from bampipe.trials.residuals import Evidence, gather_evidence
 
 
@@ -39,10 +39,10 @@ def test_the_floor_of_a_long_session_comes_from_trials_drawn_from_it(
     replayed: list[int] = []
 
     def counted(*arguments: Any) -> Evidence:
-        replayed.append(len(arguments[3]))
-        return replay(*arguments)
+        replayed.append(len(arguments[0].motions))
+        return replay_evidence(*arguments)
 
-    replay = noise_floor.replay_evidence
+    replay_evidence = noise_floor.replay_evidence
     monkeypatch.setattr(noise_floor, "replay_evidence", counted)
     monkeypatch.setattr(noise_floor, "LEAST_DRAWN", 2)
     floors = []
@@ -62,11 +62,41 @@ def test_a_replay_for_one_model_has_the_same_inputs(fitted) -> None:
     motion = replace(trials.motions[0], channels=logged)
     every, own = (
         replay_motion(
-            system, evidence.p, motion, trials.sensors, trials.kinematics,
-            np.random.default_rng(3), alone=alone,
+            StandIn(system, evidence.p, [motion], trials.sensors.rate_hz), 0,
+            trials.sensors, trials.kinematics, np.random.default_rng(3), alone=alone,
         )
         for alone in (False, True)
     )  # fmt: skip
     np.testing.assert_array_equal(every.inputs(system.inputs), own.inputs(system.inputs))
     np.testing.assert_array_equal(every.input_rates(system.inputs), own.input_rates(system.inputs))
     assert len(own.channels) < len(every.channels)
+
+
+def test_replays_differ_by_noise_alone_and_share_what_was_simulated(
+    fitted, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trials, evidence = fitted
+    simulated: list[str] = []
+
+    def counted(system: Any, p: Any, motion: Any, rate_hz: float) -> replay.Course:
+        simulated.append(motion.trial_id)
+        return follow(system, p, motion, rate_hz)
+
+    follow = replay.follow_motion
+    monkeypatch.setattr(replay, "follow_motion", counted)
+    rate_hz, motions = trials.sensors.rate_hz, trials.motions
+
+    def replayed(stand_in: StandIn, number: int) -> Any:
+        return replay.replay_motions(stand_in, trials.sensors, trials.kinematics, (7, number))
+
+    one = StandIn(evidence.system, evidence.p, motions, rate_hz)
+    shared = [replayed(one, number) for number in range(2)]
+    assert simulated == [motion.trial_id for motion in motions]
+    for number in range(2):
+        anew = replayed(StandIn(evidence.system, evidence.p, motions, rate_hz), number)
+        for known, again in zip(shared[number], anew, strict=True):
+            np.testing.assert_array_equal(known.q, again.q)
+            np.testing.assert_array_equal(
+                known.inputs(evidence.system.inputs), again.inputs(evidence.system.inputs)
+            )
+    assert not np.array_equal(shared[0][0].q, shared[1][0].q)

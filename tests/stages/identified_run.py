@@ -17,7 +17,7 @@ from bampipe.progress import silent
 from bampipe.stages import filter as filter_stage
 from bampipe.stages import ingest
 from bampipe.trials.motion import Motion
-from bampipe.trials.replay import replay_recording
+from bampipe.trials.replay import follow_motion, read_by_sensors
 from bampipe.trials.sensors import Sensors
 
 RATE = 500.0
@@ -53,7 +53,8 @@ def simulated_run(
     for number in range(trials):
         rng = np.random.default_rng([11, number])
         wanted = _wanted(rng, seconds, tuple(system.inputs), f"t{number:02d}")
-        recording = replay_recording(system, p, wanted, sensors, rng)
+        course = follow_motion(system, p, wanted, sensors.rate_hz)
+        recording = read_by_sensors(system, wanted, *course, sensors, rng)
         forces = np.column_stack([recording.channels[f"force_{c}"] for c in "xyz"])
         force = forces[::-1] if scramble else np.roll(forces, late, axis=0)
         frame = pd.DataFrame({"t": wanted.t})

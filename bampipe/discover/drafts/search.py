@@ -12,7 +12,14 @@ from numpy.typing import NDArray
 from scipy.stats import t as student
 
 from bampipe.discover.bench import Bench
-from bampipe.discover.chance import Progress, fit_trials, open_trials, system_of, workers
+from bampipe.discover.chance import (
+    Progress,
+    fit_trials,
+    open_trials,
+    stand_in_for,
+    system_of,
+    workers,
+)
 from bampipe.discover.drafts import symbolic
 from bampipe.discover.drafts.forms import Form
 from bampipe.discover.drafts.screen import Screen, Screened
@@ -165,9 +172,8 @@ class ReplayTask:
 def run_replay(task: ReplayTask) -> tuple[float, float]:
     """Gain of the best form on one replay, and error of the model there."""
     trials, system = open_trials(), system_of(task.recipe)
-    replays = replay_motions(
-        system, task.p, trials.motions, trials.sensors, trials.kinematics, task.seed
-    )
+    stand_in = stand_in_for(trials, task.recipe, task.p)
+    replays = replay_motions(stand_in, trials.sensors, trials.kinematics, task.seed)
     evidence = gather_evidence(
         system, replays, trials.band, task.p, trials.folds, most_iterations=_STEPS_OF_A_REPLAY
     )
