@@ -78,7 +78,7 @@ LAWS = {
         "pydantic dask distributed filelock fsspec bampipe",
         "progress compile_ahead errors files schema results data declarations stages.base workers",
     ),
-    "lab": law("numpy scipy", "progress errors files results data report run stages.base"),
+    "lab": law("numpy scipy", "progress errors lists files results data report run stages.base"),
     "api": law(
         "pandas", "progress errors files results physics report run stages data declarations"
     ),

@@ -31,6 +31,7 @@ from bampipe.results.identify import (
     StateBound,
     WorstSecond,
 )
+from bampipe.results.rounding import round_with_sd
 from bampipe.trials.motion import Motion
 
 Array = NDArray[np.float64]
@@ -243,7 +244,7 @@ def collect_result(
 def _headline(parameters: Mapping[str, ParameterEstimate]) -> str:
     """The parameters in one line; of a robot's many, the first."""
     shown = [
-        f"{name} {entry.estimate:.4g} ± {entry.sd:.2g} {entry.unit}"
+        f"{name} {round_with_sd(entry.estimate, entry.sd)} {entry.unit}".rstrip()
         for name, entry in parameters.items()
     ]
     if len(shown) <= MOST_SHOWN:
@@ -321,9 +322,9 @@ def _fault(name: str, entry: ParameterEstimate) -> str:
 def _describe_limit(timing: InputTiming) -> str:
     if abs(timing.estimate) < NORMAL_95 * timing.sd:
         return (
-            f"The timing of the force, {1e3 * timing.estimate:.2g} ± {1e3 * timing.sd:.2g} ms, lies"
-            f" at its limit of {1e3 * timing.limit:.3g} ms, half a sample, and these trials do not"
-            " determine it."
+            f"The timing of the force, {round_with_sd(1e3 * timing.estimate, 1e3 * timing.sd)} ms,"
+            f" lies at its limit of {1e3 * timing.limit:.3g} ms, half a sample, and these trials do"
+            " not determine it."
         )
     way = "later" if timing.estimate > 0.0 else "earlier"
     return (

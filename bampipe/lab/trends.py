@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from bampipe.lab.control_chart import FEWEST, Chart, chart
+from bampipe.lists import join_names
 from bampipe.results.lab import (
     ChartPoint,
     ControlChart,
@@ -164,7 +165,7 @@ def _decide(
     if not outside:
         lacking = [*(effect for effect in judged.effects if effect not in has), *unknown]
         if lacking:
-            return EFFECT, f"lacks {' and '.join(lacking)}; no parameter is beyond its limits", ""
+            return EFFECT, f"lacks {join_names(lacking)}; no parameter is beyond its limits", ""
         if not judged.diagnosed and judged.worst and judged.above_floor:
             sentence = (
                 f"error on unseen trials {judged.worst[0]:.3g} times the floor on "
@@ -172,7 +173,7 @@ def _decide(
             )
             return UNKNOWN, sentence, diagnose
         return IN_CONTROL, "", ""
-    what = " and ".join([*judged.effects, *unknown])
+    what = join_names([*judged.effects, *unknown])
     moved = ", ".join(_in_words(entry) for entry in judged.moved)
     if not what:
         if judged.diagnosed:

@@ -101,7 +101,7 @@ def _explained(results: Results, validated: ValidateResult | None) -> Callout:
     return Callout(
         "attention",
         f"The model leaves something unexplained on {join_names(high)}",
-        f"On trials that the parameters never saw, the error is {_ratios(high)}. "
+        f"Error on trials that the parameters never saw: {_ratios(high)}. "
         f"`bampipe diagnose {results.root.name}` says which effect is missing.",
     )
 

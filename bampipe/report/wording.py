@@ -6,6 +6,8 @@ import math
 import re
 from collections.abc import Iterable
 
+from bampipe.results.rounding import decimals_for
+
 _POWERS = {"2": "²", "3": "³"}
 _PREFIXES = ((1e-6, "µ"), (1e-3, "m"), (1.0, ""), (1e3, "k"), (1e6, "M"))
 _PREFIXED = ("rad", "m", "N", "Pa")
@@ -73,16 +75,6 @@ def significant(value: float | None, digits: int = 3) -> str:
         mantissa = plain(value / 10.0**exponent, digits - 1)
         return f"{mantissa}·10{_raised(str(exponent))}"
     return plain(value, max(0, digits - 1 - exponent))
-
-
-def decimals_for(sd: float | None, value: float) -> int:
-    """Return how many decimals of ``value`` mean something: those of two digits of ``sd``."""
-    size = abs(sd) if sd is not None and math.isfinite(sd) else 0.0
-    if size == 0.0:
-        if value == 0.0 or not math.isfinite(value):
-            return 0
-        return max(0, 3 - math.floor(math.log10(abs(value))))
-    return min(9, max(0, 1 - math.floor(math.log10(float(f"{size:.1e}")))))
 
 
 def with_sd(value: float | None, sd: float | None) -> str:

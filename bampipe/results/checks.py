@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 
 from bampipe.results.identify import METHODS_IN_WORDS, IdentifyResult
 from bampipe.results.ingest import IngestResult
+from bampipe.results.rounding import round_with_sd
 from bampipe.results.standing import FLOOR_WRONG, STANDINGS_IN_WORDS
 from bampipe.results.validate import JudgedError
 
@@ -37,8 +38,8 @@ def find_failed_checks(
     timing, half = identified.input_timing, 0.5 / session.sample_rate_hz
     if timing.sd > 0.0 and abs(timing.estimate) >= _TIMING_LIMIT * half:
         yield (
-            f"input timing: {1e3 * timing.estimate:.3g} ± {1e3 * timing.sd:.2g} ms, at its limit of"
-            " half a sample: a delay that the model lacks, or clocks that disagree"
+            f"input timing: {round_with_sd(1e3 * timing.estimate, 1e3 * timing.sd)} ms, at its"
+            " limit of half a sample: a delay that the model lacks, or clocks that disagree"
         )
     for axis, tests in (identified.innovations or {}).items():
         white, independent = tests.whiteness, tests.inputs

@@ -121,7 +121,8 @@ class RunState:
         maker = _maker(name)
         model = name.split("/")[1] if name.startswith("models/") else models.BASE
         option = "" if model == models.BASE else f" --model {model}"
-        remedy = f"run `bampipe {maker}{option}` first" if maker else ""
+        reads = "SESSION" if maker in base.READS_SESSION else self.root
+        remedy = f"run `bampipe {maker} {reads}{option}` first" if maker else ""
         return InputError(f"{name} is missing", where=str(self.root), remedy=remedy)
 
     def check_untouched(self, name: str) -> None:

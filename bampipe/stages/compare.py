@@ -15,6 +15,7 @@ from bampipe.progress import Progress
 from bampipe.results.compare import CompareResult, Moved, Rung, Value
 from bampipe.results.diagnose import DiagnoseResult, SearchStep
 from bampipe.results.identify import IdentifyResult
+from bampipe.results.rounding import round_with_sd
 from bampipe.results.validate import ValidateResult
 from bampipe.schema import STRICT, Positive
 
@@ -133,8 +134,8 @@ def _moved(
             sd, change = math.hypot(old.sd, new.sd), new.estimate - old.estimate
             if abs(change) > sigmas * sd:
                 sentence = (
-                    f"{name} moved from {old.estimate:.4g} ± {old.sd:.2g} to {new.estimate:.4g} ± "
-                    f"{new.sd:.2g} {new.unit}: "
+                    f"{name} moved from {round_with_sd(old.estimate, old.sd)} to "
+                    f"{round_with_sd(new.estimate, new.sd)} {new.unit}: "
                     "without the effect it was biased."
                 )
                 moved.append(

@@ -22,6 +22,7 @@ from bampipe.estimate.hysteresis import Branch, Cycle, Hysteresis, hysteresis
 from bampipe.physics import Model, System, compile_model
 from bampipe.progress import Progress
 from bampipe.results.ingest import IngestResult
+from bampipe.results.rounding import round_with_sd
 from bampipe.results.stiffness import (
     AxisStiffness,
     Bandwidth,
@@ -429,7 +430,7 @@ def _side(branch: Branch) -> str:
 def _describe_axes(axes: Mapping[str, AxisStiffness]) -> list[str]:
     """The stiffness of every axis that was locked."""
     return [
-        f"{axis} {entry.stiffness:.4g} ± {entry.sd:.2g} {entry.unit} "
+        f"{axis} {round_with_sd(entry.stiffness, entry.sd)} {entry.unit} "
         f"({entry.bandwidth_rad_s:.3g} rad/s, {entry.bandwidth_hz:.3g} Hz)"
         for axis, entry in axes.items()
     ]
@@ -441,7 +442,7 @@ def _describe_gears(gears: Mapping[str, GearStiffness]) -> list[str]:
     for axis, gear in gears.items():
         words = "stiffer than its encoders show"
         if gear.stiffness is not None and gear.sd is not None:
-            words = f"{gear.stiffness:.4g} ± {gear.sd:.2g} {gear.unit}"
+            words = f"{round_with_sd(gear.stiffness, gear.sd)} {gear.unit}"
         if gear.play is not None and gear.play_sd is not None and gear.play > _SURE * gear.play_sd:
             words += f", play {gear.play:.2g} ± {gear.play_sd:.1g} {gear.play_unit}"
         if abs(gear.late_s) > _SURE * gear.late_sd:

@@ -37,6 +37,7 @@ from bampipe.physics.viscous_field import NAME as FIELD
 from bampipe.physics.viscous_field import viscous_field
 from bampipe.progress import Progress
 from bampipe.results.identify import IdentifyResult
+from bampipe.results.rounding import round_with_sd
 from bampipe.results.viscous import Damping, ViscousResult
 from bampipe.schema import STRICT, Positive
 from bampipe.trials.motion import Motion
@@ -193,7 +194,7 @@ def _estimated(
         blocks=blocks,
         process_noise_factor=attempts[found.restarts][2],
         headline="; ".join(
-            f"{name} {entry.estimate:.4g} ± {entry.sd:.2g} N.s/m"
+            f"{name} {round_with_sd(entry.estimate, entry.sd)} N.s/m"
             + ("" if command is None else f" ({entry.verdict})")
             for name, entry in directions.items()
         ),

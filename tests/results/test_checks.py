@@ -65,7 +65,7 @@ def test_a_sound_model_fails_none() -> None:
         (
             "fit",
             {"input_timing": {"estimate": -9.9e-4, "sd": 1e-4}},
-            "input timing: -0.99 ± 0.1 ms",
+            "input timing: -0.99 ± 0.10 ms",
         ),
         (
             "fit",

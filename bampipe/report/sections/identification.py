@@ -22,6 +22,7 @@ from bampipe.results.identify import (
     ParameterEstimate,
     StateBound,
 )
+from bampipe.results.rounding import decimals_for
 
 TITLE = "Identification"
 _NORMAL_95 = 1.959964
@@ -73,7 +74,7 @@ def _parameters(results: Results, identified: IdentifyResult) -> Table:
     for name in names:
         entry = parameters[name]
         value, sd = entry.estimate, entry.sd
-        decimals = wording.decimals_for(sd, value)
+        decimals = decimals_for(sd, value)
         half = _NORMAL_95 * sd if sd else 0.0
         rows.append(
             (
@@ -135,7 +136,7 @@ def _without_inertial(identified: IdentifyResult) -> Mapping[str, ParameterEstim
 def _base_parameters(bases: Sequence[BaseEstimate]) -> Table:
     rows = []
     for base in bases:
-        decimals = wording.decimals_for(base.sd, base.estimate)
+        decimals = decimals_for(base.sd, base.estimate)
         rows.append(
             (
                 base.combination,

@@ -109,7 +109,7 @@ def _sensitivity(table: Mapping[str, Detectable]) -> Table:
             wording.significant(entry.smallest, 2),
             wording.significant(entry.with_proposal, 2),
             wording.significant(entry.typical, 2),
-            wording.unit(entry.unit),
+            wording.unit(entry.unit) or "1",
         )
         for name, entry in order
     )
@@ -120,5 +120,6 @@ def _sensitivity(table: Mapping[str, Detectable]) -> Table:
         "lllrrrl",
         note="With 90 % probability, the shape of the effect being typical. A dash: trials like "
         "these do not show it at any size, or the model's own parameters imitate it. Typical: "
-        "where it is clearly there.",
+        "where it is clearly there. With the next, a number may grow: errors are means over all "
+        "trials, and the next shows some effects less than those at hand do.",
     )

@@ -76,7 +76,7 @@ class ResidualMap {
         const inView = samples.x[row] >= state.view[0] && samples.x[row] <= state.view[1];
         groups[marked ? "marked" : inView ? "seen" : "away"].push([values[row], samples.residual[row]]);
       });
-      xs = samples.rows.map((row) => values[row]);
+      xs = samples.rows.map((row) => values[row]).filter(Number.isFinite);
       const colour = colourOf(samples.channel.model);
       behind.push(
         { kind: "dots", points: groups.away, colour: "faint", alpha: 0.45 },

@@ -1,0 +1,24 @@
+"""An estimate has the digits that its uncertainty leaves it."""
+
+from __future__ import annotations
+
+import pytest
+
+from bampipe.results.rounding import round_with_sd
+
+
+@pytest.mark.parametrize(
+    ("value", "sd", "words"),
+    [
+        (4.1700, 0.0011, "4.1700 ± 0.0011"),
+        (206.4, 9.96, "206 ± 10"),
+        (108623.0, 52.0, "108623 ± 52"),
+        (-0.0002, 0.02, "0.000 ± 0.020"),
+        (3.2e-9, 1.2e-10, "3.2e-09 ± 1.2e-10"),
+        (2.0, 0.0, "2 ± 0"),
+    ],
+)
+def test_both_end_at_the_second_digit_of_the_uncertainty(
+    value: float, sd: float, words: str
+) -> None:
+    assert round_with_sd(value, sd) == words
