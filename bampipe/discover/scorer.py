@@ -124,13 +124,12 @@ class Scorer:
 
     def _cost_before(self, item: Candidate) -> float:
         """Cost of the model as it is, fitted to the trials that ``item`` is fitted to."""
-        e, folds = self.evidence, self._folds_for(item)
-        steps = e.sums.subset(folds.fitted_trials).solve(e.weight, e.lower, e.upper)
-        return self._cost(e.sums, steps, folds)
+        e = self.evidence
+        fitted = e.sums.subset(self._folds_for(item).fitted_trials)
+        return self._cost(fitted.mean_square(fitted.solve(e.weight, e.lower, e.upper)))
 
-    def _cost(self, sums: NormalEquations, values: Array, folds: Folds) -> float:
-        """Cost of a fit: sum over axes of n log(mean square)."""
-        left = sums.subset(folds.fitted_trials).mean_square(values)
+    def _cost(self, left: Array) -> float:
+        """Cost of a fit that leaves a mean square, (n_q,): sum over axes of n log of it."""
         return float(np.sum(self.independent_samples * np.log(np.maximum(left, 1e-30))))
 
     def score(self, item: Candidate) -> Score | None:
@@ -168,7 +167,8 @@ class Scorer:
         problem = self._join(item, score.values[list(item.searched_indices)])
         if problem is None:
             return [np.zeros(len(r)) for r in self.evidence.residual]
-        values, weight = self._fit(item, problem.sums)
+        values, left = self._fit(item, problem.sums)
+        weight = _weight(left)
         e, count = self.evidence, len(self.evidence.free)
         rows = zip(
             self.folds.judged, e.residual, e.jacobian, problem.change, problem.added, strict=True
@@ -221,17 +221,18 @@ class Scorer:
         problem = self._join(item, searched)
         if problem is None:
             return None
-        values, _ = self._fit(item, problem.sums)
-        return self._cost(problem.sums, values, self._folds_for(item)), problem.columns
+        _, left = self._fit(item, problem.sums)
+        return self._cost(left), problem.columns
 
     def _fit(self, item: Candidate, sums: NormalEquations) -> tuple[Array, Array]:
-        """Coefficients of the joint fit, reweighted once by what each axis is left with."""
+        """Coefficients of the joint fit, reweighted once, and the mean square left, (n_q,)."""
         weight, bounds = self.evidence.weight, self._bounds(item)
         fitted = sums.subset(self._folds_for(item).fitted_trials)
         for _ in range(2):
             values = fitted.solve(weight, *bounds)
-            weight = 1.0 / np.maximum(fitted.mean_square(values), 1e-24)
-        return values, weight
+            left = fitted.mean_square(values)
+            weight = _weight(left)
+        return values, left
 
     def _score_with(self, item: Candidate, searched: Array) -> Score | None:
         """The score with given values of the searched parameters."""
@@ -239,7 +240,8 @@ class Scorer:
         if problem is None:
             return None
         sums = problem.sums
-        solution, weight = self._fit(item, sums)
+        solution, left = self._fit(item, sums)
+        weight = _weight(left)
         folds, (lower, upper) = self._folds_for(item), self._bounds(item)
         values = np.array([p.prior for p in item.parameters])
         values[list(item.searched_indices)] = searched
@@ -298,3 +300,8 @@ class Scorer:
             share = np.linalg.norm(slope, axis=2) / np.where(bare > 0.0, bare, 1.0)
             total += np.sum(np.where(bare > 0.0, np.log(np.maximum(share, 1e-3)), 0.0) * used, 0)
         return np.asarray(total / np.maximum(self.evidence.sums.count.sum(axis=0), 1.0))
+
+
+def _weight(left: Array) -> Array:
+    """Weight of the squares of each axis, where a fit leaves a mean square, (n_q,)."""
+    return np.asarray(1.0 / np.maximum(left, 1e-24))
