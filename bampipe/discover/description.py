@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -88,7 +89,7 @@ def _ripple(evidence: Evidence, axis: int, variable: Variable) -> _Sine | None:
     low, high = np.quantile(v, [0.01, 0.99])
     if high <= low:
         return None
-    return _best_sine(v, r, np.arange(2.0, BINS, 0.1) / (high - low))
+    return _best_sine([(v, r)], np.arange(2.0, BINS, 0.1) / (high - low))
 
 
 def _vibration(evidence: Evidence, axis: int) -> _Sine | None:
@@ -106,38 +107,34 @@ def _vibration(evidence: Evidence, axis: int) -> _Sine | None:
     if not trials:
         return None
     longest = max(float(np.ptp(t)) for t, _ in trials)
-    count = sum(len(r) for _, r in trials)
-    left = sum(float(np.sum((r - r.mean()) ** 2)) for _, r in trials)
-    best = _Sine(0.0, 0.0, 0.0)
     tried = np.arange(2.0 / longest, band.cutoff_hz[axis], 0.25 / longest)
-    for frequency in tried:
-        taken = sum(_sine_squares(t, r, frequency) for t, r in trials)
-        if taken > best.share * left:
-            best = _Sine(taken / left, float(np.sqrt(2.0 * taken / count)), float(frequency))
+    best = _best_sine(trials, tried)
     by_chance = gamma.isf(_LIMITS.significance / max(len(tried), 1), len(trials))
-    independent = 0.5 * count * band.independent_share[axis]
+    independent = 0.5 * sum(len(r) for _, r in trials) * band.independent_share[axis]
     return best if best.share * independent > by_chance else None
 
 
-def _sine_squares(t: Array, r: Array, frequency: float) -> float:
-    """Sum of squares that the least-squares sine of one frequency takes off a residual."""
-    phase = 2.0 * np.pi * frequency * t
-    columns = np.column_stack([np.sin(phase), np.cos(phase)])
-    product = columns.T @ (r - r.mean())
-    return float(product @ np.linalg.solve(columns.T @ columns + 1e-9 * np.eye(2), product))
+def _best_sine(trials: Sequence[tuple[Array, Array]], frequencies: Array) -> _Sine:
+    """Least-squares sine about the mean, of any phase and size in each trial (Lomb 1976).
 
-
-def _best_sine(v: Array, r: Array, frequencies: Array) -> _Sine:
-    """Least-squares sine of any phase, at the best of ``frequencies`` (Lomb 1976)."""
-    best = _Sine(0.0, 0.0, float(frequencies[0]))
-    total = max(float(np.sum((r - r.mean()) ** 2)), 1e-30)
+    Args:
+        trials: place or time, and residual, (T,) each; frequencies: to try, the best is taken.
+    """
+    centred = [(x, r - r.mean()) for x, r in trials]
+    count = sum(len(r) for _, r in trials)
+    total = max(sum(float(r @ r) for _, r in centred), 1e-30)
+    best = _Sine(0.0, 0.0, 0.0)
     for frequency in frequencies:
-        phase = 2.0 * np.pi * frequency * v
-        columns = np.column_stack([np.sin(phase), np.cos(phase)])
-        weights = np.linalg.solve(columns.T @ columns + 1e-9 * np.eye(2), columns.T @ r)
-        share = 1.0 - float(np.sum((r - columns @ weights) ** 2)) / total
-        if share > best.share:
-            best = _Sine(share, float(np.hypot(*weights)), float(frequency))
+        taken = squares = 0.0
+        for x, r in centred:
+            phase = 2.0 * np.pi * frequency * x
+            columns = np.column_stack([np.sin(phase), np.cos(phase)])
+            product = columns.T @ r
+            weights = np.linalg.solve(columns.T @ columns + 1e-9 * np.eye(2), product)
+            taken += float(product @ weights)
+            squares += len(r) * float(weights @ weights)
+        if taken > best.share * total:
+            best = _Sine(taken / total, float(np.sqrt(squares / count)), float(frequency))
     return best
 
 
