@@ -33,12 +33,19 @@ def test_a_child_is_identified_as_its_parent_was(tmp_path: Path) -> None:
     stages = {
         "identify:base": made({"model": "base", "method": "least-squares"}),
         "validate:base": made({"model": "base", "seed": 3}),
+        "diagnose:base": made({"model": "base", "seed": 2, "without": ["backlash:carriage"]}),
         f"validate:{child}": made({"model": child, "seed": 4}),
     }
     write_result(tmp_path, RunResult, schema=record.SCHEMA, stages=stages)
     given = loop.settings_of(tmp_path, "base")
-    assert given == {"identify": {"method": "least-squares"}, "validate": {"seed": 3}}
-    assert loop.settings_of(tmp_path, child) == {**given, "validate": {"seed": 4}}
+    assert given == {
+        "identify": {"method": "least-squares"},
+        "validate": {"seed": 3},
+        "diagnose": {"seed": 2, "without": ["backlash:carriage"]},
+    }
+    # What came to nothing in the parent may count in the child.
+    changed = {"validate": {"seed": 4}, "diagnose": {"seed": 2}}
+    assert loop.settings_of(tmp_path, child) == {**given, **changed}
 
 
 def test_following_judges_the_model_that_it_starts_from(
@@ -54,6 +61,35 @@ def test_following_judges_the_model_that_it_starts_from(
     assert loop.follow(options, "base", lines.append) == "base"
     assert lines == ["base, joint: unknown effect"]
     assert ran[0] == ("identify", "validate", "base") and ran[-1] == ("compare", "compare", "")
+
+
+def test_what_came_to_nothing_is_not_weighed_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The next best is tried, and at last the diagnosis says what the loop has found."""
+    ran: list[object] = []
+    left = ["backlash:joint", "transmission_compliance:joint"]
+
+    def run(_: loop.LoopOptions, first: str, last: str, model: str, changed: object = None) -> None:
+        ran.extend([changed] if first == "diagnose" else [])
+
+    def diagnosis(*_: object) -> DiagnoseResult:
+        found = left[len(ran) - 1 : len(ran)]
+        content = {"axes": {"joint": {"verdict": "missing" if found else "nothing_missing"}}}
+        return DiagnoseResult.model_validate(filled(DiagnoseResult, {**content, "selected": found}))
+
+    monkeypatch.setattr(loop.LoopOptions, "run", run)
+    monkeypatch.setattr(loop, "_diagnosis", diagnosis)
+    monkeypatch.setattr(loop, "_add", lambda *_: "")
+    lines: list[str] = []
+    options = loop.LoopOptions(tmp_path, pipeline.load(), False, True, unheard)
+    assert loop.follow(options, "base", lines.append) == "base"
+    assert lines == ["base, joint: missing"] * 2 + ["base, joint: nothing missing"]
+    assert ran == [
+        None,
+        {"diagnose": {"without": ("backlash:joint",)}},
+        {"diagnose": {"without": tuple(left)}},
+    ]
 
 
 def test_the_device_file_gives_the_base_model_its_effects(tmp_path: Path) -> None:

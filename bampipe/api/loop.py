@@ -47,8 +47,17 @@ class LoopOptions:
         """Hold the run folder, as a run does; not while one of :meth:`run` is under way."""
         return record.lock(self.root, self.wait, self.listen)
 
-    def run(self, first: str, last: str, model: str) -> None:
-        """Run the stages from ``first`` to ``last`` on ``model``."""
+    def run(
+        self,
+        first: str,
+        last: str,
+        model: str,
+        changed: Mapping[str, Mapping[str, object]] | None = None,
+    ) -> None:
+        """Run the stages ``first`` to ``last`` on ``model``, with some settings ``changed``."""
+        settings = settings_of(self.root, model)
+        for stage, values in (changed or {}).items():
+            settings[stage] = {**settings.get(stage, {}), **values}
         run_session(
             Request(
                 root=self.root,
@@ -56,7 +65,7 @@ class LoopOptions:
                 first=first,
                 last=last,
                 model=model,
-                settings=settings_of(self.root, model),
+                settings=settings,
                 force=self.force,
                 wait=self.wait,
             ),
@@ -80,6 +89,8 @@ def settings_of(root: Path, model: str) -> dict[str, dict[str, object]]:
             step = made.get(f"{stage}:{name}")
             if step is not None:
                 used[stage] = {k: value for k, value in step.settings.items() if k != "model"}
+                if name != model:  # what came to nothing in the parent may count in the child
+                    used[stage].pop("without", None)
     return used
 
 
@@ -233,7 +244,7 @@ def follow(
 
     An effect that the identified model gives no strength is left out again. What the confirmation
     finds beyond the set is added likewise, until it finds nothing more; then what is drafted for
-    the rest, where that is asked for.
+    the rest, where that is asked for. What came to nothing when it was added is not weighed again.
 
     Args:
         options: run folder, settings, listener.
@@ -245,8 +256,10 @@ def follow(
         The name of the last model that is better than its parent.
     """
     options.run("identify", "validate", model)  # what a child is held against, and the ladder shows
+    rejected: tuple[str, ...] = ()
     for _ in range(MOST_ROUNDS):
-        options.run("diagnose", "diagnose", model)
+        left_out = {"diagnose": {"without": rejected}} if rejected else None
+        options.run("diagnose", "diagnose", model, left_out)
         diagnosis = _diagnosis(options.root, model)
         for axis, entry in sorted(diagnosis.axes.items()):
             tell(f"{model}, {axis}: {entry.verdict.replace('_', ' ')}")
@@ -256,9 +269,13 @@ def follow(
         if not found:
             break
         child = _add(options, model, found, tell)
-        if not child:
+        if child:
+            model, rejected = child, ()
+        elif set(found) <= set(diagnosis.selected):
+            # Diagnosed once more: what came to nothing is no longer said to be missing.
+            rejected = (*rejected, *found)
+        else:
             break
-        model = child
     else:
         tell(f"stopped after {MOST_ROUNDS} rounds")
     options.run("compare", "compare", "")

@@ -13,7 +13,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -41,6 +41,7 @@ def diagnose(
     start: Array,
     settings: Settings | None = None,
     progress: Progress = lambda fraction, message: None,
+    without: Collection[str] = (),
 ) -> Diagnosis:
     """Find what a model lacks.
 
@@ -50,6 +51,7 @@ def diagnose(
         start: parameters to start its fit from, (n_p,).
         settings: how carefully to look.
         progress: called with a fraction and a message.
+        without: effects that are not weighed, ``name[:target]``.
 
     Raises:
         ValueError: fewer than two trials.
@@ -58,8 +60,9 @@ def diagnose(
     if len(trials.motions) < 2:
         raise ValueError("a diagnosis needs at least two trials: one is held out")
     device, extra = recipe.model().device, [effect_from(e) for e in recipe.extra]
+    candidates = [c for c in list_candidates(device, recipe.effects, extra) if c not in without]
     with workers(trials, settings.jobs) as pool:
-        bench = Bench(trials, settings, pool, tuple(list_candidates(device, recipe.effects, extra)))
+        bench = Bench(trials, settings, pool, tuple(candidates))
         searched = search(bench, recipe, start, progress)
         found = conclude(searched, settings)
     progress(0.95, "holding the final model against its floor in another band")

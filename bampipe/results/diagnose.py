@@ -182,8 +182,16 @@ class DiagnoseResult(Result):
     )
     transients: tuple[TransientCandidate, ...]
     suggested_trial: SuggestedTrial | None
+    not_weighed: Names = Field(default=(), description="Effects that the search was to leave out")
     maps: dict[str, dict[str, ResidualMap]] = Field(description="By axis, then variable")
     worst_windows: tuple[WorstWindow, ...]
+
+    @property
+    def limits(self) -> str:
+        """What the search left out, in a sentence; "" where it weighed the whole library."""
+        if not self.not_weighed:
+            return ""
+        return f"Not weighed (setting `without`): {', '.join(self.not_weighed)}."
 
     @property
     def unnamed_axes(self) -> Names:

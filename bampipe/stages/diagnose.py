@@ -16,11 +16,12 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
 from bampipe.data.store import write_parquet
 from bampipe.declarations.model_file import IDENTIFIED_MODEL, identified, load_model, read_recipe
+from bampipe.discover.candidates import list_candidates
 from bampipe.discover.diagnosis import diagnose
 from bampipe.discover.findings import Diagnosis
 from bampipe.discover.settings import Settings
 from bampipe.discover.shape import residual_map, variables, worst_windows
-from bampipe.errors import InputError
+from bampipe.errors import InputError, did_you_mean
 from bampipe.identification.terms import effect_text
 from bampipe.next_trial.choice import rank_designs
 from bampipe.next_trial.forecast import NOTHING
@@ -42,7 +43,7 @@ from bampipe.results.identify import IdentifyResult
 from bampipe.results.setup import SetupResult
 from bampipe.results.standing import FLOOR_WRONG
 from bampipe.results.terms import EffectText
-from bampipe.schema import STRICT, Count
+from bampipe.schema import STRICT, Count, Distinct
 from bampipe.trials.folds import HELD_OUT
 from bampipe.trials.measured import MeasuredTrials, read_measured_trials, trial_of_block
 
@@ -71,6 +72,7 @@ class Config:
         jobs: worker processes; 0 means one for each processor, eight at most.
         seed: of the noise in the replays.
         trust_setup: whether to diagnose in spite of a mistake that was named in the set-up.
+        without: effects that are not weighed, such as one that came to nothing when it was added.
     """
 
     model: str = "base"
@@ -80,6 +82,7 @@ class Config:
     jobs: Count = 0
     seed: Count = 0
     trust_setup: bool = False
+    without: Distinct[str] = ()
 
 
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
@@ -111,6 +114,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         )
     trials = replace(trials, motions=tuple(trials.motions))
     recipe = read_recipe(run, config.model, model)
+    _require_known(config.without, recipe)
     start = identified(run, config.model, system)
     settings = Settings(
         replicates=config.replicates,
@@ -119,14 +123,25 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         jobs=config.jobs or min(8, os.cpu_count() or 1),
         seed=config.seed,
     )
-    found = diagnose(trials, recipe, start, settings, progress)
+    found = diagnose(trials, recipe, start, settings, progress, config.without)
     samples = _map_variables(found)
     write_parquet(out / f"models/{config.model}/map_variables.parquet", samples)
     progress(0.97, "a trial that would decide what these do not")
-    result = _with_suggestion(
-        _result(found, recipe, config.model), found, trials, recipe, config.seed
-    )
-    return _summary(result.write(out))
+    result = _with_suggestion(_result(found, recipe, config), found, trials, recipe, config.seed)
+    return _summary(result.write(out), result.limits)
+
+
+def _require_known(without: Sequence[str], recipe: Recipe) -> None:
+    """Refuse a name of no effect, which would leave out nothing."""
+    extra = [effect_from(effect) for effect in recipe.extra]
+    known = list_candidates(recipe.model().device, (), extra)
+    for name in without:
+        if name not in known:
+            raise InputError(
+                f"{name!r} is no effect of this device{did_you_mean(name, known)}",
+                where="diagnose.without",
+                remedy="`bampipe effects` lists them",
+            )
 
 
 def _require_sound_setup(run: RunFolder) -> None:
@@ -143,9 +158,11 @@ def _require_sound_setup(run: RunFolder) -> None:
         )
 
 
-def _summary(result: dict[str, Any]) -> dict[str, object]:
+def _summary(result: dict[str, Any], limits: str) -> dict[str, object]:
     """What a person needs first: verdicts, the head of the ranking, what to record or do next."""
-    notes = [result["suggested_trial"]["sentence"]] if result["suggested_trial"] else []
+    notes = [limits] if limits else []
+    if result["suggested_trial"]:
+        notes.append(result["suggested_trial"]["sentence"])
     shown = ("verdict", "rmse_before", "rmse_after", "noise_floor", "unit", "explainable_share")
     return {
         "axes": {
@@ -162,10 +179,10 @@ def _summary(result: dict[str, Any]) -> dict[str, object]:
     }
 
 
-def _result(found: Diagnosis, recipe: Recipe, model: str) -> DiagnoseResult:
+def _result(found: Diagnosis, recipe: Recipe, config: Config) -> DiagnoseResult:
     names = found.evidence.system.coordinates
     return DiagnoseResult(
-        model=model,
+        model=config.model,
         axes=dict(zip(names, found.axes, strict=True)),
         ranking=found.ranking,
         descriptions=_descriptions(found.ranking[:_DESCRIBED], recipe),
@@ -177,8 +194,9 @@ def _result(found: Diagnosis, recipe: Recipe, model: str) -> DiagnoseResult:
         suggested_trial=None,
         maps=_maps(found),
         worst_windows=tuple(worst_windows(found.initial)),
+        not_weighed=config.without,
         sentence=" ".join(a.sentence for a in found.axes),
-        next=_next(found, model),
+        next=_next(found, config.model),
     )
 
 

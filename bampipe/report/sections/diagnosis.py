@@ -65,6 +65,8 @@ def _model(
     names = verdicts.ordered(results, axes)
     sentences = tuple(axes[axis].sentence for axis in names)
     blocks: list[Block] = [Bullets(sentences), _verdicts(names, axes)]
+    if found.limits:
+        blocks.append(Paragraph(found.limits))
     lacking = [axis for axis in names if axes[axis].verdict != "nothing_missing"]
     if found.ranking and lacking:
         blocks.append(_ranking(results, found.ranking))
