@@ -60,6 +60,10 @@ class InputError(Exception):
         return printable(" ".join(text.split()))
 
 
+class MissingResultError(InputError):
+    """A result that is needed has not been made yet: a stage was asked for too early."""
+
+
 def did_you_mean(word: str, known: Iterable[str]) -> str:
     """``, did you mean 'x'?`` for the closest of ``known``, or nothing where none is close."""
     lowered = {str(name).lower(): name for name in known}

@@ -201,6 +201,14 @@ def test_from_needs_what_comes_before(toy: Toy) -> None:
         toy.run(first="toy_double")
 
 
+def test_a_stage_asked_for_too_early_is_no_failure_of_the_run(toy: Toy) -> None:
+    toy.run(last="toy_read", judge=False)
+    (step,) = [s for s in ALL if s.startswith("toy_fit")]
+    with pytest.raises(InputError, match="is missing"):
+        toy.run(first=step.partition(":")[0], judge=False)
+    assert record.read(toy.root).failures == {}
+
+
 def test_until_stops_after_the_stage(toy: Toy) -> None:
     toy.run(last="toy_double", judge=False)
     assert toy.ran() == ALL[:2]

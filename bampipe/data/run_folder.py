@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-from bampipe.errors import InputError
+from bampipe.errors import InputError, MissingResultError
 from bampipe.files import is_inside
 
 if TYPE_CHECKING:
@@ -49,11 +49,11 @@ class RunFolder:
         """Return the path of ``relative``.
 
         Raises:
-            InputError: the file is not there yet; the remedy names ``stage``.
+            MissingResultError: the file is not there yet; the remedy names ``stage``.
         """
         if not self.exists(relative):
             reads = "SESSION" if stage == "ingest" else self.root
-            raise InputError(
+            raise MissingResultError(
                 f"{relative} is missing",
                 where=str(self.root),
                 remedy=f"run `bampipe {stage} {reads}` first",

@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 from bampipe import compile_ahead
-from bampipe.errors import InputError
+from bampipe.errors import InputError, MissingResultError
 from bampipe.run import accepted, hashing, models, record, staging
 from bampipe.run.events import Event, Listener, unheard
 from bampipe.run.gates import judge_gates
@@ -71,13 +71,13 @@ class _Runner:
         self.listen(Event(name, step.name, "done", 1.0))
         return StepResult(step.name, "done", reason, seconds, made.summary)
 
-    def failed(self, step: Step, error: str, refused: bool = False) -> None:
-        """Note that the step failed; what its last success left stays, and stays recorded.
+    def failed(self, step: Step, error: str, *, noted: bool = True) -> None:
+        """Say, and unless not to be ``noted`` note, that the step failed.
 
-        A setting of this request that is ``refused`` is no failure of results made without it.
+        What its last success left stays, and stays recorded.
         """
         shutil.rmtree(staging.folder(self.root, step), ignore_errors=True)
-        if not (refused and step.name in self.state.records):
+        if noted:
             self.state.failures[step.name] = error
             self.state.save()
         self.listen(Event(self.root.name, step.name, "failed", 0.0, error))
@@ -87,8 +87,13 @@ class _Runner:
             reason = self.state.reason(step)
             if reason:
                 return self.execute(step, reason)
+        except MissingResultError as error:
+            self.failed(step, str(error), noted=False)
+            raise
         except InputError as error:
-            self.failed(step, str(error), refused=bool(self.request.settings.get(step.stage)))
+            # A setting of this request that is refused is no failure of results made without it.
+            refused = self.request.settings.get(step.stage) and step.name in self.state.records
+            self.failed(step, str(error), noted=not refused)
             raise
         except Exception as error:
             self.failed(step, f"{type(error).__name__}: {error}")
