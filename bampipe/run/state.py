@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bampipe.data.run_folder import RunFolder
-from bampipe.errors import InputError
+from bampipe.errors import InputError, MissingResultError
 from bampipe.files import digest_content, digest_file, digest_input
 from bampipe.run import hashing, models, record
 from bampipe.run.request import Request, Step
@@ -117,13 +117,13 @@ class RunState:
             found.update(hashing.digest_session(self.session_folder(), self.memory))
         return dict(sorted(found.items()))
 
-    def missing(self, name: str) -> InputError:
+    def missing(self, name: str) -> MissingResultError:
         maker = _maker(name)
         model = name.split("/")[1] if name.startswith("models/") else models.BASE
         option = "" if model == models.BASE else f" --model {model}"
         reads = "SESSION" if maker in base.READS_SESSION else self.root
         remedy = f"run `bampipe {maker} {reads}{option}` first" if maker else ""
-        return InputError(f"{name} is missing", where=str(self.root), remedy=remedy)
+        return MissingResultError(f"{name} is missing", where=str(self.root), remedy=remedy)
 
     def check_untouched(self, name: str) -> None:
         for step, made in self.records.items():
