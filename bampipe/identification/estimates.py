@@ -31,6 +31,7 @@ from bampipe.results.identify import (
     StateBound,
     WorstSecond,
 )
+from bampipe.results.intervals import NORMAL_95
 from bampipe.results.rounding import round_with_sd
 from bampipe.trials.motion import Motion
 
@@ -38,8 +39,6 @@ Array = NDArray[np.float64]
 
 MOST_SHOWN = 24
 """Parameters that a headline lists."""
-NORMAL_95 = 1.96
-"""Standard deviations of a 95 % interval."""
 _STRETCH_S = 1.0
 _MOVES, _OUTLYING = 1.0, 6.0
 """Standard deviations by which the worst second moves a parameter, and times what a typical one

@@ -41,6 +41,10 @@ _LITTLE = 0.5
 """Share of the prior standard deviation above which the data are said to add little."""
 _MOVES = 0.5
 """Per cent by which an estimate moves for an error of one per cent, from which on it is said."""
+_KNOWN = 0.1
+"""Standard deviation of an estimate over its size, at best, below which its moves are shares."""
+_MOST_MOVED = 5
+"""Estimates named for one number."""
 _SHIFT = 1e-6
 """Of a position, rad or m, for the slope of a force."""
 TIMING = "input_timing"
@@ -240,9 +244,12 @@ def _number(
     covariance = cramer_rao_bound(total[np.ix_(rows, rows)])
     partner, correlation = _partner(covariance, n)
     shift = -np.linalg.lstsq(total[:n, :n], total[:n, place], rcond=1e-12)[0]
-    size = np.abs(value)
+    # A share of what may as well be zero would be large and mean nothing.
+    sd = np.sqrt(np.diag(cramer_rao_bound(total[:n, :n])))
     per_cent = {
-        names[i]: float(shift[i] * number.value / value[i]) for i in estimated if size[i] > 0.0
+        names[i]: float(shift[i] * number.value / value[i])
+        for i in estimated
+        if sd[i] < _KNOWN * abs(value[i])
     }
     return DeviceNumber(
         name=number.name,
@@ -318,8 +325,11 @@ def _leaning(numbers: Sequence[DeviceNumber]) -> list[str]:
     for number in numbers:
         moved = {name: size for name, size in number.moves_percent.items() if abs(size) >= _MOVES}
         if moved:
-            shown = join_names([f"`{name}` by {size:+.1f} %" for name, size in moved.items()])
-            sentences.append(f"An error of 1 % in `{number.name}` would move {shown}.")
+            order = sorted(moved, key=lambda name: -abs(moved[name]))
+            shown = [f"`{name}` by {moved[name]:+.1f} %" for name in order[:_MOST_MOVED]]
+            if len(order) > _MOST_MOVED:
+                shown.append(f"{len(order) - _MOST_MOVED} more by less")
+            sentences.append(f"An error of 1 % in `{number.name}` would move {join_names(shown)}.")
         if number.partner is not None and abs(number.correlation) > _CLOSE:
             sentences.append(
                 f"Were `{number.name}` estimated too, it and `{number.partner}` would move "

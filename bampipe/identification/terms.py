@@ -14,6 +14,7 @@ from bampipe.physics import System
 from bampipe.physics.effect import Effect
 from bampipe.physics.readable import model_equations
 from bampipe.results.identify import Covariance
+from bampipe.results.intervals import NORMAL_95
 from bampipe.results.terms import EffectText, ModelTerm, TermCurve, TermsResult
 from bampipe.trials.residuals import Evidence
 
@@ -22,7 +23,6 @@ Array = NDArray[np.float64]
 _BINS = 24
 _FEWEST = 8
 """Samples of a bin."""
-_NORMAL_95 = 1.959964
 _LEAST_SHARE = 0.02
 """Of the force of a term over the axis' own error, below which its curve says nothing."""
 _STEP = 1e-4
@@ -158,7 +158,7 @@ def _curves(
         mean = _means(own, which, filled)
         slope = np.array([_means(one[use, axis], which, filled) for one in slopes])
         variance = np.einsum("ib,ij,jb->b", slope, spread, slope) if rows else 0.0 * mean
-        half = _NORMAL_95 * np.sqrt(np.maximum(variance, 0.0))
+        half = NORMAL_95 * np.sqrt(np.maximum(variance, 0.0))
         yield TermCurve(
             axis=name,
             unit=system.torque_units[axis],

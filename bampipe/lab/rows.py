@@ -15,13 +15,10 @@ from bampipe.files import refuse_links
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.ingest import IngestResult
+from bampipe.results.intervals import NORMAL_95
 from bampipe.results.stiffness import StiffnessResult
 from bampipe.results.validate import ValidateResult
 from bampipe.run import models, record
-
-NORMAL_95 = 1.959963984540054
-"""Half width of a 95 % interval of a normal distribution, in standard deviations."""
-
 
 _OF_SESSION = ("ingest/session.json", "ingest/trials.parquet", "stiffness/stiffness.json")
 _OF_MODELS = ("identify.json", "validate.json", "diagnose.json")

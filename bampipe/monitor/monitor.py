@@ -15,10 +15,10 @@ from bampipe.estimate.online import OnlineFilter
 from bampipe.estimate.unscented import FilterFailure
 from bampipe.monitor.start import FIRST_LOOK, MonitorOptions, Start, start_from_samples
 from bampipe.physics import System
+from bampipe.results.intervals import NORMAL_95
 
 Array = NDArray[np.float64]
 
-NORMAL_95 = 1.959963984540054
 PORTION = 512
 """Samples filtered at once, so that memory stays the same."""
 

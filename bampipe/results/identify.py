@@ -232,7 +232,8 @@ class DeviceNumber(Record):
     partner: str | None
     correlation: float
     moves_percent: dict[str, float] = Field(
-        description="By how much each estimate moves for an error of 1 % in it, per cent"
+        description="By how much each estimate known to 10 % moves for an error of 1 % in it,"
+        " per cent"
     )
 
 

@@ -22,10 +22,10 @@ from bampipe.results.identify import (
     ParameterEstimate,
     StateBound,
 )
+from bampipe.results.intervals import NORMAL_95
 from bampipe.results.rounding import decimals_for
 
 TITLE = "Identification"
-_NORMAL_95 = 1.959964
 _TWO_COLUMNS = 6
 _DASHES = ("-", (0, (5, 1.5)), (0, (1.5, 1.2)), (0, (5, 1.5, 1, 1.5)))
 
@@ -75,7 +75,7 @@ def _parameters(results: Results, identified: IdentifyResult) -> Table:
         entry = parameters[name]
         value, sd = entry.estimate, entry.sd
         decimals = decimals_for(sd, value)
-        half = _NORMAL_95 * sd if sd else 0.0
+        half = NORMAL_95 * sd if sd else 0.0
         rows.append(
             (
                 wording.parameter(name),
@@ -184,7 +184,7 @@ def _checks(identified: IdentifyResult) -> str:
 def _timing(timing: InputTiming) -> str:
     """Return by how much the force lags the encoders, where the trials show that it does."""
     lag = 1e3 * timing.estimate
-    if abs(timing.estimate) < _NORMAL_95 * timing.sd:
+    if abs(timing.estimate) < NORMAL_95 * timing.sd:
         shown = wording.with_sd(lag, 1e3 * timing.sd)
         return f"No delay between force and encoders is shown (the force lags by {shown} ms)."
     verb = "lags" if lag > 0.0 else "leads"
@@ -289,7 +289,7 @@ def _trace(
     title = axis if axis in results.axes else "estimate"
     panel.plot(t, value, color=colour, ls=_DASHES[place % len(_DASHES)], label=title)
     if f"{name}_sd" in shown:
-        half = _NORMAL_95 * shown[f"{name}_sd"].to_numpy()
+        half = NORMAL_95 * shown[f"{name}_sd"].to_numpy()
         panel.fill_between(t, value - half, value + half, color=colour, alpha=0.18, lw=0)
 
 

@@ -11,11 +11,11 @@ from bampipe.report.document import Block, Paragraph, Section, Table
 from bampipe.report.results import Results
 from bampipe.results.compare import CompareResult
 from bampipe.results.identify import METHODS_IN_WORDS, IdentifyResult, ParameterEstimate
+from bampipe.results.intervals import NORMAL_95
 from bampipe.results.setup import SetupResult
 from bampipe.results.stiffness import AxisStiffness, StiffnessResult
 from bampipe.results.validate import AxisError, ValidateResult
 
-_NORMAL_95 = 1.959964
 _MOST_OTHERS = 12
 """Parameters of no axis that a note can name."""
 _TERMS = (
@@ -196,7 +196,7 @@ def _near_zero(results: Results, parameters: Mapping[str, ParameterEstimate]) ->
         f"`{name}`"
         for name in results.in_order(parameters)
         if name.startswith(("viscous.", "coulomb."))
-        and abs(parameters[name].estimate) < _NORMAL_95 * parameters[name].sd
+        and abs(parameters[name].estimate) < NORMAL_95 * parameters[name].sd
     ]
     verb = "is" if len(names) == 1 else "are"
     return f"{join_names(names)} {verb} not shown to differ from zero." if names else ""

@@ -10,10 +10,10 @@ from bampipe.lists import join_names
 from bampipe.report import style, wording
 from bampipe.report.document import Block, Figure, Paragraph, Section, Table
 from bampipe.report.results import Results
+from bampipe.results.intervals import NORMAL_95
 from bampipe.results.viscous import Damping, ViscousResult
 
 TITLE = "Viscous field"
-_NORMAL_95 = 1.959964
 
 
 def section(results: Results) -> Section | None:
@@ -92,7 +92,7 @@ def _figure(results: Results, directions: Mapping[str, Damping], trace: pd.DataF
     starts = trace.loc[trace["trial_id"].ne(trace["trial_id"].shift()), "t_total"].to_numpy()
     for number, (panel, name) in enumerate(zip(panels[0], names, strict=True)):
         value = shown[f"damping_{name}"].to_numpy()
-        half = _NORMAL_95 * shown[f"damping_{name}_sd"].to_numpy()
+        half = NORMAL_95 * shown[f"damping_{name}_sd"].to_numpy()
         colour = style.SERIES[number % len(style.SERIES)]
         panel.fill_between(t, value - half, value + half, color=colour, alpha=0.18, lw=0)
         panel.plot(t, value, color=colour, label="estimate")
