@@ -16,6 +16,9 @@ from bampipe.estimate.bounded import solve_bounded
 
 Array = NDArray[np.float64]
 
+_CANCELLED = 1e-8
+"""Share of a sum of squares below which what a fit leaves of it may be rounding."""
+
 
 @dataclass(frozen=True)
 class NormalEquations:
@@ -150,9 +153,18 @@ class NormalEquations:
         return solve_bounded(normal, moment, lower, upper).x
 
     def squares(self, values: Array) -> Array:
-        """Sum of squared residuals left with coefficients ``values`` (P,), (K, n_q)."""
+        """Sum of squared residuals left with coefficients ``values`` (P,), (K, n_q).
+
+        At least what rounding may have left of it: the difference of large sums is never zero.
+        """
         fitted = np.einsum("kapq,p,q->ka", self.xx, values, values)
-        return np.asarray(np.maximum(self.yy - 2.0 * self.xy @ values + fitted, 0.0))
+        left = self.yy - 2.0 * self.xy @ values + fitted
+        if np.any(left < _CANCELLED * self.yy):
+            size = np.abs(values)
+            terms = self.yy + 2.0 * np.abs(self.xy) @ size
+            terms += np.einsum("kapq,p,q->ka", np.abs(self.xx), size, size)
+            left = np.maximum(left, np.finfo(float).eps * terms)
+        return np.asarray(left)
 
     def mean_square(self, values: Array) -> Array:
         """Mean squared residual over all trials with coefficients ``values``, (n_q,)."""
