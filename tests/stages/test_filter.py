@@ -12,6 +12,7 @@ from run_folders import ingested_session, write_ingested
 from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import read_parquet
 from bampipe.errors import InputError
+from bampipe.estimate import butterworth
 from bampipe.files import digest_file, read_json
 from bampipe.progress import silent
 from bampipe.results.setup import AxisSetup, SetupResult
@@ -160,7 +161,7 @@ def test_a_trial_too_short_is_named(tmp_path: Path) -> None:
         ({"method": "spline"}, "spline"),
         ({"cutoff_hz": 400.0}, "half the sampling rate"),
         ({"cutoff_hz": -1.0}, r"filter\.cutoff_hz: found -1.0, expected 0 or more"),
-        ({"force_cutoff_hz": 0.0}, "expected more than 0"),
+        ({"force_cutoff_hz": -1.0}, "expected 0 or more"),
         ({"tuning_samples": 1}, "1000"),
     ],
 )
@@ -169,6 +170,24 @@ def test_settings_that_make_no_sense(
 ) -> None:
     with pytest.raises(InputError, match=message):
         run_stage(run, **settings)
+
+
+@pytest.mark.parametrize(
+    ("settings", "cutoff_hz"),
+    [({}, 25.0), ({"band_hz": 12.0}, 48.0), ({"band_hz": 12.0, "force_cutoff_hz": 30.0}, 30.0)],
+)
+def test_derivatives_of_the_force_reach_beyond_the_band(
+    run: RunFolder, settings: dict[str, object], cutoff_hz: float
+) -> None:
+    content, kinematics = run_stage(run, **settings)
+    assert content["force"]["derivative_cutoff_hz"] == cutoff_hz
+    force = next(c for c in kinematics if c.startswith("force_") and "rate" not in c)
+    values = kinematics[kinematics["trial_id"] == kinematics["trial_id"].iloc[0]]
+    (rate, *_) = butterworth.rates(
+        values[force].to_numpy(), content["sample_rate_hz"], cutoff_hz, 2
+    )
+    component = force.removeprefix("force_")
+    np.testing.assert_allclose(values[f"force_rate_{component}"], rate, rtol=1e-9, atol=1e-9)
 
 
 def test_no_trial_to_differentiate(tmp_path: Path) -> None:
