@@ -71,12 +71,13 @@ def test_what_came_to_nothing_is_not_weighed_again(
     left = ["backlash:joint", "transmission_compliance:joint"]
 
     def run(_: loop.LoopOptions, first: str, last: str, model: str, changed: object = None) -> None:
-        ran.extend([changed] if first == "diagnose" else [])
+        ran.extend([changed or None] if first == "diagnose" else [])
 
     def diagnosis(*_: object) -> DiagnoseResult:
-        found = left[len(ran) - 1 : len(ran)]
+        found, not_weighed = left[len(ran) - 1 : len(ran)], left[: len(ran) - 1]
         content = {"axes": {"joint": {"verdict": "missing" if found else "nothing_missing"}}}
-        return DiagnoseResult.model_validate(filled(DiagnoseResult, {**content, "selected": found}))
+        more = {"selected": found, "not_weighed": not_weighed}
+        return DiagnoseResult.model_validate(filled(DiagnoseResult, {**content, **more}))
 
     monkeypatch.setattr(loop.LoopOptions, "run", run)
     monkeypatch.setattr(loop, "_diagnosis", diagnosis)

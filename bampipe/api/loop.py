@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from bampipe.data.run_folder import RunFolder
@@ -52,11 +53,11 @@ class LoopOptions:
         first: str,
         last: str,
         model: str,
-        changed: Mapping[str, Mapping[str, object]] | None = None,
+        changed: Mapping[str, Mapping[str, object]] = MappingProxyType({}),
     ) -> None:
         """Run the stages ``first`` to ``last`` on ``model``, with some settings ``changed``."""
         settings = settings_of(self.root, model)
-        for stage, values in (changed or {}).items():
+        for stage, values in changed.items():
             settings[stage] = {**settings.get(stage, {}), **values}
         run_session(
             Request(
@@ -256,9 +257,8 @@ def follow(
         The name of the last model that is better than its parent.
     """
     options.run("identify", "validate", model)  # what a child is held against, and the ladder shows
-    rejected: tuple[str, ...] = ()
+    left_out: dict[str, dict[str, object]] = {}
     for _ in range(MOST_ROUNDS):
-        left_out = {"diagnose": {"without": rejected}} if rejected else None
         options.run("diagnose", "diagnose", model, left_out)
         diagnosis = _diagnosis(options.root, model)
         for axis, entry in sorted(diagnosis.axes.items()):
@@ -270,10 +270,10 @@ def follow(
             break
         child = _add(options, model, found, tell)
         if child:
-            model, rejected = child, ()
+            model, left_out = child, {}
         elif set(found) <= set(diagnosis.selected):
             # Diagnosed once more: what came to nothing is no longer said to be missing.
-            rejected = (*rejected, *found)
+            left_out = {"diagnose": {"without": (*diagnosis.not_weighed, *found)}}
         else:
             break
     else:

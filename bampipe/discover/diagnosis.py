@@ -60,9 +60,9 @@ def diagnose(
     if len(trials.motions) < 2:
         raise ValueError("a diagnosis needs at least two trials: one is held out")
     device, extra = recipe.model().device, [effect_from(e) for e in recipe.extra]
-    candidates = [c for c in list_candidates(device, recipe.effects, extra) if c not in without]
+    candidates = list_candidates(device, (*recipe.effects, *without), extra)
     with workers(trials, settings.jobs) as pool:
-        bench = Bench(trials, settings, pool, tuple(candidates))
+        bench = Bench(trials, settings, pool, candidates)
         searched = search(bench, recipe, start, progress)
         found = conclude(searched, settings)
     progress(0.95, "holding the final model against its floor in another band")

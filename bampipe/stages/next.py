@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Literal, get_args
@@ -16,7 +14,7 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
 from bampipe.declarations.model_file import IDENTIFIED_MODEL, identified, load_model, read_recipe
 from bampipe.errors import InputError, choose_from
-from bampipe.files import write_json
+from bampipe.files import digest_content, write_json
 from bampipe.identification.filter_choice import FilterChoice
 from bampipe.identification.sensor_noise import sensor_noise
 from bampipe.next_trial.choice import Tried, Worth, rank_designs
@@ -211,8 +209,8 @@ def _write_earlier(run: RunFolder, out: Path, result: NextResult) -> None:
     """Write the earlier proposals whose trial may still come, each named by its content."""
     for one in find_open(read_forecasts(run.root, result.model), result):
         content = one.model_dump(mode="json")
-        name = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:12]
-        write_json(out / NextResult.EARLIER.format(model=result.model) / f"{name}.json", content)
+        name = f"{digest_content(content)[:12]}.json"
+        write_json(out / NextResult.EARLIER.format(model=result.model) / name, content)
 
 
 def _split(asked: str, names: Sequence[str]) -> tuple[Purpose | Literal["auto"], str]:
