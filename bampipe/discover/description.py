@@ -15,8 +15,6 @@ from bampipe.trials.residuals import Evidence
 
 Array = NDArray[np.float64]
 
-_LIMITS = Settings()
-
 
 @dataclass(frozen=True)
 class _Sine:
@@ -27,43 +25,43 @@ class _Sine:
     frequency: float
 
 
-def describe(evidence: Evidence, axis: int) -> str:
+def describe(evidence: Evidence, axis: int, s: Settings) -> str:
     """The residual's shape in one sentence: what it varies with most, where, which way."""
     known = [v for v in variables(evidence, axis) if v.name not in ("trial", "direction")]
     maps = [residual_map(evidence, axis, v, 3 * BINS) for v in known]
     best = int(np.argmax([m.share for m in maps]))
     most, variable = maps[best], known[best]
     unit = evidence.system.torque_units[axis]
-    if most.share < _LIMITS.variable_share or most.variable == "time":
-        vibration = _vibration(evidence, axis)
-        if vibration is not None and vibration.share > max(most.share, _LIMITS.variable_share):
+    if most.share < s.variable_share or most.variable == "time":
+        vibration = _vibration(evidence, axis, s.significance)
+        if vibration is not None and vibration.share > max(most.share, s.variable_share):
             return (
                 f"a vibration of {vibration.amplitude:.2g} {unit} at {vibration.frequency:.3g} Hz "
                 "in time, whatever the machine does; it carries "
                 f"{100 * vibration.share:.0f} % of the residual's variance"
             )
-    if most.share < _LIMITS.variable_share:
+    if most.share < s.variable_share:
         return (
             "scattered over all motions; of all that the machine does, "
             f"{most.variable} explains most of it, {100 * most.share:.0f} %"
-            if most.share >= 0.005
+            if most.share >= s.mentioned_share
             else "scattered over all motions; it follows nothing that the machine does"
         )
     carries = f"{most.variable} carries {100 * most.share:.0f} % of the residual's variance"
-    turning = _by_direction(evidence, axis, variable)
+    turning = _by_direction(evidence, axis, variable, s.direction_likeness)
     ripple = _ripple(evidence, axis, variable)
-    if ripple is not None and ripple.share > _LIMITS.ripple_share * most.share:
+    if ripple is not None and ripple.share > s.ripple_share * most.share:
         period = 1.0 / ripple.frequency
         return (
             f"a ripple of {ripple.amplitude:.2g} {unit} along {most.variable} that repeats every "
             f"{period:.3g} {most.unit}, {turning}; {carries}"
         )
-    return f"{_bumps(most, unit)}, {turning}; {carries}"
+    return f"{_bumps(most, unit, s)}, {turning}; {carries}"
 
 
-def _bumps(most: Map, torque_unit: str) -> str:
+def _bumps(most: Map, torque_unit: str, s: Settings) -> str:
     unit = f"{torque_unit} near {most.variable}"
-    strong = np.abs(most.mean) > 0.5 * np.max(np.abs(most.mean))
+    strong = np.abs(most.mean) > s.bump_height * np.max(np.abs(most.mean))
     places = []
     for side in (strong & (most.mean < 0.0), strong & (most.mean > 0.0)):
         if side.any():
@@ -72,7 +70,7 @@ def _bumps(most: Map, torque_unit: str) -> str:
             peak = most.mean[side][int(np.argmax(weight))]
             places.append((middle, f"{peak:+.2g} {unit} {middle:.3g} {most.unit}".strip()))
     places.sort()
-    narrow = strong.sum() <= len(strong) / 3
+    narrow = strong.sum() <= s.bump_width * len(strong)
     form = "a bump of" if narrow else "a broad change,"
     if len(places) == 2:
         form = "opposite bumps of" if narrow else "a change of sign,"
@@ -92,7 +90,7 @@ def _ripple(evidence: Evidence, axis: int, variable: Variable) -> _Sine | None:
     return _best_sine([(v, r)], np.arange(2.0, BINS, 0.1) / (high - low))
 
 
-def _vibration(evidence: Evidence, axis: int) -> _Sine | None:
+def _vibration(evidence: Evidence, axis: int, significance: float) -> _Sine | None:
     """A sine in time, of any phase in each trial; None where chance may give one as strong.
 
     Of noise, the share at one frequency is a sum of exponential variates, one a trial (Lomb 1976).
@@ -109,7 +107,7 @@ def _vibration(evidence: Evidence, axis: int) -> _Sine | None:
     longest = max(float(np.ptp(t)) for t, _ in trials)
     tried = np.arange(2.0 / longest, band.cutoff_hz[axis], 0.25 / longest)
     best = _best_sine(trials, tried)
-    by_chance = gamma.isf(_LIMITS.significance / max(len(tried), 1), len(trials))
+    by_chance = gamma.isf(significance / max(len(tried), 1), len(trials))
     independent = 0.5 * sum(len(r) for _, r in trials) * band.independent_share[axis]
     return best if best.share * independent > by_chance else None
 
@@ -138,7 +136,7 @@ def _best_sine(trials: Sequence[tuple[Array, Array]], frequencies: Array) -> _Si
     return best
 
 
-def _by_direction(evidence: Evidence, axis: int, variable: Variable) -> str:
+def _by_direction(evidence: Evidence, axis: int, variable: Variable, alike: float) -> str:
     """Whether the residual keeps its sign when the motion turns round, as friction does not."""
     r = np.concatenate([x[:, axis] for x in evidence.residual])
     v = np.concatenate(variable.values)
@@ -154,8 +152,8 @@ def _by_direction(evidence: Evidence, axis: int, variable: Variable) -> str:
     if len(means) < 4:
         return "seen in one direction of motion only"
     likeness = float(np.corrcoef(np.array(means).T)[0, 1])
-    if likeness > _LIMITS.direction_likeness:
+    if likeness > alike:
         return "the same in both directions of motion, as of a spring"
-    if likeness < -_LIMITS.direction_likeness:
+    if likeness < -alike:
         return "opposite in the two directions of motion, as of friction"
     return "different in the two directions of motion"

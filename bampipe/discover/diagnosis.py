@@ -69,7 +69,7 @@ def diagnose(
     final = searched.found
     bands = judge_in_other_band(searched.trials, final.evidence, final.replayed, settings)
     found = _with_each_axis(found, "other_band", bands)
-    return _with_each_axis(found, "sentence", axis_sentences(found))
+    return _with_each_axis(found, "sentence", axis_sentences(found, settings))
 
 
 def _with_each_axis(found: Diagnosis, field: str, values: Sequence[object]) -> Diagnosis:

@@ -25,7 +25,7 @@ class Choice:
 
     Attributes:
         winner: the best one; "" if every one of them rests on one second.
-        alike: others that these trials cannot tell from it, two at most.
+        alike: others that these trials cannot tell from it.
         transient: candidates that only one second speaks for, and that second.
     """
 
@@ -127,7 +127,7 @@ def choose(
     if plain != winner:
         alike = (winner, *[n for n in alike if n != plain])
         winner = plain
-    return Choice(winner, alike[:2], transient)
+    return Choice(winner, alike[: s.most_alike], transient)
 
 
 def _misfit(

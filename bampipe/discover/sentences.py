@@ -6,21 +6,22 @@ from collections.abc import Sequence
 
 from bampipe.discover.description import describe
 from bampipe.discover.findings import Diagnosis
+from bampipe.discover.settings import Settings
 from bampipe.lists import join_names
 from bampipe.results.diagnose import AxisVerdict, Contender, Stretch
 from bampipe.results.standing import FLOOR_WRONG, STANDINGS_IN_WORDS
 
 
-def axis_sentences(found: Diagnosis) -> list[str]:
+def axis_sentences(found: Diagnosis, s: Settings) -> list[str]:
     """One or more sentences for each axis."""
     system = found.evidence.system
     return [
-        " ".join(_parts(axis, i, found, system.torque_units[i]))
+        " ".join(_parts(axis, i, found, system.torque_units[i], s))
         for i, axis in enumerate(system.coordinates)
     ]
 
 
-def _parts(axis: str, i: int, found: Diagnosis, unit: str) -> list[str]:
+def _parts(axis: str, i: int, found: Diagnosis, unit: str, s: Settings) -> list[str]:
     a = found.axes[i]
     name = axis.capitalize() if axis.isalpha() else axis  # joint_1 is a name, not a word
     if a.standing in FLOOR_WRONG:
@@ -39,9 +40,9 @@ def _parts(axis: str, i: int, found: Diagnosis, unit: str) -> list[str]:
             else "Its shape"
         )
         judged = found.evidence if a.effects else found.initial
-        parts.append(f"{left}: {describe(judged, i)}.")
+        parts.append(f"{left}: {describe(judged, i, s)}.")
     elif a.standing == "above_floor":
-        parts.append(_excused(a, unit))
+        parts.append(_excused(a, unit, s.second_share))
     return parts + _other_band(a)
 
 
@@ -139,10 +140,10 @@ def _transients(axis: str, found: Diagnosis) -> list[str]:
     ]
 
 
-def _excused(a: AxisVerdict, unit: str) -> str:
+def _excused(a: AxisVerdict, unit: str, second_share: float) -> str:
     """Why an error above its floor does not mean that something is missing."""
     worst = a.rmse_after - a.rmse_without_worst_second
-    if worst > 0.1 * a.rmse_after:
+    if worst > second_share * a.rmse_after:
         return (
             f"Without {_when(a.worst_second)}, the worst second, the error is "
             f"{a.rmse_without_worst_second:.3g} {unit}."

@@ -65,15 +65,26 @@ class Settings:
             likelihood, both because no replay is perfect.
         other_band_replicates: replays in another band; other_band_ratio: of its cut-off to that of
             the session, or the inverse.
-        variable_share: least share of a residual's variance that a variable carries to be named.
+        variable_share: least share of a residual's variance that a variable carries to be named;
+            mentioned_share: to be mentioned where the residual is scattered.
         ripple_share: least share of that which a sine carries to be called a ripple.
         direction_likeness: correlation of the residual in both directions from which on it is
             called the same, as of a spring, or opposite, as of friction.
+        bump_height: share of the largest mean residual from which on a place belongs to a bump;
+            bump_width: share of the range up to which it is one, and not a broad change.
+        second_share: least share of an error that the worst second makes to be pointed at.
+        most_alike: the most effects that are said to be no different from the one found.
         draft_replicates: replays on which a formula is searched as on the measurement, twice as
             many more where the decision is close; draft_significance: chance of a formula where
             nothing is missing.
         draft_close: as ``close``, for a formula.
         draft_worth: least drop of log error on held-out trials for each constant of a formula.
+        draft_rival_share: share of the best form's gain from which on another one is refitted.
+        confused: chance of confusing two effects below which these trials distinguish them;
+            confusion_left: share of it that a suggested trial may leave at most.
+        lowered: share of a chance of confusion, or of a smallest strength, from which on a
+            proposed trial is not said to lower it.
+        least_odds: odds below which a rival is not worth a trial.
         jobs: worker processes.
         seed: of all noise.
     """
@@ -118,9 +129,19 @@ class Settings:
     variable_share: float = 0.2
     ripple_share: float = 0.5
     direction_likeness: float = 0.6
+    mentioned_share: float = 0.005
+    bump_height: float = 0.5
+    bump_width: float = 1.0 / 3.0
+    second_share: float = 0.1
+    most_alike: int = 2
     draft_replicates: int = 6
     draft_significance: float = 0.01
     draft_close: float = 6.0
     draft_worth: float = 0.03
+    draft_rival_share: float = 0.5
+    confused: float = 0.01
+    confusion_left: float = 0.5
+    lowered: float = 0.8
+    least_odds: float = 0.02
     jobs: int = 2
     seed: int = 0

@@ -23,8 +23,6 @@ from bampipe.trials.residuals import Evidence
 
 Array = NDArray[np.float64]
 
-_LIKELY = 0.02
-"""Odds below which a rival is not worth a trial."""
 _MOST_RIVALS = 4
 
 
@@ -62,12 +60,14 @@ def find_ambiguity(found: DiagnoseResult) -> Ambiguity | None:
                 name: share for name, share in axis.likely.items() if name not in found.selected
             }
             if odds:
-                odds |= {"": max(1.0 - sum(odds.values()), _LIKELY)}
+                odds |= {"": max(1.0 - sum(odds.values()), s.least_odds)}
                 open_questions.append((odds, found.selected))
     best: Ambiguity | None = None
     for odds, others in open_questions:
         total = sum(odds.values())
-        shares = {name: share / total for name, share in odds.items() if share > _LIKELY * total}
+        shares = {
+            name: share / total for name, share in odds.items() if share > s.least_odds * total
+        }
         shares = dict(sorted(shares.items(), key=lambda pair: -pair[1])[:_MOST_RIVALS])
         if len(shares) > 1 and (best is None or max(shares.values()) < max(best.odds.values())):
             total = sum(shares.values())

@@ -5,16 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from bampipe.discover.settings import Settings
 from bampipe.lists import join_names
 from bampipe.results.next import Detectable, Proposal, Purpose
 
 _SHOWN = 3
 """Parameters or effects that a sentence names."""
-_SURE = 0.01
-"""Chance below which its exact size means nothing."""
-
-_LOWERS = 0.8
-"""Share of a chance of confusion from which on a trial does not lower it."""
+_LIMITS = Settings()
 
 
 @dataclass(frozen=True)
@@ -51,7 +48,7 @@ def _decision(best: Proposal) -> Reasons:
     before, after = _chance(pair.before), _chance(pair.after)
     expected = (
         f"The chance of confusing them is expected to fall from {before} to {after}."
-        if pair.after < _LOWERS * pair.before
+        if pair.after < _LIMITS.lowered * pair.before
         else f"No trial tried tells them apart: the chance would be {after} after this one. A wider"
         " motion, or another load, may."
     )
@@ -93,7 +90,7 @@ def _detected(table: Mapping[str, Detectable]) -> str:
         for name, entry in table.items()
         if name in hidden
         and entry.with_proposal is not None
-        and (entry.smallest is None or entry.with_proposal < 0.8 * entry.smallest)
+        and (entry.smallest is None or entry.with_proposal < _LIMITS.lowered * entry.smallest)
     ]
     return f"It would show {join_names(shown[:_SHOWN])} with 90 % probability." if shown else ""
 
@@ -111,7 +108,8 @@ def _narrowed(parameter: str, best: Proposal) -> str:
 
 
 def _chance(value: float) -> str:
-    return "below 1 %" if value < _SURE else f"{100.0 * value:.0f} %"
+    least = _LIMITS.confused
+    return f"below {100.0 * least:.3g} %" if value < least else f"{100.0 * value:.0f} %"
 
 
 def _hidden(table: Mapping[str, Detectable]) -> list[str]:

@@ -107,7 +107,7 @@ class Bar:
             tests: number of candidates.
         """
         s = Settings()
-        lift = np.log((AT_FLOOR * floor + 2.0 * floor_sd) / error)
+        lift = np.log((AT_FLOOR * floor + s.above_floor_sd * floor_sd) / error)
         return cls(np.minimum(s.worth_at_floor, np.maximum(s.worth, lift)), tests)
 
 

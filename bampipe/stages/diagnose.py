@@ -50,10 +50,6 @@ from bampipe.trials.measured import MeasuredTrials, read_measured_trials, trial_
 _DESCRIBED = 12
 """Effects of the ranking whose formulas are stored with it."""
 _SUGGESTED_S = 20.0
-_CONFUSED = 0.01
-"""Chance of confusing two effects below which these trials tell them apart: none has to decide."""
-_LOWERS = 0.5
-"""Share of the chance of confusion that a suggested trial must leave at most."""
 
 SUMMARY = "Find which physical effect the model lacks"
 INPUTS = (*INGESTED, *FILTERED, "filter/setup.json?", *IDENTIFIED_MODEL)
@@ -127,7 +123,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     samples = _map_variables(found)
     write_parquet(out / f"models/{config.model}/map_variables.parquet", samples)
     progress(0.97, "a trial that would decide what these do not")
-    result = _with_suggestion(_result(found, recipe, config), found, trials, recipe, config.seed)
+    result = _with_suggestion(_result(found, recipe, config), found, trials, recipe, settings)
     return _summary(result.write(out), result.limits)
 
 
@@ -242,7 +238,11 @@ def _map_variables(found: Diagnosis) -> pd.DataFrame:
 
 
 def _with_suggestion(
-    result: DiagnoseResult, found: Diagnosis, trials: MeasuredTrials, recipe: Recipe, seed: int
+    result: DiagnoseResult,
+    found: Diagnosis,
+    trials: MeasuredTrials,
+    recipe: Recipe,
+    settings: Settings,
 ) -> DiagnoseResult:
     """The result with the trial that would tell apart what these trials do not."""
     asked = find_ambiguity(result)
@@ -255,7 +255,7 @@ def _with_suggestion(
     if contest is None:
         return result
     seen = Envelope.of_trials(trials.motions, system.model.device)
-    rehearsal = Rehearsal(system, p, trials.sensors, trials.kinematics, seen, seed)
+    rehearsal = Rehearsal(system, p, trials.sensors, trials.kinematics, seen, settings.seed)
     fitted = [trials.motions[k] for k in trials.folds.fitted_trials]
     at_hand = contest.sums(fitted)
     tried = rank_designs(
@@ -270,7 +270,9 @@ def _with_suggestion(
     weights = contest.weights()
     pair = max(weights, key=lambda pair: weights[pair] * now[pair].confusion)
     confusion = float(np.median([one[pair].confusion for one in then]))
-    if now[pair].confusion < _CONFUSED or confusion > _LOWERS * now[pair].confusion:
+    if now[pair].confusion < settings.confused or (
+        confusion > settings.confusion_left * now[pair].confusion
+    ):
         return result
     left = np.median([one[pair].left for one in then], axis=0) / floor
     axis = int(np.argmax(left))

@@ -85,7 +85,7 @@ def test_an_effect_outside_the_library_is_unknown_until_its_file_is_given():
     found = run(session)
     assert verdicts(found)[0] == "unknown_effect"
     assert found.selected == ()
-    words = describe(found.evidence, 0)
+    words = describe(found.evidence, 0, QUICK)
     assert "position" in words and "bump" in words
     with_file = run(session, bam([], [SNAG]))
     assert with_file.selected == ("snag:yaw",)
@@ -158,7 +158,7 @@ HUM = RIPPLE | {
 def test_the_period_of_an_unknown_effect_is_said(effect, pattern, truth):
     session = made(bam([f"{effect['name']}:yaw"], [effect]), {})
     evidence = fit_trials(session, bam(), system_of(bam()).prior)
-    said = re.match(pattern, describe(evidence, 0))
+    said = re.match(pattern, describe(evidence, 0, QUICK))
     assert said
     assert float(said[1]) == pytest.approx(truth, rel=0.03)
 
@@ -171,5 +171,5 @@ def test_noise_within_the_band_is_no_vibration():
     for _ in range(20):
         noise = [rng.normal(size=m.q.shape) for m in session.motions]
         noisy = replace(evidence, residual=band.thin_trials(noise, [0, 1, 2]))
-        said.append(describe(noisy, 0))
+        said.append(describe(noisy, 0, QUICK))
     assert sum("vibration" in sentence for sentence in said) <= 1

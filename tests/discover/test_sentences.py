@@ -10,6 +10,7 @@ import pytest
 
 from bampipe.discover import sentences
 from bampipe.discover.findings import Diagnosis
+from bampipe.discover.settings import Settings
 from bampipe.results.diagnose import AxisVerdict, Contender, Stretch, TransientCandidate
 from bampipe.results.standing import standing
 
@@ -33,13 +34,13 @@ def finding(verdict, before, after, floor, **more):
 
 def say(monkeypatch, axis, contests=None, transients=()):
     """The sentence of one axis called joint, in N.m."""
-    monkeypatch.setattr(sentences, "describe", lambda evidence, axis: SHAPE)
+    monkeypatch.setattr(sentences, "describe", lambda evidence, axis, s: SHAPE)
     system = SimpleNamespace(coordinates=("joint",), torque_units=("N.m",))
     evidence = SimpleNamespace(system=system)
     found = Diagnosis(
         (axis,), (), axis.effects, {}, contests or {}, (), transients, evidence, evidence
     )
-    return sentences.axis_sentences(found)[0]
+    return sentences.axis_sentences(found, Settings())[0]
 
 
 def contender(effect, held_out_rmse, score, without_trial, without_second, odds):

@@ -39,8 +39,6 @@ MOST_TERMS = 2
 MOST_LISTED = 5
 _FITTED = (6, 3)
 """Forms refitted with the model, best of the first pass first: of the first term, of the next."""
-_NO_MORE_THAN = 0.5
-"""A form is refitted if its gain comes up to this share of the best one's."""
 _SEED = 11
 """First number, after the user's, of the seeds of these replays."""
 _STEPS_OF_A_REPLAY = 4
@@ -402,7 +400,7 @@ class AxisSearch:
         count: int,
     ) -> list[tuple[Option, Recipe, Array]]:
         """The model with each of the best forms, all parameters fitted together."""
-        least = _NO_MORE_THAN * screened[0].gain
+        least = self._settings.draft_rival_share * screened[0].gain
         chosen = [found for found in screened if found.gain >= least][:count]
         tasks, terms = [], []
         for found in chosen:
