@@ -421,7 +421,8 @@ def draw_figure(outcomes: Sequence[Outcome], path: Path) -> None:
         fontsize=8,
     )
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, metadata={"Date": None})
+    with plt.rc_context({"svg.hashsalt": "margins"}):
+        figure.savefig(path, metadata={"Date": None})
 
 
 def main(arguments: Sequence[str]) -> None:

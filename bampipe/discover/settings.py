@@ -1,8 +1,10 @@
 """How carefully the diagnosis looks, and what it takes for a finding.
 
-Every threshold that decides a verdict stands here; where an error is at its floor is decided in
-`bampipe.results.standing`. The figures they rest on are in docs/benchmarks.md: clean axes beside
-weak effects (benchmarks/thresholds.py), hidden effects (benchmarks/hidden_effects.py).
+Every threshold that decides a verdict, a draft or a sentence of them stands here; where an error is
+at its floor is decided in `bampipe.results.standing`. The figures they rest on are in
+docs/benchmarks.md: by how much each could move before anything comes out otherwise
+(benchmarks/margins.py), clean axes beside weak effects (benchmarks/thresholds.py), hidden effects
+(benchmarks/hidden_effects.py).
 """
 
 from __future__ import annotations
@@ -12,7 +14,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Settings:
-    """How carefully to look.
+    """How carefully to look; how far each threshold is from deciding otherwise: docs/benchmarks.md.
 
     Attributes:
         first_replicates: replays of the model for the chance level, enough where the best
