@@ -81,18 +81,35 @@ def solve_bounded(normal: Array, moment: Array, lower: Array, upper: Array) -> B
     held = np.flatnonzero(~(lower < upper))
     if open_.size:
         rest = moment[open_] - normal[np.ix_(open_, held)] @ x[held]
-        scale, values, vectors, null = scaled_eigenbasis(normal[np.ix_(open_, open_)])
-        singular, vectors = np.sqrt(values[~null]), vectors[:, ~null]
-        target = vectors.T @ (rest / scale) / singular
         low, high = lower[open_], upper[open_]
-        free = vectors @ (target / singular) / scale
-        if np.any((free < low) | (free > high)):
-            root, range_ = singular[:, None] * vectors.T, (low * scale, high * scale)
-            found = lsq_linear(root, target, range_, method="bvls", max_iter=10 * low.size)
-            free = np.clip(found.x / scale, low, high)
-            free = np.where(found.active_mask < 0, low, np.where(found.active_mask > 0, high, free))
+        free = _solve_within(normal[np.ix_(open_, open_)], rest, low, high)
         x[open_] = free
     return BoundedSolution(x, np.asarray((x <= lower) | (x >= upper)))
+
+
+def _solve_within(normal: Array, moment: Array, lower: Array, upper: Array) -> Array:
+    """`solve_bounded` where directions may be undetermined and no coefficient is given, (n,)."""
+    x = _least_norm(normal, moment)
+    if np.all((x >= lower) & (x <= upper)):
+        return x
+    scale, values, vectors, null = scaled_eigenbasis(normal)
+    singular, vectors = np.sqrt(values[~null]), vectors[:, ~null]
+    root, target = singular[:, None] * vectors.T, vectors.T @ (moment / scale) / singular
+    range_ = lower * scale, upper * scale
+    at = lsq_linear(root, target, range_, method="bvls", max_iter=10 * lower.size).active_mask
+    x = np.where(at < 0, lower, upper)
+    # Only which are at a bound: along undetermined directions the coefficients inside reach 1e12.
+    inside = at == 0
+    rest = (moment - normal[:, ~inside] @ x[~inside])[inside]
+    x[inside] = _least_norm(normal[np.ix_(inside, inside)], rest)
+    return np.asarray(np.clip(x, lower, upper))
+
+
+def _least_norm(normal: Array, moment: Array) -> Array:
+    """Solution without bounds, (n,), zero along directions that are undetermined."""
+    scale, values, vectors, null = scaled_eigenbasis(normal)
+    along = vectors.T @ (moment / scale) / np.where(null, 1.0, values)
+    return np.asarray(vectors @ np.where(null, 0.0, along) / scale)
 
 
 def _solve_definite(

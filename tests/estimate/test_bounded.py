@@ -64,6 +64,22 @@ def test_a_coefficient_with_equal_bounds_is_held() -> None:
     assert all_held.x.tolist() == [1.0] * 7
 
 
+def test_what_the_data_do_not_determine_stays_small_where_others_are_at_a_bound() -> None:
+    # Two columns of ones: with this draw, the method of bounds ends at 1e14 and minus that.
+    rng = np.random.default_rng(1437)
+    mixed = rng.normal(size=(50, 8)) @ (np.eye(8) + 0.9 * rng.normal(size=(8, 8)))
+    slope = mixed * 10.0 ** rng.uniform(-2.0, 2.0, 8)
+    slope[:, 0], slope[:, 1] = 1.0, -1.0
+    measured = slope @ (rng.normal(size=8) * 10.0) + rng.normal(size=50)
+    lower, upper = np.where(np.arange(8) < 3, -np.inf, 0.0), np.full(8, np.inf)
+    found = solve_bounded(slope.T @ slope, slope.T @ measured, lower, upper)
+    best = lsq_linear(slope[:, 1:], measured, (lower[1:], upper[1:]), tol=1e-14)
+    assert found.at_bound.any()
+    assert found.x[0] == pytest.approx(-found.x[1])
+    assert found.x[1] - found.x[0] == pytest.approx(best.x[0], rel=1e-6)
+    assert found.x[2:] == pytest.approx(best.x[1:], rel=1e-4, abs=1e-6)
+
+
 def test_what_the_data_do_not_determine_stays_at_zero() -> None:
     a, b = problem(5)
     twice = np.column_stack([a, a[:, 0], np.zeros(len(a))])
