@@ -18,7 +18,13 @@ Cost = Callable[[Array], tuple[float, Array] | None]
 _GRID = 7
 _LARGEST_RATIO = 3.0
 """Of neighbours on the grid of a searched parameter."""
-_REFINE = 3
+_NARROWINGS = 8
+_FEWEST_NARROWINGS = 2
+"""Values tried between the points of a grid: a parabola through these errs far from its vertex."""
+_ENOUGH = 0.5
+"""Fall of the cost, a log likelihood, that a next value must promise."""
+_NEAR = 0.1
+"""Of the gap between two points, nearest to either that another is tried."""
 _STARTS = (0.5, 0.8)
 """Shares of their ranges at which several searched parameters start, one after the other: a sharp
 resonance is missed between the points of a grid, one that is damped well shows from afar."""
@@ -83,7 +89,7 @@ def _scan_one(
         grid = list(np.geomspace(low, high, count))
     else:
         grid = list(np.linspace(low, high, count))
-    if at[k] not in grid:
+    if not np.isclose(grid, at[k], rtol=1e-6, atol=0.0).any():
         # Where the others were searched from must not be lost between two points.
         grid = sorted([*grid, at[k]])
     known = [cost_of(value) for value in grid]
@@ -103,17 +109,57 @@ def _scan_one(
     least, best = costs[j], grid[j]
     if has_columns and least > hopeless + _FAR:
         return float(best), float(least)
-    ends = [grid[max(j - 1, 0)], grid[min(j + 1, len(grid) - 1)]]
-    for _ in range(_REFINE):
-        for side in (0, 1):
-            middle = between(best, ends[side])
-            found = cost_of(middle)
-            if found is not None and found[0] < least:
-                ends[1 - side], best, least = best, middle, found[0]
-                break
-        else:
-            ends = [between(best, ends[0]), between(best, ends[1])]
-    return float(best), float(least)
+    return _narrow(cost_of, grid, costs)
+
+
+def _narrow(
+    cost_of: Callable[[float], tuple[float, Array] | None], grid: list[float], costs: list[float]
+) -> tuple[float, float]:
+    """The least cost around the best point of a grid, by parabolas through three points."""
+    by_ratio = grid[0] > 0.0
+    x = [float(np.log(value)) if by_ratio else value for value in grid]
+    value_at = dict(zip(x, grid, strict=True))
+    costs, gained = list(costs), np.inf
+    for tried in range(_NARROWINGS):
+        j = int(np.argmin(costs))
+        near = slice(max(j - 1, 0), j + 2)
+        u, promised = _vertex(x[near], costs[near])
+        if tried >= _FEWEST_NARROWINGS and max(promised, gained) < _ENOUGH:
+            break
+        value = float(np.exp(u)) if by_ratio else u
+        found = cost_of(value)
+        cost = found[0] if found is not None else np.inf
+        gained = max(costs[j] - cost, 0.0)
+        at = int(np.searchsorted(x, u))
+        x.insert(at, u)
+        costs.insert(at, cost)
+        value_at[u] = value
+    j = int(np.argmin(costs))
+    return value_at[x[j]], costs[j]
+
+
+def _vertex(x: Sequence[float], costs: Sequence[float]) -> tuple[float, float]:
+    """Where to look next around the least of two or three costs, and the fall to expect there.
+
+    The vertex of the parabola through three; the middle of a gap where there is none, or where it
+    lies too near a point to tell more.
+    """
+    best = int(np.argmin(costs))
+    gaps = [abs(other - x[best]) for other in x]
+    widest = int(np.argmax(gaps))
+    middle = 0.5 * (x[best] + x[widest])
+    if len(x) < 3 or not np.isfinite(costs).all():
+        return middle, 0.25 * float(max(costs) - min(costs))
+    (a, b, c), (f, g, h) = x, costs
+    curvature = ((h - g) / (c - b) - (g - f) / (b - a)) / (c - a)
+    if curvature <= 0.0:
+        return middle, 0.0
+    slope = (g - f) / (b - a) + curvature * (b - a)
+    step = -0.5 * slope / curvature
+    promised = curvature * step**2
+    if abs(step) < _NEAR * gaps[widest]:
+        return b + _NEAR * (x[widest] - b), promised
+    return b + step, promised
 
 
 def _similarity(a: Array, b: Array) -> float:
