@@ -91,7 +91,6 @@ IN_BOTH = ("AT_FLOOR", "worth")
 OF_SENTENCES = (
     "rival_score", "other_band_replicates", "other_band_ratio", "variable_share",
     "mentioned_share", "ripple_share", "direction_likeness", "bump_height", "bump_width",
-    "second_share",
 )  # fmt: skip
 """They decide what is said of a finding, and nothing else."""
 OF_THE_NEXT_TRIAL = ("confused", "confusion_left", "lowered", "least_odds")

@@ -9,7 +9,7 @@ from bampipe.discover.findings import Diagnosis
 from bampipe.discover.settings import Settings
 from bampipe.lists import join_names
 from bampipe.results.diagnose import AxisVerdict, Contender, Stretch
-from bampipe.results.standing import FLOOR_WRONG, STANDINGS_IN_WORDS
+from bampipe.results.standing import FLOOR_WRONG, STANDINGS_IN_WORDS, standing
 
 
 def axis_sentences(found: Diagnosis, s: Settings) -> list[str]:
@@ -42,7 +42,7 @@ def _parts(axis: str, i: int, found: Diagnosis, unit: str, s: Settings) -> list[
         judged = found.evidence if a.effects else found.initial
         parts.append(f"{left}: {describe(judged, i, s)}.")
     elif a.standing == "above_floor":
-        parts.append(_excused(a, unit, s.second_share))
+        parts.append(_excused(a, unit))
     return parts + _other_band(a)
 
 
@@ -96,6 +96,8 @@ def _verdict(a: AxisVerdict, found: Diagnosis, unit: str) -> str:
             f"{error:.3g} {unit}, {error / max(a.noise_floor, 1e-30):.1f} times the noise floor)"
             + near
         )
+    if a.standing == "above_floor":
+        return f"nothing is missing that these trials could show, at a {stands}"
     return (
         f"nothing is missing that these trials could show (held-out error {a.rmse_after:.3g} "
         f"{unit}, noise floor {a.noise_floor:.3g} {unit})"
@@ -140,12 +142,12 @@ def _transients(axis: str, found: Diagnosis) -> list[str]:
     ]
 
 
-def _excused(a: AxisVerdict, unit: str, second_share: float) -> str:
+def _excused(a: AxisVerdict, unit: str) -> str:
     """Why an error above its floor does not mean that something is missing."""
-    worst = a.rmse_after - a.rmse_without_worst_second
-    if worst > second_share * a.rmse_after:
+    rest = standing(a.rmse_without_worst_second, a.noise_floor, a.noise_floor_sd)
+    if rest == "at_floor":
         return (
-            f"Without {_when(a.worst_second)}, the worst second, the error is "
+            f"It is at the floor without {_when(a.worst_second)}, the worst second: "
             f"{a.rmse_without_worst_second:.3g} {unit}."
         )
     return "What exceeds the noise floor follows nothing that the arm does."
