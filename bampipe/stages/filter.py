@@ -77,7 +77,7 @@ class Config:
     method: Literal["auto", "kalman", "butterworth", "savitzky_golay"] = "auto"
     cutoff_hz: NotNegative = 0.0
     minimum_bandwidth_hz: NotNegative = 25.0
-    force_cutoff_hz: NotNegative = 25.0
+    force_cutoff_hz: NotNegative = 0.0
     band_hz: NotNegative = 0.0
     tuning_samples: Annotated[int, Field(ge=1000)] = 120_000
 
