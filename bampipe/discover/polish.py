@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.discover.bench import Bench
-from bampipe.discover.chance import candidates_of
+from bampipe.discover.chance import Progress, candidates_of
 from bampipe.discover.influence import largest_second, largest_trial, score_without
+from bampipe.discover.rivals import plausible, replay_rivals
 from bampipe.discover.scorer import Score, Scorer
 from bampipe.discover.settings import Settings
 from bampipe.discover.start import with_effect, without_effect
@@ -108,22 +109,55 @@ def is_superfluous(known: FittedSet, without: FittedSet, s: Settings) -> bool:
     return bool(np.all(np.log(without.error / known.error) < s.worth))
 
 
+@dataclass(frozen=True)
+class Polished:
+    """A set of effects that has been put to the test.
+
+    Attributes:
+        found: the set, fitted.
+        contests: by effect, those who contend for its place: itself first, then its rivals.
+        alike: by effect that was replayed beside the others, rivals that these trials cannot tell
+            from it.
+    """
+
+    found: FittedSet
+    contests: Mapping[str, tuple[Contender, ...]]
+    alike: Mapping[str, tuple[str, ...]]
+
+
 def polish(
-    bench: Bench, found: FittedSet, rivals: Mapping[str, Sequence[str]]
-) -> tuple[FittedSet, dict[str, tuple[Contender, ...]]]:
+    bench: Bench, found: FittedSet, rivals: Mapping[str, Sequence[str]], progress: Progress
+) -> Polished:
     """Drop what is superfluous, swap what another effect does better, weigh each beside its rivals.
 
     Args:
         bench: the session.
         found: the set, fitted.
         rivals: by effect of the set, others that act where it does, most promising first.
-
-    Returns:
-        The set, and by effect those who contend for its place: itself first, then the rivals.
+        progress: called with a fraction and a message.
     """
+    swapped: set[str] = set()
+    while True:
+        found, contests = _swap_by_score(bench, found, rivals, swapped)
+        alike: dict[str, tuple[str, ...]] = {}
+        for name in found.added:
+            likely, other = _swap_by_replay(bench, found, contests[name], progress)
+            if other is not None and name not in swapped:
+                swapped |= {name, likely[0]}
+                found = other
+                break
+            if likely:
+                alike[name] = tuple(n for n in likely if n != name)
+        else:
+            return Polished(found, contests, alike)
+
+
+def _swap_by_score(
+    bench: Bench, found: FittedSet, rivals: Mapping[str, Sequence[str]], swapped: set[str]
+) -> tuple[FittedSet, dict[str, tuple[Contender, ...]]]:
+    """Drop and swap effects by their scores; ``swapped`` holds those that were, for good."""
     s = bench.settings
     contests: dict[str, tuple[Contender, ...]] = {}
-    swapped: set[str] = set()
     waiting = list(found.added)
     while waiting:
         name = waiting.pop(0)
@@ -148,6 +182,42 @@ def polish(
                     continue
         contests[name] = tuple(sorted(contest, key=lambda c: c.effect != name))
     return found, contests
+
+
+def _swap_by_replay(
+    bench: Bench, found: FittedSet, contest: Sequence[Contender], progress: Progress
+) -> tuple[list[str], FittedSet | None]:
+    """Compare an effect of a set with its close rivals by replays, beside the others of the set.
+
+    Returns:
+        Those that these trials do not tell apart, none where none comes close, and the set with
+        the first of them where the effect itself is not among them.
+    """
+    if len(found.added) < 2 or not contest:
+        return [], None
+    mine, *others = contest
+    close = [c.effect for c in others if comes_close(c, mine, bench.settings)]
+    if not close:
+        return [], None
+    fewer = reduce_set(bench, found, mine.effect)
+    scores = bench.scores(fewer.recipe, fewer.evidence.p, [mine.effect, *close])
+    axis = fewer.evidence.system.coordinates.index(mine.axis)
+    misfits = replay_rivals(bench, fewer.recipe, fewer.evidence, scores, axis, progress)
+    likely = plausible(misfits, bench.settings)
+    if not likely:
+        # None looks like the measurement: those that do no worse are no less likely.
+        likely = [n for n in close if misfits[n] <= misfits[mine.effect]] + [mine.effect]
+    if mine.effect in likely:
+        return likely, None
+    return likely, extend_set(bench, fewer, scores[likely[0]])
+
+
+def comes_close(one: Contender, mine: Contender, s: Settings) -> bool:
+    """Whether an effect comes close to the one found, by any score in which that gains at all."""
+    pairs = [(one.score, mine.score), (one.score_without_second, mine.score_without_second)]
+    if one.score_without_trial is not None and mine.score_without_trial is not None:
+        pairs.append((one.score_without_trial, mine.score_without_trial))
+    return any(theirs >= s.rival_score * ours for theirs, ours in pairs if ours > 0.0)
 
 
 def weigh(fewer: FittedSet, name: str, scores: Mapping[str, Score]) -> list[Contender]:

@@ -6,9 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bampipe.discover.bench import Bench
-from bampipe.discover.chance import Progress, Replicate, candidates_of
+from bampipe.discover.chance import Progress, candidates_of
 from bampipe.discover.influence import SampleRange, largest_second, score_without
 from bampipe.discover.level import Level
 from bampipe.discover.scorer import Score, Scorer
@@ -17,6 +18,8 @@ from bampipe.discover.start import with_effect
 from bampipe.estimate.simulation import Runaway
 from bampipe.physics.recipe import Recipe
 from bampipe.trials.residuals import Evidence
+
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -94,32 +97,14 @@ def choose(
     best = simplest(rivals)
     if len(rivals) == 1:
         return Choice(best, (), transient)
-    misfit = {}
-    for k, name in enumerate(rivals):
-        progress(0.5, f"replaying {name} to tell it from {len(rivals) - 1} rival(s)")
-        wider = replace(recipe, effects=(*recipe.effects, name))
-        fitted = bench.fit(wider, with_effect(wider, evidence, scores[name]))
-        try:
-            replicas = bench.replicas(
-                wider,
-                fitted.p,
-                bench.settings.rival_replicates,
-                rivals,
-                (2, k),
-                analysed=(recipe, evidence.p),
-            )
-        except Runaway:
-            misfit[name] = np.inf
-            continue
-        misfit[name] = _misfit(rivals, scores, replicas, axis, s)
-    ordered = sorted(rivals, key=lambda n: misfit[n])
-    winner = ordered[0]
-    if misfit[winner] > s.rival_misfit + s.rival_margin:
-        # No rival's replays look like the measurement, as where more is missing than one effect:
-        # their patterns are no evidence for any of them.
+    replayed = {name: scores[name] for name in rivals}
+    misfits = replay_rivals(bench, recipe, evidence, replayed, axis, progress)
+    likely = plausible(misfits, s)
+    if not likely:
+        # As where more is missing than one effect: the patterns are no evidence for any of them.
         return Choice(best, (), transient)
-    limit = max(s.rival_misfit, misfit[winner] + s.rival_margin)
-    alike = tuple(n for n in ordered[1:] if misfit[n] < limit)
+    winner, *others = likely
+    alike = tuple(others)
     if best in alike:
         alike = (winner, *[n for n in alike if n != best])
         winner = best
@@ -130,25 +115,73 @@ def choose(
     return Choice(winner, alike[: s.most_alike], transient)
 
 
-def _misfit(
-    rivals: Sequence[str],
+def replay_rivals(
+    bench: Bench,
+    recipe: Recipe,
+    evidence: Evidence,
     scores: Mapping[str, Score],
-    replicas: Sequence[Replicate],
     axis: int,
-    s: Settings,
-) -> float:
-    """How unlike the measured pattern of scores is to the replayed one: mean squared z.
+    progress: Progress,
+) -> dict[str, float]:
+    """How unlike the measurement replays of each rival are, as a mean squared z; the likest first.
 
-    Errors of the scores themselves are allowed for, because no replay is perfect.
+    Which rival fits best is no proof: filtering and sampling blur what each should leave. Each is
+    added and replayed, and every one of them is scored on the replays as on the measurement.
+
+    Args:
+        bench: the session.
+        recipe, evidence: the model that they would be added to, fitted.
+        scores: of the rivals against it.
+        axis: on which they are compared.
+        progress: called with a fraction and a message.
     """
-    total = 0.0
-    for name in rivals:
-        measured = scores[name].gain[axis]
-        replayed = np.array(
-            [r.scores[name].gain[axis] if name in r.scores else 0.0 for r in replicas]
-        )
-        spread = np.sqrt(
-            replayed.var(ddof=1) + (s.score_error * replayed.mean()) ** 2 + s.score_sd**2
-        )
-        total += ((measured - replayed.mean()) / spread) ** 2
-    return float(total / len(rivals))
+    s, rivals = bench.settings, list(scores)
+    blur = s.replay_error * float(Scorer(evidence).independent_samples[axis])
+    misfits = {}
+    for k, name in enumerate(rivals):
+        progress(0.5, f"replaying {name} to tell it from {len(rivals) - 1} rival(s)")
+        wider = replace(recipe, effects=(*recipe.effects, name))
+        fitted = bench.fit(wider, with_effect(wider, evidence, scores[name]))
+        try:
+            replicas = bench.replicas(
+                wider, fitted.p, s.rival_replicates, rivals, (2, k),
+                analysed=(recipe, evidence.p),
+            )  # fmt: skip
+        except Runaway:
+            misfits[name] = np.inf
+            continue
+        gains = [[r.scores[n].gain[axis] if n in r.scores else 0.0 for n in rivals]
+                 for r in replicas]  # fmt: skip
+        measured = np.array([scores[n].gain[axis] for n in rivals])
+        misfits[name] = _misfit(measured, np.array(gains), blur, s)
+    return dict(sorted(misfits.items(), key=lambda pair: pair[1]))
+
+
+def plausible(misfits: Mapping[str, float], s: Settings) -> list[str]:
+    """Rivals whose replays look like the measurement, the likest first; none if those do not."""
+    least = min(misfits.values())
+    if least > s.rival_misfit + s.rival_margin:
+        return []
+    limit = max(s.rival_misfit, least + s.rival_margin)
+    return [n for n, misfit in misfits.items() if misfit == least or misfit < limit]
+
+
+def _misfit(measured: Array, replayed: Array, blur: float, s: Settings) -> float:
+    """Mean squared z of measured scores (n,) beside replayed ones, (R, n).
+
+    What replays do to all rivals alike says nothing of which is right: their mean counts as one
+    number, and how each stands to it as another.
+
+    Args:
+        measured, replayed: gains in log likelihood.
+        blur: error of a gain because no replay is perfect.
+    """
+
+    def squared_z(here: Array, there: Array) -> Array:
+        mean = there.mean(axis=0)
+        spread = there.var(axis=0, ddof=1) + (s.score_error * mean) ** 2
+        return np.asarray((here - mean) ** 2 / (spread + s.score_sd**2 + blur**2))
+
+    level, levels = measured.mean(), replayed.mean(axis=1)
+    each = squared_z(measured - level, replayed - levels[:, None])
+    return float(0.5 * (squared_z(level, levels) + each.mean()))

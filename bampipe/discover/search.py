@@ -157,7 +157,8 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
         progress(0.45 + 0.05 * len(steps), f"added {chosen.winner}, looking for more")
     progress(0.8, "weighing each effect beside its rivals")
     rivals = {name: _rivals(first, name, groups.get(name, ()), s) for name in current.added}
-    found, contests = polish(bench, current, rivals)
+    polished = polish(bench, current, rivals, lambda _, what: progress(0.8, what))
+    found, contests = polished.found, polished.contests
     if found.added != current.added:
         steps.append(_step(found))
     progress(0.85, "replaying the final model for its noise floor")
@@ -166,7 +167,7 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
     main = {name: axes.index(c[0].axis) for name, c in contests.items() if c}
     return Search(
         bench.trials, base, initial, level, first, found,
-        {name: groups.get(name, ()) for name in found.added},
+        {n: polished.alike.get(n, groups.get(n, ())) for n in found.added},
         contests, main, additions, likely, transient, tuple(steps), tuple(final),
     )  # fmt: skip
 

@@ -9,6 +9,7 @@ import numpy as np
 from bampipe.discover.chance import candidates_of
 from bampipe.discover.findings import Diagnosis
 from bampipe.discover.influence import error_without_second
+from bampipe.discover.polish import comes_close
 from bampipe.discover.ranking import rank
 from bampipe.discover.scorer import Scorer
 from bampipe.discover.search import Search
@@ -159,13 +160,7 @@ def _listed(
         return ()
     mine = contest[0]
 
-    def is_close(c: Contender) -> bool:
-        pairs = [(c.score, mine.score), (c.score_without_second, mine.score_without_second)]
-        if c.score_without_trial is not None and mine.score_without_trial is not None:
-            pairs.append((c.score_without_trial, mine.score_without_trial))
-        return any(theirs >= s.rival_score * ours for theirs, ours in pairs)
-
-    shown = [c for c in contest if c.effect in odds or is_close(c)]
+    shown = [c for c in contest if c.effect in odds or comes_close(c, mine, s)]
     return tuple(c.model_copy(update={"odds": odds.get(c.effect, 0.0)}) for c in shown)
 
 
