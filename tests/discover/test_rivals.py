@@ -1,0 +1,65 @@
+"""Rivals that come close: what replays of each, scored as the measurement was, say of them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bampipe.discover.polish import comes_close
+from bampipe.discover.rivals import _misfit, plausible
+from bampipe.discover.settings import Settings
+from bampipe.results.diagnose import Contender
+
+S = Settings()
+BLUR = 10.0
+# Scores of a delay and of a lag where a lag was hidden, and on replays of either.
+MEASURED = np.array([1649.0, 1521.0])
+OF_DELAY = np.array([[1694.0, 1297.0], [1711.0, 1306.0], [1677.0, 1288.0], [1690.0, 1299.0]])
+OF_LAG = np.array([[1575.0, 1473.0], [1592.0, 1495.0], [1558.0, 1451.0], [1571.0, 1470.0]])
+
+
+def misfits(measured):
+    """Of both, the likest first."""
+    found = {
+        "delay": _misfit(measured, OF_DELAY, BLUR, S),
+        "lag": _misfit(measured, OF_LAG, BLUR, S),
+    }
+    return dict(sorted(found.items(), key=lambda pair: pair[1]))
+
+
+def test_the_rival_whose_replays_have_the_measured_pattern_wins_over_the_one_that_fits_best():
+    assert plausible(misfits(MEASURED), S) == ["lag"]
+
+
+@pytest.mark.parametrize("factor", [0.93, 1.07])
+def test_what_replays_do_to_all_scores_alike_hides_no_difference(factor):
+    assert plausible(misfits(factor * MEASURED), S) == ["lag"]
+
+
+def test_a_pattern_between_the_two_tells_neither_from_the_other():
+    wide = 0.5 * (OF_DELAY + OF_LAG) + np.linspace(-150.0, 150.0, 4)[:, None] * [1.0, -1.0]
+    found = {"delay": _misfit(MEASURED, wide, BLUR, S), "lag": _misfit(MEASURED, wide, BLUR, S)}
+    assert plausible(found, S) == ["delay", "lag"]
+
+
+def test_where_more_is_missing_no_rival_is_plausible():
+    assert plausible(misfits(0.3 * MEASURED), S) == []
+
+
+def contender(score, without_second, without_trial=None):
+    return Contender(
+        effect="a", axis="joint", held_out_rmse=1.0, score=score, odds=0.0,
+        score_without_second=without_second, score_without_trial=without_trial,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("rival", "close"),
+    [((95.0, 10.0), True), ((50.0, 46.0), True), ((50.0, 10.0, 72.0), True), ((50.0, 10.0), False)],
+)
+def test_a_rival_is_close_by_any_score(rival, close):
+    assert comes_close(contender(*rival), contender(100.0, 50.0, 80.0), S) is close
+
+
+def test_a_score_that_gains_nothing_is_no_measure_of_closeness():
+    assert not comes_close(contender(0.0, 0.0), contender(137.0, -311.0), S)
