@@ -106,7 +106,7 @@ def fit_output(
 
     Raises:
         InputError: fewer segments than parameters, or the model's motion is not finite at the
-            start.
+            start or beside a point that the fit reaches.
     """
     if len(segments) <= free.size:
         raise InputError(
@@ -119,11 +119,7 @@ def fit_output(
     states = [segment.x0.copy() for segment in segments]
     errors = _errors(segments, states, p)
     if not all(np.isfinite(error).all() for error in errors):
-        raise InputError(
-            "the simulated motion grows without bound",
-            where="output error",
-            remedy="start from the parameters of `--method least-squares`",
-        )
+        raise _runaway()
     first = _Shot(segments, free, upper, step, p, states, errors)
     found = descend(first, lower, upper, most_iterations, _TOLERANCE)
     normal = np.array([slope.T @ slope for _, slope in found.last.projected])
@@ -193,6 +189,14 @@ class _Shot:
         return replace(self, p=p, states=states, errors=_errors(self.segments, states, p))
 
 
+def _runaway() -> InputError:
+    return InputError(
+        "the simulated motion grows without bound",
+        where="output error",
+        remedy="start from the parameters of `--method least-squares`",
+    )
+
+
 def _errors(segments: Sequence[Segment], states: Sequence[Array], p: Array) -> list[Array]:
     return [s.q - s.simulate(x0, p) for s, x0 in zip(segments, states, strict=True)]
 
@@ -216,7 +220,10 @@ def _linearise(
         size = step[k] if p[index] + step[k] <= upper[k] else -step[k]
         moved[index] += size
         by_parameter[:, k] = ((segment.simulate(x0, moved) - base) / size * weight).reshape(-1)
-    return _Linear(((segment.q - base) * weight).reshape(-1), by_state, by_parameter)
+    error = ((segment.q - base) * weight).reshape(-1)
+    if not all(np.isfinite(part).all() for part in (error, by_state, by_parameter)):
+        raise _runaway()
+    return _Linear(error, by_state, by_parameter)
 
 
 def _of_state(linear: _Linear, move: Array) -> Array:

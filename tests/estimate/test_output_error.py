@@ -66,3 +66,16 @@ def test_too_few_segments_and_a_motion_without_end_are_refused() -> None:
     lost = [replace(part, simulate=lambda x, p: np.full((250, 1), np.inf)) for part in parts]
     with pytest.raises(InputError, match="without bound"):
         fit_output(lost, TRUTH, FREE, LOWER, UPPER, STEP)
+
+
+def test_a_motion_that_ends_beside_the_point_reached_is_refused() -> None:
+    def fragile(part: Segment) -> Segment:
+        def run(x0: np.ndarray, p: np.ndarray) -> np.ndarray:
+            x = part.simulate(x0, p)
+            return x if p[1] <= TRUTH[1] else np.full_like(x, np.nan)
+
+        return replace(part, simulate=run)
+
+    parts = [fragile(part) for part in segments(0)]
+    with pytest.raises(InputError, match="without bound"):
+        fit_output(parts, TRUTH, FREE, LOWER, UPPER, STEP)
