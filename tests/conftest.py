@@ -52,6 +52,12 @@ if "coverage" in sys.modules:
     leave_compiling_unmeasured()
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put files with slow tests first: begun last, they keep one process and idle the rest."""
+    slow = {item.path for item in items if item.get_closest_marker("slow")}
+    items.sort(key=lambda item: item.path not in slow)
+
+
 class Toy:
     """A session of the toy stages in a folder of its own, and how to run it."""
 

@@ -17,6 +17,8 @@ from bampipe.results.forecast import compare_forecast, compare_forecasts, read_f
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.next import NextResult
 
+pytestmark = pytest.mark.slow
+
 FASTEST = 2.4  # of the joint, rad/s
 LONG = {"trials": 4, "seconds": 12.0}
 UNDECIDED = {"trials": 2, "pace": 0.4, "noise_factor": 8.0}
