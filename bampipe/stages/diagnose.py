@@ -50,6 +50,8 @@ from bampipe.trials.measured import MeasuredTrials, read_measured_trials, trial_
 _DESCRIBED = 12
 """Effects of the ranking whose formulas are stored with it."""
 _SUGGESTED_S = 20.0
+_CLOSER = 3
+"""Replays where a decision is close, over the usual."""
 
 SUMMARY = "Find which physical effect the model lacks"
 INPUTS = (*INGESTED, *FILTERED, "filter/setup.json?", *IDENTIFIED_MODEL)
@@ -62,7 +64,8 @@ class Config:
 
     Attributes:
         model: which model version to diagnose.
-        replicates: replays of the fitted model for the chance level; more is slower and sharper.
+        replicates: replays of the fitted model for the chance level, and up to three times as many
+            where a decision is close; more is slower and sharper.
         significance: chance of a false alarm in a session that is accepted.
         most_effects: the most effects that are tried before the search ends.
         jobs: worker processes; 0 means one for each processor, eight at most.
@@ -114,6 +117,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     start = identified(run, config.model, system)
     settings = Settings(
         replicates=config.replicates,
+        most_replicates=_CLOSER * config.replicates,
         significance=config.significance,
         most_effects=config.most_effects,
         jobs=config.jobs or min(8, os.cpu_count() or 1),

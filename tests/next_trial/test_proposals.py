@@ -83,7 +83,7 @@ def test_what_is_undecided_is_decided_after_the_proposed_trial(tmp_path):
 def test_an_undecided_diagnosis_asks_for_a_trial_that_would_decide(tmp_path):
     noisy = {"trials": 2, "pace": 0.5, "seconds": 6.0, "noise_factor": 3.0}
     run, _ = record_run(tmp_path, "joint", 905, "return_spring:joint", **noisy)
-    found = diagnose(run)
+    found = bampipe.diagnose(run, replicates=10, jobs=1)
     assert found["axes"]["joint"]["verdict"] == "undecided"
     (group,) = [{name, *others} for name, others in found["groups"].items()]
     assert "return_spring:joint" in group
