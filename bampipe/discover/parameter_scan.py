@@ -24,7 +24,7 @@ _FEWEST_NARROWINGS = 2
 _ENOUGH = 0.5
 """Fall of the cost, a log likelihood, that a next value must promise."""
 _NEAR = 0.1
-"""Of the gap between two points, nearest to either that another is tried."""
+"""Of the widest gap beside the least, how near to that another value is tried."""
 _STARTS = (0.5, 0.8)
 """Shares of their ranges at which several searched parameters start, one after the other: a sharp
 resonance is missed between the points of a grid, one that is damped well shows from afar."""
@@ -141,8 +141,8 @@ def _narrow(
 def _vertex(x: Sequence[float], costs: Sequence[float]) -> tuple[float, float]:
     """Where to look next around the least of two or three costs, and the fall to expect there.
 
-    The vertex of the parabola through three; the middle of a gap where there is none, or where it
-    lies too near a point to tell more.
+    The vertex of the parabola through three; the middle of the widest gap where there is none, and
+    a little way into that gap where the vertex lies too near the least to tell more.
     """
     best = int(np.argmin(costs))
     gaps = [abs(other - x[best]) for other in x]

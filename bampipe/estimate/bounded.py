@@ -89,10 +89,11 @@ def solve_bounded(normal: Array, moment: Array, lower: Array, upper: Array) -> B
 
 def _solve_within(normal: Array, moment: Array, lower: Array, upper: Array) -> Array:
     """`solve_bounded` where directions may be undetermined and no coefficient is given, (n,)."""
-    x = _least_norm(normal, moment)
+    basis = scaled_eigenbasis(normal)
+    x = _least_norm(basis, moment)
     if np.all((x >= lower) & (x <= upper)):
         return x
-    scale, values, vectors, null = scaled_eigenbasis(normal)
+    scale, values, vectors, null = basis
     singular, vectors = np.sqrt(values[~null]), vectors[:, ~null]
     root, target = singular[:, None] * vectors.T, vectors.T @ (moment / scale) / singular
     range_ = lower * scale, upper * scale
@@ -101,13 +102,17 @@ def _solve_within(normal: Array, moment: Array, lower: Array, upper: Array) -> A
     # Only which are at a bound: along undetermined directions the coefficients inside reach 1e12.
     inside = at == 0
     rest = (moment - normal[:, ~inside] @ x[~inside])[inside]
-    x[inside] = _least_norm(normal[np.ix_(inside, inside)], rest)
+    x[inside] = _least_norm(scaled_eigenbasis(normal[np.ix_(inside, inside)]), rest)
     return np.asarray(np.clip(x, lower, upper))
 
 
-def _least_norm(normal: Array, moment: Array) -> Array:
-    """Solution without bounds, (n,), zero along directions that are undetermined."""
-    scale, values, vectors, null = scaled_eigenbasis(normal)
+def _least_norm(basis: tuple[Array, Array, Array, NDArray[np.bool_]], moment: Array) -> Array:
+    """Solution without bounds, (n,), zero along directions that are undetermined.
+
+    Args:
+        basis: of the normal equations, see `scaled_eigenbasis`; moment: (n,) their right side.
+    """
+    scale, values, vectors, null = basis
     along = vectors.T @ (moment / scale) / np.where(null, 1.0, values)
     return np.asarray(vectors @ np.where(null, 0.0, along) / scale)
 
