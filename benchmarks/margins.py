@@ -83,7 +83,7 @@ DEFAULTS = OF_STANDING | {
 }
 IN_A_NUMBER = (
     "worth_at_floor", "above_floor_sd", "held_out_weight", "score_error", "score_sd",
-    "replay_error", "close", "draft_close", "other_band_ratio",
+    "replay_error", "close", "closer", "draft_close", "other_band_ratio",
 )  # fmt: skip
 """Never compared by themselves."""
 IN_BOTH = ("AT_FLOOR", "worth")

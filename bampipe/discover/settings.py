@@ -18,8 +18,8 @@ class Settings:
 
     Attributes:
         first_replicates: replays of the model for the chance level, enough where the best
-            candidates stand far above it; replicates: else; most_replicates: where a decision is
-            close, that is a p-value within a factor ``close`` of ``significance``.
+            candidates stand far above it; replicates: else; closer: times as many where a decision
+            is close, that is a p-value within a factor ``close`` of ``significance``.
         rival_replicates: replays of each rival when candidates come close.
         most_effects: the most effects tried, those dropped again among them.
         significance: chance of a false alarm in a session that is accepted.
@@ -92,7 +92,7 @@ class Settings:
 
     first_replicates: int = 4
     replicates: int = 10
-    most_replicates: int = 30
+    closer: float = 3.0
     close: float = 30.0
     rival_replicates: int = 4
     most_effects: int = 8
@@ -145,3 +145,8 @@ class Settings:
     least_odds: float = 0.02
     jobs: int = 2
     seed: int = 0
+
+    @property
+    def most_replicates(self) -> int:
+        """Replays of the model for the chance level where a decision is close."""
+        return round(self.closer * self.replicates)

@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import median_filter
-from scipy.optimize import minimize_scalar
+
+from bampipe.estimate.spectral_lines import find_lines
 
 Array = NDArray[np.float64]
 
@@ -20,19 +20,13 @@ _ORDERS = (2, 3, 4, 5, 6)
 _SLOWEST_HZ = 100.0
 """A sensor's own low-pass keeps noise out of neighbouring samples that acts at the frequencies of
 the motion all the same. Thinned to this rate, a record shows that noise."""
-_JUMP = 10.0
-"""Second difference, over the median one, from which on it is no part of a sine in noise."""
-_UNEVEN = 1e-3
-"""Range of the time between samples, as a share of it, from which on aliases differ."""
 _NORMAL_MEDIAN = 0.6744897501960817
 _FEWEST = 200
 """Samples below which noise is not measured."""
 _STRETCHES, _STRETCH = 8, 2000
 """A longer record is looked at in so many stretches of so many samples: enough for 1 %."""
-_MOST_LINES, _LINE, _LOWEST_LINE, _BESIDE = 6, 40.0, 0.1, 31
-"""At most so many sines are taken off. One stands so far above the typical power of so many
-frequencies around it, which chance reaches once in 10^17 of them, and has at least so many cycles a
-sample: below, differences take it out themselves."""
+_LOWEST_LINE = 0.1
+"""Cycles a sample from which on a sine is taken off: below, differences take it out themselves."""
 
 
 def white_noise_sd(record: Array, t: Array | None = None) -> float:
@@ -96,48 +90,9 @@ def _difference_noise(record: Array, t: Array | None) -> float:
 
 
 def _without_lines(record: Array, t: Array, lowest: float) -> Array:
-    """Take off the sines that stand far above what is around them in the spectrum of a record (T,).
-
-    Second differences keep the signal out of the fits; those of a sine are taken at the time stamps
-    ``t`` (T,) as they are. ``lowest`` is the least frequency of a line, in cycles a sample.
-    """
-    rate = (t.size - 1) / float(t[-1] - t[0])
-    uniform = float(np.ptp(np.diff(t))) * rate < _UNEVEN
-    frequency = np.fft.rfftfreq(t.size - 2)
-    high = frequency > lowest
-    window = np.hanning(t.size - 2)
-    for _ in range(_MOST_LINES):
-        wanted = np.diff(record, 2)
-        # A jump of the signal, as where friction turns over, would drown every line.
-        even = np.abs(wanted) <= _JUMP * float(np.median(np.abs(wanted)))
-        power = np.square(np.abs(np.fft.rfft(window * wanted * even)[high]))
-        above = power / np.maximum(median_filter(power, _BESIDE), np.finfo(float).tiny)
-        peak = int(np.argmax(above))
-        if above[peak] <= _LINE / np.log(2.0):
-            break
-        middle, apart = frequency[high][peak], frequency[1]
-
-        def fitted(
-            cycles: float, wanted: Array = wanted[even], even: NDArray[np.bool_] = even
-        ) -> tuple[Array, float]:
-            phase = 2.0 * np.pi * cycles * rate * t
-            pair = np.column_stack([np.sin(phase), np.cos(phase)])
-            columns = np.diff(pair, 2, axis=0)[even]
-            size, *_ = np.linalg.lstsq(columns, wanted, rcond=None)
-            left = wanted - columns @ size
-            return pair @ size, float(left @ left)
-
-        # Uneven stamps tell a sine from its aliases.
-        lines = [
-            minimize_scalar(
-                lambda cycles: fitted(cycles)[1],
-                bounds=(alias - apart, alias + apart),
-                method="bounded",
-            )
-            for alias in ((middle,) if uniform else (middle, 1.0 - middle, 1.0 + middle))
-        ]
-        best = min(lines, key=lambda line: float(line.fun))
-        record = record - fitted(float(best.x))[0]
+    """Take its sines off a record (T,) at stamps ``t`` (T,): see `find_lines`."""
+    for line in find_lines(record, t, lowest):
+        record = record - line.values
     return record
 
 

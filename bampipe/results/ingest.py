@@ -63,6 +63,24 @@ class RecordedChannel(Record):
     )
 
 
+class MainsHum(Record):
+    """A sine of the power supply on a channel, taken off the samples."""
+
+    channel: str
+    unit: str
+    hz: Positive = Field(description="Nominal frequency of mains, or of a harmonic")
+    amplitude: Size = Field(description="Median over the trials")
+    trials: int = Field(ge=1, description="How many trials had it")
+
+    @property
+    def sentence(self) -> str:
+        """What a person is told of it."""
+        return (
+            f"{self.channel}: mains hum of {self.amplitude:.2g} {self.unit} at {self.hz:g} Hz"
+            f" taken off (trials with it: {self.trials})"
+        )
+
+
 class IngestResult(Result):
     """What the session says, in SI units."""
 
@@ -98,5 +116,6 @@ class IngestResult(Result):
     sensor_warnings: Names = Field(
         description="Where stated and measured noise or resolution disagree by more than twice"
     )
+    mains_hum: tuple[MainsHum, ...] = ()
     brakes: dict[str, RecordedChannel]
     channels: dict[str, RecordedChannel]

@@ -50,8 +50,6 @@ from bampipe.trials.measured import MeasuredTrials, read_measured_trials, trial_
 _DESCRIBED = 12
 """Effects of the ranking whose formulas are stored with it."""
 _SUGGESTED_S = 20.0
-_CLOSER = 3
-"""Replays where a decision is close, over the usual."""
 
 SUMMARY = "Find which physical effect the model lacks"
 INPUTS = (*INGESTED, *FILTERED, "filter/setup.json?", *IDENTIFIED_MODEL)
@@ -117,7 +115,6 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     start = identified(run, config.model, system)
     settings = Settings(
         replicates=config.replicates,
-        most_replicates=_CLOSER * config.replicates,
         significance=config.significance,
         most_effects=config.most_effects,
         jobs=config.jobs or min(8, os.cpu_count() or 1),

@@ -25,12 +25,19 @@ from bampipe.data.run_folder import INGESTED, MOVING, RunFolder
 from bampipe.data.session import SECONDS, Session, TrialEntry, inside, read_session
 from bampipe.data.store import ParquetAppender, write_parquet
 from bampipe.errors import InputError, did_you_mean
+from bampipe.estimate.spectral_lines import remove_mains
 from bampipe.files import digest_content, digest_file, toml_text
 from bampipe.physics import registry
 from bampipe.physics.device import Device
 from bampipe.physics.units import parse_unit
 from bampipe.progress import Progress
-from bampipe.results.ingest import EncoderChannel, ForceChannels, IngestResult, RecordedChannel
+from bampipe.results.ingest import (
+    EncoderChannel,
+    ForceChannels,
+    IngestResult,
+    MainsHum,
+    RecordedChannel,
+)
 from bampipe.schema import STRICT
 from bampipe.trials.sensors import RecordNoise, settle_encoder, settle_force
 
@@ -73,6 +80,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     rows: list[dict[str, object]] = []
     reasons = _refused(session)
     noise: dict[str, list[RecordNoise]] = defaultdict(list)
+    hum: dict[str, list[dict[float, float]]] = defaultdict(list)
     total = len(session.trials)
     with ParquetAppender(out / "ingest/samples.parquet") as samples:
         for number, entry in enumerate(session.trials):
@@ -82,6 +90,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
             except InputError as error:
                 rows.append(_row(entry, None, str(error)))
                 continue
+            _remove_hum(hum, trial)
             rows.append(_row(entry, trial, ""))
             _append(samples, entry, trial)
             if entry.kind in MOVING:
@@ -96,7 +105,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     trials = _trials_table(rows)
     write_parquet(out / "ingest/trials.parquet", trials)
     rate = _rate(session, trials)
-    description = _description(session, device, rate, noise)
+    description = _description(session, device, rate, noise, hum)
     description.write(out)
     if session.device_file is not None:
         file = out / "ingest/device.toml"
@@ -104,7 +113,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
             file.write_bytes(session.device_file.read_bytes())
         else:  # with all that its URDF says: the run folder stands on its own
             file.write_text(toml_text(device.declaration), encoding="utf-8")
-    notes = [*description.sensor_warnings]
+    notes = [*description.sensor_warnings, *(line.sentence for line in description.mains_hum)]
     notes += _impossible(device)
     notes += [f"{place}: its source still says `fill in`" for place in description.placeholders]
     return _summary(session, rows) | {"notes": notes}
@@ -286,6 +295,32 @@ def _append(samples: ParquetAppender, entry: TrialEntry, trial: CleanTrial) -> N
     samples.append({"trial_id": ids, "t": trial.t, **trial.columns})
 
 
+def _remove_hum(hum: dict[str, list[dict[float, float]]], trial: CleanTrial) -> None:
+    """Take mains hum off the inputs of a trial, and note it; encoders have none."""
+    moving = [column for name, column in trial.columns.items() if name.startswith("q_")]
+    for name, values in trial.columns.items():
+        if not name.startswith(("q_", "brake_")) and np.isfinite(values).all():
+            trial.columns[name], found = remove_mains(values, trial.t, moving)
+            hum[name].append(found)
+
+
+def _typical_hum(
+    hum: Mapping[str, list[dict[float, float]]], device: Device
+) -> tuple[MainsHum, ...]:
+    """The hum taken off each channel, typical of the trials that had it."""
+    return tuple(
+        MainsHum(
+            channel=name,
+            unit=device.channels.get(name, device.force_unit),
+            hz=hz,
+            amplitude=float(np.median([trial[hz] for trial in trials if hz in trial])),
+            trials=sum(hz in trial for trial in trials),
+        )
+        for name, trials in sorted(hum.items())
+        for hz in sorted({hz for trial in trials for hz in trial})
+    )
+
+
 def _measure_noise(noise: dict[str, list[RecordNoise]], trial: CleanTrial) -> None:
     """Note what a trial says of the noise of its encoders (``q_<axis>``) and inputs."""
     for name, values in trial.columns.items():
@@ -328,7 +363,11 @@ def _rate(session: Session, trials: pd.DataFrame) -> float:
 
 
 def _description(
-    session: Session, device: Device, rate: float, noise: Mapping[str, list[RecordNoise]]
+    session: Session,
+    device: Device,
+    rate: float,
+    noise: Mapping[str, list[RecordNoise]],
+    hum: Mapping[str, list[dict[float, float]]],
 ) -> IngestResult:
     """Return what session.json says, the sensors settled."""
     force = session.force
@@ -387,6 +426,7 @@ def _description(
         sensor_warnings=tuple(
             sensor.warning for sensor in (*encoders.values(), *forces.values()) if sensor.warning
         ),
+        mains_hum=_typical_hum(hum, device),
         brakes={
             f"brake_{brake.axis}": RecordedChannel(unit=brake.unit) for brake in session.brakes
         },

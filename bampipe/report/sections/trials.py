@@ -41,7 +41,8 @@ def _sampling(session: IngestResult) -> str:
             f"{name} {wording.significant(sd, 2)}" for name, sd in session.force.noise_sd.items()
         )
         text += f" Noise of a sample: {each} {wording.unit(session.force.unit)}."
-    return " ".join([text, *(f"{w[:1].upper()}{w[1:]}." for w in session.sensor_warnings)])
+    told = (*session.sensor_warnings, *(hum.sentence for hum in session.mains_hum))
+    return " ".join([text, *(f"{line[:1].upper()}{line[1:]}." for line in told)])
 
 
 def _trials(results: Results) -> Table:

@@ -1,0 +1,187 @@
+"""Sines that stand far above what is around them in the spectrum of a record: mains hum, mostly.
+
+Second differences keep a signal that is smooth over a few samples out of their fits; those of a
+sine are taken at the time stamps as they are, so that uneven stamps tell it from its aliases.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import median_filter
+from scipy.optimize import minimize_scalar
+
+Array = NDArray[np.float64]
+
+_JUMP = 10.0
+"""Second difference, over the median one, from which on it is no part of a sine in noise."""
+_UNEVEN = 1e-3
+"""Range of the time between samples, as a share of it, from which on aliases differ."""
+_MOST, _ABOVE, _BESIDE = 6, 40.0, 31
+"""At most so many sines. One stands so far above the typical power of so many frequencies around
+it, which chance reaches once in 10^17 of them."""
+_FOLDS = 4
+"""Below so many times the rate, uneven stamps tell a sine from its aliases."""
+_ALONE, _ALONE_HZ, _LEAKAGE = 4.0, 12.0, 3
+"""A hum has so many times the power of all else within so many Hz, but for what leaks to so many
+bins beside it: what repeats itself has lines at every multiple of its own frequency."""
+_MAINS_HZ, _HARMONICS, _OFF = (50.0, 60.0), 5, 0.002
+"""Frequencies of mains and how many harmonics of them are looked for; how far off they may be, as a
+share: the grid keeps to half a thousandth, the clock of a recorder may be worse."""
+_LOWEST = 0.1
+"""Least frequency of a line in cycles a sample, as far as mains are not below it."""
+_STRETCH, _STRETCH_S, _STRETCHES = 2000, 4.0, 8
+"""Mains drift in phase: they are fitted by stretches of at least so many samples and seconds, and
+looked for in at most so many."""
+_FEWEST = 200
+"""Samples below which nothing is looked for."""
+
+
+@dataclass(frozen=True)
+class Line:
+    """One sine.
+
+    Attributes:
+        hz: its frequency, in cycles by the unit of the time stamps.
+        values: (T,) the sine at the time stamps, in the unit of the record.
+        alone: power over that of the strongest frequency around it.
+    """
+
+    hz: float
+    values: Array
+    alone: float
+
+
+def find_lines(
+    record: Array, t: Array, lowest: float, highest: float = 0.5, lag: int = 1
+) -> list[Line]:
+    """The sines on a record (T,) with time stamps ``t`` (T,), the clearest first.
+
+    Args:
+        lowest, highest: frequencies between which they appear at this rate, in cycles a sample; at
+            the highest there is, 0.5, aliases of faster ones are among them.
+        lag: samples between those whose second differences are taken; noise counts least where a
+            sine turns by a quarter to half a cycle in so many.
+    """
+    rate = (t.size - 1) / float(t[-1] - t[0])
+    frequency = np.fft.rfftfreq(t.size - 2 * lag)
+    high = (frequency > lowest) & (frequency <= highest)
+    window = np.hanning(t.size - 2 * lag)
+    beside = int(_ALONE_HZ / (rate * frequency[1]))
+    lines: list[Line] = []
+    while len(lines) < _MOST:
+        wanted, even = _second_differences(record, lag)
+        power = np.square(np.abs(np.fft.rfft(window * wanted * even)[high]))
+        above = power / np.maximum(median_filter(power, _BESIDE), np.finfo(float).tiny)
+        peak = int(np.argmax(above))
+        if above[peak] <= _ABOVE / np.log(2.0):
+            break
+        around = power[max(peak - beside, 0) : peak + beside + 1].copy()
+        own = min(peak, beside)
+        around[max(own - _LEAKAGE, 0) : own + _LEAKAGE + 1] = 0.0
+        middle, apart = frequency[high][peak], frequency[1]
+        one = highest < 0.5 or _is_uniform(t)
+        aliases = [middle, *(n + sign * middle for n in range(1, _FOLDS) for sign in (-1.0, 1.0))]
+        fits = [_fit(record, t, rate * a, rate * apart, lag) for a in aliases[: 1 if one else None]]
+        hz, values, _ = min(fits, key=lambda fit: fit[2])
+        lines.append(Line(hz, values, float(power[peak] / max(around.max(), 1e-300))))
+        record = record - values
+    return lines
+
+
+def remove_mains(
+    record: Array, t: Array, moving: Sequence[Array] = ()
+) -> tuple[Array, dict[float, float]]:
+    """Take the hum of mains off a record (T,) with time stamps ``t`` (T,), s.
+
+    Args:
+        moving: other records (T,) at the same stamps, which mains do not reach, as of positions: a
+            line that one of them shows, too, is a motion and no hum.
+
+    Returns:
+        The record without it; by nominal frequency of mains or of one of their harmonics, Hz, the
+        amplitude taken off, typical of all stretches. Empty where there is none.
+    """
+    if record.size < _FEWEST:
+        return record, {}
+    stretches = max(1, int(min(record.size / _STRETCH, float(t[-1] - t[0]) / _STRETCH_S)))
+    edges = np.linspace(0, record.size, stretches + 1).astype(int)
+    parts = [slice(*ends) for ends in pairwise(edges)]
+    some = [parts[i] for i in np.unique(np.linspace(0, stretches - 1, _STRETCHES).astype(int))]
+    shown = [_find_mains(record[part], t[part]) for part in some]
+    seen = {hz: [lines[hz] for lines in shown if hz in lines] for hz in set().union(*shown)}
+    hum = {hz: float(np.median(at)) for hz, at in seen.items() if 2 * len(at) > len(some)}
+    if hum:
+        moved = set().union(*(_find_mains(other[some[0]], t[some[0]]) for other in moving))
+        hum = {hz: hum[hz] for hz in sorted(hum.keys() - moved)}
+    clear = record.copy()
+    sizes: dict[float, list[float]] = {hz: [] for hz in hum}
+    for part in parts if hum else ():
+        within = 1.0 / float(t[part][-1] - t[part][0])
+        for hz, at in hum.items():
+            _, values, _ = _fit(clear[part], t[part], at, within, _lag(t[part]))
+            clear[part] -= values
+            sizes[hz].append(float(np.sqrt(2.0) * np.std(values)))
+    return clear, {hz: float(np.median(size)) for hz, size in sizes.items()}
+
+
+def _find_mains(record: Array, t: Array) -> dict[float, float]:
+    """Where a record (T,) shows mains: nominal frequencies, Hz, and those found for them."""
+    rate = (t.size - 1) / float(t[-1] - t[0])
+
+    def apparent(hz: float) -> float:
+        return abs(hz - rate * round(hz / rate)) if _is_uniform(t) else hz
+
+    found: dict[float, float] = {}
+    nominal = [n * hz for hz in _MAINS_HZ for n in range(1, _HARMONICS + 1)]
+    lowest = min(_LOWEST, 0.9 * min(_MAINS_HZ) / rate)
+    highest = min(1.1 * max(nominal) / rate, 0.5)
+    for line in find_lines(record, t, lowest, highest, _lag(t)):
+        alike = [hz for hz in nominal if abs(apparent(line.hz) - apparent(hz)) <= _OFF * hz]
+        if alike and line.alone >= _ALONE:
+            found.setdefault(min(alike), line.hz)
+    return found
+
+
+def _lag(t: Array) -> int:
+    """Samples in which mains turn by an eighth of a cycle; one at a low rate."""
+    return max(1, int(0.125 * (t.size - 1) / float(t[-1] - t[0]) / min(_MAINS_HZ)))
+
+
+def _is_uniform(t: Array) -> bool:
+    """Whether stamps (T,) are so even that a sine and its aliases are one."""
+    steps = np.diff(t)
+    return float(np.ptp(steps)) < _UNEVEN * float(np.mean(steps))
+
+
+def _second_differences(record: Array, lag: int) -> tuple[Array, NDArray[np.bool_]]:
+    """Of a record (T,), and which are no jump of the signal, as where friction turns over."""
+    wanted = record[2 * lag :] - 2.0 * record[lag:-lag] + record[: -2 * lag]
+    return wanted, np.abs(wanted) <= _JUMP * float(np.median(np.abs(wanted)))
+
+
+def _fit(record: Array, t: Array, hz: float, within: float, lag: int) -> tuple[float, Array, float]:
+    """Frequency and values (T,) of the sine that fits a record (T,) best, and squares it leaves.
+
+    Args:
+        hz, within: where it is looked for; lag: see `find_lines`.
+    """
+    wanted, even = _second_differences(record, lag)
+    wanted = wanted[even]
+
+    def fitted(frequency: float) -> tuple[Array, float]:
+        phase = 2.0 * np.pi * frequency * t
+        pair = np.column_stack([np.sin(phase), np.cos(phase)])
+        columns = (pair[2 * lag :] - 2.0 * pair[lag:-lag] + pair[: -2 * lag])[even]
+        size, *_ = np.linalg.lstsq(columns, wanted, rcond=None)
+        left = wanted - columns @ size
+        return pair @ size, float(left @ left)
+
+    best = minimize_scalar(
+        lambda frequency: fitted(frequency)[1], bounds=(hz - within, hz + within), method="bounded"
+    )
+    return float(best.x), *fitted(float(best.x))
