@@ -26,6 +26,7 @@ class Diagnosis:
         groups: for each selected effect, the others that these trials cannot tell from it.
         contests: for each selected effect, those who contend for its place, itself first.
         steps: how the search went.
+        cut_short: whether it ended at the most effects that may be tried.
         transients: candidates that only one second speaks for.
         evidence: of the model with all selected effects.
         initial: of the model as given.
@@ -37,6 +38,7 @@ class Diagnosis:
     groups: Mapping[str, tuple[str, ...]]
     contests: Mapping[str, tuple[Contender, ...]]
     steps: tuple[SearchStep, ...]
+    cut_short: bool
     transients: tuple[TransientCandidate, ...]
     evidence: Evidence
     initial: Evidence

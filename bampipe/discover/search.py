@@ -64,6 +64,7 @@ class Search:
             the final model, but do not beat chance.
         transient: candidates that only one second speaks for, and that second.
         steps: the sets tried, in order.
+        cut_short: whether it ended at `Settings.most_effects`.
         final: replays of the final model, with explainable shares.
     """
 
@@ -80,6 +81,7 @@ class Search:
     likely: Mapping[str, tuple[float, Array]]
     transient: Mapping[str, SampleRange]
     steps: tuple[SearchStep, ...]
+    cut_short: bool
     final: tuple[Replicate, ...]
 
     @property
@@ -155,6 +157,7 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
         additions[chosen.winner] = addition
         steps.append(_step(current))
         progress(0.45 + 0.05 * len(steps), f"added {chosen.winner}, looking for more")
+    cut_short = len(current.added) + len(dropped) >= s.most_effects
     progress(0.8, "weighing each effect beside its rivals")
     rivals = {name: _rivals(first, name, groups.get(name, ()), s) for name in current.added}
     polished = polish(bench, current, rivals, lambda _, what: progress(0.8, what))
@@ -168,7 +171,7 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
     return Search(
         bench.trials, base, initial, level, first, found,
         {n: polished.alike.get(n, groups.get(n, ())) for n in found.added},
-        contests, main, additions, likely, transient, tuple(steps), tuple(final),
+        contests, main, additions, likely, transient, tuple(steps), cut_short, tuple(final),
     )  # fmt: skip
 
 

@@ -34,11 +34,7 @@ def _parts(axis: str, i: int, found: Diagnosis, unit: str, s: Settings) -> list[
     parts += _rivals(axis, a, found, unit)
     parts += _transients(axis, found)
     if a.remains:
-        left = (
-            "No effect in the library explains what is left; its shape"
-            if a.effects
-            else "Its shape"
-        )
+        left = f"{_no_effect(found)} explains what is left; its shape" if a.effects else "Its shape"
         judged = found.evidence if a.effects else found.initial
         parts.append(f"{left}: {describe(judged, i, s)}.")
     elif a.standing == "above_floor":
@@ -92,7 +88,7 @@ def _verdict(a: AxisVerdict, found: Diagnosis, unit: str) -> str:
             else ""
         )
         return (
-            "something is missing that no effect in the library explains (held-out error "
+            f"something is missing that {_no_effect(found).lower()} explains (held-out error "
             f"{error:.3g} {unit}, {error / max(a.noise_floor, 1e-30):.1f} times the noise floor)"
             + near
         )
@@ -101,6 +97,13 @@ def _verdict(a: AxisVerdict, found: Diagnosis, unit: str) -> str:
     return (
         f"nothing is missing that these trials could show (held-out error {a.rmse_after:.3g} "
         f"{unit}, noise floor {a.noise_floor:.3g} {unit})"
+    )
+
+
+def _no_effect(found: Diagnosis) -> str:
+    """What does not explain the rest."""
+    return (
+        "No effect tried before the search ended" if found.cut_short else "No effect in the library"
     )
 
 

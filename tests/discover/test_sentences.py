@@ -32,13 +32,13 @@ def finding(verdict, before, after, floor, **more):
     )  # fmt: skip
 
 
-def say(monkeypatch, axis, contests=None, transients=()):
+def say(monkeypatch, axis, contests=None, transients=(), cut_short=False):
     """The sentence of one axis called joint, in N.m."""
     monkeypatch.setattr(sentences, "describe", lambda evidence, axis, s: SHAPE)
     system = SimpleNamespace(coordinates=("joint",), torque_units=("N.m",))
     evidence = SimpleNamespace(system=system)
     found = Diagnosis(
-        (axis,), (), axis.effects, {}, contests or {}, (), transients, evidence, evidence
+        (axis,), (), axis.effects, {}, contests or {}, (), cut_short, transients, evidence, evidence
     )
     return sentences.axis_sentences(found, Settings())[0]
 
@@ -126,6 +126,7 @@ def test_no_effect_explains_it_never_stands_beside_one_that_does(monkeypatch, ax
     for effect in (*axis.effects, *axis.likely):
         assert effect in said
     assert (SHAPE in said) == axis.remains
+    assert "the library" not in say(monkeypatch, axis, cut_short=True)
 
 
 def test_rivals_are_listed_with_what_they_would_leave(monkeypatch):
