@@ -63,6 +63,23 @@ def test_following_judges_the_model_that_it_starts_from(
     assert ran[0] == ("identify", "validate", "base") and ran[-1] == ("compare", "compare", "")
 
 
+@pytest.mark.parametrize("fault", [ZeroDivisionError, KeyboardInterrupt])
+def test_a_child_that_was_never_identified_is_removed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: type[BaseException]
+) -> None:
+    def run(_: loop.LoopOptions, first: str, last: str, model: str) -> None:
+        if model != "base":
+            assert (tmp_path / "models" / model / "model.toml").is_file()
+            raise fault
+
+    write_result(tmp_path, IngestResult, device="slider", axes={"carriage": {}})
+    monkeypatch.setattr(loop.LoopOptions, "run", run)
+    options = loop.LoopOptions(tmp_path, pipeline.load(), False, True, unheard)
+    with pytest.raises(fault):
+        loop.extend(options, "base", ["stribeck:carriage"])
+    assert models.names(tmp_path) == ("base",)
+
+
 def test_what_came_to_nothing_is_not_weighed_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -181,15 +181,14 @@ def extend(options: LoopOptions, parent: str, effects: Sequence[str]) -> str:
     for name in named:
         if "/" in name or not is_normal(child):
             raise InputError(f"{name!r} is no name of an effect", remedy="see `bampipe effects`")
-    fresh = f"identify:{child}" not in record.read(root).stages
     try:
         with options.lock():
             models.ensure_base(root, *options.pipeline.base_model)
             _write_child(root, parent, named)
         options.run("identify", "validate", parent)
         options.run("identify", "validate", child)
-    except InputError:
-        if fresh:
+    except BaseException:
+        if f"identify:{child}" not in record.read(root).stages:
             _remove(options, child)
         raise
     options.run("compare", "compare", "")

@@ -56,7 +56,7 @@ def _run() -> None:
         for line in error.lines():
             show.note(f"bampipe: error: {line}")
         sys.exit(2)
-    except BrokenPipeError:
-        # Whoever read our output has closed it (`bampipe effects | head`): leave without noise.
+    except show.OutputClosedError:
+        # Leave as other tools do, without noise.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(141)

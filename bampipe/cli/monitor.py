@@ -183,9 +183,8 @@ class _Output:
             return
         if isinstance(t, float):
             self._next = t + self._every
-        print(
-            json_text.dumps({**content, "bad_lines": stream.bad_lines}, sort_keys=True), flush=True
-        )
+        line = json_text.dumps({**content, "bad_lines": stream.bad_lines}, sort_keys=True)
+        show.write_line(line)
 
 
 def _table(content: Mapping[str, Any], bad_lines: int) -> Any:

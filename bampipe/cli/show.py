@@ -45,9 +45,25 @@ def number(value: object) -> str:
     return printable(str(value))
 
 
+class OutputClosedError(Exception):
+    """Whoever read our output has closed it; no OSError, of which typer makes a failed gate."""
+
+
+def write_line(line: str) -> None:
+    """Print a line on standard output, at once.
+
+    Raises:
+        OutputClosedError: nobody reads it any more, as after ``| head``.
+    """
+    try:
+        print(line, flush=True)
+    except BrokenPipeError as error:
+        raise OutputClosedError from error
+
+
 def say(text: str) -> None:
-    """Print a line on standard output."""
-    print(printable(text))
+    """Print what a person reads on standard output, a line."""
+    write_line(printable(text))
 
 
 def note(text: str) -> None:
@@ -57,7 +73,7 @@ def note(text: str) -> None:
 
 def as_json(content: object) -> None:
     """Print ``content`` as JSON on standard output."""
-    print(json.dumps(content, sort_keys=True, indent=1, ensure_ascii=False))
+    write_line(json.dumps(content, sort_keys=True, indent=1, ensure_ascii=False))
 
 
 def page(path: Path) -> None:
