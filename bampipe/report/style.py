@@ -6,6 +6,7 @@ Colours are those of Okabe and Ito (2008). Lines that matter also differ in dash
 from __future__ import annotations
 
 import io
+import textwrap
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from typing import Any
@@ -41,6 +42,8 @@ COLOURS = {
 }
 """All colours in use, by the name that the page's style sheet gives them."""
 
+_LABEL = 30
+"""Letters in a line of an axis label: more is clipped where panels stand in threes."""
 _LETTER, _HANDLE = 0.058, 0.42
 """Widths in a legend, inches: of a letter on average, and of what stands before the words."""
 _MOST_LEGEND_COLUMNS = 4
@@ -135,8 +138,8 @@ def svg(figure: Figure) -> str:
 
 
 def label(quantity: str, unit: str) -> str:
-    """Return the label of an axis: quantity and unit, the latter as printed."""
-    return f"{quantity} ({unit})" if unit else quantity
+    """Return the label of an axis: quantity and unit, the latter as printed; long ones in lines."""
+    return textwrap.fill(f"{quantity} ({unit})" if unit else quantity, _LABEL)
 
 
 def pick(length: int, most: int) -> slice:

@@ -136,7 +136,7 @@ def _moved(
                 sentence = (
                     f"{name} moved from {round_with_sd(old.estimate, old.sd)} to "
                     f"{round_with_sd(new.estimate, new.sd)} {new.unit}: "
-                    "without the effect it was biased."
+                    "without what was added it was biased."
                 )
                 moved.append(
                     Moved(

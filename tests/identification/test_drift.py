@@ -45,6 +45,18 @@ def test_a_constant_force_that_is_wrong_drifts_with_the_square_of_time():
     assert max(h.median for h in right.horizons) < 1e-5
 
 
+def test_friction_that_builds_up_within_micrometres_does_not_run_away():
+    stiff = compile_model(Model(registry.device("slider"), ("presliding:carriage",)))
+    friction = {"coulomb.carriage": 20.0, "presliding.carriage.force": 20.0}
+    values = {"mass": MASS, **friction, "presliding.carriage.distance": 4e-5}
+    p = np.array([values.get(item.name, 0.0) for item in stiff.parameters])
+    trial = motion(seconds=4.0)
+    pushed = trial.channels["force_motor"] + 20.0 * np.sign(trial.qd[:, 0])
+    trial = replace(trial, channels={**trial.channels, "force_motor": pushed})
+    found = find_drift(stiff, [trial], [p], [True])["carriage"]
+    assert not found.reason and found.horizons[0].median < 1e-6
+
+
 def test_only_judged_trials_count():
     trials, wrong = [motion(), motion()], parameters(offset=0.4)
     found = find_drift(SLIDER, trials, [parameters(), wrong], [True, False])["carriage"]

@@ -180,7 +180,7 @@ def _maps(
     )
     unit = wording.unit(entry.unit)
     for number, (panel, name) in enumerate(zip(panels.flat, names, strict=False)):
-        extents = [_map(panel, name, maps[name], style.VERMILLION, f"model {model}")]
+        extents = [_map(panel, name, maps[name], style.VERMILLION, "the model")]
         if later and name in later:
             extents.append(_map(panel, name, later[name], style.BLUE, "with the effects found"))
         panel.axhline(0.0, color=style.INK, lw=0.6, zorder=1)

@@ -30,6 +30,8 @@ TITLE = "Effects"
 _COLUMNS = 3
 _WEIGHED = 8
 _RIVALS = 3
+_LEAST_FOLLOWED = 0.2
+"""Share of a term's variance that its curve has to carry to be drawn."""
 
 
 def section(results: Results) -> Section | None:
@@ -49,13 +51,15 @@ def section(results: Results) -> Section | None:
             "its 95 % band, over the motion that it was learned from."
         )
         blocks.append(_curves("friction", curves, caption))
+    shown: set[str] = set()
     for term in effects:
-        blocks += _effect(results, term)
+        blocks += _effect(results, term, shown)
     blocks += _weighed(results, {term.name for term in effects})
     return Section(TITLE, tuple(blocks))
 
 
-def _effect(results: Results, term: ModelTerm) -> list[Block]:
+def _effect(results: Results, term: ModelTerm, shown: set[str]) -> list[Block]:
+    """Return what is said of an effect; ``shown``: versions whose worst window is drawn already."""
     text = term.text
     name = term.name.replace(":", "-")
     blocks: list[Block] = [
@@ -63,7 +67,7 @@ def _effect(results: Results, term: ModelTerm) -> list[Block]:
         Paragraph(f"{text.summary}. {_found(results, term)}".rstrip()),
         Formulas(text.formulas),
     ]
-    blocks += _pictures(results, term, name)
+    blocks += _pictures(results, term, name, shown)
     words = []
     if text.on_the_machine:
         words.append(f"**On the machine.** {text.on_the_machine}.")
@@ -115,41 +119,52 @@ def _curve(panel: Axes, curve: TermCurve) -> None:
     panel.set_ylabel(style.label("force it takes", wording.unit(curve.unit)))
 
 
-def _pictures(results: Results, term: ModelTerm, name: str) -> list[Figure]:
-    """Draw the curves of an effect and, where it is known, the worst window without and with it."""
+def _pictures(results: Results, term: ModelTerm, name: str, shown: set[str]) -> list[Block]:
+    """Draw the curves of an effect and, once a version, its worst window without and with it."""
+    curves = [curve for curve in term.curves if curve.variance_share >= _LEAST_FOLLOWED]
+    blocks: list[Block] = []
+    if term.curves and not curves:
+        blocks.append(Paragraph("Its force follows no single variable of the motion."))
     found = _window(results, term)
-    if found is None:
-        words = _contribution(term, term.curves)
-        return [_curves(f"effect-{name}", term.curves, words)] if term.curves else []
-    first = next(curve for curve in term.curves if curve.axis == found.window.axis)
-    figure, panels = style.beside(2, 2.7)
-    _curve(panels[0], first)
+    if found is None or found.added in shown:
+        if curves:
+            words = _contribution(term, curves)
+            blocks.append(_curves(f"effect-{name}", curves, f"What {words}"))
+        return blocks
+    shown.add(found.added)
+    first = next((curve for curve in curves if curve.axis == found.window.axis), None)
+    if first is None:
+        figure, panels = style.panels(2, 1, 2.7)
+        top, bottom = panels.flat
+    else:
+        figure, (left, top, bottom) = style.beside(2, 2.7)
+        _curve(left, first)
     unit = wording.unit(results.force_unit(found.window.axis))
-    errors = _draw_window(panels[1], panels[2], found, unit)
-    style.legend_below(figure, panels[1])
+    errors = _draw_window(top, bottom, found, unit)
+    style.legend_below(figure, top)
     size = [wording.significant(error, 2) for error in errors]
     change = (
         f"the residual falls from {size[0]} to {size[1]} {unit} (RMSE)"
         if errors[1] < errors[0]
         else f"the residual does not fall ({size[0]} and {size[1]} {unit} RMSE)"
     )
-    left = _contribution(term, [first]).replace("What", "Left: what", 1)
-    whole = (
-        f"{left} Right: the worst window of {found.window.axis} without {found.added} "
+    window = (
+        f"worst window of {found.window.axis} without {found.added} "
         f"({found.window.doing}), where {change}."
     )
-    others = [curve for curve in term.curves if curve is not first]
-    pictures = [Figure(f"effect-{name}", whole, style.svg(figure))]
+    beside = f"Left: what {_contribution(term, [first])} Right: the {window}" if first else ""
+    blocks.append(Figure(f"effect-{name}", beside or f"The {window}", style.svg(figure)))
+    others = [curve for curve in curves if curve is not first]
     if others:
         axes = join_names(curve.axis for curve in others)
-        more = f"{_contribution(term, others).rstrip('.')}, on {axes}."
-        pictures.append(_curves(f"effect-{name}-more", others, more))
-    return pictures
+        more = f"What {_contribution(term, others).rstrip('.')}, on {axes}."
+        blocks.append(_curves(f"effect-{name}-more", others, more))
+    return blocks
 
 
 def _contribution(term: ModelTerm, curves: Sequence[TermCurve]) -> str:
     return (
-        f"What `{term.name}` contributes: the force that it takes, with its 95 % band, against "
+        f"`{term.name}` contributes: the force that it takes, with its 95 % band, against "
         f"{_variables(curves)}, which it follows most, over the trials that it was learned from."
     )
 

@@ -109,8 +109,8 @@ def _at_the_handle(validated: ValidateResult, pusher: str) -> str:
         f"{wording.words(name)} {wording.significant(entry.rmse)} {wording.unit(entry.unit)}"
         for name, entry in validated.forces.items()
     )
-    place = "At the handle the error" if pusher == "hand" else "The error of the predicted readings"
-    return f"{place} is {join_names(shown)} (RMSE)."
+    place = "at the handle" if pusher == "hand" else "of the drives"
+    return f"Error of the predicted force {place} (RMSE): {join_names(shown)}."
 
 
 def _drift(results: Results, drift: Mapping[str, AxisDrift]) -> list[Block]:
@@ -120,7 +120,7 @@ def _drift(results: Results, drift: Mapping[str, AxisDrift]) -> list[Block]:
     reasons = tuple(f"{axis}: {drift[axis].reason}" for axis in axes if drift[axis].reason)
     everywhere = {drift[axis].reason for axis in axes}
     if not horizons and len(everywhere) == 1 and reasons:
-        return [Paragraph(f"The model is not left to itself. {everywhere.pop()}")]
+        return [Paragraph(f"No short free runs of this model. {everywhere.pop()}")]
     blocks: list[Block] = []
     rows = []
     for axis in axes:
