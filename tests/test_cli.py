@@ -430,6 +430,14 @@ def test_summary_prints_tables(capsys: pytest.CaptureFixture[str]) -> None:
     assert "note: mind the gap" in out
 
 
+def test_long_names_of_models_are_broken(capsys: pytest.CaptureFixture[str]) -> None:
+    name = "base+asymmetric_coulomb.carriage+thermal_damping.carriage+actuator_delay"
+    show.table(["model", "rmse", ""], [["base", 2.0, ""], [name, 1.0, "x " * 50]])
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[2].split()[:2] == [name.removesuffix("actuator_delay"), "1"]
+    assert lines[3] == "  actuator_delay" and lines[2].endswith("x x")
+
+
 def test_summary_prints_the_ladder(capsys: pytest.CaptureFixture[str]) -> None:
     rung = {"held_out_rmse": {"yaw": 0.5}, "noise_floor": {"yaw": 0.25}, "unit": {"yaw": "N.m"}}
     axis = {"mean_absolute": 0.1, "rmse": 0.2, "relative_error_percent": 3.0, "unit": "rad"}

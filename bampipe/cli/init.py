@@ -64,5 +64,5 @@ def init(
             for line in lines:
                 show.say(f"  {line}")
     show.say("")
-    after = f"bampipe ingest {folder}" if not proposal.fill_in else f"edit {folder}/session.toml"
+    after = f"bampipe run {folder}" if not proposal.fill_in else f"edit {folder}/session.toml"
     show.say(f"next: {after}")

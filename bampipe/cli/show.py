@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 import threading
 import time
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import zip_longest
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
@@ -19,12 +21,13 @@ if TYPE_CHECKING:
     from bampipe.results.compare import Rung
 
 LARGEST_TABLE = 40
+WIDEST_CELL = 60
 MOST_TRIALS = 10
 QUIET_S = 10.0
 """Off a terminal, a long step prints a line this often."""
 FIRST_COLUMNS = (
     *("", "trial_id", "estimate", "sd", "unit", "rmse", "held_out_rmse", "noise_floor"),
-    *("verdict", "rmse_before", "rmse_after", "explainable_share"),
+    *("verdict", "rmse_before", "rmse_after", "noise_floor_after"),
     *("effect", "axis", "held_out_rmse_before", "held_out_rmse_after", "p_value"),
 )
 """In this order, whether a summary has just been made or is read from the run folder."""
@@ -90,7 +93,7 @@ def page(path: Path) -> None:
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-    """Print a table: text to the left, numbers to the right, no lines.
+    """Print a table: text to the left, in lines where it is long, numbers to the right, no rules.
 
     Args:
         head: column names.
@@ -101,8 +104,14 @@ def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
     for column in range(len(head)):
         if head[column] == "" and all(not row[column] for row in cells):
             cells = [[*row[:column], "", *row[column + 1 :]] for row in cells]
+    last = len(head) - 1  # nothing stands behind it, so it may be as long as it likes
+    lines = [
+        [[cell] if column == last else _broken(cell) for column, cell in enumerate(row)]
+        for row in cells
+    ]
     widths = [
-        max([len(name), *(len(row[column]) for row in cells)]) for column, name in enumerate(head)
+        max([len(name), *(len(part) for row in lines for part in row[column])])
+        for column, name in enumerate(head)
     ]
     right = [
         bool(raw) and all(isinstance(row[column], int | float | None) for row in raw)
@@ -117,8 +126,19 @@ def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
         return "  " + "  ".join(parts).rstrip()
 
     say(line(list(head)))
-    for row in cells:
-        say(line(row))
+    for row in lines:
+        for parts in zip_longest(*row, fillvalue=""):
+            say(line(parts))
+
+
+def _broken(text: str) -> list[str]:
+    """Break the name of a model, or of several effects, into lines where it is long."""
+    found = [""]
+    for part in re.split(r"(?<=[+ ])", text):
+        if len(found[-1]) + len(part) > WIDEST_CELL and found[-1]:
+            found.append("")
+        found[-1] += part
+    return found
 
 
 def _is_scalar(value: object) -> bool:

@@ -130,7 +130,7 @@ def _advance(system: System, window: _Window, horizon: float) -> _Reach | None:
     if end > window.last:
         return None
     if window.state is not None:
-        window.state = _simulate(system, window, end)
+        window.state = _simulate(system, window, window.state, end)
     window.at = end
     motion = window.motion
     measured = motion.q[window.start : end + 1]
@@ -143,13 +143,13 @@ def _advance(system: System, window: _Window, horizon: float) -> _Reach | None:
     return _Reach(error, np.abs(measured[-1] - measured[0]), moves)
 
 
-def _simulate(system: System, window: _Window, end: int) -> Array | None:
-    """Return the state (nx,) at sample ``end``; None where the motion runs away by then."""
+def _simulate(system: System, window: _Window, state: Array, end: int) -> Array | None:
+    """Return the state (nx,) at sample ``end``, from ``state`` on; None where the motion runs away by then."""
     width = np.array([c.sign_width for c in system.model.device.coordinates])
     for step in _STEPS_S:
         with contextlib.suppress(Runaway):
             path = simulate(
-                system.derivative, window.state, window.u[window.at : end + 1], window.p, window.dt,
+                system.derivative, state, window.u[window.at : end + 1], window.p, window.dt,
                 width=width, n_noise=len(system.noise), max_step=step,
             )  # fmt: skip
             return np.asarray(path[-1])

@@ -316,7 +316,8 @@ def _find_gears(
     best = min(found, key=lambda solution: float(solution.cost))
     ratio = ratios(best.x)
     judged = _judge_along(device, robot, q / ratio, drives, at_joint, t)
-    return (ratio, judged) if _fits(judged) else None
+    # A gear that speeds up would take the joint further beyond its range than the log goes.
+    return (ratio, judged) if _fits(judged) and ratio.min() >= 1.0 else None
 
 
 def _compare(required: Array, rate: Array, change: Array, drive: Array) -> Drive:
@@ -362,7 +363,9 @@ def _sentences(
             lines.append(f"{shown}: its sign is turned; or that of {c.name} is the wrong one")
         elif device.force_unit == "A":
             agreed.append(f"{c.name} {1.0 / drive.share:.3g} N.m/A")
-        elif not LEAST_AT_JOINT < drive.share < 1.0 / LEAST_AT_JOINT:
+        elif drive.share >= 1.0 / LEAST_AT_JOINT:
+            lines.append(f"{shown}: another unit, or bodies that are not drawn")
+        elif drive.share <= LEAST_AT_JOINT:
             lines.append(
                 f"{shown}: another unit, or the torque of a motor with a reduction of about"
                 f" {1.0 / drive.share:.3g}"

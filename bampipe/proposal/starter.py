@@ -58,6 +58,7 @@ def starter_device(position: str, linear: bool, drive: Drive, found: Driven) -> 
         _torque(axis, drive.coil),
         _inputs(source, drive),
         f'[applied]\n{axis.name} = "{source.applied}"\n',
+        _scale(source.placeholders),
         _friction(axis, found),
         _inertia(axis, drive.coil, found),
         _offset(axis, found),
@@ -87,6 +88,8 @@ def _energy(axis: Axis, found: Driven) -> str:
     potential = f'"-moment*cos({name}) + moment_across*sin({name})"'
     if not any(found.gravity):
         hint = f'gravity of a link: "-moment*cos({name})", moment in N.m'
+        if axis.linear:
+            hint = f'gravity where the axis rises: "9.81*inertia*{name}"'
         potential = f'"0"                     # {hint}'
     return f'[energy]\nkinetic = "inertia*ddt({name})**2/2"\npotential = {potential}\n'
 
@@ -111,6 +114,14 @@ force_unit = "{source.si}"
 {_DRIVE if motor else _PRESCRIBED if drive.coil else ""}{channels}"""
 
 
+def _scale(placeholders: tuple[str, ...]) -> str:
+    """What the sizes below are of, where they hang on constants that are not known."""
+    if not placeholders:
+        return ""
+    guessed = f"# Guessed with {' and '.join(placeholders)} as above"
+    return f"{guessed}: scale what follows with what you put in."
+
+
 def _friction(axis: Axis, found: Driven) -> str:
     viscous, coulomb = (", ".join(_prior(size)) for size in (found.viscous, found.coulomb))
     return f"""[friction.{axis.name}]
@@ -124,7 +135,7 @@ def _inertia(axis: Axis, coil: bool, found: Driven) -> str:
     least = 0.02 * found.inertia if found.inertia > 0.0 else 0.1 if axis.linear else 1e-5
     least = max(least, 0.3) if coil and axis.linear else least
     prior, sd = _prior(found.inertia)
-    values = (f"{prior}  # guess", sd, f"lower = {_rounded(least):g}")
+    values = (prior, sd, f"lower = {_rounded(least):g}")
     return _parameter("inertia", axis.inertia, values, "all that moves, reduced to this axis")
 
 
@@ -141,7 +152,7 @@ def _moments(found: Driven) -> list[str]:
     sd = f"sd = {_rounded(max(map(abs, found.gravity))):g}"
     meaning = "mass times gravity times distance of the centre of gravity"
     return [
-        _parameter(name, "N.m", (f"prior = {_rounded(size):g}  # guess", sd), meaning)
+        _parameter(name, "N.m", (f"prior = {_rounded(size):g}", sd), meaning)
         for name, size in zip(("moment", "moment_across"), found.gravity, strict=True)
     ]
 
@@ -152,16 +163,18 @@ def _coil_parameters(axis: Axis, found: Driven) -> list[str]:
         ("friction_per_ampere", axis.torque, found.coulomb),
         ("viscous_per_ampere", axis.viscous, found.viscous),
     ):
-        prior, sd = _prior(size)
-        values = (f"{prior}  # guess", sd, "lower = 0.0")
         meaning = "what the coil adds, in proportion to its current"
-        texts.append(_parameter(name, f"{unit}/A", values, meaning))
+        texts.append(_parameter(name, f"{unit}/A", _prior(size), meaning, "lower = 0.0"))
     return texts
 
 
-def _parameter(name: str, unit: str, values: tuple[str, ...], meaning: str) -> str:
-    lines = (f"[parameters.{name}]", f'unit = "{unit}"', *values, f'description = "{meaning}"')
-    return "\n".join(lines) + "\n"
+def _parameter(
+    name: str, unit: str, guessed: tuple[str, ...], meaning: str, known: str = ""
+) -> str:
+    """A table of a parameter: lines that are ``guessed``, and one that follows from its meaning."""
+    marked = [f"{line}  # guess" for line in guessed]
+    lines = [f"[parameters.{name}]", f'unit = "{unit}"', *marked, f'description = "{meaning}"']
+    return "\n".join([*lines, known] if known else lines) + "\n"
 
 
 def _prior(size: float) -> tuple[str, str]:

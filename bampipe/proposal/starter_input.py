@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from bampipe.physics.device import KINDS
 
-_GAIN = {"current": ("A", "torque_per_ampere"), "voltage": ("V", "torque_per_volt")}
+_GAIN = {"current": ("A", "ampere"), "voltage": ("V", "volt")}
 _SCALE = "[constants]                         # sets the scale of all that is estimated\n"
 _MOTOR = """[constants]                         # they set the scale of all that is estimated
 torque_constant = { value = 1.0, unit = "N.m/A", source = "fill in: at the joint" }  # guess
@@ -85,7 +85,8 @@ class Input:
 def input_of(axis: Axis, drive: Drive) -> Input:
     """The input that goes with what drives the axis, with constants of 1 where none is known."""
     if drive.role in _GAIN:
-        si, gain = _GAIN[drive.role]
+        si, per = _GAIN[drive.role]
+        gain = f"{'force' if axis.linear else 'torque'}_per_{per}"
         constants = (
             f'{_SCALE}{gain} = {{ value = 1.0, unit = "{axis.torque}/{si}", '
             'source = "fill in: data sheet, at the axis, gears included" }  # guess\n'

@@ -160,10 +160,10 @@ def _summary(result: dict[str, Any], limits: str) -> dict[str, object]:
     notes = [limits] if limits else []
     if result["suggested_trial"]:
         notes.append(result["suggested_trial"]["sentence"])
-    shown = ("verdict", "rmse_before", "rmse_after", "noise_floor", "unit", "explainable_share")
+    shown = ("verdict", "rmse_before", "rmse_after", "unit", "sentence")
     return {
         "axes": {
-            axis: {k: entry[k] for k in (*shown, "sentence")}
+            axis: {**{k: entry[k] for k in shown}, "noise_floor_after": entry["noise_floor"]}
             for axis, entry in result["axes"].items()
         },
         "ranking": [

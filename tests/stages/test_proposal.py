@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import tomllib
 from collections.abc import Callable
@@ -21,6 +22,7 @@ from other_labs import (
     write_joint_logs,
 )
 
+from bampipe.data import guesses
 from bampipe.data.run_folder import RunFolder
 from bampipe.data.session import read_session
 from bampipe.data.store import read_parquet
@@ -29,6 +31,8 @@ from bampipe.physics import registry
 from bampipe.physics.units import check_device
 from bampipe.progress import silent
 from bampipe.proposal import propose, write_proposal
+from bampipe.proposal.starter import starter_device
+from bampipe.proposal.starter_input import Drive
 from bampipe.stages import ingest
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -68,6 +72,22 @@ def test_a_joint_with_motor_current(tmp_path):
     np.testing.assert_allclose(found["q_joint"], np.deg2rad(truth["joint_angle"]), atol=1e-7)
     np.testing.assert_allclose(found["motor_current"], 1e-3 * truth["motor_current"], atol=1e-8)
     np.testing.assert_allclose(found["t"], truth["stamp"] - truth["stamp"][0], atol=2e-6)
+
+
+@pytest.mark.parametrize(
+    ("linear", "constant"), [(True, "force_per_volt"), (False, "torque_per_volt")]
+)
+def test_every_size_of_a_new_device_is_marked_as_a_guess(linear: bool, constant: str):
+    found = guesses.Driven(0.9, inertia=3.0, viscous=200.0, coulomb=20.0)
+    starter = starter_device("pos", linear, Drive("voltage", "u"), found)
+    assert starter.placeholders == (constant,)
+    device = registry.device_from(tomllib.loads(starter.text))
+    assert check_device(device) == []
+    sizes = [
+        line for line in starter.text.splitlines() if re.search(r"(prior|sd|value|lower) =", line)
+    ]
+    assert len(sizes) == 8 and all("# guess" in line for line in sizes)
+    assert f"# Guessed with {constant} as above" in starter.text
 
 
 def test_a_damper_with_a_coil(tmp_path):
