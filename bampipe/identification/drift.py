@@ -144,7 +144,7 @@ def _advance(system: System, window: _Window, horizon: float) -> _Reach | None:
 
 
 def _simulate(system: System, window: _Window, state: Array, end: int) -> Array | None:
-    """Return the state (nx,) at sample ``end``, from ``state`` on; None where the motion runs away by then."""
+    """Return the state (nx,) at sample ``end``, from ``state`` on; None if it runs away."""
     width = np.array([c.sign_width for c in system.model.device.coordinates])
     for step in _STEPS_S:
         with contextlib.suppress(Runaway):
