@@ -111,6 +111,22 @@ def read_parquet(
     Raises:
         InputError: no such file, not a sound Parquet file, no such column, no such trial.
     """
+    return _read_table(path, columns, trial).to_pandas()
+
+
+def read_arrays(path: Path, columns: Sequence[str], trial: str) -> dict[str, np.ndarray]:
+    """Read columns of numbers of one trial, each as a float64 array (T,); absent values are NaN.
+
+    A tenth of the time of `read_parquet`. The arrays may be written to.
+
+    Raises:
+        InputError: as `read_parquet`.
+    """
+    table = _read_table(path, columns, trial)
+    return {name: np.array(table.column(name).to_numpy(), dtype=float) for name in columns}
+
+
+def _read_table(path: Path, columns: Sequence[str] | None, trial: str | None) -> pa.Table:
     path = Path(path)
     if not path.is_file():
         raise InputError("no such file", where=str(path))
@@ -127,15 +143,24 @@ def read_parquet(
                         f"no column '{name}'", where=str(path), remedy=f"it has {', '.join(names)}"
                     )
             if trial is None or footer is None:
-                return file.read(columns=wanted).select(wanted).to_pandas()
-            table = _read_trial(file, wanted, trial, footer.groups.get(trial, ()))
+                return file.read(columns=wanted).select(wanted)
+            table = _read_trial(file, wanted, trial, footer)
     except (pa.ArrowException, OSError) as error:
         raise InputError(
             "not a sound Parquet file", where=str(path), remedy="make it again (--force)"
         ) from error
     if table.num_rows == 0:
         raise InputError(f"no trial '{trial}'", where=str(path))
-    return table.to_pandas()
+    return table
+
+
+def column_names(path: Path) -> tuple[str, ...]:
+    """The columns of a Parquet file.
+
+    Raises:
+        InputError: no such file, or not a sound Parquet file.
+    """
+    return tuple(_sound_footer(path).metadata.schema.names)
 
 
 def trial_ids(path: Path) -> frozenset[str]:
@@ -144,18 +169,22 @@ def trial_ids(path: Path) -> frozenset[str]:
     Raises:
         InputError: no such file, or not a sound Parquet file with ``trial_id``.
     """
+    footer = _sound_footer(path)
+    if "trial_id" not in footer.metadata.schema.names:
+        raise InputError("no column 'trial_id'", where=str(path))
+    return frozenset(footer.groups)
+
+
+def _sound_footer(path: Path) -> _Footer:
     path = Path(path)
     if not path.is_file():
         raise InputError("no such file", where=str(path))
     try:
-        footer = _footer(path)
+        return _footer(path)
     except (pa.ArrowException, OSError) as error:
         raise InputError(
             "not a sound Parquet file", where=str(path), remedy="make it again (--force)"
         ) from error
-    if "trial_id" not in footer.metadata.schema.names:
-        raise InputError("no column 'trial_id'", where=str(path))
-    return frozenset(footer.groups)
 
 
 def _table(frame: Frame) -> pa.Table:
@@ -201,10 +230,16 @@ def _trial_bounds(table: pa.Table) -> list[int]:
 
 @dataclass(frozen=True)
 class _Footer:
-    """What is known of a Parquet file before its data: row groups by the trial they hold."""
+    """What is known of a Parquet file before its data.
+
+    Attributes:
+        metadata: of the file.
+        groups: row groups by the trial they hold; mixed: those with rows of more than one, or none.
+    """
 
     metadata: pq.FileMetaData
     groups: Mapping[str, tuple[int, ...]]
+    mixed: frozenset[int]
 
 
 def _footer(path: Path) -> _Footer:
@@ -219,6 +254,7 @@ def _footer(path: Path) -> _Footer:
 @lru_cache(maxsize=8)
 def _read_footer(path: Path, inode: int, size: int, changed_ns: int) -> _Footer:
     groups: dict[str, list[int]] = {}
+    mixed = set()
     with pq.ParquetFile(path, memory_map=False) as file:
         metadata = file.metadata
         if "trial_id" in metadata.schema.names:
@@ -227,18 +263,24 @@ def _read_footer(path: Path, inode: int, size: int, changed_ns: int) -> _Footer:
                 limits = metadata.row_group(group).column(column).statistics
                 if limits is not None and limits.has_min_max and limits.min == limits.max:
                     held = [str(limits.min)]
+                    if limits.null_count != 0:
+                        mixed.add(group)
                 else:
+                    mixed.add(group)
                     table = file.read_row_group(group, columns=["trial_id"])
                     held = [str(name) for name in table.column("trial_id").unique().to_pylist()]
                 for name in held:
                     groups.setdefault(name, []).append(group)
-    return _Footer(metadata, {name: tuple(found) for name, found in groups.items()})
+    return _Footer(
+        metadata, {name: tuple(found) for name, found in groups.items()}, frozenset(mixed)
+    )
 
 
-def _read_trial(
-    file: pq.ParquetFile, wanted: list[str], trial: str, groups: Sequence[int]
-) -> pa.Table:
+def _read_trial(file: pq.ParquetFile, wanted: list[str], trial: str, footer: _Footer) -> pa.Table:
+    groups = footer.groups.get(trial, ())
     if not groups:
         return file.schema_arrow.empty_table().select(wanted)
+    if footer.mixed.isdisjoint(groups):
+        return file.read_row_groups(groups, columns=wanted, use_threads=False).select(wanted)
     table = file.read_row_groups(groups, columns=list(dict.fromkeys([*wanted, "trial_id"])))
     return table.filter(pc.equal(table.column("trial_id"), trial)).select(wanted)

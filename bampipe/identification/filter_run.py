@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.data.run_folder import RunFolder
-from bampipe.data.store import read_parquet
 from bampipe.errors import InputError
 from bampipe.estimate.innovations import average_stretches
 from bampipe.estimate.unscented import (
@@ -26,7 +25,7 @@ from bampipe.identification.filter_choice import FilterChoice
 from bampipe.identification.sensor_noise import Noise
 from bampipe.physics import System
 from bampipe.trials.motion import Motion
-from bampipe.trials.reading import input_columns
+from bampipe.trials.reading import input_columns, read_samples
 
 Array = NDArray[np.float64]
 
@@ -142,25 +141,22 @@ def load_filter_trial(
         noise: of the sensors; stride: the filter stores every so many samples; choice: of the
             filter.
     """
-    path = run.require("ingest/samples.parquet", "ingest")
-    frame = read_parquet(path, trial=motion.trial_id)
-    n = len(system.coordinates)
-    stamps = frame["t"].to_numpy(dtype=float)
-    t = stamps - stamps[0]
-    brakes = system.model.device.brakes.values()
+    columns = read_samples(run, motion.trial_id, system)
+    t = columns["t"] - columns["t"][0]
+    brakes = system.model.device.brakes
     for place, name in enumerate(system.inputs):
-        if name not in frame and name != "t" and name not in brakes:
-            frame[name] = np.interp(t, motion.t, motion.inputs(system.inputs)[:, place])
-    u = input_columns(frame, system.inputs, system.model.device.brakes, t, str(path))
+        if name not in columns and name != "t" and name not in brakes.values():
+            columns[name] = np.interp(t, motion.t, motion.inputs(system.inputs)[:, place])
+    u = input_columns(columns, system.inputs, brakes)
     for column in u.T:
         lost = np.isnan(column)
         if lost.any():
             column[lost] = np.interp(t[lost], t[~lost], column[~lost])
-    # A copy: a table's only column would come out read-only, which compiled code refuses.
-    y = frame[[f"q_{axis}" for axis in system.coordinates]].to_numpy(dtype=float, copy=True)
+    y = np.column_stack([columns[f"q_{axis}"] for axis in system.coordinates])
     if choice.measure == "position_velocity":
         velocity = [np.interp(t, motion.t, column) for column in motion.qd.T]
         y = np.hstack([y, np.stack(velocity, axis=1)])
+    n = len(system.coordinates)
     first = int(np.flatnonzero(np.isfinite(y).all(axis=1))[0])
     speed = np.maximum(motion.qd_sd[0], np.sqrt(np.mean(motion.qd**2, axis=0)) * 0.1)
     read = (y[first, :n], motion.qd[0], motion.qdd[0])
@@ -302,11 +298,13 @@ def run_filter(
                 theta, covariance = one.theta, one.covariance
                 passes.append(_summarise_pass(one.trials[0], trial))
                 report_progress(done, place)
+                if _is_lost(passes[-1]):
+                    break  # whatever the other trials say
         except FilterFailure as lost_motion:
             failure = (place, lost_motion)
             continue
         found = FilterRun(search, tuple(passes), theta, covariance, level, order, restarts)
-        if max(each.nis for each in passes) / len(passes[0].ratio) < _LARGEST_NIS:
+        if not _is_lost(passes[-1]):
             if agrees(found):
                 return found
             following.append(found)
@@ -323,6 +321,10 @@ def run_filter(
     raise lost_error(
         f"the filter lost the motion of trial {{}} at {t:.2f} s: {error.reason}", place
     )
+
+
+def _is_lost(one: Pass) -> bool:
+    return not one.nis / len(one.ratio) < _LARGEST_NIS
 
 
 def _summarise_pass(filtered: FilteredTrial, trial: Trial) -> Pass:

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.data.session import Session, read_session
-from bampipe.data.store import read_parquet
 from bampipe.data.stream import SampleStream, StreamLayout
 from bampipe.declarations.model_file import load_model
 from bampipe.errors import InputError
@@ -29,7 +28,7 @@ from bampipe.identification.filter_run import build_filter_model, infer_initial_
 from bampipe.physics import System, compile_model
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.ingest import IngestResult
-from bampipe.trials.reading import free_trials, input_columns
+from bampipe.trials.reading import free_trials, input_columns, read_samples
 from bampipe.trials.sensors import RecordNoise, settle_encoder, settle_force
 
 Array = NDArray[np.float64]
@@ -282,11 +281,10 @@ def start_from_samples(
 
 def _trial(run: RunFolder, trial_id: str, system: System) -> Trial:
     """The raw samples of a trial from the first complete reading on; its state is left open."""
-    path = run.require("ingest/samples.parquet", "ingest")
-    frame = read_parquet(path, trial=trial_id)
-    t = frame["t"].to_numpy(dtype=float, copy=True)
-    u = input_columns(frame, system.inputs, system.model.device.brakes, t, str(path))
-    y = frame[[f"q_{axis}" for axis in system.coordinates]].to_numpy(dtype=float, copy=True)
+    columns = read_samples(run, trial_id, system)
+    t = columns["t"]
+    u = input_columns(columns, system.inputs, system.model.device.brakes)
+    y = np.column_stack([columns[f"q_{axis}"] for axis in system.coordinates])
     first = int(np.flatnonzero(np.isfinite(y).all(axis=1) & np.isfinite(u).all(axis=1))[0])
     for column in u.T:
         lost = np.isnan(column)

@@ -6,11 +6,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
 from bampipe.data.run_folder import MOVING, RunFolder
-from bampipe.data.store import read_parquet, trial_ids
+from bampipe.data.store import column_names, read_arrays, read_parquet, trial_ids
 from bampipe.errors import InputError
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import System
@@ -106,9 +105,8 @@ def read_motion_of(
     path: Path, trial_id: str, system: System, *, every_input: bool = False
 ) -> Motion:
     """Read one trial of a table of kinematics; arguments and errors as `read_motion`."""
-    frame = read_parquet(path, trial=trial_id)
     axes, device = system.coordinates, system.model.device
-    t = frame["t"].to_numpy(dtype=float)
+    stored = frozenset(column_names(path))
     brakes = {name: f"brake_{axis}" for axis, name in device.brakes.items()}
     needed = [name for name in system.inputs if name != "t"]
     wanted = list(needed)
@@ -118,22 +116,32 @@ def read_motion_of(
         wanted = [*needed, *(rate for name in smooth for rate in input_derivatives(name))]
     else:
         wanted += [input_derivatives(name)[0] for name in needed if _is_smooth(device, name)]
-    channels: dict[str, Array] = {}
-    for name in dict.fromkeys(wanted):
-        column = brakes.get(name, name)
-        if column in frame:
-            channels[name] = frame[column].to_numpy(dtype=float, copy=True)
-        elif name in brakes:  # a brake without a logged command was off
-            channels[name] = np.zeros(t.size)
-        elif name in needed:
+    column_of = {name: brakes.get(name, name) for name in dict.fromkeys(wanted)}
+    motion = {key: [f"{key}_{axis}" for axis in axes] for key in ("q", "qd", "qdd", "qd_sd")}
+    required = [column for columns in motion.values() for column in columns]
+    required += [column_of[name] for name in needed if name not in brakes]
+    for column in required:
+        if column not in stored:
             raise _no_column(column, str(path))
+    read = dict.fromkeys(["t", *required, *(c for c in column_of.values() if c in stored)])
+    columns = read_arrays(path, list(read), trial_id)
+    t = columns["t"]
+    channels = {
+        name: columns[column] if column in stored else np.zeros(t.size)
+        for name, column in column_of.items()
+        if column in stored or name in brakes  # a brake without a logged command was off
+    }
+
+    def stack(kind: str) -> Array:
+        return np.stack([columns[name] for name in motion[kind]]).T
+
     return Motion(
         trial_id=trial_id,
         t=t - t[0],
-        q=_columns(frame, [f"q_{axis}" for axis in axes], str(path)),
-        qd=_columns(frame, [f"qd_{axis}" for axis in axes], str(path)),
-        qdd=_columns(frame, [f"qdd_{axis}" for axis in axes], str(path)),
-        qd_sd=_columns(frame, [f"qd_sd_{axis}" for axis in axes], str(path)),
+        q=stack("q"),
+        qd=stack("qd"),
+        qdd=stack("qdd"),
+        qd_sd=stack("qd_sd"),
         channels=channels,
     )
 
@@ -180,38 +188,52 @@ def require_sound_motions(system: System, motions: Sequence[Motion]) -> None:
         )  # fmt: skip
 
 
+def read_samples(run: RunFolder, trial_id: str, system: System) -> dict[str, Array]:
+    """Return raw samples of one trial, each (T,): ``t``, ``q_<axis>``, and the inputs as logged.
+
+    Args:
+        run: the run folder; trial_id: which trial; system: the model, whose inputs are read.
+
+    Raises:
+        InputError: the file or the trial is missing.
+    """
+    path = run.require("ingest/samples.parquet", "ingest")
+    stored = frozenset(column_names(path))
+    brakes = {name: f"brake_{axis}" for axis, name in system.model.device.brakes.items()}
+    inputs = [brakes.get(name, name) for name in system.inputs]
+    wanted = ["t", *(f"q_{axis}" for axis in system.coordinates)]
+    wanted += [name for name in inputs if name in stored]
+    return read_arrays(path, list(dict.fromkeys(wanted)), trial_id)
+
+
 def input_columns(
-    frame: pd.DataFrame, names: Sequence[str], brakes: Mapping[str, str], t: Array, where: str
+    columns: Mapping[str, Array], names: Sequence[str], brakes: Mapping[str, str]
 ) -> Array:
     """Return inputs of a model as columns (T, n_u) of raw samples.
 
     Args:
-        frame: columns force_<c>, brake_<axis>, ...; a brake without a column was off.
+        columns: t, force_<c>, brake_<axis>, ...; a brake without a column was off.
         names: inputs of the model; brakes: input that is the brake command, by axis.
-        t: (T,) time, s; where: file, for messages.
 
     Raises:
         InputError: an input has no column.
     """
     column = {name: f"brake_{axis}" for axis, name in brakes.items()}
-    values = np.zeros((len(frame), len(names)))
+    t = columns["t"]
+    values = np.zeros((t.size, len(names)))
     for number, name in enumerate(names):
+        logged = column.get(name, name)
         if name == "t":
             values[:, number] = t - t[0]
-        elif name not in column or column[name] in frame:
-            values[:, number] = _columns(frame, [column.get(name, name)], where)[:, 0]
+        elif logged in columns:
+            values[:, number] = columns[logged]
+        elif name not in column:
+            raise _no_column(name, "ingest/samples.parquet")
     return values
 
 
 def _is_smooth(device: Device, name: str) -> bool:
     return name in device.forces or name in device.channels
-
-
-def _columns(frame: pd.DataFrame, names: Sequence[str], where: str) -> Array:
-    for name in names:
-        if name not in frame:
-            raise _no_column(name, where)
-    return np.array(frame[list(names)], dtype=float)  # a copy: one column alone is read-only
 
 
 def _no_column(name: str, where: str) -> InputError:
