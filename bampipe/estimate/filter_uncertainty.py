@@ -27,7 +27,6 @@ def sandwich_covariance(
     n_states: int,
     theta: Array,
     covariance: Array,
-    block_s: float,
 ) -> tuple[Array, int]:
     """Covariance of the filter's final parameters from the scatter of blocks of time.
 
@@ -38,11 +37,10 @@ def sandwich_covariance(
     which no block says anything.
 
     Args:
-        trials: filtered trials in order, parameters not walking.
+        trials: filtered trials in order, at the ends of blocks, parameters not walking.
         n_states: length of the state in front of the parameters.
         theta: (nt,) parameters before the first of them, on the scale of estimation;
             covariance: (nt, nt).
-        block_s: shortest length of a block, s; the last of a trial takes the rest.
 
     Returns:
         (nt, nt) covariance on the scale of estimation, and the number of blocks. With no more
@@ -52,7 +50,7 @@ def sandwich_covariance(
     vector = information @ theta
     gains: list[tuple[Array, Array]] = []
     for trial in trials:
-        for row in _block_ends(trial.t, block_s):
+        for row in range(trial.t.size):
             after = np.linalg.inv(trial.covariance[row][n_states:, n_states:])
             end = after @ trial.mean[row][n_states:]
             gains.append((after - information, end - vector))
@@ -86,7 +84,7 @@ def leave_out(
     its parameters and the filter near its answer throughout.
 
     Args:
-        trials: filtered, in order, parameters not walking; groups: of each of them.
+        trials: as of `sandwich_covariance`; groups: of each of them.
         n_states, theta, covariance: as of `sandwich_covariance`.
     """
     information = np.linalg.inv(covariance)
@@ -105,11 +103,16 @@ def leave_out(
     }
 
 
-def _block_ends(t: Array, block_s: float) -> list[int]:
-    """Rows at which blocks of at least ``block_s`` end; the last row always is one."""
+def at_block_ends(trial: Stored, block_s: float) -> Stored:
+    """Return what is stored of a trial where blocks of time end; the last sample ends one.
+
+    Args:
+        trial: filtered; block_s: shortest length of a block, s; the last takes the rest.
+    """
+    t = trial.t
     count = max(1, int((t[-1] - t[0]) / block_s))
-    ends = np.searchsorted(t, t[0] + block_s * np.arange(1, count))
-    return [*(int(end) for end in ends), len(t) - 1]
+    rows = np.append(np.searchsorted(t, t[0] + block_s * np.arange(1, count)), len(t) - 1)
+    return Stored(t[rows], trial.mean[rows], trial.covariance[rows])
 
 
 def climb(

@@ -88,13 +88,17 @@ def find_drift(
         why = "A machine prescribes the motion, and the force is what that takes."
         return {axis: AxisDrift(unit=unit, horizons=(), reason=why) for axis, unit in axes}
     chosen = [k for k, counts in enumerate(judged) if counts] or range(len(motions))
+    starts = _STARTS_OF_ROBOT if system.model.device.robot is not None else _STARTS
+    if len(chosen) > starts:  # one from each of so many, spread over the session
+        chosen = [chosen[i] for i in np.linspace(0, len(chosen) - 1, starts).round().astype(int)]
     usable = [max(motions[k].t[-1] - motions[k].t[0] - 2.0 * _MARGIN_S, 0.0) for k in chosen]
-    robot = system.model.device.robot is not None
-    spacing = sum(usable) / (_STARTS_OF_ROBOT if robot else _STARTS)
+    spacing = sum(usable) / starts
     windows = [
         window
         for k, length in zip(chosen, usable, strict=True)
-        for window in _windows(system, motions[k], parameters[k], length, spacing)
+        for window in _windows(
+            system, motions[k], parameters[k], length, length if len(chosen) == starts else spacing
+        )
     ]
     found = {axis: AxisDrift(unit=unit, horizons=()) for axis, unit in axes}
     for horizon in HORIZONS_S:

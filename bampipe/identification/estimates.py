@@ -33,7 +33,7 @@ from bampipe.results.identify import (
 )
 from bampipe.results.intervals import NORMAL_95
 from bampipe.results.rounding import round_with_sd
-from bampipe.trials.motion import Motion
+from bampipe.trials.motion import Motion, trial_names
 
 Array = NDArray[np.float64]
 
@@ -222,7 +222,7 @@ def collect_result(
         effects=effects,
         influence=influence,
         covariance=Covariance(names=names, matrix=estimate.covariance.tolist()),
-        trials=tuple(motion.trial_id for motion in motions),
+        trials=tuple(trial_names(motions)),
         identifiability=identifiability,
         base_parameters=base_parameters,
         notes=(
@@ -262,12 +262,13 @@ def _assess_influence(
     worst = find_worst_stretch(estimate.problem, raw, _STRETCH_S)
     count = len(names)
     place = int(np.argmax(np.abs(worst.move[:count])))
-    trial, move = motions[worst.trial].trial_id, float(worst.move[place])
+    trials = trial_names(motions)
+    trial, move = trials[worst.trial], float(worst.move[place])
     stands_out = abs(move) > max(_MOVES, _OUTLYING * float(worst.typical[place]))
     return Influence(
         trials={
-            motion.trial_id: dict(zip(names, (float(x) for x in row), strict=True))
-            for motion, row in zip(motions, moved, strict=True)
+            name: dict(zip(names, (float(x) for x in row), strict=True))
+            for name, row in zip(trials, moved, strict=True)
         },
         worst_second=WorstSecond(
             trial=trial,

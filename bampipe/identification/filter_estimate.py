@@ -47,7 +47,7 @@ from bampipe.progress import Progress
 from bampipe.trials.bias import UnbiasedFit
 from bampipe.trials.cache import TrialCache
 from bampipe.trials.folds import Folds
-from bampipe.trials.motion import Motion
+from bampipe.trials.motion import Motion, trial_names
 
 Array = NDArray[np.float64]
 
@@ -151,12 +151,14 @@ def estimate_by_filter(
         sd = np.hypot(slope * np.sqrt(np.diag(found.covariance)), known)
         return bool(np.all(np.abs(value - answer)[:count] < _AGREE * sd[:count]))
 
+    trial_ids = trial_names(motions)
+
     def report_progress(done: int, place: int) -> None:
-        progress(0.35 + 0.6 * done / (len(trials) + 1), motions[place].trial_id)
+        progress(0.35 + 0.6 * done / (len(trials) + 1), trial_ids[place])
 
     def lost_error(what: str, place: int) -> MotionLost:
         remedy = "try --method least-squares, or set the trial aside if its sensors jumped there"
-        message = what.format(motions[place].trial_id)
+        message = what.format(trial_ids[place])
         return MotionLost(message, where=f"model {model_name}", remedy=remedy)
 
     def run_from(attempts: Sequence[Attempt], settings: FilterSettings) -> FilterRun:
@@ -170,11 +172,7 @@ def estimate_by_filter(
         finer = _choose_longest_step(found, model, trials[0])
         found = _repeat_until_settled(found, model, finer, run_from)
     covariance, blocks = sandwich_covariance(
-        found.trials,
-        model.n_states,
-        found.search.theta,
-        found.search.covariance,
-        choice.block_s,
+        found.ends, model.n_states, found.search_theta, found.search_covariance
     )
     value, slope = model.to_physical(constrain(model, found.theta, covariance))
     scaled = covariance * np.outer(slope, slope)
@@ -189,7 +187,7 @@ def estimate_by_filter(
     nis = tabulate_nis(found, motions)
     report = {
         "nis": nis,
-        "innovations": innovation_tests(system, found, trials, clear_by_axis),
+        "innovations": innovation_tests(system, found, clear_by_axis),
         "noise": noise_levels(system, found.settings, noise),
         "input_timing": input_timing(p, problem, scaled),
         "blocks": blocks,
@@ -228,8 +226,9 @@ def _leave_out(
     if folds.nothing_held_out:
         return [p] * len(folds.groups)
     groups = [folds.groups[place] for place in found.order]
-    search = found.search
-    without = leave_out(found.trials, groups, model.n_states, search.theta, search.covariance)
+    without = leave_out(
+        found.ends, groups, model.n_states, found.search_theta, found.search_covariance
+    )
     parameters = {}
     for group, theta in without.items():
         value, _ = model.to_physical(constrain(model, theta, covariance))

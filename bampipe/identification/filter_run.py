@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError
+from bampipe.estimate.filter_uncertainty import at_block_ends
 from bampipe.estimate.innovations import average_stretches
 from bampipe.estimate.unscented import (
     FilteredTrial,
@@ -24,7 +25,7 @@ from bampipe.estimate.unscented import (
 from bampipe.identification.filter_choice import FilterChoice
 from bampipe.identification.sensor_noise import Noise
 from bampipe.physics import System
-from bampipe.trials.motion import Motion
+from bampipe.trials.motion import Motion, trial_sizes
 from bampipe.trials.reading import input_columns, read_samples
 
 Array = NDArray[np.float64]
@@ -56,22 +57,31 @@ Attempt = tuple[Array, Array, float]
 
 
 @dataclass(frozen=True)
-class Pass(Stored):
+class Pass:
     """A filtered trial without its samples, so that memory does not grow with the log.
 
     Attributes:
+        t: (R,) times, s: every ``stride``-th sample.
+        mean: (R, n) state and parameters on the scale of estimation; variance: (R, n).
+        ends: distributions at the ends of blocks of time.
         nis: mean normalised innovation squared; counted: over so many samples.
         log_likelihood: of all readings, each given those before.
         ratio: (ny,) root mean square of each innovation in its standard deviation.
         stretches: (K, ny) means of innovations in their standard deviations over ``STRETCH_S``,
-            NaN where one is missing.
+            NaN where one is missing; inputs: (K, nu) those of the inputs; stretch_samples: in one.
     """
 
+    t: Array
+    mean: Array
+    variance: Array
+    ends: Stored
     nis: float
     counted: int
     log_likelihood: float
     ratio: Array
     stretches: Array
+    inputs: Array
+    stretch_samples: int
 
 
 @dataclass(frozen=True)
@@ -80,8 +90,10 @@ class FilterRun:
 
     Attributes:
         search: the first pass over the first trial.
+        search_theta: (nt,) parameters after it, on the scale of estimation; search_covariance:
+            (nt, nt).
         trials: the main passes over all trials in ``order``.
-        theta: (nt,) parameters after them, on the scale of estimation; covariance: (nt, nt).
+        theta: (nt,) parameters after them; covariance: (nt, nt).
         settings: noise levels of the main pass.
         order: indices of ``trials`` in the session.
         restarts: attempts that failed before.
@@ -89,7 +101,9 @@ class FilterRun:
         first: passes before that, of the run from the real start; empty where there is one run.
     """
 
-    search: FilterOutcome
+    search: Pass
+    search_theta: Array
+    search_covariance: Array
     trials: tuple[Pass, ...]
     theta: Array
     covariance: Array
@@ -97,12 +111,17 @@ class FilterRun:
     order: tuple[int, ...]
     restarts: int
     repeats: int = 0
-    first: tuple[Stored, ...] = ()
+    first: tuple[Pass, ...] = ()
 
     @property
-    def passes(self) -> tuple[Stored, ...]:
+    def ends(self) -> list[Stored]:
+        """The main passes at the ends of blocks of time."""
+        return [one.ends for one in self.trials]
+
+    @property
+    def passes(self) -> tuple[Pass, ...]:
         """All passes over trials of the first run and of the last, the search of each first."""
-        return (*self.first, *self.search.trials, *self.trials)
+        return (*self.first, self.search, *self.trials)
 
     @property
     def steps(self) -> tuple[int, ...]:
@@ -117,7 +136,7 @@ class FilterRun:
 
 def choose_stride(motions: Sequence[Motion]) -> int:
     """Return every how many samples the filter stores its distribution."""
-    sizes = [motion.t.size for motion in motions]
+    sizes = trial_sizes(motions)
     return max(-(-max(sizes) // _STORED), -(-sum(sizes) // _STORED_IN_ALL))
 
 
@@ -296,14 +315,18 @@ def run_filter(
                 trial = trials[place]
                 one = engine(model, [trial], theta, covariance, level)
                 theta, covariance = one.theta, one.covariance
-                passes.append(_summarise_pass(one.trials[0], trial))
+                passes.append(_summarise_pass(one.trials[0], trial, choice.block_s))
                 report_progress(done, place)
                 if _is_lost(passes[-1]):
                     break  # whatever the other trials say
         except FilterFailure as lost_motion:
             failure = (place, lost_motion)
             continue
-        found = FilterRun(search, tuple(passes), theta, covariance, level, order, restarts)
+        found = FilterRun(
+            _summarise_pass(search.trials[0], trials[0], choice.block_s),
+            search.theta, search.covariance, tuple(passes),
+            theta, covariance, level, order, restarts,
+        )  # fmt: skip
         if not _is_lost(passes[-1]):
             if agrees(found):
                 return found
@@ -327,25 +350,24 @@ def _is_lost(one: Pass) -> bool:
     return not one.nis / len(one.ratio) < _LARGEST_NIS
 
 
-def _summarise_pass(filtered: FilteredTrial, trial: Trial) -> Pass:
+def _summarise_pass(filtered: FilteredTrial, trial: Trial, block_s: float) -> Pass:
     """What later steps need of a filtered trial."""
     size = np.asarray(filtered.innovation / filtered.innovation_sd)
     present = ~np.isnan(filtered.nis)
+    samples = max(1, round(STRETCH_S / float(np.median(np.diff(trial.t)))))
     return Pass(
         t=filtered.t,
         mean=filtered.mean,
-        covariance=filtered.covariance,
+        variance=np.diagonal(filtered.covariance, axis1=1, axis2=2).copy(),
+        ends=at_block_ends(filtered, block_s),
         nis=float(filtered.nis[present].mean()) if present.any() else np.inf,
         counted=int(present.sum()),
         log_likelihood=float(np.nansum(filtered.log_likelihood)),
         ratio=np.sqrt(np.nanmean(size**2, axis=0)),
-        stretches=average_stretches(size, samples_per_stretch(trial)),
+        stretches=average_stretches(size, samples),
+        inputs=average_stretches(trial.u, samples),
+        stretch_samples=samples,
     )
-
-
-def samples_per_stretch(trial: Trial) -> int:
-    """Return the number of samples in ``STRETCH_S``."""
-    return max(1, round(STRETCH_S / float(np.median(np.diff(trial.t)))))
 
 
 def _engine(choice: FilterChoice) -> Callable[..., FilterOutcome]:

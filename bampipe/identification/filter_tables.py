@@ -8,11 +8,11 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from bampipe.estimate.unscented import FilterModel, Stored
-from bampipe.identification.filter_run import FilterRun
+from bampipe.estimate.unscented import FilterModel
+from bampipe.identification.filter_run import FilterRun, Pass
 from bampipe.physics import System
 from bampipe.results.identify import Consistency, Convergence, StateBound
-from bampipe.trials.motion import Motion
+from bampipe.trials.motion import Motion, trial_names
 
 Array = NDArray[np.float64]
 
@@ -20,8 +20,9 @@ Array = NDArray[np.float64]
 def tabulate_nis(found: FilterRun, motions: Sequence[Motion]) -> Consistency:
     """Return the normalised innovation squared: near 1 where the noise levels are right."""
     size = found.settings.observed.size
+    names = trial_names(motions)
     by_trial = {
-        motions[place].trial_id: trial.nis / size
+        names[place]: trial.nis / size
         for place, trial in zip(found.order, found.trials, strict=True)
     }
     counts = [trial.counted for trial in found.trials]
@@ -29,12 +30,10 @@ def tabulate_nis(found: FilterRun, motions: Sequence[Motion]) -> Consistency:
     return Consistency(mean=total / size, by_trial=by_trial)
 
 
-def state_3sigma(system: System, trials: Sequence[Stored]) -> dict[str, StateBound]:
+def state_3sigma(system: System, trials: Sequence[Pass]) -> dict[str, StateBound]:
     """Return three standard deviations of position and velocity, median over time (Table VI)."""
     n = len(system.coordinates)
-    variance = np.concatenate(
-        [np.diagonal(trial.covariance, axis1=1, axis2=2)[:, : 2 * n] for trial in trials]
-    )
+    variance = np.concatenate([trial.variance[:, : 2 * n] for trial in trials])
     bound = 3.0 * np.sqrt(np.median(variance, axis=0))
     return {
         axis: StateBound(position=bound[i], velocity=bound[n + i])
@@ -66,7 +65,7 @@ def convergence(
     return Convergence(settled_s=settled, total_s=total, converged=converged)
 
 
-def _elapsed(passes: Sequence[Stored]) -> list[Array]:
+def _elapsed(passes: Sequence[Pass]) -> list[Array]:
     """Return the time of each pass, counted from the start of the first."""
     clock, times = 0.0, []
     for trial in passes:
@@ -96,7 +95,7 @@ def tabulate_states(
     for place, trial in zip(found.order, found.trials, strict=True):
         keep = _thinned(trial.t.size, rows)
         t, mean = trial.t[keep], trial.mean[keep]
-        sd = np.sqrt(np.diagonal(trial.covariance[keep], axis1=1, axis2=2))
+        sd = np.sqrt(trial.variance[keep])
         columns = {}
         for i, axis in enumerate(system.coordinates):
             columns[f"q_{axis}"], columns[f"q_sd_{axis}"] = mean[:, i], sd[:, i]
@@ -158,14 +157,15 @@ def tabulate_trace(
         found: the passes.
     """
     frames = []
+    trial_ids = trial_names(motions)
     passes = zip(found.steps, found.passes, _elapsed(found.passes), strict=True)
     for place, (step, trial, elapsed) in enumerate(passes):
         keep = _thinned(trial.t.size, rows)
         value, slope = model.to_physical(trial.mean[keep, model.n_states :])
         value = np.clip(value, model.lower, model.upper)
-        variance = np.diagonal(trial.covariance[keep], axis1=1, axis2=2)[:, model.n_states :]
+        variance = trial.variance[keep, model.n_states :]
         run = int(bool(found.first) and place >= len(found.first))
-        columns = {"t_total": elapsed[keep], "trial_id": motions[step].trial_id, "run": run}
+        columns = {"t_total": elapsed[keep], "trial_id": trial_ids[step], "run": run}
         frame = pd.DataFrame(columns)
         for k, name in enumerate(names):
             frame[name] = value[:, k]

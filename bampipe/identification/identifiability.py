@@ -29,7 +29,7 @@ from bampipe.results.identify import (
     TrialGrowth,
     WeakDirection,
 )
-from bampipe.trials.motion import Motion
+from bampipe.trials.motion import Motion, trial_names
 
 Array = NDArray[np.float64]
 
@@ -107,10 +107,10 @@ def assess_identifiability(
     place = np.ix_(estimated, estimated)
     parameters = {names[i]: _entry(own, covariance, i, names) for i in estimated}
     trials = {
-        motion.trial_id: TrialGrowth(
+        name: TrialGrowth(
             growth=min(row.max(initial=0.0), 1e9), parameter=names[estimated[int(np.argmax(row))]]
         )
-        for motion, row in zip(motions, growth, strict=True)
+        for name, row in zip(trial_names(motions), growth, strict=True)
     }
     report = IdentifiabilityReport(
         parameters=parameters,

@@ -13,8 +13,7 @@ from bampipe.estimate.innovations import (
     check_independence,
     check_whiteness,
 )
-from bampipe.estimate.unscented import Trial
-from bampipe.identification.filter_run import STRETCH_S, FilterRun, samples_per_stretch
+from bampipe.identification.filter_run import STRETCH_S, FilterRun
 from bampipe.physics import System
 from bampipe.results.identify import Independence, InnovationTests, Whiteness
 
@@ -30,24 +29,21 @@ _SIGNIFICANT = 0.01
 def innovation_tests(
     system: System,
     found: FilterRun,
-    trials: Sequence[Trial],
     moving: Sequence[NDArray[np.bool_]],
 ) -> dict[str, InnovationTests]:
     """Return both tests for each position channel, and a sentence on each.
 
     Args:
-        system: the model; found: the filter's; trials: as it was given them.
+        system: the model; found: the filter's.
         moving: by trial, (T, n_q) where each axis is clear of standstill and reversal.
     """
     n = len(system.coordinates)
     channels = [i for i, name in enumerate(system.inputs) if name != "t"]
     by_trial, inputs = [], []
     for place, trial in zip(found.order, found.trials, strict=True):
-        given = trials[place]
-        length = samples_per_stretch(given)
-        clear = average_stretches(moving[place].astype(float), length) == 1.0
+        clear = average_stretches(moving[place].astype(float), trial.stretch_samples) == 1.0
         by_trial.append(np.where(clear, trial.stretches[:, :n], np.nan))
-        inputs.append(average_stretches(given.u[:, channels], length))
+        inputs.append(trial.inputs[:, channels])
     tests = {}
     for axis in range(n):
         records = [stretches[:, axis] for stretches in by_trial]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,7 @@ def estimate_by_least_squares(
 ) -> Estimate:
     """Return the least-squares estimate; its trace is the fit to the trials so far."""
     problem, raw = squares.problem, squares.raw
+    unbiased = replace(raw, covariance=squares.covariance)
     shift = 0.0 if squares.bias is None else squares.bias
 
     def rows() -> list[dict[str, object]]:
@@ -40,7 +42,7 @@ def estimate_by_least_squares(
 
     residual_sd = dict(zip(system.coordinates, raw.residual_sd, strict=True))
     return estimate_of_fit(
-        "least-squares", system, motions, problem, raw, squares.p,
+        "least-squares", system, motions, problem, unbiased, squares.p,
         _leave_out(squares, folds), bias_details(squares), rows, residual_sd=residual_sd,
     )  # fmt: skip
 

@@ -153,9 +153,13 @@ def _disagreement(one: Estimate, other: Estimate, squares: UnbiasedFit) -> Array
     A fit to filtered motions can move by many times what the truth does, so that this does not say
     how far the two are apart.
     """
-    variance = one.sd**2 + other.sd**2
-    difference = np.abs(one.value - other.value)
     by_squares = [each.method == "least-squares" for each in (one, other)]
+    variance = one.sd**2 + other.sd**2
+    if any(by_squares):
+        # That their bias is of some trials only is no reason to trust the other more.
+        drawn = np.diag(squares.covariance - squares.raw.covariance)
+        variance -= drawn[: len(variance)]
+    difference = np.abs(one.value - other.value)
     if not squares.problem.linear and any(by_squares) and np.any(difference**2 > variance):
         # An answer that cannot be replayed is all the more in doubt.
         with suppress(InputError):

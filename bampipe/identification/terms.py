@@ -16,6 +16,7 @@ from bampipe.physics.readable import model_equations
 from bampipe.results.identify import Covariance
 from bampipe.results.intervals import NORMAL_95
 from bampipe.results.terms import EffectText, ModelTerm, TermCurve, TermsResult
+from bampipe.trials.draw import draw_trials
 from bampipe.trials.residuals import Evidence
 
 Array = NDArray[np.float64]
@@ -54,13 +55,18 @@ def describe_terms(evidence: Evidence, p: Array, covariance: Covariance, model: 
     """Return the equations of a model with its numbers, and the curve of each term.
 
     A curve is the force that the term takes: the residual of the model without it minus that of the
-    model, both low-passed, in bins of the variable that explains most of its variance.
+    model, both low-passed, in bins of the variable that explains most of its variance. Of a long
+    session, trials drawn from all are binned (`draw_trials`).
 
     Args:
         evidence: of the model on its trials; p: its parameters as published, (n_p,).
         covariance: of the estimates; model: its name.
     """
     system = evidence.system
+    error = evidence.rmse()
+    chosen = draw_trials(evidence.sizes)
+    if len(chosen) < len(evidence.motions):
+        evidence = evidence.subset(chosen)
     values = {item.name: float(value) for item, value in zip(system.parameters, p, strict=True)}
     try:
         equations = model_equations(system.model, values)
@@ -79,7 +85,7 @@ def describe_terms(evidence: Evidence, p: Array, covariance: Covariance, model: 
                 name=part.name,
                 text=part.text,
                 parameters=tuple(system.parameters[i].name for i in part.parameters),
-                curves=tuple(_curves(evidence, p, present, covariance, part, known)),
+                curves=tuple(_curves(evidence, p, present, error, covariance, part, known)),
             )
             for part in _parts(system)
         ),
@@ -116,6 +122,7 @@ def _curves(
     evidence: Evidence,
     p: Array,
     present: Array,
+    error: Array,
     covariance: Covariance,
     part: _Part,
     known: dict[int, list[Variable]],
@@ -136,7 +143,6 @@ def _curves(
         step = _STEP * max(abs(p[i]), system.parameters[i].sd, 1e-12)
         moved[i] += step
         slopes.append((present - _residual(evidence, moved)) / step)
-    error = evidence.rmse()
     for axis, name in enumerate(system.coordinates):
         use = np.concatenate([u[:, axis] for u in evidence.used]) > 0
         own = force[use, axis]

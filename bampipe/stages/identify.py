@@ -46,6 +46,7 @@ from bampipe.schema import STRICT, Positive
 from bampipe.trials.bias import UnbiasedFit, remove_bias
 from bampipe.trials.folds import Folds
 from bampipe.trials.measured import read_measured_trials
+from bampipe.trials.motion import trial_names
 from bampipe.trials.reading import (
     read_band,
     read_kinematics,
@@ -132,7 +133,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     squares, notes = make_possible(system, squares)
     near = raw.p[: len(start)]
     noise = sensor_noise(sensors, system, motions, near, config)
-    names = [motion.trial_id for motion in motions]
+    names = trial_names(motions)
     folds = Folds.of_trials(names, (), names)
     estimates: list[Estimate] = []
     lost = ""

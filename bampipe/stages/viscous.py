@@ -176,7 +176,7 @@ def _estimated(
     estimate, slope = model.to_physical(found.theta)
     names = [item.name for item in free]
     field = [i for i, name in enumerate(names) if name.startswith(f"{FIELD}.")]
-    field_sd, blocks = _block_sd(found, model.n_states, field, config.block_s)
+    field_sd, blocks = _block_sd(found, model.n_states, field)
     spread = slope[field] * field_sd
     friction = _device_damping(system, motions, start)
     directions = {}
@@ -202,9 +202,7 @@ def _estimated(
     return result, frame
 
 
-def _block_sd(
-    found: FilterRun, n_states: int, field: Sequence[int], block_s: float
-) -> tuple[Array, int]:
+def _block_sd(found: FilterRun, n_states: int, field: Sequence[int]) -> tuple[Array, int]:
     """Return standard deviations of the ``field`` from the scatter of blocks, and their number.
 
     Identified parameters are known so much better than the field that these trials hardly move
@@ -213,16 +211,12 @@ def _block_sd(
     scale = np.sqrt(np.diag(found.covariance))
     all_scales = np.concatenate([np.ones(n_states), scale])
     both = np.outer(all_scales, all_scales)
-    trials = [
-        replace(trial, mean=trial.mean / all_scales, covariance=trial.covariance / both)
-        for trial in found.trials
+    ends = [
+        replace(one, mean=one.mean / all_scales, covariance=one.covariance / both)
+        for one in found.ends
     ]
     covariance, blocks = sandwich_covariance(
-        trials,
-        n_states,
-        found.search.theta / scale,
-        found.search.covariance / np.outer(scale, scale),
-        block_s,
+        ends, n_states, found.search_theta / scale, found.search_covariance / np.outer(scale, scale)
     )
     return scale[field] * np.sqrt(np.diag(covariance)[field]), blocks
 

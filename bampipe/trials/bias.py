@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from bampipe.errors import InputError
 from bampipe.estimate.least_squares import LeastSquares, Problem, fit
 from bampipe.physics import System
+from bampipe.trials.draw import draw_trials
 from bampipe.trials.kinematics import Kinematics
-from bampipe.trials.motion import Motion
+from bampipe.trials.motion import Motion, trial_sizes
 from bampipe.trials.replay import UNLIKE, StandIn, replay_motions
 from bampipe.trials.residuals import problem_of
 from bampipe.trials.sensors import Sensors
@@ -37,6 +38,8 @@ class UnbiasedFit:
         problem: what was fitted.
         bias_at: (n_p + 1,) parameters to their bias (n_free,), by a replay, which may raise
             :class:`InputError`; None where there is no bias.
+        drawn_covariance: (n_free, n_free) of the bias of the trials drawn for it about that of all;
+            zero where all were replayed, and None where there is no bias.
     """
 
     raw: LeastSquares
@@ -44,6 +47,14 @@ class UnbiasedFit:
     bias: Array | None
     problem: Problem
     bias_at: Callable[[Array], Array] | None = None
+    drawn_covariance: Array | None = None
+
+    @property
+    def covariance(self) -> Array:
+        """(n_free, n_free) of the parameters without bias."""
+        if self.drawn_covariance is None:
+            return self.raw.covariance
+        return self.raw.covariance + self.drawn_covariance
 
     def gap(self, p: Array) -> Array:
         """Return how far the fit would be from what it is if ``p`` (n_p + 1,) were true, (n_free,).
@@ -73,7 +84,8 @@ def remove_bias(
     noise there: its noise adds scatter, not bias. Where the model is nonlinear in its parameters
     and the bias is large, it is not that at the answer: those parameters are looked for whose
     replay is fitted as the measurement is (indirect inference, Gourieroux, Monfort and Renault
-    1993).
+    1993). Of a long session, trials drawn from all are replayed; how far their bias may be from
+    that of all is given as a covariance.
 
     Args:
         sensors: that read the trials; kinematics: the filters they went through.
@@ -83,22 +95,28 @@ def remove_bias(
     count = len(system.parameters)
     timing = bool(free[-1] == count)
 
-    known: dict[bytes, Array] = {}
+    drawn = draw_trials(trial_sizes(motions))
+    left_out = 1.0 - len(drawn) / len(motions)
+    replayed = [motions[number] for number in drawn] if left_out else motions
+    known: dict[bytes, LeastSquares] = {}
 
     def bias_at(p: Array) -> Array:
+        return np.asarray((refit(p).p - np.append(p[:count], 0.0))[free])
+
+    def refit(p: Array) -> LeastSquares:
         if p.tobytes() not in known:
-            known[p.tobytes()] = replayed_bias(p)
+            known[p.tobytes()] = fit_replay(p)
         return known[p.tobytes()]
 
-    def replayed_bias(p: Array) -> Array:
+    def fit_replay(p: Array) -> LeastSquares:
         replays = replay_motions(
-            StandIn(system, p[:count], motions, sensors.rate_hz), sensors, kinematics, (0, 0),
+            StandIn(system, p[:count], replayed, sensors.rate_hz), sensors, kinematics, (0, 0),
             force_noise=False, alone=True,
         )  # fmt: skip
         again = fit(problem_of(system, replays, problem.band, timing=timing), raw.p)
         if np.any(again.residual_sd > UNLIKE * raw.residual_sd):
             raise InputError("the replay of the model does not resemble the machine")
-        return np.asarray((again.p - np.append(p[:count], 0.0))[free])
+        return replace(again, stacked=())
 
     def moved(bias: Array) -> Array:
         p = raw.p.copy()
@@ -113,7 +131,8 @@ def remove_bias(
         return UnbiasedFit(raw, raw.p, None, problem)
     # A large bias of a nonlinear model changes on the way to the answer, by some bias^2 / p.
     sd = np.sqrt(np.diag(raw.covariance))
-    found = UnbiasedFit(raw, moved(bias), bias, problem, bias_at)
+    about_all = left_out * refit(raw.p).covariance
+    found = UnbiasedFit(raw, moved(bias), bias, problem, bias_at, about_all)
     if not problem.linear and np.any((bias**2 > sd * np.abs(raw.p[free]))[free < count]):
         bias = _settled(found, bias, moved)
         found = replace(found, p=moved(bias), bias=bias)

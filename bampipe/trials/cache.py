@@ -20,6 +20,7 @@ class TrialCache(Sequence[Item], Generic[Item]):
         count: number of items.
         samples: size of an item, in samples.
         most: samples in memory at most; the item used last always stays.
+        names: of the items, where they are known without fetching any.
     """
 
     def __init__(
@@ -28,13 +29,16 @@ class TrialCache(Sequence[Item], Generic[Item]):
         count: int,
         samples: Callable[[Any], int],
         most: int = MOST_SAMPLES,
+        names: Sequence[str] = (),
     ) -> None:
+        self.names = tuple(names)
         self._fetch = fetch
         self._count = count
         self._samples = samples
         self._most = most
         self._size = 0
         self._items: OrderedDict[int, Item] = OrderedDict()
+        self._sizes: dict[int, int] = {}
 
     def __len__(self) -> int:
         return self._count
@@ -55,10 +59,16 @@ class TrialCache(Sequence[Item], Generic[Item]):
             self._items.move_to_end(place)
             return self._items[place]
         item = self._fetch(place)
-        size = self._samples(item)
+        size = self._sizes[place] = self._samples(item)
         while self._items and self._size + size > self._most:
             _, old = self._items.popitem(last=False)
             self._size -= self._samples(old)
         self._items[place] = item
         self._size += size
         return item
+
+    def size(self, place: int) -> int:
+        """Samples of the item at a place, which is fetched if it never was."""
+        if place not in self._sizes:
+            _ = self[place]
+        return self._sizes[place]

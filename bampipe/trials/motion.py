@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.physics.device import INPUT_ORDERS, derivative
+from bampipe.trials.cache import TrialCache
 
 Array = NDArray[np.float64]
 
@@ -96,3 +97,17 @@ def input_derivatives(name: str) -> tuple[str, ...]:
 def n_samples(motion: Motion) -> int:
     """Return the number of samples of a trial."""
     return int(motion.t.size)
+
+
+def trial_sizes(motions: Sequence[Motion]) -> list[int]:
+    """Return the number of samples of each trial; none is fetched a second time for that."""
+    if isinstance(motions, TrialCache):
+        return [motions.size(place) for place in range(len(motions))]
+    return [n_samples(motion) for motion in motions]
+
+
+def trial_names(motions: Sequence[Motion]) -> list[str]:
+    """Return the names of trials; where they are known, none is fetched for that."""
+    if isinstance(motions, TrialCache) and motions.names:
+        return list(motions.names)
+    return [motion.trial_id for motion in motions]

@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from bampipe.estimate.least_squares import fit
 from bampipe.estimate.low_pass import Band
 from bampipe.trials.bias import remove_bias
+from bampipe.trials.draw import ENOUGH_SAMPLES, draw_trials
 from bampipe.trials.folds import Folds
 from bampipe.trials.kinematics import Kinematics
-from bampipe.trials.motion import Motion
+from bampipe.trials.motion import Motion, trial_sizes
 from bampipe.trials.replay import StandIn, replay_motions
 from bampipe.trials.residuals import Evidence, gather_evidence, problem_of
 from bampipe.trials.sensors import Sensors
@@ -31,11 +32,9 @@ _LIKELY = 1.5
 filtering does to its readings the fit takes on, they do not."""
 _SD_OF_DEVIATION = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation."""
-ENOUGH_SAMPLES, MOST_REPLAYS = 250_000, 6
-"""Replays are repeated until they hold so many samples, but no oftener than this: the floor of a
+MOST_REPLAYS = 6
+"""Replays are repeated until they hold `ENOUGH_SAMPLES`, but no oftener than this: the floor of a
 session of forty thousand samples is then known to about 1 %, and longer ones need fewer."""
-LEAST_DRAWN = 50
-"""Fewest trials that stand for all of a long session: the errors of trials differ by a third."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +62,7 @@ class NoiseFloor:
 
 def floor_replays(motions: Sequence[Motion]) -> int:
     """How many replays of these trials give the floor."""
-    total = sum(motion.t.size for motion in motions)
+    total = sum(trial_sizes(motions))
     return int(np.clip(-(-ENOUGH_SAMPLES // max(total, 1)), 1, MOST_REPLAYS))
 
 
@@ -125,9 +124,8 @@ def find_noise_floor(
     """Return the held-out error that the fitted model leaves when it is the truth.
 
     Every trial is replayed by the model under the measured force and an arm that keeps the motion
-    near the measured one; the replay goes through the same sensors, filters and fits. Of a longer
-    session than `ENOUGH_SAMPLES`, so many are replayed, in `LEAST_DRAWN` trials or more drawn from
-    all.
+    near the measured one; the replay goes through the same sensors, filters and fits. Of a long
+    session, trials drawn from all are replayed (`draw_trials`).
 
     Args:
         evidence: the model, fitted; p: `parameters_to_replay`.
@@ -156,14 +154,10 @@ def _choose_trials(evidence: Evidence) -> list[int]:
 
     Where the session holds trials out, these are few, and all are needed to judge by.
     """
-    sizes = [residual.shape[0] for residual in evidence.residual]
-    everything = list(range(len(sizes)))
-    total = sum(sizes) * evidence.band.step
-    if total <= ENOUGH_SAMPLES or not all(evidence.folds.judged):
+    everything = list(range(len(evidence.motions)))
+    if not all(evidence.folds.judged):
         return everything
-    count = -(-len(sizes) * ENOUGH_SAMPLES // total)
-    drawn = np.random.default_rng(FLOOR_SEED).permutation(len(sizes))[: max(count, LEAST_DRAWN)]
-    chosen = sorted(int(number) for number in drawn)
+    chosen = draw_trials(evidence.sizes)
     folds = evidence.folds.subset(chosen)
     groups = {folds.groups[number] for number in folds.fitted_trials}
     return chosen if len(groups) > 1 else everything

@@ -167,12 +167,13 @@ def read_motions(
         InputError: there is none; on reading one, as :func:`read_motion`.
     """
     names = free_trials(run, fitted=fitted, braked=braked)
+    path = run.require(KINEMATICS, "filter")
 
     def fetch(number: int) -> Motion:
-        motion = read_motion(run, names[number], system, every_input=every_input)
+        motion = read_motion_of(path, names[number], system, every_input=every_input)
         return motion.with_input_timing(late_s)
 
-    return TrialCache(fetch, len(names), n_samples)
+    return TrialCache(fetch, len(names), n_samples, names=names)
 
 
 def require_sound_motions(system: System, motions: Sequence[Motion]) -> None:

@@ -29,7 +29,7 @@ from bampipe.physics import System
 from bampipe.physics.device import derivative
 from bampipe.trials.cache import MOST_SAMPLES, TrialCache
 from bampipe.trials.kinematics import Kinematics
-from bampipe.trials.motion import Motion, Recording, n_samples
+from bampipe.trials.motion import Motion, Recording, n_samples, trial_sizes
 from bampipe.trials.residuals import ModelOnTrial
 from bampipe.trials.sensors import Sensors
 
@@ -234,7 +234,7 @@ def replay_motions(
             rng = np.random.default_rng([*seed, trial])
             yield replay_motion(stand_in, trial, sensors, kinematics, rng, alone=alone)
 
-    if sum(n_samples(motion) for motion in stand_in.motions) <= MOST_SAMPLES:
+    if sum(trial_sizes(stand_in.motions)) <= MOST_SAMPLES:
         return list(replays())
     return store_motions(replays())
 

@@ -8,7 +8,7 @@ goes through one low-pass before anything is fitted, and is thinned to what that
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -197,6 +197,23 @@ class Evidence:
     upper: Array
     precision: Array
     known: Array
+
+    def subset(self, trials: Sequence[int]) -> Evidence:
+        """The same on some trials, given by number, linearised where it is."""
+        return replace(
+            self,
+            motions=[self.motions[k] for k in trials],
+            fitted=tuple(self.fitted[k] for k in trials),
+            folds=self.folds.subset(trials),
+            residual=tuple(self.residual[k] for k in trials),
+            jacobian=tuple(self.jacobian[k] for k in trials),
+            used=tuple(self.used[k] for k in trials),
+        )
+
+    @property
+    def sizes(self) -> list[int]:
+        """Samples of each trial that its residual stands for."""
+        return [len(residual) * self.band.step for residual in self.residual]
 
     @cached_property
     def sums(self) -> NormalEquations:

@@ -10,7 +10,7 @@ import pytest
 from independent_runs import record_trials
 
 from bampipe.discover.chance import system_of
-from bampipe.trials import noise_floor, replay
+from bampipe.trials import draw, noise_floor, replay
 from bampipe.trials.measured import MeasuredTrials
 from bampipe.trials.noise_floor import find_noise_floor
 from bampipe.trials.replay import StandIn, replay_motion
@@ -44,10 +44,10 @@ def test_the_floor_of_a_long_session_comes_from_trials_drawn_from_it(
 
     replay_evidence = noise_floor.replay_evidence
     monkeypatch.setattr(noise_floor, "replay_evidence", counted)
-    monkeypatch.setattr(noise_floor, "LEAST_DRAWN", 2)
+    monkeypatch.setattr(draw, "LEAST_DRAWN", 2)
     floors = []
     for most in (10**6, 1400):
-        monkeypatch.setattr(noise_floor, "ENOUGH_SAMPLES", most)
+        monkeypatch.setattr(draw, "ENOUGH_SAMPLES", most)
         floors.append(
             find_noise_floor(evidence, evidence.p, trials.sensors, trials.kinematics, 0, 3).level
         )

@@ -10,7 +10,7 @@ import pytest
 from plain_filters import filter_by_covariance
 from slider import TRUTH, model, position_only, record, settings
 
-from bampipe.estimate.filter_uncertainty import climb, sandwich_covariance
+from bampipe.estimate.filter_uncertainty import at_block_ends, climb, sandwich_covariance
 from bampipe.estimate.filterpy_engine import filter_trials_by_filterpy
 from bampipe.estimate.sigma_points import SigmaPoints
 from bampipe.estimate.unscented import FilterFailure, Trial, constrain, filter_trials
@@ -117,7 +117,8 @@ def test_intervals_cover_and_innovations_are_consistent() -> None:
         mean, spread = slider.to_estimated(1.2 * TRUTH, 0.5 * TRUTH)
         found = filter_trials(slider, trials, mean, np.diag(spread**2), settings())
         nis.append(np.nanmean(np.concatenate([t.nis for t in found.trials])))
-        covariance, blocks = sandwich_covariance(found.trials, 2, mean, np.diag(spread**2), 2.0)
+        ends = [at_block_ends(trial, 2.0) for trial in found.trials]
+        covariance, blocks = sandwich_covariance(ends, 2, mean, np.diag(spread**2))
         value, slope = slider.to_physical(found.theta)
         sd = slope * np.sqrt(np.diag(covariance))
         covered.append(np.abs(value - TRUTH) < 1.96 * sd)
@@ -140,7 +141,8 @@ def test_a_parameter_of_which_no_block_says_anything_keeps_its_spread() -> None:
     found = filter_trials(
         slider, trials, mean, np.diag(spread**2), settings(walk_sd=np.zeros(value.size))
     )
-    covariance, blocks = sandwich_covariance(found.trials, 2, mean, np.diag(spread**2), 1.0)
+    ends = [at_block_ends(trial, 1.0) for trial in found.trials]
+    covariance, blocks = sandwich_covariance(ends, 2, mean, np.diag(spread**2))
     assert blocks > value.size
     assert np.isfinite(covariance).all()
     assert np.sqrt(covariance[-1, -1]) == pytest.approx(0.05, rel=1e-6)
