@@ -26,21 +26,25 @@ def test_trials_are_held_out_one_by_one_up_to_ten_then_in_ten_groups() -> None:
     assert max(many.count(k) for k in range(10)) - min(many.count(k) for k in range(10)) <= 1
 
 
-def test_a_cache_holds_no_more_than_it_may_and_fetches_the_rest_again() -> None:
+def test_a_cache_holds_all_or_a_tenth_and_fetches_the_rest_again() -> None:
     fetched: list[int] = []
 
     def fetch(place: int) -> list[int]:
         fetched.append(place)
         return [place] * 10
 
-    cache = TrialCache(fetch, 5, len, most=20)
-    assert [item[0] for item in cache] == [0, 1, 2, 3, 4]
+    whole = TrialCache(fetch, 5, len, most=50)
+    assert [item[0] for item in [*whole, *whole]] == 2 * [0, 1, 2, 3, 4]
     assert fetched == [0, 1, 2, 3, 4]
-    assert cache[-1][0] == 4 and cache[3][0] == 3 and len(fetched) == 5
-    assert cache[0][0] == 0 and len(fetched) == 6
+    fetched.clear()
+    cache = TrialCache(fetch, 50, len, most=200)
+    assert [item[0] for item in cache] == list(range(50))
+    assert cache[-1][0] == 49 and cache[48][0] == 48 and len(fetched) == 50
+    assert cache[0][0] == 0 and len(fetched) == 51
     assert [item[0] for item in cache[1:3]] == [1, 2]
+    assert cache.size(40) == 10 and len(fetched) == 53
     with pytest.raises(IndexError):
-        cache[5]
+        cache[50]
     one = TrialCache(fetch, 1, len, most=1)
     assert one[0] is one[0]
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import rfft
 
 from bampipe.estimate.bounded import scaled_eigenbasis
 
@@ -58,14 +59,16 @@ def information(slope: Array, spectrum: Array) -> Array:
         slope: (T, n_q, n) of the residual, zero where an axis stands still.
         spectrum: (T // 2 + 1, n_q) of the residual's noise, positive.
     """
-    transformed = np.fft.rfft(slope, axis=0, norm="ortho")
+    transformed = rfft(slope, axis=0, norm="ortho")
     weight = np.full(len(spectrum), 2.0)  # each bin stands for itself and its negative
     weight[0] = 1.0
     if len(slope) % 2 == 0:
         weight[-1] = 1.0
     scaled = transformed * np.sqrt(weight[:, None] / spectrum)[:, :, None]
     flat = scaled.reshape(-1, slope.shape[2])
-    return np.asarray((flat.conj().T @ flat).real)
+    # As real numbers: of the complex product, nothing but the real part is wanted.
+    parts = [np.ascontiguousarray(part) for part in (flat.real, flat.imag)]
+    return np.asarray(parts[0].T @ parts[0] + parts[1].T @ parts[1])
 
 
 def cramer_rao_bound(matrix: Array) -> Array:

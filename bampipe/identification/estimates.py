@@ -33,13 +33,15 @@ from bampipe.results.identify import (
 )
 from bampipe.results.intervals import NORMAL_95
 from bampipe.results.rounding import round_with_sd
-from bampipe.trials.motion import Motion, trial_names
+from bampipe.trials.motion import Motion, trial_names, trial_sizes
 
 Array = NDArray[np.float64]
 
 MOST_SHOWN = 24
 """Parameters that a headline lists."""
 _STRETCH_S = 1.0
+_STATES = 500_000
+"""Samples, spread over all, that the typical uncertainty of a state is taken from."""
 _MOVES, _OUTLYING = 1.0, 6.0
 """Standard deviations by which the worst second moves a parameter, and times what a typical one
 does, from which on it is said: of hundreds of seconds of Gaussian noise, the worst moves it by 3 to
@@ -148,7 +150,8 @@ def estimate_of_fit(
         held_out, details, report: as of `Estimate`; rows: makes those of its trace.
     """
     count = int(np.sum(problem.free < len(system.parameters)))
-    sd = 3.0 * np.median(np.concatenate([motion.qd_sd for motion in motions]), axis=0)
+    stride = -(-sum(trial_sizes(motions)) // _STATES)
+    sd = 3.0 * np.median(np.concatenate([motion.qd_sd[::stride] for motion in motions]), axis=0)
 
     def tabulate() -> tuple[pd.DataFrame, pd.DataFrame]:
         frames = [as_filtered(system, motion, p[:-1]) for motion in motions]

@@ -9,7 +9,10 @@ from typing import Any, Generic, TypeVar, overload
 Item = TypeVar("Item")
 
 MOST_SAMPLES = 500_000
-"""Most samples in memory, those used last: all of a usual session (0.4 kB each)."""
+"""Most samples in memory: all of a usual session (0.2 kB each)."""
+_SHARE_OF_LONG = 0.1
+"""Of that, those used last, of a session that does not fit: it is gone through from its first trial
+to its last, so that none would still be there when its turn comes again."""
 
 
 class TrialCache(Sequence[Item], Generic[Item]):
@@ -36,6 +39,7 @@ class TrialCache(Sequence[Item], Generic[Item]):
         self._count = count
         self._samples = samples
         self._most = most
+        self._overflown = False
         self._size = 0
         self._items: OrderedDict[int, Item] = OrderedDict()
         self._sizes: dict[int, int] = {}
@@ -60,6 +64,8 @@ class TrialCache(Sequence[Item], Generic[Item]):
             return self._items[place]
         item = self._fetch(place)
         size = self._sizes[place] = self._samples(item)
+        if self._items and self._size + size > self._most and not self._overflown:
+            self._overflown, self._most = True, round(_SHARE_OF_LONG * self._most)
         while self._items and self._size + size > self._most:
             _, old = self._items.popitem(last=False)
             self._size -= self._samples(old)
