@@ -324,13 +324,17 @@ def _fault(name: str, entry: ParameterEstimate) -> str:
 
 def _describe_limit(timing: InputTiming) -> str:
     way = "later" if timing.estimate > 0.0 else "earlier"
+    lacks = (
+        "the model lacks something that shifts the force in time, such as a delay, a lag or"
+        " friction that builds up."
+    )
     if abs(timing.estimate) < NORMAL_95 * timing.sd:
         return (
             f"The timing of the force lies at its limit, {1e3 * timing.limit:.3g} ms {way} than"
             f" logged, half a sample, and is uncertain by {1e3 * timing.sd:.2g} ms: these trials do"
-            " not determine it, or a delay or a lag acts that the model lacks."
+            f" not determine it, or {lacks}"
         )
     return (
         f"The force acts {1e3 * timing.limit:.3g} ms or more {way} than logged, half a sample, all"
-        " that the timing of the samples may be: a delay or a lag acts that the model lacks."
+        f" that the timing of the samples may be: {lacks}"
     )

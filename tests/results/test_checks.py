@@ -87,5 +87,6 @@ def test_each_check_is_heard(where: str, change: dict[str, Any], words: str) -> 
     assert len(found) == 1 and words in found[0]
 
 
-def test_a_timing_that_was_not_estimated_is_at_no_limit() -> None:
-    assert failed(fit={"input_timing": {"estimate": 1e-3, "sd": 0.0}}) == []
+@pytest.mark.parametrize("sd", [0.0, 6e-4])
+def test_a_timing_that_was_not_estimated_or_determined_is_at_no_limit(sd: float) -> None:
+    assert failed(fit={"input_timing": {"estimate": 1e-3, "sd": sd}}) == []

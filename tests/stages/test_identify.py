@@ -334,7 +334,7 @@ def test_innovations_of_the_right_model_pass_and_those_of_a_late_force_do_not(
     content = identified(late)
     note = next(note for note in content["notes"] if "timing of the force" in note)
     assert "at its limit, 1 ms earlier than logged" in note
-    assert "or a delay or a lag acts that the model lacks" in note
+    assert "or the model lacks something that shifts the force in time" in note
     innovations = content["innovations"]
     assert not innovations["yaw"]["inputs"]["independent"]
     assert "Not independent of the inputs" in innovations["yaw"]["sentence"]
