@@ -29,7 +29,7 @@ _LOWEST_LINE = 0.1
 """Cycles a sample from which on a sine is taken off: below, differences take it out themselves."""
 
 
-def white_noise_sd(record: Array, t: Array | None = None) -> float:
+def white_noise_sd(record: Array, t: Array | None = None, step: float = 0.0) -> float:
     """Standard deviation of the white noise on a record (T,) of a signal that is otherwise smooth.
 
     From the median absolute difference, which resists spikes and steps; NaN for records too short
@@ -38,11 +38,12 @@ def white_noise_sd(record: Array, t: Array | None = None) -> float:
     Args:
         record: samples.
         t: (T,) their time stamps, s, which need not be uniform; a uniform record needs none.
+        step: of its counts, 0.0 where its values lie on no grid.
     """
-    return _difference_noise(record, t)
+    return _without_dither(_difference_noise(_dithered(record, step), t), step)
 
 
-def slow_noise_sd(record: Array, t: Array) -> float:
+def slow_noise_sd(record: Array, t: Array, step: float = 0.0) -> float:
     """The same of a record (T,) at stamps ``t`` (T,), thinned to `_SLOWEST_HZ`.
 
     It shows noise that a sensor's own low-pass keeps out of neighbouring samples, and takes a
@@ -53,13 +54,24 @@ def slow_noise_sd(record: Array, t: Array) -> float:
     if every < 2:
         return float("nan")
     length = min(record.size, every * _STRETCH // 4)
+    record = _dithered(record, step)
     starts = np.linspace(0, record.size - length, min(_STRETCHES // 2, record.size // length))
     found = []
     for start in starts.astype(int):
         part = slice(start, start + length)
         clear = _without_lines(record[part], t[part], _LOWEST_LINE / every)
         found.append(_difference_noise(clear[::every], t[part][::every]))
-    return float(np.median(found))
+    return _without_dither(float(np.median(found)), step)
+
+
+def _dithered(record: Array, step: float) -> Array:
+    """A record (T,) spread evenly over its counts: a median of whole counts is a whole count."""
+    return record + step * np.random.default_rng(0).uniform(-0.5, 0.5, record.size)
+
+
+def _without_dither(noise: float, step: float) -> float:
+    """The noise of a record, from that of the dithered one."""
+    return float(np.sqrt(np.maximum(noise**2 - step**2 / 12.0, 0.0)))
 
 
 def _difference_noise(record: Array, t: Array | None) -> float:

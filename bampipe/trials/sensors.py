@@ -42,8 +42,9 @@ class RecordNoise:
         sound = np.isfinite(record)
         stamps = None if t is None else t[sound]
         record = record[sound]
-        slow = float("nan") if stamps is None else slow_noise_sd(record, stamps)
-        return cls(counting_step(record), white_noise_sd(record, stamps), slow)
+        step = counting_step(record)
+        slow = float("nan") if stamps is None else slow_noise_sd(record, stamps, step)
+        return cls(step, white_noise_sd(record, stamps, step), slow)
 
 
 @dataclass(frozen=True)
