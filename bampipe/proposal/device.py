@@ -14,9 +14,10 @@ from bampipe.data.device_file import complete_device, read_device_file
 from bampipe.data.survey import Survey, SurveyedColumn, words
 from bampipe.data.urdf import Branches
 from bampipe.errors import InputError
+from bampipe.estimate.white_noise import counting_step, white_noise_sd
 from bampipe.files import read_toml
 from bampipe.physics import registry
-from bampipe.physics.device import Device
+from bampipe.physics.device import KINDS, Device
 from bampipe.proposal.encoders import measured_position
 from bampipe.proposal.matching import Matcher
 from bampipe.proposal.notes import Notes
@@ -173,7 +174,8 @@ def new_device(folder: Path, match: Matcher, notes: Notes) -> ChosenDevice:
     coil = role == "force" and any(not c.is_constant for c in found.of("current"))
     fit = _rough_fit(position, driver, role, linear, match.t)
     drive = Drive(role, driver.name if driver is not None else "", supply is not None, coil)
-    starter = starter_device(position.name, linear, drive, fit)
+    width = 0.0 if in_counts(position) else _sign_width(position, match.t, linear)
+    starter = starter_device(position.name, linear, drive, fit, width)
     kind = "linear" if linear else "rotary"
     notes.check.append(
         f"{DEVICE}: one {kind} axis '{starter.axis}' driven by a {role}; put in what you know of it"
@@ -191,6 +193,23 @@ def new_device(folder: Path, match: Matcher, notes: Notes) -> ChosenDevice:
         starter.text,
         {name: column for name, column in columns.items() if column is not None},
     )
+
+
+def _sign_width(position: SurveyedColumn, t: np.ndarray, linear: bool) -> float:
+    """Width for the sign of the velocity, rad/s or m/s, where less than the usual; else 0.
+
+    Friction that truly stops an axis is a sign over no width: replays that creep over the usual one
+    leave less at reversals than such a machine, which then seems to lack a Stribeck friction or a
+    compliance. What the encoder tells of slow motion allows as little as the speed of an eighth of
+    a step a sample, where filtered velocities still know the sign.
+    """
+    kind = "linear" if linear else "rotary"
+    unit, _, usual = KINDS[kind]
+    q = position_in_si(position, t, unit)
+    step = counting_step(q)
+    step = max(step, float(np.sqrt(12.0)) * float(np.nan_to_num(white_noise_sd(q, t, step))))
+    width = max(step / float(np.median(np.diff(t))) / 8.0, usual / 10.0)
+    return float(f"{width:.0e}") if width < usual / 2.0 else 0.0
 
 
 def _rough_fit(

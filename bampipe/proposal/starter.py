@@ -39,7 +39,9 @@ class Starter:
     placeholders: tuple[str, ...]
 
 
-def starter_device(position: str, linear: bool, drive: Drive, found: Driven) -> Starter:
+def starter_device(
+    position: str, linear: bool, drive: Drive, found: Driven, sign_width: float = 0.0
+) -> Starter:
     """Write a device file of one axis.
 
     Args:
@@ -47,12 +49,13 @@ def starter_device(position: str, linear: bool, drive: Drive, found: Driven) -> 
         linear: whether the axis slides rather than turns.
         drive: what drives it.
         found: sizes by a rough fit, SI, from which the priors are taken.
+        sign_width: of the sign of the velocity, rad/s or m/s; 0 for the usual one.
     """
     names = [word for word in words(position) if word not in _TAKEN and len(word) > 2]
     axis = Axis(names[0] if names else ("carriage" if linear else "joint"), linear)
     source = input_of(axis, drive)
     sections = [
-        _coordinate(axis, drive),
+        _coordinate(axis, drive, sign_width),
         source.constants,
         _energy(axis, found),
         _torque(axis, drive.coil),
@@ -69,8 +72,10 @@ def starter_device(position: str, linear: bool, drive: Drive, found: Driven) -> 
     return Starter(text, axis.name, source.name, source.placeholders)
 
 
-def _coordinate(axis: Axis, drive: Drive) -> str:
-    width = f"sign_width = {_YIELDS:g}                  # a fluid yields over some mm/s\n"
+def _coordinate(axis: Axis, drive: Drive, sign_width: float) -> str:
+    width = f"sign_width = {sign_width:g}  # guess: the encoder tells speeds as low\n"
+    if drive.coil:
+        width = f"sign_width = {_YIELDS:g}                  # a fluid yields over some mm/s\n"
     return f"""# Proposed by `bampipe init`: one axis with inertia and friction
 schema = "bampipe.device/1"
 name = "{axis.name}"
@@ -80,7 +85,7 @@ source = "fill in"
 [coordinates.{axis.name}]
 kind = "{axis.kind}"
 symbol = "{axis.name[0]}"
-{width if drive.coil else ""}"""
+{width if drive.coil or sign_width else ""}"""
 
 
 def _energy(axis: Axis, found: Driven) -> str:

@@ -90,6 +90,23 @@ def test_every_size_of_a_new_device_is_marked_as_a_guess(linear: bool, constant:
     assert f"# Guessed with {constant} as above" in starter.text
 
 
+@pytest.mark.parametrize(
+    ("step", "width"), [(1e-4, None), (2e-5, 3e-4), (1e-7, 1e-4)], ids=["coarse", "fine", "finest"]
+)
+def test_a_fine_encoder_allows_a_narrow_sign(tmp_path, step: float, width: float | None):
+    t = np.arange(4000) / 125.0
+    angle = np.round(0.8 * np.sin(1.3 * t) / step) * step
+    pushed = 2.0 * np.sign(np.cos(1.3 * t)) + np.cos(1.3 * t)
+    (tmp_path / "arm").mkdir()
+    columns = np.column_stack([t, angle, pushed])
+    names = "time_s,joint_angle_rad,torque_nm"
+    np.savetxt(tmp_path / "arm" / "run.csv", columns, "%.9g", ",", header=names, comments="")
+    proposed(tmp_path / "arm")
+    device = tomllib.loads((tmp_path / "arm" / "device.toml").read_text())
+    (axis,) = device["coordinates"].values()
+    assert axis.get("sign_width") == width
+
+
 def test_a_damper_with_a_coil(tmp_path):
     write_damper_logs(tmp_path / "damper")
     session, proposal = proposed(tmp_path / "damper")
