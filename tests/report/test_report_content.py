@@ -111,7 +111,7 @@ def test_what_the_stages_say_of_themselves_is_passed_on(full: Report) -> None:
     assert "All estimates had settled after 16.9 s of 48.0 s" in words
     assert "normalised innovation squared is 1.0;" in words
     assert "The force lags the encoders by 0.120 ± 0.031 ms" in words
-    assert "Error of the predicted force at the handle (RMSE): force x 0.123 N" in words
+    assert "Error of the predicted force (RMSE): force x 0.123 N" in words
     assert "A note of the validation." in words
     assert f"Added since, as model {synthetic_run.CHILD}" in words
     assert "At the limit of its range" in words

@@ -109,8 +109,8 @@ def _at_the_handle(validated: ValidateResult, pusher: str) -> str:
         f"{wording.words(name)} {wording.significant(entry.rmse)} {wording.unit(entry.unit)}"
         for name, entry in validated.forces.items()
     )
-    place = "at the handle" if pusher == "hand" else "of the drives"
-    return f"Error of the predicted force {place} (RMSE): {join_names(shown)}."
+    place = " at the handle" if pusher == "hand" else ""
+    return f"Error of the predicted force{place} (RMSE): {join_names(shown)}."
 
 
 def _drift(results: Results, drift: Mapping[str, AxisDrift]) -> list[Block]:
