@@ -137,7 +137,7 @@ def tune_noise(
         choice: fixes levels that are not to be found.
     """
     quick = replace(settings, longest_step=max(settings.longest_step, _TUNING_STEP_S))
-    longest = max(range(len(trials)), key=lambda i: trials[i].t.size)
+    longest = max(range(len(trials)), key=lambda i: clear[i].size)
     record = trials[longest]
     part = replace(
         record,

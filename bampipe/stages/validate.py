@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from pydantic.dataclasses import dataclass as checked_dataclass
 
 from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
-from bampipe.data.store import read_parquet, write_parquet
+from bampipe.data.store import ParquetAppender, read_parquet
 from bampipe.declarations.model_file import IDENTIFIED_MODEL, identified, load_model
 from bampipe.errors import InputError
 from bampipe.identification.drift import find_drift
@@ -166,7 +167,9 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         free = _run_freely(run, system, whole, [evidence.p] * len(whole), judged)
     if system.model.device.robot is not None:
         notes += _silent_joints(system, compared, floor)
-    write_parquet(out / f"models/{config.model}/residuals.parquet", _table(system, compared))
+    with ParquetAppender(out / f"models/{config.model}/residuals.parquet") as file:
+        for frame in _tables(system, compared):
+            file.append(frame)
     describe_terms(evidence, p, estimates.covariance, config.model).write(out)
     return _result(run, system, trials, compared, expected, floor, free, notes, estimates).write(
         out
@@ -400,27 +403,25 @@ def _result(
     )
 
 
-def _table(system: System, compared: Sequence[_Compared]) -> pd.DataFrame:
-    """Return residuals.parquet: predictions by parameters that have not seen the trial."""
-    frames = []
-    for c in compared:
-        columns: dict[str, object] = {
-            "trial_id": trial_of_block(c.trial_id),
-            "t": c.t,
-            "held_out": c.judged,
-        }
-        for i, axis in enumerate(system.coordinates):
-            measured = c.measured[:, i]
-            columns[f"torque_measured_{axis}"] = measured
-            columns[f"torque_predicted_{axis}"] = measured - c.residual_held_out[:, i]
-            columns[f"torque_predicted_without_friction_{axis}"] = (
-                measured - c.residual_without_friction[:, i]
-            )
-            columns[f"residual_{axis}"] = c.residual_held_out[:, i]
-            columns[f"moving_{axis}"] = c.used[:, i]
-        for j, name in enumerate(system.model.device.forces):
-            component = name.removeprefix("force_")
-            columns[f"force_measured_{component}"] = c.force[:, j]
-            columns[f"force_predicted_{component}"] = c.force[:, j] - c.force_residual[:, j]
-        frames.append(pd.DataFrame(columns))
-    return pd.concat(frames, ignore_index=True)
+def _tables(system: System, compared: Sequence[_Compared]) -> Iterator[pd.DataFrame]:
+    """Yield residuals.parquet by trial: predictions by parameters that have not seen it."""
+    for name, parts in groupby(compared, key=lambda c: trial_of_block(c.trial_id)):
+        yield pd.concat([_table(system, name, c) for c in parts], ignore_index=True)
+
+
+def _table(system: System, trial_id: str, c: _Compared) -> pd.DataFrame:
+    columns: dict[str, object] = {"trial_id": trial_id, "t": c.t, "held_out": c.judged}
+    for i, axis in enumerate(system.coordinates):
+        measured = c.measured[:, i]
+        columns[f"torque_measured_{axis}"] = measured
+        columns[f"torque_predicted_{axis}"] = measured - c.residual_held_out[:, i]
+        columns[f"torque_predicted_without_friction_{axis}"] = (
+            measured - c.residual_without_friction[:, i]
+        )
+        columns[f"residual_{axis}"] = c.residual_held_out[:, i]
+        columns[f"moving_{axis}"] = c.used[:, i]
+    for j, name in enumerate(system.model.device.forces):
+        component = name.removeprefix("force_")
+        columns[f"force_measured_{component}"] = c.force[:, j]
+        columns[f"force_predicted_{component}"] = c.force[:, j] - c.force_residual[:, j]
+    return pd.DataFrame(columns)

@@ -19,6 +19,7 @@ from bampipe.estimate.low_pass import Band
 from bampipe.estimate.normal_equations import NormalEquations
 from bampipe.estimate.standstill import find_standstill
 from bampipe.physics import System
+from bampipe.trials.cache import TrialCache
 from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion
 
@@ -97,7 +98,7 @@ def problem_of(
             [not timing and not system.moves_sensors and system.constant[i] for i in free]
         ),
         band=band,
-        standstill=[_standstill(motion, system, band) for motion in motions],
+        standstill=TrialCache(lambda k: _standstill(motions[k], system, band), len(motions), len),
         precision=np.array(precision),
         known=np.array(known),
     )
