@@ -9,6 +9,7 @@ import pytest
 from independent_runs import record_trials
 
 from bampipe.discover.chance import system_of
+from bampipe.identification import drift
 from bampipe.identification.drift import HORIZONS_S, find_drift
 from bampipe.physics import Model, compile_model, registry
 from bampipe.trials.motion import Motion
@@ -101,3 +102,10 @@ def test_the_true_model_stays_close_to_an_independent_simulator(tmp_path):
         assert w.median > 2.0 * h.median
     again = find_drift(system, trials.motions, [right] * len(judged), judged)["carriage"]
     assert again.horizons == near
+
+
+def test_of_more_trials_than_starts_each_of_so_many_has_one(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(drift, "_STARTS", 12)
+    trials = [motion(seconds=4.0)] * 30
+    found = find_drift(SLIDER, trials, [parameters()] * 30, [True] * 30)["carriage"]
+    assert found.horizons[0].windows == 12
