@@ -31,6 +31,9 @@ _TIME = (2.0, 3.0)
 """In samples, in trials: the time in which something settles."""
 _PARTS = {"travel": (0.02, 0.98), "upper half": (0.5, 0.98), "lower half": (0.02, 0.5)}
 """Of the travel: where a position is looked for."""
+_RESONANCE = 3.0
+"""Of the highest frequency of the band: what rings beyond leaves a tenth of its force in the band,
+which a late sample or a filter leaves as well."""
 _DELAY = 0.2
 """In samples: both sides of the equation are filtered alike, so that less than one shows."""
 
@@ -65,6 +68,7 @@ class MachineScale:
         load: the highest generalised force applied, (n_q,), N.m or N.
         coordinates: names and units of these and of their forces.
         interval, duration: time between samples, and of the longest trial, s.
+        band_hz: highest frequency of the residual, (n_q,), Hz.
     """
 
     lowest: Array
@@ -74,6 +78,7 @@ class MachineScale:
     coordinates: dict[str, tuple[str, str]]
     interval: float
     duration: float
+    band_hz: tuple[float, ...]
 
     @classmethod
     def of_trials(cls, evidence: Evidence) -> MachineScale:
@@ -90,6 +95,7 @@ class MachineScale:
             np.min(q, axis=0), np.max(q, axis=0), np.max(qd, axis=0), np.max(load, axis=0),
             {c.name: (c.unit, c.torque_unit) for c in system.model.device.coordinates},
             float(np.median(np.diff(times[0]))), max(float(np.ptp(t)) for t in times),
+            evidence.band.cutoff_hz,
         )  # fmt: skip
 
     def range_of(self, item: BoundEffect, parameter: Parameter) -> SearchRange:
@@ -130,9 +136,11 @@ class MachineScale:
         speed, load = float(self.speed[i]), float(self.load[i])
         if not travel > 0.0 or not load > 0.0:
             return found
+        highest = 2.0 * np.pi * _RESONANCE * self.band_hz[i]
         per_force = force.replace(".", "/")
         return found | {
             unit: (_TRAVEL[0] * travel, _TRAVEL[1] * travel),
+            "1/s": (0.0, highest),
             f"{unit}/s": (_SPEED[0] * speed, _SPEED[1] * speed),
             f"1/{unit}": (2 * np.pi * _WAVES[0] / travel, 2 * np.pi * _WAVES[1] / travel),
             f"{unit}/{per_force}": (_GIVE[0] * travel / load, _GIVE[1] * travel / load),

@@ -13,9 +13,9 @@ from bampipe.trials.residuals import gather_evidence
 
 AXIS = MachineScale(
     np.array([-0.05]), np.array([0.2]), np.array([0.3]), np.array([100.0]),
-    {"carriage": ("m", "N")}, 1e-3, 20.0,
+    {"carriage": ("m", "N")}, 1e-3, 20.0, (8.0,),
 )  # fmt: skip
-"""A positioning axis: 0.25 m, 0.3 m/s, 100 N, 1 kHz."""
+"""A positioning axis: 0.25 m, 0.3 m/s, 100 N, 1 kHz, a band up to 8 Hz."""
 
 
 def range_of(effect, parameter, scale=AXIS):
@@ -27,6 +27,7 @@ def range_of(effect, parameter, scale=AXIS):
     ("effect", "parameter", "low", "high"),
     [
         ("presliding:carriage", "distance", 25e-6, 0.03),
+        ("flexible_load:carriage", "frequency", 25.0, 2.0 * np.pi * 24.0),
         ("stribeck:carriage", "speed", 3e-4, 0.2),
         ("torque_ripple:carriage", "wavenumber", 4 * np.pi / 0.25, 60 * np.pi / 0.25),
         ("transmission_compliance:carriage", "compliance", 2.5e-8, 2.5e-4),
