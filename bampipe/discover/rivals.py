@@ -139,7 +139,7 @@ def replay_rivals(
     blur = s.replay_error * float(Scorer(evidence).independent_samples[axis])
     misfits = {}
     for k, name in enumerate(rivals):
-        progress(0.5, f"replaying {name} to tell it from {len(rivals) - 1} rival(s)")
+        progress(0.5, f"replaying {name} and what may be mistaken for it")
         wider = replace(recipe, effects=(*recipe.effects, name))
         fitted = bench.fit(wider, with_effect(wider, evidence, scores[name]))
         try:

@@ -33,6 +33,8 @@ from bampipe.trials.motion import Motion, trial_names
 
 Array = NDArray[np.float64]
 
+_LISTED = 4
+"""Trials named in a sentence."""
 _NOTHING = 0.01
 """A trial without which no bound would grow by this share adds nothing."""
 _CLOSE = 0.9
@@ -311,12 +313,15 @@ def _limits(names: Sequence[str], at_bound: NDArray[np.bool_]) -> list[str]:
 def _idle(trials: Mapping[str, TrialGrowth]) -> list[str]:
     if len(trials) < 2:
         return []
-    return [
-        f"Trial {name} adds next to nothing: without it no bound would grow by more than "
-        f"{100.0 * entry.growth:.1g} %."
-        for name, entry in trials.items()
-        if entry.growth < _NOTHING
-    ]
+    idle = [name for name, entry in trials.items() if entry.growth < _NOTHING]
+    if not idle:
+        return []
+    growth = max(trials[name].growth for name in idle)
+    alone = f"no bound would grow by more than {100.0 * growth:.1g} %."
+    if len(idle) == 1:
+        return [f"Trial {idle[0]} adds next to nothing: without it {alone}"]
+    which = join_names(idle, _LISTED)
+    return [f"Trials {which} add next to nothing: without any one of them {alone}"]
 
 
 def _leaning(numbers: Sequence[DeviceNumber]) -> list[str]:
