@@ -25,6 +25,8 @@ _FEWEST = 200
 """Samples below which noise is not measured."""
 _STRETCHES, _STRETCH = 8, 2000
 """A longer record is looked at in so many stretches of so many samples: enough for 1 %."""
+_REACHES, _OFF_GRID = (1.5, 10.0, 100.0), 0.05
+"""Multiples of a step up to which it is found ever more exactly; how far off the grid values may be."""
 _LOWEST_LINE = 0.1
 """Cycles a sample from which on a sine is taken off: below, differences take it out themselves."""
 
@@ -115,9 +117,12 @@ def counting_step(record: Array) -> float:
     if steps.size < _FEWEST // 4:
         return 0.0
     smallest = float(np.quantile(steps, 0.02))
-    for step in (float(steps.min()), smallest):
-        multiples = steps / step
-        off = np.abs(multiples - np.round(multiples))
-        if multiples.max() < 1e4 and np.mean(off < 0.05) > 0.95:
-            return float(np.median(steps[np.round(multiples) == 1]))
+    for guess in (float(steps.min()), smallest):
+        step = guess
+        for reach in _REACHES:  # a log rounds its counts: larger multiples say more of the step
+            near = steps[steps < reach * step]
+            step = float(near.sum() / np.round(near / step).sum())
+        off = np.abs(steps - step * np.round(steps / step))
+        if steps.max() < 1e4 * step and np.mean(off < _OFF_GRID * step) > 0.95:
+            return step
     return 0.0

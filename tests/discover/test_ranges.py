@@ -30,7 +30,7 @@ def range_of(effect, parameter, scale=AXIS):
         ("flexible_load:carriage", "frequency", 25.0, 2.0 * np.pi * 24.0),
         ("stribeck:carriage", "speed", 3e-4, 0.2),
         ("torque_ripple:carriage", "wavenumber", 4 * np.pi / 0.25, 60 * np.pi / 0.25),
-        ("transmission_compliance:carriage", "compliance", 2.5e-8, 2.5e-4),
+        ("transmission_compliance:carriage", "compliance", 2.5e-7, 2.5e-4),
         ("drive_sag:carriage", "sag", 1e-4, 0.03),
         ("actuator_delay", "delay", 2e-4, 0.08),
         ("thermal_damping:carriage", "time_constant", 1.0, 60.0),
