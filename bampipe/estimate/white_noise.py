@@ -26,7 +26,7 @@ _FEWEST = 200
 _STRETCHES, _STRETCH = 8, 2000
 """A longer record is looked at in so many stretches of so many samples: enough for 1 %."""
 _REACHES, _OFF_GRID = (1.5, 10.0, 100.0), 0.05
-"""Multiples of a step up to which it is found ever more exactly; how far off the grid values may be."""
+"""Multiples of a step up to which it is found ever more exactly; how far off values may be."""
 _LOWEST_LINE = 0.1
 """Cycles a sample from which on a sine is taken off: below, differences take it out themselves."""
 

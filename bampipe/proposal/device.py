@@ -198,17 +198,16 @@ def new_device(folder: Path, match: Matcher, notes: Notes) -> ChosenDevice:
 def _sign_width(position: SurveyedColumn, t: np.ndarray, linear: bool) -> float:
     """Width for the sign of the velocity, rad/s or m/s, where less than the usual; else 0.
 
-    Friction that truly stops an axis is a sign over no width: replays that creep over the usual one
+    Friction that truly stops an axis is a sign over no width. Replays that creep over the usual one
     leave less at reversals than such a machine, which then seems to lack a Stribeck friction or a
-    compliance. What the encoder tells of slow motion allows as little as the speed of an eighth of
-    a step a sample, where filtered velocities still know the sign.
+    compliance; filtered velocities know the sign down to a fortieth of a step a sample.
     """
     kind = "linear" if linear else "rotary"
     unit, _, usual = KINDS[kind]
     q = position_in_si(position, t, unit)
     step = counting_step(q)
     step = max(step, float(np.sqrt(12.0)) * float(np.nan_to_num(white_noise_sd(q, t, step))))
-    width = max(step / float(np.median(np.diff(t))) / 8.0, usual / 10.0)
+    width = max(step / float(np.median(np.diff(t))) / 40.0, usual / 20.0)
     return float(f"{width:.0e}") if width < usual / 2.0 else 0.0
 
 

@@ -91,7 +91,7 @@ def test_every_size_of_a_new_device_is_marked_as_a_guess(linear: bool, constant:
 
 
 @pytest.mark.parametrize(
-    ("step", "width"), [(1e-4, None), (2e-5, 3e-4), (1e-7, 1e-4)], ids=["coarse", "fine", "finest"]
+    ("step", "width"), [(4e-4, None), (4e-5, 1e-4), (1e-7, 5e-5)], ids=["coarse", "fine", "finest"]
 )
 def test_a_fine_encoder_allows_a_narrow_sign(tmp_path, step: float, width: float | None):
     t = np.arange(4000) / 125.0
