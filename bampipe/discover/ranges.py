@@ -24,8 +24,8 @@ _SPEED = (1e-3, 1.0)
 _WAVES = (2.0, 30.0)
 """Waves on the travel."""
 _GIVE = (1e-4, 0.1)
-"""Of the travel, at the highest load: less than that is not told from what happens between two
-samples where friction turns over."""
+"""Of the travel, at the highest load: less cannot be distinguished from what happens between two
+samples where friction changes its sign."""
 _LOSS = (1e-2, 3.0)
 """Of the load, at the highest load."""
 _TIME = (2.0, 3.0)

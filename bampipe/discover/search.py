@@ -121,7 +121,7 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
     steps = [_step(current)]
     known = level
 
-    def tell(_: float, message: str) -> None:
+    def report_step(_: float, message: str) -> None:
         progress(0.4 + 0.05 * len(steps), message)
 
     while len(current.added) + len(dropped) < s.most_effects:
@@ -129,7 +129,7 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
         significant, likely = _weigh(bench, scores, known, evidence)
         if not significant:
             break
-        chosen = choose(bench, significant, known, current.recipe, evidence, scores, tell)
+        chosen = choose(bench, significant, known, current.recipe, evidence, scores, report_step)
         transient |= chosen.transient
         scores = {n: score for n, score in scores.items() if n not in chosen.transient}
         if not chosen.winner:
@@ -160,7 +160,7 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
         groups[chosen.winner] = chosen.alike
         additions[chosen.winner] = addition
         steps.append(_step(current))
-        tell(0.0, f"added {chosen.winner}, looking for more")
+        report_step(0.0, f"added {chosen.winner}, looking for more")
     cut_short = len(current.added) + len(dropped) >= s.most_effects
     progress(0.8, "weighing each effect beside its rivals")
     rivals = {name: _rivals(first, name, groups.get(name, ()), s) for name in current.added}

@@ -17,6 +17,9 @@ from scipy.optimize import minimize_scalar
 
 Array = NDArray[np.float64]
 
+LOWEST_LINE = 0.1
+"""Cycles a sample from which on a sine counts: below, differences take it out themselves."""
+
 _JUMP = 10.0
 """Second difference, over the median one, from which on it is no part of a sine in noise."""
 _UNEVEN = 1e-3
@@ -32,8 +35,6 @@ bins beside it: what repeats itself has lines at every multiple of its own frequ
 _MAINS_HZ, _HARMONICS, _OFF = (50.0, 60.0), 5, 0.002
 """Frequencies of mains and how many harmonics of them are looked for; how far off they may be, as a
 share: the grid keeps to half a thousandth, the clock of a recorder may be worse."""
-_LOWEST = 0.1
-"""Least frequency of a line in cycles a sample, as far as mains are not below it."""
 _STRETCH, _STRETCH_S, _STRETCHES = 2000, 4.0, 8
 """Mains drift in phase: they are fitted by stretches of at least so many samples and seconds, and
 looked for in at most so many."""
@@ -67,7 +68,7 @@ def find_lines(
         lag: samples between those whose second differences are taken; noise counts least where a
             sine turns by a quarter to half a cycle in so many.
     """
-    rate = (t.size - 1) / float(t[-1] - t[0])
+    rate = _mean_rate(t)
     frequency = np.fft.rfftfreq(t.size - 2 * lag)
     high = (frequency > lowest) & (frequency <= highest)
     window = np.hanning(t.size - 2 * lag)
@@ -131,14 +132,14 @@ def remove_mains(
 
 def _find_mains(record: Array, t: Array) -> dict[float, float]:
     """Where a record (T,) shows mains: nominal frequencies, Hz, and those found for them."""
-    rate = (t.size - 1) / float(t[-1] - t[0])
+    rate = _mean_rate(t)
 
     def apparent(hz: float) -> float:
         return abs(hz - rate * round(hz / rate)) if _is_uniform(t) else hz
 
     found: dict[float, float] = {}
     nominal = [n * hz for hz in _MAINS_HZ for n in range(1, _HARMONICS + 1)]
-    lowest = min(_LOWEST, 0.9 * min(_MAINS_HZ) / rate)
+    lowest = min(LOWEST_LINE, 0.9 * min(_MAINS_HZ) / rate)
     highest = min(1.1 * max(nominal) / rate, 0.5)
     for line in find_lines(record, t, lowest, highest, _lag(t)):
         alike = [hz for hz in nominal if abs(apparent(line.hz) - apparent(hz)) <= _OFF * hz]
@@ -147,9 +148,13 @@ def _find_mains(record: Array, t: Array) -> dict[float, float]:
     return found
 
 
+def _mean_rate(t: Array) -> float:
+    return (t.size - 1) / float(t[-1] - t[0])
+
+
 def _lag(t: Array) -> int:
     """Samples in which mains turn by an eighth of a cycle; one at a low rate."""
-    return max(1, int(0.125 * (t.size - 1) / float(t[-1] - t[0]) / min(_MAINS_HZ)))
+    return max(1, int(0.125 * _mean_rate(t) / min(_MAINS_HZ)))
 
 
 def _is_uniform(t: Array) -> bool:

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from bampipe.estimate.spectral_lines import find_lines
+from bampipe.estimate.spectral_lines import LOWEST_LINE, find_lines
 
 Array = NDArray[np.float64]
 
@@ -27,8 +27,6 @@ _STRETCHES, _STRETCH = 8, 2000
 """A longer record is looked at in so many stretches of so many samples: enough for 1 %."""
 _REACHES, _OFF_GRID = (1.5, 10.0, 100.0), 0.05
 """Multiples of a step up to which it is found ever more exactly; how far off values may be."""
-_LOWEST_LINE = 0.1
-"""Cycles a sample from which on a sine is taken off: below, differences take it out themselves."""
 
 
 def white_noise_sd(record: Array, t: Array | None = None, step: float = 0.0) -> float:
@@ -61,7 +59,7 @@ def slow_noise_sd(record: Array, t: Array, step: float = 0.0) -> float:
     found = []
     for start in starts.astype(int):
         part = slice(start, start + length)
-        clear = _without_lines(record[part], t[part], _LOWEST_LINE / every)
+        clear = _without_lines(record[part], t[part], LOWEST_LINE / every)
         found.append(_difference_noise(clear[::every], t[part][::every]))
     return _without_dither(float(np.median(found)), step)
 
@@ -86,7 +84,7 @@ def _difference_noise(record: Array, t: Array | None) -> float:
         some = [_difference_noise(record[p], None if t is None else t[p]) for p in parts]
         return float(np.median(some))
     stamps = np.arange(record.size, dtype=float) if t is None else t / float(np.median(np.diff(t)))
-    record = _without_lines(record, stamps, _LOWEST_LINE)
+    record = _without_lines(record, stamps, LOWEST_LINE)
     found = []
     for order in _ORDERS:
         windows = np.lib.stride_tricks.sliding_window_view(stamps, order + 1)

@@ -74,7 +74,7 @@ class MainsHum(Record):
 
     @property
     def sentence(self) -> str:
-        """What a person is told of it."""
+        """Channel, amplitude and frequency in words."""
         return (
             f"{self.channel}: mains hum of {self.amplitude:.2g} {self.unit} at {self.hz:g} Hz"
             f" taken off (trials with it: {self.trials})"

@@ -41,8 +41,8 @@ def _sampling(session: IngestResult) -> str:
             f"{name} {wording.significant(sd, 2)}" for name, sd in session.force.noise_sd.items()
         )
         text += f" Noise of a sample: {each} {wording.unit(session.force.unit)}."
-    told = (*session.sensor_warnings, *(hum.sentence for hum in session.mains_hum))
-    return " ".join([text, *(f"{line[:1].upper()}{line[1:]}." for line in told)])
+    remarks = (*session.sensor_warnings, *(hum.sentence for hum in session.mains_hum))
+    return " ".join([text, *(f"{line[:1].upper()}{line[1:]}." for line in remarks)])
 
 
 def _trials(results: Results) -> Table:
