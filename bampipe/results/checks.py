@@ -46,6 +46,9 @@ def find_failed_checks(
             " as a delay or friction that builds up, or the clocks disagree"
         )
     for axis, tests in (identified.innovations or {}).items():
+        # A filter that is not published may be at fault itself where the model is at its floor.
+        if identified.method != "ukf" and axis in errors and errors[axis].standing == "at_floor":
+            continue
         white, independent = tests.whiteness, tests.inputs
         if (white and not white.white) or (independent and not independent.independent):
             yield f"{axis}, innovations: {tests.sentence}"

@@ -192,7 +192,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     # What the trials say nothing of is as uncertain as it was before, whatever the fit believes.
     estimate = replace(estimate, covariance=estimate.covariance + unseen)
     if estimates[0].method == "ukf":
-        # What the filter's innovations say of model and noise holds whatever is published.
+        # What the filter's innovations say of model and noise is kept whatever is published.
         estimate = replace(estimate, report={**estimates[0].evidence, **estimate.report})
     methods = tabulate_methods(system, estimate, judged, lost)
     moved = propagate_calibration(

@@ -32,7 +32,7 @@ def section(results: Results) -> Section | None:
         if len(known.trials) > 1:
             blocks.append(_trials(known.trials))
     if identified.innovations:
-        blocks.append(_innovations(results, identified.innovations))
+        blocks.append(_innovations(results, identified.innovations, identified.method == "ukf"))
     return Section(TITLE, tuple(blocks)) if blocks else None
 
 
@@ -97,7 +97,9 @@ def _trials(trials: Mapping[str, TrialGrowth]) -> Table:
     )
 
 
-def _innovations(results: Results, tests: Mapping[str, InnovationTests]) -> Table:
+def _innovations(
+    results: Results, tests: Mapping[str, InnovationTests], published: bool
+) -> Table:
     rows = []
     for axis in verdicts.ordered(results, tests):
         own, driven = tests[axis].whiteness, tests[axis].inputs
@@ -118,7 +120,8 @@ def _innovations(results: Results, tests: Mapping[str, InnovationTests]) -> Tabl
         "llrlrl",
         (0.0, 0.0, 0.0, 0.0, 0.0, 1.0),
         "White: Ljung-Box over one second. Inputs: regression on the inputs up to half a second "
-        "back. Share: of the variance that is predictable beyond chance.",
+        "back. Share: of the variance that is predictable beyond chance."
+        + ("" if published else " The filter's parameters are not those published."),
     )
 
 
