@@ -23,11 +23,10 @@ from bampipe.discover.drafts.forms import (
     INERTIA,
     READING,
     Form,
-    Span,
-    coordinates,
     forms,
-    hats,
 )
+from bampipe.discover.drafts.quantities import Span, coordinates
+from bampipe.discover.drafts.shapes import hats
 from bampipe.discover.settings import Settings
 from bampipe.estimate.low_pass import low_pass_at
 from bampipe.trials.folds import HELD_OUT

@@ -17,8 +17,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bampipe.discover.drafts.forms import FORCE, Form, Quantity, Shape, coordinates
+from bampipe.discover.drafts.forms import FORCE, Form
+from bampipe.discover.drafts.quantities import Quantity, coordinates
 from bampipe.discover.drafts.screen import Screen, Screened
+from bampipe.discover.drafts.shapes import Shape
 from bampipe.discover.settings import Settings
 
 Array = NDArray[np.float64]
