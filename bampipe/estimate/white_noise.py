@@ -16,7 +16,7 @@ from bampipe.estimate.spectral_lines import LOWEST_LINE, find_lines
 
 Array = NDArray[np.float64]
 
-_ORDERS = (2, 3, 4, 5, 6)
+_LOWEST_ORDER, _HIGHEST_ORDER = 2, 6
 _SLOWEST_HZ = 100.0
 """A sensor's own low-pass keeps noise out of neighbouring samples that acts at the frequencies of
 the motion all the same. Thinned to this rate, a record shows that noise."""
@@ -86,14 +86,18 @@ def _difference_noise(record: Array, t: Array | None) -> float:
     stamps = np.arange(record.size, dtype=float) if t is None else t / float(np.median(np.diff(t)))
     record = _without_lines(record, stamps, LOWEST_LINE)
     found = []
-    for order in _ORDERS:
-        windows = np.lib.stride_tricks.sliding_window_view(stamps, order + 1)
-        # A divided difference takes every polynomial of lower degree out, whatever the spacing.
-        gaps = windows[:, :, None] - windows[:, None, :]
-        gaps[:, range(order + 1), range(order + 1)] = 1.0
-        weights = 1.0 / np.prod(gaps, axis=2)
-        values = np.lib.stride_tricks.sliding_window_view(record, order + 1)
-        size = np.abs(np.sum(weights * values, axis=1)) / np.sqrt(np.sum(weights**2, axis=1))
+    # Divided differences take every polynomial of lower degree out, whatever the spacing; each
+    # order follows from the one before, and so do its weights of the samples.
+    differences, weights = record, np.ones((1, record.size))
+    for order in range(1, _HIGHEST_ORDER + 1):
+        gap = stamps[order:] - stamps[:-order]
+        differences = np.diff(differences) / gap
+        nothing = np.zeros((1, gap.size))
+        weights = np.vstack([nothing, weights[:, 1:]]) - np.vstack([weights[:, :-1], nothing])
+        weights /= gap
+        if order < _LOWEST_ORDER:
+            continue
+        size = np.abs(differences) / np.sqrt(np.sum(weights**2, axis=0))
         typical = float(np.median(size)) / _NORMAL_MEDIAN
         if typical == 0.0:  # more than half the differences are zero: coarse steps
             typical = float(np.sqrt(np.mean(np.square(size))))
