@@ -116,13 +116,18 @@ class Bench:
         ]
         return list(self.pool(run_replicate, tasks))
 
-    def floor_replicas(self, recipe: Recipe, evidence: Evidence, p: Array) -> list[Replicate]:
+    def floor_replicas(
+        self, recipe: Recipe, evidence: Evidence, p: Array, known: Sequence[Replicate]
+    ) -> list[Replicate]:
         """Replays that give the noise floor of a fitted model, those that `validate` makes of it.
 
         Args:
             recipe: the model; evidence: its fit; p: parameters that are replayed, (n_p,).
+            known: replays of the same by `level`, taken where they have what is wanted.
         """
         count, again = floor_replays(self.trials.motions), (recipe, evidence.p)
+        if len(known) >= count and all(replay.share.size for replay in known[:count]):
+            return list(known[:count])
         return self.replicas(recipe, p, count, (), (FLOOR_SEED,), share=True, analysed=again)
 
     def scores(self, recipe: Recipe, p: Array, names: Sequence[str]) -> dict[str, Score]:
@@ -144,20 +149,33 @@ class Bench:
             asked: candidates that are learned at once.
         """
         again = (recipe, evidence.p)
+        # Where nothing gains, the search is at its end: these are the replays of the final model.
+        last = not asked
 
         def replay(names: Sequence[str], first: int, count: int) -> list[Replicate]:
             return self.replicas(
-                recipe, p, count, names, (FLOOR_SEED,), analysed=again, first=first
+                recipe,
+                p,
+                count,
+                names,
+                (FLOOR_SEED,),
+                share=last and not names,
+                analysed=again,
+                first=first,
             )
+
+        s = self.settings
+        least = min(s.first_replicates, s.replicates)
 
         scorer = Scorer(evidence)
         return Level(
             replay,
             asked,
+            floor_replays(self.trials.motions) if last else least,
             len(self.names),
             scorer.base_error,
             np.maximum(scorer.independent_samples, 1.0),
-            self.settings,
+            s,
         )
 
     def gaining(self, scores: Mapping[str, Score], scorer: Scorer) -> list[str]:

@@ -27,6 +27,7 @@ class Level:
         self,
         replay: Callable[[Sequence[str], int, int], list[Replicate]],
         asked: Sequence[str],
+        first: int,
         tests: int,
         before: Array,
         independent: Array,
@@ -36,7 +37,7 @@ class Level:
 
         Args:
             replay: candidates to score, number of the first replay, count; returns the replays.
-            asked: candidates to learn at once.
+            asked: candidates to learn at once; first: replays for them.
             tests: number of candidates in the library.
             before: error of the model, by axis; independent: samples that count, by axis.
             settings: how many replays, and what is significant.
@@ -47,7 +48,7 @@ class Level:
         self._error = settings.replay_error * float(independent.mean())
         self._gains: dict[str, Array] = {}
         self.replicates: list[Replicate] = []
-        self._learn(asked, 0, min(settings.first_replicates, settings.replicates))
+        self._learn(asked, 0, first)
 
     def _learn(self, names: Sequence[str], first: int, count: int) -> None:
         replicates = self._replay(names, first, count)

@@ -169,7 +169,8 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
     if found.added != current.added:
         steps.append(_step(found))
     progress(0.85, "replaying the final model for its noise floor")
-    final = bench.floor_replicas(found.recipe, found.evidence, found.replayed)
+    same = known.replicates if found is current else ()
+    final = bench.floor_replicas(found.recipe, found.evidence, found.replayed, same)
     axes = initial.system.coordinates
     main = {name: axes.index(c[0].axis) for name, c in contests.items() if c}
     return Search(

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from scipy.signal import butter, periodogram, sosfiltfilt
 
 from bampipe.estimate.differentiation import Array, Derivatives, extend, linear_noise_gains
 
 
+@lru_cache(maxsize=64)
 def _design(cutoff_hz: float, rate_hz: float, order: int) -> Array:
-    """Return second-order sections.
+    """Return second-order sections, which are not to be written to.
 
     Raises:
         ValueError: the cut-off is not between 0 and half the sampling rate.

@@ -11,8 +11,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
+from numpy.polynomial.polynomial import polyder, polyval, polyvander
 from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
@@ -104,17 +106,29 @@ def extend(values: Array, reach: int, fit: int) -> Array:
     """
     reach = min(reach, len(values) - 1)
     fit = min(fit, len(values))
-    degree = min(3, fit - 1)
-    steps = np.arange(fit, dtype=np.float64)
+    weights = _end_weights(fit, min(3, fit - 1))
     offsets = np.arange(1, reach + 1, dtype=np.float64)
 
     def extrapolate(end: Array) -> Array:
         """Return the samples before ``end[0]``, the nearest first."""
-        curve = np.polynomial.Polynomial.fit(steps, end[:fit], degree)
-        start, curvature = curve(0.0), curve.deriv(2)(0.0) if degree >= 2 else 0.0
+        start, curvature = weights @ end[:fit]
         return np.asarray(2.0 * start - end[1 : reach + 1] + curvature * offsets**2)
 
     return np.concatenate((extrapolate(values)[::-1], values, extrapolate(values[::-1])))
+
+
+@lru_cache(maxsize=64)
+def _end_weights(fit: int, degree: int) -> Array:
+    """Value and second derivative, at the first of ``fit`` samples, of a polynomial fitted to them.
+
+    Returns:
+        (2, fit) weights of the samples, which are not to be written to.
+    """
+    scale = 2.0 / max(fit - 1, 1)
+    fitted = np.linalg.pinv(polyvander(scale * np.arange(fit) - 1.0, degree))
+    curved = polyder(np.eye(degree + 1), 2) if degree >= 2 else np.zeros((1, degree + 1))
+    at_start = [polyval(-1.0, np.eye(degree + 1)), scale**2 * polyval(-1.0, curved)]
+    return np.asarray(np.array(at_start) @ fitted)
 
 
 Linear = Callable[[Array], tuple[Array, Array, Array]]

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
+from bampipe.physics.device import Device
 from bampipe.physics.model import Model
 from bampipe.physics.registry import device_from, effect_from
 
@@ -39,4 +42,11 @@ class Recipe:
 
     def model(self) -> Model:
         """Build the model."""
-        return Model(device_from(self.device), self.effects, [effect_from(e) for e in self.extra])
+        device = _device(json.dumps(self.device))
+        return Model(device, self.effects, [effect_from(e) for e in self.extra])
+
+
+@lru_cache(maxsize=16)
+def _device(declaration: str) -> Device:
+    """The device of a declaration: a diagnosis builds hundreds of models of the same one."""
+    return device_from(json.loads(declaration))
