@@ -6,7 +6,7 @@ They have fixed options and no metadata that varies. A file that cannot be read 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
@@ -175,6 +175,17 @@ def trial_ids(path: Path) -> frozenset[str]:
     return frozenset(footer.groups)
 
 
+def row_count(path: Path, trials: Collection[str]) -> int:
+    """Rows of the row groups that hold these trials.
+
+    Raises:
+        InputError: no such file, or not a sound Parquet file.
+    """
+    footer = _sound_footer(path)
+    groups = {group for name in trials for group in footer.groups.get(name, ())}
+    return sum(footer.metadata.row_group(group).num_rows for group in groups)
+
+
 def _sound_footer(path: Path) -> _Footer:
     path = Path(path)
     if not path.is_file():
@@ -211,7 +222,8 @@ def _writer(stream: BinaryIO, schema: pa.Schema) -> pq.ParquetWriter:
         compression="zstd",
         compression_level=3,
         use_dictionary=[field.name for field in schema if _is_text(field.type)],
-        write_statistics=True,
+        # Those that find a trial: others would make most of a footer with thousands of row groups.
+        write_statistics=["trial_id"] if "trial_id" in schema.names else False,
         store_schema=False,
     )
 

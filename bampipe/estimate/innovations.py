@@ -7,7 +7,7 @@ rejects every filter on earth, so each test also says how much is predictable: i
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -87,31 +87,33 @@ def check_independence(
         lags: by how many values back each input is taken.
     """
     reach = max(lags)
-    rows, targets = [], []
-    for record, given in zip(records, inputs, strict=True):
-        if len(record) <= reach:
-            continue
-        shifted = [given[reach - lag : len(given) - lag] for lag in lags]
-        rows.append(np.concatenate(shifted, axis=1))
-        targets.append(record[reach:])
-    if not rows:
+
+    def tables() -> Iterator[Array]:
+        """By record: the inputs at each lag and the innovation, (K', m + 1)."""
+        for record, given in zip(records, inputs, strict=True):
+            if len(record) > reach:
+                shifted = [given[reach - lag : len(given) - lag] for lag in lags]
+                table = np.concatenate([*shifted, record[reach:, None]], axis=1)
+                yield table[np.isfinite(record[reach:])]
+
+    # Sums, not samples: of a long session all tables together would be the largest thing in memory.
+    count = sum(len(table) for table in tables())
+    if count == 0:
         return None
-    x, y = np.concatenate(rows), np.concatenate(targets)
-    found = np.isfinite(y)
-    x, y = x[found], y[found]
-    spread = x.std(axis=0) if len(x) else np.zeros(0)
-    x = (x - x.mean(axis=0))[:, spread > 0.0] / spread[spread > 0.0]
-    m = x.shape[1]
-    if m == 0 or len(y) < 10 * m:
+    mean = sum(table.sum(axis=0) for table in tables()) / count
+    products = sum((table - mean).T @ (table - mean) for table in tables())
+    total = float(products[-1, -1])
+    changing = np.flatnonzero(np.diag(products)[:-1] > 0.0)
+    m = changing.size
+    if m == 0 or count < 10 * m or total == 0.0:
         return None
-    y = y - y.mean()
-    fitted = x @ np.linalg.lstsq(x, y, rcond=None)[0]
-    explained, total = float(fitted @ fitted), float(y @ y)
-    if total == 0.0:
-        return None
-    rest = len(y) - m - 1
+    scale = np.sqrt(np.diag(products)[changing])
+    moment = products[changing, -1] / scale
+    normal = products[np.ix_(changing, changing)] / np.outer(scale, scale)
+    explained = float(moment @ np.linalg.lstsq(normal, moment, rcond=None)[0])
+    rest = count - m - 1
     statistic = (explained / m) / max((total - explained) / rest, 1e-300)
-    share = explained / total - m / len(y)
+    share = explained / total - m / count
     return InnovationTest(
         statistic, m, float(stats.f.sf(statistic, m, rest)), min(max(share, 0.0), 1.0)
     )

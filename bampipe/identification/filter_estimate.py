@@ -120,11 +120,21 @@ def estimate_by_filter(
     known = np.append(np.sqrt(np.diag(squares.raw.covariance))[:count], late_sd)
     settings = untuned_settings(system, noise, choice)
     settings = replace(settings, walk_sd=np.append(settings.walk_sd, late))
-    clear_by_axis = [
-        clear_of_reversal_mask(m, system, trial.t) for m, trial in zip(motions, trials, strict=True)
-    ]
-    clear = [np.asarray(every.all(axis=1)) for every in clear_by_axis]
-    settings = tune_noise(settings, model, trials, clear, settled, known, noise, choice)
+
+    def clear(place: int) -> NDArray[np.bool_]:
+        return clear_of_reversal_mask(motions[place], system, trials[place].t)
+
+    longest = max(range(len(trials)), key=trials.size)
+    settings = tune_noise(
+        settings,
+        model,
+        trials[longest],
+        np.asarray(clear(longest).all(axis=1)),
+        settled,
+        known,
+        noise,
+        choice,
+    )
     settings = replace(settings, stride=stride)
     prior_sd = np.append([item.sd for item in free], late_sd)
     first = np.append(start[problem.free[:count]], late)
@@ -187,7 +197,7 @@ def estimate_by_filter(
     nis = tabulate_nis(found, motions)
     report = {
         "nis": nis,
-        "innovations": innovation_tests(system, found, clear_by_axis),
+        "innovations": innovation_tests(system, found, clear),
         "noise": noise_levels(system, found.settings, noise),
         "input_timing": input_timing(p, problem, scaled),
         "blocks": blocks,

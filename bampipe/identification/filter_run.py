@@ -30,7 +30,7 @@ from bampipe.trials.reading import input_columns, read_samples
 
 Array = NDArray[np.float64]
 
-_STORED, _STORED_IN_ALL = 20_000, 200_000
+_STORED, _STORED_IN_ALL = 20_000, 100_000
 """Most distributions stored of one trial: memory must not grow with the log."""
 _COARSE = 300.0
 """Factor on the process noise of the search for the region of the answer."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,19 +29,20 @@ _SIGNIFICANT = 0.01
 def innovation_tests(
     system: System,
     found: FilterRun,
-    moving: Sequence[NDArray[np.bool_]],
+    moving: Callable[[int], NDArray[np.bool_]],
 ) -> dict[str, InnovationTests]:
     """Return both tests for each position channel, and a sentence on each.
 
     Args:
         system: the model; found: the filter's.
-        moving: by trial, (T, n_q) where each axis is clear of standstill and reversal.
+        moving: of a trial, by its place, where each axis is clear of standstill and reversal,
+            (T, n_q).
     """
     n = len(system.coordinates)
     channels = [i for i, name in enumerate(system.inputs) if name != "t"]
     by_trial, inputs = [], []
     for place, trial in zip(found.order, found.trials, strict=True):
-        clear = average_stretches(moving[place].astype(float), trial.stretch_samples) == 1.0
+        clear = average_stretches(moving(place).astype(float), trial.stretch_samples) == 1.0
         by_trial.append(np.where(clear, trial.stretches[:, :n], np.nan))
         inputs.append(trial.inputs[:, channels])
     tests = {}

@@ -115,14 +115,14 @@ def untuned_settings(system: System, noise: Noise, choice: FilterChoice) -> Filt
 def tune_noise(
     settings: FilterSettings,
     model: FilterModel,
-    trials: Sequence[Trial],
-    clear: Sequence[NDArray[np.bool_]],
+    record: Trial,
+    clear: NDArray[np.bool_],
     value: Array,
     sd: Array,
     noise: Noise,
     choice: FilterChoice,
 ) -> FilterSettings:
-    """Set the noise levels at the maximum of the filter's likelihood on part of one trial.
+    """Set the noise levels at the maximum of the filter's likelihood on part of a trial.
 
     The noise of a measured force is at least that of its sensor: what is more is model error.
     Reversals are left out: there the filter's Gaussian fits whatever the noise, and noise of
@@ -130,22 +130,20 @@ def tune_noise(
 
     Args:
         settings: with the levels to start from.
-        model: the filter's; trials: of which the longest is used.
-        clear: by trial, (T,) samples at which no axis reverses; all count where none is clear.
+        model: the filter's; record: the trial, the longest one.
+        clear: (T,) its samples at which no axis reverses; all count where none is clear.
         value: (nt,) parameters near the answer, physical; sd: (nt,) how well they are known.
         noise: of the sensors.
         choice: fixes levels that are not to be found.
     """
     quick = replace(settings, longest_step=max(settings.longest_step, _TUNING_STEP_S))
-    longest = max(range(len(trials)), key=lambda i: clear[i].size)
-    record = trials[longest]
     part = replace(
         record,
         t=record.t[:_TUNING_SAMPLES],
         u=record.u[:_TUNING_SAMPLES],
         y=record.y[:_TUNING_SAMPLES],
     )
-    counts = clear[longest][:_TUNING_SAMPLES]
+    counts = clear[:_TUNING_SAMPLES]
     counts = counts if counts.any() else np.ones(part.t.size, dtype=bool)
     spread = np.maximum(sd, 1e-6 * np.abs(value))
     mean, sd = model.to_estimated(value, np.maximum(spread, np.finfo(float).tiny))

@@ -24,6 +24,7 @@ class TrialCache(Sequence[Item], Generic[Item]):
         samples: size of an item, in samples.
         most: samples in memory at most; the item used last always stays.
         names: of the items, where they are known without fetching any.
+        in_all: size of all items, where that is known.
     """
 
     def __init__(
@@ -33,13 +34,14 @@ class TrialCache(Sequence[Item], Generic[Item]):
         samples: Callable[[Any], int],
         most: int = MOST_SAMPLES,
         names: Sequence[str] = (),
+        in_all: int = 0,
     ) -> None:
         self.names = tuple(names)
         self._fetch = fetch
         self._count = count
         self._samples = samples
-        self._most = most
-        self._overflown = False
+        self._overflown = in_all > most
+        self._most = round(_SHARE_OF_LONG * most) if self._overflown else most
         self._size = 0
         self._items: OrderedDict[int, Item] = OrderedDict()
         self._sizes: dict[int, int] = {}

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.data.run_folder import MOVING, RunFolder
-from bampipe.data.store import column_names, read_arrays, read_parquet, trial_ids
+from bampipe.data.store import column_names, read_arrays, read_parquet, row_count, trial_ids
 from bampipe.errors import InputError
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import System
@@ -173,7 +173,7 @@ def read_motions(
         motion = read_motion_of(path, names[number], system, every_input=every_input)
         return motion.with_input_timing(late_s)
 
-    return TrialCache(fetch, len(names), n_samples, names=names)
+    return TrialCache(fetch, len(names), n_samples, names=names, in_all=row_count(path, names))
 
 
 def require_sound_motions(system: System, motions: Sequence[Motion]) -> None:

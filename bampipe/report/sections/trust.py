@@ -97,9 +97,7 @@ def _trials(trials: Mapping[str, TrialGrowth]) -> Table:
     )
 
 
-def _innovations(
-    results: Results, tests: Mapping[str, InnovationTests], published: bool
-) -> Table:
+def _innovations(results: Results, tests: Mapping[str, InnovationTests], published: bool) -> Table:
     rows = []
     for axis in verdicts.ordered(results, tests):
         own, driven = tests[axis].whiteness, tests[axis].inputs
