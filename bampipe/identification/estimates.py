@@ -17,6 +17,7 @@ from bampipe.identification.filter_tables import as_filtered
 from bampipe.physics import System
 from bampipe.physics.effect import BoundEffect
 from bampipe.results.identify import (
+    LACKS_TIMING,
     BaseEstimate,
     Convergence,
     Covariance,
@@ -324,17 +325,13 @@ def _fault(name: str, entry: ParameterEstimate) -> str:
 
 def _describe_limit(timing: InputTiming) -> str:
     way = "later" if timing.estimate > 0.0 else "earlier"
-    lacks = (
-        "the model lacks something that shifts the force in time, such as a delay, a lag or"
-        " friction that builds up."
-    )
     if abs(timing.estimate) < NORMAL_95 * timing.sd:
         return (
             f"The timing of the force lies at its limit, {1e3 * timing.limit:.3g} ms {way} than"
             f" logged, half a sample, and is uncertain by {1e3 * timing.sd:.2g} ms: these trials do"
-            f" not determine it, or {lacks}"
+            f" not determine it, or {LACKS_TIMING}."
         )
     return (
         f"The force acts {1e3 * timing.limit:.3g} ms or more {way} than logged, half a sample, all"
-        f" that the timing of the samples may be: {lacks}"
+        f" that the timing of the samples may be: {LACKS_TIMING}."
     )

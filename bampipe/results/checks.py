@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 
-from bampipe.results.identify import METHODS_IN_WORDS, IdentifyResult
+from bampipe.results.identify import LACKS_TIMING, METHODS_IN_WORDS, IdentifyResult
 from bampipe.results.ingest import IngestResult
 from bampipe.results.intervals import NORMAL_95
 from bampipe.results.rounding import round_with_sd
@@ -42,8 +42,7 @@ def find_failed_checks(
     if timing.sd > 0.0 and abs(timing.estimate) >= least:
         yield (
             f"input timing: {round_with_sd(1e3 * timing.estimate, 1e3 * timing.sd)} ms, at its"
-            " limit of half a sample: the model lacks something that shifts the force in time, such"
-            " as a delay or friction that builds up, or the clocks disagree"
+            f" limit of half a sample: {LACKS_TIMING}, or the clocks disagree"
         )
     for axis, tests in (identified.innovations or {}).items():
         # A filter that is not published may be at fault itself where the model is at its floor.

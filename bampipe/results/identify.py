@@ -12,6 +12,11 @@ from bampipe.schema import Count
 Method = Literal["ukf", "least-squares", "output-error"]
 """How parameters are estimated."""
 
+LACKS_TIMING = (
+    "the model lacks something that shifts the force in time, such as a delay, a lag or friction"
+    " that builds up"
+)
+"""What a timing at its limit points to."""
 METHODS_IN_WORDS: dict[Method, str] = {
     "ukf": "the unscented filter",
     "least-squares": "least squares",
