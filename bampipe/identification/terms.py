@@ -12,7 +12,6 @@ from bampipe.discover.shape import Variable, variables
 from bampipe.errors import InputError
 from bampipe.physics import System
 from bampipe.physics.effect import Effect
-from bampipe.physics.readable import model_equations
 from bampipe.results.identify import Covariance
 from bampipe.results.intervals import NORMAL_95
 from bampipe.results.terms import EffectText, ModelTerm, TermCurve, TermsResult
@@ -67,6 +66,8 @@ def describe_terms(evidence: Evidence, p: Array, covariance: Covariance, model: 
     chosen = draw_trials(evidence.sizes)
     if len(chosen) < len(evidence.motions):
         evidence = evidence.subset(chosen)
+    from bampipe.physics.readable import model_equations
+
     values = {item.name: float(value) for item, value in zip(system.parameters, p, strict=True)}
     try:
         equations = model_equations(system.model, values)

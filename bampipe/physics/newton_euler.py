@@ -14,7 +14,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import sympy as sp
 from numpy.typing import NDArray
 
 Vector = tuple[Any, Any, Any]
@@ -58,6 +57,8 @@ class Text:
         if value.is_Mul and len(value.args) == 2 and value.args[0] == -1:
             return -self.name(-value)
         if value not in self._known:
+            import sympy as sp  # takes half a second, which derived code saves
+
             self._known[value] = sp.Symbol(f"r_{len(self.steps)}")
             self.steps.append((self._known[value], value))
         return self._known[value]
@@ -79,6 +80,8 @@ class Algebra:
     @classmethod
     def symbols(cls, text: Text) -> Algebra:
         """Symbols, every intermediate a name in ``text``."""
+        import sympy as sp
+
         return cls(sp.sin, sp.cos, text.name)
 
     @classmethod

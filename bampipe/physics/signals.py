@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any, get_args
-
-import sympy as sp
+from typing import TYPE_CHECKING, Any, get_args
 
 from bampipe.errors import InputError
 from bampipe.physics.device import INPUT_ORDERS, LAST_ORDER, Device, derivative
 from bampipe.physics.effect import EACH, BoundEffect, Link
-from bampipe.physics.vocabulary import Vocabulary
+
+if TYPE_CHECKING:
+    from bampipe.physics.vocabulary import Vocabulary
 
 _ORDER = {link: number for number, link in enumerate(get_args(Link))}
 
@@ -123,6 +123,8 @@ class ActingInputs:
 
     def _rate(self, expr: Any) -> Any:
         """Time derivative along the motion; a series in the derivatives of a force ends there."""
+        import sympy as sp
+
         d = self._d
         rates = dict(zip([*d.q, *d.qd], [*d.qd, *d.qdd], strict=True)) | self.rates
         for force in d.model.device.forces:
