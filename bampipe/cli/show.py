@@ -281,6 +281,9 @@ def _free_runs(rungs: Sequence[Rung]) -> None:
     say("")
     say("free run: position error of the model left to itself over held-out trials")
     table(head, body)
+    for rung in rungs:
+        if not rung.free_run:
+            say(f"  {rung.model}: {rung.free_run_reason}")
 
 
 def _drift(rungs: Sequence[Rung], horizons: Sequence[float]) -> None:

@@ -317,7 +317,7 @@ def _fault(name: str, entry: ParameterEstimate) -> str:
     if NORMAL_95 * entry.sd >= abs(entry.estimate):
         half = NORMAL_95 * entry.sd
         return (
-            f"`{name}` is {entry.estimate:.2g} ± {half:.2g} {entry.unit}".rstrip()
+            f"`{name}` is {round_with_sd(entry.estimate, half)} {entry.unit}".rstrip()
             + ", an interval larger than itself"
         )
     return ""

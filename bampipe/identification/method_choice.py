@@ -20,6 +20,7 @@ from bampipe.errors import InputError
 from bampipe.identification.estimates import Estimate
 from bampipe.physics import System
 from bampipe.results.identify import METHODS_IN_WORDS, Method, MethodTried, MethodValue
+from bampipe.results.rounding import round_with_sd
 from bampipe.trials.bias import UnbiasedFit
 from bampipe.trials.folds import Folds
 
@@ -211,11 +212,11 @@ def describe_methods(system: System, methods: Mapping[Method, MethodTried]) -> l
         against = [*_worse(system, published, tried), *tried.doubts]
         if tried.disagrees:
             against.append(
-                "it has "
+                "it puts "
                 + ", ".join(
-                    f"`{name}` at {tried.parameters[name].estimate:.4g}"
-                    f" ± {tried.parameters[name].sd:.2g}"
+                    f"`{name}` at {round_with_sd(one.estimate, one.sd)}"
                     for name in tried.disagrees
+                    for one in (tried.parameters[name],)
                 )
             )
         if against:

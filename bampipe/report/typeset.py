@@ -38,9 +38,11 @@ _FEW_ROWS = 3
 """Rows up to which a table stays in one piece, hole or not."""
 _PAGE_END_PT = 782.0
 """Where the text of a page ends, points from its upper edge: A4 less the margin of the template."""
+_PAGE_TOP_PT = 65.0
+"""Where it begins."""
 _HOLE_PT = 85.0
 """White above the end of a page, 3 cm, from which a page looks unfinished."""
-_PASSES = 24
+_PASSES = 48
 
 
 def pdf(document: Document, recorded: int) -> bytes:
@@ -76,20 +78,22 @@ def pdf(document: Document, recorded: int) -> bytes:
 
 
 def _lay_out(shown: dict[str, Any], source: Path) -> typst.Compiler:
-    """Return a compiler of what is ``shown``, without holes above figures and tables.
+    """Return a compiler of what is ``shown``: no holes above figures and tables, figures in order.
 
     Pages fill from the first, and what is made loose on one moves all that comes later: each pass
-    mends the first hole that is left.
+    mends the first fault that is left.
     """
     blocks = [block for section in shown["sections"] for block in section["blocks"]]
     compiler = typst.Compiler(source, root=source.parent, ignore_system_fonts=True)
     for _ in range(_PASSES):
         (source.parent / "document.json").write_text(json.dumps(shown), encoding="utf-8")
         edges = json.loads(compiler.query("<edge>", field="value"))
-        found = first_below_a_hole(blocks, edges)
-        if found is None:
+        if found := first_below_a_hole(blocks, edges) or first_overtaking(blocks, edges):
+            found["loose"] = True
+        elif found := first_with_few_rows(blocks, edges):
+            found["kept"] = True
+        else:
             break
-        found["loose"] = True
     return compiler
 
 
@@ -108,12 +112,52 @@ def first_below_a_hole(
     for block in blocks:
         start, end = starts.get(block["id"]), ends.get(block["id"])
         hole = _PAGE_END_PT - filled > _HOLE_PT
-        whole = block["kind"] == "table" and len(block["rows"]) <= _FEW_ROWS
+        whole = block["kind"] == "table" and (block["kept"] or len(block["rows"]) <= _FEW_ROWS)
         if start and not (block["loose"] or whole) and start["page"] > page and hole:
             return block
         floats = block["kind"] == "figure" and block["loose"]
         if end and not floats:
             page, filled = end["page"], end["y"]
+    return None
+
+
+def first_overtaking(
+    blocks: list[dict[str, Any]], edges: list[dict[str, Any]]
+) -> dict[str, Any] | None:
+    """Return the first figure that stands before an earlier one, which went to a later page.
+
+    Args:
+        blocks: those of `content`, in order.
+        edges: as for `first_below_a_hole`.
+    """
+    starts = {edge["block"]: edge["page"] for edge in edges if edge["edge"] == "start"}
+    page = 0
+    for block in blocks:
+        if block["kind"] == "figure" and block["id"] in starts:
+            if starts[block["id"]] < page and not block["loose"]:
+                return block
+            page = max(page, starts[block["id"]])
+    return None
+
+
+def first_with_few_rows(
+    blocks: list[dict[str, Any]], edges: list[dict[str, Any]]
+) -> dict[str, Any] | None:
+    """Return the first table that leaves one or two rows at the end of a page, and fits on one.
+
+    Args:
+        blocks: those of `content`, in order.
+        edges: as for `first_below_a_hole`, with the edge "third row" of tables.
+    """
+    at = {(edge["block"], edge["edge"]): edge for edge in edges}
+    for block in blocks:
+        start, third, end = (at.get((block["id"], name)) for name in ("start", "third row", "end"))
+        if not (start and third and end) or block["kept"]:
+            continue
+        high = _PAGE_END_PT - start["y"] + end["y"] - _PAGE_TOP_PT
+        split = start["page"] < third["page"] and end["page"] == start["page"] + 1
+        if split and high < _PAGE_END_PT - _PAGE_TOP_PT:
+            return block
     return None
 
 
@@ -175,6 +219,7 @@ def _block(block: Block, number: str) -> dict[str, Any]:
                 "note": _spans(block.note),
                 "size": _NORMAL_SIZE if len(block.head) < _MANY_COLUMNS else _SMALL_SIZE,
                 "loose": len(block.rows) > _MANY_ROWS,
+                "kept": False,
             }
         case Figure(name, caption, _):
             return {

@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Iterable
 
-from bampipe.results.rounding import decimals_for
+from bampipe.results.rounding import SMALLEST_PLAIN, decimals_for, power_for
 
 _POWERS = {"2": "²", "3": "³"}
 _PREFIXES = ((1e-6, "µ"), (1e-3, "m"), (1.0, ""), (1e3, "k"), (1e6, "M"))
@@ -56,12 +56,16 @@ def scale(values: Iterable[float], base: str) -> tuple[float, str]:
     return 1.0 / size, letter + unit(base)
 
 
-def plain(value: float, decimals: int) -> str:
-    """Return ``value`` with so many decimals and a true minus sign."""
-    text = f"{value:.{decimals}f}"
+def plain(value: float, decimals: int, power: int = 0) -> str:
+    """Return ``value`` with so many decimals, a true minus sign and that power of ten taken out."""
+    text = f"{value / 10.0**power:.{decimals}f}"
     if float(text) == 0.0:
         text = text.removeprefix("-")
-    return text.replace("-", "−")
+    return text.replace("-", "−") + _times(power)
+
+
+def _times(power: int) -> str:
+    return f"·10{_raised(str(power))}" if power else ""
 
 
 def significant(value: float | None, digits: int = 3) -> str:
@@ -70,27 +74,40 @@ def significant(value: float | None, digits: int = 3) -> str:
         return "–"
     if value == 0.0:
         return "0"
-    exponent = math.floor(math.log10(abs(float(f"{value:.{digits - 1}e}"))))
-    if exponent < -5 or exponent > 6:
-        mantissa = plain(value / 10.0**exponent, digits - 1)
-        return f"{mantissa}·10{_raised(str(exponent))}"
+    rounded = float(f"{value:.{digits - 1}e}")
+    exponent = math.floor(math.log10(abs(rounded)))
+    if abs(rounded) < SMALLEST_PLAIN or exponent > 6:
+        return plain(value, digits - 1, exponent)
     return plain(value, max(0, digits - 1 - exponent))
+
+
+def as_written(value: float) -> str:
+    """Return a number that somebody stated: four digits at most, and no zeros of our own."""
+    return prose(f"{value:.4g}")
 
 
 def with_sd(value: float | None, sd: float | None) -> str:
     """Return ``value ± sd``, both rounded to two digits of ``sd``."""
     if value is None or not math.isfinite(value):
         return "–"
-    decimals = decimals_for(sd, value)
+    decimals, power = digits_of(value, sd)
     if sd is None or not math.isfinite(sd) or sd == 0.0:
-        return plain(value, decimals)
-    return f"{plain(value, decimals)} ± {plain(sd, decimals)}"
+        return plain(value, decimals, power)
+    shown = f"{plain(value / 10.0**power, decimals)} ± {plain(sd / 10.0**power, decimals)}"
+    return f"({shown}){_times(power)}" if power else shown
+
+
+def digits_of(value: float, sd: float | None) -> tuple[int, int]:
+    """Return the decimals that ``sd`` leaves ``value``, and the power of ten to take out first."""
+    power = power_for(value, sd)
+    return decimals_for(sd / 10.0**power if sd else sd, value / 10.0**power), power
 
 
 def interval(low: float, high: float, sd: float | None) -> str:
     """Return ``low to high``, rounded as :func:`with_sd` rounds."""
-    decimals = decimals_for(sd if sd else (high - low) / 4.0, low)
-    return f"{plain(low, decimals)} to {plain(high, decimals)}"
+    decimals, power = digits_of(0.5 * (low + high), sd if sd else (high - low) / 4.0)
+    shown = f"{plain(low / 10.0**power, decimals)} to {plain(high / 10.0**power, decimals)}"
+    return f"({shown}){_times(power)}" if power else shown
 
 
 def percent(share: float | None) -> str:

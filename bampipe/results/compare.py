@@ -36,6 +36,9 @@ class Rung(Record):
     )
     unit: dict[str, str]
     free_run_mode: Literal["closed_loop", "open_loop"] | None = None
+    free_run_reason: str = Field(
+        default="", description="Why there is no free run, or none in closed loop"
+    )
     free_run: dict[str, FreeRunError] = Field(default={}, description="By axis")
     drift: dict[str, AxisDrift] = Field(default={}, description="By axis: short free runs")
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 
 _MOST_DECIMALS = 9
+SMALLEST_PLAIN, _LARGEST_PLAIN = 1e-4, 1e7
+"""Sizes outside which a number is written with a power of ten: nobody counts zeros."""
 
 
 def decimals_for(sd: float | None, value: float) -> int:
@@ -17,9 +19,20 @@ def decimals_for(sd: float | None, value: float) -> int:
     return min(_MOST_DECIMALS, max(0, 1 - math.floor(math.log10(float(f"{size:.1e}")))))
 
 
+def power_for(value: float, sd: float | None) -> int:
+    """Return the power of ten to take out of ``value`` and ``sd``; 0 where both read well as is."""
+    largest = max((abs(x) for x in (value, sd or 0.0) if math.isfinite(x)), default=0.0)
+    if largest == 0.0 or SMALLEST_PLAIN <= largest < _LARGEST_PLAIN:
+        return 0
+    return math.floor(math.log10(float(f"{largest:.1e}")))
+
+
 def round_with_sd(value: float, sd: float) -> str:
     """Return ``value ± sd``, both to two digits of ``sd``, and by powers of ten where need be."""
-    if not 1e-7 < sd < 1e4 or abs(value) >= 1e7:
-        return f"{value:.4g} ± {sd:.2g}"
+    if sd == 0.0:
+        return f"{value:.4g} ± 0"
+    power = power_for(value, sd)
+    size = f"e{power:+03d}" if power else ""
+    value, sd = value / 10.0**power, sd / 10.0**power
     decimals = decimals_for(sd, value)
-    return f"{round(value, decimals) + 0.0:.{decimals}f} ± {sd:.{decimals}f}"
+    return f"{round(value, decimals) + 0.0:.{decimals}f}{size} ± {sd:.{decimals}f}{size}"

@@ -36,6 +36,7 @@ from bampipe.results.draft import (
 )
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.ingest import IngestResult
+from bampipe.results.rounding import round_with_sd
 from bampipe.schema import STRICT, Count
 from bampipe.trials.measured import read_measured_trials
 
@@ -168,7 +169,7 @@ def _effect(term: Term, file: str, system: System) -> DraftedEffect:
     }
     is_curve = form.shape.name == "curve"
     numbers = ", ".join(
-        f"{name} {c.value:.4g} ± {0.5 * (c.high - c.low):.2g} {c.unit}"
+        f"{name} {round_with_sd(c.value, 0.5 * (c.high - c.low))} {c.unit}"
         for name, c in constants.items()
     )
     return DraftedEffect(

@@ -444,7 +444,7 @@ def _describe_gears(gears: Mapping[str, GearStiffness]) -> list[str]:
         if gear.stiffness is not None and gear.sd is not None:
             words = f"{round_with_sd(gear.stiffness, gear.sd)} {gear.unit}"
         if gear.play is not None and gear.play_sd is not None and gear.play > _SURE * gear.play_sd:
-            words += f", play {gear.play:.2g} ± {gear.play_sd:.1g} {gear.play_unit}"
+            words += f", play {round_with_sd(gear.play, gear.play_sd)} {gear.play_unit}"
         if abs(gear.late_s) > _SURE * gear.late_sd:
             when = "after" if gear.late_s > 0.0 else "before"
             words += f", second encoder read {1e3 * abs(gear.late_s):.2g} ms {when} the first"

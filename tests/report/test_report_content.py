@@ -304,8 +304,8 @@ def test_the_drift_of_a_model_is_a_table_and_its_absence_a_sentence(
     path.write_text(json.dumps(content))
     blocks = validation.section(Results(root)).blocks
     table = next(b for b in blocks if getattr(b, "caption", "").startswith("Drift"))
-    assert table.rows == (("yaw", "0.0012", "0.0034", "0.20", "rad"),)
-    assert any(f"yaw: {why}" in getattr(b, "items", ()) for b in blocks)
+    assert table.rows == (("yaw", "1.2", "3.4", "200", "mrad"),)
+    assert any(f"yaw: {why[:1].lower()}{why[1:]}" in getattr(b, "items", ()) for b in blocks)
 
 
 def test_figures_are_vectors_in_the_palette(full: Report) -> None:

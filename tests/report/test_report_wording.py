@@ -31,6 +31,10 @@ def test_unit(stored: str, shown: str) -> None:
         (None, 0.1, "–"),
         (float("nan"), 0.1, "–"),
         (-0.0001, 0.13, "0.00 ± 0.13"),
+        (4.4e-6, 3.8e-6, "(4.4 ± 3.8)·10⁻⁶"),
+        (-3e-7, 1.2e-5, "(0.0 ± 1.2)·10⁻⁵"),
+        (2.134e-5, None, "2.134·10⁻⁵"),
+        (1.1e-3, 2e-6, "0.0011000 ± 0.0000020"),
     ],
 )
 def test_with_sd(value: float | None, sd: float | None, shown: str) -> None:
@@ -39,9 +43,14 @@ def test_with_sd(value: float | None, sd: float | None, shown: str) -> None:
 
 @given(st.floats(-1e6, 1e6), st.floats(1e-6, 1e4))
 def test_rounding_stays_within_a_twentieth_of_the_uncertainty(value: float, sd: float) -> None:
-    shown = wording.with_sd(value, sd).replace("−", "-").split(" ± ")
-    assert abs(float(shown[0]) - value) <= 0.0505 * sd + 1e-9 * abs(value)
-    assert abs(float(shown[1]) - sd) <= 0.0505 * sd
+    both, _, raised = wording.with_sd(value, sd).replace("−", "-").partition(")·10")
+    shown = [10.0 ** read_power(raised) * float(x) for x in both.strip("()").split(" ± ")]
+    assert abs(shown[0] - value) <= 0.0505 * sd + 1e-9 * abs(value)
+    assert abs(shown[1] - sd) <= 0.0505 * sd
+
+
+def read_power(raised: str) -> int:
+    return int("".join("-0123456789"["⁻⁰¹²³⁴⁵⁶⁷⁸⁹".index(mark)] for mark in raised) or "0")
 
 
 @given(st.floats(1e-9, 1e9))
@@ -49,8 +58,7 @@ def test_significant_keeps_three_digits(value: float) -> None:
     text = wording.significant(value)
     if "·10" in text:
         mantissa, raised = text.split("·10")
-        power = int("".join("-0123456789"["⁻⁰¹²³⁴⁵⁶⁷⁸⁹".index(mark)] for mark in raised))
-        shown = float(mantissa) * 10.0**power
+        shown = float(mantissa) * 10.0 ** read_power(raised)
     else:
         shown = float(text)
     assert shown == pytest.approx(value, rel=5.01e-3)

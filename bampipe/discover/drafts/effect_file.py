@@ -10,6 +10,7 @@ import numpy as np
 
 from bampipe.discover.drafts.forms import rounded
 from bampipe.discover.drafts.search import Term
+from bampipe.results.rounding import round_with_sd
 
 _PLACE_IN_WIDTHS = 2.0
 _PLACE_IN_SPANS = 0.1
@@ -31,7 +32,7 @@ def declare(term: Term, source: str) -> dict[str, Any]:
     for name, entry in term.form.entries().items():
         entries[name] = dict(entry)
         if name in term.values:
-            interval = f"{term.values[name]:.4g} ± {1.96 * term.sd[name]:.2g} {entry['unit']}"
+            interval = f"{round_with_sd(term.values[name], 1.96 * term.sd[name])} {entry['unit']}"
             entries[name]["description"] += f"; drafted as {interval}".rstrip()
             entries[name] |= _numbers(term, name, entry)
     return term.form.declaration(source, term.name, entries)

@@ -34,10 +34,10 @@ def _constants(
         rows.append(
             (
                 f"`{name}`",
-                entry.description or "–",
-                wording.significant(entry.value, 4),
+                entry.description,
+                wording.as_written(entry.value),
                 wording.unit(entry.unit) or "1",
-                entry.source or "–",
+                entry.source,
             )
         )
     return Table(
@@ -63,7 +63,7 @@ def _numbers(numbers: Iterable[DeviceNumber]) -> Table:
         rows.append(
             (
                 f"`{entry.name}`",
-                f"{wording.significant(entry.value, 4)} {unit}",
+                f"{wording.as_written(entry.value)} {unit}",
                 wording.significant(entry.bound_sd, 2),
                 ", ".join(most) or "none by 0.01 %",
             )

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from bampipe.lists import join_names
 from bampipe.report import style, verdicts, wording
 from bampipe.report.document import (
     Block,
@@ -80,8 +81,9 @@ def _model(
         for axis in lacking
         if found.maps.get(axis)
     ]
-    if found.worst_windows and lacking:
-        blocks.append(_windows(results, found.worst_windows))
+    windows = [window for window in found.worst_windows if window.axis in lacking]
+    if windows:
+        blocks.append(_windows(results, windows))
     return blocks
 
 
@@ -134,6 +136,8 @@ def _verdicts(names: tuple[str, ...], axes: Mapping[str, AxisVerdict]) -> Table:
 
 
 def _ranking(results: Results, ranking: Sequence[RankedEffect]) -> Table:
+    shown = ranking[:_RANKED]
+    imitated = any(entry.indistinguishable_from for entry in shown)
     rows = [
         (
             f"`{entry.effect}`",
@@ -142,9 +146,9 @@ def _ranking(results: Results, ranking: Sequence[RankedEffect]) -> Table:
             wording.significant(entry.held_out_rmse_after),
             wording.unit(results.force_unit(entry.axis)) if entry.axis in results.axes else "",
             wording.probability(entry.p_value),
-            ", ".join(f"`{name}`" for name in entry.indistinguishable_from) or "–",
+            *((join_names(f"`{n}`" for n in entry.indistinguishable_from),) if imitated else ()),
         )
-        for entry in ranking[:_RANKED]
+        for entry in shown
     ]
     more = len(ranking) - len(rows)
     note = (
@@ -156,10 +160,18 @@ def _ranking(results: Results, ranking: Sequence[RankedEffect]) -> Table:
         note += f" {wording.count(more, 'candidate')} further down not shown."
     return Table(
         "Candidate effects, best first: error on held-out trials without and with each",
-        ("Effect", "Axis", "Without", "With", "Unit", "p", "Indistinguishable from"),
+        (
+            "Effect",
+            "Axis",
+            "Without",
+            "With",
+            "Unit",
+            "p",
+            *(("Indistinguishable from",) if imitated else ()),
+        ),
         tuple(rows),
-        "llrrlrl",
-        (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0),
+        "llrrlr" + "l" * imitated,
+        (0.0,) * 6 + (1.0,) * imitated,
         note,
     )
 

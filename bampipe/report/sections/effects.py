@@ -116,7 +116,8 @@ def _curve(panel: Axes, curve: TermCurve) -> None:
     panel.axhline(0.0, color=style.INK, lw=0.5)
     panel.set_title(curve.axis)
     panel.set_xlabel(style.label(wording.words(curve.variable), unit))
-    panel.set_ylabel(style.label("force it takes", wording.unit(curve.unit)))
+    kind = "torque" if curve.unit.startswith("N.m") else "force"
+    panel.set_ylabel(style.label(f"{kind} it takes", wording.unit(curve.unit)))
 
 
 def _pictures(results: Results, term: ModelTerm, name: str, shown: set[str]) -> list[Block]:
@@ -124,7 +125,11 @@ def _pictures(results: Results, term: ModelTerm, name: str, shown: set[str]) -> 
     curves = [curve for curve in term.curves if curve.variance_share >= _LEAST_FOLLOWED]
     blocks: list[Block] = []
     if term.curves and not curves:
-        blocks.append(Paragraph("Its force follows no single variable of the motion."))
+        blocks.append(
+            Paragraph(
+                "No single variable carries a fifth of its low-passed force: no curve is drawn."
+            )
+        )
     found = _window(results, term)
     if found is None or found.added in shown:
         if curves:

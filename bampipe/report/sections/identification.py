@@ -23,10 +23,10 @@ from bampipe.results.identify import (
     StateBound,
 )
 from bampipe.results.intervals import NORMAL_95
-from bampipe.results.rounding import decimals_for
 
 TITLE = "Identification"
-_TWO_COLUMNS = 6
+_COLUMNS = (2, 3, 4)
+"""Of panels: those that leave the fewest places empty, and of these the least."""
 _DASHES = ("-", (0, (5, 1.5)), (0, (1.5, 1.2)), (0, (5, 1.5, 1, 1.5)))
 
 
@@ -74,19 +74,19 @@ def _parameters(results: Results, identified: IdentifyResult) -> Table:
     for name in names:
         entry = parameters[name]
         value, sd = entry.estimate, entry.sd
-        decimals = decimals_for(sd, value)
+        digits = wording.digits_of(value, sd)
         half = NORMAL_95 * sd if sd else 0.0
         rows.append(
             (
                 wording.parameter(name),
                 f"`{name}`",
-                wording.plain(value, decimals) + (" *" if entry.at_bound else ""),
+                wording.plain(value, *digits) + (" *" if entry.at_bound else ""),
                 wording.significant(sd, 2) if sd else "fixed",
                 *((wording.significant(entry.calibration_sd, 2),) if calibrated else ()),
                 *((wording.significant(entry.bound_sd, 2),) if bounded else ()),
                 wording.interval(value - half, value + half, sd) if sd else "–",
                 *(
-                    wording.plain(identified.methods[method].parameters[name].estimate, decimals)
+                    wording.plain(identified.methods[method].parameters[name].estimate, *digits)
                     for method in others
                 ),
                 wording.unit(entry.unit),
@@ -136,11 +136,10 @@ def _without_inertial(identified: IdentifyResult) -> Mapping[str, ParameterEstim
 def _base_parameters(bases: Sequence[BaseEstimate]) -> Table:
     rows = []
     for base in bases:
-        decimals = decimals_for(base.sd, base.estimate)
         rows.append(
             (
                 base.combination,
-                wording.plain(base.estimate, decimals),
+                wording.plain(base.estimate, *wording.digits_of(base.estimate, base.sd)),
                 wording.significant(base.sd, 2),
                 wording.with_sd(base.drawn, base.drawn_sd),
                 "yes" if base.shown else "no",
@@ -237,7 +236,7 @@ def _groups(
 
 def _convergence(results: Results, identified: IdentifyResult, trace: pd.DataFrame) -> Figure:
     groups = _groups(results, _without_inertial(identified), trace)
-    columns = 2 if len(groups) <= _TWO_COLUMNS else 3
+    columns = min(_COLUMNS, key=lambda columns: (-len(groups) % columns, columns))
     rows = math.ceil(len(groups) / columns)
     figure, panels = style.panels(rows, columns, 0.35 + 1.35 * rows, sharex=True)
     time_column = "t_total" if "t_total" in trace else "t"
@@ -255,7 +254,7 @@ def _convergence(results: Results, identified: IdentifyResult, trace: pd.DataFra
         if again.size:
             panel.axvline(again[0], color=style.INK, lw=0.6, zorder=0)
         _settled(panel, trace, names)
-        panel.set_title(textwrap.fill(kind, 26))
+        panel.set_title(textwrap.fill(kind, 22))
         panel.set_ylabel(wording.unit(unit) or "1")
         if len(panel.get_legend_handles_labels()[1]) > 1:
             panel.legend(loc="best", ncols=2 if columns == 2 else 1)

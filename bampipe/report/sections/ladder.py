@@ -54,7 +54,7 @@ def _steps(results: Results, rungs: Sequence[Rung]) -> Table:
             floor = rung.noise_floor.get(axis)
             text = wording.significant(error)
             cells.append(f"{text} ({wording.significant(floor)})" if floor else text)
-        rows.append((_version(rungs, rung), f"`{rung.added}`" if rung.added else "–", *cells))
+        rows.append((_version(rungs, rung), f"`{rung.added}`" if rung.added else "", *cells))
     units = (f"{axis} ({wording.unit(results.force_unit(axis))})" for axis in axes)
     return Table(
         "RMSE on the same held-out trials (noise floor)",
@@ -67,6 +67,13 @@ def _steps(results: Results, rungs: Sequence[Rung]) -> Table:
 def _free_runs(results: Results, rungs: Sequence[Rung]) -> Table:
     """Position error of each version left to itself: mean absolute, and relative to the motion."""
     axes = _axes(results, rungs)
+    scales = {
+        axis: wording.scale(
+            (rung.free_run[axis].mean_absolute for rung in rungs if axis in rung.free_run),
+            results.unit(axis),
+        )
+        for axis in axes
+    }
     rows = []
     for rung in rungs:
         cells = []
@@ -75,20 +82,21 @@ def _free_runs(results: Results, rungs: Sequence[Rung]) -> Table:
             if entry is None:
                 cells += ["–", "–"]
                 continue
-            cells.append(wording.significant(entry.mean_absolute))
+            cells.append(wording.significant(scales[axis][0] * entry.mean_absolute))
             cells.append(wording.significant(entry.relative_error_percent))
-        loop = (rung.free_run_mode or "–").replace("_", " ")
+        loop = wording.words(rung.free_run_mode or "–")
         rows.append((_version(rungs, rung), loop, *cells))
-    units = [
-        column
-        for axis in axes
-        for column in (f"{axis} ({wording.unit(results.unit(axis))})", "relative (%)")
-    ]
+    units = [column for axis in axes for column in (f"{axis} ({scales[axis][1]})", "relative (%)")]
     return Table(
         "Free run over held-out trials: mean absolute error of the position, and relative error",
         ("Version", "Loop", *units),
         tuple(rows),
         "ll" + "rr" * len(axes),
+        note=" ".join(
+            f"{_version(rungs, rung).capitalize()}, –: {rung.free_run_reason}."
+            for rung in rungs
+            if not rung.free_run
+        ),
     )
 
 
@@ -97,14 +105,21 @@ def _drift(results: Results, rungs: Sequence[Rung]) -> Table:
     axes = _axes(results, rungs)
     horizons = horizons_of(rungs)
     rows = []
-    for rung in rungs:
+    drifts = {axis: [rung.median_drift(axis) for rung in rungs] for axis in axes}
+    scales = {
+        axis: wording.scale(
+            (x for found in drifts[axis] for x in found.values()), results.unit(axis)
+        )
+        for axis in axes
+    }
+    for number, rung in enumerate(rungs):
         cells = []
-        for axis in axes:
-            found = rung.median_drift(axis)
+        for axis, (factor, _) in scales.items():
+            found = {h: factor * x for h, x in drifts[axis][number].items()}
             cells.append(" / ".join(wording.significant(found.get(h), 2) for h in horizons))
         rows.append((_version(rungs, rung), *cells))
-    units = (f"{axis} ({wording.unit(results.unit(axis))})" for axis in axes)
-    within = " / ".join(wording.plain(h, 1) for h in horizons)
+    units = (f"{axis} ({unit})" for axis, (_, unit) in scales.items())
+    within = " / ".join(f"{h:g}" for h in horizons)
     return Table(
         f"Drift of each version left to itself for {within} s under the recorded inputs, median",
         ("Version", *units),
@@ -196,4 +211,5 @@ def _parameters(
         ("Parameter", *(_version(rungs, rung) for rung in shown), "Unit"),
         tuple(rows),
         "l" + "r" * len(shown) + "l",
+        note="–: not in that version." if any("–" in row for row in rows) else "",
     )

@@ -107,7 +107,7 @@ def _settings(stages: Mapping[str, StepRecord]) -> Table | None:
         ("Stage", "Settings"),
         rows,
         "ll",
-        (0.4, 1.0),
+        (0.0, 1.0),
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 from bampipe.report import wording
@@ -31,6 +32,7 @@ def section(results: Results) -> Section | None:
             ("Quantity", "Place", "Paper", "This session", "Unit"),
             rows,
             "llrrl",
+            note="Paper: digits as printed there." + _lacking(rows),
         ),
     ]
     if "comparison" in paper:
@@ -72,7 +74,15 @@ def _comparison(results: Results, comparison: dict[str, Any]) -> Table:
         tuple(rows),
         "llllll",
         (0.9, 1.2, 1.2, 0.95, 0.95, 0.9),
-        comparison["note"],
+        comparison["note"] + _lacking(rows),
+    )
+
+
+def _lacking(rows: Iterable[tuple[str, ...]]) -> str:
+    return (
+        " –: no such result in this session: no trials for it, or a method that does not give it."
+        if any("–" in row for row in rows)
+        else ""
     )
 
 

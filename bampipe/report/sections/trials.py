@@ -91,7 +91,7 @@ def _duration(seconds: object) -> str:
 
 def _remarks(row: dict[Any, Any]) -> str:
     found = [_flat(row.get("reason")), _flat(row.get("repairs"))]
-    return "; ".join(text for text in found if text) or "–"
+    return "; ".join(text for text in found if text) or "none"
 
 
 def _flat(value: object) -> str:

@@ -60,9 +60,12 @@ def _by_axis(results: Results, validated: ValidateResult) -> Table:
                 wording.unit(entry.unit),
             )
         )
-    each = join_names(
-        f"{axis} at {wording.significant(hz, 2)} Hz" for axis, hz in validated.cutoff_hz.items()
-    )
+    bands = {
+        axis: f"at {wording.significant(hz, 2)} Hz" for axis, hz in validated.cutoff_hz.items()
+    }
+    each = join_names(f"{axis} {band}" for axis, band in bands.items())
+    if len(set(bands.values())) == 1:
+        each = next(iter(bands.values()))
     return Table(
         f"Error of the predicted force, model `{validated.model}`",
         (
@@ -80,7 +83,7 @@ def _by_axis(results: Results, validated: ValidateResult) -> Table:
         "Held out: each trial predicted with parameters that never saw it. Noise floor: what "
         "sensor noise, quantisation and filtering alone would leave. Fit: share of the measured "
         "force that is explained, as 100 (1 − held-out RMSE / standard deviation)."
-        f" Measured and predicted force are low-passed, {each}.",
+        f" Measured and predicted force are low-passed {each}.",
     )
 
 
@@ -100,6 +103,7 @@ def _by_trial(results: Results, validated: ValidateResult) -> Table:
         ("Trial", "Held out", *units),
         tuple(rows),
         "ll" + "r" * len(results.axes),
+        note="–: the axis rested." if any("–" in row for row in rows) else "",
     )
 
 
@@ -117,7 +121,11 @@ def _drift(results: Results, drift: Mapping[str, AxisDrift]) -> list[Block]:
     """Return how far the model drifts in short free runs, and where it is not said why."""
     axes = verdicts.ordered(results, drift)
     horizons = sorted({h.horizon_s for axis in axes for h in drift[axis].horizons})
-    reasons = tuple(f"{axis}: {drift[axis].reason}" for axis in axes if drift[axis].reason)
+    reasons = tuple(
+        f"{axis}: {reason[:1].lower()}{reason[1:]}"
+        for axis in axes
+        if (reason := drift[axis].reason)
+    )
     everywhere = {drift[axis].reason for axis in axes}
     if not horizons and len(everywhere) == 1 and reasons:
         return [Paragraph(f"No short free runs of this model. {everywhere.pop()}")]
@@ -125,14 +133,16 @@ def _drift(results: Results, drift: Mapping[str, AxisDrift]) -> list[Block]:
     rows = []
     for axis in axes:
         found = {h.horizon_s: h for h in drift[axis].horizons}
+        largest = [h.quantile_90 for h in found.values()]
+        factor, unit = wording.scale(largest, results.unit(axis))
         cells = []
         for horizon in horizons:
             h = found.get(horizon)
             shown = (h.median, h.quantile_90, h.displacement) if h else ()
-            cells += [wording.significant(value, 2) for value in shown] or ["–"] * 3
-        rows.append((axis, *cells, wording.unit(results.unit(axis))))
+            cells += [wording.significant(factor * value, 2) for value in shown] or ["–"] * 3
+        rows.append((axis, *cells, unit))
     if horizons:
-        head = (("in " + wording.plain(h, 1) + " s", "90 %", "moved") for h in horizons)
+        head = ((f"in {h:g} s", "90 %", "moved") for h in horizons)
         blocks.append(
             Table(
                 "Drift of the model left to itself",

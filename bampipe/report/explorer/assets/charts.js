@@ -20,7 +20,7 @@ function buildStructure() {
     label: `Autocorrelation of the residual of ${axis} in view, with 95 % bounds`,
   });
   structure.causes = new Figure(host, {
-    title: `residual ${axis}: correlation with motion and load`, xLabel: "", yLabel: "correlation", height: 260,
+    title: `residual ${axis}: correlation with motion and load`, xLabel: "the strongest first; all of them in the CSV", yLabel: "correlation", height: 260,
     label: `Correlation of the residual of ${axis} in view with each variable, with 95 % intervals`,
     xTicks: (_min, _max, width) => {
       const { names } = structure.causes;
