@@ -56,7 +56,10 @@ class InputError(Exception):
     def __str__(self) -> str:
         text = f"{self.where}: {self.what}" if self.where else self.what
         text += f" (and {len(self.others)} more)" if self.others else ""
-        text = f"{text}; {self.remedy}" if self.remedy else text
+        if self.remedy:
+            remedy = self.remedy
+            asks = text.endswith("?")
+            text += f" {remedy[:1].upper()}{remedy[1:]}" if asks else f"; {remedy}"
         return printable(" ".join(text.split()))
 
 

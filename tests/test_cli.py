@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import json
+import shutil
 import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
@@ -316,6 +317,18 @@ def test_run_is_found_by_name_folder_session_or_not_named(toy: Toy) -> None:
         assert places.find_run(argument, toy.runs) == toy.root
     with pytest.raises(InputError, match="did you mean 'first'"):
         places.find_run("frist", toy.runs)
+
+
+def test_a_name_means_the_run_and_a_path_the_folder(
+    toy: Toy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    toy.run()
+    here = tmp_path / "here"
+    shutil.copytree(toy.root, here / "first")
+    monkeypatch.chdir(here)
+    assert places.find_run("first", toy.runs) == toy.root
+    assert places.find_run("./first", toy.runs).resolve() == here / "first"
+    assert places.find_run("first", here / "no-runs") == Path("first")
 
 
 def test_pattern_without_a_session(tmp_path: Path) -> None:

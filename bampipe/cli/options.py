@@ -17,7 +17,8 @@ SessionArgument = Annotated[
 RunArgument = Annotated[
     str | None,
     typer.Argument(
-        metavar="[RUN]", help="Run folder, or its name under runs/; the most recent run if omitted."
+        metavar="[RUN]",
+        help="A run by its name in --runs, or by its path or session; the latest if omitted.",
     ),
 ]
 RunsOption = Annotated[

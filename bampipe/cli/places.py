@@ -20,31 +20,38 @@ def known_runs(runs: Path) -> list[Path]:
 
 def is_run(argument: str, runs: Path) -> bool:
     """Return whether ``argument`` is a run folder, or the name of one in ``runs``."""
-    return any((path / record.FILE).is_file() for path in (Path(argument), runs / argument))
+    return _run_folder(argument, runs) is not None
+
+
+def _run_folder(argument: str, runs: Path) -> Path | None:
+    """Return the run folder: a bare name is first of all one in ``runs``, anything else a path."""
+    is_name = argument == Path(argument).name
+    places = (runs / argument, Path(argument)) if is_name else (Path(argument), runs / argument)
+    return next((path for path in places if (path / record.FILE).is_file()), None)
 
 
 def find_run(argument: str | None, runs: Path) -> Path:
     """Return the run folder that ``argument`` means.
 
     Args:
-        argument: a run folder, the name of one in ``runs``, or a session that was run; None for
-            the most recent run.
+        argument: the name of a run in ``runs``, which goes before a folder of that name in the
+            current directory; the path of a run folder; or a session that was run. None for the
+            most recent run.
         runs: the folder of runs.
 
     Raises:
         InputError: there is no such run, or it holds a link.
     """
-    argument = None if argument is None else str(session_folder(argument))
     if argument is None:
         known = known_runs(runs)
         if not known:
             raise InputError(f"no run yet in {runs}", remedy="start with `bampipe run SESSION`")
         refuse_links(known[0])
         return known[0]
-    for path in (Path(argument), runs / argument):
-        if (path / record.FILE).is_file():
-            refuse_links(path)
-            return path
+    if (root := _run_folder(argument, runs)) is not None:
+        refuse_links(root)
+        return root
+    argument = str(session_folder(argument))
     if (Path(argument) / "session.toml").is_file():
         root = runs / session_id(Path(argument))
         if (root / record.FILE).is_file():
