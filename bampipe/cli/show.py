@@ -282,7 +282,7 @@ def _free_runs(rungs: Sequence[Rung]) -> None:
     say("free run: position error of the model left to itself over held-out trials")
     table(head, body)
     for rung in rungs:
-        if not rung.free_run:
+        if not rung.free_run and rung.free_run_reason:
             say(f"  {rung.model}: {rung.free_run_reason}")
 
 

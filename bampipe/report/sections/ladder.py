@@ -95,7 +95,7 @@ def _free_runs(results: Results, rungs: Sequence[Rung]) -> Table:
         note=" ".join(
             f"{_version(rungs, rung).capitalize()}, –: {rung.free_run_reason}."
             for rung in rungs
-            if not rung.free_run
+            if not rung.free_run and rung.free_run_reason
         ),
     )
 
