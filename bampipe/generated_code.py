@@ -56,6 +56,7 @@ class Generated:
     def module(self, name: str) -> ModuleType:
         """Return the module ``name``, executed once a process."""
         path = self._path(name)
+        # Named by what is in it: models with the same text share what is compiled from it.
         title = f"bampipe_generated_{path.stem}"
         if title in sys.modules:
             return sys.modules[title]
@@ -73,7 +74,7 @@ class Generated:
         return module
 
     def _path(self, name: str) -> Path:
-        return self.folder / f"{name}_{self.key}.py"
+        return _source_path(self.folder, name, digest_bytes(self.sources[name].encode()))
 
     def write(self) -> None:
         """Write all files, the one that vouches for the others last.
@@ -123,12 +124,17 @@ def _read(folder: Path, key: str) -> Generated | None:
     sources = {}
     for name, digest in content["sources"].items():
         try:
-            sources[name] = (folder / f"{name}_{key}.py").read_text(encoding="utf-8")
+            sources[name] = _source_path(folder, name, digest).read_text(encoding="utf-8")
         except (OSError, UnicodeDecodeError):
             return None
         if digest_bytes(sources[name].encode()) != digest:
             return None
     return Generated(key, folder, content["facts"], sources)
+
+
+def _source_path(folder: Path, name: str, digest: str) -> Path:
+    """Where the source of a module is, whose hash is ``digest``."""
+    return folder / f"{name}_{digest[:24]}.py"
 
 
 def folder_of_user() -> Path:

@@ -81,6 +81,7 @@ def memory(q, qd, u, p, t, z0, steps, out):
                     at[j] = z[j] + 0.5 * h * k1[j]
             for j in range(len(a)):
                 a[j] = q[i, j] + share * (q[i + 1, j] - q[i, j])
+            for j in range(len(b)):
                 b[j] = qd[i, j] + share * (qd[i + 1, j] - qd[i, j])
             for j in range(len(c)):
                 c[j] = u[i, j] + share * (u[i + 1, j] - u[i, j])
@@ -119,6 +120,7 @@ def memory(q, qd, u, p, t, z0, steps, out):
             share = (s + 1) / steps
             for j in range(len(x)):
                 x[j] = q[i, j] + share * (q[i + 1, j] - q[i, j])
+            for j in range(len(v)):
                 v[j] = qd[i, j] + share * (qd[i + 1, j] - qd[i, j])
             for j in range(len(w)):
                 w[j] = u[i, j] + share * (u[i + 1, j] - u[i, j])
@@ -261,9 +263,7 @@ def portable_expressions(
 
 def array_source(e: Equations, added: Sequence[Any]) -> str:
     """Source of the functions over columns; ``added`` is what the effects add to the residual."""
-    quiet = dict.fromkeys(e.w, 0)
     motion = {"q": e.q, "qd": e.qd, "qdd": e.qdd}
-    required = [f - o.subs(quiet) for f, o in zip(e.dynamics, e.other, strict=True)]
     true = [
         *[a + b for a, b in zip(e.q, e.offset, strict=True)],
         *[a + b for a, b in zip(e.qd, e.offset_rate, strict=True)],
@@ -271,7 +271,6 @@ def array_source(e: Equations, added: Sequence[Any]) -> str:
     ]
     parts = [
         ARRAY_HEADER,
-        function_source("required", {**motion, "z": e.z, "u": e.u, "p": e.p}, required, e.steps),
         function_source("applied", {**motion, "z": e.z, "u": e.u, "p": e.p}, e.applied),
         function_source(
             "contribution",
@@ -286,15 +285,27 @@ def array_source(e: Equations, added: Sequence[Any]) -> str:
         ),
         function_source("initial_memory", {"q": e.q, "u": e.u, "p": e.p}, e.initial),
         function_source(
+            "compensation",
+            {"q": e.q, "qd": e.qd, "z": e.z, "u": e.u, "p": e.p},
+            [expr for expr in e.compensation if expr != 0],
+        ),
+    ]
+    return "".join(parts)
+
+
+def dynamics_source(e: Equations) -> str:
+    """Source of the functions over columns of the whole mechanism: long where it is a robot."""
+    quiet = dict.fromkeys(e.w, 0)
+    motion = {"q": e.q, "qd": e.qd, "qdd": e.qdd}
+    required = [f - o.subs(quiet) for f, o in zip(e.dynamics, e.other, strict=True)]
+    parts = [
+        ARRAY_HEADER,
+        function_source("required", {**motion, "z": e.z, "u": e.u, "p": e.p}, required, e.steps),
+        function_source(
             "mass_matrix", {"q": e.q, "p": e.p}, [m for row in e.mass for m in row], e.steps
         ),
         function_source(
             "energy", {"q": e.q, "qd": e.qd, "p": e.p}, [e.kinetic, e.potential], e.steps
-        ),
-        function_source(
-            "compensation",
-            {"q": e.q, "qd": e.qd, "z": e.z, "u": e.u, "p": e.p},
-            [expr for expr in e.compensation if expr != 0],
         ),
     ]
     return "".join(parts)
@@ -427,31 +438,50 @@ def residual_source(e: Equations) -> str:
     )
 
 
-def memory_source(e: Equations) -> str:
-    """Source of the compiled internal states along a motion."""
+def memory_source(e: Equations) -> tuple[str, dict[str, list[int]]]:
+    """Source of the compiled internal states along a motion, and the columns that it takes.
+
+    It knows its columns by number only: the states of an effect have the same text on every joint,
+    which is compiled once.
+
+    Returns:
+        The source, and by group (q, qd, u, p) the numbers of the columns that are passed.
+    """
     slopes = [sp.diff(rate, z) for rate, z in zip(e.rates, e.z, strict=True)]
     others = [set(e.z) - {z} for z in e.z]
     coupled = any(r.free_symbols & o for r, o in zip(e.rates, others, strict=True))
+    groups = {"q": e.q, "qd": e.qd, "u": e.u, "p": e.p}
+    used = set().union(*(sp.sympify(rate).free_symbols for rate in e.rates))
+    uses = {g: [i for i, s in enumerate(some) if s in used] for g, some in groups.items()}
+    numbered = {
+        groups[g][i]: sp.Symbol(f"{g}_{k:03d}", real=True)
+        for g, places in uses.items()
+        for k, i in enumerate(places)
+    }
+    numbered |= {z: sp.Symbol(f"z_{k:03d}", real=True) for k, z in enumerate(e.z)}
+    passed = {g: [numbered[groups[g][i]] for i in places] for g, places in uses.items()}
+    states = [numbered[z] for z in e.z]
+
+    def renamed(expressions: Sequence[Any]) -> list[Any]:
+        return [sp.sympify(x).xreplace(numbered) for x in expressions]
+
     if coupled or any(slope.free_symbols & set(e.z) for slope in slopes):
-        rate = _memory_function("memory_rate", e, {"z": e.z}, {"dz": e.rates})
-        return SCALAR_HEADER + "import numpy as np\n" + rate + MEMORY_LOOP
+        groups_of = {**passed, "z": states}
+        rate = _memory_function("memory_rate", groups_of, {"dz": renamed(e.rates)})
+        return SCALAR_HEADER + "import numpy as np\n" + rate + MEMORY_LOOP, uses
     still = [rate.subs(z, 0) for rate, z in zip(e.rates, e.z, strict=True)]
-    terms = _memory_function("memory_terms", e, {}, {"c": still, "b": slopes})
+    terms = _memory_function("memory_terms", passed, {"c": renamed(still), "b": renamed(slopes)})
     steady = not any(slope.free_symbols & {*e.q, *e.qd, *e.u} for slope in slopes)
     head = f"import numpy as np\nRAMP = {steady}\n"
-    return SCALAR_HEADER + head + terms + LINEAR_MEMORY_LOOP
+    return SCALAR_HEADER + head + terms + LINEAR_MEMORY_LOOP, uses
 
 
 def _memory_function(
-    name: str,
-    e: Equations,
-    more: Mapping[str, Sequence[Any]],
-    results: Mapping[str, Sequence[Any]],
+    name: str, groups: Mapping[str, Sequence[Any]], results: Mapping[str, Sequence[Any]]
 ) -> str:
-    """A compiled function of motion, inputs, parameters and ``more`` that fills ``results``."""
-    block = _block([sp.sympify(x) for part in results.values() for x in part])
+    """A compiled function of groups of columns that fills ``results``."""
+    block = _block([x for part in results.values() for x in part])
     body = []
-    groups = {"q": e.q, "qd": e.qd, "u": e.u, "p": e.p, **more}
     for group, symbols in groups.items():
         body += _unpack(group, symbols, block.used)
     places = [f"{part}[{i}]" for part, parts in results.items() for i in range(len(parts))]

@@ -202,13 +202,17 @@ def _derive(model: Model, named_constants: bool) -> Equations:
     products: list[tuple[int, int]] = []
     constant: list[bool] = []
     varying = {*d.p.values(), *d.z.values()}
+    # An expression has few of a robot's hundred parameters, and sympy is slow to find a slope zero.
+    present = [(e, e.free_symbols) for e in residual]
+    elsewhere: set[Any] = set().union(*(e.free_symbols for e in [*rates, *moved]))
     for i, symbol in enumerate(d.p.values()):
-        slopes = [slope for e in residual if (slope := sp.diff(e, symbol)) != 0]
-        curved = any(sp.diff(slope, symbol) != 0 for slope in slopes)
-        linear.append(not curved and not any(e.has(symbol) for e in [*rates, *moved]))
-        constant.append(linear[i] and not any(s.free_symbols & varying for s in slopes))
+        slopes = [sp.diff(e, symbol) for e, symbols in present if symbol in symbols]
+        left: set[Any] = set().union(*(s.free_symbols for s in slopes))
+        curved = symbol in left and any(sp.diff(slope, symbol) != 0 for slope in slopes)
+        linear.append(not curved and symbol not in elsewhere)
+        constant.append(linear[i] and not left & varying)
         for j, earlier in enumerate([*d.p.values()][:i]):
-            if any(sp.diff(slope, earlier) != 0 for slope in slopes):
+            if earlier in left and any(sp.diff(slope, earlier) != 0 for slope in slopes):
                 products.append((j, i))
     return Equations(
         q=d.q, qd=d.qd, qdd=d.qdd, z=[*d.z.values()], z_names=z_names,

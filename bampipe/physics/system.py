@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe import generated_code
+from bampipe.physics.device import Device
+from bampipe.physics.equations import Equations
 from bampipe.physics.model import Model
 from bampipe.physics.parameter import Parameter
 
@@ -75,6 +77,7 @@ class System:
         self.delays: tuple[str, ...] = tuple(meta["delays"])
         self.braked: bool = meta["braked"]
         self._commands: list[int] = meta["commands"]
+        self._memory_uses: dict[str, list[int]] = meta["memory_uses"]
 
     @property
     def prior(self) -> Array:
@@ -109,6 +112,10 @@ class System:
     @cached_property
     def _arrays(self) -> ModuleType:
         return self._code.module("columns")
+
+    @cached_property
+    def _dynamics(self) -> ModuleType:
+        return self._code.module("dynamics")
 
     @cached_property
     def _compiled(self) -> ModuleType:
@@ -197,7 +204,7 @@ class System:
             (T, n_q), N.m or N.
         """
         a, b, c = self.true_motion(q, qd, qdd, u, p)
-        return _stack(self._arrays.required(a.T, b.T, c.T, z.T, u.T, p), len(q))
+        return _stack(self._dynamics.required(a.T, b.T, c.T, z.T, u.T, p), len(q))
 
     def applied(self, q: Array, qd: Array, qdd: Array, z: Array, u: Array, p: Array) -> Array:
         """Generalised force of the measured input mapped to the joints (eq 19), (T, n_q).
@@ -247,11 +254,11 @@ class System:
     def mass_matrix(self, q: Array, p: Array) -> Array:
         """Mass matrix (eq 13), (T, n_q, n_q), kg m2, kg m, kg."""
         n = len(self.coordinates)
-        return _stack(self._arrays.mass_matrix(q.T, p), len(q)).reshape(len(q), n, n)
+        return _stack(self._dynamics.mass_matrix(q.T, p), len(q)).reshape(len(q), n, n)
 
     def energy(self, q: Array, qd: Array, p: Array) -> tuple[Array, Array]:
         """Kinetic and potential energy, each (T,), J."""
-        both = _stack(self._arrays.energy(q.T, qd.T, p), len(q))
+        both = _stack(self._dynamics.energy(q.T, qd.T, p), len(q))
         return both[:, 0], both[:, 1]
 
     def compensation(self, q: Array, qd: Array, z: Array, u: Array, p: Array) -> Array:
@@ -292,7 +299,9 @@ class System:
             held = np.where(switched[at], u[at - 1], u[at])
             u = np.insert(u, at, held, axis=0)
             a, b, t = (np.insert(x, at, x[at], axis=0) for x in (a, b, t))
-        arrays = [np.ascontiguousarray(x, dtype=np.float64) for x in (a, b, u, p, t)]
+        groups = {"q": a, "qd": b, "u": u, "p": p}
+        columns = [x[..., self._memory_uses[group]] for group, x in groups.items()]
+        arrays = [np.ascontiguousarray(x, dtype=np.float64) for x in (*columns, t)]
         out = np.empty((len(t), len(z0)))
         module = self._code.module("memory")
         for steps in _MEMORY_STEPS:
@@ -335,6 +344,7 @@ def _generate(model: Model) -> tuple[dict[str, Any], dict[str, str]]:
     from bampipe.model_functions import ROWS
     from bampipe.physics.codegen import (
         array_source,
+        dynamics_source,
         memory_source,
         residual_source,
         rows_source,
@@ -344,7 +354,7 @@ def _generate(model: Model) -> tuple[dict[str, Any], dict[str, str]]:
     from bampipe.physics.equations import contribution
 
     equations = derive(model)
-    bare = derive(Model(model.device)) if model.effects else equations
+    bare = _derive_bare(model.device) if model.effects else equations
     added = contribution(equations, bare)
     channels = dict(zip(equations.inputs, equations.u, strict=True))
     forces = [channels[name] for name in model.device.forces]
@@ -362,6 +372,7 @@ def _generate(model: Model) -> tuple[dict[str, Any], dict[str, str]]:
         and not any(e.has(*forces) for e in equations.rates),
         "compensated": [i for i, e in enumerate(equations.compensation) if e != 0],
         "delays": equations.delays,
+        "memory_uses": {},
         "commands": [
             i
             for i, u in enumerate(equations.u)
@@ -373,10 +384,26 @@ def _generate(model: Model) -> tuple[dict[str, Any], dict[str, str]]:
     }
     sources = {
         "columns": array_source(equations, added),
+        "dynamics": dynamics_source(equations),
         "compiled": scalar_source(equations),
         "residual": residual_source(equations),
         "rows": rows_source(equations, ROWS),
     }
     if equations.z:
-        sources["memory"] = memory_source(equations)
+        sources["memory"], facts["memory_uses"] = memory_source(equations)
     return facts, sources
+
+
+_bare: dict[str, Equations] = {}
+"""Of the device whose model was derived last: the candidates of a diagnosis share it."""
+
+
+def _derive_bare(device: Device) -> Equations:
+    """Equations of a device without effects."""
+    from bampipe.physics.derivation import derive
+
+    model = Model(device)
+    if model.key not in _bare:
+        _bare.clear()
+        _bare[model.key] = derive(model)
+    return _bare[model.key]

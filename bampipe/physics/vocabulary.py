@@ -140,20 +140,17 @@ class Vocabulary:
         brakes = [self.channel[b] for b in self.model.device.brakes.values()]
         if expr.has(*self.z.values(), *brakes):
             raise InputError("ddt() of an internal state or of a brake command")
-        total = sp.S.Zero
-        for a, b in (
-            *zip(self.q, self.qd, strict=True),
-            *zip(self.qd, self.qdd, strict=True),
-        ):
-            total += sp.diff(expr, a) * b
+        symbols = expr.free_symbols
+        rates = [*zip([*self.q, *self.qd], [*self.qd, *self.qdd], strict=True)]
         for force in self.model.device.forces:
             for k in range(LAST_ORDER):
-                low, high = (
-                    self.channel[derivative(force, k)],
-                    self.channel[derivative(force, k + 1)],
-                )
-                total += sp.diff(expr, low) * high
-        total += sp.diff(expr, self.channel["t"])
+                low, high = derivative(force, k), derivative(force, k + 1)
+                rates.append((self.channel[low], self.channel[high]))
+        rates.append((self.channel["t"], sp.S.One))
+        total = sp.S.Zero
+        for symbol, rate in rates:
+            if symbol in symbols:
+                total += sp.diff(expr, symbol) * rate
         return total.replace(sp.DiracDelta, lambda *_: sp.S.Zero)
 
     def table(self, entries: Mapping[str, ast.expr], what: str) -> list[Any]:

@@ -286,7 +286,7 @@ def energy(system: System) -> float:
     return float(kinetic[0] + potential[0])
 
 
-@pytest.mark.parametrize("name", ["columns", "compiled", "residual", "rows", "meta"])
+@pytest.mark.parametrize("name", ["columns", "dynamics", "compiled", "residual", "rows", "meta"])
 @pytest.mark.parametrize("damage", ["truncated", "edited", "garbage", "gone"])
 def test_damaged_generated_code_is_generated_again(
     model: Model, tmp_path: Path, name: str, damage: str
@@ -310,11 +310,33 @@ def test_damaged_generated_code_is_generated_again(
 
 def test_code_that_nobody_vouches_for_is_not_run(model: Model, tmp_path: Path) -> None:
     """A module planted for a model that was never generated is overwritten, not executed."""
-    folder = generated_code.folder_of_user()
-    planted = folder / f"columns_{model.key}.py"
+    right = energy(compile_model(model))
+    cache = tmp_path / "cache"
+    for path in cache.rglob("meta_*"):
+        path.unlink()
+    (planted,) = cache.rglob("dynamics_*")
     planted.write_text("raise SystemExit('planted code ran')\n")
-    energy(compile_model(model))
+    assert energy(compile_model(model)) == right
     assert "planted" not in planted.read_text()
+
+
+def test_the_memory_of_an_effect_is_compiled_once_for_all_joints(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its text knows columns by number only; on either axis it uses its own."""
+    monkeypatch.setenv("BAMPIPE_CACHE_DIR", str(tmp_path / "cache"))
+    device = registry.device("bam")
+    axes = tuple(c.name for c in device.coordinates)[:2]
+    systems = [compile_model(Model(device, (f"presliding:{axis}",))) for axis in axes]
+    t = np.linspace(0.0, 0.5, 200)
+    still = np.zeros((len(t), len(device.coordinates)))
+    for k, system in enumerate(systems):
+        u = np.zeros((len(t), len(system.inputs)))
+        qd = still.copy()
+        qd[:, k] = 0.3 * np.sin(12.0 * t)
+        assert np.ptp(system.memory(still, qd, still, u, system.prior, t)) > 0.0
+        assert np.ptp(system.memory(still, np.roll(qd, 1, 1), still, u, system.prior, t)) == 0.0
+    assert len(list((tmp_path / "cache").rglob("memory_*.py"))) == 1
 
 
 def test_no_byte_code_stands_beside_generated_source(model: Model, tmp_path: Path) -> None:
