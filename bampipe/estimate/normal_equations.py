@@ -91,31 +91,27 @@ class NormalEquations:
             change: what is added to the residual, each (T, n_q).
             residuals: r by trial, of which these sums are, each (T, n_q).
         """
-        xx, xy, yy = [], [], []
+        (trials, n_q, size), more = self.xy.shape, columns[0].shape[2]
+        xx = np.zeros((trials, n_q, size + more, size + more))
+        xx[:, :, :size, :size] = self.xx
+        xy = np.zeros((trials, n_q, size + more))
+        yy = np.empty((trials, n_q))
         for k, (slope, column, moved, residual) in enumerate(
             zip(slopes, columns, change, residuals, strict=True)
         ):
-            new = column.transpose(1, 2, 0)
-            cross = new @ slope.transpose(1, 0, 2)
-            own = new @ column.transpose(1, 0, 2)
-            xx.append(
-                np.concatenate(
-                    [
-                        np.concatenate([self.xx[k], cross.transpose(0, 2, 1)], axis=2),
-                        np.concatenate([cross, own], axis=2),
-                    ],
-                    axis=1,
-                )
-            )
+            new, right = column.transpose(1, 2, 0), (residual + moved).T
+            # Most effects act on one axis.
+            for axis in np.flatnonzero(column.any(axis=(0, 2))):
+                cross = new[axis] @ slope[:, axis]
+                xx[k, axis, size:, :size], xx[k, axis, :size, size:] = cross, cross.T
+                xx[k, axis, size:, size:] = new[axis] @ column[:, axis]
+                xy[k, axis, size:] = -(new[axis] @ right[axis])
             shift = np.einsum("tap,ta->ap", slope, moved) if moved.any() else 0.0
-            right = (residual + moved).T
-            xy.append(
-                np.concatenate([self.xy[k] - shift, -(new @ right[:, :, None])[:, :, 0]], axis=1)
-            )
-            yy.append(np.sum(right**2, axis=1))
-        nothing = np.zeros(columns[0].shape[2])
+            xy[k, :, :size] = self.xy[k] - shift
+            yy[k] = np.sum(right**2, axis=1)
+        nothing = np.zeros(more)
         return NormalEquations(
-            np.array(xx), np.array(xy), np.array(yy), self.count,
+            xx, xy, yy, self.count,
             np.append(self.precision, nothing), np.append(self.known, nothing),
         )  # fmt: skip
 
