@@ -82,16 +82,18 @@ def portable_source(model: Model, parameters: Array, language: Language) -> str:
     """Return the source of ``inverse_dynamics(q, qd, qdd[, u])``.
 
     Args:
-        model: without internal states and effects on sensors or inputs.
+        model: without internal states and effects on encoders. Effects on inputs, such as a drive's
+            offset, are no part of the force that a motion requires: the text names them.
         parameters: (n_p,), SI.
         language: of the source.
 
     Raises:
-        InputError: an effect of the model has memory, or acts on inputs or encoders.
+        InputError: an effect of the model has memory, or acts on encoders.
     """
-    kinds = {"input": "acts on what is logged", "measurement": "acts on what encoders read"}
     for item in model.effects:
-        what = "has internal states" if item.effect.states else kinds.get(item.effect.kind)
+        what = "has internal states" if item.effect.states else ""
+        if item.effect.kind == "measurement":
+            what = "acts on what encoders read"
         if what:
             raise InputError(
                 f"effect {item.name!r} {what}: it is no function of motion alone",
@@ -116,10 +118,16 @@ def portable_source(model: Model, parameters: Array, language: Language) -> str:
     )
     axes = model.device.coordinates
     of = ", ".join(f"{c.name} ({c.unit})" for c in axes)
-    effects = ", ".join(item.name for item in model.effects)
+    effects, logged = (
+        ", ".join(item.name for item in model.effects if (item.effect.kind == "input") is on_inputs)
+        for on_inputs in (False, True)
+    )
+    about = f"Coordinates: {of}." + (f" Inputs u: {', '.join(names)}." if names else "")
+    if logged:
+        about += f" Forces are those that act; what is logged differs by {logged}."
     words = _Words(
         f"{model.device.name}{f' with {effects}' if effects else ''}, identified by bampipe.",
-        f"Coordinates: {of}." + (f" Inputs u: {', '.join(names)}." if names else ""),
+        about,
         "Generalised forces that the motion requires, N.m or N, one a coordinate.",
     )
     return _print(language, words, [c.name for c in axes], names, lines, values)

@@ -77,3 +77,24 @@ def test_a_model_with_memory_is_refused() -> None:
     p = compile_model(model).prior
     with pytest.raises(InputError, match="has internal states"):
         portable_source(model, p, "c")
+
+
+def test_the_offset_of_a_drive_is_no_part_of_the_force_and_is_named() -> None:
+    device = registry.device("bam")
+    name = f"force_bias:{device.components[0]}"
+    bare, biased = Model(device), Model(device, [name])
+    p = compile_model(biased).prior + 0.1
+    without = portable_source(bare, p[: len(bare.parameters)], "python")
+    text = portable_source(biased, p, "python")
+    assert f"what is logged differs by {name}." in text
+    assert (
+        text.replace(f" Forces are those that act; what is logged differs by {name}.", "")
+        == without
+    )
+
+
+def test_a_model_of_what_encoders_read_is_refused() -> None:
+    device = registry.device("bam")
+    model = Model(device, ["encoder_scale:yaw"])
+    with pytest.raises(InputError, match="acts on what encoders read"):
+        portable_source(model, compile_model(model).prior, "python")
