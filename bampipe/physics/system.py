@@ -5,16 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bampipe import generated_code
 from bampipe.physics.device import Device
-from bampipe.physics.equations import Equations
 from bampipe.physics.model import Model
 from bampipe.physics.parameter import Parameter
+
+if TYPE_CHECKING:  # it brings sympy, which few need
+    from bampipe.physics.equations import Equations
 
 Array = NDArray[np.float64]
 _MEMORY_STEPS = (3, 12, 48)
