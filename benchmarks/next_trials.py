@@ -2,10 +2,12 @@
 
     python benchmarks/next_trials.py precision --machine joint --seeds 5001 5010
     python benchmarks/next_trials.py decision --seeds 5101 5110
+    python benchmarks/next_trials.py decision --timid lag-delay --seeds 5201 5202
 
 Sessions come from simulators that share no code with bampipe. A proposal is followed there by
 somebody who follows well, and by somebody who covers half the range at twice the speed; beside it,
-one more trial of the usual motion of the same length is recorded.
+one more trial of the motion at hand of the same length is recorded. With ``--timid``, that motion
+is confined to where two effects look alike.
 """
 
 from __future__ import annotations
@@ -13,8 +15,9 @@ from __future__ import annotations
 import argparse
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import independent
@@ -45,6 +48,35 @@ HIDDEN = (
     ("axis", "actuator_delay"), ("axis", "presliding:carriage"),
     ("bam", "force_bias:x"), ("bam", "return_spring:yaw"), ("bam", "base_tilt"),
 )  # fmt: skip
+
+
+def _timid(seconds: float, coarse: float = 1.0, **moves: tuple[float, float, float]) -> Conditions:
+    """Two trials of strokes by axis: middle and half the range, rad or m, and speed, per s."""
+    strokes = {
+        axis: {"low": middle - half, "high": middle + half, "slow": 0.85 * speed, "fast": speed}
+        for axis, (middle, half, speed) in moves.items()
+    }
+    tasks = (Task(strokes, {}, seconds),) * 2
+    return Conditions(creep=True, trials=0, seconds=seconds, coarse=coarse, tasks=tasks)
+
+
+_ONE_POSE = _timid(8.0, yaw=(0.3, 0.15, 0.25), pitch=(0.2, 0.1, 0.25), extension=(1.1, 0.05, 0.1))
+TIMID = {
+    "drag-thinning": (
+        "joint", ("quadratic_drag:joint", "shear_thinning:joint"),
+        _timid(8.0, joint=(0.0, 0.3, 0.4)),
+    ),
+    "lag-delay": (
+        "joint", ("actuator_lag:current", "actuator_delay"), _timid(8.0, joint=(0.0, 0.8, 0.3)),
+    ),
+    "presliding-stribeck": (
+        "joint", ("presliding:joint", "stribeck:joint"),
+        _timid(8.0, 4.0, joint=(0.0, 0.5, 0.2)),
+    ),
+    "bias-gain": ("bam", ("force_bias:x", "force_gain:x"), replace(_ONE_POSE, rate_hz=250.0)),
+    "spring-tilt": ("bam", ("return_spring:yaw", "base_tilt"), replace(_ONE_POSE, rate_hz=250.0)),
+}  # fmt: skip
+"""By pair of effects: machine, the two, and motion that is confined to where they look alike."""
 PIPELINE = """schema = "bampipe.pipeline/1"
 name = "short"
 stages = ["ingest", "filter", "identify", "validate"]
@@ -76,29 +108,42 @@ def sds(run: bampipe.Run) -> dict[str, float]:
     return {name: entry.sd for name, entry in found.parameters.items()}
 
 
-def measure_precision(machine: str, seeds: range) -> None:
+def worst_known(run: bampipe.Run) -> str:
+    """The parameter with the largest standard deviation over its estimate."""
+    found = IdentifyResult.read(run.root / IdentifyResult.file("base")).parameters
+    return max(found, key=lambda name: found[name].sd / max(abs(found[name].estimate), 1e-12))
+
+
+def ways_on(conditions: Conditions, path: Path) -> dict[str, Conditions]:
+    """One trial more: the proposal in ``path`` followed well, sloppily, or the motion at hand."""
+    more = {"trials": (conditions.trials or 0) + 1}
+    at_hand = {"tasks": (*conditions.tasks, conditions.tasks[0])} if conditions.tasks else more
+    well, sloppy = Task.read(path), Task.read(path, reach=0.5, haste=2.0)
+    return {
+        "well": replace(conditions, tasks=(*conditions.tasks, well)),
+        "sloppy": replace(conditions, tasks=(*conditions.tasks, sloppy)),
+        "free": replace(conditions, **at_hand),
+    }
+
+
+def measure_precision(machine: str, conditions: Conditions, seeds: range) -> None:
     """Print forecast over actual uncertainties, and the gain against free and sloppy motion."""
-    conditions = USUAL[machine]
-    ratios, free_gain, sloppy_gain = [], [], []
+    ratios, free_sd, free_gain, sloppy_gain = [], [], [], []
     for seed in seeds:
         with tempfile.TemporaryDirectory() as name:
             root = Path(name)
             run = run_of(root / "now", machine, seed, {}, conditions)
             before = sds(run)
-            dry = [n for n in before if n.startswith("coulomb.")]
-            target = dry[seed % len(dry)]
+            target = worst_known(run)
             found, path = propose(run, purpose=target, seconds=conditions.seconds)
             followed = {
                 kind: sds(run_of(root / kind, machine, seed, {}, chosen))
-                for kind, chosen in {
-                    "well": replace(conditions, tasks=(Task.read(path),)),
-                    "sloppy": replace(conditions, tasks=(Task.read(path, reach=0.5, haste=2.0),)),
-                    "free": replace(conditions, trials=(conditions.trials or 0) + 1),
-                }.items()
+                for kind, chosen in ways_on(conditions, path).items()
             }
             forecast = found.proposals[0].sd
             ratios += [followed["well"][n] / forecast[n].after for n in forecast]
             gain = {k: sd[target] ** -2 - before[target] ** -2 for k, sd in followed.items()}
+            free_sd.append(followed["free"][target] / followed["well"][target])
             free_gain.append(gain["well"] / gain["free"])
             sloppy_gain.append(gain["sloppy"] / gain["well"])
             print(
@@ -111,6 +156,7 @@ def measure_precision(machine: str, seeds: range) -> None:
     print(
         f"{machine}: {len(ratios)} uncertainties, {100 * within:.0f} % within 1.3 of the forecast"
     )
+    print(f"sd after a free trial, over that after the proposed: median {np.median(free_sd):.2f}")
     print(f"information added, over that of a free trial: median {np.median(free_gain):.2f}")
     print(f"of it when followed sloppily: median {np.median(sloppy_gain):.2f}")
 
@@ -125,46 +171,59 @@ def verdict(run: bampipe.Run, truth: str) -> str:
     return "undecided" if unsure else f"said {', '.join(found.selected) or 'nothing'}"
 
 
-def ambiguous_sessions(root: Path, seeds: range) -> Iterator[tuple[str, str, int, bampipe.Run]]:
-    """Sessions of poor motion whose diagnosis leaves something to decide."""
+@dataclass(frozen=True)
+class Hidden:
+    """One effect to hide on a machine, and how its session is recorded."""
+
+    machine: str
+    effect: str
+    conditions: Conditions
+
+
+def ambiguous_sessions(
+    root: Path, hidden: Sequence[Hidden], seeds: range
+) -> Iterator[tuple[Hidden, int, bampipe.Run]]:
+    """Sessions that the diagnosis leaves undecided; what it says of the others is printed."""
     for seed in seeds:
-        for machine, effect in HIDDEN:
-            folder = root / f"{machine}-{effect.replace(':', '.')}-{seed}"
-            run = run_of(folder, machine, seed, {effect: 1.0}, POOR[machine])
-            if verdict(run, effect) == "undecided":
-                yield machine, effect, seed, run
+        for one in hidden:
+            folder = root / f"{one.machine}-{one.effect.replace(':', '.')}-{seed}"
+            run = run_of(folder, one.machine, seed, {one.effect: 1.0}, one.conditions)
+            said = verdict(run, one.effect)
+            if said == "undecided":
+                yield one, seed, run
+            else:
+                print(f"{one.machine} {seed} {one.effect}: at once {said}", flush=True)
 
 
-def measure_decision(seeds: range) -> None:
+def measure_decision(hidden: Sequence[Hidden], seeds: range) -> None:
     """Print what the diagnosis says after the proposed trial, and after one more free trial."""
-    counts: dict[str, int] = {"well": 0, "sloppy": 0, "free": 0}
+    counts = {kind: Counter[str]() for kind in ("well", "sloppy", "free")}
     cases = 0
     with tempfile.TemporaryDirectory() as name:
         root = Path(name)
-        for machine, effect, seed, run in ambiguous_sessions(root, seeds):
-            conditions = POOR[machine]
+        for one, seed, run in ambiguous_sessions(root, hidden, seeds):
+            head = f"{one.machine} {seed} {one.effect}"
             try:
-                found, path = propose(run, purpose="decision", seconds=conditions.seconds)
+                found, path = propose(run, purpose="decision", seconds=one.conditions.seconds)
             except InputError as error:
-                print(f"{machine} {seed} {effect}: {error}", flush=True)
+                print(f"{head}: {error}", flush=True)
                 continue
             cases += 1
-            pair = max(found.proposals[0].confusion, key=lambda one: one.weight * one.before)
+            pair = max(found.proposals[0].confusion, key=lambda c: c.weight * c.before)
             said = {}
-            for kind, chosen in {
-                "well": replace(conditions, tasks=(Task.read(path),)),
-                "sloppy": replace(conditions, tasks=(Task.read(path, reach=0.5, haste=2.0),)),
-                "free": replace(conditions, trials=(conditions.trials or 0) + 1),
-            }.items():
+            for kind, chosen in ways_on(one.conditions, path).items():
                 folder = root / f"{kind}-{cases}"
-                said[kind] = verdict(run_of(folder, machine, seed, {effect: 1.0}, chosen), effect)
-                counts[kind] += said[kind] == "right"
+                after = run_of(folder, one.machine, seed, {one.effect: 1.0}, chosen)
+                said[kind] = verdict(after, one.effect)
+                counts[kind][said[kind].partition(" ")[0]] += 1
             print(
-                f"{machine} {seed} {effect}: {' or '.join(pair.between)}, confusion"
+                f"{head}: {' or '.join(pair.between)}, confusion"
                 f" {pair.before:.2f} to {pair.after:.2f}; {said}",
                 flush=True,
             )
-    print(f"{cases} undecided sessions; decided rightly: {counts}")
+    print(f"{cases} undecided sessions; after one more trial:")
+    for kind, count in counts.items():
+        print(f"  {kind}: {dict(count)}")
 
 
 def main() -> int:
@@ -172,12 +231,19 @@ def main() -> int:
     parser.add_argument("what", choices=("precision", "decision"))
     parser.add_argument("--machine", choices=sorted(USUAL), default="joint")
     parser.add_argument("--seeds", type=int, nargs=2, default=(5001, 5004), metavar=("A", "B"))
+    parser.add_argument(
+        "--timid", choices=sorted(TIMID), help="confined motion, by pair of effects"
+    )
     given = parser.parse_args()
     seeds = range(given.seeds[0], given.seeds[1] + 1)
     if given.what == "precision":
-        measure_precision(given.machine, seeds)
+        machine, _, motion = TIMID[given.timid] if given.timid else (given.machine, (), None)
+        measure_precision(machine, motion or USUAL[machine], seeds)
+    elif given.timid:
+        machine, either, motion = TIMID[given.timid]
+        measure_decision([Hidden(machine, effect, motion) for effect in either], seeds)
     else:
-        measure_decision(seeds)
+        measure_decision([Hidden(machine, e, POOR[machine]) for machine, e in HIDDEN], seeds)
     return 0
 
 

@@ -73,7 +73,7 @@ def record(
     rate_hz = c.rate_hz or RATE_HZ
     steps = round((c.seconds or 6.0) / STEP)
     trials = []
-    for number, task in enumerate([*(None,) * (c.trials or 4), *c.tasks]):
+    for number, task in enumerate([*(None,) * (4 if c.trials is None else c.trials), *c.tasks]):
         rng = np.random.default_rng([seed, 1 + number])
         if task is None:
             goal, rate = draw_moves(rng, steps, 0.12, 0.3 * c.pace, 0.1)

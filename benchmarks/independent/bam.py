@@ -481,7 +481,7 @@ def record(
         columns |= {f"brake_{axis}": brake[:, i] for i, axis in enumerate(AXES)}
         write_trial(folder / trials[-1]["file"], columns)
 
-    usual = (c.trials or 5, c.viscous_trials)
+    usual = (5 if c.trials is None else c.trials, c.viscous_trials)
     kinds = [(kind == 1, None) for kind in (0, 1) for _ in range(usual[kind])]
     for number, (braked, task) in enumerate([*kinds, *((t.brakes > 0.0, t) for t in c.tasks)]):
         rng = np.random.default_rng([seed, 1 + number])

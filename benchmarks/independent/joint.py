@@ -121,7 +121,7 @@ def record(
     rate_hz = c.rate_hz or RATE_HZ
     steps = round((c.seconds or 15.0) / STEP)
     trials = []
-    for number, task in enumerate([*(None,) * (c.trials or 5), *c.tasks]):
+    for number, task in enumerate([*(None,) * (5 if c.trials is None else c.trials), *c.tasks]):
         rng = np.random.default_rng([seed, 1 + number])
         if task is not None:
             goal, rate = (column[:, 0] for column in follow(rng, task, ("joint",), STEP))
