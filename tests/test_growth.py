@@ -92,6 +92,6 @@ def test_what_the_filter_stores_is_bounded_in_a_trial_and_in_all() -> None:
 
     assert stride(8000, 8000, 8000) == 1
     assert stride(20_001) == 2
-    assert stride(*[8000] * 25) == 1
-    assert stride(*[8000] * 26) == 2
-    assert stride(*[4000] * 2500) == 50
+    assert stride(*[8000] * 12) == 1
+    assert stride(*[8000] * 13) == 2
+    assert stride(*[4000] * 2500) == 100

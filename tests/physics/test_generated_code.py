@@ -158,7 +158,7 @@ def test_generated_code_is_the_same_text_again(tmp_path, monkeypatch):
         compile_model(Model(BAM, ("presliding:pitch", "force_delay")))
         files = sorted((tmp_path / folder).rglob("*_*.*"))
         texts.append([(f.name, f.read_text()) for f in files])
-    assert len(texts[0]) == 6
+    assert len(texts[0]) == 7
     assert texts[0] == texts[1]
 
 
@@ -194,7 +194,7 @@ def test_generated_code_holds_no_name_from_a_file(tmp_path, monkeypatch):
     device = awkward(("wandering", "pushing", "heaviness"))
     compile_model(Model(device, ("presliding:wandering", "force_drift:pushing")))
     sources = [f.read_text() for f in tmp_path.rglob("*.py")]
-    assert len(sources) == 5
+    assert len(sources) == 6
     for word in ("wandering", "pushing", "heaviness", "presliding", "deflection", "drift"):
         assert not any(word in text for text in sources)
     assert all(set(text) <= set(string.printable) for text in sources)
