@@ -164,10 +164,8 @@ class Bench:
                 first=first,
             )
 
-        s = self.settings
+        scorer, s = Scorer(evidence), self.settings
         least = min(s.first_replicates, s.replicates)
-
-        scorer = Scorer(evidence)
         return Level(
             replay,
             asked,

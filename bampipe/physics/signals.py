@@ -111,7 +111,7 @@ class ActingInputs:
             ]
             value = self.acting.get(d.channel[force])
             for k in range(1, max(used) + 1) if used and value is not None else ():
-                value = self._rate(value)
+                value = d.rate_along(value, self.rates)
                 if value.has(*d.qdd):
                     raise InputError(f"the time derivative {k} of {force!r} is not known")
                 values[d.channel[derivative(force, k)]] = value
@@ -120,16 +120,3 @@ class ActingInputs:
     def put_in_initial(self, expr: Any) -> Any:
         """The same of an initial value: states between log and mechanism are at theirs."""
         return self.put_in(expr).subs(self.initial, simultaneous=True)
-
-    def _rate(self, expr: Any) -> Any:
-        """Time derivative along the motion; a series in the derivatives of a force ends there."""
-        import sympy as sp
-
-        d = self._d
-        rates = dict(zip([*d.q, *d.qd], [*d.qd, *d.qdd], strict=True)) | self.rates
-        for force in d.model.device.forces:
-            for k in range(LAST_ORDER):
-                low, high = derivative(force, k), derivative(force, k + 1)
-                rates[d.channel[low]] = d.channel[high]
-        rates[d.channel["t"]] = sp.S.One
-        return sp.Add(*(sp.diff(expr, symbol) * rate for symbol, rate in rates.items()))

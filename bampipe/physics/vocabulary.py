@@ -140,18 +140,22 @@ class Vocabulary:
         brakes = [self.channel[b] for b in self.model.device.brakes.values()]
         if expr.has(*self.z.values(), *brakes):
             raise InputError("ddt() of an internal state or of a brake command")
-        symbols = expr.free_symbols
-        rates = [*zip([*self.q, *self.qd], [*self.qd, *self.qdd], strict=True)]
+        return self.rate_along(expr, {}).replace(sp.DiracDelta, lambda *_: sp.S.Zero)
+
+    def rate_along(self, expr: Any, further: Mapping[Any, Any]) -> Any:
+        """Time derivative along the motion; a series in the derivatives of a force ends there.
+
+        Args:
+            expr: of motion, inputs and time; further: rates of other symbols in it.
+        """
+        rates = dict(zip([*self.q, *self.qd], [*self.qd, *self.qdd], strict=True))
         for force in self.model.device.forces:
             for k in range(LAST_ORDER):
                 low, high = derivative(force, k), derivative(force, k + 1)
-                rates.append((self.channel[low], self.channel[high]))
-        rates.append((self.channel["t"], sp.S.One))
-        total = sp.S.Zero
-        for symbol, rate in rates:
-            if symbol in symbols:
-                total += sp.diff(expr, symbol) * rate
-        return total.replace(sp.DiracDelta, lambda *_: sp.S.Zero)
+                rates[self.channel[low]] = self.channel[high]
+        rates |= {self.channel["t"]: sp.S.One, **further}
+        present = expr.free_symbols
+        return sp.Add(*(sp.diff(expr, s) * rate for s, rate in rates.items() if s in present))
 
     def table(self, entries: Mapping[str, ast.expr], what: str) -> list[Any]:
         """One expression an axis, zero where the table has none."""
