@@ -30,11 +30,16 @@ class Choice:
         winner: the best one; "" if every one of them rests on one second.
         alike: others that these trials cannot tell from it.
         transient: candidates that only one second speaks for, and that second.
+        unlike: the others that were replayed, where replays of none of them, nor of the best, look
+            like the measurement: scores are all that distinguishes them.
+        misfit: mean squared z of the likest of those replays.
     """
 
     winner: str
     alike: tuple[str, ...]
     transient: Mapping[str, SampleRange]
+    unlike: tuple[str, ...] = ()
+    misfit: float = 1.0
 
 
 def choose(
@@ -102,9 +107,10 @@ def choose(
     likely = plausible(misfits, s)
     if not likely:
         # As where more is missing than one effect: the patterns are no evidence for any of them.
-        return Choice(best, (), transient)
-    winner, *others = likely
-    alike = tuple(others)
+        others = tuple(n for n in rivals if n != best)
+        return Choice(best, (), transient, others, min(misfits.values()))
+    winner, *rest_likely = likely
+    alike = tuple(rest_likely)
     if best in alike:
         alike = (winner, *[n for n in alike if n != best])
         winner = best

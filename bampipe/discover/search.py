@@ -13,7 +13,7 @@ from bampipe.discover.chance import Progress, Replicate, candidates_of
 from bampipe.discover.influence import SampleRange, error_without_second
 from bampipe.discover.level import Level
 from bampipe.discover.polish import FittedSet, extend_set, is_superfluous, polish, reduce_set
-from bampipe.discover.rivals import choose
+from bampipe.discover.rivals import Choice, choose
 from bampipe.discover.scorer import Score, Scorer
 from bampipe.discover.settings import Settings
 from bampipe.estimate.simulation import Runaway
@@ -57,6 +57,9 @@ class Search:
         first: scores against it.
         found: the model with every effect found, fitted.
         groups: for each effect found, in order, the others that these trials cannot tell from it.
+        unlike: where one effect is found and no replay looks like the measurement, neither its own
+            nor those of its rivals: these rivals.
+        misfit: mean squared z of the likest of those replays, else 1.
         contests: for each, those who contend for its place, itself first.
         main: for each, the axis on which it helps most.
         additions: for each, how it stood against the model that it was added to.
@@ -75,6 +78,8 @@ class Search:
     first: Mapping[str, Score]
     found: FittedSet
     groups: Mapping[str, tuple[str, ...]]
+    unlike: tuple[str, ...]
+    misfit: float
     contests: Mapping[str, tuple[Contender, ...]]
     main: Mapping[str, int]
     additions: Mapping[str, Addition]
@@ -114,7 +119,7 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
     current, scores = FittedSet(base, (), initial, bench.trials, start), dict(first)
     asked = bench.gaining(first, current.scorer)
     level = bench.level(base, initial, current.replayed, asked)
-    groups: dict[str, tuple[str, ...]] = {}
+    choices: dict[str, Choice] = {}
     additions: dict[str, Addition] = {}
     dropped: set[str] = set()
     transient: dict[str, SampleRange] = {}
@@ -157,12 +162,13 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
             continue
         dropped |= {*current.added, chosen.winner} - {*wider.added}
         bench, current, (scores, known) = timed, wider, sound
-        groups[chosen.winner] = chosen.alike
+        choices[chosen.winner] = chosen
         additions[chosen.winner] = addition
         steps.append(_step(current))
         report_step(0.0, f"added {chosen.winner}, looking for more")
     cut_short = len(current.added) + len(dropped) >= s.most_effects
     progress(0.8, "weighing each effect beside its rivals")
+    groups = {name: choices[name].alike for name in choices}
     rivals = {name: _rivals(first, name, groups.get(name, ()), s) for name in current.added}
     polished = polish(bench, current, rivals, lambda _, what: progress(0.8, what))
     found, contests = polished.found, polished.contests
@@ -172,11 +178,15 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
     same = known.replicates if found is current else ()
     final = bench.floor_replicas(found.recipe, found.evidence, found.replayed, same)
     axes = initial.system.coordinates
+    # Beside others, an effect has been replayed again, and what it was chosen by is out of date.
+    alone = choices.get(found.added[0]) if len(found.added) == 1 else None
+    unlike, misfit = (alone.unlike, alone.misfit) if alone else ((), 1.0)
     main = {name: axes.index(c[0].axis) for name, c in contests.items() if c}
     return Search(
         bench.trials, base, initial, level, first, found,
         {n: polished.alike.get(n, groups.get(n, ())) for n in found.added},
-        contests, main, additions, likely, transient, tuple(steps), cut_short, tuple(final),
+        unlike, misfit, contests, main, additions, likely, transient, tuple(steps), cut_short,
+        tuple(final),
     )  # fmt: skip
 
 

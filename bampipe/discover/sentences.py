@@ -31,7 +31,7 @@ def _parts(axis: str, i: int, found: Diagnosis, unit: str, s: Settings) -> list[
         ]
         return parts + ([f"Weighed: {join_names(a.effects)}."] if a.effects else [])
     parts = [f"{name}: {_verdict(a, found, unit)}."]
-    parts += _rivals(axis, a, found, unit)
+    parts += _rivals(axis, a, found, unit, s)
     parts += _transients(axis, found)
     if a.remains:
         left = f"{_no_effect(found)} explains what is left; its shape" if a.effects else "Its shape"
@@ -111,21 +111,35 @@ def _missing(names: Sequence[str]) -> str:
     return f"{join_names(names)} {'is' if len(names) == 1 else 'are'} missing"
 
 
-def _rivals(axis: str, a: AxisVerdict, found: Diagnosis, unit: str) -> list[str]:
+def _rivals(axis: str, a: AxisVerdict, found: Diagnosis, unit: str, s: Settings) -> list[str]:
     """The effects that come close to one found on this axis, with what they would leave."""
     said = []
     for name in a.effects:
-        contest = found.contests.get(name, ())
-        rivals = [c for c in contest[1:] if c.effect not in a.likely]
-        if rivals:
-            mine = contest[0]
-            listed = join_names(f"{c.effect} ({_left(c, unit)})" for c in rivals)
-            where = f" on {mine.axis}" if mine.axis != axis else ""
-            verb = "comes" if len(rivals) == 1 else "come"
-            better = [c for c in rivals if c.held_out_rmse < mine.held_out_rmse]
-            better = better if all(c.score < mine.score for c in better) else []
-            over_all = "; over all axes together it explains most" if better else ""
-            said.append(f"Close to {name} ({_left(mine, unit)}{where}{over_all}) {verb} {listed}.")
+        mine, *others = found.contests.get(name, ()) or (None,)
+        rivals = [c for c in others if c.effect not in a.likely]
+        if mine is None or not rivals:
+            continue
+        doubted = [c for c in (mine, *rivals) if c.odds >= s.least_odds]
+        if mine.odds < s.decided and len(doubted) > 1 and not found.groups.get(name):
+            names, every = (
+                join_names(c.effect for c in doubted),
+                "both" if len(doubted) == 2 else "all",
+            )
+            odds = join_names(
+                f"{100 * c.odds:.0f} % for {c.effect} ({_left(c, unit)})" for c in doubted
+            )
+            said.append(
+                f"Replays of {names} {every} differ from the measurement by more than chance: by"
+                f" their scores alone the odds are {odds}."
+            )
+            continue
+        listed = join_names(f"{c.effect} ({_left(c, unit)})" for c in rivals)
+        where = f" on {mine.axis}" if mine.axis != axis else ""
+        verb = "comes" if len(rivals) == 1 else "come"
+        better = [c for c in rivals if c.held_out_rmse < mine.held_out_rmse]
+        better = better if all(c.score < mine.score for c in better) else []
+        over_all = "; over all axes together it explains most" if better else ""
+        said.append(f"Close to {name} ({_left(mine, unit)}{where}{over_all}) {verb} {listed}.")
     return said
 
 

@@ -69,7 +69,8 @@ def conclude(search: Search, s: Settings) -> Diagnosis:
             verdict = "undecided"
         elif here[axis]:
             verdict = "missing"
-            unsure = [n for n in here[axis] if max(odds[n].values()) < s.decided]
+            alike = [n for n in here[axis] if search.groups[n]]
+            unsure = [n for n in alike if max(odds[n].values()) < s.decided]
             if unsure:
                 verdict, at = "undecided", odds[unsure[0]]
             if fails[axis] or weak.issuperset(here[axis]):
@@ -125,16 +126,20 @@ def _transients(search: Search) -> tuple[TransientCandidate, ...]:
 
 
 def _odds_of_group(search: Search, name: str, s: Settings) -> dict[str, float]:
-    """Odds of an effect found and of those that these trials cannot tell from it."""
-    alike = {name, *search.groups[name]}
-    scores = {c.effect: c.score for c in search.contests.get(name, ()) if c.effect in alike}
-    return _odds(scores or {name: 0.0}, s)
+    """Odds of an effect found and of those that replays cannot tell from it.
+
+    Where no replay looks like the measurement, scores err by as much as that: their scale grows by
+    the Birge ratio (Birge 1932, Physical Review 40, 207).
+    """
+    among = {name, *search.groups[name], *search.unlike}
+    scores = {c.effect: c.score for c in search.contests.get(name, ()) if c.effect in among}
+    return _odds(scores or {name: 0.0}, s, float(np.sqrt(search.misfit)))
 
 
-def _odds(scores: Mapping[str, float], s: Settings) -> dict[str, float]:
+def _odds(scores: Mapping[str, float], s: Settings, widening: float = 1.0) -> dict[str, float]:
     """Odds by log likelihood, tempered by what the scores are good for: no replay is perfect."""
     top = max(scores.values())
-    scale = np.hypot(s.score_sd, s.score_error * top)
+    scale = widening * np.hypot(s.score_sd, s.score_error * top)
     weights = {name: float(np.exp((score - top) / scale)) for name, score in scores.items()}
     total = sum(weights.values())
     return {name: weight / total for name, weight in weights.items()}

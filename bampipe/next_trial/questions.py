@@ -45,6 +45,7 @@ def find_ambiguity(found: DiagnoseResult) -> Ambiguity | None:
     for name in found.selected:
         contest = found.contests.get(name, ())
         scores = {c.effect: c.score for c in contest}
+        known = {c.effect: c.odds for c in contest if c.odds > 0.0}
         ranked = {row.effect: row.score for row in found.ranking}
         alike = {name, *found.groups.get(name, ())}
         scores |= {other: ranked[other] for other in alike - {*scores} if other in ranked}
@@ -53,6 +54,9 @@ def find_ambiguity(found: DiagnoseResult) -> Ambiguity | None:
             continue
         scale = np.hypot(s.score_sd, s.score_error * top)
         odds = {other: float(np.exp((score - top) / scale)) for other, score in scores.items()}
+        if known.get(name):
+            # Replays were heard: on the scale of the others.
+            odds |= {o: share / known[name] * odds[name] for o, share in known.items()}
         open_questions.append((odds, tuple(n for n in found.selected if n != name)))
     for axis in found.axes.values():
         if axis.verdict == "undecided" and axis.likely and not axis.effects:

@@ -99,7 +99,9 @@ class Contender(Record):
     score_without_second: float = Field(
         description="Without the second that speaks most for the effect found"
     )
-    odds: Share = Field(description="That it is this one, of those that fit alike; 0 if it is not")
+    odds: Share = Field(
+        description="That it is this one, of those that replays do not distinguish; else 0"
+    )
 
 
 class SearchStep(Record):

@@ -139,6 +139,18 @@ def test_rivals_are_listed_with_what_they_would_leave(monkeypatch):
     assert "b:joint (leaves 0.12 N.m)" in said
 
 
+def test_odds_are_given_where_no_replay_looks_like_the_measurement(monkeypatch):
+    axis = finding("missing", 1.0, 0.1, 0.1, effects=("a:joint",), explained_by_effects=1.0)
+    contest = (
+        contender("a:joint", 0.1, 60.0, None, 52.0, 0.84),
+        contender("b:joint", 0.13, 37.0, None, 35.0, 0.16),
+    )
+    said = say(monkeypatch, axis, contests={"a:joint": contest})
+    assert "84 % for a:joint (leaves 0.1 N.m) and 16 % for b:joint (leaves 0.13 N.m)" in said
+    sure = (contest[0].model_copy(update={"odds": 0.97}), contest[1])
+    assert "%" not in say(monkeypatch, axis, contests={"a:joint": sure})
+
+
 def test_an_error_above_its_floor_for_one_second_says_which(monkeypatch):
     axis = finding("nothing_missing", 1.0, 1.0, 0.5, rmse_without_worst_second=0.55)
     said = say(monkeypatch, axis)

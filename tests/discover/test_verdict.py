@@ -43,3 +43,14 @@ def test_an_effect_that_fails_where_it_helps_most_is_missing_nowhere(monkeypatch
         assert [shoulder.verdict, elbow.verdict] == ["unknown_effect", "undecided"]
         assert found.selected == shoulder.effects == elbow.effects == ()
         assert list(elbow.likely) == ["gain"]
+
+
+@pytest.mark.parametrize(("misfit", "least", "most"), [(1.0, 0.97, 1.0), (4.74, 0.8, 0.88)])
+def test_scores_decide_the_less_the_less_replays_look_like_the_measurement(misfit, least, most):
+    """Between 60 and 37 in log likelihood, good to a tenth."""
+    contest = tuple(SimpleNamespace(effect=n, score=x) for n, x in (("lag", 60.0), ("delay", 37.0)))
+    search = SimpleNamespace(
+        groups={"lag": ()}, unlike=("delay",), misfit=misfit, contests={"lag": contest}
+    )
+    odds = verdict._odds_of_group(search, "lag", Settings())
+    assert least < odds["lag"] < most and sum(odds.values()) == pytest.approx(1.0)
