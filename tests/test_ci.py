@@ -241,7 +241,7 @@ def test_the_documented_gate_is_valid(tmp_path: Path) -> None:
     assert pipeline.load(str(path)).gates[0].max == 1.2
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_shell_script_runs(tmp_path: Path) -> None:
     """On a sample session: gates passed, then one that cannot be, then a session that is none."""
     (tmp_path / "bin").mkdir()

@@ -77,7 +77,9 @@ def test_the_draft_brings_the_error_to_the_floor(detent):
     rung = longer.ladder.loc[longer.model]
     assert longer.model != "base"
     assert rung["held_out_rmse.joint"] < 1.3 * rung["noise_floor.joint"]
-    assert found["axes"]["joint"]["rmse_after"] == pytest.approx(rung["held_out_rmse.joint"], rel=0.05)
+    assert found["axes"]["joint"]["rmse_after"] == pytest.approx(
+        rung["held_out_rmse.joint"], rel=0.05
+    )
 
 
 def test_the_effects_of_the_library_that_come_nearest_leave_more(detent):

@@ -63,6 +63,7 @@ def test_the_candidate_has_the_size_of_what_was_hidden(stribeck):
     assert fitted[name] == pytest.approx(truth[name], rel=0.15)
 
 
+@pytest.mark.long
 def test_adding_the_effect_brings_the_held_out_error_down_and_its_parameters_to_the_truth(stribeck):
     run, found, truth = stribeck
     longer = bampipe.extend(run, found["selected"][0])
@@ -76,6 +77,7 @@ def test_adding_the_effect_brings_the_held_out_error_down_and_its_parameters_to_
         assert off < 0.15 * truth[name], name
 
 
+@pytest.mark.long
 def test_effects_that_no_trial_tells_apart_are_named_as_one_group(alike):
     (name,) = alike["selected"]
     assert {"force_bias:z", "asymmetric_coulomb:extension"} <= names_of(alike, name)
@@ -84,6 +86,7 @@ def test_effects_that_no_trial_tells_apart_are_named_as_one_group(alike):
     assert all(rival in said for rival in alike["groups"][name])
 
 
+@pytest.mark.long
 def test_the_rivals_of_a_group_stand_in_the_ranking_and_fit_alike(alike):
     (name,) = alike["selected"]
     rows = {row["effect"]: row for row in alike["ranking"]}
@@ -133,6 +136,7 @@ def test_effects_of_other_machines_are_named(tmp_path, machine, seed, effect, ax
     assert found["axes"][axis]["rmse_after"] < 0.5 * found["axes"][axis]["rmse_before"]
 
 
+@pytest.mark.long
 def test_a_damper_on_a_test_bench_lacks_nothing_or_the_lag_of_its_coil(tmp_path):
     run, _ = record_run(tmp_path, "damper", 501)
     (clean,) = diagnose(run)["axes"].values()

@@ -16,6 +16,7 @@ def extended(run, effect):
     return read_json(folder / "identify.json"), read_json(folder / "validate.json")
 
 
+@pytest.mark.long
 def test_friction_that_fades_with_speed_is_found_and_not_refused(tmp_path):
     """A fit to filtered motions sharpens it; beside that fit the truth looks a third worse."""
     run, truth = record_run(tmp_path, "bam", 7301, "stribeck:extension", rate_hz=500.0)

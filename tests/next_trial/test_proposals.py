@@ -59,6 +59,7 @@ def test_the_uncertainty_forecast_is_the_one_that_comes(tmp_path):
     assert found.proposals[0].moves["joint"].fast < 0.1 * FASTEST
 
 
+@pytest.mark.long
 def test_what_is_undecided_is_decided_after_the_proposed_trial(tmp_path):
     run, _ = record_run(tmp_path / "now", "joint", 905, "quadratic_drag:joint", **UNDECIDED)
     before = diagnose(run)
@@ -103,6 +104,7 @@ def test_bad_requests_are_refused_in_one_line(tmp_path):
     assert "next:base" not in content["stages"]
 
 
+@pytest.mark.long
 def test_effects_are_found_from_the_strength_on_that_the_trials_would_have_shown(tmp_path):
     run, _ = record_run(tmp_path / "clean", "joint", 931)
     found, _ = propose(run, purpose="sensitivity")

@@ -22,12 +22,13 @@ BAM = registry.device("bam")
 
 
 def placed(name):
-    """A device that can have the effect, and the effect at its last target there.
+    """The device with the fewest axes that can have the effect, and the effect at its last target.
 
-    On the BAM, where it can have it, that is the extension, which has side loads, or a force.
+    Many axes take long to compile; `test_composition` has effects on the BAM.
     """
-    others = map(registry.device, registry.device_names())
-    for device in (BAM, *others, registry.device_from(ARM)):
+    shipped = map(registry.device, registry.device_names())
+    by_size = sorted(shipped, key=lambda device: len(device.coordinates))
+    for device in (*by_size, registry.device_from(ARM)):
         targets = registry.effect(name).targets(device)
         if targets:
             return device, f"{name}:{targets[-1]}" if targets[-1] else name

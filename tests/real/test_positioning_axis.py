@@ -91,6 +91,7 @@ def test_the_filter_agrees_within_its_uncertainty(stretches):
         assert abs(entry["estimate"] - published) < 2.0 * entry["sd"], name
 
 
+@pytest.mark.long
 def test_the_diagnosis_finds_friction_by_direction_unaided(stretches):
     few = [f"--set={name}" for name in ("replicates=4", "most_effects=1", "jobs=2")]
     bampipe("diagnose", stretches, *few)

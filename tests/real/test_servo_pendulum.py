@@ -20,6 +20,8 @@ from bampipe.physics import Model, compile_model, registry
 from bampipe.trials.reading import free_trials, read_motion
 from bampipe.trials.residuals import problem_of
 
+pytestmark = pytest.mark.long
+
 HELD_OUT_GAIN = 200
 FULL_DUTY = 885.0
 """Count at which the motor is always on: the manual's limit of the pulse width."""

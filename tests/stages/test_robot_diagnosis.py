@@ -24,7 +24,7 @@ def run_arm(root: Path, seed: int, kinds: str, effects: dict[str, float]) -> Run
     return RunFolder(root / "runs" / "arm")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_spring_that_the_model_lacks_carries_no_replay_away(tmp_path: Path) -> None:
     run = run_arm(tmp_path, 31, "ZY", {"return_spring:base_yaw": 4.0})
     axes = read_json(run.path("models/base/validate.json"))["axes"]
