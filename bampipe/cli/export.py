@@ -15,7 +15,7 @@ from bampipe.run import models
 
 def export(
     run: RunArgument = None,
-    form: Annotated[str, typer.Option("--as", help="json, urdf, python or c.")] = "json",
+    form: Annotated[str, typer.Option("--as", help="json, urdf, mjcf, python or c.")] = "json",
     model: Annotated[
         str, typer.Option(help="Model that is written; the best confirmed one if omitted.")
     ] = "",
@@ -27,7 +27,8 @@ def export(
     """Write an identified model for other programs.
 
     json: the device and its effects, every parameter with its uncertainty. urdf: the bodies and
-    the friction of a robot's joints. python, c: one self-contained function of inverse dynamics.
+    the friction of a robot's joints. mjcf: the same with its drives' inertia, for MuJoCo. python,
+    c: one self-contained function of inverse dynamics.
 
     Example: bampipe export 2026-10-03_s01 --as c --out inverse_dynamics.c
     """

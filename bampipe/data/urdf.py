@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import takewhile
 from pathlib import Path
@@ -445,7 +445,7 @@ def urdf_text(
     for joint, table in joints.items():
         link = ElementTree.SubElement(robot, "link", name=f"{joint}_link")
         inertial = ElementTree.SubElement(link, "inertial")
-        ElementTree.SubElement(inertial, "origin", xyz=_text(table["center"]), rpy="0 0 0")
+        ElementTree.SubElement(inertial, "origin", xyz=number_list(table["center"]), rpy="0 0 0")
         ElementTree.SubElement(inertial, "mass", value=repr(float(table["mass"])))
         keys = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
         moments = {k: repr(float(v)) for k, v in zip(keys, table["inertia"], strict=True)}
@@ -457,12 +457,12 @@ def urdf_text(
             kind = "continuous"
         entry = ElementTree.SubElement(robot, "joint", name=joint, type=kind)
         ElementTree.SubElement(
-            entry, "origin", xyz=_text(table["position"]), rpy=_text(table["rotation"])
+            entry, "origin", xyz=number_list(table["position"]), rpy=number_list(table["rotation"])
         )
         after = table.get("after")
         ElementTree.SubElement(entry, "parent", link=f"{after}_link" if after else "base")
         ElementTree.SubElement(entry, "child", link=f"{joint}_link")
-        ElementTree.SubElement(entry, "axis", xyz=_text(table["axis"]))
+        ElementTree.SubElement(entry, "axis", xyz=number_list(table["axis"]))
         ElementTree.SubElement(
             entry, "limit", lower=repr(own.lower), upper=repr(own.upper),
             effort=repr(own.effort or _UNLIMITED), velocity=repr(own.velocity or _UNLIMITED),
@@ -474,5 +474,6 @@ def urdf_text(
     return f'<?xml version="1.0"?>\n{ElementTree.tostring(robot, encoding="unicode")}\n'
 
 
-def _text(values: Any) -> str:
+def number_list(values: Iterable[float]) -> str:
+    """Numbers as an attribute of XML holds them."""
     return " ".join(repr(float(v)) for v in values)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bampipe.data.mjcf import mjcf_text
 from bampipe.data.run_folder import RunFolder
 from bampipe.data.urdf import DriveLimits, urdf_text
 from bampipe.declarations.model_file import identified, load_model
@@ -16,12 +17,12 @@ from bampipe.files import json_text
 from bampipe.physics import System, compile_model
 from bampipe.physics.newton_euler import INERTIAL
 from bampipe.physics.portable import portable_source
+from bampipe.physics.robot import Robot
 from bampipe.results.identify import IdentifyResult
 
 Array = NDArray[np.float64]
-Form = Literal["json", "urdf", "python", "c"]
+Form = Literal["json", "urdf", "mjcf", "python", "c"]
 FORMS: tuple[Form, ...] = get_args(Form)
-SUFFIXES: Mapping[Form, str] = {"json": ".json", "urdf": ".urdf", "python": ".py", "c": ".c"}
 
 
 def export_model(run: RunFolder, name: str, form: Form) -> str:
@@ -30,7 +31,8 @@ def export_model(run: RunFolder, name: str, form: Form) -> str:
     Args:
         run: the run folder; name: of the model.
         form: json, device, parameters and uncertainties; urdf, the bodies and joint friction of a
-            robot; python or c, a self-contained function of inverse dynamics.
+            robot; mjcf, these and the inertia of its drives, for MuJoCo; python or c, a
+            self-contained function of inverse dynamics.
 
     Raises:
         InputError: the model is not identified, or cannot be written in this form.
@@ -40,6 +42,7 @@ def export_model(run: RunFolder, name: str, form: Form) -> str:
     writers: dict[Form, Callable[[], str]] = {
         "json": lambda: _json(run, name, system, p),
         "urdf": lambda: _urdf(run, system, p),
+        "mjcf": lambda: _mjcf(run, system, p),
         "python": lambda: portable_source(system.model, p, "python"),
         "c": lambda: portable_source(system.model, p, "c"),
     }
@@ -65,13 +68,47 @@ def _json(run: RunFolder, name: str, system: System, p: Array) -> str:
 
 
 def _urdf(run: RunFolder, system: System, p: Array) -> str:
+    _, joints, limits = _bodies_on_joints(run, system, p)
+    comment = _head(system, ["drives' inertia"])
+    return urdf_text(system.model.device.name, joints, limits, comment)
+
+
+def _mjcf(run: RunFolder, system: System, p: Array) -> str:
+    robot, joints, limits = _bodies_on_joints(run, system, p)
+    # What is left of the inertia when no body has any is the drives'.
+    without = p.copy()
+    inertial = {item.name for item in robot.parameters}
+    without[[item.name in inertial for item in system.parameters]] = 0.0
+    (drives,) = system.mass_matrix(np.zeros((1, len(joints))), without)
+    armature = dict(zip(system.coordinates, (float(v) for v in np.diag(drives)), strict=True))
+    coupled = np.any(np.abs(drives - np.diag(np.diag(drives))) > 0.0)
+    comment = _head(system, ["inertia by which drives couple joints"] if coupled else [])
+    gravity = [float(v) for v in robot.gravity]
+    return mjcf_text(system.model.device.name, joints, limits, armature, gravity, comment)
+
+
+def _head(system: System, lacks: Sequence[str]) -> str:
+    """Where a model comes from and what of it is not in the text."""
+    lacks = [*lacks, *(item.name for item in system.model.effects)]
+    return "identified by bampipe" + (f"; not in it: {', '.join(lacks)}" if lacks else "")
+
+
+def _bodies_on_joints(
+    run: RunFolder, system: System, p: Array
+) -> tuple[Robot, dict[str, dict[str, Any]], dict[str, DriveLimits]]:
+    """The robot, tables of its joints with identified bodies, and limits with their friction.
+
+    Raises:
+        InputError: the device is no robot.
+    """
     device = system.model.device
     robot = device.robot
     if robot is None:
+        others = (f for f in FORMS if f not in ("urdf", "mjcf"))
         raise InputError(
             f"device {device.name!r} is no robot: it has no bodies on joints",
             where=str(run.root),
-            remedy=f"choose another form: {', '.join(f for f in FORMS if f != 'urdf')}",
+            remedy=f"choose another form: {', '.join(others)}",
         )
     value = {item.name: float(p[i]) for i, item in enumerate(system.parameters)}
     joints, limits = {}, {}
@@ -92,11 +129,7 @@ def _urdf(run: RunFolder, system: System, p: Array) -> str:
             damping=max(value.get(f"viscous.{joint.name}", 0.0), 0.0),
             friction=max(value.get(f"coulomb.{joint.name}", 0.0), 0.0),
         )
-    effects = ", ".join(item.name for item in system.model.effects)
-    comment = "identified by bampipe; drives' inertia is not in it"
-    if effects:
-        comment += f", nor {effects}"
-    return urdf_text(device.name, joints, limits, comment)
+    return robot, joints, limits
 
 
 _BARE: Mapping[str, Any] = {
