@@ -67,6 +67,10 @@ class MissingResultError(InputError):
     """A result that is needed has not been made yet: a stage was asked for too early."""
 
 
+class NothingToDoError(InputError):
+    """A stage was asked for something that these results leave no room for."""
+
+
 def did_you_mean(word: str, known: Iterable[str]) -> str:
     """``, did you mean 'x'?`` for the closest of ``known``, or nothing where none is close."""
     lowered = {str(name).lower(): name for name in known}

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from bampipe.cli import show
+from bampipe.cli.options import RUNS, RunsOption
 from bampipe.errors import InputError
 
 if TYPE_CHECKING:
@@ -19,16 +20,17 @@ MOST_SESSIONS = 60
 
 
 def lab(
-    runs: Annotated[
+    folder: Annotated[
         Path | None,
         typer.Argument(
-            metavar="[RUNS]", help="Folder that holds the run folders; runs/ if omitted."
+            metavar="[FOLDER]", help="Folder that holds the run folders; that of --runs if omitted."
         ),
     ] = None,
     out: Annotated[
         Path | None, typer.Option(help="Folder to write to; lab/ beside the runs if omitted.")
     ] = None,
     json: Annotated[bool, typer.Option("--json", help="Print the trends as JSON.")] = False,
+    runs: RunsOption = RUNS,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no advice.")] = False,
 ) -> None:
     """Compare all sessions: one data set, control charts, and which session drifted and why.
@@ -39,7 +41,7 @@ def lab(
 
     Example: bampipe lab /data/runs --out /data/lab
     """
-    folder = runs or Path("runs")
+    folder = folder or runs
     if not folder.is_dir():
         raise InputError("no such folder of runs", where=str(folder))
     found = gather(folder, out, quiet or json)

@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 from bampipe import compile_ahead
-from bampipe.errors import InputError, MissingResultError
+from bampipe.errors import InputError, MissingResultError, NothingToDoError
 from bampipe.run import accepted, hashing, models, record, staging
 from bampipe.run.events import Event, Listener, unheard
 from bampipe.run.gates import judge_gates
@@ -87,7 +87,7 @@ class _Runner:
             reason = self.state.reason(step)
             if reason:
                 return self.execute(step, reason)
-        except MissingResultError as error:
+        except (MissingResultError, NothingToDoError) as error:
             self.failed(step, str(error), noted=False)
             raise
         except InputError as error:

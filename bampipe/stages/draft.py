@@ -18,7 +18,7 @@ from bampipe.discover.drafts import symbolic
 from bampipe.discover.drafts.effect_file import declare, write_toml
 from bampipe.discover.drafts.search import FoundDraft, Term, draft
 from bampipe.discover.settings import Settings
-from bampipe.errors import InputError
+from bampipe.errors import NothingToDoError
 from bampipe.files import write_text
 from bampipe.physics import compile_model
 from bampipe.physics.system import System
@@ -127,11 +127,11 @@ def _axes_to_draft(diagnosis: DiagnoseResult, system: System, run: RunFolder) ->
     """Numbers of the axes that lack something without a name.
 
     Raises:
-        InputError: there are none.
+        NothingToDoError: there are none.
     """
     found = [system.coordinates.index(axis) for axis in diagnosis.unnamed_axes]
     if not found:
-        raise InputError(
+        raise NothingToDoError(
             f"nothing to draft: the diagnosis of model {diagnosis.model!r} leaves nothing unnamed",
             where=str(run.root),
             remedy="a formula is drafted where `remains` is true: something is left without a name",

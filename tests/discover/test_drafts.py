@@ -20,7 +20,7 @@ from bampipe.discover.drafts.effect_file import write_toml
 from bampipe.discover.drafts.screen import Screen
 from bampipe.discover.drafts.search import FoundDraft, Option, draft
 from bampipe.discover.settings import Settings
-from bampipe.errors import InputError
+from bampipe.errors import InputError, NothingToDoError
 from bampipe.physics import Model, compile_model
 from bampipe.physics.effect import effect_from
 from bampipe.progress import silent
@@ -220,7 +220,7 @@ def test_what_is_missing_for_a_draft_is_said(tmp_path, detent):
     path = run.path(DiagnoseResult.file("base"))
     known = path.read_text(encoding="utf-8")
     path.write_text(known.replace('"remains": true', '"remains": false'), encoding="utf-8")
-    with pytest.raises(InputError, match="leaves nothing unnamed"):
+    with pytest.raises(NothingToDoError, match="leaves nothing unnamed"):
         draft_stage.execute(run, tmp_path, draft_stage.Config(), silent)
     path.unlink()
     with pytest.raises(InputError, match=r"diagnose\.json is missing"):

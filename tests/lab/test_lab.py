@@ -317,5 +317,8 @@ def test_the_command(
     content = json.loads(out)
     assert content["sessions"][4]["verdict"] == "device drifted"
     assert (tmp_path / "elsewhere/parameters").is_dir()
+    monkeypatch.chdir(tmp_path.parent)
+    code, named, _ = command("lab", "--runs", tmp_path / "runs", "--json")
+    assert code == 0 and json.loads(named)["sessions"] == content["sessions"]
     code, _, err = command("lab", "nowhere")
     assert code == 2 and "no such folder of runs" in err

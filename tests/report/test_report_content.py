@@ -7,6 +7,7 @@ import json
 import re
 import shutil
 import subprocess
+from collections.abc import Callable
 from pathlib import Path
 
 import pandas as pd
@@ -482,3 +483,13 @@ def test_a_draft_is_shown_with_its_curve_its_length_and_its_chance(
     drawn = report.figures["draft-base-yaw"]
     for label in ("constants", "first formula", "draft"):
         assert label in drawn
+
+
+def test_a_model_that_is_not_there_changes_nothing_in_the_run(
+    tmp_path: Path, command: Callable[..., tuple[int, str, str]]
+) -> None:
+    root = synthetic_run.write_all(tmp_path / "s01")
+    before = (root / "run.json").read_bytes()
+    code, _, err = command("report", root, "--model", "bse")
+    assert code == 2 and "no model 'bse'" in err and "base" in err
+    assert (root / "run.json").read_bytes() == before and not (root / "report").exists()
