@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from bampipe.data.urdf import DriveLimits, read_chain
+from bampipe.data.chain import DriveLimits
+from bampipe.data.robot_file import read_chain
 from bampipe.errors import InputError
 from bampipe.files import read_toml
 
@@ -33,7 +34,7 @@ def read_device_file(path: Path) -> dict[str, Any]:
     """The table of a device file, a robot's joints, inputs and friction in it.
 
     Raises:
-        InputError: no such file, not TOML, or a URDF that cannot be used.
+        InputError: no such file, not TOML, or a URDF or MJCF that cannot be used.
     """
     return complete_device(read_toml(path), path.parent, str(path))
 
@@ -42,7 +43,7 @@ def complete_device(table: dict[str, Any], folder: Path, where: str) -> dict[str
     """``table`` of a device file in ``folder``; as it is where it is no robot, or not well formed.
 
     Raises:
-        InputError: a URDF that cannot be used.
+        InputError: a URDF or MJCF that cannot be used.
     """
     robot = table.get("robot")
     if not isinstance(robot, Mapping):
@@ -57,7 +58,7 @@ def complete_device(table: dict[str, Any], folder: Path, where: str) -> dict[str
             raise InputError(
                 f"path '{name}' leaves the folder of the device file",
                 where=f"{where}: robot.urdf",
-                remedy="copy the URDF beside the device file",
+                remedy="copy the robot's file beside the device file",
             )
         payload = robot.get("payload")
         chain = read_chain(
@@ -67,6 +68,8 @@ def complete_device(table: dict[str, Any], folder: Path, where: str) -> dict[str
             payload if isinstance(payload, Mapping) else None,
         )
         robot |= {"joints": dict(chain.joints), "base": chain.base, "tip": chain.tip}
+        if chain.gravity is not None:
+            robot.setdefault("gravity", list(chain.gravity))
         limits = chain.limits
         source = "; ".join([f"{file.name}, {chain.base} to {chain.tip}", *chain.notes])
     if isinstance(robot.get("dh"), Mapping) and "joints" not in robot:

@@ -1,16 +1,32 @@
-"""A chain or tree of joints as a model file of MuJoCo (MJCF)."""
+"""MJCF, the model files of MuJoCo: what their bodies and joints say, and a robot written as one.
+
+Source: MuJoCo's documentation, XML reference.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 from xml.etree import ElementTree
 
+import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from bampipe.data.urdf import DriveLimits, number_list
+from bampipe.data.chain import Body, DriveLimits, Tree, TreeJoint, symmetric
+from bampipe.data.robot_xml import number_list, numbers
+from bampipe.errors import InputError
+from bampipe.lists import join_names
 
+Array = NDArray[np.float64]
+
+_WORLD = "world"
 _KINDS = {"revolute": "hinge", "prismatic": "slide"}
+_READ = {name: kind for kind, name in _KINDS.items()}
+_COUPLES = ("equality", "tendon")
+_BUILDS = ("include", "replicate", "composite", "flexcomp", "attach", "frame")
+_FLAT = 'write it out flat: mj_saveLastXML, with saveinertial="true" in <compiler>'
 
 
 def mjcf_text(
@@ -22,8 +38,6 @@ def mjcf_text(
     comment: str,
 ) -> str:
     """An MJCF of joints and bodies without shapes, one body and one motor a joint.
-
-    Source: MuJoCo's documentation, XML reference.
 
     Args:
         name: of the robot.
@@ -66,3 +80,216 @@ def mjcf_text(
             motor.set("ctrlrange", number_list((-own.effort, own.effort)))
     ElementTree.indent(root)
     return f'<?xml version="1.0"?>\n{ElementTree.tostring(root, encoding="unicode")}\n'
+
+
+class _Reader:
+    """Walks the bodies of an MJCF and collects links and joints."""
+
+    def __init__(self, root: ElementTree.Element, where: str) -> None:
+        self.where = where
+        compiler = _merged(root, "compiler")
+        self.radian = compiler.get("angle", "degree") == "radian"
+        self.sequence = compiler.get("eulerseq", "xyz")
+        self.autolimits = compiler.get("autolimits", "true") == "true"
+        self.by_shape = compiler.get("inertiafromgeom", "auto") == "true"
+        if compiler.get("coordinate", "local") != "local":
+            raise InputError("coordinates are global", where=where, remedy=_FLAT)
+        for tag in _BUILDS:
+            if next(root.iter(tag), None) is not None:
+                raise InputError(f"a <{tag}>, which MuJoCo expands", where=where, remedy=_FLAT)
+        self.defaults: dict[str, dict[str, str]] = {"": {}}
+        for entry in root.iterfind("default"):
+            self._read_defaults(entry, {}, is_main=True)
+        self.efforts: dict[str, float] = {}
+        for motor in root.iterfind("actuator/*"):
+            self._read_motor(motor)
+        self.bodies = {_WORLD: Body()}
+        self.joints: list[TreeJoint] = []
+
+    def _read_defaults(
+        self, entry: ElementTree.Element, outer: Mapping[str, str], is_main: bool = False
+    ) -> None:
+        joint = entry.find("joint")
+        own = {**outer, **({} if joint is None else joint.attrib)}
+        self.defaults[entry.get("class", "")] = own
+        if is_main:
+            self.defaults[""] = own
+        for inner in entry.iterfind("default"):
+            self._read_defaults(inner, own)
+
+    def _read_motor(self, motor: ElementTree.Element) -> None:
+        """Note the effort of a joint that a motor alone is for."""
+        joint = motor.get("joint")
+        place = f"{self.where}: actuator of {joint!r}"
+        torque = "ctrlrange" if motor.tag == "motor" else "forcerange"
+        if joint is None or not (motor.get(torque) or motor.get("forcerange")):
+            return
+        key = torque if motor.get(torque) else "forcerange"
+        low, high = numbers(motor, key, "0 0", 2, place)
+        gear = float(motor.get("gear", "1").split()[0])
+        self.efforts[joint] = max(abs(low), abs(high)) * abs(gear)
+
+    def walk(
+        self, body: ElementTree.Element, parent: str, shift: Array, given: str, moves: bool
+    ) -> None:
+        """Read a body and those on it.
+
+        Args:
+            body: the element; parent: link that carries it.
+            shift: of the body's parent in the frame of that link, (3,), m.
+            given: class of defaults that it inherits; moves: whether a joint is above it.
+        """
+        name = body.get("name") or f"body_{len(self.bodies)}"
+        place = f"{self.where}: body {name!r}"
+        if name in self.bodies:
+            raise InputError("a second body of that name", where=place)
+        given = body.get("childclass", given)
+        turn = self.orientation(body, place)
+        offset = shift + np.array(numbers(body, "pos", "0 0 0", 3, place))
+        free = (
+            [ElementTree.Element("joint", type="free")]
+            if body.find("freejoint") is not None
+            else []
+        )
+        joints = [*free, *body.iterfind("joint")]
+        center = np.zeros(3)
+        for k, entry in enumerate(joints):
+            known = {**self.defaults.get(entry.get("class", given), {}), **entry.attrib}
+            joint = known.get("name") or f"{name}_joint{k or ''}"
+            own = ElementTree.Element("joint", known)
+            spot = f"{self.where}: joint {joint!r}"
+            at = np.array(numbers(own, "pos", "0 0 0", 3, spot))
+            kind = _READ.get(known.get("type", "hinge"), known.get("type", ""))
+            axis = numbers(own, "axis", "0 0 1", 3, spot)
+            if kind in _KINDS and not any(axis):
+                raise InputError("an axis of length zero", where=spot)
+            child = name if k == len(joints) - 1 else f"{name}_before_{k + 1}"
+            offset = offset + turn @ (at - center)
+            start = numbers(own, "ref", "0", 1, spot)[0]
+            along = _unit(np.array(axis))
+            if kind == "revolute" and start:
+                turn = turn @ Rotation.from_rotvec(-self.angle(start) * along).as_matrix()
+            elif kind == "prismatic":
+                offset = offset - turn @ along * start
+            self.joints.append(self.joint(joint, kind, (parent, child), turn, offset, axis, own))
+            if child != name:
+                self.bodies[child] = Body()
+            parent, turn, offset, center, moves = child, np.eye(3), np.zeros(3), at, True
+        if not joints:
+            bare = ElementTree.Element("joint")
+            self.joints.append(
+                self.joint(
+                    f"{name}_fixed", "fixed", (parent, name), turn, offset, [0.0, 0.0, 1.0], bare
+                )
+            )
+        self.bodies[name] = self.body(body, moves, place).moved(np.eye(3), -center)
+        for inner in body.iterfind("body"):
+            self.walk(inner, name, -center, given, moves)
+
+    def joint(
+        self,
+        name: str,
+        kind: str,
+        ends: tuple[str, str],
+        turn: Array,
+        offset: Array,
+        axis: list[float],
+        own: ElementTree.Element,
+    ) -> TreeJoint:
+        """A joint, its limits and losses those of the element ``own``."""
+        roll, pitch, yaw = Rotation.from_matrix(turn).as_euler("xyz")
+        limits = self.limits(own, name, kind, f"{self.where}: joint {name!r}")
+        return TreeJoint(name, kind, *ends, turn, offset, (roll, pitch, yaw), axis, limits)
+
+    def angle(self, value: float) -> float:
+        return value if self.radian else math.radians(value)
+
+    def orientation(self, element: ElementTree.Element, place: str) -> Array:
+        """Rotation of an element's frame, (3, 3)."""
+        if element.get("quat"):
+            w, x, y, z = numbers(element, "quat", "", 4, place)
+            return np.asarray(Rotation.from_quat((x, y, z, w)).as_matrix())
+        if element.get("axisangle"):
+            *about_axis, angle = numbers(element, "axisangle", "", 4, place)
+            turned = self.angle(angle) * _unit(np.array(about_axis))
+            return np.asarray(Rotation.from_rotvec(turned).as_matrix())
+        if element.get("euler"):
+            angles = [self.angle(v) for v in numbers(element, "euler", "", 3, place)]
+            # Small letters of MuJoCo turn with the body, which scipy writes in capitals.
+            return np.asarray(Rotation.from_euler(self.sequence.swapcase(), angles).as_matrix())
+        if element.get("xyaxes"):
+            six = np.array(numbers(element, "xyaxes", "", 6, place))
+            first = _unit(six[:3])
+            second = _unit(six[3:] - (six[3:] @ first) * first)
+            return np.column_stack([first, second, np.cross(first, second)])
+        if element.get("zaxis"):
+            up = _unit(np.array(numbers(element, "zaxis", "", 3, place)))
+            about = np.cross([0.0, 0.0, 1.0], up)
+            size = float(np.linalg.norm(about))
+            if size == 0.0:
+                return np.diag([1.0, 1.0, 1.0]) if up[2] > 0.0 else np.diag([1.0, -1.0, -1.0])
+            turned = about / size * np.arctan2(size, up[2])
+            return np.asarray(Rotation.from_rotvec(turned).as_matrix())
+        return np.eye(3)
+
+    def body(self, body: ElementTree.Element, moves: bool, place: str) -> Body:
+        """Its mass; refused where it moves and follows from shapes."""
+        inertial = body.find("inertial")
+        shapes = body.find("geom") is not None
+        if moves and shapes and (inertial is None or self.by_shape):
+            raise InputError("mass and inertia follow from shapes", where=place, remedy=_FLAT)
+        if inertial is None:
+            return Body()
+        mass = numbers(inertial, "mass", "0", 1, place)[0]
+        center = np.array(numbers(inertial, "pos", "0 0 0", 3, place))
+        if inertial.get("fullinertia"):
+            xx, yy, zz, xy, xz, yz = numbers(inertial, "fullinertia", "", 6, place)
+            return Body(mass, center, symmetric((xx, xy, xz, yy, yz, zz)))
+        inertia = np.diag(numbers(inertial, "diaginertia", "0 0 0", 3, place))
+        return Body(mass, np.zeros(3), inertia).moved(self.orientation(inertial, place), center)
+
+    def limits(self, own: ElementTree.Element, joint: str, kind: str, place: str) -> DriveLimits:
+        low, high = numbers(own, "range", "0 0", 2, place)
+        limited = own.get("limited", "auto")
+        if limited == "false" or (limited == "auto" and not self.autolimits):
+            low = high = 0.0
+        if kind == "revolute":
+            low, high = self.angle(low), self.angle(high)
+        effort = max(map(abs, numbers(own, "actuatorfrcrange", "0 0", 2, place)))
+        return DriveLimits(
+            low, high, effort or self.efforts.get(joint, 0.0), 0.0,
+            numbers(own, "damping", "0", 1, place)[0],
+            numbers(own, "frictionloss", "0", 1, place)[0],
+        )  # fmt: skip
+
+
+def mjcf_tree(root: ElementTree.Element, where: str) -> Tree:
+    """The bodies and joints of an MJCF.
+
+    A joint beside a body's origin moves the frame of the link to the joint. Inertia of drives
+    (``armature``) is not heard: a device file has it with its motors.
+
+    Raises:
+        InputError: what only MuJoCo can expand, masses that follow from shapes, or wrong numbers.
+    """
+    reader = _Reader(root, where)
+    for world in root.iterfind("worldbody"):
+        for body in world.iterfind("body"):
+            reader.walk(body, _WORLD, np.zeros(3), "", moves=False)
+    coupled = [tag for tag in _COUPLES if root.find(f"{tag}/*") is not None]
+    notes = (f"not heard: {join_names(coupled)}",) if coupled else ()
+    x, y, z = numbers(_merged(root, "option"), "gravity", "0 0 -9.81", 3, where)
+    return Tree(reader.bodies, reader.joints, notes, (x, y, z))
+
+
+def _merged(root: ElementTree.Element, tag: str) -> ElementTree.Element:
+    """All elements of a tag as one, the later ones counting."""
+    merged = ElementTree.Element(tag)
+    for element in root.iterfind(tag):
+        merged.attrib.update(element.attrib)
+    return merged
+
+
+def _unit(vector: Array) -> Array:
+    """The vector at length one; as it is, if that is zero."""
+    return np.asarray(vector / (np.linalg.norm(vector) or 1.0))

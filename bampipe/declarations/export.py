@@ -8,9 +8,10 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from bampipe.data.chain import DriveLimits
 from bampipe.data.mjcf import mjcf_text
 from bampipe.data.run_folder import RunFolder
-from bampipe.data.urdf import DriveLimits, urdf_text
+from bampipe.data.urdf import urdf_text
 from bampipe.declarations.model_file import identified, load_model
 from bampipe.errors import InputError
 from bampipe.files import json_text

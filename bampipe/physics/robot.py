@@ -136,7 +136,7 @@ class Robot(Declaration):
     """Rigid bodies on joints; what stands in [energy] beside it is added."""
 
     urdf: Text | None = Field(
-        default=None, description="URDF file beside this one that the joints are read from"
+        default=None, description="URDF or MJCF file beside this one that the joints are read from"
     )
     base: str = Field(default="", description="Link that stands still; the URDF's root by default")
     tip: str = Field(default="", description="Last link of the chain; the URDF's only end")

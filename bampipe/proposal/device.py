@@ -10,9 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from bampipe.data import guesses
+from bampipe.data.chain import Branches
 from bampipe.data.device_file import complete_device, read_device_file
+from bampipe.data.robot_xml import read_xml
 from bampipe.data.survey import Survey, SurveyedColumn, words
-from bampipe.data.urdf import Branches
 from bampipe.errors import InputError
 from bampipe.estimate.white_noise import counting_step, white_noise_sd
 from bampipe.files import read_toml
@@ -63,20 +64,29 @@ def find_device(folder: Path, found: Survey, wanted: str) -> ChosenDevice | None
     return _robot(folder, found) or _built_in(found)
 
 
+def _is_mjcf(path: Path) -> bool:
+    try:
+        return read_xml(path).tag == "mujoco"
+    except InputError:
+        return False
+
+
 def _robot(folder: Path, found: Survey) -> ChosenDevice | None:
-    """The robot of the URDF in the folder, its drives logged as torque or as current.
+    """The robot of the URDF or MJCF in the folder, its drives logged as torque or as current.
 
     Where joints branch, as fingers do, it ends before them.
 
     Raises:
-        InputError: the URDF cannot be used, or there are several.
+        InputError: the file cannot be used, or there are several.
     """
-    urdfs = sorted(folder.glob("*.urdf"))
+    urdfs = sorted(folder.glob("*.urdf")) or [
+        path for path in sorted(folder.glob("*.xml")) if _is_mjcf(path)
+    ]
     if not urdfs:
         return None
     if len(urdfs) > 1:
         raise InputError(
-            f"{len(urdfs)} URDF files: {', '.join(path.name for path in urdfs)}",
+            f"{len(urdfs)} files of robots: {', '.join(path.name for path in urdfs)}",
             where=str(folder),
             remedy="leave the one of the logs",
         )

@@ -211,7 +211,7 @@ def test_a_robot_with_fingers_ends_before_them(tmp_path: Path) -> None:
 def test_of_several_urdf_files_none_is_guessed(tmp_path: Path) -> None:
     write_log(tmp_path)
     (tmp_path / "other.urdf").write_text(URDF)
-    with pytest.raises(InputError, match=r"2 URDF files: arm.urdf, other.urdf"):
+    with pytest.raises(InputError, match=r"2 files of robots: arm.urdf, other.urdf"):
         propose(tmp_path)
 
 

@@ -1,0 +1,351 @@
+"""A chain of joints out of a tree of links, as the plain tables that a device file holds.
+
+Bodies on fixed joints, and on joints beside the chain, are joined to the link that carries them.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import takewhile
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from bampipe.errors import InputError, did_you_mean
+from bampipe.lists import join_names
+
+Array = NDArray[np.float64]
+
+_MOVING = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
+_MANY = 8
+"""Most names that a message lists."""
+
+
+class Branches(InputError):
+    """The joints of a file branch.
+
+    Attributes:
+        stem: last link before they do; empty where they do at the base.
+    """
+
+    def __init__(
+        self,
+        what: str,
+        *,
+        where: str = "",
+        remedy: str = "",
+        others: Sequence[InputError] = (),
+        stem: str = "",
+    ) -> None:
+        super().__init__(what, where=where, remedy=remedy, others=others)
+        self.stem = stem
+
+
+@dataclass(frozen=True)
+class DriveLimits:
+    """What a file says of a joint's drive; 0 where it says nothing.
+
+    Attributes:
+        lower, upper: range, rad or m; equal where there is none.
+        effort: N.m or N; velocity: rad/s or m/s.
+        damping: N.m.s/rad or N.s/m; friction: N.m or N.
+    """
+
+    lower: float = 0.0
+    upper: float = 0.0
+    effort: float = 0.0
+    velocity: float = 0.0
+    damping: float = 0.0
+    friction: float = 0.0
+
+
+@dataclass(frozen=True)
+class Chain:
+    """The moving joints between two links.
+
+    Attributes:
+        joints: by name, tables as of ``[robot.joints]``.
+        limits: by name.
+        base, tip: the links.
+        notes: what was left out or joined, one sentence each.
+        gravity: in the base's frame, m/s2; None where it is not known.
+    """
+
+    joints: Mapping[str, dict[str, Any]]
+    limits: Mapping[str, DriveLimits]
+    base: str
+    tip: str
+    notes: tuple[str, ...]
+    gravity: tuple[float, float, float] | None = None
+
+
+@dataclass
+class Body:
+    """Mass, centre (3,) and inertia about it (3, 3), in the axes of a frame."""
+
+    mass: float = 0.0
+    center: Array = field(default_factory=lambda: np.zeros(3))
+    inertia: Array = field(default_factory=lambda: np.zeros((3, 3)))
+
+    def moved(self, turn: Array, offset: Array) -> Body:
+        """The same body seen from a frame in which its own lies at ``offset``, ``turn``."""
+        return Body(self.mass, turn @ self.center + offset, turn @ self.inertia @ turn.T)
+
+    def joined(self, other: Body) -> Body:
+        """Both as one."""
+        mass = self.mass + other.mass
+        if mass == 0.0:
+            return Body(0.0, self.center, self.inertia + other.inertia)
+        center = (self.mass * self.center + other.mass * other.center) / mass
+        return Body(mass, center, self.about(center) + other.about(center))
+
+    def about(self, point: Array) -> Array:
+        """Inertia about a point, (3, 3)."""
+        r = self.center - point
+        return self.inertia + self.mass * ((r @ r) * np.eye(3) - np.outer(r, r))
+
+    def table(self) -> dict[str, Any]:
+        """As of a joint in a device file."""
+        upper = [float(v) for v in self.inertia[np.triu_indices(3)]]
+        return {"mass": self.mass, "center": [float(v) for v in self.center], "inertia": upper}
+
+
+@dataclass(frozen=True)
+class TreeJoint:
+    """A joint between two links.
+
+    Attributes:
+        name: its own; kind: as of a URDF.
+        parent, child: the links.
+        turn, offset: of its frame in that of the parent, (3, 3) and (3,), m.
+        angles: of ``turn``, about the fixed axes x, y, z, rad.
+        axis: in its own frame.
+        limits: of its drive.
+    """
+
+    name: str
+    kind: str
+    parent: str
+    child: str
+    turn: Array
+    offset: Array
+    angles: tuple[float, float, float]
+    axis: list[float]
+    limits: DriveLimits
+
+
+@dataclass(frozen=True)
+class Tree:
+    """Links and the joints between them, as a file has them.
+
+    Attributes:
+        bodies: by link, in its frame.
+        joints: from a link to one behind it.
+        notes: what of the file is not heard, one sentence each.
+        gravity: in the frame of the link at the root, m/s2; None where the file says nothing.
+    """
+
+    bodies: Mapping[str, Body]
+    joints: Sequence[TreeJoint]
+    notes: tuple[str, ...] = ()
+    gravity: tuple[float, float, float] | None = None
+
+
+def select_chain(
+    tree: Tree, base: str, tip: str, payload: Mapping[str, Any] | None, where: str
+) -> Chain:
+    """The chain of joints from ``base`` to ``tip``.
+
+    Args:
+        tree: what a file has.
+        base: link that stands still; the root of the tree where empty.
+        tip: last link; where empty, the only end of the tree.
+        payload: ``mass``, ``center`` and ``inertia`` of a body held at the tip, in its frame.
+        where: the file.
+
+    Raises:
+        InputError: a joint or link that is wrong, or no single chain between the links.
+    """
+    bodies, joints = dict(tree.bodies), list(tree.joints)
+    for joint in joints:
+        for end in (joint.parent, joint.child):
+            if end not in bodies:
+                raise InputError(
+                    f"joint {joint.name!r} names link {end!r}, which is not there"
+                    f"{did_you_mean(end, bodies)}",
+                    where=where,
+                )
+    above = {joint.child: joint for joint in joints}
+    if len(above) < len(joints):
+        twice = next(j for j in joints if above[j.child] is not j)
+        raise InputError(
+            f"link {twice.child!r} has two joints above it: a closed loop", where=where,
+            remedy="cut the loop: leave one of the joints out",
+        )  # fmt: skip
+    base = _link(base, bodies, where) if base else _only_root(bodies, above, where)
+    tip = _link(tip, bodies, where) if tip else _only_end(base, joints, above, where)
+    path_up = _path(base, tip, above, where)
+    if payload is not None:
+        held = Body(
+            float(payload["mass"]),
+            np.array(payload.get("center", (0.0,) * 3), dtype=float),
+            symmetric(payload.get("inertia", (0.0,) * 6)),
+        )
+        bodies[tip] = bodies[tip].joined(held)
+    gravity = tree.gravity if base not in above else None
+    found = _chain(base, tip, path_up, bodies, joints, where)
+    return replace(found, notes=(*found.notes, *tree.notes), gravity=gravity)
+
+
+def _chain(
+    base: str,
+    tip: str,
+    path_up: list[TreeJoint],
+    bodies: Mapping[str, Body],
+    joints: list[TreeJoint],
+    where: str,
+) -> Chain:
+    below: dict[str, list[TreeJoint]] = {}
+    for joint in joints:
+        below.setdefault(joint.parent, []).append(joint)
+    moving = [joint for joint in path_up if joint.kind != "fixed"]
+    if not moving:
+        raise InputError(f"no joint moves between {base!r} and {tip!r}", where=where)
+    starts = {joint.child for joint in moving}
+    held: list[str] = []
+
+    def carried(link: str) -> Body:
+        """The body of a link with all that is fixed to it or held still on it."""
+        total = bodies[link]
+        for joint in below.get(link, ()):
+            if joint.child in starts:
+                continue
+            if joint.kind != "fixed" and bodies_below(joint.child) > 0.0:
+                held.append(joint.name)
+            part = carried(joint.child)
+            total = total.joined(part.moved(joint.turn, joint.offset))
+        return total
+
+    def bodies_below(link: str) -> float:
+        own = bodies[link].mass
+        return own + sum(bodies_below(joint.child) for joint in below.get(link, ()))
+
+    found: dict[str, dict[str, Any]] = {}
+    limits: dict[str, DriveLimits] = {}
+    turn, offset, before = np.eye(3), np.zeros(3), ""
+    fixed_between = False
+    for joint in path_up:
+        offset = offset + turn @ joint.offset
+        turn = turn @ joint.turn
+        if joint.kind == "fixed":
+            fixed_between = True
+            continue
+        name = _identifier(joint.name)
+        if name in found:
+            raise InputError(f"two joints are called {name!r}", where=where)
+        angles = Rotation.from_matrix(turn).as_euler("xyz") if fixed_between else joint.angles
+        table: dict[str, Any] = {
+            "kind": _MOVING[joint.kind],
+            "position": [float(v) for v in offset],
+            "rotation": [float(v) for v in angles],
+            "axis": joint.axis,
+            "effort": max(joint.limits.effort, 0.0),
+            "velocity": max(joint.limits.velocity, 0.0),
+            **carried(joint.child).table(),
+        }
+        found[name] = {"after": before, **table} if before else table
+        limits[name] = joint.limits
+        turn, offset, before, fixed_between = np.eye(3), np.zeros(3), name, False
+    notes = []
+    if held:
+        notes.append(f"held at zero beside the chain: {join_names(held, _MANY)}")
+    return Chain(found, limits, base, tip, tuple(notes))
+
+
+def _identifier(name: str) -> str:
+    """The joint's name as expressions can use it."""
+    text = re.sub(r"\W", "_", name, flags=re.ASCII)
+    return text if text[:1].isalpha() else f"joint_{text}"
+
+
+def symmetric(six: Any) -> Array:
+    """The matrix, (3, 3), of its upper triangle by rows."""
+    xx, xy, xz, yy, yz, zz = (float(v) for v in six)
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+
+def _link(name: str, bodies: Mapping[str, Body], where: str) -> str:
+    if name not in bodies:
+        raise InputError(f"no link {name!r}{did_you_mean(name, bodies)}", where=where)
+    return name
+
+
+def _only_root(bodies: Mapping[str, Body], above: Mapping[str, TreeJoint], where: str) -> str:
+    roots = [name for name in bodies if name not in above]
+    if len(roots) != 1:
+        raise InputError(
+            f"{len(roots)} links have nothing above them: {join_names(roots, _MANY)}",
+            where=where,
+            remedy="name the one that stands still: base = ...",
+        )
+    return roots[0]
+
+
+def _only_end(
+    base: str, joints: list[TreeJoint], above: Mapping[str, TreeJoint], where: str
+) -> str:
+    """The last link of the only chain of moving joints from ``base``."""
+
+    def moving(link: str) -> list[str]:
+        found = []
+        while link != base and link in above:
+            if above[link].kind != "fixed":
+                found.append(above[link].name)
+            link = above[link].parent
+        return found[::-1] if link == base else []
+
+    chains = {joint.child: moving(joint.child) for joint in joints}
+    longest = max(chains, key=lambda link: len(chains[link]), default="")
+    ends = [
+        link
+        for link, names in chains.items()
+        if names and above[link].kind != "fixed" and names != chains[longest][: len(names)]
+    ]
+    if not longest or not chains[longest]:
+        raise InputError(f"no joint moves below {base!r}", where=where)
+    if ends:
+        others = [above[longest].child, *ends]
+        levels = zip(*(chains[link] for link in others), strict=False)
+        common = [level[0] for level in takewhile(lambda level: len(set(level)) == 1, levels)]
+        raise Branches(
+            f"the joints branch; chains end at {join_names(others, _MANY)}",
+            where=where,
+            remedy='choose one: base = "..." and tip = "..." in [robot]',
+            stem=next((j.child for j in joints if common and j.name == common[-1]), ""),
+        )
+    return longest
+
+
+def _path(base: str, tip: str, above: Mapping[str, TreeJoint], where: str) -> list[TreeJoint]:
+    """Joints from base to tip."""
+    found: list[TreeJoint] = []
+    link = tip
+    while link != base:
+        if link not in above:
+            raise InputError(f"link {tip!r} does not hang on {base!r}", where=where)
+        joint = above[link]
+        if joint.kind not in (*_MOVING, "fixed"):
+            raise InputError(
+                f"a joint of type {joint.kind!r}",
+                where=f"{where}: joint {joint.name!r}",
+                remedy="between base and tip joints are revolute, continuous, prismatic or fixed",
+            )
+        found.append(joint)
+        link = joint.parent
+        if len(found) > len(above):
+            raise InputError(f"the joints above {tip!r} form a loop", where=where)
+    return found[::-1]

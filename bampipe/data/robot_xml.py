@@ -1,0 +1,57 @@
+"""XML as files of robots have it: one element, numbers in attributes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from pathlib import Path
+from xml.etree import ElementTree
+
+from bampipe.errors import InputError
+from bampipe.files import read_bytes
+
+LARGEST_BYTES = 20_000_000
+
+
+def read_xml(path: Path) -> ElementTree.Element:
+    """The root of an XML file.
+
+    Raises:
+        InputError: no XML, or one with a document type or entities.
+    """
+    where = str(path)
+    text = read_bytes(path, LARGEST_BYTES)
+    if b"<!ENTITY" in text or b"<!DOCTYPE" in text:
+        raise InputError("a robot's file has no document type or entities", where=where)
+    try:
+        return ElementTree.fromstring(text)
+    except ElementTree.ParseError as error:
+        line = error.position[0]
+        raise InputError(
+            f"not XML: {str(error).partition(':')[0]}", where=f"{where}, line {line}"
+        ) from error
+
+
+def numbers(
+    element: ElementTree.Element | None, key: str, default: str, count: int, where: str
+) -> list[float]:
+    """The ``count`` numbers of an attribute, ``default`` where there is none.
+
+    Raises:
+        InputError: others, or another number of them.
+    """
+    text = default if element is None else element.get(key, default)
+    try:
+        found = [float(part) for part in text.split()]
+    except ValueError:
+        found = []
+    if len(found) != count or not all(map(math.isfinite, found)):
+        tag = "" if element is None else f"<{element.tag} {key}>: "
+        expected = "a number" if count == 1 else f"{count} numbers"
+        raise InputError(f'{tag}found "{text}", expected {expected}', where=where)
+    return found
+
+
+def number_list(values: Iterable[float]) -> str:
+    """Numbers as an attribute of XML holds them."""
+    return " ".join(repr(float(v)) for v in values)
