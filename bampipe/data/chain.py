@@ -20,13 +20,13 @@ from bampipe.lists import join_names
 
 Array = NDArray[np.float64]
 
-_MOVING = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
+MOVING = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
 _MANY = 8
 """Most names that a message lists."""
 
 
 class Branches(InputError):
-    """The joints of a file branch.
+    """The joints of a robot branch.
 
     Attributes:
         stem: last link before they do; empty where they do at the base.
@@ -249,7 +249,7 @@ def _chain(
             raise InputError(f"two joints are called {name!r}", where=where)
         angles = Rotation.from_matrix(turn).as_euler("xyz") if fixed_between else joint.angles
         table: dict[str, Any] = {
-            "kind": _MOVING[joint.kind],
+            "kind": MOVING[joint.kind],
             "position": [float(v) for v in offset],
             "rotation": [float(v) for v in angles],
             "axis": joint.axis,
@@ -338,7 +338,7 @@ def _path(base: str, tip: str, above: Mapping[str, TreeJoint], where: str) -> li
         if link not in above:
             raise InputError(f"link {tip!r} does not hang on {base!r}", where=where)
         joint = above[link]
-        if joint.kind not in (*_MOVING, "fixed"):
+        if joint.kind not in (*MOVING, "fixed"):
             raise InputError(
                 f"a joint of type {joint.kind!r}",
                 where=f"{where}: joint {joint.name!r}",

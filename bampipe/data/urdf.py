@@ -11,13 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from bampipe.data.chain import Body, DriveLimits, Tree, TreeJoint, symmetric
+from bampipe.data.chain import MOVING, Body, DriveLimits, Tree, TreeJoint, symmetric
 from bampipe.data.robot_xml import number_list, numbers
 from bampipe.errors import InputError
 
 Array = NDArray[np.float64]
 
-_KINDS = ("revolute", "continuous", "prismatic")
 _XACRO = ("{http://www.ros.org/wiki/xacro", "{http://ros.org/wiki/xacro", "{http://ros.org/xacro")
 _UNLIMITED = 1e6
 """Effort and velocity of a joint of which none is known: a URDF has some, and 0 is a limit."""
@@ -81,7 +80,7 @@ def _joint(entry: ElementTree.Element, where: str) -> TreeJoint:
     turn, offset, angles = _pose(entry.find("origin"), place)
     kind = entry.get("type", "")
     axis = numbers(entry.find("axis"), "xyz", "1 0 0", 3, place)
-    if kind in _KINDS and not any(axis):
+    if kind in MOVING and not any(axis):
         raise InputError("an axis of length zero", where=place)
 
     def number(tag: str, key: str) -> float:

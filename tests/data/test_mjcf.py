@@ -47,8 +47,8 @@ def write(folder: Path, text: str) -> Path:
     return folder / "device.toml"
 
 
-# Motion (position, velocity, acceleration) and the forces that MuJoCo 4.0.0 takes for it (mj_inverse
-# without constraints and damping).
+# Position, velocity and acceleration, and the forces that MuJoCo 4.0.0 takes for them: mj_inverse
+# without constraints and damping.
 MUJOCO = (
     (
         ((0.3, -0.5, 0.07), (0.4, -0.2, 0.3), (1.0, -2.0, 0.5)),
