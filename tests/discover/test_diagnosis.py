@@ -58,6 +58,7 @@ def test_an_effect_that_no_mechanism_could_have_is_left_out(monkeypatch):
     assert found.axes[0].verdict != "nothing_missing"
 
 
+@pytest.mark.long
 def test_an_effect_outside_the_library_is_unknown_and_its_shape_is_said():
     found = run(made(bam(["snag:yaw"], [SNAG]), SNAGGED))
     assert verdicts(found)[0] == "unknown_effect"

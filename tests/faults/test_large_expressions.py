@@ -81,8 +81,8 @@ def test_an_effect_that_takes_too_long_is_refused(monkeypatch: pytest.MonkeyPatc
         "looks_like": "s", "kinetic": f"swung*({reach})**12*qd**2",
         "parameters": {"swung": {"unit": "kg.m2", "prior": 0.0, "sd": 1.0}},
     })  # fmt: skip
-    with pytest.raises(InputError, match=r"effect 'swing:yaw': kinetic.*takes too long"):
-        derive(Model(registry.device("bam"), ["swing:yaw"], [effect]))
+    with pytest.raises(InputError, match=r"effect 'swing:joint': kinetic.*takes too long"):
+        derive(Model(registry.device("servo_pendulum"), ["swing:joint"], [effect]))
 
 
 def test_units_are_judged_before_anything_is_derived(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -81,6 +81,7 @@ def test_what_is_undecided_is_decided_after_the_proposed_trial(tmp_path):
     assert narrow.expected.startswith("Expected: `viscous.joint` from ±")
 
 
+@pytest.mark.long
 def test_an_undecided_diagnosis_asks_for_a_trial_that_would_decide(tmp_path):
     noisy = {"trials": 2, "pace": 0.5, "seconds": 6.0, "noise_factor": 3.0}
     run, _ = record_run(tmp_path, "joint", 905, "return_spring:joint", **noisy)

@@ -69,7 +69,17 @@ def test_columns_and_compiled_functions_agree(name):
         np.testing.assert_allclose(again, 0.0, atol=1e-12 * max(scale, inertia))
 
 
-@pytest.mark.parametrize("name", registry.effect_names())
+def one_of_each_kind():
+    """Names of effects: every kind and scope once, the others marked long."""
+    seen = set()
+    for name in registry.effect_names():
+        effect = registry.effect(name)
+        known = (effect.kind, effect.scope) in seen
+        seen.add((effect.kind, effect.scope))
+        yield pytest.param(name, marks=pytest.mark.long) if known else name
+
+
+@pytest.mark.parametrize("name", one_of_each_kind())
 def test_rows_and_single_states_agree(name):
     """The functions for many states at once are those for one, but for rounding."""
     device, effect = placed(name)

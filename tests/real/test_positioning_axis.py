@@ -49,15 +49,18 @@ def stretches(tmp_path_factory) -> Path:
     return runs / "positioning_axis"
 
 
+@pytest.mark.long
 def test_least_squares_gives_the_published_parameters(whole):
     assert estimates(whole) == pytest.approx(PUBLISHED, rel=0.01)
 
 
+@pytest.mark.long
 def test_least_squares_gives_the_published_relative_error(whole):
     axis = result(whole, "models/base/validate.json")["axes"]["carriage"]
     assert axis["relative_error_percent"] == pytest.approx(4.0834, abs=0.1)
 
 
+@pytest.mark.long
 def test_friction_by_direction_gives_the_published_relative_error(whole):
     axis = result(whole, f"models/{BY_DIRECTION}/validate.json")["axes"]["carriage"]
     assert axis["relative_error_percent"] <= 3.1117
@@ -68,6 +71,7 @@ def test_friction_by_direction_gives_the_published_relative_error(whole):
     assert found["viscous.carriage"] - half == pytest.approx(240.4236, rel=0.01)
 
 
+@pytest.mark.long
 def test_free_runs_stay_closer_than_published(whole):
     """Published for the symmetric model in closed loop, relative to the measured quantity:
     position 0.013752 %, velocity 0.22911 %, force 5.848 %."""

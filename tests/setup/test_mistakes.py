@@ -28,9 +28,9 @@ NAMED = [
     ("damper", "force and current exchanged"),
     ("bam", "encoder of the pitch reversed"),
     ("bam", "counts per radian left at 1"),
-    ("bam", "encoder columns exchanged"),
-    ("bam", "pitch counted from the vertical"),
-    ("bam", "brake commands negative"),
+    pytest.param("bam", "encoder columns exchanged", marks=pytest.mark.long),
+    pytest.param("bam", "pitch counted from the vertical", marks=pytest.mark.long),
+    pytest.param("bam", "brake commands negative", marks=pytest.mark.long),
 ]
 TIED = [("joint", "encoder reversed"), ("axis", "force reversed"), ("damper", "load cell reversed")]
 

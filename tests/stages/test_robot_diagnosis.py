@@ -33,7 +33,7 @@ def test_a_spring_that_the_model_lacks_carries_no_replay_away(tmp_path: Path) ->
         assert over > 50.0 if axis == "base_yaw" else 0.8 < over < 1.25
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_drive_that_is_late_is_named(tmp_path: Path) -> None:
     run = run_arm(tmp_path, 32, "ZY", {"actuator_delay:shoulder": 1.0})
     bampipe.diagnose(run.root)
