@@ -99,7 +99,10 @@ def test_the_rivals_of_a_group_stand_in_the_ranking_and_fit_alike(alike):
 
 @pytest.mark.parametrize(
     ("machine", "seed", "effect", "axis"),
-    [("bam", 12, "detent:yaw", "yaw"), ("joint", 6, "detent:joint", "joint")],
+    [
+        pytest.param("bam", 12, "detent:yaw", "yaw", marks=pytest.mark.long),
+        ("joint", 6, "detent:joint", "joint"),
+    ],
 )
 def test_what_the_library_has_no_name_for_is_unknown(tmp_path, machine, seed, effect, axis):
     run, _ = record_run(tmp_path, machine, seed, effect)

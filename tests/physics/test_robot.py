@@ -99,7 +99,7 @@ def arguments(system: System) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return np.zeros((SAMPLES, 0)), np.zeros((SAMPLES, len(system.inputs))), system.prior
 
 
-@pytest.mark.parametrize("joints", [1, 2, 4, 6, pytest.param(8, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("joints", [1, 2, 4, 6, pytest.param(8, marks=pytest.mark.long)])
 def test_every_function_equals_that_of_pinocchio(joints: int) -> None:
     device = random_robot(joints, seed=joints)
     system, reference = compile_model(Model(device)), Reference(device)

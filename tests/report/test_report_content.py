@@ -17,7 +17,7 @@ from made_results import write_result
 
 from bampipe.data.store import write_parquet
 from bampipe.errors import InputError
-from bampipe.report import style
+from bampipe.report import style, typeset
 from bampipe.report.build import Report, build
 from bampipe.report.results import Results
 from bampipe.report.sections import identification, validation
@@ -28,6 +28,13 @@ from bampipe.results.validate import ValidateResult
 def quiet(fraction: float, message: str) -> None:
     assert 0.0 <= fraction <= 1.0
     assert message
+
+
+def page_of(root: Path) -> str:
+    """The page of a run's report; setting it for print takes longer than everything else."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(typeset, "pdf", lambda *_: b"")
+        return build(Results(root), quiet).html
 
 
 def text_of(page: str) -> str:
@@ -162,7 +169,7 @@ def test_a_simulated_session_says_so_and_who_recorded_what(full_run: Path, tmp_p
     said = {"simulated": True, "operator": "A. Lee", "device_serial": "B-3", "notes": "warm room"}
     path = root / "ingest/session.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), **said}))
-    words = text_of(build(Results(root), quiet).html)
+    words = text_of(page_of(root))
     assert "simulated, device bam B-3, recorded 2026-10-03 10:12 UTC, by A. Lee" in words
     assert "Notes: warm room." in words
     assert "It replicates nothing that was measured" in words
@@ -180,7 +187,7 @@ def test_a_better_version_that_does_not_count_is_said_with_the_reason(tmp_path: 
     path = root / "compare.json"
     compared = json.loads(path.read_text())
     path.write_text(json.dumps(compared | {"best": "base"}))
-    words = text_of(build(Results(root), quiet).html)
+    words = text_of(page_of(root))
     assert "With stribeck:yaw the error would be lower than that of base" in words.replace(
         " ,", ","
     )
@@ -199,7 +206,7 @@ def test_a_note_names_few_parameters_and_an_axis_at_rest_has_no_error(tmp_path: 
     validated = json.loads((folder / "validate.json").read_text())
     validated["trials"]["t02_free"]["yaw"]["held_out_rmse"] = 0.0
     (folder / "validate.json").write_text(json.dumps(validated))
-    page = build(Results(root), quiet).html
+    page = page_of(root)
     assert "other parameters under Identification." in page
     assert row_of(page[page.index("RMSE by trial") :], "t02_free", "yes")[2] == "–"
 
@@ -239,7 +246,7 @@ def test_settings_that_all_models_share_stand_once(full_run: Path, tmp_path: Pat
     stages["identify:other"] = stages["identify:base"] | {"config": shared | {"model": "other"}}
     stages["filter"]["config"] = {"band_hz": 5.0}
     (root / "run.json").write_text(json.dumps(record))
-    table = build(Results(root), quiet).html
+    table = page_of(root)
     table = table[table.index("Settings of each stage") :]
     assert row_of(table, "identify")[1] == "seed = 3"
     assert row_of(table, "filter")[1] == "band_hz = 5.0"
@@ -261,9 +268,9 @@ def test_results_older_than_their_inputs_are_named_first(
     record["stages"]["ingest"]["outputs"]["ingest/x"] = "f" * 64
     (root / "run.json").write_text(json.dumps(record))
     assert Results(root).outdated == ("filter", "identify:base", "stiffness")
-    report = build(Results(root), quiet)
-    place = report.html.index("older than what they were made from")
-    assert place < report.html.index("<table") and "identify:base" in report.html[place:][:400]
+    page = page_of(root)
+    place = page.index("older than what they were made from")
+    assert place < page.index("<table") and "identify:base" in page[place:][:400]
 
 
 def test_all_figures_of_the_paper(full: Report) -> None:
@@ -419,10 +426,10 @@ def test_green_means_that_no_check_failed(tmp_path: Path) -> None:
     root = synthetic_run.write_all(tmp_path / "s01")
     path = root / f"models/{synthetic_run.CHILD}/validate.json"
     content = json.loads(path.read_text())
-    assert "callout good" in build(Results(root), quiet).html
+    assert "callout good" in page_of(root)
     content["failed_checks"] = ["yaw, innovations: Not white: 60 % of their variance is left."]
     path.write_text(json.dumps(content))
-    page = build(Results(root), quiet).html
+    page = page_of(root)
     start = text_of(page)[:1500]
     assert "nothing is missing, but 1 check failed" in start
     assert "Yaw, innovations: Not white: 60 % of their variance is left." in start
