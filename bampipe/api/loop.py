@@ -310,7 +310,13 @@ def _add(
     ladder = {rung.model: rung for rung in RunFolder(options.root).read(CompareResult).ladder}
     if ladder[child].improves_on(ladder[model]):
         return child
-    tell(f"{', '.join(effects)}: the held-out error does not fall after all, stopped at {model}")
+    lost = ladder[child].has_lost_its_floor(ladder[model])
+    why = (
+        "no noise floor could be computed with it, so that its error cannot be judged"
+        if lost
+        else "the held-out error does not fall after all"
+    )
+    tell(f"{', '.join(effects)}: {why}, stopped at {model}")
     return ""
 
 

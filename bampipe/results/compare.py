@@ -32,7 +32,8 @@ class Rung(Record):
     standing: dict[str, Standing]
     confirmed: bool = Field(
         description="A model without a parent; or one whose parent is confirmed, whose parameters "
-        "are not refused, and whose held-out error is lower than its parent's"
+        "are not refused, and whose held-out error is lower than its parent's; not one without a "
+        "noise floor where its parent has one"
     )
     unit: dict[str, str]
     free_run_mode: Literal["closed_loop", "open_loop"] | None = None
@@ -48,9 +49,22 @@ class Rung(Record):
         return {h.horizon_s: h.median for h in found.horizons} if found else {}
 
     def improves_on(self, other: Rung) -> bool:
-        """Whether the held-out error, as the product over the axes, is noticeably lower."""
+        """Whether the held-out error, as the product over the axes, is noticeably lower.
+
+        A version that has lost its noise floor is no better, whatever its error: nothing says what
+        the sensors alone would leave of it, most often since its replays run away.
+        """
+        if self.has_lost_its_floor(other):
+            return False
         ratios = (self.held_out_rmse[a] / max(e, 1e-300) for a, e in other.held_out_rmse.items())
         return math.prod(ratios) < 1.0 - NOTICEABLE
+
+    def has_lost_its_floor(self, other: Rung) -> bool:
+        """Whether it has no noise floor on an axis where ``other`` has one."""
+        return any(
+            floor is not None and self.noise_floor.get(axis) is None
+            for axis, floor in other.noise_floor.items()
+        )
 
 
 def horizons_of(rungs: Iterable[Rung]) -> list[float]:

@@ -64,6 +64,18 @@ def test_a_child_that_is_no_better_does_not_count(
     assert found.best == models.counting_model(tmp_path) == "base"
 
 
+def test_a_child_whose_floor_is_lost_does_not_count(tmp_path: Path) -> None:
+    for name, parent, error, floor in (("base", "", 0.5, 0.1), ("base+a.yaw", "base", 0.05, None)):
+        add(tmp_path, name, parent, yaw=error)
+        path = tmp_path / ValidateResult.file(name)
+        content = ValidateResult.read(path)
+        axis = content.axes["yaw"].model_copy(update={"noise_floor": floor})
+        path.write_text(content.model_copy(update={"axes": {"yaw": axis}}).model_dump_json())
+    found = compared(tmp_path)
+    assert [rung.confirmed for rung in found.ladder] == [True, False]
+    assert found.best == "base"
+
+
 def test_a_damaged_ladder_is_as_none(tmp_path: Path) -> None:
     add(tmp_path, "base", "", yaw=0.5)
     add(tmp_path, "base+a.yaw", "base", yaw=0.2)
