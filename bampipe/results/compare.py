@@ -49,13 +49,15 @@ class Rung(Record):
         return {h.horizon_s: h.median for h in found.horizons} if found else {}
 
     def improves_on(self, other: Rung) -> bool:
-        """Whether the held-out error, as the product over the axes, is noticeably lower.
+        """Whether its held-out error is lower, and can be judged where that of ``other`` can.
 
         A version that has lost its noise floor is no better, whatever its error: nothing says what
         the sensors alone would leave of it, most often since its replays run away.
         """
-        if self.has_lost_its_floor(other):
-            return False
+        return self.has_lower_error_than(other) and not self.has_lost_its_floor(other)
+
+    def has_lower_error_than(self, other: Rung) -> bool:
+        """Whether the held-out error, as the product over the axes, is noticeably lower."""
         ratios = (self.held_out_rmse[a] / max(e, 1e-300) for a, e in other.held_out_rmse.items())
         return math.prod(ratios) < 1.0 - NOTICEABLE
 

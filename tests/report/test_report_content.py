@@ -194,6 +194,25 @@ def test_a_better_version_that_does_not_count_is_said_with_the_reason(tmp_path: 
     assert "none has a lower error" not in words
 
 
+def test_a_version_without_a_floor_is_not_said_to_have_no_lower_error(tmp_path: Path) -> None:
+    root = synthetic_run.write_all(tmp_path / "s01")
+    path = root / "compare.json"
+    compared = json.loads(path.read_text())
+    compared["ladder"][1]["noise_floor"] = dict.fromkeys(compared["ladder"][1]["noise_floor"])
+    path.write_text(json.dumps(compared | {"best": "base"}))
+    words = text_of(page_of(root))
+    assert "none has a lower error" not in words
+    assert "no noise floor could be computed for it" in words
+
+
+def test_a_rival_with_odds_of_its_own_is_not_said_to_be_beaten(tmp_path: Path) -> None:
+    root = synthetic_run.write_all(tmp_path / "s01")
+    path = root / "models/base/diagnose.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"groups": {}}))
+    words = text_of(page_of(root))
+    assert "(odds 30 %)" in words and "fits better beyond chance" not in words
+
+
 def test_a_note_names_few_parameters_and_an_axis_at_rest_has_no_error(tmp_path: Path) -> None:
     root = synthetic_run.write_all(tmp_path / "s01")
     folder = root / "models" / synthetic_run.CHILD

@@ -270,7 +270,8 @@ def _rivals(results: Results, effect: str) -> str:
             + (f" (odds {wording.percent(one.odds)})" if one.odds else "")
             for one in others[:_RIVALS]
         ]
-        sure = "" if diagnosis.groups.get(effect) else " It fits better beyond chance."
+        unsure = diagnosis.groups.get(effect) or any(one.odds for one in others)
+        sure = "" if unsure else " It fits better beyond chance."
         return (
             f"In its place {join_names(shown)} on held-out trials of {own.axis}, against "
             f"{wording.significant(own.held_out_rmse)} {unit}.{sure}"

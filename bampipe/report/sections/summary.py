@@ -96,12 +96,14 @@ def _ladder(results: Results) -> str:
 def _unconfirmed(results: Results, compared: CompareResult) -> str:
     """Say why no later version counts, which may have a lower error all the same."""
     first = compared.ladder[0]
-    better = [rung for rung in compared.ladder if rung.improves_on(first)]
+    better = [rung for rung in compared.ladder if rung.has_lower_error_than(first)]
     if not better:
         return f"Of {len(compared.ladder)} models none has a lower error than `{first.model}`."
     validated = results.read(ValidateResult, better[-1].model)
     refused = validated is not None and validated.is_refused
     why = "its parameters are refused" if refused else "the version it builds on is not confirmed"
+    if better[-1].has_lost_its_floor(first):
+        why = "no noise floor could be computed for it, so that its error cannot be judged"
     return (
         f"With `{better[-1].added}` the error would be lower than that of `{first.model}`, but that"
         f" version does not count: {why}."
