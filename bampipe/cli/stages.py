@@ -193,8 +193,6 @@ def report(
 
     Example: bampipe report 2026-10-03_s01 --open
     """
-    if model and not options.list_settings:
-        models.choose_model(places.find_run(run, options.runs), model)
     plain_stage("report", run, options, detail_model=model)
     if open_ and not options.list_settings:
         show.page(places.find_run(run, options.runs) / "report" / "explore.html")

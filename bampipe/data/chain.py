@@ -20,7 +20,7 @@ from bampipe.lists import join_names
 
 Array = NDArray[np.float64]
 
-MOVING = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
+_MOVING = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
 _MANY = 8
 """Most names that a message lists."""
 
@@ -179,6 +179,8 @@ def select_chain(
                     f"{did_you_mean(end, bodies)}",
                     where=where,
                 )
+        if joint.kind in _MOVING and not any(joint.axis):
+            raise InputError("an axis of length zero", where=f"{where}: joint {joint.name!r}")
     above = {joint.child: joint for joint in joints}
     if len(above) < len(joints):
         twice = next(j for j in joints if above[j.child] is not j)
@@ -249,7 +251,7 @@ def _chain(
             raise InputError(f"two joints are called {name!r}", where=where)
         angles = Rotation.from_matrix(turn).as_euler("xyz") if fixed_between else joint.angles
         table: dict[str, Any] = {
-            "kind": MOVING[joint.kind],
+            "kind": _MOVING[joint.kind],
             "position": [float(v) for v in offset],
             "rotation": [float(v) for v in angles],
             "axis": joint.axis,
@@ -338,7 +340,7 @@ def _path(base: str, tip: str, above: Mapping[str, TreeJoint], where: str) -> li
         if link not in above:
             raise InputError(f"link {tip!r} does not hang on {base!r}", where=where)
         joint = above[link]
-        if joint.kind not in (*MOVING, "fixed"):
+        if joint.kind not in (*_MOVING, "fixed"):
             raise InputError(
                 f"a joint of type {joint.kind!r}",
                 where=f"{where}: joint {joint.name!r}",

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from bampipe.data.chain import DriveLimits
+from bampipe.data.chain import DriveLimits, symmetric
 from bampipe.data.robot_file import read_chain
 from bampipe.errors import InputError
 from bampipe.files import read_toml
@@ -107,9 +107,7 @@ def _from_dh(rows: Mapping[str, Any]) -> dict[str, dict[str, Any]] | None:
             return None
         twist = Rotation.from_euler("x", alpha).as_matrix()
         behind = np.array([a, 0.0, d])
-        inertia = np.empty((3, 3))
-        inertia[np.triu_indices(3)] = six
-        inertia.T[np.triu_indices(3)] = six
+        inertia = symmetric(six)
         placed = turn @ Rotation.from_euler("z", zero).as_matrix()
         found[name] = {
             "kind": row.get("kind", "revolute"),

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from bampipe.data.chain import Body, DriveLimits, Tree, TreeJoint, symmetric
-from bampipe.data.robot_xml import number_list, numbers
+from bampipe.data.robot_xml import document, number_list, numbers
 from bampipe.errors import InputError
 from bampipe.lists import join_names
 
@@ -48,7 +48,6 @@ def mjcf_text(
         comment: what to say at its head.
     """
     root = ElementTree.Element("mujoco", model=name)
-    root.append(ElementTree.Comment(f" {comment.replace('--', '- -')} "))
     ElementTree.SubElement(root, "compiler", angle="radian", inertiafromgeom="false")
     ElementTree.SubElement(root, "option", gravity=number_list(gravity))
     bodies = {"": ElementTree.SubElement(root, "worldbody")}
@@ -78,8 +77,7 @@ def mjcf_text(
         if own.effort > 0.0:
             motor.set("ctrllimited", "true")
             motor.set("ctrlrange", number_list((-own.effort, own.effort)))
-    ElementTree.indent(root)
-    return f'<?xml version="1.0"?>\n{ElementTree.tostring(root, encoding="unicode")}\n'
+    return document(root, comment)
 
 
 class _Reader:
@@ -146,12 +144,7 @@ class _Reader:
         given = body.get("childclass", given)
         turn = self.orientation(body, place)
         offset = shift + np.array(numbers(body, "pos", "0 0 0", 3, place))
-        free = (
-            [ElementTree.Element("joint", type="free")]
-            if body.find("freejoint") is not None
-            else []
-        )
-        joints = [*free, *body.iterfind("joint")]
+        joints = [*body.iterfind("freejoint"), *body.iterfind("joint")]
         center = np.zeros(3)
         for k, entry in enumerate(joints):
             known = {**self.defaults.get(entry.get("class", given), {}), **entry.attrib}
@@ -159,10 +152,9 @@ class _Reader:
             own = ElementTree.Element("joint", known)
             spot = f"{self.where}: joint {joint!r}"
             at = np.array(numbers(own, "pos", "0 0 0", 3, spot))
-            kind = _READ.get(known.get("type", "hinge"), known.get("type", ""))
+            kind = "free" if entry.tag == "freejoint" else known.get("type", "hinge")
+            kind = _READ.get(kind, kind)
             axis = numbers(own, "axis", "0 0 1", 3, spot)
-            if kind in _KINDS and not any(axis):
-                raise InputError("an axis of length zero", where=spot)
             child = name if k == len(joints) - 1 else f"{name}_before_{k + 1}"
             offset = offset + turn @ (at - center)
             start = numbers(own, "ref", "0", 1, spot)[0]

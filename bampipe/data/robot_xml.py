@@ -52,6 +52,14 @@ def numbers(
     return found
 
 
+def document(root: ElementTree.Element, comment: str) -> str:
+    """The text of a file, a comment at its head unless that is empty."""
+    if comment:
+        root.insert(0, ElementTree.Comment(f" {comment.replace('--', '- -')} "))
+    ElementTree.indent(root)
+    return f'<?xml version="1.0"?>\n{ElementTree.tostring(root, encoding="unicode")}\n'
+
+
 def number_list(values: Iterable[float]) -> str:
     """Numbers as an attribute of XML holds them."""
     return " ".join(repr(float(v)) for v in values)

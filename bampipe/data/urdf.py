@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from bampipe.data.chain import MOVING, Body, DriveLimits, Tree, TreeJoint, symmetric
-from bampipe.data.robot_xml import number_list, numbers
+from bampipe.data.chain import Body, DriveLimits, Tree, TreeJoint, symmetric
+from bampipe.data.robot_xml import document, number_list, numbers
 from bampipe.errors import InputError
 
 Array = NDArray[np.float64]
@@ -80,8 +80,6 @@ def _joint(entry: ElementTree.Element, where: str) -> TreeJoint:
     turn, offset, angles = _pose(entry.find("origin"), place)
     kind = entry.get("type", "")
     axis = numbers(entry.find("axis"), "xyz", "1 0 0", 3, place)
-    if kind in MOVING and not any(axis):
-        raise InputError("an axis of length zero", where=place)
 
     def number(tag: str, key: str) -> float:
         return numbers(entry.find(tag), key, "0", 1, place)[0]
@@ -114,8 +112,6 @@ def urdf_text(
         comment: what to say at its head.
     """
     robot = ElementTree.Element("robot", name=name)
-    if comment:
-        robot.append(ElementTree.Comment(f" {comment.replace('--', '- -')} "))
     ElementTree.SubElement(robot, "link", name="base")
     for joint, table in joints.items():
         link = ElementTree.SubElement(robot, "link", name=f"{joint}_link")
@@ -145,5 +141,4 @@ def urdf_text(
         ElementTree.SubElement(
             entry, "dynamics", damping=repr(own.damping), friction=repr(own.friction)
         )
-    ElementTree.indent(robot)
-    return f'<?xml version="1.0"?>\n{ElementTree.tostring(robot, encoding="unicode")}\n'
+    return document(robot, comment)

@@ -8,7 +8,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from bampipe.data.chain import DriveLimits
+from bampipe.data.chain import Body, DriveLimits, symmetric
 from bampipe.data.mjcf import mjcf_text
 from bampipe.data.run_folder import RunFolder
 from bampipe.data.urdf import urdf_text
@@ -142,12 +142,5 @@ def _body(numbers: Array) -> dict[str, Any]:
     """Mass, centre and inertia about it, of the ten numbers about the joint."""
     mass = float(numbers[0])
     center = numbers[1:4] / mass if mass != 0.0 else np.zeros(3)
-    about = np.zeros((3, 3))
-    about[np.triu_indices(3)] = numbers[4:]
-    about = about + np.triu(about, 1).T
-    inertia = about - mass * ((center @ center) * np.eye(3) - np.outer(center, center))
-    return {
-        "mass": mass,
-        "center": [float(v) for v in center],
-        "inertia": [float(v) for v in inertia[np.triu_indices(3)]],
-    }
+    inertia = symmetric(numbers[4:]) - Body(mass, center).about(np.zeros(3))
+    return Body(mass, center, inertia).table()

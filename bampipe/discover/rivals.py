@@ -107,10 +107,10 @@ def choose(
     likely = plausible(misfits, s)
     if not likely:
         # As where more is missing than one effect: the patterns are no evidence for any of them.
-        others = tuple(n for n in rivals if n != best)
-        return Choice(best, (), transient, others, min(misfits.values()))
-    winner, *rest_likely = likely
-    alike = tuple(rest_likely)
+        unlike = tuple(n for n in rivals if n != best)
+        return Choice(best, (), transient, unlike, min(misfits.values()))
+    winner, *others = likely
+    alike = tuple(others)
     if best in alike:
         alike = (winner, *[n for n in alike if n != best])
         winner = best

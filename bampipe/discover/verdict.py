@@ -9,6 +9,7 @@ import numpy as np
 from bampipe.discover.chance import candidates_of
 from bampipe.discover.findings import Diagnosis
 from bampipe.discover.influence import error_without_second
+from bampipe.discover.odds import odds_by_score
 from bampipe.discover.polish import comes_close
 from bampipe.discover.ranking import rank
 from bampipe.discover.scorer import Scorer
@@ -133,16 +134,7 @@ def _odds_of_group(search: Search, name: str, s: Settings) -> dict[str, float]:
     """
     among = {name, *search.groups[name], *search.unlike}
     scores = {c.effect: c.score for c in search.contests.get(name, ()) if c.effect in among}
-    return _odds(scores or {name: 0.0}, s, float(np.sqrt(search.misfit)))
-
-
-def _odds(scores: Mapping[str, float], s: Settings, widening: float = 1.0) -> dict[str, float]:
-    """Odds by log likelihood, tempered by what the scores are good for: no replay is perfect."""
-    top = max(scores.values())
-    scale = widening * np.hypot(s.score_sd, s.score_error * top)
-    weights = {name: float(np.exp((score - top) / scale)) for name, score in scores.items()}
-    total = sum(weights.values())
-    return {name: weight / total for name, weight in weights.items()}
+    return odds_by_score(scores or {name: 0.0}, s, float(np.sqrt(search.misfit)))
 
 
 def _odds_of_likely(search: Search, axis: int, s: Settings) -> dict[str, float]:
@@ -151,7 +143,7 @@ def _odds_of_likely(search: Search, axis: int, s: Settings) -> dict[str, float]:
     here = {n: (p, gain[axis]) for n, (p, gain) in search.likely.items() if gain[axis] > s.worth}
     if not here:
         return {}
-    odds = _odds({n: float(gain * count) for n, (_, gain) in here.items()}, s)
+    odds = odds_by_score({n: float(gain * count) for n, (_, gain) in here.items()}, s)
     found = {n: (1.0 - here[n][0]) * share for n, share in odds.items()}
     return dict(sorted(found.items(), key=lambda pair: -pair[1]))
 

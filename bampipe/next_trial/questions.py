@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from bampipe.discover.candidates import list_candidates
 from bampipe.discover.chance import candidates_of, fit_trials, system_of
+from bampipe.discover.odds import odds_by_score
 from bampipe.discover.scorer import Scorer
 from bampipe.discover.settings import Settings
 from bampipe.next_trial.discrimination import Contest, Rival, Sums
@@ -49,11 +50,9 @@ def find_ambiguity(found: DiagnoseResult) -> Ambiguity | None:
         ranked = {row.effect: row.score for row in found.ranking}
         alike = {name, *found.groups.get(name, ())}
         scores |= {other: ranked[other] for other in alike - {*scores} if other in ranked}
-        top = max(scores.values(), default=0.0)
-        if len(scores) < 2 or top <= 0.0:
+        if len(scores) < 2 or max(scores.values()) <= 0.0:
             continue
-        scale = np.hypot(s.score_sd, s.score_error * top)
-        odds = {other: float(np.exp((score - top) / scale)) for other, score in scores.items()}
+        odds = odds_by_score(scores, s)
         if known.get(name):
             # Replays were heard: on the scale of the others.
             odds |= {o: share / known[name] * odds[name] for o, share in known.items()}

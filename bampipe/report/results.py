@@ -11,7 +11,7 @@ from typing import Any, TypeVar, cast
 import pandas as pd
 
 from bampipe.declarations.model import read_model_file
-from bampipe.errors import InputError
+from bampipe.errors import InputError, MissingResultError
 from bampipe.files import read_json_table, read_toml
 from bampipe.results.compare import CompareResult
 from bampipe.results.ingest import IngestResult
@@ -205,7 +205,7 @@ class Results:
         """
         if name in self.models:
             return name
-        raise InputError(
+        raise MissingResultError(
             f"no results for model {name!r}",
             where=str(self.root),
             remedy=f"choose from {', '.join(self.models) or 'none: identify first'}",

@@ -517,5 +517,5 @@ def test_a_model_that_is_not_there_changes_nothing_in_the_run(
     root = synthetic_run.write_all(tmp_path / "s01")
     before = (root / "run.json").read_bytes()
     code, _, err = command("report", root, "--model", "bse")
-    assert code == 2 and "no model 'bse'" in err and "base" in err
+    assert code == 2 and "no results for model 'bse'" in err and "base" in err
     assert (root / "run.json").read_bytes() == before and not (root / "report").exists()
