@@ -6,6 +6,7 @@ Source: MuJoCo's documentation, XML reference.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 from xml.etree import ElementTree
@@ -16,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from bampipe.data.chain import Body, DriveLimits, Tree, TreeJoint, symmetric
 from bampipe.data.robot_xml import document, number_list, numbers
-from bampipe.errors import InputError
+from bampipe.errors import InputError, did_you_mean
 from bampipe.lists import join_names
 
 Array = NDArray[np.float64]
@@ -88,6 +89,10 @@ class _Reader:
         compiler = _merged(root, "compiler")
         self.radian = compiler.get("angle", "degree") == "radian"
         self.sequence = compiler.get("eulerseq", "xyz")
+        if not re.fullmatch("[xyzXYZ]{3}", self.sequence):
+            raise InputError(
+                f'eulerseq: found "{self.sequence}", expected three of x, y, z', where=where
+            )
         self.autolimits = compiler.get("autolimits", "true") == "true"
         self.by_shape = compiler.get("inertiafromgeom", "auto") == "true"
         if compiler.get("coordinate", "local") != "local":
@@ -95,7 +100,7 @@ class _Reader:
         for tag in _BUILDS:
             if next(root.iter(tag), None) is not None:
                 raise InputError(f"a <{tag}>, which MuJoCo expands", where=where, remedy=_FLAT)
-        self.defaults: dict[str, dict[str, str]] = {"": {}}
+        self.defaults: dict[str, dict[str, str]] = {"": {}, "main": {}}
         for entry in root.iterfind("default"):
             self._read_defaults(entry, {}, is_main=True)
         self.efforts: dict[str, float] = {}
@@ -119,12 +124,12 @@ class _Reader:
         """Note the effort of a joint that a motor alone is for."""
         joint = motor.get("joint")
         place = f"{self.where}: actuator of {joint!r}"
-        torque = "ctrlrange" if motor.tag == "motor" else "forcerange"
-        if joint is None or not (motor.get(torque) or motor.get("forcerange")):
+        ranges = ("ctrlrange", "forcerange") if motor.tag == "motor" else ("forcerange",)
+        key = next((key for key in ranges if motor.get(key)), "")
+        if joint is None or not key:
             return
-        key = torque if motor.get(torque) else "forcerange"
-        low, high = numbers(motor, key, "0 0", 2, place)
-        gear = float(motor.get("gear", "1").split()[0])
+        low, high = numbers(motor, key, "", 2, place)
+        gear = numbers(motor, "gear", "1", max(len(motor.get("gear", "1").split()), 1), place)[0]
         self.efforts[joint] = max(abs(low), abs(high)) * abs(gear)
 
     def walk(
@@ -147,7 +152,7 @@ class _Reader:
         joints = [*body.iterfind("freejoint"), *body.iterfind("joint")]
         center = np.zeros(3)
         for k, entry in enumerate(joints):
-            known = {**self.defaults.get(entry.get("class", given), {}), **entry.attrib}
+            known = {**self.default(entry.get("class", given), place), **entry.attrib}
             joint = known.get("name") or f"{name}_joint{k or ''}"
             own = ElementTree.Element("joint", known)
             spot = f"{self.where}: joint {joint!r}"
@@ -178,6 +183,14 @@ class _Reader:
         for inner in body.iterfind("body"):
             self.walk(inner, name, -center, given, moves)
 
+    def default(self, name: str, place: str) -> dict[str, str]:
+        """What a class gives a joint."""
+        if name not in self.defaults:
+            raise InputError(
+                f"no <default> of class {name!r}{did_you_mean(name, self.defaults)}", where=place
+            )
+        return self.defaults[name]
+
     def joint(
         self,
         name: str,
@@ -200,6 +213,8 @@ class _Reader:
         """Rotation of an element's frame, (3, 3)."""
         if element.get("quat"):
             w, x, y, z = numbers(element, "quat", "", 4, place)
+            if not any((w, x, y, z)):
+                raise InputError("a quat of length zero", where=place)
             return np.asarray(Rotation.from_quat((x, y, z, w)).as_matrix())
         if element.get("axisangle"):
             *about_axis, angle = numbers(element, "axisangle", "", 4, place)
@@ -207,8 +222,12 @@ class _Reader:
             return np.asarray(Rotation.from_rotvec(turned).as_matrix())
         if element.get("euler"):
             angles = [self.angle(v) for v in numbers(element, "euler", "", 3, place)]
-            # Small letters of MuJoCo turn with the body, which scipy writes in capitals.
-            return np.asarray(Rotation.from_euler(self.sequence.swapcase(), angles).as_matrix())
+            turn = np.eye(3)
+            for letter, angle in zip(self.sequence, angles, strict=True):
+                one = Rotation.from_euler(letter.lower(), angle).as_matrix()
+                # About axes that turn along, small letters; about fixed ones, capitals.
+                turn = turn @ one if letter.islower() else one @ turn
+            return turn
         if element.get("xyaxes"):
             six = np.array(numbers(element, "xyaxes", "", 6, place))
             first = _unit(six[:3])

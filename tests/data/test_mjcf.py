@@ -97,6 +97,10 @@ def test_limits_and_losses_are_heard(tmp_path: Path) -> None:
         ('class="wrist"/>', 'type="ball"/>', "joint of type 'ball'"),
         ('axis="1 0 0.5"', 'axis="1 0"', "expected 3 numbers"),
         ('name="lower"', 'name="upper"', "a second body of that name"),
+        ('gear="50"', 'gear="fifty"', "<motor gear>.*expected a number"),
+        ('eulerseq="xyz"', 'eulerseq="xyw"', "eulerseq.*three of x, y, z"),
+        ('class="wrist"/>', 'class="wirst"/>', "class 'wirst', did you mean 'wrist'"),
+        ('quat="0.9 0.1 0.3 -0.2"', 'quat="0 0 0 0"', "quat of length zero"),
         ("<mujoco ", "<sdf ", "not XML|expected <robot>"),
     ],
 )  # fmt: skip

@@ -59,12 +59,18 @@ def test_an_effect_that_no_mechanism_could_have_is_left_out(monkeypatch):
 
 
 @pytest.mark.long
-def test_an_effect_outside_the_library_is_unknown_and_its_shape_is_said():
-    found = run(made(bam(["snag:yaw"], [SNAG]), SNAGGED))
+def test_an_effect_outside_the_library_is_unknown_until_its_file_is_given():
+    session = made(bam(["snag:yaw"], [SNAG]), SNAGGED)
+    found = run(session)
     assert verdicts(found)[0] == "unknown_effect"
     assert found.selected == ()
     words = describe(found.evidence, 0, QUICK)
     assert "position" in words and "bump" in words
+    with_file = run(session, bam([], [SNAG]))
+    assert with_file.selected == ("snag:yaw",)
+    values = with_file.ranking[0].parameters
+    assert values["snag.yaw.place"] == pytest.approx(0.22, abs=0.02)
+    assert with_file.axes[0].rmse_after < 1.2 * with_file.axes[0].noise_floor
 
 
 def test_what_a_named_effect_leaves_is_said_to_remain():

@@ -24,7 +24,7 @@ BAM = registry.device("bam")
 def placed(name):
     """The device with the fewest axes that can have the effect, and the effect at its last target.
 
-    Many axes take long to compile; `test_composition` has effects on the BAM.
+    Many axes take long to compile; `test_effects` has every effect at every target on the BAM.
     """
     shipped = map(registry.device, registry.device_names())
     by_size = sorted(shipped, key=lambda device: len(device.coordinates))
