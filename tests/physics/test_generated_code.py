@@ -79,7 +79,7 @@ def one_of_each_kind():
         yield pytest.param(name, marks=pytest.mark.long) if known else name
 
 
-@pytest.mark.parametrize("name", one_of_each_kind())
+@pytest.mark.parametrize("name", [*one_of_each_kind()])
 def test_rows_and_single_states_agree(name):
     """The functions for many states at once are those for one, but for rounding."""
     device, effect = placed(name)
