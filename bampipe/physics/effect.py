@@ -197,6 +197,14 @@ class Effect(Declaration):
         return tuple(lines)
 
     @property
+    def is_dry_friction(self) -> bool:
+        """Whether it is a torque on axes that turns with the sign of their motion."""
+        nodes = (node for tree in self.expressions.values() for node in ast.walk(tree))
+        names = (node.func for node in nodes if isinstance(node, ast.Call))
+        turns = any(isinstance(name, ast.Name) and name.id == "sgn" for name in names)
+        return self.kind == "torque" and self.scope in ("axis", "axis_pair") and turns
+
+    @property
     def acting_link(self) -> Link | None:
         """Its link; None for what acts on the mechanism itself."""
         usual: dict[str, Link] = {"input": "scale", "measurement": "lever"}

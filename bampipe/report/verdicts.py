@@ -12,6 +12,8 @@ from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.standing import FLOOR_WRONG, STANDINGS_IN_WORDS
 from bampipe.results.validate import ValidateResult
 
+_MOST_NAMED = 3
+"""Held-out trials that a note can name."""
 VERDICTS_IN_WORDS = {
     "nothing_missing": "nothing missing",
     "missing": "an effect is missing",
@@ -31,6 +33,21 @@ def error_over_floor(results: Results, model: str) -> dict[str, float] | None:
         for axis in ordered(results, axes)
         if (floor := axes[axis].noise_floor)
     }
+
+
+def held_out_in_words(validated: ValidateResult) -> str:
+    """Return which trials were held out, and from what."""
+    names = [name for name, trial in validated.trials.items() if trial.held_out]
+    if not names:
+        return "nothing could be held out, so that the error is that of the fit"
+    if len(validated.trials) == 1:
+        return "each part of the trial predicted with parameters fitted to its other parts"
+    if len(names) == len(validated.trials):
+        return "each trial predicted with parameters fitted to others"
+    if len(names) > _MOST_NAMED:
+        return f"{len(names)} of the {len(validated.trials)} trials, which no parameter has seen"
+    trials = "trial" if len(names) == 1 else "trials"
+    return f"{trials} {join_names(names)}, which no parameter has seen"
 
 
 def ordered(results: Results, by_axis: Collection[str]) -> tuple[str, ...]:

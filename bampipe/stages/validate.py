@@ -238,9 +238,11 @@ def _expected_ratio(evidence: Evidence, trials: MeasuredTrials, p: Array, seed: 
 def _compare(evidence: Evidence, number: int, p: Array) -> _Compared:
     """Compare one trial with the model as published, held out, and without friction."""
     system, motion = evidence.system, evidence.motions[number]
+    dry = (effect for effect in system.model.effects if effect.effect.is_dry_friction)
+    strengths = {item.name for effect in dry for item in effect.parameters if item.strength}
     frictionless = p.copy()
     for i, item in enumerate(system.parameters):
-        if item.name.startswith(("viscous.", "coulomb.")):
+        if item.name in strengths or item.name.startswith(("viscous.", "coulomb.")):
             frictionless[i] = 0.0
     band, folds = evidence.band, evidence.folds
     u = motion.inputs(system.inputs)

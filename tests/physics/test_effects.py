@@ -417,3 +417,9 @@ def test_unknown_effect_and_target_are_named():
         Model(BAM, ["stribek:yaw"])
     with pytest.raises(InputError, match="stribeck:pitch"):
         Model(BAM, ["stribeck:pich"])
+
+
+def test_dry_friction_is_what_turns_with_the_motion_of_an_axis():
+    dry = {name for name in registry.effect_names() if registry.effect(name).is_dry_friction}
+    assert {"presliding", "maxwell_slip", "stribeck", "load_dependent_friction"} <= dry
+    assert dry.isdisjoint({"brake_lag", "return_spring", "handle_payload", "force_bias"})

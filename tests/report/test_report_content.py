@@ -116,7 +116,7 @@ def test_errors_of_every_axis_stand_beside_the_floor(full: Report) -> None:
 
 def test_what_the_stages_say_of_themselves_is_passed_on(full: Report) -> None:
     words = text_of(full.html)
-    assert "All estimates had settled after 16.9 s of 48.0 s" in words
+    assert "All estimates had settled after 16.9 s of the 48.0 s" in words
     assert "normalised innovation squared is 1.0;" in words
     assert "The force lags the encoders by 0.120 ± 0.031 ms" in words
     assert "Error of the predicted force (RMSE): force x 0.123 N" in words
@@ -211,6 +211,52 @@ def test_a_rival_with_odds_of_its_own_is_not_said_to_be_beaten(tmp_path: Path) -
     path.write_text(json.dumps(json.loads(path.read_text()) | {"groups": {}}))
     words = text_of(page_of(root))
     assert "(odds 30 %)" in words and "fits better beyond chance" not in words
+
+
+@pytest.mark.parametrize(
+    ("held_out", "said"),
+    [
+        ((True, True), "Held-out: each trial predicted with parameters fitted to others."),
+        ((False, True), f"Held-out: trial {synthetic_run.FREE[1]}, which no parameter has seen."),
+        ((False, False), "Held-out: nothing could be held out"),
+    ],
+)
+def test_what_was_held_out_is_said_as_it_was(
+    tmp_path: Path, held_out: tuple[bool, bool], said: str
+) -> None:
+    root = synthetic_run.write_all(tmp_path / "s01")
+    for path in (root / "models").glob("*/validate.json"):
+        content = json.loads(path.read_text())
+        entry = next(iter(content["trials"].values()))
+        names = synthetic_run.FREE[:2]
+        content["trials"] = {
+            name: entry | {"held_out": out} for name, out in zip(names, held_out, strict=True)
+        }
+        path.write_text(json.dumps(content))
+    assert said in text_of(page_of(root))
+
+
+def test_intervals_of_a_model_that_lacks_something_say_so(tmp_path: Path) -> None:
+    root = synthetic_run.write_all(tmp_path / "s01")
+    path = root / "models" / synthetic_run.CHILD / "validate.json"
+    content = json.loads(path.read_text())
+    assert "as if the model lacked nothing" not in text_of(page_of(root))
+    yaw = content["axes"]["yaw"]
+    yaw |= {"standing": "above_floor", "held_out_rmse": 23.0 * yaw["noise_floor"]}
+    path.write_text(json.dumps(content))
+    assert "its held-out error is up to 23.0 times the noise floor" in text_of(page_of(root))
+
+
+def test_the_rate_of_samples_is_that_of_the_clock(tmp_path: Path) -> None:
+    root = synthetic_run.write_all(tmp_path / "s01")
+    path = root / "ingest/trials.parquet"
+    trials = pd.read_parquet(path)
+    grid = json.loads((root / "ingest/session.json").read_text())["sample_rate_hz"]
+    counted = 1 + 0.9 * grid * trials["duration_s"].fillna(0.0)
+    trials["n_samples"] = counted.round().astype(int)
+    write_parquet(path, trials)
+    words = text_of(page_of(root))
+    assert f"Hz on average, put on a grid of {grid:.0f} Hz when filtered" in words
 
 
 def test_a_note_names_few_parameters_and_an_axis_at_rest_has_no_error(tmp_path: Path) -> None:

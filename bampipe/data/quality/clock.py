@@ -191,8 +191,10 @@ def note_clock(table: TrialTable) -> None:
             " put on a uniform grid by monotone cubic interpolation when filtered"
         )
     nominal = table.session.sample_rate
-    if abs(1 / median - nominal) > 0.02 * nominal:
-        table.notes.append(f"sampled at {1 / median:.4g} Hz, announced {nominal:g} Hz")
+    # The mean, and not the median: a clock of whole milliseconds steps by 10 and 12 ms at 94 Hz.
+    rate = 1 / float(np.mean(steps[~gaps]))
+    if abs(rate - nominal) > 0.02 * nominal:
+        table.notes.append(f"sampled at {rate:.4g} Hz, announced {nominal:g} Hz")
 
 
 def _few(table: TrialTable, total: int) -> int:

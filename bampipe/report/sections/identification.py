@@ -23,6 +23,7 @@ from bampipe.results.identify import (
     StateBound,
 )
 from bampipe.results.intervals import NORMAL_95
+from bampipe.results.validate import ValidateResult
 
 TITLE = "Identification"
 _COLUMNS = (2, 3, 4)
@@ -92,13 +93,13 @@ def _parameters(results: Results, identified: IdentifyResult) -> Table:
                 wording.unit(entry.unit),
             )
         )
-    note = "Interval: estimate ± 1.96 standard deviations."
+    note = f"Interval: estimate ± 1.96 standard deviations{_caveat(results)}."
     if calibrated:
         note += (
             " Calibration: the part of SD that the stated uncertainty of sensors and constants is."
         )
     else:
-        note += " No uncertainty of a calibration is stated: it is in no interval."
+        note += " No calibration uncertainty is stated, so that no interval holds any."
     if bounded:
         note += " Bound: the least SD that these sensors allow on these trials (Cramér-Rao)."
     if others:
@@ -124,6 +125,24 @@ def _parameters(results: Results, identified: IdentifyResult) -> Table:
         "llrrr" + "r" * (len(others) + bounded + calibrated) + "l",
         (1.1, 1.0) + (0.0,) * (4 + len(others) + bounded + calibrated),
         note,
+    )
+
+
+def _caveat(results: Results) -> str:
+    """Return what an interval is worth where the model lacks something; "" where it does not."""
+    validated = results.read(ValidateResult)
+    ratios = verdicts.error_over_floor(results, results.model) or {}
+    lacking = [
+        ratio
+        for axis, ratio in ratios.items()
+        if validated is not None and validated.axes[axis].standing == "above_floor"
+    ]
+    if not lacking:
+        return ""
+    return (
+        ", as if the model lacked nothing; its held-out error is up to "
+        f"{wording.significant(max(lacking))} times the noise floor, and what it lacks may have "
+        "moved the estimates out of them"
     )
 
 
@@ -164,8 +183,9 @@ def _checks(identified: IdentifyResult) -> str:
     if settled and convergence.total_s:
         last = max(settled, key=lambda name: (settled[name], name))
         parts.append(
-            f"All estimates had settled after {wording.plain(settled[last], 1)} s of "
-            f"{wording.plain(convergence.total_s, 1)} s (the last was `{last}`)."
+            f"All estimates had settled after {wording.plain(settled[last], 1)} s of the "
+            f"{wording.plain(convergence.total_s, 1)} s of the filter's first run and last (the "
+            f"last to settle was `{last}`)."
         )
     if not convergence.converged:
         parts.append("**The estimates have not converged.**")

@@ -19,9 +19,9 @@ from bampipe.results.validate import AxisError, ValidateResult
 _MOST_OTHERS = 12
 """Parameters of no axis that a note can name."""
 _TERMS = (
-    "Held-out: each trial predicted with parameters that never saw it. RMSE: root mean square of "
-    "measured minus predicted force. Noise floor: the error that sensor noise, quantisation and "
-    "filtering alone would leave. Fit: share of the measured force that is explained."
+    "RMSE: root mean square of measured minus predicted force. Noise floor: the error that sensor "
+    "noise, quantisation and filtering alone would leave. Fit: share of the measured force that is "
+    "explained."
 )
 
 
@@ -56,15 +56,17 @@ def _done(results: Results) -> str:
     if identified is not None:
         names = len(identified.parameters)
         effects = results.effects(results.model)
-        added = f", with {join_names(f'`{name}`' for name in effects)}" if effects else ""
+        added = f", with {join_names(f'`{name}`' for name in effects)}," if effects else ""
         parts.append(
             f"{wording.count(names, 'parameter')} of model `{results.model}`{added} were identified"
             f" by {METHODS_IN_WORDS[identified.method]}."
         )
-    if results.read(ValidateResult) is not None:
+    validated = results.read(ValidateResult)
+    if validated is not None:
+        where = "held-out" if any(t.held_out for t in validated.trials.values()) else "the same"
         parts.append(
-            "The force that the model predicts was compared with the measured one on trials not "
-            "used for identification."
+            f"The force that the model predicts was compared with the measured one on {where} "
+            "trials."
         )
     return " ".join(parts)
 
@@ -156,7 +158,7 @@ def _numbers(results: Results) -> Table | None:
             for part in (
                 _near_zero(results, identified),
                 _others(results, identified),
-                _TERMS if validate else "",
+                f"Held-out: {verdicts.held_out_in_words(validate)}. {_TERMS}" if validate else "",
             )
             if part
         ),

@@ -11,13 +11,15 @@ from bampipe.report import verdicts, wording
 from bampipe.report.document import Block, Paragraph, Section, Table
 from bampipe.report.results import Results
 from bampipe.results.filter import FilterResult
-from bampipe.results.ingest import IngestResult
+
+_SAME_RATE = 0.02
+"""Of the rate of the grid: a mean that differs by less is said to be the same."""
 
 
 def section(results: Results) -> Section:
     """Return the section."""
     session = results.session
-    blocks: list[Block] = [Paragraph(_sampling(session))]
+    blocks: list[Block] = [Paragraph(_sampling(results))]
     if session.notes:
         blocks.append(Paragraph(f"Notes: {session.notes.rstrip('.')}."))
     blocks.append(_trials(results))
@@ -34,8 +36,9 @@ def section(results: Results) -> Section:
     return Section("Data", tuple(blocks))
 
 
-def _sampling(session: IngestResult) -> str:
-    text = f"Sampled at {wording.plain(session.sample_rate_hz, 0)} Hz."
+def _sampling(results: Results) -> str:
+    session = results.session
+    text = f"{_rates(results)}."
     if session.force.noise_sd:
         each = join_names(
             f"{name} {wording.significant(sd, 2)}" for name, sd in session.force.noise_sd.items()
@@ -43,6 +46,19 @@ def _sampling(session: IngestResult) -> str:
         text += f" Noise of a sample: {each} {wording.unit(session.force.unit)}."
     remarks = (*session.sensor_warnings, *(hum.sentence for hum in session.mains_hum))
     return " ".join([text, *(f"{line[:1].upper()}{line[1:]}." for line in remarks)])
+
+
+def _rates(results: Results) -> str:
+    """Return how fast was sampled on average, and the grid where that is another."""
+    grid = results.session.sample_rate_hz
+    read = results.trials[results.trials["n_samples"] > 1]
+    rate = float(((read["n_samples"] - 1) / read["duration_s"]).median())
+    if not math.isfinite(rate) or abs(rate - grid) <= _SAME_RATE * grid:
+        return f"Sampled at {wording.plain(grid, 0)} Hz"
+    return (
+        f"Sampled at {wording.significant(rate)} Hz on average, put on a grid of "
+        f"{wording.plain(grid, 0)} Hz when filtered"
+    )
 
 
 def _trials(results: Results) -> Table:

@@ -32,7 +32,7 @@ def section(results: Results) -> Section:
     if validated.forces:
         blocks.append(Paragraph(_at_the_handle(validated, results.pusher)))
     if validated.free_run is not None and validated.free_run.drift:
-        blocks += _drift(results, validated.free_run.drift)
+        blocks += _drift(results, validated, validated.free_run.drift)
     if validated.notes:
         blocks.append(Bullets(validated.notes))
     residuals = _shown_trial(results)
@@ -80,8 +80,8 @@ def _by_axis(results: Results, validated: ValidateResult) -> Table:
         tuple(rows),
         "lrrrrrl",
         (0.0, 1.0, 1.0, 1.0, 1.2, 0.6, 0.0),
-        "Held out: each trial predicted with parameters that never saw it. Noise floor: what "
-        "sensor noise, quantisation and filtering alone would leave. Fit: share of the measured "
+        f"Held out: {verdicts.held_out_in_words(validated)}. Noise floor: what sensor noise, "
+        "quantisation and filtering alone would leave. Fit: share of the measured "
         "force that is explained, as 100 (1 − held-out RMSE / standard deviation)."
         f" Measured and predicted force are low-passed {each}.",
     )
@@ -117,7 +117,9 @@ def _at_the_handle(validated: ValidateResult, pusher: str) -> str:
     return f"Error of the predicted force{place} (RMSE): {join_names(shown)}."
 
 
-def _drift(results: Results, drift: Mapping[str, AxisDrift]) -> list[Block]:
+def _drift(
+    results: Results, validated: ValidateResult, drift: Mapping[str, AxisDrift]
+) -> list[Block]:
     """Return how far the model drifts in short free runs, and where it is not said why."""
     axes = verdicts.ordered(results, drift)
     horizons = sorted({h.horizon_s for axis in axes for h in drift[axis].horizons})
@@ -150,14 +152,23 @@ def _drift(results: Results, drift: Mapping[str, AxisDrift]) -> list[Block]:
                 tuple(rows),
                 "l" + "rrr" * len(horizons) + "l",
                 (),
-                "From many moments of each trial the model runs freely under the recorded inputs, "
-                "with parameters that never saw the trial: distance from the measured position, "
-                "median and 90 % quantile, beside how far the axis itself has moved by then.",
+                f"From many moments of {_where_it_ran(validated)} the model runs freely under the "
+                "recorded inputs: distance from the measured position, median and 90 % quantile, "
+                "beside how far the axis itself has moved by then.",
             )
         )
     if reasons:
         blocks.append(Bullets(reasons))
     return blocks
+
+
+def _where_it_ran(validated: ValidateResult) -> str:
+    """Return the trials of the free runs, and with what parameters."""
+    held_out = sum(trial.held_out for trial in validated.trials.values())
+    if not held_out or len(validated.trials) == 1:
+        return "each trial"
+    which = "each trial," if held_out == len(validated.trials) else "each held-out trial,"
+    return f"{which} with parameters that never saw it,"
 
 
 def _shown_trial(results: Results) -> pd.DataFrame | None:
