@@ -109,7 +109,7 @@ def table(found: Lab) -> None:
             one.recorded[:16].replace("T", " "),
             one.model,
             f"{one.worst[0]:.3g} {one.worst[1]}" if one.worst else None,
-            one.verdict,
+            found.content.verdict_in_words(one),
             one.sentence,
         ]
         for one in (sessions if len(sessions) <= MOST_SESSIONS else odd)

@@ -66,7 +66,9 @@ def _summary(trends: TrendsResult, pages: Mapping[str, str]) -> Section:
     odd = [one for one in sessions if one.verdict != "in control"]
     blocks: list[Block] = []
     if not odd:
-        blocks.append(Callout("good", "No session stands out", _limits_in_words(trends)))
+        judged = all(trends.verdict_in_words(one) == "in control" for one in sessions)
+        title = "No session stands out" if judged else "Too few sessions for control limits"
+        blocks.append(Callout("good" if judged else "note", title, _limits_in_words(trends)))
     for one in odd[:6]:
         remedy = f" To go on: `{one.remedy}`." if one.remedy else ""
         title = f"{one.session}: {one.verdict}"
@@ -84,7 +86,7 @@ def _summary(trends: TrendsResult, pages: Mapping[str, str]) -> Section:
             f"`{one.model}`",
             f"{wording.significant(one.worst[0])} ({one.worst[1]})" if one.worst else "–",
             ", ".join(moved.parameter for moved in one.moved) or "–",
-            one.verdict,
+            trends.verdict_in_words(one),
         )
         for one in sessions
     ]
@@ -245,7 +247,10 @@ def _chart_table(charts: list[ControlChart]) -> Table:
         rows.append(
             (
                 wording.parameter(chart.name),
-                wording.with_sd(centre, chart.between_sd or within),
+                # Without control limits nothing is known of the scatter that the centre has.
+                wording.with_sd(centre, chart.between_sd or within)
+                if chart.has_limits
+                else wording.significant(centre),
                 wording.unit(chart.unit),
                 wording.significant(chart.between_sd, 2),
                 wording.significant(within, 2),

@@ -97,3 +97,8 @@ class TrendsResult(Result):
     fewest_sessions: int = Field(ge=1, description="Fewer have no limits")
     series: tuple[ControlChart, ...]
     sessions: tuple[SessionVerdict, ...]
+
+    def verdict_in_words(self, session: SessionVerdict) -> str:
+        """Its verdict; where its device has no control limits yet, nothing is in control either."""
+        limited = any(c.has_limits for c in self.series if c.device == session.device)
+        return session.verdict if limited or session.verdict != "in control" else "no limits yet"

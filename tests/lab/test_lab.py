@@ -233,6 +233,14 @@ def test_a_result_that_was_edited_leaves_its_run_out(tmp_path: Path) -> None:
         accept(runs / "s01", "base", tmp_path / "accepted")
 
 
+@pytest.mark.parametrize(("sessions", "said"), [(3, "no limits yet"), (9, "in control")])
+def test_nothing_is_in_control_before_there_are_limits(
+    tmp_path: Path, sessions: int, said: str
+) -> None:
+    found = collect(make_lab(tmp_path, sessions=sessions), tmp_path / "lab", report=False).content
+    assert {found.verdict_in_words(one) for one in found.sessions} == {said}
+
+
 def test_nothing_to_collect_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no run in"):
         collect(tmp_path, tmp_path / "lab")
