@@ -11,6 +11,7 @@ from scipy.stats import gamma
 
 from bampipe.discover.settings import Settings
 from bampipe.discover.shape import BINS, Map, Variable, residual_map, variables
+from bampipe.results.rounding import significant
 from bampipe.trials.residuals import Evidence
 
 Array = NDArray[np.float64]
@@ -36,8 +37,8 @@ def describe(evidence: Evidence, axis: int, s: Settings) -> str:
         vibration = _vibration(evidence, axis, s.significance)
         if vibration is not None and vibration.share > max(most.share, s.variable_share):
             return (
-                f"a vibration of {vibration.amplitude:.2g} {unit} at {vibration.frequency:.3g} Hz "
-                "in time, whatever the machine does; it carries "
+                f"a vibration of {significant(vibration.amplitude, 2)} {unit} at "
+                f"{vibration.frequency:.3g} Hz in time, whatever the machine does; it carries "
                 f"{100 * vibration.share:.0f} % of the residual's variance"
             )
     if most.share < s.variable_share:
@@ -53,8 +54,8 @@ def describe(evidence: Evidence, axis: int, s: Settings) -> str:
     if ripple is not None and ripple.share > s.ripple_share * most.share:
         period = 1.0 / ripple.frequency
         return (
-            f"a ripple of {ripple.amplitude:.2g} {unit} along {most.variable} that repeats every "
-            f"{period:.3g} {most.unit}, {turning}; {carries}"
+            f"a ripple of {significant(ripple.amplitude, 2)} {unit} along {most.variable} that "
+            f"repeats every {period:.3g} {most.unit}, {turning}; {carries}"
         )
     return f"{_bumps(most, unit, s)}, {turning}; {carries}"
 

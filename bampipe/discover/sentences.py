@@ -9,6 +9,7 @@ from bampipe.discover.findings import Diagnosis
 from bampipe.discover.settings import Settings
 from bampipe.lists import join_names
 from bampipe.results.diagnose import AxisVerdict, Contender, Stretch
+from bampipe.results.rounding import significant as three
 from bampipe.results.standing import FLOOR_WRONG, STANDINGS_IN_WORDS, standing
 
 
@@ -26,8 +27,8 @@ def _parts(axis: str, i: int, found: Diagnosis, unit: str, s: Settings) -> list[
     name = axis.capitalize() if axis.isalpha() else axis  # joint_1 is a name, not a word
     if a.standing in FLOOR_WRONG:
         parts = [
-            f"{name}: no verdict can be trusted, for its held-out error of {a.rmse_after:.3g} "
-            f"{unit} is {STANDINGS_IN_WORDS[a.standing]} ({a.noise_floor:.3g} {unit})."
+            f"{name}: no verdict can be trusted, for its held-out error of {three(a.rmse_after)} "
+            f"{unit} is {STANDINGS_IN_WORDS[a.standing]} ({three(a.noise_floor)} {unit})."
         ]
         return parts + ([f"Weighed: {join_names(a.effects)}."] if a.effects else [])
     parts = [f"{name}: {_verdict(a, found, unit)}."]
@@ -58,12 +59,12 @@ def _other_band(a: AxisVerdict) -> list[str]:
 def _verdict(a: AxisVerdict, found: Diagnosis, unit: str) -> str:
     ratio = a.rmse_after / max(a.noise_floor, 1e-30)
     falls = (
-        f"takes the held-out error from {a.rmse_before:.3g} to {a.rmse_after:.3g} {unit}, "
+        f"takes the held-out error from {three(a.rmse_before)} to {three(a.rmse_after)} {unit}, "
         f"{ratio:.2f} times the noise floor"
     )
     share = f"{100 * a.explained_by_effects:.0f} %"
     explained = f"{share} of what exceeds the noise floor in the mean square"
-    stands = f"held-out error {a.rmse_after:.3g} {unit}, {ratio:.1f} times the noise floor"
+    stands = f"held-out error {three(a.rmse_after)} {unit}, {ratio:.1f} times the noise floor"
     if a.verdict == "missing":
         it = "it" if len(a.effects) == 1 else "them"
         return f"{_missing(a.effects)}; adding {it} {falls}"
@@ -74,8 +75,8 @@ def _verdict(a: AxisVerdict, found: Diagnosis, unit: str) -> str:
         return f"{also}these trials cannot tell {_odds(a, ' from ')}; {adding}"
     if a.verdict == "undecided" and a.explained_by_effects > 0.0:
         return (
-            f"{join_names(a.likely)} would take the held-out error from {a.rmse_before:.3g} to "
-            f"{a.rmse_after:.3g} {unit} only, {explained}: likely, but not the effect that is "
+            f"{join_names(a.likely)} would take the held-out error from {three(a.rmse_before)} to "
+            f"{three(a.rmse_after)} {unit} only, {explained}: likely, but not the effect that is "
             "missing"
         )
     if a.verdict == "undecided":
@@ -83,20 +84,21 @@ def _verdict(a: AxisVerdict, found: Diagnosis, unit: str) -> str:
     if a.verdict == "unknown_effect":
         error = a.rmse_before
         near = (
-            f"; {join_names(a.likely)} would take {explained}, and leave {a.rmse_after:.3g} {unit}"
+            f"; {join_names(a.likely)} would take {explained}, and leave "
+            f"{three(a.rmse_after)} {unit}"
             if a.likely
             else ""
         )
         return (
             f"something is missing that {_no_effect(found).lower()} explains (held-out error "
-            f"{error:.3g} {unit}, {error / max(a.noise_floor, 1e-30):.1f} times the noise floor)"
+            f"{three(error)} {unit}, {error / max(a.noise_floor, 1e-30):.1f} times the noise floor)"
             + near
         )
     if a.standing == "above_floor":
         return f"nothing is missing that these trials could show, at a {stands}"
     return (
-        f"nothing is missing that these trials could show (held-out error {a.rmse_after:.3g} "
-        f"{unit}, noise floor {a.noise_floor:.3g} {unit})"
+        f"nothing is missing that these trials could show (held-out error {three(a.rmse_after)} "
+        f"{unit}, noise floor {three(a.noise_floor)} {unit})"
     )
 
 
@@ -144,7 +146,7 @@ def _rivals(axis: str, a: AxisVerdict, found: Diagnosis, unit: str, s: Settings)
 
 
 def _left(c: Contender, unit: str) -> str:
-    return f"leaves {c.held_out_rmse:.3g} {unit}"
+    return f"leaves {three(c.held_out_rmse)} {unit}"
 
 
 def _transients(axis: str, found: Diagnosis) -> list[str]:
@@ -165,7 +167,7 @@ def _excused(a: AxisVerdict, unit: str) -> str:
     if rest == "at_floor":
         return (
             f"It is at the floor without {_when(a.worst_second)}, the worst second: "
-            f"{a.rmse_without_worst_second:.3g} {unit}."
+            f"{three(a.rmse_without_worst_second)} {unit}."
         )
     return "What exceeds the noise floor follows nothing that the arm does."
 

@@ -20,7 +20,7 @@ from bampipe.errors import InputError
 from bampipe.identification.estimates import Estimate
 from bampipe.physics import System
 from bampipe.results.identify import METHODS_IN_WORDS, Method, MethodTried, MethodValue
-from bampipe.results.rounding import round_with_sd
+from bampipe.results.rounding import round_with_sd, significant
 from bampipe.trials.bias import UnbiasedFit
 from bampipe.trials.folds import Folds
 
@@ -237,6 +237,6 @@ def _worse(system: System, published: MethodTried, tried: MethodTried) -> list[s
         return []
     axis = max(units, key=lambda a: tried.held_out_rmse[a] - published.held_out_rmse[a])
     return [
-        f"on trials left out it errs by {tried.held_out_rmse[axis]:.3g} {units[axis]} on {axis}"
-        f" instead of {published.held_out_rmse[axis]:.3g}"
+        f"on trials left out it errs by {significant(tried.held_out_rmse[axis])} {units[axis]} on"
+        f" {axis} instead of {significant(published.held_out_rmse[axis])}"
     ]

@@ -6,7 +6,8 @@ import math
 import re
 from collections.abc import Iterable
 
-from bampipe.results.rounding import SMALLEST_PLAIN, decimals_for, power_for
+from bampipe.results import rounding
+from bampipe.results.rounding import decimals_for, power_for
 
 _POWERS = {"2": "²", "3": "³"}
 _PREFIXES = ((1e-6, "µ"), (1e-3, "m"), (1.0, ""), (1e3, "k"), (1e6, "M"))
@@ -72,13 +73,7 @@ def significant(value: float | None, digits: int = 3) -> str:
     """Return ``value`` with so many significant digits; a dash for none."""
     if value is None or not math.isfinite(value):
         return "–"
-    if value == 0.0:
-        return "0"
-    rounded = float(f"{value:.{digits - 1}e}")
-    exponent = math.floor(math.log10(abs(rounded)))
-    if abs(rounded) < SMALLEST_PLAIN or exponent > 6:
-        return plain(value, digits - 1, exponent)
-    return plain(value, max(0, digits - 1 - exponent))
+    return prose(rounding.significant(value, digits))
 
 
 def as_written(value: float) -> str:

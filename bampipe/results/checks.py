@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from bampipe.results.identify import LACKS_TIMING, METHODS_IN_WORDS, IdentifyResult
 from bampipe.results.ingest import IngestResult
 from bampipe.results.intervals import NORMAL_95
-from bampipe.results.rounding import round_with_sd
+from bampipe.results.rounding import round_with_sd, significant
 from bampipe.results.standing import FLOOR_WRONG, STANDINGS_IN_WORDS
 from bampipe.results.validate import JudgedError
 
@@ -55,8 +55,8 @@ def find_failed_checks(
         if error.estimate == "refused":
             yield (
                 f"{axis}: the published parameters are refused, they err by"
-                f" {error.published_rmse:.3g} {error.unit} where parameters refitted without each"
-                f" trial err by {error.held_out_rmse:.3g}"
+                f" {significant(error.published_rmse)} {error.unit} where parameters refitted"
+                f" without each trial err by {significant(error.held_out_rmse)}"
             )
         if error.standing in FLOOR_WRONG:
             yield f"{axis}: the error is {STANDINGS_IN_WORDS[error.standing]}"

@@ -19,6 +19,16 @@ def decimals_for(sd: float | None, value: float) -> int:
     return min(_MOST_DECIMALS, max(0, 1 - math.floor(math.log10(float(f"{size:.1e}")))))
 
 
+def significant(value: float, digits: int = 3) -> str:
+    """Return ``value`` with so many significant digits, as tables have it: zeros at its end too."""
+    if value == 0.0 or not math.isfinite(value):
+        return f"{value:g}"
+    size = math.floor(math.log10(abs(float(f"{value:.{digits - 1}e}"))))
+    if not SMALLEST_PLAIN <= 10.0**size < _LARGEST_PLAIN:
+        return f"{value:.{digits - 1}e}"
+    return f"{value:.{max(0, digits - 1 - size)}f}"
+
+
 def power_for(value: float, sd: float | None) -> int:
     """Return the power of ten to take out of ``value`` and ``sd``; 0 where both read well as is."""
     largest = max((abs(x) for x in (value, sd or 0.0) if math.isfinite(x)), default=0.0)

@@ -36,7 +36,7 @@ from bampipe.results.draft import (
 )
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.ingest import IngestResult
-from bampipe.results.rounding import round_with_sd
+from bampipe.results.rounding import round_with_sd, significant
 from bampipe.schema import STRICT, Count
 from bampipe.trials.measured import read_measured_trials
 
@@ -271,7 +271,7 @@ def _nearest(
             effect=row.effect,
             held_out_rmse=row.held_out_rmse_after,
             sentence=(
-                f"{row.effect} leaves {row.held_out_rmse_after:.3g} {unit}, "
+                f"{row.effect} leaves {significant(row.held_out_rmse_after)} {unit}, "
                 f"{row.held_out_rmse_after / max(found.after, 1e-30):.2g} times what the draft "
                 "leaves"
             ),
@@ -292,7 +292,8 @@ def _sentence(
     if not effects and found.terms:
         return (
             f"{name}: no draft, for {', '.join(diagnosed.effects)} leaves no more "
-            f"({diagnosed.rmse_after:.3g} {unit}) than the best formula ({found.after:.3g} {unit})."
+            f"({significant(diagnosed.rmse_after)} {unit}) than the best formula "
+            f"({significant(found.after)} {unit})."
         )
     if not effects and len(found.options) > 1:
         return f"{name}: no draft, for no formula lowers the held-out error enough; {by_chance}."
@@ -301,7 +302,7 @@ def _sentence(
     ratio = found.after / max(found.noise_floor, 1e-30)
     return (
         f"{name}: {' '.join(effect.sentence for effect in effects)} The held-out error falls from "
-        f"{found.before:.3g} to {found.after:.3g} {unit}, {ratio:.2f} "
+        f"{significant(found.before)} to {significant(found.after)} {unit}, {ratio:.2f} "
         f"times the noise floor{_beside_curve(found, unit)}; {by_chance}."
     )
 
@@ -312,5 +313,5 @@ def _beside_curve(found: FoundDraft, unit: str) -> str:
         return ""
     return (
         f" (a free curve along {found.bound.variable} leaves "
-        f"{found.bound.held_out_rmse:.3g} {unit})"
+        f"{significant(found.bound.held_out_rmse)} {unit})"
     )

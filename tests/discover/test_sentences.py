@@ -59,7 +59,7 @@ def test_a_rival_that_leaves_less_on_this_axis_says_why_it_is_none(monkeypatch):
         sentence = say(monkeypatch, axis, {"a:joint": (*contest, rival)})
         assert said in sentence
         assert ("over all axes" in sentence) is (score < 90.0)
-        assert "comes b:joint (leaves 0.73 N.m)" in sentence
+        assert "comes b:joint (leaves 0.730 N.m)" in sentence
 
 
 def numbers(sentence):
@@ -136,7 +136,7 @@ def test_rivals_are_listed_with_what_they_would_leave(monkeypatch):
         contender("b:joint", 0.12, 454.3, 440.0, 431.0, 0.0),
     )
     said = say(monkeypatch, axis, contests={"a:joint": contest})
-    assert "b:joint (leaves 0.12 N.m)" in said
+    assert "b:joint (leaves 0.120 N.m)" in said
 
 
 def test_odds_are_given_where_no_replay_looks_like_the_measurement(monkeypatch):
@@ -146,7 +146,7 @@ def test_odds_are_given_where_no_replay_looks_like_the_measurement(monkeypatch):
         contender("b:joint", 0.13, 37.0, None, 35.0, 0.16),
     )
     said = say(monkeypatch, axis, contests={"a:joint": contest})
-    assert "84 % for a:joint (leaves 0.1 N.m) and 16 % for b:joint (leaves 0.13 N.m)" in said
+    assert "84 % for a:joint (leaves 0.100 N.m) and 16 % for b:joint (leaves 0.130 N.m)" in said
     sure = (contest[0].model_copy(update={"odds": 0.97}), contest[1])
     assert "%" not in say(monkeypatch, axis, contests={"a:joint": sure})
 
@@ -154,7 +154,7 @@ def test_odds_are_given_where_no_replay_looks_like_the_measurement(monkeypatch):
 def test_an_error_above_its_floor_for_one_second_says_which(monkeypatch):
     axis = finding("nothing_missing", 1.0, 1.0, 0.5, rmse_without_worst_second=0.55)
     said = say(monkeypatch, axis)
-    assert "4.0 to 5.0 s of trial t3" in said and "0.55 N.m" in said
+    assert "4.0 to 5.0 s of trial t3" in said and "0.550 N.m" in said
 
 
 def test_a_candidate_that_one_second_speaks_for_is_not_called_missing(monkeypatch):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from bampipe.results.rounding import round_with_sd
+from bampipe.results.rounding import round_with_sd, significant
 
 
 @pytest.mark.parametrize(
@@ -24,3 +24,14 @@ def test_both_end_at_the_second_digit_of_the_uncertainty(
     value: float, sd: float, words: str
 ) -> None:
     assert round_with_sd(value, sd) == words
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [
+        (0.073, "0.0730"), (2.4, "2.40"), (0.03196, "0.0320"), (9.996, "10.0"), (1234.5, "1234"),
+        (0.0, "0"), (3.4e-5, "3.40e-05"), (-0.5, "-0.500"), (9.9996e-5, "0.000100"),
+    ],
+)  # fmt: skip
+def test_sentences_round_as_tables_do(value: float, words: str) -> None:
+    assert significant(value) == words
