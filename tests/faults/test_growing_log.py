@@ -22,6 +22,17 @@ ROWS = 300
 TABLE = {"t": np.arange(ROWS) / 64.0, "x": np.arange(ROWS) * 0.25 + 1000.125}
 
 
+class Growing(io.FileIO):
+    """A file to which a row is added whenever its size is asked for."""
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        place = super().seek(offset, whence)
+        if whence == io.SEEK_END:
+            with open(self.name, "ab") as stream:
+                stream.write(b"9.000000,9.000000\n")
+        return place
+
+
 def as_lines() -> bytes:
     rows = (json.dumps({name: float(TABLE[name][n]) for name in TABLE}) for n in range(ROWS))
     return "\n".join(rows).encode()
@@ -120,3 +131,14 @@ def test_a_log_read_while_it_grows(
     assert ending not in (".csv", ".jsonl") or len(lengths) > 20  # what is there is read
     assert all("\n" not in line and line.startswith("log") for line in refused), refused
     assert capfd.readouterr() == ("", "")
+
+
+def test_what_is_written_while_the_end_is_looked_for_is_not_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "a.csv"
+    path.write_bytes(b"t,x\n1.000000,1.000000\n2.000000,2.00")
+    monkeypatch.setattr(Path, "open", lambda self, mode: Growing(self, "rb"))
+    trial = read_trial(path, ("t", "x"), name="log")
+    assert trial.columns["x"].tolist() == [1.0]
+    assert trial.notes == ("last line is cut off: 1 row dropped",)

@@ -238,7 +238,7 @@ def _sound_end(stream: BinaryIO, layout: TableLayout) -> tuple[int, tuple[str, .
     size = stream.seek(0, 2)
     start = max(layout.start, size - HEAD)
     stream.seek(start)
-    tail = stream.read()
+    tail = stream.read(size - start)  # no further: the file may have grown since its size was taken
     content = tail.rstrip(b"\r\n")
     ended = len(content) < len(tail)
     cut = max(content.rfind(b"\n"), content.rfind(b"\r"))
