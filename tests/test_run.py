@@ -244,16 +244,18 @@ def test_bad_input_leaves_no_run_folder(toy: Toy) -> None:
     assert not toy.root.exists()
 
 
-def test_failure_keeps_the_last_good_result(toy: Toy) -> None:
+def test_a_session_that_is_refused_changes_nothing(toy: Toy) -> None:
     toy.run()
-    good = toy.files()
+    good, written = toy.files(), (toy.root / record.FILE).read_bytes()
     toy.ran()
     (toy.session / "numbers.txt").write_text("1 two")
-    with pytest.raises(InputError):
+    with pytest.raises(InputError, match="write whole numbers"):
         toy.run()
     assert toy.files() == good
+    assert (toy.root / record.FILE).read_bytes() == written
     pipeline = toy.request().pipeline
-    assert status(toy.root, pipeline)[0].state == "failed"
+    first = status(toy.root, pipeline)[0]
+    assert (first.state, first.reason) == ("stale", "numbers.txt changed")
     (toy.session / "numbers.txt").write_text("1 2 3")
     toy.ran()
     assert states(toy.run()) == ["unchanged"] * 4

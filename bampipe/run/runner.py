@@ -91,9 +91,9 @@ class _Runner:
             self.failed(step, str(error), noted=False)
             raise
         except InputError as error:
-            # A setting of this request that is refused is no failure of results made without it.
-            refused = self.request.settings.get(step.stage) and step.name in self.state.records
-            self.failed(step, str(error), noted=not refused)
+            # A setting or a session that is refused is no failure of results made without it.
+            given = step.stage in base.READS_SESSION or self.request.settings.get(step.stage)
+            self.failed(step, str(error), noted=not (given and step.name in self.state.records))
             raise
         except Exception as error:
             self.failed(step, f"{type(error).__name__}: {error}")

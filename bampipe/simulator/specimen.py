@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bampipe.errors import InputError
+from bampipe.errors import InputError, did_you_mean
 from bampipe.files import read_toml
+from bampipe.lists import join_names
 from bampipe.physics import Model, registry
 from bampipe.physics.device import Device
 from bampipe.physics.effect import BoundEffect, Effect
@@ -91,6 +92,29 @@ class Specimen:
         return np.array([self.values[p.name] for p in system.parameters])
 
 
+def _device(name: str) -> Device:
+    """The built-in device of that name.
+
+    Raises:
+        InputError: there is none, or it takes more than forces.
+    """
+    known = registry.device_names()
+    if name not in known:
+        raise InputError(
+            f"no built-in device {name!r}{did_you_mean(name, known)}",
+            remedy=f"these are built in: {', '.join(known)}",
+        )
+    device = registry.device(name)
+    no_forces = () if device.force_unit in ("N", "N.m") else device.forces
+    others = (*no_forces, *device.channels)
+    if others:
+        raise InputError(
+            f"device {name!r} cannot be simulated: it takes {join_names(others)}, and nothing but"
+            " forces is simulated"
+        )
+    return device
+
+
 def input_column(system: System, name: str) -> int:
     """Column of an input in u, -1 where the model has no use for it."""
     return system.inputs.index(name) if name in system.inputs else -1
@@ -98,7 +122,7 @@ def input_column(system: System, name: str) -> int:
 
 def draw_specimen(config: Config) -> tuple[Specimen, dict[str, float]]:
     """Draw the specimen; also the strength of each effect by canonical name."""
-    device = registry.device(config.device)
+    device = _device(config.device)
     extra = [_read_effect(Path(path)) for path in config.effect_files]
     strengths = dict(_strength(text, config.strength) for text in config.effects)
     if len(strengths) < len(config.effects):

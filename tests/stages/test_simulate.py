@@ -14,6 +14,7 @@ from conftest import misfits
 from scipy.optimize import least_squares
 from scipy.signal import butter, sosfiltfilt
 
+import bampipe
 from bampipe.data.session import read_session
 from bampipe.errors import InputError
 from bampipe.physics import Model, compile_model, registry
@@ -64,6 +65,17 @@ def test_a_session_that_ingest_accepts(tmp_path):
     assert [t.locked_axis for t in session.trials[3:]] == list(AXES)
     assert all((out / name).is_file() for name in summary["trials"])
     assert session.force.noise_sd == 0.05
+
+
+@pytest.mark.parametrize("device", registry.device_names())
+def test_every_built_in_device_is_ingested_or_refused(tmp_path, device):
+    try:
+        out, *_ = make(tmp_path, device=device, duration=1.0, trials=1)
+    except InputError as refusal:
+        assert device in refusal.what
+        return
+    bampipe.run_session(out, runs=tmp_path / "runs", last="ingest")
+    assert (tmp_path / "runs/made/ingest/samples.parquet").exists()
 
 
 def test_same_seed_same_bytes_other_seed_other_motion(tmp_path):
@@ -235,7 +247,9 @@ def test_parquet_holds_the_same(tmp_path):
         ({"effects": ("stribeck:yaw", "stribeck:yaw=2")}, "named twice"),
         ({"effects": ("stribeck:yaw=much",)}, "not a number"),
         ({"effects": ("stribeck:yaw=-1",)}, "must not be negative"),
-        ({"device": "bamm"}, "unknown device"),
+        ({"device": "bamm"}, "no built-in device 'bamm', did you mean 'bam'"),
+        ({"device": "magnetic_damper"}, "it takes current, and nothing but forces is simulated"),
+        ({"device": "servo_pendulum"}, "it takes duty and supply, and nothing but forces"),
         ({"trials": 0}, "nothing to simulate"),
         ({"duration": 0.0}, "duration must be positive"),
         ({"duration": 0.001}, "fewer than 10 samples"),
