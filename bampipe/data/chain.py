@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from bampipe.data.robot_xml import DEEPEST
 from bampipe.errors import InputError, did_you_mean
 from bampipe.lists import join_names
 
@@ -188,6 +189,7 @@ def select_chain(
             f"link {twice.child!r} has two joints above it: a closed loop", where=where,
             remedy="cut the loop: leave one of the joints out",
         )  # fmt: skip
+    _refuse_loops(above, where)
     base = _link(base, bodies, where) if base else _only_root(bodies, above, where)
     tip = _link(tip, bodies, where) if tip else _only_end(base, joints, above, where)
     path_up = _path(base, tip, above, where)
@@ -286,8 +288,30 @@ def _link(name: str, bodies: Mapping[str, Body], where: str) -> str:
     return name
 
 
+def _refuse_loops(above: Mapping[str, TreeJoint], where: str) -> None:
+    """Refuse links that hang on themselves, or too many one behind another."""
+    depth: dict[str, int] = {}
+    for first in above:
+        path = [first]
+        while path[-1] in above and path[-1] not in depth:
+            parent = above[path[-1]].parent
+            if parent in path:
+                raise InputError(f"the joints above {parent!r} form a loop", where=where)
+            if len(path) > DEEPEST:
+                raise InputError(f"more than {DEEPEST} links one behind another", where=where)
+            path.append(parent)
+        reached = depth.get(path.pop(), 0)
+        for link in reversed(path):
+            reached += 1
+            depth[link] = reached
+        if reached > DEEPEST:
+            raise InputError(f"more than {DEEPEST} links one behind another", where=where)
+
+
 def _only_root(bodies: Mapping[str, Body], above: Mapping[str, TreeJoint], where: str) -> str:
     roots = [name for name in bodies if name not in above]
+    if not roots:
+        raise InputError("no links", where=where)
     if len(roots) != 1:
         raise InputError(
             f"{len(roots)} links have nothing above them: {join_names(roots, _MANY)}",
@@ -348,6 +372,4 @@ def _path(base: str, tip: str, above: Mapping[str, TreeJoint], where: str) -> li
             )
         found.append(joint)
         link = joint.parent
-        if len(found) > len(above):
-            raise InputError(f"the joints above {tip!r} form a loop", where=where)
     return found[::-1]

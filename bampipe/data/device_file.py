@@ -30,6 +30,10 @@ _ACCELERATING_S = 0.02
 A joint whose drawn body has no inertia, as of many last links, moves by that of its drive."""
 
 
+_MOST_JOINTS = 32
+"""Of a chain: its equations grow with their square, and no drive of more is logged as one."""
+
+
 def read_device_file(path: Path) -> dict[str, Any]:
     """The table of a device file, a robot's joints, inputs and friction in it.
 
@@ -77,6 +81,12 @@ def complete_device(table: dict[str, Any], folder: Path, where: str) -> dict[str
     joints = robot.get("joints")
     if not isinstance(joints, Mapping) or not all(isinstance(j, Mapping) for j in joints.values()):
         return table
+    if len(joints) > _MOST_JOINTS:
+        raise InputError(
+            f"{len(joints)} joints; a robot has at most {_MOST_JOINTS}",
+            where=where,
+            remedy='choose a part: base = "..." and tip = "..." in [robot]',
+        )
     kinds = {joint: str(entry.get("kind")) for joint, entry in joints.items()}
     if not set(kinds.values()) <= set(_UNITS):
         return table
@@ -277,7 +287,7 @@ def _rotor(limits: DriveLimits) -> float:
 
 def _scale(limits: DriveLimits) -> tuple[float, float]:
     """Largest effort and velocity of a joint."""
-    return limits.effort or _EFFORT, limits.velocity or _VELOCITY
+    return max(limits.effort, 0.0) or _EFFORT, max(limits.velocity, 0.0) or _VELOCITY
 
 
 def _text(value: object) -> str:

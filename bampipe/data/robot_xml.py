@@ -11,25 +11,33 @@ from bampipe.errors import InputError
 from bampipe.files import read_bytes
 
 LARGEST_BYTES = 20_000_000
+DEEPEST = 200
+"""Most elements inside one another, and most links one behind another."""
 
 
 def read_xml(path: Path) -> ElementTree.Element:
     """The root of an XML file.
 
     Raises:
-        InputError: no XML, or one with a document type or entities.
+        InputError: no XML, one with a document type or entities, or too deep.
     """
     where = str(path)
     text = read_bytes(path, LARGEST_BYTES)
     if b"<!ENTITY" in text or b"<!DOCTYPE" in text:
         raise InputError("a robot's file has no document type or entities", where=where)
     try:
-        return ElementTree.fromstring(text)
+        root = ElementTree.fromstring(text)
     except ElementTree.ParseError as error:
         line = error.position[0]
         raise InputError(
             f"not XML: {str(error).partition(':')[0]}", where=f"{where}, line {line}"
         ) from error
+    level, depth = [root], 0
+    while level := [inner for element in level for inner in element]:
+        depth += 1
+        if depth > DEEPEST:
+            raise InputError(f"elements are nested more than {DEEPEST} deep", where=where)
+    return root
 
 
 def numbers(

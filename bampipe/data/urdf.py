@@ -38,7 +38,12 @@ def urdf_tree(root: ElementTree.Element, path: Path) -> Tree:
             where=where,
             remedy=f"expand it first: xacro {path.name} > {path.name.partition('.')[0]}.urdf",
         )
-    bodies = {_name(link, where): _body(link, where) for link in root.iterfind("link")}
+    bodies: dict[str, Body] = {}
+    for link in root.iterfind("link"):
+        name = _name(link, where)
+        if name in bodies:
+            raise InputError(f"two links are called {name!r}", where=where)
+        bodies[name] = _body(link, where)
     return Tree(bodies, [_joint(entry, where) for entry in root.iterfind("joint")])
 
 

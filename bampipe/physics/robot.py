@@ -28,6 +28,8 @@ from bampipe.schema import (
 
 Array = NDArray[np.float64]
 
+_LARGEST = 1e9
+"""Of a drawn body, kg, m or kg.m2: sums over the bodies stay below what a parameter can be."""
 Triple = Annotated[Several[Number], Field(min_length=3, max_length=3)]
 INERTIAL_NAMES = (
     "mass",
@@ -70,8 +72,18 @@ class Joint(NamedDeclaration):
     velocity: NotNegative = Field(default=0.0, description="Largest, rad/s or m/s; 0: not known")
 
     def cross_faults(self) -> Iterator[InputError]:
-        if not math.hypot(*self.axis) > 0.0:
-            yield InputError("found a vector of length zero, expected a direction", where="axis")
+        length = math.hypot(*self.axis)
+        if not 0.0 < length < math.inf:
+            yield InputError(
+                f"found a vector of length {length:g}, expected a direction", where="axis"
+            )
+        with np.errstate(over="ignore", invalid="ignore"):
+            largest = float(np.abs([*self.inertial, *self.position]).max())
+        if not largest <= _LARGEST:
+            yield InputError(
+                f"a body beyond what can be computed with, {_LARGEST:.0e} in SI units",
+                remedy="give what is physically possible",
+            )
 
     @property
     def inertial(self) -> Array:

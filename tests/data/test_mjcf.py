@@ -101,6 +101,8 @@ def test_limits_and_losses_are_heard(tmp_path: Path) -> None:
         ('eulerseq="xyz"', 'eulerseq="xyw"', "eulerseq.*three of x, y, z"),
         ('class="wrist"/>', 'class="wirst"/>', "class 'wirst', did you mean 'wrist'"),
         ('quat="0.9 0.1 0.3 -0.2"', 'quat="0 0 0 0"', "quat of length zero"),
+        ("<worldbody>", f"<default>{'<default>' * 300}{'</default>' * 300}</default><worldbody>",
+         "elements are nested more than 200 deep"),
         ("<mujoco ", "<sdf ", "not XML|expected <robot>"),
     ],
 )  # fmt: skip

@@ -33,6 +33,11 @@ def joint(name: str, parent: str, child: str, kind: str = "revolute", x: float =
     return JOINT.format(name=name, parent=parent, child=child, kind=kind, x=x)
 
 
+def chain_of(count: int, kind: str = "revolute") -> tuple[str, ...]:
+    links = (link(f"l{k}") for k in range(count + 1))
+    return (*links, *(joint(f"j{k}", f"l{k}", f"l{k + 1}", kind) for k in range(count)))
+
+
 def write(folder: Path, *parts: str) -> Path:
     path = folder / "arm.urdf"
     path.write_text(f'<?xml version="1.0"?><robot name="arm">{"".join(parts)}</robot>')
@@ -111,6 +116,15 @@ def test_joints_beside_the_chain_are_held_and_named(tmp_path: Path) -> None:
         ),
         ((*ARM, joint("loop", "base", "lower")), "two joints above it: a closed loop", "cut"),
         ((*ARM, joint("j", "lower", "nowhere")), "names link 'nowhere', which is not there", ""),
+        ((*ARM, link("upper")), "two links are called 'upper'", ""),
+        (
+            (*ARM, link("a"), link("b"), joint("x", "a", "b"), joint("y", "b", "a")),
+            "the joints above 'b' form a loop",
+            "",
+        ),
+        ((link("a"), joint("x", "a", "a")), "the joints above 'a' form a loop", ""),
+        (chain_of(250, "fixed"), "more than 200 links one behind another", ""),
+        ((), "no links", ""),
         ((link("a"), link("b")), "2 links have nothing above them", "base = ..."),
     ],
 )
@@ -140,6 +154,33 @@ def test_damaged_files_are_refused(text: str, what: str, tmp_path: Path) -> None
     path.write_text(text)
     with pytest.raises(InputError, match=what):
         read_chain(path)
+
+
+@pytest.mark.parametrize(
+    ("parts", "what"),
+    [
+        (chain_of(40), "40 joints; a robot has at most 32; choose a part"),
+        ((link("a"), link("b", mass=1e300), joint("j", "a", "b")), "joints.j: a body beyond"),
+    ],
+)
+def test_what_cannot_be_computed_is_one_line(
+    parts: tuple[str, ...], what: str, tmp_path: Path
+) -> None:
+    write(tmp_path, *parts)
+    file = tmp_path / "device.toml"
+    file.write_text('schema = "bampipe.device/1"\nname = "arm"\n[robot]\nurdf = "arm.urdf"\n')
+    with pytest.raises(InputError, match=what) as caught:
+        check_device(device_from(read_device_file(file), str(file)))
+    assert not caught.value.others and "\n" not in str(caught.value)
+
+
+def test_a_limit_below_zero_is_one_that_is_not_known(tmp_path: Path) -> None:
+    parts = (link("a"), link("b"), joint("j", "a", "b"))
+    write(tmp_path, *(part.replace('effort="40"', 'effort="-40"') for part in parts))
+    file = tmp_path / "device.toml"
+    file.write_text('schema = "bampipe.device/1"\nname = "arm"\n[robot]\nurdf = "arm.urdf"\n')
+    device = device_from(read_device_file(file), str(file))
+    assert {p.name: p.sd for p in device.parameters}["coulomb.j"] == 5.0
 
 
 def test_a_urdf_outside_the_folder_is_refused(tmp_path: Path) -> None:
