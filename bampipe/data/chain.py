@@ -54,6 +54,7 @@ class DriveLimits:
         lower, upper: range, rad or m; equal where there is none.
         effort: N.m or N; velocity: rad/s or m/s.
         damping: N.m.s/rad or N.s/m; friction: N.m or N.
+        armature: inertia of the drive at the joint, kg.m2 or kg.
     """
 
     lower: float = 0.0
@@ -62,6 +63,7 @@ class DriveLimits:
     velocity: float = 0.0
     damping: float = 0.0
     friction: float = 0.0
+    armature: float = 0.0
 
 
 @dataclass(frozen=True)

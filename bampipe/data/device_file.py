@@ -245,7 +245,7 @@ def _constant(motor: Mapping[str, Any]) -> dict[str, Any]:
 def _rotor_parameter(
     motor: Mapping[str, Any], name: str, limits: DriveLimits, turns: float, unit: str
 ) -> dict[str, Any]:
-    """Inertia of a rotor: of the data sheet where it is given, else a guess."""
+    """Inertia of a rotor: of the data sheet where it is given, else of the file, else a guess."""
     about = f"inertia of the rotor of {name}, seen from where its torque is"
     if "rotor_inertia" in motor:
         value = float(motor["rotor_inertia"])
@@ -254,8 +254,11 @@ def _rotor_parameter(
             "weighed": True, "description": about,
         }  # fmt: skip
     guess = _rotor(limits) / turns**2
+    # Many a file has an armature that only steadies its simulation: a start, not weighed as data.
+    prior = max(limits.armature, 0.0) / turns**2 or guess
     return {
-        "unit": unit, "prior": guess, "sd": 5.0 * guess, "lower": 0.0, "description": about,
+        "unit": unit, "prior": prior, "sd": 5.0 * max(prior, guess), "lower": 0.0,
+        "description": about,
     }  # fmt: skip
 
 

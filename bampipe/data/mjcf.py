@@ -34,7 +34,6 @@ def mjcf_text(
     name: str,
     joints: Mapping[str, Mapping[str, Any]],
     limits: Mapping[str, DriveLimits],
-    armature: Mapping[str, float],
     gravity: Sequence[float],
     comment: str,
 ) -> str:
@@ -43,8 +42,7 @@ def mjcf_text(
     Args:
         name: of the robot.
         joints: by name, tables as of ``[robot.joints]``, the bodies' numbers in them.
-        limits: by name: range, effort, damping and friction.
-        armature: inertia of the drives at the joints, by name, kg.m2 or kg.
+        limits: by name: range, effort, damping, friction and inertia of the drive.
         gravity: in the base's frame, m/s2.
         comment: what to say at its head.
     """
@@ -69,7 +67,7 @@ def mjcf_text(
         moves = ElementTree.SubElement(
             body, "joint", name=joint, type=_KINDS[table["kind"]],
             axis=number_list(table["axis"]), damping=number_list([own.damping]),
-            frictionloss=number_list([own.friction]), armature=number_list([armature[joint]]),
+            frictionloss=number_list([own.friction]), armature=number_list([own.armature]),
         )  # fmt: skip
         motor = ElementTree.SubElement(actuators, "motor", name=f"drive_{joint}", joint=joint)
         if own.lower < own.upper:
@@ -271,14 +269,14 @@ class _Reader:
             low, high, effort or self.efforts.get(joint, 0.0), 0.0,
             numbers(own, "damping", "0", 1, place)[0],
             numbers(own, "frictionloss", "0", 1, place)[0],
+            numbers(own, "armature", "0", 1, place)[0],
         )  # fmt: skip
 
 
 def mjcf_tree(root: ElementTree.Element, where: str) -> Tree:
     """The bodies and joints of an MJCF.
 
-    A joint beside a body's origin moves the frame of the link to the joint. Inertia of drives
-    (``armature``) is not heard: a device file has it with its motors.
+    A joint beside a body's origin moves the frame of the link to the joint.
 
     Raises:
         InputError: what only MuJoCo can expand, masses that follow from shapes, or wrong numbers.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -81,11 +82,14 @@ def _mjcf(run: RunFolder, system: System, p: Array) -> str:
     inertial = {item.name for item in robot.parameters}
     without[[item.name in inertial for item in system.parameters]] = 0.0
     (drives,) = system.mass_matrix(np.zeros((1, len(joints))), without)
-    armature = dict(zip(system.coordinates, (float(v) for v in np.diag(drives)), strict=True))
+    limits = {
+        joint: replace(limits[joint], armature=float(own))
+        for joint, own in zip(system.coordinates, np.diag(drives), strict=True)
+    }
     coupled = np.any(np.abs(drives - np.diag(np.diag(drives))) > 0.0)
     comment = _head(system, ["inertia by which drives couple joints"] if coupled else [])
     gravity = [float(v) for v in robot.gravity]
-    return mjcf_text(system.model.device.name, joints, limits, armature, gravity, comment)
+    return mjcf_text(system.model.device.name, joints, limits, gravity, comment)
 
 
 def _head(system: System, lacks: Sequence[str]) -> str:

@@ -22,7 +22,8 @@ ARM = """<mujoco model="arm">
  <body name="stand" pos="0 0.1 0.4" euler="{a} {b} 0"><geom type="box" size="1 1 1"/>
   <body name="upper" pos="0.1 0 0.2" quat="0.9 0.1 0.3 -0.2">
    <inertial pos="0.1 0.02 0" mass="3" diaginertia="0.02 0.03 0.04" euler="{b} 0 {a}"/>
-   <joint name="lift" axis="0 0 1" pos="0.05 0.02 -0.03" range="{low} {high}" frictionloss="0.3"/>
+   <joint name="lift" axis="0 0 1" pos="0.05 0.02 -0.03" range="{low} {high}" frictionloss="0.3"
+    armature="0.04"/>
    <body name="lower" pos="0.3 0 0" xyaxes="0 1 0 -1 0.2 0">
     <inertial pos="0.1 0 0.05" mass="1.5" fullinertia="0.02 0.03 0.04 0.001 0.002 -0.003"/>
     <joint name="bend" class="wrist"/>
@@ -83,9 +84,26 @@ def test_limits_and_losses_are_heard(tmp_path: Path) -> None:
     lift, bend, reach = (chain.limits[name] for name in ("lift", "bend", "reach"))
     assert (lift.lower, lift.upper) == pytest.approx((-np.pi / 2, np.pi / 3))
     assert (lift.effort, lift.damping, lift.friction) == (100.0, 0.5, 0.3)
+    assert (lift.armature, bend.armature) == (0.04, 0.0)
     assert (bend.damping, bend.lower, bend.upper) == (0.1, 0.0, 0.0)
     assert (reach.effort, reach.damping) == (40.0, 0.5)
     assert chain.gravity == (0.0, 1.5, -9.7)
+
+
+@pytest.mark.parametrize(("motors", "ratio"), [("", 1.0), ("[robot.motors.m]\n", 10.0)])
+def test_losses_and_armature_are_where_estimates_start(
+    tmp_path: Path, motors: str, ratio: float
+) -> None:
+    file = write(tmp_path, ARM.format(**DEGREES))
+    if motors:
+        others = "".join(f"[robot.motors.{j}]\nturns = {{ {j} = 1 }}\n" for j in ("bend", "reach"))
+        file.write_text(f"{file.read_text()}{motors}turns = {{ lift = -{ratio} }}\n{others}")
+    found = {p.name: p for p in device_from(read_device_file(file)).parameters}
+    rotor = found["rotor_inertia_m" if motors else "rotor_inertia_lift"]
+    assert rotor.prior == pytest.approx(0.04 / ratio**2)
+    assert rotor.sd >= 5.0 * rotor.prior and not rotor.weighed
+    assert (found["viscous.lift"].prior, found["coulomb.lift"].prior) == (0.5, 0.3)
+    assert found["rotor_inertia_bend"].prior > 0.0
 
 
 @pytest.mark.parametrize(
