@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from bampipe.errors import InputError, did_you_mean
 from bampipe.files import read_toml
-from bampipe.lists import join_names
 from bampipe.physics import Model, registry
 from bampipe.physics.device import Device
 from bampipe.physics.effect import BoundEffect, Effect
@@ -109,7 +108,7 @@ def _device(name: str) -> Device:
     others = (*no_forces, *device.channels)
     if others:
         raise InputError(
-            f"device {name!r} cannot be simulated: it takes {join_names(others)}, and nothing but"
+            f"device {name!r} cannot be simulated: it takes {" and ".join(others)}, and nothing but"
             " forces is simulated"
         )
     return device
