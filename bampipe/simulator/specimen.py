@@ -108,7 +108,7 @@ def _device(name: str) -> Device:
     others = (*no_forces, *device.channels)
     if others:
         raise InputError(
-            f"device {name!r} cannot be simulated: it takes {" and ".join(others)}, and nothing but"
+            f"device {name!r} cannot be simulated: it takes {' and '.join(others)}, and nothing but"
             " forces is simulated"
         )
     return device

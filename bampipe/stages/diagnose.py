@@ -21,7 +21,8 @@ from bampipe.discover.diagnosis import diagnose
 from bampipe.discover.findings import Diagnosis
 from bampipe.discover.settings import Settings
 from bampipe.discover.shape import residual_map, variables, worst_windows
-from bampipe.errors import InputError, did_you_mean
+from bampipe.errors import InputError, NothingToDoError, did_you_mean
+from bampipe.estimate.simulation import Runaway
 from bampipe.identification.terms import effect_text
 from bampipe.next_trial.choice import rank_designs
 from bampipe.next_trial.forecast import NOTHING
@@ -120,7 +121,15 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         jobs=config.jobs or min(8, os.cpu_count() or 1),
         seed=config.seed,
     )
-    found = diagnose(trials, recipe, start, settings, progress, config.without)
+    try:
+        found = diagnose(trials, recipe, start, settings, progress, config.without)
+    except Runaway as error:
+        raise NothingToDoError(
+            f"model {config.model!r} cannot be diagnosed, for it cannot be replayed and so has no"
+            f" chance level: {error.what}",
+            where=str(run.root),
+            remedy="judge it by validate and compare, and diagnose the model that it came from",
+        ) from error
     samples = _map_variables(found)
     write_parquet(out / f"models/{config.model}/map_variables.parquet", samples)
     progress(0.97, "a trial that would decide what these do not")

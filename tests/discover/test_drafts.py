@@ -19,6 +19,7 @@ from bampipe.discover.chance import candidates_of, fit_trials, system_of
 from bampipe.discover.drafts.effect_file import write_toml
 from bampipe.discover.drafts.screen import Screen
 from bampipe.discover.drafts.search import FoundDraft, Option, draft
+from bampipe.discover.scorer import Scorer
 from bampipe.discover.settings import Settings
 from bampipe.errors import InputError, NothingToDoError
 from bampipe.physics import Model, compile_model
@@ -169,6 +170,30 @@ def _low_passed(evidence, system, trial, p):
     return evidence.band.thin(whole)[:, 0]
 
 
+def test_a_form_that_cancels_the_drive_gains_nothing(clean, damper):
+    """As the score of an effect has it: what is to be explained is no explanation."""
+    for recipe, evidence in (clean[1:], damper):
+        screen = Screen(evidence, 0)
+        forms = [f for f in screen.forms() if f.coordinate.quantity == "load"]
+        assert {f.shape.name for f in forms} == {"parabola", "rise"}
+        for form in forms:
+            place = {name: 0.0 for name in form.shape.searched}
+            constants = {n: v for n, (v, _) in form.fixed().items()}
+            for share in (-0.2, -1.0):
+                # A rise of this height from load zero is the load itself, against the motion.
+                values = {n: share * constants["reach"] for n in form.shape.strengths} | place
+                wider = replace(recipe, extra=(form.declaration("a test"),))
+                item = candidates_of(wider, (form.canonical,))[0]
+                p = [values.get(q.name.rpartition(".")[2], q.prior) for q in item.parameters]
+                exact = Scorer(evidence)._sensitivity(item, np.array(p))[0]
+                assert screen._slope(form, values) == pytest.approx(exact, rel=0.05, abs=0.05)
+            if form.shape.name == "rise":
+                assert screen._slope(form, values) < -1.0
+    for name in ("parabola_by_position", "slope_by_position"):
+        form = next(f for f in screen.forms() if f.name.endswith(name))
+        assert screen._slope(form, dict.fromkeys(form.shape.strengths, 1.0)) == 0.0
+
+
 def test_hysteresis_of_a_force_sensor_is_found(tmp_path):
     trials, recipe, _ = record_trials(tmp_path, "bam", 7, "sensor_hysteresis:x")
     evidence = fit_trials(trials, recipe, system_of(recipe).prior)
@@ -201,7 +226,7 @@ def test_a_missing_library_is_named_where_one_quantity_did_not_do(detent):
     run, _ = detent
     folder = RunFolder(run.root)
     system = compile_model(load_model(folder, "base"))
-    nothing = Option((), 0, np.array([0.5, 0.1, 0.1]))
+    nothing = Option((), 0, np.array([0.5, 0.1, 0.1]), np.ones(3))
     chance = ChanceOfDraft(gain=3.0, gains=(2.0, 3.0, 4.0, 5.0), p_value=0.6)
     found = FoundDraft(
         0, (), (chance,), 0.02, (nothing,), 0.5, 0.5, None, True, None, None

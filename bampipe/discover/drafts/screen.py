@@ -54,6 +54,10 @@ _REFINED = 12
 _TRIES = 90
 """Evaluations in refining one."""
 _NEGLIGIBLE = 1e-9
+_APPLIED = "applied"
+"""Of the signals: what drives the axis, with its sign."""
+_STEP, _LEAST_SLOPE = 1e-6, 1e-3
+"""Relative step of the drive; slope of the residual by it below which it counts as cancelled."""
 _KNOWN = 2.0
 """Times the residual that the force must be beyond what the model's own parameters can do: it is
 once where these scale with it, and more than three times on an arm of known inertia."""
@@ -161,9 +165,10 @@ class Screen:
             q, qd, qdd = motion.q[rows], motion.qd[rows], motion.qdd[rows]
             u = motion.inputs(system.inputs)[rows]
             z = evidence.fitted[k].memory[rows]
-            load = np.abs(system.applied(q, qd, qdd, z, u, evidence.p)[:, axis])
+            applied = system.applied(q, qd, qdd, z, u, evidence.p)[:, axis]
             width = device.coordinates[axis].sign_width
             values = {
+                _APPLIED: applied,
                 FORCE: np.ones(len(q)),
                 FRICTION: np.tanh(qd[:, axis] / width),
                 DAMPING: qd[:, axis],
@@ -178,7 +183,7 @@ class Screen:
                     "speed": np.abs(qd[:, c.axis]),
                     "velocity": qd[:, c.axis],
                     "direction": values[FRICTION],
-                    "load": load,
+                    "load": np.abs(applied),
                     "time": motion.t[rows],
                 }
                 logged = motion.channels.get(c.channel, np.zeros(len(motion.t)))[rows]
@@ -397,7 +402,34 @@ class Screen:
         columns = self.columns(form, searched)
         strengths = self._explained(columns)[1][0]
         values = dict(zip(form.shape.strengths, map(float, strengths), strict=True)) | at
-        return Screened(form, values, self._gain(columns[:, :, 0].T))
+        gain = self._gain(columns[:, :, 0].T) + self.independent * self._slope(form, values)
+        return Screened(form, values, gain)
+
+    def _slope(self, form: Form, values: dict[str, float]) -> float:
+        """Mean of log |d residual / d drive| with a form, of which the model alone has one.
+
+        What follows the load can cancel the drive, which is to be explained: the residual is then
+        small whatever the device does. As the score of an effect, a gain has that taken off.
+        """
+        by_load = [q.quantity == "load" for q, _ in form.quantities]
+        if not any(by_load):
+            return 0.0
+        constants = {name: value for name, (value, _) in form.fixed().items()} | values
+        constants["interval"] = 1.0 / self._rate_hz
+        found = []
+        for i in range(len(self._sampling)):
+            x = np.hstack([self.signals[q.words][i] for q, _ in form.quantities])
+            more = x * np.where(by_load, 1.0 + _STEP, 1.0)
+            size = np.array([values[name] for name in form.shape.strengths])
+            here, there = (
+                np.tensordot(size, np.stack(form.shape.columns(at, constants)), 1)
+                for at in (x, more)
+            )
+            applied = self.signals[_APPLIED][i]
+            step = np.where(applied == 0.0, np.inf, _STEP * applied)
+            slope = 1.0 + (there - here) / step * self.signals[form.lever][i] / form.scale
+            found.append(np.log(np.maximum(np.abs(slope), _LEAST_SLOPE)))
+        return float(np.mean(np.concatenate(found)))
 
     def curve_bound(self, form: Form) -> tuple[int, float]:
         """What no formula of the form's coordinate, acting as it does, could do better.

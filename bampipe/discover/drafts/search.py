@@ -23,6 +23,7 @@ from bampipe.discover.chance import (
 from bampipe.discover.drafts import symbolic
 from bampipe.discover.drafts.forms import Form
 from bampipe.discover.drafts.screen import Screen, Screened
+from bampipe.discover.polish import FittedSet
 from bampipe.discover.scorer import Score, Scorer
 from bampipe.discover.settings import Settings
 from bampipe.discover.start import with_effect
@@ -108,11 +109,17 @@ class Option:
         terms: forms and the names of their effects.
         constants: how many numbers they have.
         held_out_rmse: by axis, (n_q,), N.m or N.
+        slope: of the residual by the force, by axis, (n_q,); see `FittedSet.slope_by_force`.
     """
 
     terms: tuple[tuple[Form, str], ...]
     constants: int
     held_out_rmse: Array
+    slope: Array
+
+    def error(self, axis: int) -> float:
+        """Held-out error over slope: making both sides of the equation small explains nothing."""
+        return float(self.held_out_rmse[axis] / self.slope[axis])
 
 
 @dataclass(frozen=True)
@@ -190,16 +197,22 @@ class FitTask:
 
 @dataclass(frozen=True)
 class Fitted:
-    """Parameters of a fit and its error on held-out trials, by axis."""
+    """Parameters of a fit, its error on held-out trials and its slope by the force, by axis."""
 
     p: Array
     held_out_rmse: Array
+    slope: Array
 
 
 def run_fit(task: FitTask) -> Fitted:
     """Fit a model, all its parameters together."""
-    evidence = fit_trials(open_trials(), task.recipe, task.start)
-    return Fitted(evidence.p, evidence.held_out_rmse)
+    trials = open_trials()
+    evidence = fit_trials(trials, task.recipe, task.start)
+    return Fitted(evidence.p, evidence.held_out_rmse, _slope(task.recipe, evidence, trials))
+
+
+def _slope(recipe: Recipe, evidence: Evidence, trials: MeasuredTrials) -> Array:
+    return FittedSet(recipe, (), evidence, trials).slope_by_force
 
 
 def draft(
@@ -272,7 +285,8 @@ class AxisSearch:
         """Add terms to a model as long as one beats chance and is worth its constants."""
         axis = self._axis
         bare = self._bench.fit(recipe, start)
-        nothing = Option((), 0, bare.held_out_rmse)
+        slope = _slope(recipe, bare, self._bench.trials)
+        nothing = Option((), 0, bare.held_out_rmse, slope)
         found = self._add_terms(_Stand(recipe, bare, nothing, (nothing,), (), 0.0), progress)
         wanting = self._search == "structured" and self._leaves_much(found)
         if wanting and symbolic.is_available():
@@ -345,8 +359,9 @@ class AxisSearch:
 
     def _cost(self, option: Option) -> float:
         """Log of the held-out error plus what its constants must be worth."""
-        error = float(option.held_out_rmse[self._axis])
-        return float(np.log(error)) + self._settings.draft_worth * option.constants
+        return (
+            float(np.log(option.error(self._axis))) + self._settings.draft_worth * option.constants
+        )
 
     def _chance(
         self,
@@ -423,7 +438,12 @@ class AxisSearch:
         fits = self._bench.pool(run_fit, tasks)
         return [
             (
-                Option(term, sum(form.constants for form, _ in term), fitted.held_out_rmse),
+                Option(
+                    term,
+                    sum(form.constants for form, _ in term),
+                    fitted.held_out_rmse,
+                    fitted.slope,
+                ),
                 task.recipe,
                 fitted.p,
             )
@@ -455,8 +475,8 @@ class AxisSearch:
         ordered = sorted(options, key=lambda o: (o.constants, self._cost(o)))
         front: list[Option] = []
         for option in ordered:
-            error = option.held_out_rmse[self._axis]
-            if option is chosen or all(error < o.held_out_rmse[self._axis] for o in front):
+            error = option.error(self._axis)
+            if option is chosen or all(error < o.error(self._axis) for o in front):
                 front.append(option)
         while len(front) > MOST_LISTED:
             front.remove(max((o for o in front if o is not chosen and o.terms), key=self._cost))
