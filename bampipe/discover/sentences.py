@@ -8,7 +8,7 @@ from bampipe.discover.description import describe
 from bampipe.discover.findings import Diagnosis
 from bampipe.discover.settings import Settings
 from bampipe.lists import join_names
-from bampipe.results.diagnose import AxisVerdict, Contender, Stretch
+from bampipe.results.diagnose import AxisVerdict, Contender, Stretch, in_words
 from bampipe.results.rounding import significant as three
 from bampipe.results.standing import FLOOR_WRONG, STANDINGS_IN_WORDS, standing
 
@@ -67,10 +67,12 @@ def _verdict(a: AxisVerdict, found: Diagnosis, unit: str) -> str:
     stands = f"held-out error {three(a.rmse_after)} {unit}, {ratio:.1f} times the noise floor"
     if a.verdict == "missing":
         it = "it" if len(a.effects) == 1 else "them"
-        return f"{_missing(a.effects)}; adding {it} {falls}"
+        if any(c.beside for name in a.effects for c in found.contests.get(name, ())):
+            it = join_names(a.effects)
+        return f"{_missing(a.effects, found)}; adding {it} {falls}"
     if a.verdict == "undecided" and a.effects:
         sure = [n for n in a.effects if n not in a.likely]
-        also = f"{_missing(sure)}, and " if sure else ""
+        also = f"{_missing(sure, found)}, and " if sure else ""
         adding = f"adding {join_names(a.effects)} {falls}"
         return f"{also}these trials cannot tell {_odds(a, ' from ')}; {adding}"
     if a.verdict == "undecided" and a.explained_by_effects > 0.0:
@@ -109,8 +111,9 @@ def _no_effect(found: Diagnosis) -> str:
     )
 
 
-def _missing(names: Sequence[str]) -> str:
-    return f"{join_names(names)} {'is' if len(names) == 1 else 'are'} missing"
+def _missing(names: Sequence[str], found: Diagnosis) -> str:
+    named = [in_words(name, found.contests.get(name, ())) for name in names]
+    return f"{join_names(named)} {'is' if len(names) == 1 else 'are'} missing"
 
 
 def _rivals(axis: str, a: AxisVerdict, found: Diagnosis, unit: str, s: Settings) -> list[str]:

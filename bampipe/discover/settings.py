@@ -55,6 +55,8 @@ class Settings:
         resembles: below this share they are no more than resemblances, and the effect is unknown.
         likely: p-value up to which a candidate that does not beat chance is named as likely.
         decided: odds from which on an effect is found although others fit alike.
+        clear_odds: odds of an effect found to one rival, below which a verdict names both: scores
+            err by about that, and the name that stands alone is taken for sure.
         rival_score: share of an effect's score from which on another one is listed beside it.
         swap: relative gain in score from which on another effect takes the place of one found.
         replay_error: how far the log error of a replay may be off because no replay is perfect.
@@ -115,6 +117,7 @@ class Settings:
     resembles: float = 0.35
     likely: float = 0.5
     decided: float = 0.9
+    clear_odds: float = 2.0
     rival_score: float = 0.9
     swap: float = 0.05
     replay_error: float = 0.01

@@ -158,7 +158,15 @@ def _listed(
     mine = contest[0]
 
     shown = [c for c in contest if c.effect in odds or comes_close(c, mine, s)]
-    return tuple(c.model_copy(update={"odds": odds.get(c.effect, 0.0)}) for c in shown)
+    own = odds.get(mine.effect, 0.0)
+    found = []
+    for c in shown:
+        rate = odds.get(c.effect, 0.0)
+        beside = ""
+        if c is not mine and rate * s.clear_odds > own:
+            beside = "about as likely" if rate < own * s.clear_odds else "likelier by score"
+        found.append(c.model_copy(update={"odds": rate, "beside": beside}))
+    return tuple(found)
 
 
 def _reach(search: Search, name: str, worth: float) -> set[int]:

@@ -8,7 +8,7 @@ from bampipe.lists import join_names
 from bampipe.report import wording
 from bampipe.report.document import Callout
 from bampipe.report.results import Results
-from bampipe.results.diagnose import DiagnoseResult
+from bampipe.results.diagnose import DiagnoseResult, in_words
 from bampipe.results.standing import FLOOR_WRONG, STANDINGS_IN_WORDS
 from bampipe.results.validate import ValidateResult
 
@@ -147,7 +147,9 @@ def _diagnosed(results: Results, diagnosis: DiagnoseResult) -> Callout:
     with_effects = f" with {join_names(f'`{name}`' for name in effects)}" if effects else ""
     sentence = "\n".join(axes[axis].sentence for axis in found)
     if by_verdict["missing"]:
-        what = join_names(f"`{name}`" for name in diagnosis.selected) or "an effect"
+        contests = diagnosis.contests
+        named = (in_words(name, contests.get(name, ()), "`") for name in diagnosis.selected)
+        what = join_names(named) or "an effect"
         where = join_names(by_verdict["missing"])
         return Callout("attention", f"The model{with_effects} lacks {what} ({where})", sentence)
     if by_verdict["unknown_effect"]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
@@ -102,6 +103,23 @@ class Contender(Record):
     odds: Share = Field(
         description="That it is this one, of those that replays do not distinguish; else 0"
     )
+    beside: Literal["", "about as likely", "likelier by score"] = Field(
+        default="", description="Of a rival that a verdict names beside the effect found, why"
+    )
+
+
+def in_words(effect: str, contest: Sequence[Contender], mark: str = "") -> str:
+    """An effect found, with the rivals that its odds do not set it apart from.
+
+    Args:
+        effect: its name; contest: who contends for its place, itself among them.
+        mark: what a name stands between.
+    """
+    said = f"{mark}{effect}{mark}"
+    for why in ("about as likely", "likelier by score"):
+        rivals = [f"{mark}{c.effect}{mark}" for c in contest if c.beside == why]
+        said += f" or, {why}, {' or '.join(rivals)}" if rivals else ""
+    return said
 
 
 class SearchStep(Record):

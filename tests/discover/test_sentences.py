@@ -8,10 +8,16 @@ from types import SimpleNamespace
 
 import pytest
 
-from bampipe.discover import sentences
+from bampipe.discover import sentences, verdict
 from bampipe.discover.findings import Diagnosis
 from bampipe.discover.settings import Settings
-from bampipe.results.diagnose import AxisVerdict, Contender, Stretch, TransientCandidate
+from bampipe.results.diagnose import (
+    AxisVerdict,
+    Contender,
+    Stretch,
+    TransientCandidate,
+    in_words,
+)
 from bampipe.results.standing import standing
 
 SECOND = Stretch(trial_id="t3", t_start=4.0, t_end=5.0)
@@ -137,6 +143,29 @@ def test_rivals_are_listed_with_what_they_would_leave(monkeypatch):
     )
     said = say(monkeypatch, axis, contests={"a:joint": contest})
     assert "b:joint (leaves 0.120 N.m)" in said
+
+
+def test_a_rival_about_as_likely_is_named_in_the_verdict(monkeypatch):
+    """Odds of less than two to one set no effect apart; of more they do."""
+    axis = finding("missing", 1.0, 0.1, 0.1, effects=("a:joint",), explained_by_effects=1.0)
+    for share, beside, head in (
+        (0.30, "", "Joint: a:joint is missing; adding it takes"),
+        (0.35, "about as likely", "Joint: a:joint or, about as likely, b:joint is missing"),
+        (0.54, "about as likely", "Joint: a:joint or, about as likely, b:joint is missing"),
+        (0.70, "likelier by score", "Joint: a:joint or, likelier by score, b:joint is missing"),
+    ):
+        contest = (
+            contender("a:joint", 0.1, 60.0, None, 52.0, 0.0),
+            contender("b:joint", 0.13, 59.0, None, 35.0, 0.0),
+        )
+        odds = {"a:joint": 1.0 - share, "b:joint": share}
+        listed = verdict._listed(contest, odds, Settings())
+        assert [c.beside for c in listed] == ["", beside]
+        said = say(monkeypatch, axis, contests={"a:joint": listed})
+        assert said.startswith(head)
+        assert ("adding a:joint takes" in said) is bool(beside)
+        marked = in_words("a:joint", listed, "`")
+        assert marked == (f"`a:joint` or, {beside}, `b:joint`" if beside else "`a:joint`")
 
 
 def test_odds_are_given_where_no_replay_looks_like_the_measurement(monkeypatch):
