@@ -9,6 +9,7 @@ from bampipe.results.diagnose import (
     AxisVerdict,
     Contender,
     RankedEffect,
+    RefusedEffect,
     SearchStep,
     TransientCandidate,
 )
@@ -30,6 +31,7 @@ class Diagnosis:
         transients: candidates that only one second speaks for.
         evidence: of the model with all selected effects.
         initial: of the model as given.
+        refused: candidates that beat chance and were added, but not kept.
     """
 
     axes: tuple[AxisVerdict, ...]
@@ -42,3 +44,4 @@ class Diagnosis:
     transients: tuple[TransientCandidate, ...]
     evidence: Evidence
     initial: Evidence
+    refused: tuple[RefusedEffect, ...] = ()

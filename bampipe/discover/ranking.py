@@ -18,7 +18,8 @@ def rank(search: Search, selected: Sequence[str]) -> list[RankedEffect]:
     """Selected effects with their groups, then the others by their score beyond chance.
 
     Selected effects are held against the model that they were added to, others against the model
-    as given: what a second effect does may not show before the first is there. The parameters of
+    as given: what a second effect does may not show before the first is there. What was added and
+    refused stands with what it did then, whatever its score had promised. The parameters of
     selected ones are those of the final model, free of the bias that filters give a fit.
     """
     names = (q.name for q in search.evidence.system.parameters)
@@ -31,6 +32,7 @@ def rank(search: Search, selected: Sequence[str]) -> list[RankedEffect]:
         key=lambda n: -float(search.level.excess(search.first[n]).sum()),
     )
     initial, system = Scorer(search.initial), search.initial.system
+    refused = {r.effect: r for r in search.refused}
     rows = []
     for name in [*order, *others]:
         if name not in search.first:
@@ -43,6 +45,12 @@ def rank(search: Search, selected: Sequence[str]) -> list[RankedEffect]:
                 found.score, found.scorer, found.excess, found.p_value,
             )  # fmt: skip
         axis = int(np.argmax(excess))
+        before = scorer.evidence.held_out_rmse[axis]
+        after = scorer.held_out_scale[axis] * score.error[axis]
+        if name in refused:
+            known = refused[name]
+            axis = system.coordinates.index(known.axis)
+            before, after = known.held_out_rmse_before, known.held_out_rmse_after
         group = next(({g, *r} - {name} for g, r in search.groups.items() if name in (g, *r)), set())
         own = [q.name for q in _own_parameters(search.recipe, name)]
         scored = dict(zip(own, score.values, strict=True))
@@ -50,8 +58,8 @@ def rank(search: Search, selected: Sequence[str]) -> list[RankedEffect]:
             RankedEffect(
                 effect=name,
                 axis=system.coordinates[axis],
-                held_out_rmse_before=scorer.evidence.held_out_rmse[axis],
-                held_out_rmse_after=scorer.held_out_scale[axis] * score.error[axis],
+                held_out_rmse_before=before,
+                held_out_rmse_after=after,
                 unit=system.torque_units[axis],
                 p_value=p_value,
                 score=excess.sum(),

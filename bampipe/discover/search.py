@@ -18,7 +18,7 @@ from bampipe.discover.scorer import Score, Scorer
 from bampipe.discover.settings import Settings
 from bampipe.estimate.simulation import Runaway
 from bampipe.physics.recipe import Recipe
-from bampipe.results.diagnose import Contender, SearchStep
+from bampipe.results.diagnose import Contender, RefusedEffect, SearchStep
 from bampipe.results.standing import AT_FLOOR, standing
 from bampipe.trials.folds import HELD_OUT
 from bampipe.trials.measured import MeasuredTrials
@@ -66,6 +66,7 @@ class Search:
         likely: p-value and gain in log error by axis of candidates that would lower the error of
             the final model, but do not beat chance.
         transient: candidates that only one second speaks for, and that second.
+        refused: candidates that beat chance and were added, but not kept.
         steps: the sets tried, in order.
         cut_short: whether it ended at `Settings.most_effects`.
         final: replays of the final model, with explainable shares.
@@ -85,6 +86,7 @@ class Search:
     additions: Mapping[str, Addition]
     likely: Mapping[str, tuple[float, Array]]
     transient: Mapping[str, SampleRange]
+    refused: tuple[RefusedEffect, ...]
     steps: tuple[SearchStep, ...]
     cut_short: bool
     final: tuple[Replicate, ...]
@@ -123,6 +125,7 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
     additions: dict[str, Addition] = {}
     dropped: set[str] = set()
     transient: dict[str, SampleRange] = {}
+    refused: list[RefusedEffect] = []
     steps = [_step(current)]
     known = level
 
@@ -158,6 +161,7 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
         if sound is None:
             # It resembles what is missing in these trials, but no mechanism could have it.
             dropped.add(chosen.winner)
+            refused.append(_refusal(chosen.winner, addition, current, wider, s))
             scores = {name: score for name, score in scores.items() if name != chosen.winner}
             continue
         dropped |= {*current.added, chosen.winner} - {*wider.added}
@@ -185,7 +189,8 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
     return Search(
         bench.trials, base, initial, level, first, found,
         {n: polished.alike.get(n, groups.get(n, ())) for n in found.added},
-        unlike, misfit, contests, main, additions, likely, transient, tuple(steps), cut_short,
+        unlike, misfit, contests, main, additions, likely, transient,
+        tuple(r for r in refused if r.effect not in found.added), tuple(steps), cut_short,
         tuple(final),
     )  # fmt: skip
 
@@ -297,15 +302,38 @@ def _carries_over(before: FittedSet, after: FittedSet, promised: Array, s: Setti
     the worst second of each and without.
     """
 
-    def errors(known: FittedSet, axis: int) -> Array:
-        least = error_without_second(known.evidence, axis)[1]
-        both = np.array([known.evidence.held_out_rmse[axis], least])
-        return np.asarray(both / known.slope_by_force[axis])
-
     return any(
-        float(np.min(np.log(errors(before, axis) / errors(after, axis))))
+        float(np.min(np.log(_held_out(before, axis) / _held_out(after, axis))))
         > max(s.worth, s.carried * promised[axis])
         for axis in range(len(before.error))
+    )
+
+
+def _held_out(known: FittedSet, axis: int) -> Array:
+    """Error on held-out trials over the slope by the force: whole, and but for the worst second."""
+    least = error_without_second(known.evidence, axis)[1]
+    both = np.array([known.evidence.held_out_rmse[axis], least])
+    return np.asarray(both / known.slope_by_force[axis])
+
+
+def _refusal(
+    name: str, addition: Addition, before: FittedSet, after: FittedSet, s: Settings
+) -> RefusedEffect:
+    """Why an effect that was added is not kept, and what it did on the axis that it was for."""
+    axis = int(np.argmax(addition.excess))
+    promised = addition.score.gain / before.scorer.independent_samples
+    carries = _carries_over(before, after, promised, s)
+    first, then = (
+        _held_out(known, axis) * before.slope_by_force[axis] for known in (before, after)
+    )
+    return RefusedEffect(
+        effect=name,
+        axis=before.evidence.system.coordinates[axis],
+        held_out_rmse_before=first[0],
+        held_out_rmse_after=then[0],
+        without_worst_second_before=first[1],
+        without_worst_second_after=then[1],
+        why="replays" if carries else "held_out",
     )
 
 

@@ -35,6 +35,7 @@ def _parts(axis: str, i: int, found: Diagnosis, unit: str, s: Settings) -> list[
     parts += _rivals(axis, a, found, unit, s)
     parts += _transients(axis, found)
     if a.remains:
+        parts += _refused(axis, found, unit)
         left = f"{_no_effect(found)} explains what is left; its shape" if a.effects else "Its shape"
         judged = found.evidence if a.effects else found.initial
         parts.append(f"{left}: {describe(judged, i, s)}.")
@@ -162,6 +163,29 @@ def _transients(axis: str, found: Diagnosis) -> list[str]:
         f"{'it counts' if len(effects) == 1 else 'they count'} once another trial shows it."
         for second, effects in by_second.items()
     ]
+
+
+def _refused(axis: str, found: Diagnosis, unit: str) -> list[str]:
+    """The candidates that beat chance by their score and are not kept, and why."""
+    said = []
+    for one in found.refused:
+        if one.axis != axis:
+            continue
+        before, after = one.held_out_rmse_before, one.held_out_rmse_after
+        rest, left = one.without_worst_second_before, one.without_worst_second_after
+        aside = ""
+        if one.why == "held_out" and left * before > after * rest:
+            before, after, aside = rest, left, " but for the worst second"
+        numbers = f"{three(before)} to {three(after)} {unit}{aside}"
+        if one.why == "replays":
+            why = f"would take the held-out error from {numbers}, but replays with it give no floor"
+            why += " that this could be judged by"
+        elif after < before:
+            why = f"beats chance by its score, but takes the held-out error only from {numbers}"
+        else:
+            why = f"beats chance by its score, but does not lower the held-out error ({numbers})"
+        said.append(f"{one.effect} {why}: it is not named.")
+    return said
 
 
 def _excused(a: AxisVerdict, unit: str) -> str:

@@ -110,7 +110,7 @@ def conclude(search: Search, s: Settings) -> Diagnosis:
     contests = {n: _listed(search.contests.get(n, ()), odds[n], s) for n in kept}
     return Diagnosis(
         tuple(findings), tuple(ranking), tuple(kept), groups, contests, search.steps,
-        search.cut_short, _transients(search), evidence, search.initial,
+        search.cut_short, _transients(search), evidence, search.initial, search.refused,
     )  # fmt: skip
 
 

@@ -75,7 +75,8 @@ class RankedEffect(Record):
         description="Of the model diagnosed; for an effect found, of the one it was added to"
     )
     held_out_rmse_after: Size = Field(
-        description="That, times the ratio of the cross-validated errors with and without it"
+        description="That, times the ratio of the cross-validated errors with and without it; "
+        "measured for an effect that was added and refused"
     )
     unit: str
     p_value: Share
@@ -135,6 +136,23 @@ class TransientCandidate(Record):
     effect: str
     axis: str
     second: Stretch
+
+
+class RefusedEffect(Record):
+    """A candidate that beats chance by its score, was added for that, and is not kept."""
+
+    effect: str
+    axis: str
+    held_out_rmse_before: Size = Field(description="Of the model that it was added to")
+    held_out_rmse_after: Size = Field(
+        description="With it, fitted, as if it left both sides of the equation at their size"
+    )
+    without_worst_second_before: Size = Field(description="The same but for the worst second")
+    without_worst_second_after: Size
+    why: Literal["held_out", "replays"] = Field(
+        description="It does too little on held-out trials; or replays with it give no floor that "
+        "an error could be judged by"
+    )
 
 
 class SuggestedTrial(Record):
@@ -201,6 +219,7 @@ class DiagnoseResult(Result):
         description="Sets of effects that the search went through"
     )
     transients: tuple[TransientCandidate, ...]
+    refused: tuple[RefusedEffect, ...] = ()
     suggested_trial: SuggestedTrial | None
     not_weighed: Names = Field(default=(), description="Effects that the search was to leave out")
     maps: dict[str, dict[str, ResidualMap]] = Field(description="By axis, then variable")

@@ -197,6 +197,7 @@ def _result(found: Diagnosis, recipe: Recipe, config: Config) -> DiagnoseResult:
         contests=dict(found.contests),
         steps=found.steps,
         transients=found.transients,
+        refused=found.refused,
         suggested_trial=None,
         maps=_maps(found),
         worst_windows=tuple(worst_windows(found.initial)),

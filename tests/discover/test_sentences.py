@@ -14,6 +14,7 @@ from bampipe.discover.settings import Settings
 from bampipe.results.diagnose import (
     AxisVerdict,
     Contender,
+    RefusedEffect,
     Stretch,
     TransientCandidate,
     in_words,
@@ -38,13 +39,23 @@ def finding(verdict, before, after, floor, **more):
     )  # fmt: skip
 
 
-def say(monkeypatch, axis, contests=None, transients=(), cut_short=False):
+def say(monkeypatch, axis, contests=None, transients=(), cut_short=False, refused=()):
     """The sentence of one axis called joint, in N.m."""
     monkeypatch.setattr(sentences, "describe", lambda evidence, axis, s: SHAPE)
     system = SimpleNamespace(coordinates=("joint",), torque_units=("N.m",))
     evidence = SimpleNamespace(system=system)
     found = Diagnosis(
-        (axis,), (), axis.effects, {}, contests or {}, (), cut_short, transients, evidence, evidence
+        (axis,),
+        (),
+        axis.effects,
+        {},
+        contests or {},
+        (),
+        cut_short,
+        transients,
+        evidence,
+        evidence,
+        refused,
     )
     return sentences.axis_sentences(found, Settings())[0]
 
@@ -166,6 +177,34 @@ def test_a_rival_about_as_likely_is_named_in_the_verdict(monkeypatch):
         assert ("adding a:joint takes" in said) is bool(beside)
         marked = in_words("a:joint", listed, "`")
         assert marked == (f"`a:joint` or, {beside}, `b:joint`" if beside else "`a:joint`")
+
+
+@pytest.mark.parametrize(
+    ("after", "without", "why", "said"),
+    [
+        (0.98, 0.60, "held_out", "takes the held-out error only from 1.00 to 0.980 N.m: it is not"),
+        (
+            0.70,
+            0.78,
+            "held_out",
+            "only from 0.800 to 0.780 N.m but for the worst second: it is not",
+        ),
+        (1.02, 0.60, "held_out", "does not lower the held-out error (1.00 to 1.02 N.m): it is not"),
+        (0.20, 0.10, "replays", "from 1.00 to 0.200 N.m, but replays with it give no floor"),
+    ],
+)
+def test_what_beats_chance_and_is_refused_is_said(monkeypatch, after, without, why, said):
+    """No effect explains what is left: then the table's first line needs a reason."""
+    one = RefusedEffect(
+        effect="lag:x", axis="joint", held_out_rmse_before=1.0, held_out_rmse_after=after,
+        without_worst_second_before=0.8, without_worst_second_after=without, why=why,
+    )  # fmt: skip
+    axis = finding("unknown_effect", 1.0, 1.0, 0.1, remains=True)
+    assert said in say(monkeypatch, axis, refused=(one,))
+    other = one.model_copy(update={"axis": "elbow"})
+    assert "lag:x" not in say(monkeypatch, axis, refused=(other,))
+    fine = finding("nothing_missing", 1.0, 1.0, 1.0)
+    assert "lag:x" not in say(monkeypatch, fine, refused=(one,))
 
 
 def test_odds_are_given_where_no_replay_looks_like_the_measurement(monkeypatch):

@@ -1,10 +1,11 @@
-"""Verdicts of several axes that one effect acts on."""
+"""Verdicts of several axes that one effect acts on, and what a search refused."""
 
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from bampipe.discover import search as search_of
 from bampipe.discover import verdict
 from bampipe.discover.settings import Settings
 from bampipe.results.diagnose import Stretch
@@ -25,6 +26,7 @@ def test_an_effect_that_fails_where_it_helps_most_is_missing_nowhere(monkeypatch
         initial=evidence(1.0, 1.0), evidence=evidence(shoulder_after, 0.3), selected=("gain",),
         main={"gain": 0}, final=(replay,) * 4, level=SimpleNamespace(replicates=(replay,) * 4),
         groups={"gain": ()}, contests={}, steps=(), cut_short=False, first={}, transient={},
+        refused=(),
     )  # fmt: skip
     second = SimpleNamespace(stretch=Stretch(trial_id="t01", t_start=0.0, t_end=1.0))
     monkeypatch.setattr(verdict, "_reach", lambda *_: {0, 1})
@@ -43,6 +45,35 @@ def test_an_effect_that_fails_where_it_helps_most_is_missing_nowhere(monkeypatch
         assert [shoulder.verdict, elbow.verdict] == ["unknown_effect", "undecided"]
         assert found.selected == shoulder.effects == elbow.effects == ()
         assert list(elbow.likely) == ["gain"]
+
+
+@pytest.mark.parametrize(
+    ("error", "without", "slope", "why"),
+    [
+        (0.97, 0.5, 1.0, "held_out"),  # 2.3 % is not worth an effect
+        (0.90, 0.5, 1.0, "held_out"),  # nor is less than a quarter of what was promised
+        (0.50, 0.4, 0.5, "held_out"),  # nor what makes both sides of the equation small
+        (0.50, 0.4, 1.0, "replays"),
+    ],
+)
+def test_what_is_added_and_refused_stands_with_what_it_did(monkeypatch, error, without, slope, why):
+    system = SimpleNamespace(coordinates=("elbow",))
+
+    def fitted(whole, rest, slope):
+        evidence = SimpleNamespace(held_out_rmse=np.array([whole]), rest=rest, system=system)
+        return SimpleNamespace(
+            evidence=evidence, error=np.array([whole]), slope_by_force=np.array([slope]),
+            scorer=SimpleNamespace(independent_samples=np.array([100.0])),
+        )  # fmt: skip
+
+    monkeypatch.setattr(search_of, "error_without_second", lambda e, axis: (None, e.rest))
+    score = SimpleNamespace(gain=np.array([60.0]))
+    addition = SimpleNamespace(score=score, excess=np.array([60.0]))
+    before, after = fitted(1.0, 0.9, 1.0), fitted(error, without, slope)
+    found = search_of._refusal("lag:x", addition, before, after, Settings())
+    assert (found.axis, found.why) == ("elbow", why)
+    assert (found.held_out_rmse_before, found.held_out_rmse_after) == (1.0, error / slope)
+    assert found.without_worst_second_after == without / slope
 
 
 @pytest.mark.parametrize(("misfit", "least", "most"), [(1.0, 0.97, 1.0), (4.74, 0.8, 0.88)])
