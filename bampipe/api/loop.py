@@ -260,8 +260,8 @@ def follow(
     for _ in range(MOST_ROUNDS):
         options.run("diagnose", "diagnose", model, left_out)
         diagnosis = _diagnosis(options.root, model)
-        for axis, entry in sorted(diagnosis.axes.items()):
-            tell(f"{model}, {axis}: {entry.verdict.replace('_', ' ')}")
+        for axis, words in sorted(diagnosis.verdicts_in_words.items()):
+            tell(f"{model}, {axis}: {words}")
         found = diagnosis.selected
         if draft and diagnosis.unnamed_axes:
             found = _drafted(options, model, tell) or found

@@ -233,6 +233,17 @@ class DiagnoseResult(Result):
         return f"Not weighed (setting `without`): {', '.join(self.not_weighed)}."
 
     @property
+    def verdicts_in_words(self) -> dict[str, str]:
+        """By axis, in a few words, with what is missing there."""
+        found = {}
+        for axis, entry in self.axes.items():
+            contests = ((name, self.contests.get(name, ())) for name in entry.effects)
+            named = " and ".join(in_words(*one) for one in contests)
+            words = entry.verdict.replace("_", " ")
+            found[axis] = f"{words} {named}".rstrip() if entry.verdict == "missing" else words
+        return found
+
+    @property
     def unnamed_axes(self) -> Names:
         """Axes on which something is left that no effect of the library explains."""
         return tuple(

@@ -134,7 +134,8 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     write_parquet(out / f"models/{config.model}/map_variables.parquet", samples)
     progress(0.97, "a trial that would decide what these do not")
     result = _with_suggestion(_result(found, recipe, config), found, trials, recipe, settings)
-    return _summary(result.write(out), result.limits)
+    headline = "; ".join(f"{axis}: {words}" for axis, words in result.verdicts_in_words.items())
+    return {"headline": headline, **_summary(result.write(out), result.limits)}
 
 
 def _require_known(without: Sequence[str], recipe: Recipe) -> None:

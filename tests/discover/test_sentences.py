@@ -14,6 +14,7 @@ from bampipe.discover.settings import Settings
 from bampipe.results.diagnose import (
     AxisVerdict,
     Contender,
+    DiagnoseResult,
     RefusedEffect,
     Stretch,
     TransientCandidate,
@@ -175,6 +176,9 @@ def test_a_rival_about_as_likely_is_named_in_the_verdict(monkeypatch):
         said = say(monkeypatch, axis, contests={"a:joint": listed})
         assert said.startswith(head)
         assert ("adding a:joint takes" in said) is bool(beside)
+        told = SimpleNamespace(axes={"joint": axis}, contests={"a:joint": listed})
+        words = DiagnoseResult.verdicts_in_words.fget(told)
+        assert words == {"joint": f"missing {head.removeprefix('Joint: ').partition(' is ')[0]}"}
         marked = in_words("a:joint", listed, "`")
         assert marked == (f"`a:joint` or, {beside}, `b:joint`" if beside else "`a:joint`")
 
