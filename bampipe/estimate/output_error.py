@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.errors import InputError
-from bampipe.estimate.bounded import descend
+from bampipe.estimate.bounded import descend, solve_bounded
 
 Array = NDArray[np.float64]
 
@@ -52,6 +52,7 @@ class OutputError:
         at_bound: (n_free,) which parameters ended on a bound.
         normal, moment: by segment, (n_free, n_free) and (n_free,), its part of the normal equations
             at ``p``, initial states eliminated.
+        reached: where the fit ended.
     """
 
     p: Array
@@ -62,6 +63,24 @@ class OutputError:
     iterations: int
     converged: bool
     at_bound: NDArray[np.bool_]
+    reached: _Shot
+
+    def moved_by(self, segments: Sequence[Segment]) -> Array:
+        """How far segments of another model, of the same samples and parameters, move the fit.
+
+        Returns:
+            (n_free,) one Gauss-Newton step, zero where it does not bring them closer than the fit.
+        """
+        here = self.reached
+        other = replace(here, segments=segments, errors=_errors(segments, here.states, here.p))
+        still = np.zeros(here.free.size)
+        try:
+            normal, moment = other.normal_equations()
+        except InputError:  # its motion grows without bound: further off than any
+            return still
+        found = solve_bounded(normal, moment, here.lower - here.value, here.upper - here.value)
+        closer = other.moved(here.value + found.x, 1.0).cost < here.cost
+        return found.x if closer else still
 
 
 @dataclass(frozen=True)
@@ -120,7 +139,7 @@ def fit_output(
     errors = _errors(segments, states, p)
     if not all(np.isfinite(error).all() for error in errors):
         raise _runaway()
-    first = _Shot(segments, free, upper, step, p, states, errors)
+    first = _Shot(segments, free, lower, upper, step, p, states, errors)
     found = descend(first, lower, upper, most_iterations, _TOLERANCE)
     normal = np.array([slope.T @ slope for _, slope in found.last.projected])
     moment = np.array([slope.T @ error for error, slope in found.last.projected])
@@ -133,6 +152,7 @@ def fit_output(
         iterations=found.iterations,
         converged=found.converged,
         at_bound=found.at_bound,
+        reached=replace(found.last),  # without what it has kept for steps that are not taken
     )
 
 
@@ -142,6 +162,7 @@ class _Shot:
 
     segments: Sequence[Segment]
     free: NDArray[np.int64]
+    lower: Array
     upper: Array
     step: Array
     p: Array

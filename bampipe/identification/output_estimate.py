@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -96,17 +97,20 @@ def estimate_by_output_error(
         InputError: too few segments, or the simulated motion grows without bound.
     """
     problem = squares.problem
-    segments = [
-        cut_segments(system, motion, trial, squares.p[:-1])
-        for motion, trial in zip(motions, trials, strict=True)
-    ]
-    if most_samples is not None:
-        segments = _spread(segments, most_samples)
+
+    def cut(model: System) -> list[list[Segment]]:
+        by_trial = [
+            cut_segments(model, motion, trial, squares.p[:-1])
+            for motion, trial in zip(motions, trials, strict=True)
+        ]
+        return by_trial if most_samples is None else _spread(by_trial, most_samples)
+
+    segments = cut(system)
     sd = np.array([*(item.sd for item in system.parameters), 0.0])
     step = np.where(problem.free < len(sd) - 1, _PARAMETER_STEP * sd[problem.free], _TIMING_STEP)
 
     def fit(number: int, start: Array, most: int) -> OutputError:
-        chosen = [segment for trial in segments[:number] for segment in trial]
+        chosen = _joined(segments[:number])
         return fit_output(chosen, start, problem.free, problem.lower, problem.upper, step, most)
 
     progress(0.4, "output error")
@@ -138,11 +142,17 @@ def estimate_by_output_error(
                 problem.upper - value,
             ).x
         held_out[left_out] = p
-    return estimate_of_fit(
+    estimate = estimate_of_fit(
         "output-error", system, motions, problem, found, found.p,
         [held_out[k] for k in folds.groups], [{} for _ in problem.free], rows,
         position_error=dict(zip(system.coordinates, found.rms, strict=True)),
     )  # fmt: skip
+    count = len(estimate.value)
+    return replace(estimate, moved_by=lambda other: found.moved_by(_joined(cut(other)))[:count])
+
+
+def _joined(segments: Sequence[Sequence[Segment]]) -> list[Segment]:
+    return [segment for trial in segments for segment in trial]
 
 
 def _spread(segments: Sequence[Sequence[Segment]], most_samples: int) -> list[list[Segment]]:

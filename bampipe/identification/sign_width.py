@@ -21,10 +21,10 @@ def with_smoothing(estimate: Estimate, recipe: Recipe) -> Estimate:
     """Return the estimate with how far it is from that without smoothing in its covariance.
 
     A machine with dry friction truly stands still, where the model creeps within the width of its
-    smoothed sign. A filter's estimate errs in proportion to that width: it is off by twice what
-    half the width moves it. A machine that does creep shows that by readings which are less likely
-    with the narrower sign. Least squares leaves standstill out and takes the rest off as bias;
-    output error stays as it is.
+    smoothed sign. An estimate by the filter or by output error errs in proportion to that width:
+    it is off by twice what half the width moves it. A machine that does creep shows that by
+    readings that the narrower sign comes less close to. Least squares leaves standstill out and
+    takes the rest off as bias.
 
     Args:
         estimate: as published; recipe: its model as data.
