@@ -17,12 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.errors import InputError
-from bampipe.estimate.bounded import descend, solve_bounded
+from bampipe.estimate.bounded import descend
 
 Array = NDArray[np.float64]
 
 _TOLERANCE = 1e-8
 """Change of the logarithm of the position error below which the fit has converged."""
+_STEPS = 4
+"""With the equations of another model; one step is halved where it leads too far."""
 
 
 @dataclass(frozen=True)
@@ -69,18 +71,15 @@ class OutputError:
         """How far segments of another model, of the same samples and parameters, move the fit.
 
         Returns:
-            (n_free,) one Gauss-Newton step, zero where it does not bring them closer than the fit.
+            (n_free,) some Gauss-Newton steps, zero where they do not come closer than the fit.
         """
         here = self.reached
         other = replace(here, segments=segments, errors=_errors(segments, here.states, here.p))
-        still = np.zeros(here.free.size)
         try:
-            normal, moment = other.normal_equations()
+            found = descend(other, here.lower, here.upper, _STEPS, _TOLERANCE).last
         except InputError:  # its motion grows without bound: further off than any
-            return still
-        found = solve_bounded(normal, moment, here.lower - here.value, here.upper - here.value)
-        closer = other.moved(here.value + found.x, 1.0).cost < here.cost
-        return found.x if closer else still
+            found = here
+        return found.value - here.value if found.cost < here.cost else np.zeros(here.free.size)
 
 
 @dataclass(frozen=True)
