@@ -27,7 +27,7 @@ def test_outputs_and_figures_are_kept():
     assert "/tmp" not in NOTEBOOK.read_text(encoding="utf-8")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_code_gives_the_numbers_that_are_stored(monkeypatch):
     monkeypatch.chdir(NOTEBOOK.parent)
     matplotlib.use("Agg")

@@ -131,6 +131,7 @@ def test_twice_the_same_bytes(run: Path, tmp_path: Path) -> None:
     assert [name for name in first if first[name] != second[name]] == []
 
 
+@pytest.mark.long
 def test_the_report_follows_a_setting_that_changed_no_result(run: Path) -> None:
     page = run / "report" / "report.html"
     kinematics = (run / "filter" / "kinematics.parquet").read_bytes()

@@ -60,7 +60,13 @@ NAMED = [
     ("joint", 41, "shear_thinning:joint", ("stribeck:joint", "quadratic_drag:joint")),
     ("joint", 43, "maxwell_slip:joint", ("presliding:joint", "stribeck:joint")),
     ("joint", 45, "presliding:joint", ("maxwell_slip:joint", "stribeck:joint")),
-    ("bam", 52, "return_spring:yaw", ("upper_stop:yaw", "lower_stop:yaw", "base_tilt")),
+    pytest.param(
+        "bam",
+        52,
+        "return_spring:yaw",
+        ("upper_stop:yaw", "lower_stop:yaw", "base_tilt"),
+        marks=pytest.mark.long,
+    ),
     pytest.param(
         "bam", 53, "upper_stop:yaw", ("return_spring:yaw", "lower_stop:yaw"), marks=pytest.mark.long
     ),

@@ -42,6 +42,7 @@ def run(session, recipe=None):
     return diagnose(session, recipe, system_of(recipe).prior, QUICK)
 
 
+@pytest.mark.long
 def test_an_effect_that_no_mechanism_could_have_is_left_out(monkeypatch):
     recipe = bam(["stribeck:yaw"])
     session = made(recipe, {"stribeck.yaw.force": 1.1, "stribeck.yaw.speed": 0.05})
@@ -73,6 +74,7 @@ def test_an_effect_outside_the_library_is_unknown_until_its_file_is_given():
     assert with_file.axes[0].rmse_after < 1.2 * with_file.axes[0].noise_floor
 
 
+@pytest.mark.long
 def test_what_a_named_effect_leaves_is_said_to_remain():
     recipe = bam(["return_spring:yaw", "snag:yaw"], [SNAG])
     values = SNAGGED | {

@@ -123,6 +123,7 @@ def test_nothing_is_drafted_where_nothing_is_missing(clean):
     assert found.chance[0].p_value > 0.05
 
 
+@pytest.mark.long
 def test_columns_of_the_first_pass_are_those_of_the_compiled_effect(clean, damper):
     """Every shape and factor once: the grammar's text and its columns must say the same."""
     seen = set()

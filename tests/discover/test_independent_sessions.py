@@ -115,6 +115,7 @@ def test_what_the_library_has_no_name_for_is_unknown(tmp_path, machine, seed, ef
     assert others <= {"nothing_missing"}
 
 
+@pytest.mark.long
 def test_two_effects_on_one_axis_are_both_named(tmp_path):
     hidden = ("asymmetric_coulomb:joint", "actuator_lag:current")
     run, _ = record_run(tmp_path, "joint", 31, *hidden)
@@ -128,7 +129,7 @@ def test_two_effects_on_one_axis_are_both_named(tmp_path):
     ("machine", "seed", "effect", "axis"),
     [
         ("joint", 4, "load_dependent_friction:joint", "joint"),
-        ("axis", 4, "asymmetric_coulomb:carriage", "carriage"),
+        pytest.param("axis", 4, "asymmetric_coulomb:carriage", "carriage", marks=pytest.mark.long),
     ],
 )
 def test_effects_of_other_machines_are_named(tmp_path, machine, seed, effect, axis):

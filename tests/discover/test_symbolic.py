@@ -63,6 +63,7 @@ def test_a_bred_expression_and_its_form_have_the_same_value(arm, text):
     assert columns @ strengths == pytest.approx(wanted, rel=1e-5, abs=1e-5)
 
 
+@pytest.mark.long
 def test_what_two_axes_shape_is_found_by_symbolic_regression_alone(arm, monkeypatch):
     pytest.importorskip("pyoperon")
     recipe, clean, screen = arm

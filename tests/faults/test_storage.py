@@ -58,7 +58,10 @@ def disk(toy: Toy) -> Iterator[Callable[[str], None]]:
         subprocess.run(["umount", "-l", str(toy.runs)], check=True)
 
 
-@pytest.mark.parametrize("room", [0, 4096, 8192, 16384, 24576])
+LONG = [pytest.param(room, marks=pytest.mark.long) for room in (4096, 8192, 16384)]
+
+
+@pytest.mark.parametrize("room", [0, *LONG, 24576])
 def test_a_full_disk_is_said_and_costs_nothing(
     toy: Toy, disk: Callable[[str], None], room: int
 ) -> None:

@@ -180,6 +180,7 @@ def test_mistakes_are_told(simulated: RunFolder, tmp_path: Path) -> None:
         identified(simulated, replace(FAST, model="base+none"))
 
 
+@pytest.mark.long
 def test_a_motion_that_no_noise_explains_is_refused(tmp_path: Path) -> None:
     """Force channels that have nothing to do with the motion, and noise that may not grow."""
     run = simulated_run(tmp_path / "wrong", scramble=True)
@@ -254,6 +255,7 @@ def test_a_model_that_bends_with_its_parameters_is_not_led_astray(
         assert abs(entry["estimate"] - value) < 4.0 * entry["sd"], name
 
 
+@pytest.mark.long
 def test_friction_that_falls_within_a_step(tmp_path: Path) -> None:
     """Stribeck friction gone at 17 mm/s, which an axis passes in a few samples.
 
