@@ -7,7 +7,7 @@ a page of our own, ``[words](../s01/report/report.html)``.
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from bampipe.report.wording import prose
@@ -108,6 +108,17 @@ class Table:
     align: str
     widths: tuple[float, ...] = ()
     note: str = ""
+
+    def without_empty_columns(self) -> Table:
+        """Return it without the columns in which no row has anything to say."""
+        full = [k for k in range(len(self.head)) if any(row[k] for row in self.rows)]
+        return replace(
+            self,
+            head=tuple(self.head[k] for k in full),
+            rows=tuple(tuple(row[k] for k in full) for row in self.rows),
+            align="".join(self.align[k] for k in full),
+            widths=tuple(self.widths[k] for k in full) if self.widths else (),
+        )
 
 
 @dataclass(frozen=True)

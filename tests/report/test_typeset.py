@@ -98,3 +98,12 @@ def test_a_table_leaves_no_two_rows_at_the_end_of_a_page(
     ]
     found = first_with_few_rows(blocks, edges)
     assert (found and found["id"]) == expected
+
+
+def test_a_column_in_which_no_row_says_anything_is_left_out() -> None:
+    table = Table(
+        "t", ("Name", "What", "Unit"), (("a", "", "N"), ("b", "", "")), "llr", (0, 1.6, 1)
+    )
+    shown = table.without_empty_columns()
+    assert shown.head == ("Name", "Unit") and shown.rows == (("a", "N"), ("b", ""))
+    assert (shown.align, shown.widths) == ("lr", (0, 1))

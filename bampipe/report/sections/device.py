@@ -46,7 +46,7 @@ def _constants(
         tuple(rows),
         "llrll",
         (0.0, 1.6, 0.0, 0.0, 1.2),
-    )
+    ).without_empty_columns()
 
 
 def _numbers(numbers: Iterable[DeviceNumber]) -> Table:
