@@ -18,10 +18,11 @@ from made_results import filled, write_result
 
 import bampipe
 from bampipe.cli import one_stage, places, show
-from bampipe.cli.loop import suggest_after_loop
+from bampipe.cli.next_step import after_loop, after_run
 from bampipe.errors import InputError
 from bampipe.results.compare import CompareResult
 from bampipe.results.diagnose import DiagnoseResult
+from bampipe.results.draft import DraftResult
 from bampipe.results.ingest import IngestResult
 from bampipe.run.events import Event
 from bampipe.run.pipeline import load
@@ -552,10 +553,18 @@ def test_an_effect_is_not_added_twice(ingested: Path, command: Command) -> None:
 def test_after_the_loop_comes_what_its_last_diagnosis_says(
     ingested: Path, verdict: str, selected: tuple[str, ...], after: str
 ) -> None:
-    assert suggest_after_loop(ingested, "base", "s01") == "bampipe diagnose s01"
+    assert after_loop(ingested, "base", "s01") == "bampipe diagnose s01"
     axes, command = {"yaw": {"verdict": verdict}}, "bampipe draft RUN --model base"
     write_result(ingested, DiagnoseResult, axes=axes, selected=selected, next=command)
-    assert suggest_after_loop(ingested, "base", "s01") == after
+    assert after_loop(ingested, "base", "s01") == after
+
+
+def test_what_has_been_drafted_is_not_asked_for_again(ingested: Path) -> None:
+    axes, command = {"yaw": {"verdict": "unknown_effect"}}, "bampipe draft RUN --model base"
+    write_result(ingested, DiagnoseResult, axes=axes, next=command)
+    write_result(ingested, DraftResult, axes={"yaw": {"chance": [{}]}}, next="record more trials like these")
+    for after in (after_loop, after_run):
+        assert after(ingested, "base", "s01") == "record more trials like these"
 
 
 def test_a_diagnosis_that_is_older_than_its_inputs_is_said(
@@ -586,8 +595,6 @@ def test_a_diagnosis_that_is_older_than_its_inputs_is_said(
 def test_what_to_do_next_is_what_the_diagnosis_stored(
     ingested: Path, command: Command, verdict: str, after: str
 ) -> None:
-    from bampipe.cli.run import suggest_next
-
-    assert suggest_next(ingested, "base", "s01") == "bampipe status s01"
+    assert after_run(ingested, "base", "s01") == "bampipe status s01"
     write_result(ingested, DiagnoseResult, axes={"yaw": {"verdict": verdict}}, next=after)
-    assert suggest_next(ingested, "base", "s01") == after.replace("RUN", "s01")
+    assert after_run(ingested, "base", "s01") == after.replace("RUN", "s01")

@@ -9,6 +9,7 @@ import typer
 
 from bampipe.cli import places, show
 from bampipe.cli.forecast import say_what_came
+from bampipe.cli.next_step import after_loop
 from bampipe.cli.one_stage import advise, one_stage, print_settings, whole_pipeline
 from bampipe.cli.options import (
     DEFAULTS,
@@ -159,28 +160,7 @@ def extend(
     show.say(f"{root}: {last}")
     show.summary(ladder)
     name = places.next_to(root, runs)
-    advise(
-        quiet, json, suggest_after_loop(root, last, name) if auto else f"bampipe diagnose {name}"
-    )
-
-
-def suggest_after_loop(root: Path, model: str, name: str) -> str:
-    """Return what to do after the loop has ended with ``model``, as its diagnosis has it.
-
-    Args:
-        root: the run folder; name: how to call it in a command.
-    """
-    from bampipe.results.diagnose import DiagnoseResult
-
-    run = RunFolder(root)
-    if not run.exists(DiagnoseResult.file(model)):  # stopped after many rounds
-        return f"bampipe diagnose {name}"
-    found = run.read(DiagnoseResult, model)
-    lacking = any(axis.verdict != "nothing_missing" for axis in found.axes.values())
-    # What a diagnosis selects and the loop has not added makes no better model.
-    if found.selected or not lacking:
-        return f"bampipe report {name} --open"
-    return found.next.replace("RUN", name)
+    advise(quiet, json, after_loop(root, last, name) if auto else f"bampipe diagnose {name}")
 
 
 def _is_effect(argument: str) -> bool:

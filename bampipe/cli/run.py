@@ -11,6 +11,7 @@ import typer
 from bampipe.cli import places, show
 from bampipe.cli.forecast import say_what_came
 from bampipe.cli.lab import refresh
+from bampipe.cli.next_step import after_run
 from bampipe.cli.one_stage import advise, assignments
 from bampipe.cli.options import (
     RUNS,
@@ -21,7 +22,6 @@ from bampipe.cli.options import (
     QuietOption,
     RunsOption,
 )
-from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError
 from bampipe.run import batch
 from bampipe.run import junit as junit_xml
@@ -148,7 +148,7 @@ def run(
         say_what_came(outcomes[0].root, one, f"diagnose:{one}" in made)
     if not several:
         name = places.next_to(requests[0].root, runs)
-        advise(quiet, json, suggest_next(outcomes[0].root, outcomes[0].model, name))
+        advise(quiet, json, after_run(outcomes[0].root, outcomes[0].model, name))
     code = max(outcome.exit_code for outcome in outcomes)
     if code:
         raise typer.Exit(code)
@@ -212,29 +212,3 @@ def _report_runs(outcomes: Sequence[Outcome], several: bool, json: bool) -> None
         show.table(["session", "state", "seconds", ""], rows)
     else:
         show.outcome(outcomes[0])
-
-
-def suggest_next(root: Path, model: str, name: str) -> str:
-    """Return what to do after a run, as the results of the ``model`` that counts have it.
-
-    Args:
-        root: the run folder; name: how to call it in a command.
-    """
-    from bampipe.results.diagnose import DiagnoseResult
-    from bampipe.results.setup import SetupResult
-    from bampipe.results.validate import ValidateResult
-
-    run = RunFolder(root)
-    if run.exists(SetupResult.FILE) and run.read(SetupResult).mistakes:
-        return "correct the session file as the first line says, and run it again"
-    if run.exists(DiagnoseResult.file(model)):
-        found = run.read(DiagnoseResult, model)
-        if any(axis.verdict != "nothing_missing" for axis in found.axes.values()):
-            return found.next.replace("RUN", name)
-    elif run.exists(ValidateResult.file(model)):
-        errors = run.read(ValidateResult, model).axes.values()
-        if any(error.standing == "above_floor" for error in errors):
-            return f"bampipe diagnose {name}"
-    if run.exists("report/report.pdf"):
-        return f"open {root / 'report' / 'report.pdf'}"
-    return f"bampipe status {name}"

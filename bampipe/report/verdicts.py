@@ -133,7 +133,7 @@ def _wrong_floors(results: Results, validated: ValidateResult) -> dict[str, str]
 
 
 def _ratios(ratios: dict[str, float]) -> str:
-    parts = (f"{axis} {wording.plain(ratio, 2)} ×" for axis, ratio in ratios.items())
+    parts = (f"{axis} {wording.significant(ratio)} ×" for axis, ratio in ratios.items())
     return f"{join_names(parts)} the noise floor"
 
 

@@ -1,0 +1,57 @@
+"""What to do next, as the results of a run have it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from bampipe.data.run_folder import RunFolder
+
+
+def after_run(root: Path, model: str, name: str) -> str:
+    """Return what to do after a run.
+
+    Args:
+        root: the run folder; model: that counts; name: how to call the run in a command.
+    """
+    from bampipe.results.diagnose import DiagnoseResult
+    from bampipe.results.setup import SetupResult
+    from bampipe.results.validate import ValidateResult
+
+    run = RunFolder(root)
+    if run.exists(SetupResult.FILE) and run.read(SetupResult).mistakes:
+        return "correct the session file as the first line says, and run it again"
+    if run.exists(DiagnoseResult.file(model)):
+        found = run.read(DiagnoseResult, model)
+        if any(axis.verdict != "nothing_missing" for axis in found.axes.values()):
+            return _after_diagnosis(run, model, found.next).replace("RUN", name)
+    elif run.exists(ValidateResult.file(model)):
+        errors = run.read(ValidateResult, model).axes.values()
+        if any(error.standing == "above_floor" for error in errors):
+            return f"bampipe diagnose {name}"
+    if run.exists("report/report.pdf"):
+        return f"open {root / 'report' / 'report.pdf'}"
+    return f"bampipe status {name}"
+
+
+def after_loop(root: Path, model: str, name: str) -> str:
+    """Return what to do after the loop has ended with ``model``; arguments as for `after_run`."""
+    from bampipe.results.diagnose import DiagnoseResult
+
+    run = RunFolder(root)
+    if not run.exists(DiagnoseResult.file(model)):  # stopped after many rounds
+        return f"bampipe diagnose {name}"
+    found = run.read(DiagnoseResult, model)
+    lacking = any(axis.verdict != "nothing_missing" for axis in found.axes.values())
+    # What a diagnosis selects and the loop has not added makes no better model.
+    if found.selected or not lacking:
+        return f"bampipe report {name} --open"
+    return _after_diagnosis(run, model, found.next).replace("RUN", name)
+
+
+def _after_diagnosis(run: RunFolder, model: str, said: str) -> str:
+    """Return what a diagnosis said; where that is to draft and it is done, what came of that."""
+    from bampipe.results.draft import DraftResult
+
+    if said.startswith("bampipe draft ") and run.exists(DraftResult.file(model)):
+        return run.read(DraftResult, model).next
+    return said
