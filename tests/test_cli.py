@@ -562,7 +562,9 @@ def test_after_the_loop_comes_what_its_last_diagnosis_says(
 def test_what_has_been_drafted_is_not_asked_for_again(ingested: Path) -> None:
     axes, command = {"yaw": {"verdict": "unknown_effect"}}, "bampipe draft RUN --model base"
     write_result(ingested, DiagnoseResult, axes=axes, next=command)
-    write_result(ingested, DraftResult, axes={"yaw": {"chance": [{}]}}, next="record more trials like these")
+    write_result(
+        ingested, DraftResult, axes={"yaw": {"chance": [{}]}}, next="record more trials like these"
+    )
     for after in (after_loop, after_run):
         assert after(ingested, "base", "s01") == "record more trials like these"
 
