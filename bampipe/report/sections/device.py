@@ -41,7 +41,7 @@ def _constants(
             )
         )
     return Table(
-        f"Numbers that the device file takes from drawings{results.in_paper('Table II')}",
+        f"Numbers that the device file gives, none of them estimated{results.in_paper('Table II')}",
         ("Name", "What", "Value", "Unit", "Source"),
         tuple(rows),
         "llrll",
