@@ -401,6 +401,25 @@ def test_a_session_without_results_opens(opened: Opened, tmp_path: Path, empty: 
         page.get_by_role("button", name="Trial after").click()
 
 
+@pytest.mark.parametrize("diagnosed", [True, False])
+def test_correlations_come_with_the_variables_of_a_diagnosis(
+    opened: Opened, run: Path, tmp_path: Path, diagnosed: bool
+) -> None:
+    root = tmp_path / "s05"
+    shutil.copytree(run, root)
+    if not diagnosed:
+        for path in root.glob("models/*/*"):
+            if path.name in ("diagnose.json", "map_variables.parquet"):
+                path.unlink()
+    path = tmp_path / "page.html"
+    path.write_text(explorer_page(Results(root), ""))
+    page = opened(path)
+    assert figure(page, "autocorrelation of the residual").count() == 1
+    drawn = page.locator("figure.plot").filter(has_text="correlation with motion and load")
+    assert drawn.count() == int(diagnosed)
+    assert page.get_by_text("No diagnosis of").count() == int(not diagnosed)
+
+
 @pytest.mark.slow
 def test_eight_channels_of_a_million_samples(opened: Opened, tmp_path: Path) -> None:
     """Everything else must wait for these: 13.4 MB, 1.5 s to ready, 82 ms a zoom."""

@@ -19,6 +19,8 @@ function buildStructure() {
     title: `autocorrelation of the residual ${axis}`, xLabel: "lag (s)", yLabel: "correlation", height: 240,
     label: `Autocorrelation of the residual of ${axis} in view, with 95 % bounds`,
   });
+  delete structure.causes;
+  if (!variablesOf(axis).length) return; // variables come with the maps of a diagnosis
   structure.causes = new Figure(host, {
     title: `residual ${axis}: correlation with motion and load`, xLabel: "the strongest first; all of them in the CSV", yLabel: "correlation", height: 260,
     label: `Correlation of the residual of ${axis} in view with each variable, with 95 % intervals`,
@@ -68,7 +70,7 @@ function drawStructure() {
     });
     structure.lags.drawKey();
   }
-  drawCauses(residuals.at(-1));
+  if (structure.causes) drawCauses(residuals.at(-1));
 }
 
 /** The correlation of one residual with each variable of the maps. */
