@@ -16,7 +16,7 @@ from bampipe.physics import System, compile_model
 from bampipe.physics.recipe import Recipe
 from bampipe.results.ingest import IngestResult
 from bampipe.trials.motion import Motion
-from bampipe.trials.signals import Signals, calibration_changes
+from bampipe.trials.signals import ZERO_OF, Signals, calibration_changes
 
 Array = NDArray[np.float64]
 
@@ -40,7 +40,8 @@ def propagate_calibration(
     """Return by how much one standard uncertainty of each source moves the estimates, (n,) each.
 
     Sources are gains and cross-talk of sensors and scales of encoders and channels as the session
-    file states them, and constants of the device file with an ``sd``; they are independent. A
+    file states them, zeros of encoders, and constants of the device file with an ``sd``; they are
+    independent. A
     parameter moves as least squares would near the estimate (law of propagation of uncertainty,
     JCGM 100:2008, 5.1), whichever method made it; one at its bound stays.
 
@@ -110,9 +111,11 @@ def _sources(system: System, recipe: Recipe, session: IngestResult) -> Iterator[
 
 
 def describe_calibration(estimate: Estimate, moved: Mapping[str, Array]) -> tuple[str, ...]:
-    """A sentence on what calibration adds; none where no uncertainty is stated."""
-    if not moved:
-        return ()
+    """A sentence on what calibration adds, or that it is not stated."""
+    if all(name.startswith(ZERO_OF) for name in moved):
+        return (
+            "No uncertainty of gains, scales and constants is stated: the intervals hold none.",
+        )
     sd = estimate.sd
     shares = {
         name: float(np.max(np.abs(step) / np.maximum(sd, np.finfo(float).tiny)))

@@ -48,8 +48,8 @@ class ParameterEstimate(Record):
     )
     calibration_sd: Size | None = Field(
         default=None,
-        description="Part of sd that comes from sensors and constants known so well only; null "
-        "where no such uncertainty is stated",
+        description="Part of sd that comes from sensors and constants known so well only, zeros "
+        "of encoders to a step among them; null where there is none",
     )
     statistical_sd: Size | None = Field(
         default=None, description="The rest of sd, null where all of it is statistical"

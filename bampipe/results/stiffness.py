@@ -62,7 +62,7 @@ class AxisStiffness(Record):
         "could change by"
     )
     calibration_sd: Size = Field(
-        description="Part that the stated uncertainty of sensors makes; 0 where none is stated"
+        description="Part that what is stated of sensors makes, and the zeros of encoders"
     )
     cycle_scatter: Size = Field(description="Standard deviation over the cycles")
     unit: str = Field(description="Of the stiffness: N.m/rad or N/m")

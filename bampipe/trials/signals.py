@@ -16,6 +16,9 @@ from bampipe.trials.motion import Motion
 
 Array = NDArray[np.float64]
 
+ZERO_OF = "zero of "
+"""What the uncertainty of an encoder's zero is called, before its axis."""
+
 
 @dataclass(frozen=True)
 class Signals:
@@ -27,6 +30,8 @@ class Signals:
         gain: (n, n), offset: (n,): value = gain @ raw + offset.
         gain_sd: (n, n) standard uncertainty of the calibration, as a share: value' = (1 + that)
             @ value.
+        offset_sd: (n,) that of the offset: the zero of an encoder is known to a step, whether it
+            rounds or cuts (rectangular distribution, JCGM 100:2008, 4.3.7).
     """
 
     axes: tuple[str, ...]
@@ -38,6 +43,7 @@ class Signals:
     gain: Array
     offset: Array
     gain_sd: Array
+    offset_sd: Array
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -71,9 +77,11 @@ class Signals:
         stated = [session.axes[axis].raw_unit or session.axes[axis].unit for axis in axes]
         stated += [_stated(name, session) for name in inputs]
         gain, offset = np.eye(len(axes) + len(inputs)), np.zeros(len(axes) + len(inputs))
+        offset_sd = np.zeros_like(offset)
         for i, axis in enumerate(axes):
             encoder = session.axes[axis]
             gain[i, i], offset[i] = encoder.scale, -encoder.scale * encoder.zero
+            offset_sd[i] = encoder.resolution / np.sqrt(3.0)
         for i, name in enumerate(inputs, len(axes)):
             if name in session.channels:
                 channel = session.channels[name]
@@ -100,8 +108,9 @@ class Signals:
                 else 0.0
             )
         return cls(
-            axes, forces, channels, brakes, tuple(units), tuple(stated), gain, offset, gain_sd
-        )
+            axes, forces, channels, brakes, tuple(units), tuple(stated), gain, offset, gain_sd,
+            offset_sd,
+        )  # fmt: skip
 
 
 def _stated(name: str, session: IngestResult) -> str:
@@ -174,3 +183,7 @@ def calibration_changes(signals: Signals) -> Iterator[tuple[str, Change]]:
         change.gain[row, column] += signals.gain_sd[row, column]
         one, other = signals.names[row], signals.names[column]
         yield f"scale of {one}" if row == column else f"{other} in {one}", change
+    for row in np.flatnonzero(signals.offset_sd):
+        change = Change.none(len(signals.names))
+        change.offset[row] = signals.offset_sd[row]
+        yield f"{ZERO_OF}{signals.names[row]}", change

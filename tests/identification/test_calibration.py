@@ -53,7 +53,7 @@ def test_what_scales_the_input_scales_all(tmp_path, bare, pattern, new, file) ->
         # Of least squares as it stands: its bias is taken off what is published.
         part, share = entry.calibration_sd, SHARE * abs(entry.estimate)
         assert part == pytest.approx(share, rel=0.02, abs=0.1 * entry.statistical_sd), name
-        assert entry.statistical_sd == pytest.approx(bare[name].sd, rel=1e-6)
+        assert entry.statistical_sd == pytest.approx(bare[name].statistical_sd, rel=1e-6)
         total = np.hypot(entry.statistical_sd, entry.calibration_sd)
         assert entry.sd == pytest.approx(total, rel=1e-6)
 
@@ -76,7 +76,21 @@ def test_an_interval_holds_the_truth_of_a_sensor_that_errs(tmp_path, bare) -> No
     stated = set_text('unit = "A" }', f'unit = "A", scale_sd = {SHARE} }}')
     for name, entry in parameters_of(tmp_path, off, stated).items():
         assert abs(entry.estimate - bare[name].estimate) < 1.3 * entry.sd, name
-    assert all(entry.calibration_sd is None for entry in bare.values())
+    assert all(entry.calibration_sd < 0.1 * entry.sd for entry in bare.values())
+
+
+def test_the_zero_of_an_encoder_is_known_to_a_step(tmp_path) -> None:
+    """It turns gravity: the moments across and along the zero move as the arm's angle does."""
+    step = 2e-3
+    found = parameters_of(tmp_path, set_text("resolution = 5e-05", f"resolution = {step}"))
+    turned = step / np.sqrt(3.0)
+    across, moment = found["moment_across"], found["moment"]
+    assert across.calibration_sd == pytest.approx(abs(moment.estimate) * turned, rel=0.05)
+    assert moment.calibration_sd == pytest.approx(
+        abs(across.estimate) * turned, abs=0.1 * moment.sd
+    )
+    for name in ("inertia", "viscous.joint", "coulomb.joint"):
+        assert found[name].calibration_sd < 0.1 * found[name].sd, name
 
 
 def test_a_stiffness_is_as_uncertain_as_its_force(tmp_path) -> None:

@@ -26,6 +26,8 @@ from bampipe.results.intervals import NORMAL_95
 from bampipe.results.validate import ValidateResult
 
 TITLE = "Identification"
+_WORTH_A_COLUMN = 0.1
+"""Share of an SD from which on a table gives the part that calibration has in it."""
 _COLUMNS = (2, 3, 4)
 """Of panels: those that leave the fewest places empty, and of these the least."""
 _DASHES = ("-", (0, (5, 1.5)), (0, (1.5, 1.2)), (0, (5, 1.5, 1, 1.5)))
@@ -70,7 +72,10 @@ def _parameters(results: Results, identified: IdentifyResult) -> Table:
         if method != identified.method and tried.parameters
     ]
     bounded = any(parameters[name].bound_sd is not None for name in names)
-    calibrated = any(parameters[name].calibration_sd is not None for name in names)
+    calibrated = any(
+        (entry.calibration_sd or 0.0) > _WORTH_A_COLUMN * (entry.sd or math.inf)
+        for entry in parameters.values()
+    )
     rows = []
     for name in names:
         entry = parameters[name]
@@ -83,7 +88,7 @@ def _parameters(results: Results, identified: IdentifyResult) -> Table:
                 f"`{name}`",
                 wording.plain(value, *digits) + (" *" if entry.at_bound else ""),
                 wording.significant(sd, 2) if sd else "fixed",
-                *((wording.significant(entry.calibration_sd, 2),) if calibrated else ()),
+                *((wording.significant(entry.calibration_sd or 0.0, 2),) if calibrated else ()),
                 *((wording.significant(entry.bound_sd, 2),) if bounded else ()),
                 wording.interval(value - half, value + half, sd) if sd else "–",
                 *(
@@ -96,10 +101,9 @@ def _parameters(results: Results, identified: IdentifyResult) -> Table:
     note = f"Interval: estimate ± 1.96 standard deviations{_caveat(results)}."
     if calibrated:
         note += (
-            " Calibration: the part of SD that the stated uncertainty of sensors and constants is."
+            " Calibration: the part of SD that comes from what is stated of sensors and constants,"
+            " and from the zeros of encoders, known to a step."
         )
-    else:
-        note += " No calibration uncertainty is stated, so that no interval holds any."
     if bounded:
         note += " Bound: the least SD that these sensors allow on these trials (Cramér-Rao)."
     if others:
