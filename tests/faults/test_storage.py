@@ -96,7 +96,9 @@ def test_a_read_only_disk_is_said_and_can_still_be_read(
     assert verify(toy.root) == []
 
 
-@pytest.mark.parametrize("limit", [0, 60, 300, 1500])
+@pytest.mark.parametrize(
+    "limit", [*(pytest.param(n, marks=pytest.mark.long) for n in (0, 1500)), 60, 300]
+)
 def test_a_file_that_may_not_grow_is_said(toy: Toy, limit: int) -> None:
     assert bampipe(toy).returncode == 0
     good = toy.files()

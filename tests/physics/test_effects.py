@@ -378,8 +378,12 @@ def recorded(system, p, braked):
     return *seen, u, t
 
 
-PLACES = ("", "yaw", "extension", "x", "z", "xy", "yaw-extension")
-RECOVERED = [c for c in CASES if c.partition(":")[2] in PLACES]
+PLACES = ("", "yaw", "x", "xy", "yaw-extension")
+ELSEWHERE = ("extension", "z")
+RECOVERED = [
+    *(c for c in CASES if c.partition(":")[2] in PLACES),
+    *(pytest.param(c, marks=pytest.mark.long) for c in CASES if c.partition(":")[2] in ELSEWHERE),
+]
 
 
 @pytest.mark.parametrize("case", RECOVERED)
