@@ -16,7 +16,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.polynomial.polynomial import polyder, polyval, polyvander
 from numpy.typing import NDArray
-from scipy.interpolate import PchipInterpolator
+from scipy.interpolate import CubicSpline, PchipInterpolator
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -65,13 +65,32 @@ class UniformGrid:
     def resample(self, values: Array) -> Array:
         """Return ``values`` (N,) on the grid (T,).
 
-        Between samples by monotone cubic interpolation (Fritsch and Butland 1984), which does
-        not overshoot the steps of a quantised signal.
+        By a cubic spline, whose error falls with the fourth power of the sampling interval (de
+        Boor 1978, A Practical Guide to Splines); across gaps by monotone cubic interpolation
+        (Fritsch and Butland 1984), which does not overshoot.
         """
         if self.exact:
             return np.array(values, dtype=np.float64)
         inside = np.clip(self.t, self.source[0], self.source[-1])
-        return np.asarray(PchipInterpolator(self.source, values)(inside), dtype=np.float64)
+        t, values = _well_apart(self.source, values, (self.t[-1] - self.t[0]) / len(self.t) / 4)
+        monotone = PchipInterpolator(t, values)
+        if len(t) < 4:
+            return np.asarray(monotone(inside), dtype=np.float64)
+        on_grid = np.asarray(CubicSpline(t, values)(inside), dtype=np.float64)
+        on_grid[self.bridged] = monotone(inside[self.bridged])
+        return on_grid
+
+
+def _well_apart(t: Array, values: Array, closest: float) -> tuple[Array, Array]:
+    """Stamps (N,) and values (N,), those of stamps closer to each other than ``closest`` averaged.
+
+    A spline follows noise along the slope between two stamps, which has no bound as they approach.
+    """
+    group = np.concatenate(([0], np.cumsum(np.diff(t) >= closest)))
+    if group[-1] == 0 or group[-1] == len(t) - 1:
+        return t, values
+    size = np.bincount(group)
+    return np.bincount(group, t) / size, np.bincount(group, values) / size
 
 
 def uniform_grid(t: Array, rate_hz: float) -> UniformGrid:

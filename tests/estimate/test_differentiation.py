@@ -187,6 +187,22 @@ class TestUniformGrid:
         error = np.abs(grid.resample(signal) - np.sin(2 * np.pi * 2.0 * grid.t))
         assert np.max(error[~grid.bridged]) < 5e-4
 
+    def test_jitter_leaves_fast_motion_as_it_is(self) -> None:
+        """Eight samples a period, as of a damper shaken at 60 Hz and recorded at 500."""
+        rng = np.random.default_rng(1)
+        t = np.cumsum((1.0 + 0.14 * rng.standard_normal(2000)) / RATE)
+        turn = 2 * np.pi * RATE / 8.0
+        grid = uniform_grid(t, RATE)
+        error = grid.resample(np.sin(turn * t)) - np.sin(turn * grid.t)
+        assert np.std(error[20:-20]) < 2e-3
+
+    def test_stamps_that_nearly_coincide_do_not_throw_the_rest(self) -> None:
+        rng = np.random.default_rng(2)
+        t = np.arange(400) / RATE
+        t[1::7] = t[0::7][: len(t[1::7])] + 1e-7
+        noise = rng.standard_normal(len(t))
+        assert np.std(uniform_grid(t, RATE).resample(noise)) < 1.2
+
     def test_a_command_is_held(self) -> None:
         t = np.array([0.0, 0.002, 0.0041, 0.008, 0.010])
         held = uniform_grid(t, RATE).hold(np.array([0.0, 1.0, 2.0, 3.0, 4.0]))

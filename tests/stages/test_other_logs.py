@@ -107,7 +107,7 @@ def test_degrees_milliamperes_and_decimal_commas(tmp_path):
     check(samples)
     assert about["channels"]["current"]["unit"] == "A"
     assert trial["status"] == "ok" and "decimal commas" in trial["repairs"]
-    assert "time stamps jitter by" in trial["repairs"] and "monotone cubic" in trial["repairs"]
+    assert "time stamps jitter by" in trial["repairs"] and "cubic spline" in trial["repairs"]
 
 
 @pytest.mark.parametrize(

@@ -188,7 +188,7 @@ def note_clock(table: TrialTable) -> None:
         table.notes.append(
             f"time stamps jitter by {jitter * 1e3:.3g} ms (standard deviation), from"
             f" {steps.min() * 1e3:.3g} to {steps[~gaps].max() * 1e3:.3g} ms between samples:"
-            " put on a uniform grid by monotone cubic interpolation when filtered"
+            " put on a uniform grid by a cubic spline when filtered"
         )
     nominal = table.session.sample_rate
     # The mean, and not the median: a clock of whole milliseconds steps by 10 and 12 ms at 94 Hz.
