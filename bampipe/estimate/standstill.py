@@ -13,7 +13,7 @@ from bampipe.estimate.low_pass import Band
 Array = NDArray[np.float64]
 
 REST_S = 0.03
-"""A change of direction is shorter than this, a rest is longer, s."""
+"""A rest is longer than this, s, beyond what a change of direction takes by itself."""
 REST_SPEED = 5.0
 """Speed below which an axis may rest, in standard deviations of the velocity."""
 _BRAKED_SPEED = 10.0
@@ -29,7 +29,8 @@ def find_standstill(
     """Tell where an axis stands still.
 
     An axis rests where its velocity stays within five of its standard deviations, where its sign
-    is noise, for longer than 0.03 s; where its brake is on, within ten, however shortly.
+    is noise, for longer than 0.03 s beyond what it takes to turn round; where its brake is on,
+    within ten, however shortly. How friction builds up in a slow turn is seen nowhere else.
 
     Args:
         qd: (T, n_q) velocity; qd_sd: (T, n_q) or (n_q,) its standard deviation; rate_hz: of the
@@ -39,15 +40,30 @@ def find_standstill(
     Returns:
         (T, n_q).
     """
-    still = np.abs(qd) < REST_SPEED * qd_sd
+    slow = REST_SPEED * np.broadcast_to(qd_sd, qd.shape)
+    still = np.abs(qd) < slow
     longest = int(REST_S * rate_hz)
-    for column in still.T:
+    for column, v, limit in zip(still.T, qd.T, slow.T, strict=True):
         edges = np.flatnonzero(np.diff(np.concatenate([[0], column.astype(int), [0]])))
         for start, end in zip(edges[::2], edges[1::2], strict=True):
-            column[start:end] = end - start > longest
+            column[start:end] = end - start - _turning(v, limit, start, end) > longest
     if braked is not None:
         still |= (np.abs(qd) < _BRAKED_SPEED * qd_sd) & braked
     return still
+
+
+def _turning(v: Array, limit: Array, start: int, end: int) -> float:
+    """Samples that a change of direction takes from ``-limit`` to ``limit``, of ``start:end``.
+
+    At the acceleration of the same time before and after; zero where the velocity (T,) does not
+    change its sign, or where the trial begins or ends.
+    """
+    length = end - start
+    before, after = start - 1 - length, end + length
+    if before < 0 or after >= len(v) or v[start - 1] * v[end] >= 0.0:
+        return 0.0
+    outside = abs(v[start - 1] - v[before]) + abs(v[after] - v[end])
+    return float(2.0 * limit[start:end].mean() * 2.0 * length / max(outside, 1e-30))
 
 
 def find_moving_samples(rest: NDArray[np.bool_], band: Band) -> NDArray[np.bool_]:
@@ -59,4 +75,7 @@ def find_moving_samples(rest: NDArray[np.bool_], band: Band) -> NDArray[np.bool_
     Returns:
         (K, n_q).
     """
-    return np.asarray(np.abs(band.thin(rest.astype(float))) < _REACH)
+    reached = np.abs(band.thin(rest.astype(float))) >= _REACH
+    # The response to a rest rings: where it passes zero between two lobes the rest acts, too.
+    reached[1:-1] |= reached[:-2] & reached[2:]
+    return ~reached

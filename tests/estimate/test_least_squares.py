@@ -13,7 +13,7 @@ from bampipe.estimate.butterworth import zero_phase
 from bampipe.estimate.influence import find_worst_stretch
 from bampipe.estimate.least_squares import Problem, fit, stacked_residual
 from bampipe.estimate.low_pass import Band
-from bampipe.estimate.standstill import find_standstill
+from bampipe.estimate.standstill import find_moving_samples, find_standstill
 
 BOUNDS = (np.array([0.0, 0.0, 0.01]), np.array([np.inf, np.inf, np.inf]))
 
@@ -138,6 +138,29 @@ def test_rest_is_told_from_a_change_of_direction() -> None:
     still = find_standstill(qd, np.full_like(qd, 1e-3), RATE)
     assert still[1001:1199].all()
     assert not still[:990].any()
+
+
+def test_a_slow_change_of_direction_is_no_rest() -> None:
+    """The velocity stays within its noise for 0.16 s, and a rest of 0.1 s within the same noise."""
+    t = np.arange(-2.0, 2.0, 1.0 / RATE)[:, None]
+    sd = np.full_like(t, 1e-3)
+    turning = np.abs(0.0625 * t) < 5e-3
+    assert np.sum(turning) / RATE == pytest.approx(0.16, abs=0.01)
+    assert not find_standstill(0.0625 * t, sd, RATE).any()
+    rests = 0.0625 * np.sign(t) * np.maximum(np.abs(t) - 0.05, 0.0)
+    still = find_standstill(rests, sd, RATE)
+    np.testing.assert_array_equal(still, np.abs(rests) < 5e-3)
+
+
+def test_no_sample_between_two_that_a_rest_reaches_counts() -> None:
+    """The low-passed rest passes zero there, which makes none of its friction small."""
+    band = Band(RATE, (8.0,), 0.1)
+    rest = np.zeros((4000, 1), dtype=bool)
+    rest[2000:2016] = True
+    used = find_moving_samples(rest, band)[:, 0]
+    left_out = np.flatnonzero(~used)
+    alone = used[1:-1] & ~used[:-2] & ~used[2:]
+    assert left_out.size and not alone.any()
 
 
 def test_a_brake_may_hold_an_axis_at_every_change_of_direction() -> None:
