@@ -54,7 +54,8 @@ def describe_terms(evidence: Evidence, p: Array, covariance: Covariance, model: 
     """Return the equations of a model with its numbers, and the curve of each term.
 
     A curve is the force that the term takes: the residual of the model without it minus that of the
-    model, both low-passed, in bins of the variable that explains most of its variance. Of a long
+    model, in bins of the variable that explains most of its variance. Nothing is low-passed: what
+    was measured cancels, and a force low-passed against a motion that is not would bend. Of a long
     session, trials drawn from all are binned (`draw_trials`).
 
     Args:
@@ -114,9 +115,9 @@ def _parts(system: System) -> Iterator[_Part]:
 
 
 def _residual(evidence: Evidence, p: Array) -> Array:
-    """Return the residual over all trials, low-passed and thinned, (K, n_q)."""
-    trials = range(len(evidence.motions))
-    return np.concatenate([evidence.band.thin(evidence.unfiltered_residual(k, p)) for k in trials])
+    """Return the residual over all trials, thinned, (K, n_q)."""
+    found = (evidence.unfiltered_residual(k, p) for k in range(len(evidence.motions)))
+    return np.concatenate([one[evidence.band.thinned_rows(len(one))] for one in found])
 
 
 def _curves(

@@ -47,8 +47,8 @@ def section(results: Results) -> Section | None:
     if friction:
         curves = [curve for term in friction for curve in term.curves[:1]]
         caption = (
-            "Friction as identified: the force that it takes, low-passed as the trials are, with "
-            "its 95 % band, over the motion that it was learned from."
+            "Friction as identified: the force that it takes, with its 95 % band, over the motion "
+            "that it was learned from."
         )
         blocks.append(_curves("friction", curves, caption))
     shown: set[str] = set()
@@ -126,9 +126,7 @@ def _pictures(results: Results, term: ModelTerm, name: str, shown: set[str]) -> 
     blocks: list[Block] = []
     if term.curves and not curves:
         blocks.append(
-            Paragraph(
-                "No single variable carries a fifth of its low-passed force: no curve is drawn."
-            )
+            Paragraph("No single variable carries a fifth of its force: no curve is drawn.")
         )
     found = _window(results, term)
     if found is None or found.added in shown:
