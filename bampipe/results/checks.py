@@ -44,10 +44,9 @@ def find_failed_checks(
             f"input timing: {round_with_sd(1e3 * timing.estimate, 1e3 * timing.sd)} ms, at its"
             f" limit of half a sample: {LACKS_TIMING}, or the clocks disagree"
         )
-    for axis, tests in (identified.innovations or {}).items():
-        # A filter that is not published may be at fault itself where the model is at its floor.
-        if identified.method != "ukf" and axis in errors and errors[axis].standing == "at_floor":
-            continue
+    # The innovations of a filter that is not published speak of its own parameters.
+    tested = identified.innovations if identified.method == "ukf" else None
+    for axis, tests in (tested or {}).items():
         white, independent = tests.whiteness, tests.inputs
         if (white and not white.white) or (independent and not independent.independent):
             yield f"{axis}, innovations: {tests.sentence}"

@@ -98,6 +98,7 @@ def _trials(trials: Mapping[str, TrialGrowth]) -> Table:
 
 
 def _innovations(results: Results, tests: Mapping[str, InnovationTests], published: bool) -> Table:
+    """Tabulate the tests, in words only where the filter's parameters are those published."""
     rows = []
     for axis in verdicts.ordered(results, tests):
         own, driven = tests[axis].whiteness, tests[axis].inputs
@@ -108,8 +109,16 @@ def _innovations(results: Results, tests: Mapping[str, InnovationTests], publish
                 wording.percent(own.share if own else None),
                 _outcome(driven.independent if driven else None),
                 wording.percent(driven.share if driven else None),
-                tests[axis].sentence,
+                tests[axis].sentence if published else "",
             )
+        )
+    note = (
+        "White: Ljung-Box over one second. Inputs: regression on the inputs up to half a second "
+        "back. Share: of the variance that is predictable beyond chance."
+    )
+    if not published:
+        note += (
+            " The filter's parameters are not those published: a failure may speak of them alone."
         )
     return Table(
         "Innovations of the filter",
@@ -117,10 +126,8 @@ def _innovations(results: Results, tests: Mapping[str, InnovationTests], publish
         tuple(rows),
         "llrlrl",
         (0.0, 0.0, 0.0, 0.0, 0.0, 1.0),
-        "White: Ljung-Box over one second. Inputs: regression on the inputs up to half a second "
-        "back. Share: of the variance that is predictable beyond chance."
-        + ("" if published else " The filter's parameters are not those published."),
-    )
+        note,
+    ).without_empty_columns()
 
 
 def _outcome(passed: bool | None) -> str:
