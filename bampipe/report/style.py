@@ -9,12 +9,14 @@ import io
 import textwrap
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
+from itertools import pairwise
 from typing import Any
 
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from bampipe.report import wording
 
@@ -47,6 +49,7 @@ _LABEL = 30
 _LETTER, _HANDLE = 0.058, 0.42
 """Widths in a legend, inches: of a letter on average, and of what stands before the words."""
 _MOST_LEGEND_COLUMNS = 4
+_FEWER_TICKS = (6, 5, 4, 3, 2)
 
 WIDTH = 6.69
 """Width of the text in print, inches: figures are drawn at the size at which they are printed."""
@@ -132,9 +135,33 @@ def beside(rows: int, height: float) -> tuple[Figure, list[Axes]]:
 
 def svg(figure: Figure) -> str:
     """Return the figure as SVG: the same figure gives the same text."""
+    _part_labels(figure)
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
     return buffer.getvalue()
+
+
+def _part_labels(figure: Figure) -> None:
+    """Take fewer ticks along horizontal axes whose labels touch."""
+    for most in _FEWER_TICKS:
+        figure.draw_without_rendering()
+        touching = [axes for axes in figure.axes if _touch(axes)]
+        if not touching:
+            return
+        for axes in touching:
+            axes.xaxis.set_major_locator(MaxNLocator(most, steps=[1, 2, 2.5, 5, 10]))
+
+
+def _touch(axes: Axes) -> bool:
+    """Whether ticks that matplotlib chose have labels closer than the width of a letter."""
+    if not isinstance(axes.xaxis.get_major_locator(), MaxNLocator) or not axes.axison:
+        return False
+    boxes = [
+        text.get_window_extent() for text in axes.get_xticklabels()
+        if text.get_visible() and text.get_text()
+    ]  # fmt: skip
+    between = 72.0 * _LETTER
+    return any(b.x0 - a.x1 < between for a, b in pairwise(boxes))
 
 
 def label(quantity: str, unit: str) -> str:
