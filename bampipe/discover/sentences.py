@@ -145,7 +145,12 @@ def _rivals(axis: str, a: AxisVerdict, found: Diagnosis, unit: str, s: Settings)
         better = [c for c in rivals if c.held_out_rmse < mine.held_out_rmse]
         better = better if all(c.score < mine.score for c in better) else []
         over_all = "; over all axes together it explains most" if better else ""
-        said.append(f"Close to {name} ({_left(mine, unit)}{where}{over_all}) {verb} {listed}.")
+        # Scores take a shape at the best of a few values: a full fit may leave far less.
+        fitted = three(mine.held_out_rmse) == three(a.rmse_after)
+        when = "" if fitted or where else ", before any is fitted in full"
+        said.append(
+            f"Close to {name} ({_left(mine, unit)}{where}{over_all}) {verb} {listed}{when}."
+        )
     return said
 
 

@@ -272,7 +272,8 @@ def _rivals(results: Results, effect: str) -> str:
         sure = "" if unsure else " It fits better beyond chance."
         return (
             f"In its place {join_names(shown)} on held-out trials of {own.axis}, against "
-            f"{wording.significant(own.held_out_rmse)} {unit}.{sure}"
+            f"{wording.significant(own.held_out_rmse)} {unit}, before either is fitted in full."
+            f"{sure}"
         )
     return "It was not found by a diagnosis of this run: none has weighed it against others."
 
