@@ -7,7 +7,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Iterator
-from itertools import count
+from itertools import count, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -36,13 +36,24 @@ _MANY_ROWS = 8
 """Rows beyond which a table may break wherever it stands."""
 _FEW_ROWS = 3
 """Rows up to which a table stays in one piece, hole or not."""
+_PASSED = ("text", "bullets", "table")
+"""Kinds of blocks above which a figure may go, within its section."""
 _PAGE_END_PT = 782.0
 """Where the text of a page ends, points from its upper edge: A4 less the margin of the template."""
 _PAGE_TOP_PT = 65.0
 """Where it begins."""
 _HOLE_PT = 85.0
 """White above the end of a page, 3 cm, from which a page looks unfinished."""
-_PASSES = 48
+_SECTION_HOLE_PT = 200.0
+"""White that is better than a figure in a later section: a quarter of the page."""
+_ROWS_HOLE_PT = 130.0
+"""White that is better than a few rows by themselves."""
+_PASSES = 96
+
+_Shown = dict[str, Any]
+"""A section or a block, as the template reads it."""
+_Edge = dict[str, Any]
+"""Where an edge of a block stands."""
 
 
 def pdf(document: Document, recorded: int) -> bytes:
@@ -80,85 +91,148 @@ def pdf(document: Document, recorded: int) -> bytes:
 def _lay_out(shown: dict[str, Any], source: Path) -> typst.Compiler:
     """Return a compiler of what is ``shown``: no holes above figures and tables, figures in order.
 
-    Pages fill from the first, and what is made loose on one moves all that comes later: each pass
-    mends the first fault that is left.
+    Pages fill from the first, and what is moved on one moves all that comes later: each pass mends
+    the first fault that is left.
     """
-    blocks = [block for section in shown["sections"] for block in section["blocks"]]
     compiler = typst.Compiler(source, root=source.parent, ignore_system_fonts=True)
     for _ in range(_PASSES):
         (source.parent / "document.json").write_text(json.dumps(shown), encoding="utf-8")
         edges = json.loads(compiler.query("<edge>", field="value"))
-        if found := first_below_a_hole(blocks, edges) or first_overtaking(blocks, edges):
-            found["loose"] = True
-        elif found := first_with_few_rows(blocks, edges):
-            found["kept"] = True
-        else:
+        if not mend_first(shown["sections"], edges):
             break
     return compiler
 
 
-def first_below_a_hole(
-    blocks: list[dict[str, Any]], edges: list[dict[str, Any]]
-) -> dict[str, Any] | None:
+def mend_first(sections: list[_Shown], edges: list[_Edge]) -> bool:
+    """Mend the first fault in place; whether there was one.
+
+    Args:
+        sections: those of `content`, changed in place.
+        edges: what the template reports: block, edge (such as "start"), page, y in points. The
+            start of a section bears the number of its first block.
+    """
+    order = [block["id"] for _, block in _each(sections)]
+    faults = [
+        (order.index(block["id"]), find, block)
+        for find in (first_below_a_hole, first_overtaking, first_with_few_rows)
+        if (block := find(sections, edges))
+    ]
+    if behind := first_left_behind(sections, edges):
+        faults.append((order.index(behind["blocks"][-1]["id"]), first_left_behind, behind))
+    if not faults:
+        return False
+    # What comes before it is as it will stay.
+    _, find, found = min(faults, key=lambda fault: fault[0])
+    if find is first_left_behind:
+        found["held"] = True
+    elif find is first_with_few_rows:
+        found["kept"] = True
+    elif not (find is first_below_a_hole and found["kind"] == "figure" and _raise(sections, found)):
+        found["loose"] = True
+    return True
+
+
+def _raise(sections: list[_Shown], figure: _Shown) -> bool:
+    """Put a figure above what stands before it in its section; back where it came from, if none."""
+    blocks = next(section["blocks"] for section in sections if figure in section["blocks"])
+    place = blocks.index(figure)
+    if place > 0 and (passed := blocks[place - 1])["kind"] in _PASSED:
+        if passed["kind"] == "table":  # where it stands now, it may break as if for the first time
+            passed |= {"loose": len(passed["rows"]) > _MANY_ROWS, "kept": False}
+        blocks[place - 1 : place + 1] = figure, passed
+        figure["raised"] += 1
+        return True
+    blocks.insert(place + figure["raised"], blocks.pop(place))
+    return False
+
+
+def first_below_a_hole(sections: list[_Shown], edges: list[_Edge]) -> _Shown | None:
     """Return the first block that went to a new page and left a hole on the one before.
 
     Args:
-        blocks: those of `content`, in order.
-        edges: what the template reports of them: block, edge ("start" or "end"), page, y in points.
+        sections, edges: as for `mend_first`.
     """
-    starts = {edge["block"]: edge for edge in edges if edge["edge"] == "start"}
-    ends = {edge["block"]: edge for edge in edges if edge["edge"] == "end"}
-    page, filled = 1, _PAGE_END_PT
-    for block in blocks:
+    starts, ends = _at(edges, "start"), _at(edges, "end")
+    page, filled = 0, _PAGE_END_PT
+    for section, block in _each(sections):
         start, end = starts.get(block["id"]), ends.get(block["id"])
-        hole = _PAGE_END_PT - filled > _HOLE_PT
+        first = block["kind"] == "figure" and block is section["blocks"][0]
+        hole = _PAGE_END_PT - filled > (_SECTION_HOLE_PT if first else _HOLE_PT)
         whole = block["kind"] == "table" and (block["kept"] or len(block["rows"]) <= _FEW_ROWS)
         if start and not (block["loose"] or whole) and start["page"] > page and hole:
             return block
-        floats = block["kind"] == "figure" and block["loose"]
+        floats = block["kind"] == "figure" and block["loose"] and not section["held"]
         if end and not floats:
-            page, filled = end["page"], end["y"]
+            page, filled = max((page, filled), (end["page"], end["y"]))
     return None
 
 
-def first_overtaking(
-    blocks: list[dict[str, Any]], edges: list[dict[str, Any]]
-) -> dict[str, Any] | None:
+def first_overtaking(sections: list[_Shown], edges: list[_Edge]) -> _Shown | None:
     """Return the first figure that stands before an earlier one, which went to a later page.
 
     Args:
-        blocks: those of `content`, in order.
-        edges: as for `first_below_a_hole`.
+        sections, edges: as for `mend_first`.
     """
-    starts = {edge["block"]: edge["page"] for edge in edges if edge["edge"] == "start"}
+    starts = _at(edges, "start")
     page = 0
-    for block in blocks:
+    for _, block in _each(sections):
         if block["kind"] == "figure" and block["id"] in starts:
-            if starts[block["id"]] < page and not block["loose"]:
+            if starts[block["id"]]["page"] < page and not block["loose"]:
                 return block
-            page = max(page, starts[block["id"]])
+            page = max(page, starts[block["id"]]["page"])
     return None
 
 
-def first_with_few_rows(
-    blocks: list[dict[str, Any]], edges: list[dict[str, Any]]
-) -> dict[str, Any] | None:
-    """Return the first table that leaves one or two rows at the end of a page, and fits on one.
+def first_with_few_rows(sections: list[_Shown], edges: list[_Edge]) -> _Shown | None:
+    """Return the first table with one or two rows by themselves on a page, that fits on one.
 
     Args:
-        blocks: those of `content`, in order.
-        edges: as for `first_below_a_hole`, with the edge "third row" of tables.
+        sections, edges: as for `mend_first`.
     """
-    at = {(edge["block"], edge["edge"]): edge for edge in edges}
-    for block in blocks:
-        start, third, end = (at.get((block["id"], name)) for name in ("start", "third row", "end"))
-        if not (start and third and end) or block["kept"]:
+    starts, ends = _at(edges, "start"), _at(edges, "end")
+    third, last_but_one = _at(edges, "third row"), _at(edges, "last but one")
+    for _, block in _each(sections):
+        if block["kind"] != "table" or block["kept"] or block["id"] not in third:
             continue
-        high = _PAGE_END_PT - start["y"] + end["y"] - _PAGE_TOP_PT
-        split = start["page"] < third["page"] and end["page"] == start["page"] + 1
-        if split and high < _PAGE_END_PT - _PAGE_TOP_PT:
+        start, end = starts[block["id"]], ends[block["id"]]
+        left = _PAGE_END_PT - start["y"]
+        high = left + end["y"] - _PAGE_TOP_PT
+        if end["page"] != start["page"] + 1 or high > _PAGE_END_PT - _PAGE_TOP_PT:
+            continue
+        few = third[block["id"]]["page"] > start["page"]
+        alone = last_but_one[block["id"]]["page"] == start["page"]
+        if (few or alone) and left <= _ROWS_HOLE_PT:
             return block
     return None
+
+
+def first_left_behind(sections: list[_Shown], edges: list[_Edge]) -> _Shown | None:
+    """Return the first section with a figure in the one after it, where a small hole spares that.
+
+    Args:
+        sections, edges: as for `mend_first`.
+    """
+    heads, starts, ends = (_at(edges, name) for name in ("section", "start", "end"))
+    for section, later in pairwise(sections):
+        floating = [b for b in section["blocks"] if b["kind"] == "figure" and b["loose"]]
+        pages = {starts[figure["id"]]["page"] for figure in floating}
+        head = heads[later["blocks"][0]["id"]]["page"]
+        text = [ends[b["id"]] for b in section["blocks"] if b not in floating and b["id"] in ends]
+        filled = text[-1]["y"] if text else _PAGE_TOP_PT
+        small = _PAGE_END_PT - filled <= _SECTION_HOLE_PT
+        if not section["held"] and small and max(pages, default=0) == head + 1:
+            return section
+    return None
+
+
+def _each(sections: list[_Shown]) -> Iterator[tuple[_Shown, _Shown]]:
+    """Yield each block with its section before it."""
+    return ((section, block) for section in sections for block in section["blocks"])
+
+
+def _at(edges: list[_Edge], name: str) -> dict[int, _Edge]:
+    """Return the edges of one name by block."""
+    return {edge["block"]: edge for edge in edges if edge["edge"] == name}
 
 
 def content(document: Document) -> dict[str, Any]:
@@ -170,6 +244,7 @@ def content(document: Document) -> dict[str, Any]:
         "sections": [
             {
                 "title": section.title,
+                "held": False,
                 "blocks": [
                     {"id": next(ids), **_block(block, next_number(numbers, block))}
                     for block in section.blocks
@@ -229,6 +304,7 @@ def _block(block: Block, number: str) -> dict[str, Any]:
                 "caption": _spans(caption),
                 "alt": caption,
                 "loose": False,
+                "raised": 0,
             }
 
 

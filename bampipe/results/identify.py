@@ -328,6 +328,12 @@ class IdentifyResult(Result):
     restarts: Count | None = Field(
         default=None, description="Searches before the filter held on to the motion"
     )
+
+    @property
+    def inertial(self) -> frozenset[str]:
+        """Inertial numbers of a robot's bodies, of which motion shows combinations only."""
+        return frozenset(name for base in self.base_parameters or () for name in base.members)
+
     repeats: Count | None = Field(
         default=None,
         description="How often the filter ran again around its answer; the states are of the last "

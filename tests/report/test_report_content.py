@@ -132,6 +132,22 @@ def test_trials_set_aside_and_repaired_say_why(full: Report) -> None:
     assert "interpolated" in row_of(full.html, "t03_free")[-1]
 
 
+def test_a_long_remark_of_several_trials_stands_once_below_the_table(tmp_path: Path) -> None:
+    root = synthetic_run.write_all(tmp_path / "s01")
+    path = root / "ingest/trials.parquet"
+    trials = pd.read_parquet(path)
+    said = "from {} s of the record; time stamps jitter by {} ms: put on a uniform grid by cubics"
+    trials.loc[:1, "repairs"] = [said.format(*numbers) for numbers in ((0, 0.9), (15, 1.25))]
+    trials.loc[2, "repairs"] = "12 samples missing at 3.2 s"
+    write_parquet(path, trials)
+    page = page_of(root)
+    assert [row_of(page, f"t0{n}_free")[-1] for n in (1, 2, 3)] == [
+        "from 0 s of the record", "from 15 s of the record", "12 samples missing at 3.2 s",
+    ]  # fmt: skip
+    below = "Trials t01_free and t02_free: time stamps jitter by 0.9–1.25 ms: put on a uniform"
+    assert text_of(page).count("time stamps jitter") == 1 and below in text_of(page)
+
+
 def test_diagnosis_names_effect_group_and_trial(full: Report) -> None:
     words = text_of(full.html)
     assert row_of(full.html, "stribeck:yaw", "yaw")[2:] == [
@@ -151,7 +167,7 @@ def test_each_effect_found_is_explained(full: Report) -> None:
     assert "torque = -force*exp(-qd**2)" in words
     assert "On the machine. Grease the joint." in words
     assert "In its place presliding:yaw leaves 0.232 N·m (odds 30 %) on held-out trials" in words
-    assert "of yaw, against 0.212 N·m." in words
+    assert "of yaw, against 0.212 N·m, before either is fitted in full." in words
     assert "fits better beyond chance" not in words
     assert "Right: the worst window of yaw without stribeck:yaw (reversing slowly" in words
     assert "the residual falls from 0.2" in words

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from typing import Any
 
 import pytest
 
@@ -11,6 +12,7 @@ from bampipe.report.typeset import (
     first_below_a_hole,
     first_overtaking,
     first_with_few_rows,
+    mend_first,
     pdf,
 )
 
@@ -45,13 +47,23 @@ def test_a_table_that_leaves_a_hole_is_broken() -> None:
 
 @pytest.mark.parametrize(("rows", "breaks"), [(3, False), (4, True)])
 def test_a_table_of_few_rows_stays_in_one_piece(rows: int, breaks: bool) -> None:
-    table = {"id": 1, "kind": "table", "loose": False, "kept": False, "rows": [[]] * rows}
+    table = block(1, "table", rows=[[]] * rows)
     edges = [edge(0, "end", 1, 500.0), edge(1, "start", 2, 65.0), edge(1, "end", 2, 200.0)]
-    assert (first_below_a_hole([{"id": 0, "kind": "text"}, table], edges) is table) is breaks
+    found = first_below_a_hole([section(block(0, "text"), table)], edges)
+    assert (found is table) is breaks
 
 
-def edge(block: int, side: str, page: int, y: float) -> dict[str, object]:
+def edge(block: int, side: str, page: int, y: float) -> dict[str, Any]:
     return {"block": block, "edge": side, "page": page, "y": y}
+
+
+def block(number: int, kind: str, **more: Any) -> dict[str, Any]:
+    known = {"id": number, "kind": kind, "loose": False, "kept": False, "raised": 0}
+    return {**known, **more}
+
+
+def section(*blocks: dict[str, Any]) -> dict[str, Any]:
+    return {"held": False, "blocks": list(blocks)}
 
 
 @pytest.mark.parametrize(
@@ -62,9 +74,9 @@ def edge(block: int, side: str, page: int, y: float) -> dict[str, object]:
 def test_the_first_block_below_a_hole(
     text_ends: float, figure_page: int, expected: int | None
 ) -> None:
-    blocks = [{"id": 0, "kind": "text"}, {"id": 1, "kind": "figure", "loose": False}]
+    sections = [section(block(0, "text"), block(1, "figure"))]
     edges = [edge(0, "end", 1, text_ends), edge(1, "start", figure_page, 65.0)]
-    found = first_below_a_hole(blocks, edges)
+    found = first_below_a_hole(sections, edges)
     assert (found and found["id"]) == expected
 
 
@@ -76,28 +88,71 @@ def test_the_first_block_below_a_hole(
 def test_no_figure_stands_before_an_earlier_one(
     pages_of_figures: tuple[int, int], loose: bool, expected: int | None
 ) -> None:
-    blocks = [{"id": n, "kind": "figure", "loose": loose or n == 0} for n in range(2)]
+    figures = [block(n, "figure", loose=loose or n == 0) for n in range(2)]
     edges = [edge(n, "start", page, 65.0) for n, page in enumerate(pages_of_figures)]
-    found = first_overtaking(blocks, edges)
+    found = first_overtaking([section(*figures)], edges)
     assert (found and found["id"]) == expected
 
 
 @pytest.mark.parametrize(
-    ("third_row_page", "end", "expected"),
-    [(2, 300.0, 1), (1, 300.0, None), (2, 740.0, None)],
-    ids=["two rows alone", "three rows", "longer than a page"],
+    ("start", "third_row_page", "last_but_one_page", "end", "expected"),
+    [
+        (720.0, 2, 2, 300.0, 1),
+        (700.0, 1, 2, 300.0, None),
+        (720.0, 2, 2, 740.0, None),
+        (660.0, 1, 1, 90.0, 1),
+        (600.0, 1, 1, 90.0, None),
+        (600.0, 2, 2, 300.0, None),
+    ],
+    ids=["two rows", "three rows", "longer than a page", "one left", "a hole", "two high rows"],
 )
-def test_a_table_leaves_no_two_rows_at_the_end_of_a_page(
-    third_row_page: int, end: float, expected: int | None
+def test_a_table_leaves_no_row_or_two_by_themselves(
+    start: float, third_row_page: int, last_but_one_page: int, end: float, expected: int | None
 ) -> None:
-    blocks = [{"id": 1, "kind": "table", "kept": False}]
     edges = [
-        edge(1, "start", 1, 720.0),
+        edge(1, "start", 1, start),
         edge(1, "third row", third_row_page, 90.0),
+        edge(1, "last but one", last_but_one_page, 90.0),
         edge(1, "end", 2, end),
     ]
-    found = first_with_few_rows(blocks, edges)
+    found = first_with_few_rows([section(block(1, "table"))], edges)
     assert (found and found["id"]) == expected
+
+
+def test_a_figure_that_leaves_a_hole_goes_up_in_its_section_before_it_floats() -> None:
+    blocks = [
+        block(0, "subheading"),
+        block(1, "text"),
+        block(2, "table", rows=[]),
+        block(3, "figure"),
+    ]
+    sections = [section(*blocks)]
+    edges = [edge(1, "end", 1, 300.0), edge(2, "end", 1, 500.0), edge(3, "start", 2, 65.0)]
+    orders = []
+    for _ in range(3):
+        assert mend_first(sections, edges)
+        orders.append([one["id"] for one in sections[0]["blocks"]])
+        at = orders[-1].index(3)
+        # What stands above it is too high for it wherever it goes.
+        edges = [edge(0, "end", 1, 500.0 - at), edge(3, "start", 2, 65.0)]
+    assert orders == [[0, 1, 3, 2], [0, 3, 1, 2], [0, 1, 2, 3]]
+    assert blocks[3]["loose"]
+
+
+@pytest.mark.parametrize(("text_ends", "held"), [(650.0, True), (500.0, False)])
+def test_a_figure_stays_in_its_section_where_the_hole_is_small(
+    text_ends: float, held: bool
+) -> None:
+    figure = block(1, "figure", loose=True)
+    sections = [section(block(0, "text"), figure), section(block(2, "text"))]
+    edges = [
+        edge(0, "end", 1, text_ends),
+        edge(2, "section", 1, text_ends + 20.0),
+        edge(1, "start", 2, 65.0),
+        edge(1, "end", 2, 300.0),
+    ]
+    assert mend_first(sections, edges) is held
+    assert sections[0]["held"] is held
 
 
 def test_a_column_in_which_no_row_says_anything_is_left_out() -> None:

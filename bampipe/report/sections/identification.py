@@ -152,8 +152,8 @@ def _caveat(results: Results) -> str:
 
 def _without_inertial(identified: IdentifyResult) -> Mapping[str, ParameterEstimate]:
     """The parameters without a robot's inertial numbers: motion shows combinations of them only."""
-    inertial = {name for base in identified.base_parameters or () for name in base.members}
-    return {n: entry for n, entry in identified.parameters.items() if n not in inertial}
+    inertial, found = identified.inertial, identified.parameters
+    return {name: entry for name, entry in found.items() if name not in inertial}
 
 
 def _base_parameters(bases: Sequence[BaseEstimate]) -> Table:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import math
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from bampipe.lists import join_names
@@ -12,6 +14,11 @@ from bampipe.report.document import Block, Paragraph, Section, Table
 from bampipe.report.results import Results
 from bampipe.results.filter import FilterResult
 
+_NUMBER = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?:e[+-]?\d+)?")
+_BLANK = "\0"
+"""Where a number was taken out."""
+_LONG = 60
+"""Letters from which a remark that several trials share stands below the table, once."""
 _SAME_RATE = 0.02
 """Of the rate of the grid: a mean that differs by less is said to be the same."""
 
@@ -62,8 +69,13 @@ def _rates(results: Results) -> str:
 
 
 def _trials(results: Results) -> Table:
+    records = results.trials.to_dict("records")
+    remarks = {str(row["trial_id"]): _remarks(row) for row in records}
+    shared = _shared(remarks)
     rows = []
-    for row in results.trials.to_dict("records"):
+    for row in records:
+        own = remarks[str(row["trial_id"])]
+        left = [text for text in own if _pattern(text) not in shared]
         rows.append(
             (
                 str(row["trial_id"]),
@@ -71,7 +83,7 @@ def _trials(results: Results) -> Table:
                 _duration(row["duration_s"]),
                 str(int(row["n_samples"])) if row["n_samples"] else "–",
                 _emphasised(str(row["status"])),
-                _remarks(row),
+                "; ".join(left) or ("below" if own else "none"),
             )
         )
     return Table(
@@ -80,7 +92,33 @@ def _trials(results: Results) -> Table:
         tuple(rows),
         "llrrll",
         (0.0, 0.0, 0.0, 0.0, 0.0, 1.0),
+        " ".join(_once(remarks, pattern) for pattern in shared),
     )
+
+
+def _pattern(remark: str) -> str:
+    """Return a remark without its numbers."""
+    return _NUMBER.sub(_BLANK, remark)
+
+
+def _shared(remarks: Mapping[str, Sequence[str]]) -> list[str]:
+    """Return the patterns of long remarks that hold for several trials."""
+    found = Counter(_pattern(text) for own in remarks.values() for text in own if len(text) > _LONG)
+    return [pattern for pattern, count in found.items() if count > 1]
+
+
+def _once(remarks: Mapping[str, Sequence[str]], pattern: str) -> str:
+    """Return a remark of several trials as one sentence: which trials, each number's range."""
+    held = {
+        trial: _NUMBER.findall(text)
+        for trial, own in remarks.items()
+        for text in own
+        if _pattern(text) == pattern
+    }
+    columns = [sorted(set(numbers), key=float) for numbers in zip(*held.values(), strict=True)]
+    shown = iter("–".join(dict.fromkeys((each[0], each[-1]))) for each in columns)
+    which = "All trials" if len(held) == len(remarks) else f"Trials {join_names(held)}"
+    return f"{which}: {re.sub(_BLANK, lambda _: next(shown), pattern)}."
 
 
 def _emphasised(status: str) -> str:
@@ -105,24 +143,10 @@ def _duration(seconds: object) -> str:
     return "–"
 
 
-def _remarks(row: dict[Any, Any]) -> str:
-    found = [_flat(row.get("reason")), _flat(row.get("repairs"))]
-    return "; ".join(text for text in found if text) or "none"
-
-
-def _flat(value: object) -> str:
-    """Return a text column as a sentence: plain text, or a JSON list or table of texts."""
-    if not isinstance(value, str) or not value.strip():
-        return ""
-    if value.lstrip()[0] not in "[{":
-        return value.strip()
-    try:
-        content = json.loads(value)
-    except json.JSONDecodeError:
-        return value.strip()
-    if isinstance(content, dict):
-        return "; ".join(f"{wording.words(str(key))}: {item}" for key, item in content.items())
-    return "; ".join(str(item) for item in content)
+def _remarks(row: dict[Any, Any]) -> list[str]:
+    """Return why a trial is in its state, and what was repaired, each remark by itself."""
+    texts = (row.get("reason"), row.get("repairs"))
+    return [part for text in texts if isinstance(text, str) and text for part in text.split("; ")]
 
 
 def _filter(results: Results, filtered: FilterResult) -> list[Block]:

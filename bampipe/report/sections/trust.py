@@ -38,23 +38,27 @@ def section(results: Results) -> Section | None:
 
 def _words(identified: IdentifyResult, known: IdentifiabilityReport) -> str:
     if known.weak_directions:
-        return "Not everything below is known as well as its interval alone suggests."
-    if identified.base_parameters:
-        return (
-            "Of a robot's bodies motion shows combinations only (under Identification): a single "
-            "inertial number below leans on the drawing, however small its standard deviation."
+        words = "Not everything below is known as well as its interval alone suggests."
+    elif identified.base_parameters:
+        words = "Of a robot's bodies motion shows combinations only (under Identification)."
+    else:
+        words = (
+            "No two parameters hide each other in these trials. What remains beyond reach follows "
+            "from the equations and from the numbers of the device file."
         )
-    return (
-        "No two parameters hide each other in these trials. What remains beyond reach follows from "
-        "the equations and from the numbers of the device file."
-    )
+    if identified.inertial:
+        words += (
+            " A single inertial number leans on the drawing, however small its standard deviation: "
+            f"those are left out below, and stand in `models/{identified.model}/identify.json`."
+        )
+    return words
 
 
 def _parameters(
     results: Results, identified: IdentifyResult, known: IdentifiabilityReport
 ) -> Table:
     rows = []
-    for name in results.in_order(known.parameters):
+    for name in results.in_order(known.parameters.keys() - identified.inertial):
         entry, found = known.parameters[name], identified.parameters[name]
         partner = (
             "–"
