@@ -554,6 +554,10 @@ def test_after_the_loop_comes_what_its_last_diagnosis_says(
     ingested: Path, verdict: str, selected: tuple[str, ...], after: str
 ) -> None:
     assert after_loop(ingested, "base", "s01") == "bampipe diagnose s01"
+    other = ingested / "models/base+stribeck.yaw/model.toml"
+    other.parent.mkdir()
+    other.touch()
+    assert after_loop(ingested, "base", "s01") == "bampipe diagnose s01 --model base"
     axes, command = {"yaw": {"verdict": verdict}}, "bampipe draft RUN --model base"
     write_result(ingested, DiagnoseResult, axes=axes, selected=selected, next=command)
     assert after_loop(ingested, "base", "s01") == after

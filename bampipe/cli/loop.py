@@ -160,7 +160,8 @@ def extend(
     show.say(f"{root}: {last}")
     show.summary(ladder)
     name = places.next_to(root, runs)
-    advise(quiet, json, after_loop(root, last, name) if auto else f"bampipe diagnose {name}")
+    asked = f"bampipe diagnose {name}{RunFolder(root).model_option(last)}"
+    advise(quiet, json, after_loop(root, last, name) if auto else asked)
 
 
 def _is_effect(argument: str) -> bool:

@@ -27,7 +27,7 @@ def after_run(root: Path, model: str, name: str) -> str:
     elif run.exists(ValidateResult.file(model)):
         errors = run.read(ValidateResult, model).axes.values()
         if any(error.standing == "above_floor" for error in errors):
-            return f"bampipe diagnose {name}"
+            return f"bampipe diagnose {name}{run.model_option(model)}"
     if run.exists("report/report.pdf"):
         return f"open {root / 'report' / 'report.pdf'}"
     return f"bampipe status {name}"
@@ -39,7 +39,7 @@ def after_loop(root: Path, model: str, name: str) -> str:
 
     run = RunFolder(root)
     if not run.exists(DiagnoseResult.file(model)):  # stopped after many rounds
-        return f"bampipe diagnose {name}"
+        return f"bampipe diagnose {name}{run.model_option(model)}"
     found = run.read(DiagnoseResult, model)
     lacking = any(axis.verdict != "nothing_missing" for axis in found.axes.values())
     # What a diagnosis selects and the loop has not added makes no better model.

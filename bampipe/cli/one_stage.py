@@ -116,7 +116,7 @@ def _say_if_outdated(root: Path, pipeline: Pipeline, model: str) -> None:
         if step.step == f"diagnose:{model}" and step.state == "stale" and "/" in step.reason:
             show.say(
                 f"note: the diagnosis of {model} is older than what it was made from"
-                f" ({step.reason}): run `bampipe diagnose {root}`, and this again."
+                f" ({step.reason}): run `bampipe diagnose {root} --model {model}`, and this again."
             )
 
 

@@ -52,13 +52,21 @@ class RunFolder:
             MissingResultError: the file is not there yet; the remedy names ``stage``.
         """
         if not self.exists(relative):
-            reads = "SESSION" if stage == "ingest" else self.root
-            raise MissingResultError(
-                f"{relative} is missing",
-                where=str(self.root),
-                remedy=f"run `bampipe {stage} {reads}` first",
-            )
+            raise self.missing(relative, f"{stage} {'SESSION' if stage == 'ingest' else self.root}")
         return self.path(relative)
+
+    def missing(self, relative: str, maker: str = "") -> MissingResultError:
+        """Return the error that ``relative`` is not there yet; ``maker``: the command for it."""
+        head, *rest = relative.split("/")
+        # A command that names no model takes the best one.
+        option = self.model_option(rest[0]) if head == "models" else ""
+        remedy = f"run `bampipe {maker}{option}` first" if maker else ""
+        return MissingResultError(f"{relative} is missing", where=str(self.root), remedy=remedy)
+
+    def model_option(self, model: str) -> str:
+        """Return `` --model`` with a model; "" where the run has no other."""
+        others = {path.parent.name for path in self.root.glob("models/*/model.toml")} - {model}
+        return f" --model {model}" if others else ""
 
     def read(self, kind: type[R], model: str = "") -> R:
         """Return the result ``kind``, of ``model`` where it is one of a model.

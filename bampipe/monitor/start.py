@@ -231,7 +231,7 @@ def start_from_run(run: RunFolder, name: str, options: MonitorOptions) -> tuple[
             raise InputError(
                 f"the identified model does not follow its own trials: {failure.reason}",
                 where=str(run.path(path)),
-                remedy=f"bampipe diagnose {run.root}",
+                remedy=f"bampipe diagnose {run.root}{run.model_option(name)}",
             ) from failure
         means.append(window_means(filtered.nis[window:], n, window))
     return system, replace(start, reference=Reference.of_windows(np.concatenate(means), window * n))

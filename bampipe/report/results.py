@@ -197,6 +197,12 @@ class Results:
         compared = self.read(CompareResult)
         return compared.best if compared and compared.best in self.models else "base"
 
+    @property
+    def diagnose(self) -> str:
+        """The command that diagnoses the model shown."""
+        option = f" --model {self.model}" if len(self.models) > 1 else ""
+        return f"bampipe diagnose {self.root.name}{option}"
+
     def require_model(self, name: str) -> str:
         """Return ``name``.
 

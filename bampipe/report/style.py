@@ -16,7 +16,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
 from bampipe.report import wording
 
@@ -49,6 +49,8 @@ _LABEL = 30
 _LETTER, _HANDLE = 0.058, 0.42
 """Widths in a legend, inches: of a letter on average, and of what stands before the words."""
 _MOST_LEGEND_COLUMNS = 4
+_FEW_DECADES = 300.0
+"""Ratio of values up to which a logarithmic axis has room for labels within a decade."""
 _FEWER_TICKS = (6, 5, 4, 3, 2)
 
 WIDTH = 6.69
@@ -193,6 +195,21 @@ def limits(axes: Axes, values: Sequence[np.ndarray], *, zero: bool = False) -> N
         low, high = min(low, 0.0), max(high, 0.0)
     margin = 0.06 * (high - low) or 0.1 * abs(high) or 1.0
     axes.set_ylim(low if zero and low == 0.0 else low - margin, high + margin)
+
+
+def decades(axes: Axes, values: Sequence[float] | np.ndarray) -> None:
+    """Make the vertical axis logarithmic: plain numbers over a few decades, none crowded.
+
+    Args:
+        axes: the panel; values: all that it shows, above zero.
+    """
+    low, high = float(min(values)), float(max(values))
+    axes.set_yscale("log")
+    axes.set_ylim(low / 1.6, high * 1.6)
+    if high < _FEW_DECADES * low:
+        axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.yaxis.set_major_formatter("{x:g}")
+    axes.yaxis.set_minor_formatter(NullFormatter())
 
 
 def legend_below(figure: Figure, axes: Axes) -> None:

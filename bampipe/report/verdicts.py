@@ -119,7 +119,7 @@ def _explained(results: Results, validated: ValidateResult | None) -> Callout:
         "attention",
         f"The model leaves something unexplained on {join_names(high)}",
         f"Error on trials that the parameters never saw: {_ratios(high)}. "
-        f"`bampipe diagnose {results.root.name}` says which effect is missing.",
+        f"`{results.diagnose}` says which effect is missing.",
     )
 
 

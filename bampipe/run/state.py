@@ -119,11 +119,8 @@ class RunState:
 
     def missing(self, name: str) -> MissingResultError:
         maker = _maker(name)
-        model = name.split("/")[1] if name.startswith("models/") else models.BASE
-        option = "" if model == models.BASE else f" --model {model}"
         reads = "SESSION" if maker in base.READS_SESSION else self.root
-        remedy = f"run `bampipe {maker} {reads}{option}` first" if maker else ""
-        return MissingResultError(f"{name} is missing", where=str(self.root), remedy=remedy)
+        return self.folder.missing(name, f"{maker} {reads}" if maker else "")
 
     def check_untouched(self, name: str) -> None:
         for step, made in self.records.items():

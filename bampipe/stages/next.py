@@ -115,7 +115,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         raise InputError(
             "what is to be decided is not known yet",
             where=str(run.root),
-            remedy=f"run `bampipe diagnose {run.root}` first",
+            remedy=f"run `bampipe diagnose {run.root}{run.model_option(config.model)}` first",
         )
     progress(0.0, "what the trials at hand say")
     trials = read_measured_trials(run, system, every_input=True, timing=found.input_timing)

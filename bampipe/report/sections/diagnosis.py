@@ -29,6 +29,7 @@ from bampipe.results.diagnose import (
     ResidualMap,
     WorstWindow,
 )
+from bampipe.results.draft import DraftResult
 
 Maps = Mapping[str, ResidualMap]
 TITLE = "Diagnosis"
@@ -46,8 +47,8 @@ def section(results: Results) -> Section:
         if (content := results.read(DiagnoseResult, model)) is not None
     ]
     if not found:
-        command = f"`bampipe diagnose {results.root.name}`"
-        text = f"Whether an effect is missing, and which, has not been asked: {command} does it."
+        text = "Whether an effect is missing, and which, has not been asked: "
+        text += f"`{results.diagnose}` does it."
         return Section(TITLE, (Paragraph(text),))
     blocks: list[Block] = []
     last, after = found[-1]
@@ -95,6 +96,8 @@ def _next(results: Results, model: str, found: DiagnoseResult) -> list[Block]:
     for rung in rungs:
         if wanted and rung.parent == model and wanted == set((rung.added or "").split(", ")):
             return [Paragraph(f"Added since, as model `{rung.model}`.")]
+    if found.next.startswith("bampipe draft ") and results.read(DraftResult, model):
+        return [Paragraph("Drafted since (under Drafts).")]
     what = found.next.replace("RUN", results.root.name)
     return [Paragraph(f"Next: `{what}`" if what.startswith("bampipe ") else f"Next: {what}.")]
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.ticker import NullFormatter
 
 from bampipe.lists import join_names
 from bampipe.report import style, wording
@@ -42,7 +41,18 @@ def section(results: Results) -> Section | None:
             blocks.append(_pictures(model, axis, entry, effects, maps))
             if entry.nearest:
                 blocks.append(_nearest(entry))
+        blocks += _next(results, model, found)
     return Section(TITLE, tuple(blocks)) if blocks else None
+
+
+def _next(results: Results, model: str, found: DraftResult) -> list[Block]:
+    """Return what to do about the drafts; nothing where a later model has them."""
+    drafted, own = set(found.selected), set(results.effects(model))
+    later = (set(results.effects(name)) for name in results.models)
+    if drafted and any(drafted <= effects - own for effects in later):
+        return []
+    what = found.next.replace("RUN", results.root.name)
+    return [Paragraph(f"Next: `{what}`" if what.startswith("bampipe ") else f"Next: {what}.")]
 
 
 def _pictures(
@@ -108,7 +118,8 @@ def _curve(panel: Axes, name: str, effect: DraftedEffect, left: ResidualMap | No
     panel.axhline(0.0, color=style.INK, lw=0.5)
     panel.set_title(name.partition(":")[0].replace("_", " "), fontsize="small")
     panel.set_xlabel(style.label(wording.words(curve.variable), unit))
-    panel.set_ylabel(style.label("force", wording.unit(curve.unit)))
+    kind = "torque" if curve.unit.startswith("N.m") else "force"
+    panel.set_ylabel(style.label(kind, wording.unit(curve.unit)))
 
 
 def _length(panel: Axes, entry: AxisDraft) -> None:
@@ -116,8 +127,7 @@ def _length(panel: Axes, entry: AxisDraft) -> None:
     errors = [option.held_out_rmse for option in entry.options]
     panel.plot(counts, errors, color=style.INK, marker="o", ms=3.5, lw=0.8)
     panel.axhline(entry.noise_floor, color=style.BLUE, lw=0.8)
-    panel.set_yscale("log")
-    panel.yaxis.set_minor_formatter(NullFormatter())
+    style.decades(panel, [*errors, entry.noise_floor])
     panel.set_xticks(sorted(set(counts)))
     panel.set_xlabel("constants")
     panel.set_ylabel(style.label("held-out error", wording.unit(entry.unit)))

@@ -6,7 +6,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from matplotlib.ticker import LogLocator
 
 from bampipe.lists import join_names
 from bampipe.report import style, verdicts, wording
@@ -18,8 +17,6 @@ TITLE = "Model versions"
 _MOST_COLUMNS = 3
 _MOST_NUMBERS = 4
 """Versions of which each can have its number below a panel."""
-_FEW_DECADES = 300.0
-"""Ratio of errors up to which an axis has room for labels within a decade."""
 
 
 def section(results: Results) -> Section | None:
@@ -173,12 +170,7 @@ def _scale(panel: Any, values: np.ndarray) -> None:
     """Set the vertical range; logarithmic where the values span more than a decade."""
     known = values[np.isfinite(values) & (values > 0.0)]
     if known.size and known.max() > 10.0 * known.min():
-        panel.set_yscale("log")
-        panel.set_ylim(known.min() / 1.6, known.max() * 1.6)
-        steps = (1.0, 2.0, 5.0) if known.max() < _FEW_DECADES * known.min() else (1.0,)
-        panel.yaxis.set_major_locator(LogLocator(subs=steps))
-        panel.yaxis.set_major_formatter("{x:g}")
-        panel.yaxis.set_minor_formatter("")
+        style.decades(panel, known)
     else:
         panel.set_ylim(0.0, 1.1 * known.max(initial=0.0) or 1.0)
 
