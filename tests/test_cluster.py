@@ -231,7 +231,11 @@ def scheduler(tmp_path: Path, *workers: str) -> Iterator[tuple[str, list[Any]]]:
             assert time.monotonic() < deadline
             time.sleep(0.05)
         started += [subprocess.Popen(command, cwd=tmp_path, **quiet) for command in commands[1:]]
-        yield json.loads(file.read_text())["address"], started
+        address = json.loads(file.read_text())["address"]
+        if workers:
+            with distributed.Client(address, set_as_default=False) as client:
+                client.wait_for_workers(len(workers), timeout=60.0)
+        yield address, started
     finally:
         for process in started:
             process.kill()

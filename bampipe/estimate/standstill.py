@@ -56,14 +56,18 @@ def _turning(v: Array, limit: Array, start: int, end: int) -> float:
     """Samples that a change of direction takes from ``-limit`` to ``limit``, of ``start:end``.
 
     At the acceleration of the same time before and after; zero where the velocity (T,) does not
-    change its sign, or where the trial begins or ends.
+    change its sign, where it is not known well enough to say so, or where the trial begins or ends.
     """
     length = end - start
     before, after = start - 1 - length, end + length
     if before < 0 or after >= len(v) or v[start - 1] * v[end] >= 0.0:
         return 0.0
+    slow = float(limit[start:end].mean())
+    # A steady turn comes from three times the limit, and goes to it.
+    if min(v[before] * np.sign(v[start - 1]), v[after] * np.sign(v[end])) < 2.0 * slow:
+        return 0.0
     outside = abs(v[start - 1] - v[before]) + abs(v[after] - v[end])
-    return float(2.0 * limit[start:end].mean() * 2.0 * length / max(outside, 1e-30))
+    return 4.0 * slow * length / max(outside, 1e-30)
 
 
 def find_moving_samples(rest: NDArray[np.bool_], band: Band) -> NDArray[np.bool_]:

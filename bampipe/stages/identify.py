@@ -120,10 +120,11 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
             f"the free trials are too short to identify from ({error})", where=str(run.root)
         ) from error
     moving = sum(int(stacked.used.sum()) for stacked in raw.stacked)
-    if moving <= problem.free.size:
+    # Their scatter about the fit must be known, too, or no interval means anything.
+    if moving < 2 * problem.free.size:
         raise InputError(
             f"of the free trials, {moving} independent samples are clear of standstill, fewer than"
-            f" the {problem.free.size} numbers to be found",
+            f" twice the {problem.free.size} numbers to be found",
             where=str(run.root),
             remedy="record faster motion at a higher rate, or more of it",
         )
