@@ -83,6 +83,8 @@ TABLES: dict[str, dict[str, pa.DataType]] = {
         "axis": _TEXT,
         "verdict": _TEXT,
         "effects": _LIST,
+        "named": _LIST,
+        "likely": _LIST,
         "explainable_share": _NUMBER,
         "explainable_chance": _NUMBER,
         "rmse_before": _NUMBER,

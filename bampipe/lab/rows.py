@@ -121,13 +121,16 @@ def _model(
                 fit_percent=error.fit_percent,
             )
     if run.exists(DiagnoseResult.file(model)):
-        for axis, said in run.read(DiagnoseResult, model).axes.items():
+        diagnosis = run.read(DiagnoseResult, model)
+        for axis, said in diagnosis.axes.items():
             rows.add(
                 "verdicts",
                 model=model,
                 axis=axis,
                 verdict=said.verdict,
                 effects=list(said.effects),
+                named=diagnosis.named(axis),
+                likely=said.by_odds,
                 unit=said.unit,
                 sentence=said.sentence,
                 explainable_share=said.explainable_share,

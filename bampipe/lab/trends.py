@@ -160,11 +160,9 @@ def _decide(
     has: Sequence[str],
 ) -> tuple[str, str, str]:
     """Return verdict, sentence and remedy; ``has``: effects of the model that counts."""
-    unknown = [f"something unknown on {axis}" for axis in judged.unexplained]
     diagnose = f"bampipe diagnose {judged.session} --model {judged.model}"
     if not outside:
-        lacking = [*(effect for effect in judged.effects if effect not in has), *unknown]
-        if lacking:
+        if lacking := _named(judged, mine["verdicts"], has):
             return EFFECT, f"lacks {join_names(lacking)}; no parameter is beyond its limits", ""
         if not judged.diagnosed and judged.worst and judged.above_floor:
             sentence = (
@@ -173,7 +171,7 @@ def _decide(
             )
             return UNKNOWN, sentence, diagnose
         return IN_CONTROL, "", ""
-    what = join_names([*judged.effects, *unknown])
+    what = join_names(_named(judged, mine["verdicts"]))
     moved = ", ".join(_in_words(entry) for entry in judged.moved)
     if not what:
         if judged.diagnosed:
@@ -194,6 +192,24 @@ def _decide(
         return EFFECT, sentence, ""
     remedy = f"bampipe extend {judged.session} --auto, then bampipe lab"
     return EFFECT, f"{moved}; lacks {what}, which biases the parameters", remedy
+
+
+def _named(
+    judged: SessionVerdict, verdicts: Sequence[TableRow], has: Sequence[str] = ()
+) -> list[str]:
+    """Return what is missing in words, but for what a model ``has``: effects, rivals, unknowns."""
+    words = {
+        effect: said
+        for row in verdicts
+        for effect, said in zip(row["effects"], row["named"], strict=True)
+    }
+    said = [words.get(effect, effect) for effect in judged.effects if effect not in has]
+    last = judged.model if judged.diagnosed else BASE
+    for row in verdicts:
+        if row["model"] == last and row["likely"] and not row["effects"]:
+            said.append(f"perhaps {' or '.join(row['likely'])} on {row['axis']} (undecided)")
+    unknown = (f"something unknown on {axis}" for axis in judged.unexplained)
+    return [*dict.fromkeys(said), *unknown]
 
 
 def _with_the_effect(

@@ -65,6 +65,11 @@ class AxisVerdict(Record):
     )
     sentence: str
 
+    @property
+    def by_odds(self) -> list[str]:
+        """The effects that may be missing, the likeliest first."""
+        return sorted(self.likely, key=lambda name: -self.likely[name])
+
 
 class RankedEffect(Record):
     """A candidate effect on the axis that it helps most."""
@@ -242,6 +247,16 @@ class DiagnoseResult(Result):
             words = entry.verdict.replace("_", " ")
             found[axis] = f"{words} {named}".rstrip() if entry.verdict == "missing" else words
         return found
+
+    def named(self, axis: str) -> list[str]:
+        """Each effect found on an axis in words: with its rivals, and with those it is one of."""
+        entry = self.axes[axis]
+        return [
+            f"{' or '.join(entry.by_odds)} (undecided)"
+            if effect in entry.likely and len(entry.likely) > 1
+            else in_words(effect, self.contests.get(effect, ()))
+            for effect in entry.effects
+        ]
 
     @property
     def unnamed_axes(self) -> Names:

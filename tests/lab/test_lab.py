@@ -21,6 +21,7 @@ from bampipe.files import digest_file
 from bampipe.lab.collect import collect
 from bampipe.lab.folders import is_current
 from bampipe.results.compare import CompareResult
+from bampipe.results.diagnose import DiagnoseResult
 from bampipe.run.accepted import accept
 
 ROOT = Path(__file__).parent.parent.parent
@@ -98,6 +99,25 @@ def test_an_effect_on_another_axis_does_not_account_for_a_parameter(tmp_path: Pa
     one = verdicts(make_lab(tmp_path, {7: own}))["s07"]
     assert one["verdict"] == "missing effect"
     assert one["remedy"] == "bampipe extend s07 --auto, then bampipe lab"
+
+
+def test_rivals_and_what_is_undecided_are_named(tmp_path: Path) -> None:
+    runs = make_lab(tmp_path, {7: changed(7, estimates(7), verdicts=MISSING)})
+    rival = {"effect": "presliding:yaw", "beside": "about as likely"}
+    contests = {"stribeck:yaw": [{"effect": "stribeck:yaw"}, rival]}
+    axes = {"yaw": {"verdict": "missing", "effects": ["stribeck:yaw"]}}
+    write_result(runs / "s07", DiagnoseResult, model="base", axes=axes, contests=contests)
+    odds = {"stribeck:yaw": 0.6, "presliding:yaw": 0.4}
+    for number, effects in ((4, ["stribeck:yaw"]), (5, [])):
+        axes = {"yaw": {"verdict": "undecided", "effects": effects, "likely": odds}}
+        write_result(runs / f"s0{number}", DiagnoseResult, model="base", axes=axes)
+    found = verdicts(runs)
+    within = "; no parameter is beyond its limits"
+    assert {number: found[f"s0{number}"]["sentence"] for number in (4, 5, 7)} == {
+        4: f"lacks stribeck:yaw or presliding:yaw (undecided){within}",
+        5: f"lacks perhaps stribeck:yaw or presliding:yaw on yaw (undecided){within}",
+        7: f"lacks stribeck:yaw or, about as likely, presliding:yaw{within}",
+    }
 
 
 def test_what_was_not_diagnosed_is_said(tmp_path: Path) -> None:
