@@ -555,7 +555,7 @@ def test_after_the_loop_comes_what_its_last_diagnosis_says(
 ) -> None:
     assert after_loop(ingested, "base", "s01") == "bampipe diagnose s01"
     other = ingested / "models/base+stribeck.yaw/model.toml"
-    other.parent.mkdir()
+    other.parent.mkdir(parents=True)
     other.touch()
     assert after_loop(ingested, "base", "s01") == "bampipe diagnose s01 --model base"
     axes, command = {"yaw": {"verdict": verdict}}, "bampipe draft RUN --model base"

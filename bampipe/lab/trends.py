@@ -137,7 +137,8 @@ def _judge_session(
         sentence="",
         remedy="",
     )
-    verdict, sentence, remedy = _decide(judged, outside, mine, row["effects"])
+    limited = any(c.device == device and len(c.sessions) >= FEWEST for c in charts)
+    verdict, sentence, remedy = _decide(judged, outside, mine, row["effects"], limited)
     return judged.model_copy(update={"verdict": verdict, "sentence": sentence, "remedy": remedy})
 
 
@@ -158,12 +159,17 @@ def _decide(
     outside: Sequence[Series],
     mine: Mapping[str, Sequence[TableRow]],
     has: Sequence[str],
+    limited: bool,
 ) -> tuple[str, str, str]:
-    """Return verdict, sentence and remedy; ``has``: effects of the model that counts."""
+    """Return verdict, sentence and remedy.
+
+    ``has``: effects of the model that counts; ``limited``: whether its device has control limits.
+    """
     diagnose = f"bampipe diagnose {judged.session} --model {judged.model}"
     if not outside:
         if lacking := _named(judged, mine["verdicts"], has):
-            return EFFECT, f"lacks {join_names(lacking)}; no parameter is beyond its limits", ""
+            limits = "; no parameter is beyond its limits" if limited else ""
+            return EFFECT, f"lacks {join_names(lacking)}{limits}", ""
         if not judged.diagnosed and judged.worst and judged.above_floor:
             sentence = (
                 f"error on unseen trials {judged.worst[0]:.3g} times the floor on "

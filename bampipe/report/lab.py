@@ -140,6 +140,10 @@ def _charts(trends: TrendsResult) -> list[Section]:
     for place, device in enumerate(devices, start=1):
         charts = [c for c in trends.series if c.device == device]
         title = "Parameters over time" + (f", {device}" if len(devices) > 1 else "")
+        if all(len(chart.points) == 1 for chart in charts):
+            text = f"One session of this device, {charts[0].points[0].session}: nothing to compare."
+            sections.append(Section(title, (Paragraph(text),)))
+            continue
         blocks: list[Block] = [
             Paragraph(
                 "Each point is a session's estimate with two standard deviations, by the base "

@@ -267,12 +267,13 @@ class Figure {
     if (value === null) return null;
     const log = which === "x" ? this.options.logX : this.options.logY;
     if (!log) return format(value, 6);
-    const decade = Math.log10(value);
-    const plain = Math.abs(decade - Math.round(decade)) < 1e-6;
-    return plain || this.narrow(which) ? format(value, 3) : "";
+    // uPlot sets a tick at the edge, too: only 1, 2 and 5 of a decade get their number.
+    const [first, ...others] = value.toExponential(5);
+    const plain = Number(others.join("").split("e")[0]) === 0;
+    return plain && (first === "1" || (this.narrow(which) && "25".includes(first))) ? format(value, 3) : "";
   }
 
-  /** Whether a logarithmic range holds less than two decades, so that every tick needs its number. */
+  /** Whether a logarithmic range holds less than two decades, so that ticks within a decade need numbers. */
   narrow(which) {
     const scale = this.plot?.scales[which];
     return !scale?.min || scale.max / scale.min < 100;

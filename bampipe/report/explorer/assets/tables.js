@@ -1,7 +1,11 @@
 // Tables that can be sorted and searched.
 
-/** {title, note, head, rows, texts?, drawn?: {head, cells}, csv?, buttons?} as an element. */
-function tableOf({ title, note = "", head, rows, texts = null, drawn = null, csv = null, buttons = null }) {
+/** {title, note, head, rows, texts?, drawn?: {head, cells}, csv?, buttons?} as an element; columns
+    without a word in any row are left out. */
+function tableOf({ title, note = "", head: heading, rows: all, texts: words = null, drawn = null, csv = null, buttons = null }) {
+  const kept = heading.map((_, k) => k).filter((k) => k === 0 || all.some((row) => row[k] !== null && row[k] !== ""));
+  const [head, ...rows] = [heading, ...all].map((row) => kept.map((k) => row[k]));
+  const texts = words?.map((row) => kept.map((k) => row[k]));
   const numeric = head.map((_, k) => rows.some((row) => typeof row[k] === "number") && rows.every((row) => row[k] === null || typeof row[k] === "number"));
   const said = (row, k) => texts?.[row][k] ?? (typeof rows[row][k] === "number" ? format(rows[row][k]) : (rows[row][k] ?? "–"));
   const lines = rows.map((_, row) => {
