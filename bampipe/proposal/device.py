@@ -27,6 +27,8 @@ from bampipe.proposal.starter import starter_device
 from bampipe.proposal.starter_input import Drive
 
 DEVICE = "device.toml"
+_HEAD_BYTES = 4096
+"""Of a file that cannot be read whole, in which its first element is looked for."""
 
 
 @dataclass(frozen=True)
@@ -65,9 +67,26 @@ def find_device(folder: Path, found: Survey, wanted: str) -> ChosenDevice | None
 
 
 def _is_mjcf(path: Path) -> bool:
+    """Whether an XML file is one of MuJoCo.
+
+    Raises:
+        InputError: it names itself one, and cannot be read.
+    """
     try:
         return read_xml(path).tag == "mujoco"
-    except InputError:
+    except InputError as error:
+        if not _starts_as_mjcf(path):
+            return False
+        raise InputError(
+            error.what, where=error.where, remedy="mend it, or take it out of the folder"
+        ) from error
+
+
+def _starts_as_mjcf(path: Path) -> bool:
+    try:
+        with path.open("rb") as file:
+            return b"<mujoco" in file.read(_HEAD_BYTES)
+    except OSError:
         return False
 
 

@@ -219,3 +219,25 @@ def test_several_positions_without_a_urdf_may_be_those_of_joints(tmp_path: Path)
     write_log(tmp_path)
     (tmp_path / "arm.urdf").unlink()
     assert any("put its URDF beside the logs" in line for line in propose(tmp_path).check)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("<mujoco><worldbody><body></worldbody>", "not XML: mismatched tag"),
+        (f"<mujoco>{'<body>' * 300}{'</body>' * 300}</mujoco>", "nested more than 200 deep"),
+    ],
+)
+def test_an_mjcf_that_cannot_be_read_is_not_passed_over(
+    tmp_path: Path, text: str, said: str
+) -> None:
+    (tmp_path / "arm.xml").write_text(text)
+    t = np.arange(400) / 100.0
+    pd.DataFrame({"t": t, "position": np.sin(t), "current": np.cos(t)}).to_csv(
+        tmp_path / "log.csv", index=False
+    )
+    with pytest.raises(InputError, match=said) as caught:
+        propose(tmp_path)
+    assert "take it out of the folder" in str(caught.value)
+    (tmp_path / "arm.xml").write_text("<recording><channel></recording>")
+    assert propose(tmp_path)
