@@ -313,17 +313,21 @@ def _trial_errors(results: Results) -> Content:
     axes = verdicts.ordered(results, validated.axes) if validated else ()
     rows: list[list[Cell]] = []
     for row in results.trials.to_dict("records"):
-        name = str(row["trial_id"])
-        judged = trials.get(name)
-        errors = [
-            judged.axes[axis].held_out_rmse if judged and axis in judged.axes else None
-            for axis in axes
-        ]
-        seconds = float(row["duration_s"])
+        name, kind = str(row["trial_id"]), str(row["kind"])
         state = wording.trial_state(str(row["status"]))
-        rows.append(
-            [name, str(row["kind"]), state, seconds if np.isfinite(seconds) else None, *errors]
-        )
+        seconds = float(row["duration_s"])
+        # A trial that is alone is held out block by block.
+        blocks = [block for block in trials if block.startswith(f"{name}@")]
+        for part in [name, *blocks]:
+            judged = trials.get(part)
+            errors = [
+                (judged.axes[axis].held_out_rmse or None)
+                if judged and axis in judged.axes
+                else None
+                for axis in axes
+            ]
+            whole = part == name and np.isfinite(seconds)
+            rows.append([part, kind, state, seconds if whole else None, *errors])
     heads = [f"RMSE {axis} ({wording.unit(results.force_unit(axis))})" for axis in axes]
     return {
         "title": "Trials",
