@@ -72,6 +72,7 @@ _SPELLINGS = {
     "lb": "lbf", "lbs": "lbf", "°c": "degC", "c": "degC", "degc": "degC", "percent": "%",
     "pct": "%", "-": "", "1": "", "none": "", "inch": "in", "kgf": "kgf",
 }  # fmt: skip
+_STEPS = re.compile(r"(?P<number>\d+\.?\d*|\.\d+)\.?(?P<unit>[^\W\d_].*|%|°.*)")
 _SQUEEZED = {"Nm": "N.m", "Ncm": "N.cm", "Nmm": "N.mm", "mNm": "mN.m", "kNm": "kN.m"}
 
 
@@ -87,7 +88,8 @@ def unit(text: str) -> RecordedUnit | None:
     """What ``text`` stands for, None where that is not known.
 
     ``Nm``, ``N*m``, ``N·m`` and ``N.m`` are the same, ``mA``, ``kN`` and the like are put together
-    from their prefix. ``nm`` is a nanometre, not a torque.
+    from their prefix; ``13.5mA`` is a reading in steps of 13.5 mA. ``nm`` is a nanometre, not a
+    torque.
     """
     plain = text.strip().strip("[]()").strip()
     plain = re.sub(r"\s*[*·⋅ ]\s*", ".", plain)
@@ -100,4 +102,8 @@ def unit(text: str) -> RecordedUnit | None:
         if prefix in _PREFIXES and rest in _PREFIXED:
             base = _BASE[rest]
             return RecordedUnit(base.si, base.scale * _PREFIXES[prefix])
-    return None
+    steps = _STEPS.fullmatch(plain)
+    one = unit(steps["unit"]) if steps else None
+    if steps is None or one is None or one.offset or not float(steps["number"]):
+        return None
+    return RecordedUnit(one.si, float(steps["number"]) * one.scale)

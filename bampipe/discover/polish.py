@@ -29,6 +29,10 @@ from bampipe.trials.residuals import Evidence, residual_and_memory
 Array = NDArray[np.float64]
 
 
+_LEAST_SLOPE = 1e-6
+"""Of a residual by its force, where a sample has none: its logarithm stays finite."""
+
+
 @dataclass(frozen=True)
 class FittedSet:
     """A model with some effects, fitted.
@@ -86,7 +90,7 @@ class FittedSet:
             moved[:, column] += step
             changed, _ = residual_and_memory(system, motion, moved, evidence.p)
             square += np.square((changed - plain) / step)
-        return np.asarray(np.exp(0.5 * np.mean(np.log(np.maximum(square, 1e-6)), axis=0)))
+        return np.asarray(np.exp(0.5 * np.mean(np.log(np.maximum(square, _LEAST_SLOPE**2)), axis=0)))
 
 
 def extend_set(bench: Bench, known: FittedSet, score: Score) -> FittedSet:

@@ -227,10 +227,11 @@ def _sound_level(
     has not seen are asked first, for replays cost more. What was known of a candidate that acts on
     axes which the effect left as they were still holds.
     """
-    if not _carries_over(before, after, promised, bench.settings):
+    s = bench.settings
+    if _collapses(before, after, s) or not _carries_over(before, after, promised, s):
         return None
     evidence = after.evidence
-    s, error, error_before = bench.settings, after.scorer.base_error, before.scorer.base_error
+    error, error_before = after.scorer.base_error, before.scorer.base_error
     moved = np.abs(np.log(error / error_before)) > s.unmoved
     holds = _unmoved_candidates(before, after, moved, [n for n in names if n in known_scores])
     anew = bench.scores(after.recipe, evidence.p, [n for n in names if n not in holds])
@@ -294,6 +295,14 @@ def _keeps_the_floor(
     return not (shrunk.any() or any(raised))
 
 
+def _collapses(before: FittedSet, after: FittedSet, s: Settings) -> bool:
+    """Whether an effect leaves so little of what the force does that the equation has no scale.
+
+    Forces, masses and friction can then all go to zero together, and every error with them.
+    """
+    return bool((after.slope_by_force < s.least_slope * before.slope_by_force).any())
+
+
 def _carries_over(before: FittedSet, after: FittedSet, promised: Array, s: Settings) -> bool:
     """Whether some axis errs less, by what is worth it, on trials that the fit has not seen at all.
 
@@ -333,7 +342,7 @@ def _refusal(
         held_out_rmse_after=then[0],
         without_worst_second_before=first[1],
         without_worst_second_after=then[1],
-        why="replays" if carries else "held_out",
+        why="scale" if _collapses(before, after, s) else "replays" if carries else "held_out",
     )
 
 

@@ -182,7 +182,10 @@ def _refused(axis: str, found: Diagnosis, unit: str) -> list[str]:
         if one.why == "held_out" and left * before > after * rest:
             before, after, aside = rest, left, " but for the worst second"
         numbers = f"{three(before)} to {three(after)} {unit}{aside}"
-        if one.why == "replays":
+        if one.why == "scale":
+            why = "fits best where next to nothing is left of what the applied force does, and every"
+            why += " force and error is small"
+        elif one.why == "replays":
             why = f"would take the held-out error from {numbers}, but replays with it give no floor"
             why += " that this could be judged by"
         elif after < before:

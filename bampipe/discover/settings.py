@@ -29,6 +29,8 @@ class Settings:
             spurious effects, up to a tenth of the error on a linear axis.
         unmoved: change of log error on an axis up to which an effect has left it as it was: what is
             known of candidates that act on such axes alone is not found anew.
+        least_slope: least share of what the applied force does that an effect must leave of it, as
+            a geometric mean on every axis.
         carried: least share of the drop of log error by its score that an effect must show on
             trials that its fit has not seen at all.
         share: least share of what exceeds the floor on one axis, in the mean square, that an effect
@@ -102,6 +104,7 @@ class Settings:
     worth: float = 0.03
     worth_at_floor: float = 0.16
     unmoved: float = 0.01
+    least_slope: float = 0.2
     carried: float = 0.25
     share: float = 0.15
     above_floor_sd: float = 2.0

@@ -27,6 +27,8 @@ _A_PERIOD = 5
 """Thinned samples in a period of the band; see `Band.step`."""
 _PERIODS = 10
 """Periods of the band in the shortest block that is taken as independent of the next."""
+_LEAST_STEP = 1e-8
+"""Of a difference, as a share of the parameter: half the digits of a number."""
 Residual = Callable[[int, Array], Array]
 """residual(trial, p) -> (T, n_q): unfiltered residual of one trial for parameters p (np,)."""
 
@@ -119,9 +121,11 @@ def residual_and_slopes(
     slopes = np.empty((*base.shape, len(chosen)))
     for column, k in enumerate(chosen):
         index, moved = problem.free[k], p.copy()
-        moved[index] += problem.step[k]
+        # A replay of a model that lacks much can run far from any prior, where a step is rounding.
+        step = max(problem.step[k], _LEAST_STEP * abs(p[index]))
+        moved[index] += step
         if moved[index] > problem.upper[k]:
-            moved[index] = p[index] - problem.step[k]
+            moved[index] = p[index] - step
         slopes[:, :, column] = (problem.residual(trial, moved) - base) / (moved[index] - p[index])
     return base, slopes
 

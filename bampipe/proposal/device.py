@@ -249,4 +249,7 @@ def _rough_fit(
     si = {"current": "A", "voltage": "V", "duty": ""}.get(role, "N" if linear else "N.m")
     drive = np.nan_to_num(driver.values * scale_to(si, driver))
     q = position_in_si(position, t, "m" if linear else "rad")
-    return guesses.driven(t, q, drive, angle=not linear and not in_counts(position))
+    counted = in_counts(position)
+    found = guesses.driven(t, q, drive, angle=not linear and not counted)
+    # Sizes per count would pass for sizes per radian or metre.
+    return replace(found, inertia=0.0, viscous=0.0) if counted else found

@@ -154,9 +154,10 @@ class RefusedEffect(Record):
     )
     without_worst_second_before: Size = Field(description="The same but for the worst second")
     without_worst_second_after: Size
-    why: Literal["held_out", "replays"] = Field(
+    why: Literal["held_out", "replays", "scale"] = Field(
         description="It does too little on held-out trials; or replays with it give no floor that "
-        "an error could be judged by"
+        "an error could be judged by; or it leaves next to nothing of what the force does, so that "
+        "all forces become small together"
     )
 
 

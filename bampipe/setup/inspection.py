@@ -14,7 +14,7 @@ from bampipe.results.setup import AxisSetup, PossibleMistake, SetupMistake, Setu
 from bampipe.setup.placeholders import Placeholder, find_placeholders
 from bampipe.setup.plausibility import LEAST_MOVING, Plausibility
 from bampipe.setup.search import CorrectionSearch, Finding, shorten, spoilt_axes
-from bampipe.setup.words import describe_correction, describe_evidence, describe_size
+from bampipe.setup.words import describe_correction, describe_evidence, describe_lack, describe_size
 from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion
 from bampipe.trials.signals import Change, Signals
@@ -50,6 +50,8 @@ def inspect_setup(
         for axis, entry in axes.items()
         if entry.state == "hardly_moves"
     ]
+    if held is not None and search.over_position is not None:
+        warnings += describe_lack(system, held, search.over_position)
     named = " ".join(mistake.sentence for mistake in mistakes)
     warnings += [
         f"{p.sentence}: the scale of all estimates rests on it"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ from bampipe.physics import System
 from bampipe.physics.parameter import Parameter
 from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion
-from bampipe.trials.residuals import Evidence, gather_evidence
+from bampipe.trials.residuals import Evidence, applied_rms, gather_evidence
 
 Array = NDArray[np.float64]
 
@@ -29,6 +29,8 @@ CERTAIN = 5.0
 of a model that lacks something are too small."""
 VAGUE = 100.0
 """Deviations of its prior within which a parameter is even where the trials say nothing of it."""
+_RIDGE = 1e-9
+"""What holds the sizes of shapes that look alike, as a share of what the trials say of each."""
 LEAST_MOVING = 0.05
 """Share of the samples in which an axis must move for its equation to be judged."""
 
@@ -63,67 +65,121 @@ class Plausibility:
 
 
 def judge_setup(
-    system: System, motions: Sequence[Motion], band: Band, folds: Folds, steps: int
+    system: System,
+    motions: Sequence[Motion],
+    band: Band,
+    folds: Folds,
+    steps: int,
+    posed: Sequence[int] = (),
 ) -> Plausibility | None:
     """Fit the bare device by least squares; None where it cannot be computed with.
 
     Args:
         system: the bare device; motions: as the set-up has them; band: of the residual.
         folds: which trials are fitted, which left out together; steps: of the fit, the most.
+        posed: numbers of axes that are given a torque over their own position beside the device.
     """
     with np.errstate(all="ignore"):
         try:
             evidence = gather_evidence(
                 system, motions, band, system.prior, folds, most_iterations=steps
             )
-            error, moving = evidence.rmse(), _moving(evidence.used)
-            size = _applied(system, motions, band, evidence.p, evidence.used)
-            sd = _standard_deviations(evidence)
+            found = _with_pose(evidence, posed)
+            moving = _moving(evidence.used)
+            size = applied_rms(system, motions, band, found.p, evidence.used)
         except (InputError, ValueError, np.linalg.LinAlgError):
             return None
-        share = np.where(size > 0.0, error / size, 0.0)
+        share = np.where(size > 0.0, found.error / size, 0.0)
         share = np.where(moving >= LEAST_MOVING, share, 1.0)
     if not np.isfinite(share).all():
         return None
     objections = [
         _objection(item, value, CERTAIN * spread)
-        for item, value, spread in zip(system.parameters, evidence.p, sd, strict=True)
+        for item, value, spread in zip(system.parameters, found.p, found.sd, strict=True)
     ]
-    return Plausibility(share, moving, evidence.p, np.array(objections))
+    return Plausibility(share, moving, found.p, np.array(objections))
 
 
-def _standard_deviations(evidence: Evidence) -> Array:
-    """Of the fitted parameters, (n_p,), as if samples were independent; zero of those held."""
-    sums, free = evidence.sums, list(evidence.free)
-    prior_sd = np.array([evidence.system.parameters[i].sd for i in free])
-    normal = np.einsum("q,kqij->ij", evidence.weight, sums.xx)
-    normal += np.diag(1.0 / np.maximum(VAGUE * prior_sd, np.finfo(float).tiny) ** 2)
-    sd = np.zeros(len(evidence.p))
-    sd[free] = np.sqrt(np.diag(np.linalg.inv(normal)))
-    return sd
+def axes_without_pose(system: System, motions: Sequence[Motion]) -> list[int]:
+    """Numbers of the axes at which no torque of the device follows their own position."""
+    p = system.prior + np.array([item.sd for item in system.parameters])
+    return [i for i in range(len(system.coordinates)) if not _follows(system, motions, p, i)]
+
+
+def _follows(system: System, motions: Sequence[Motion], p: Array, axis: int) -> bool:
+    for motion in motions:
+        still = np.zeros_like(motion.q)
+        u = np.zeros((len(motion.q), len(system.inputs)))
+        z = system.memory(motion.q, still, still, u, p, motion.t)
+        middle = motion.q.copy()
+        middle[:, axis] = motion.q[:, axis].mean()
+        held, moved = (system.residual(q, still, still, z, u, p) for q in (middle, motion.q))
+        if not np.allclose(held[:, axis], moved[:, axis], rtol=1e-9, atol=1e-12):
+            return True
+    return False
+
+
+@dataclass(frozen=True)
+class _Fitted:
+    """Error by axis, (n_q,), parameters, (n_p,), and their standard deviations, (n_p,).
+
+    The deviations are as if samples were independent, and zero of what is held.
+    """
+
+    error: Array
+    p: Array
+    sd: Array
+
+
+def _with_pose(evidence: Evidence, posed: Sequence[int]) -> _Fitted:
+    """The fit with a torque over the position of the axes ``posed`` beside the device."""
+    system, free = evidence.system, list(evidence.free)
+    columns = [_pose_columns(evidence, k, posed) for k in range(len(evidence.residual))]
+    nothing = [np.zeros_like(residual) for residual in evidence.residual]
+    sums = evidence.sums.bordered(evidence.jacobian, columns, nothing, evidence.residual)
+    normal, more = np.einsum("q,kqij->ij", evidence.weight, sums.xx), columns[0].shape[2]
+    # The device may have a constant of its own, and a short travel shows no more than a line.
+    ridge = np.append(np.zeros(len(free)), _RIDGE * np.diag(normal)[len(free) :])
+    step = np.zeros(len(free) + more)
+    if posed:
+        wide = np.full(more, np.inf)
+        part = sums.subset(evidence.folds.fitted_trials)
+        step = replace(part, precision=part.precision + ridge).solve(
+            evidence.weight, np.append(evidence.lower, -wide), np.append(evidence.upper, wide)
+        )
+    prior_sd = np.array([system.parameters[i].sd for i in free])
+    normal += np.diag(ridge)
+    normal[: len(free), : len(free)] += np.diag(
+        1.0 / np.maximum(VAGUE * prior_sd, np.finfo(float).tiny) ** 2
+    )
+    p, sd = evidence.p.copy(), np.zeros(len(evidence.p))
+    p[free] += step[: len(free)]
+    sd[free] = np.sqrt(np.diag(np.linalg.inv(normal)))[: len(free)]
+    return _Fitted(np.sqrt(sums.mean_square(step)), p, sd)
+
+
+def _pose_columns(evidence: Evidence, trial: int, posed: Sequence[int]) -> Array:
+    """What a torque over the own position of each axis ``posed`` is made of, (K, n_q, P).
+
+    A constant and a line, with a wave a turn long on an axis that turns, a cubic on one that slides.
+    """
+    motion, n_q = evidence.motions[trial], len(evidence.system.coordinates)
+    found = np.zeros((*evidence.residual[trial].shape, 4 * len(posed)))
+    for number, axis in enumerate(posed):
+        q = motion.q[:, axis]
+        turning = evidence.system.model.device.coordinates[axis].kind == "rotary"
+        curves = (np.sin(q), np.cos(q)) if turning else (q**2, q**3)
+        shapes = (np.ones_like(q), q, *curves)
+        for place, shape in enumerate(shapes, start=4 * number):
+            column = np.zeros((len(q), n_q))
+            column[:, axis] = shape
+            found[..., place] = evidence.band.thin(column) * evidence.used[trial]
+    return found
 
 
 def _moving(used: Sequence[NDArray[np.bool_]]) -> Array:
     total = sum(len(u) for u in used)
     return np.asarray(sum(u.sum(axis=0) for u in used) / max(total, 1))
-
-
-def _applied(
-    system: System,
-    motions: Sequence[Motion],
-    band: Band,
-    p: Array,
-    used: Sequence[NDArray[np.bool_]],
-) -> Array:
-    """Root mean square of the applied force by axis where it moves, (n_q,)."""
-    square, count = np.zeros(len(system.coordinates)), np.zeros(len(system.coordinates))
-    for motion, moves in zip(motions, used, strict=True):
-        u = motion.inputs(system.inputs)
-        z = system.memory(motion.q, motion.qd, motion.qdd, u, p, motion.t)
-        applied = band.thin(system.applied(motion.q, motion.qd, motion.qdd, z, u, p))
-        square += np.sum(applied**2 * moves, axis=0)
-        count += moves.sum(axis=0)
-    return np.asarray(np.sqrt(square / np.maximum(count, 1)))
 
 
 def distance_from_prior(item: Parameter, value: float) -> float:

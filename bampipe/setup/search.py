@@ -23,7 +23,7 @@ from bampipe.setup.corrections import (
     sign_corrections,
     unit_corrections,
 )
-from bampipe.setup.plausibility import Plausibility, judge_setup
+from bampipe.setup.plausibility import Plausibility, axes_without_pose, judge_setup
 from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion
 from bampipe.trials.signals import Change, Signals
@@ -90,6 +90,8 @@ class CorrectionSearch:
         system: the bare device; motions: the trials as they are stated, short enough.
         band: of the residual; folds: of the trials; signals: of the session.
         tested: number of set-ups tried.
+        over_position: what the stated set-up explains with a torque over position that the device
+            lacks, where that rather than a mistake is what spoils it; None else.
     """
 
     system: System
@@ -98,6 +100,7 @@ class CorrectionSearch:
     folds: Folds
     signals: Signals
     tested: int = field(default=0, init=False)
+    over_position: Plausibility | None = field(default=None, init=False)
 
     @property
     def has_few_axes(self) -> bool:
@@ -147,11 +150,26 @@ class CorrectionSearch:
         found: list[Finding] = []
         while len(found) < MOST_MISTAKES and self._is_suspicious(now, placeholders):
             step = self._best(change, now, placeholders)
-            if step is None:
+            if (now is not None and not found and self._lacks_pose(now, step)) or step is None:
                 break
             found.append(step)
             change, now = step.correction.change.after(change), step.after
         return tuple(f for f in found if now is None or self._is_explained(f, now))
+
+    def _lacks_pose(self, stated: Plausibility, step: Finding | None) -> bool:
+        """Whether a torque over position explains as much of the stated set-up as ``step`` does.
+
+        That of gravity on a link or of a spring, where the device has none: no column is mistaken.
+        """
+        axes = axes_without_pose(self.system, self.motions) if self.has_few_axes else []
+        if not axes:
+            return False
+        found = judge_setup(self.system, self.motions, self.band, self.folds, 12, axes)
+        least = LEAST_GAIN if step is None else step.gain - ALIKE
+        if found is None or stated.score(JUDGED_ERROR) - found.score(JUDGED_ERROR) < least:
+            return False
+        self.over_position = found
+        return True
 
     def _is_suspicious(self, now: Plausibility | None, placeholders: Sequence[str]) -> bool:
         if now is None or now.error.max() > SUSPICIOUS_ERROR:

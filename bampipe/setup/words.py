@@ -27,8 +27,7 @@ def describe_evidence(
 ) -> str:
     """What setting it right changes: errors, and parameters that were not believable."""
     parts = [
-        f"error of {system.coordinates[i]} falls from"
-        f" {percent(before.error[i])} to {percent(after.error[i])} of the applied force"
+        f"error of {system.coordinates[i]} falls from {_fall(i, before, after)}"
         for i in axes
         if after.error[i] < before.error[i] / 1.5
     ]
@@ -39,6 +38,22 @@ def describe_evidence(
         if abs(distance_from_prior(item, old)) > abs(distance_from_prior(item, new)) + 1.0
     ]
     return "; ".join(parts or back[:3])
+
+
+def describe_lack(system: System, before: Plausibility, after: Plausibility) -> list[str]:
+    """A sentence without a full stop for each axis on which a torque over position is missing."""
+    return [
+        f"a torque that follows the position of {axis}, as of gravity or a spring, takes its error"
+        f" from {_fall(i, before, after)}, and the device has none there: put it into [energy]"
+        " potential of the device file, or let diagnose name it"
+        for i, axis in enumerate(system.coordinates)
+        if after.error[i] < before.error[i] / 1.5
+    ]
+
+
+def _fall(axis: int, before: Plausibility, after: Plausibility) -> str:
+    fallen = percent(before.error[axis]), percent(after.error[axis])
+    return f"{fallen[0]} to {fallen[1]} of the applied force"
 
 
 def percent(share: float) -> str:

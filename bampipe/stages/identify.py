@@ -54,7 +54,7 @@ from bampipe.trials.reading import (
     read_sensors,
     require_sound_motions,
 )
-from bampipe.trials.residuals import problem_of
+from bampipe.trials.residuals import applied_rms, problem_of
 
 SUMMARY = "Parameters of the model with uncertainties, from the free trials"
 INPUTS = (*INGESTED, *FILTERED, *MODEL_INPUTS)
@@ -66,6 +66,14 @@ OUTPUTS = (
 
 _MOST_SAMPLES = 4_000
 """Of segments that `auto` fits by output error, which takes half a millisecond a sample."""
+
+_MOST_LEFT = 0.5
+"""Share of the applied force that least squares may leave for output error to be worth its time:
+the summary refuses a model that explains less than half."""
+_NOT_SIMULATED = (
+    "Output error was not tried: of the applied force, least squares leaves more than half"
+    " unexplained, and a simulated motion would not be that of the machine."
+)
 
 MOST_FILTERED = 30
 """Parameters beyond which ``auto`` takes least squares: the filter's cost grows with the cube of
@@ -169,10 +177,16 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     moved_by_force = not system.model.device.prescribed
     if method == "auto" and estimates[chosen].method != "ukf" and moved_by_force:
         # Where the filter is out of the question, a third opinion is worth its time. On a test
-        # bench there is none: the stroke is given, whatever the force.
-        with suppress(InputError):
-            judged.append(judge(squares, folds, by_output_error(_MOST_SAMPLES)))
-            chosen = choose(system, judged)
+        # bench there is none: the stroke is given, whatever the force. A model that explains
+        # nothing moves nowhere near the machine, and simulations of it take minutes.
+        size = applied_rms(system, motions, band, near, [stacked.used for stacked in raw.stacked])
+        driven = [axis not in system.undriven for axis in system.coordinates]
+        if (raw.residual_sd > _MOST_LEFT * size)[driven].any():
+            notes.append(_NOT_SIMULATED)
+        else:
+            with suppress(InputError):
+                judged.append(judge(squares, folds, by_output_error(_MOST_SAMPLES)))
+                chosen = choose(system, judged)
     recipe = read_recipe(run, config.model, system.model)
     estimate = with_smoothing(widen(system, judged, chosen, squares), recipe)
     if estimate.method == "least-squares":

@@ -127,6 +127,29 @@ def residual_and_memory(
     return system.residual(*true, z, u, p), z
 
 
+def applied_rms(
+    system: System,
+    motions: Sequence[Motion],
+    band: Band,
+    p: Array,
+    used: Sequence[NDArray[np.bool_]],
+) -> Array:
+    """Root mean square of the applied force by axis, low-passed as the residual is, (n_q,).
+
+    Args:
+        system: the model; motions: the trials; band: the low-pass; p: parameters, (n_p,).
+        used: which samples count, by trial, each (K, n_q).
+    """
+    square, count = np.zeros(len(system.coordinates)), np.zeros(len(system.coordinates))
+    for motion, moves in zip(motions, used, strict=True):
+        u = motion.inputs(system.inputs)
+        z = system.memory(motion.q, motion.qd, motion.qdd, u, p, motion.t)
+        applied = band.thin(system.applied(motion.q, motion.qd, motion.qdd, z, u, p))
+        square += np.sum(applied**2 * moves, axis=0)
+        count += moves.sum(axis=0)
+    return np.asarray(np.sqrt(square / np.maximum(count, 1)))
+
+
 @dataclass(frozen=True)
 class ModelOnTrial:
     """A model with given parameters on one trial, computed when it is first asked for.
