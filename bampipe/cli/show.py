@@ -247,8 +247,9 @@ def _ladder(rungs: Sequence[Rung]) -> None:
             body.append(["  fitted in the search", ", ".join(step.effects), *errors])
         cells = [rung.model, rung.added or ""]
         for axis in axes:
-            error, floor = rung.held_out_rmse.get(axis), rung.noise_floor.get(axis)
-            cells += [number(error), number(error / floor) if error and floor else ""]
+            error, floor = rung.sound_error(axis), rung.sound_floor(axis)
+            shown = "refused" if axis in rung.refused else number(error)
+            cells += [shown, number(error / floor) if error and floor else ""]
         body.append(cells)
     head = ["model", "added"]
     for axis in axes:

@@ -90,7 +90,9 @@ class FittedSet:
             moved[:, column] += step
             changed, _ = residual_and_memory(system, motion, moved, evidence.p)
             square += np.square((changed - plain) / step)
-        return np.asarray(np.exp(0.5 * np.mean(np.log(np.maximum(square, _LEAST_SLOPE**2)), axis=0)))
+        return np.asarray(
+            np.exp(0.5 * np.mean(np.log(np.maximum(square, _LEAST_SLOPE**2)), axis=0))
+        )
 
 
 def extend_set(bench: Bench, known: FittedSet, score: Score) -> FittedSet:

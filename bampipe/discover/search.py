@@ -228,7 +228,7 @@ def _sound_level(
     axes which the effect left as they were still holds.
     """
     s = bench.settings
-    if _collapses(before, after, s) or not _carries_over(before, after, promised, s):
+    if collapses(before, after, s) or not _carries_over(before, after, promised, s):
         return None
     evidence = after.evidence
     error, error_before = after.scorer.base_error, before.scorer.base_error
@@ -295,7 +295,7 @@ def _keeps_the_floor(
     return not (shrunk.any() or any(raised))
 
 
-def _collapses(before: FittedSet, after: FittedSet, s: Settings) -> bool:
+def collapses(before: FittedSet, after: FittedSet, s: Settings) -> bool:
     """Whether an effect leaves so little of what the force does that the equation has no scale.
 
     Forces, masses and friction can then all go to zero together, and every error with them.
@@ -342,7 +342,7 @@ def _refusal(
         held_out_rmse_after=then[0],
         without_worst_second_before=first[1],
         without_worst_second_after=then[1],
-        why="scale" if _collapses(before, after, s) else "replays" if carries else "held_out",
+        why="scale" if collapses(before, after, s) else "replays" if carries else "held_out",
     )
 
 

@@ -183,8 +183,8 @@ def _refused(axis: str, found: Diagnosis, unit: str) -> list[str]:
             before, after, aside = rest, left, " but for the worst second"
         numbers = f"{three(before)} to {three(after)} {unit}{aside}"
         if one.why == "scale":
-            why = "fits best where next to nothing is left of what the applied force does, and every"
-            why += " force and error is small"
+            why = "fits best where next to nothing is left of what the applied force does, which"
+            why += " makes every error small"
         elif one.why == "replays":
             why = f"would take the held-out error from {numbers}, but replays with it give no floor"
             why += " that this could be judged by"

@@ -161,7 +161,7 @@ def _with_pose(evidence: Evidence, posed: Sequence[int]) -> _Fitted:
 def _pose_columns(evidence: Evidence, trial: int, posed: Sequence[int]) -> Array:
     """What a torque over the own position of each axis ``posed`` is made of, (K, n_q, P).
 
-    A constant and a line, with a wave a turn long on an axis that turns, a cubic on one that slides.
+    A constant and a line; with a wave a turn long where the axis turns, a cubic where it slides.
     """
     motion, n_q = evidence.motions[trial], len(evidence.system.coordinates)
     found = np.zeros((*evidence.residual[trial].shape, 4 * len(posed)))

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from independent_runs import device_of, record_trials
 
 from bampipe.discover.candidates import build_candidate_model, compile_candidate
 from bampipe.discover.chance import fit_trials, system_of
+from bampipe.discover.polish import FittedSet
 from bampipe.discover.scorer import Scorer
+from bampipe.discover.search import collapses
+from bampipe.discover.settings import Settings
 from bampipe.discover.start import search_start
 from bampipe.physics import registry
 from bampipe.physics.recipe import Recipe
@@ -54,6 +59,18 @@ def test_only_effects_that_meet_are_taken_together():
         "encoder_scale:yaw",
     ]
     assert names("stribeck:yaw", "backlash:yaw", device="bam") == ["stribeck:yaw"]
+
+
+def test_an_effect_that_leaves_no_force_makes_the_scale_collapse(tmp_path):
+    """Forces, inertia and friction all near zero fit any log."""
+    trials, recipe, _ = record_trials(tmp_path, "joint", 41, "shear_thinning:joint")
+    before = FittedSet(recipe, (), fit_trials(trials, recipe, system_of(recipe).prior), trials)
+    sagging = replace(recipe, effects=("drive_sag:joint",))
+    fitted = fit_trials(trials, sagging, search_start(trials, sagging))
+    for sag, collapsed in ((0.01, False), (100.0, True)):
+        p = np.append(fitted.p[:-1], sag)
+        after = FittedSet(sagging, sagging.effects, replace(fitted, p=p), trials)
+        assert collapses(before, after, Settings()) is collapsed
 
 
 NAMED = [

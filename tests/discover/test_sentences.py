@@ -237,6 +237,17 @@ def test_a_candidate_that_one_second_speaks_for_is_not_called_missing(monkeypatc
     assert "drive_sag:joint is missing" not in said
 
 
+def test_an_effect_that_leaves_no_force_is_not_said_to_lower_the_error(monkeypatch):
+    axis = finding("unknown_effect", 1.0, 1.0, 0.1)
+    refused = RefusedEffect(
+        effect="drive_sag:joint", axis="joint", held_out_rmse_before=1.0, held_out_rmse_after=1e-5,
+        without_worst_second_before=1.0, without_worst_second_after=1e-5, why="scale",
+    )  # fmt: skip
+    said = say(monkeypatch, axis, refused=(refused,))
+    assert "drive_sag:joint fits best where next to nothing is left of what the applied" in said
+    assert "1e-05" not in said and "drive_sag:joint is missing" not in said
+
+
 def test_a_wrong_floor_gives_no_verdict(monkeypatch):
     axis = finding("undecided", 1.0, 0.3, 1.0, effects=("a:joint",))
     said = say(monkeypatch, axis)

@@ -165,3 +165,13 @@ def test_the_report_says_it_first(reversed_joint: bampipe.Run) -> None:
         ("Set-up: the encoder of joint counts", "Set-up: current has the wrong")
     )
     assert "leaves something unexplained" not in page
+
+
+def test_gravity_that_the_device_lacks_is_no_exchanged_column(tmp_path: Path) -> None:
+    """A pendulum whose device file has no weight: its current follows position, and is none."""
+    weightless = set_text(r'potential = ".*"', 'potential = "0"', "joint.toml")
+    no_moments = set_text(r"moment\w* = .*\n", "", "joint.toml")
+    found = inspected(tmp_path, weightless, no_moments)
+    assert found.mistakes == ()
+    (line,) = found.lines
+    assert line.startswith("a torque that follows the position of joint, as of gravity or a spring")

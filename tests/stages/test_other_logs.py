@@ -236,6 +236,7 @@ def test_the_layout_that_a_session_declares(tmp_path):
         ("[deg/s]", "rad/s", np.pi / 180), ("µs", "s", 1e-6), ("mA", "A", 1e-3),
         ("degC", "K", 1.0), ("-", "", 1.0), ("%", "", 0.01), ("m/s²", "m/s2", 1.0),
         ("nm", "m", 1e-9), ("MN", "N", 1e6), ("lbf", "N", 4.4482216152605),
+        ("13.5mA", "A", 0.0135), ("[2.69 mA]", "A", 2.69e-3), ("0.5 deg", "rad", np.pi / 360),
     ],
 )  # fmt: skip
 def test_units_of_logs(text, si, scale):
@@ -244,6 +245,9 @@ def test_units_of_logs(text, si, scale):
     assert found.si == si and found.scale == pytest.approx(scale)
 
 
-@pytest.mark.parametrize("text", ["counts", "ticks", "furlong", "N.m.s/rad", "q", "m m m"])
+@pytest.mark.parametrize(
+    "text",
+    ["counts", "ticks", "furlong", "N.m.s/rad", "q", "m m m", "2", "1/s", "0 mA", "3e", "20 degC"],
+)
 def test_units_that_are_not_known(text):
     assert unit(text) is None

@@ -50,9 +50,8 @@ def _steps(results: Results, rungs: Sequence[Rung]) -> Table:
             rows.append(("in the search", f"`{', '.join(step.effects)}`", *errors))
         cells = []
         for axis in axes:
-            error = rung.held_out_rmse.get(axis)
-            floor = rung.noise_floor.get(axis)
-            text = wording.significant(error)
+            error, floor = rung.sound_error(axis), rung.sound_floor(axis)
+            text = "refused" if axis in rung.refused else wording.significant(error)
             cells.append(f"{text} ({wording.significant(floor)})" if floor else text)
         rows.append((_version(rungs, rung), f"`{rung.added}`" if rung.added else "", *cells))
     units = (f"{axis} ({wording.unit(results.force_unit(axis))})" for axis in axes)
@@ -142,8 +141,8 @@ def _picture(results: Results, rungs: Sequence[Rung]) -> Figure:
     figure, panels = style.panels(1, len(axes), 2.3, width=min(style.WIDTH, 1.2 + 1.9 * len(axes)))
     x = np.arange(len(rungs))
     for panel, axis in zip(panels[0], axes, strict=True):
-        error = _values(rung.held_out_rmse.get(axis) for rung in rungs)
-        floor = _values(rung.noise_floor.get(axis) for rung in rungs)
+        error = _values(rung.sound_error(axis) for rung in rungs)
+        floor = _values(rung.sound_floor(axis) for rung in rungs)
         panel.plot(x, error, "o-", color=style.BLUE, ms=4.5, lw=1.3, label="held-out error")
         panel.plot(x, floor, "s--", color=style.VERMILLION, ms=3.0, lw=1.0, label="noise floor")
         _scale(panel, np.concatenate([error, floor]))
@@ -176,18 +175,20 @@ def _scale(panel: Any, values: np.ndarray) -> None:
 
 
 def _caption(rungs: Sequence[Rung], axes: Sequence[str]) -> str:
-    """Say by how much the error of each axis changed from the first version to the last."""
+    """Say by how much each axis' error changed from the first version to the last not refused."""
     parts = []
     for axis in axes:
-        before, after = (rung.held_out_rmse.get(axis) for rung in (rungs[0], rungs[-1]))
-        if before and after:
+        sound = [rung for rung in rungs if axis not in rung.refused] or rungs
+        before, after = (rung.held_out_rmse.get(axis) for rung in (rungs[0], sound[-1]))
+        if before and after and axis not in rungs[0].refused:
             change = 100.0 * (after / before - 1.0)
             verb = "falls" if change <= -1.0 else "rises" if change >= 1.0 else ""
             # A fall by 100 % would leave nothing.
             left = 100.0 * after / before
             size = wording.plain(abs(change), max(0, int(np.ceil(-np.log10(left)))))
             parts.append(f"{axis} {verb} by {size} %" if verb else f"{axis} stays as it is")
-    return f"Error on held-out trials by version, against the noise floor: {join_names(parts)}."
+    said = f": {join_names(parts)}" if parts else ""
+    return f"Error on held-out trials by version, against the noise floor{said}."
 
 
 def _values(found: Iterable[float | None]) -> np.ndarray:
