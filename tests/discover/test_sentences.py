@@ -195,6 +195,7 @@ def test_a_rival_about_as_likely_is_named_in_the_verdict(monkeypatch):
         ),
         (1.02, 0.60, "held_out", "does not lower the held-out error (1.00 to 1.02 N.m): it is not"),
         (0.20, 0.10, "replays", "from 1.00 to 0.200 N.m, but replays with it give no floor"),
+        (1e-5, 1e-5, "scale", "lag:x fits best where next to nothing is left of what the applied"),
     ],
 )
 def test_what_beats_chance_and_is_refused_is_said(monkeypatch, after, without, why, said):
@@ -235,17 +236,6 @@ def test_a_candidate_that_one_second_speaks_for_is_not_called_missing(monkeypatc
     said = say(monkeypatch, axis, transients=(only,))
     assert "Only 4.0 to 5.0 s of trial t3 speaks for drive_sag:joint" in said
     assert "drive_sag:joint is missing" not in said
-
-
-def test_an_effect_that_leaves_no_force_is_not_said_to_lower_the_error(monkeypatch):
-    axis = finding("unknown_effect", 1.0, 1.0, 0.1)
-    refused = RefusedEffect(
-        effect="drive_sag:joint", axis="joint", held_out_rmse_before=1.0, held_out_rmse_after=1e-5,
-        without_worst_second_before=1.0, without_worst_second_after=1e-5, why="scale",
-    )  # fmt: skip
-    said = say(monkeypatch, axis, refused=(refused,))
-    assert "drive_sag:joint fits best where next to nothing is left of what the applied" in said
-    assert "1e-05" not in said and "drive_sag:joint is missing" not in said
 
 
 def test_a_wrong_floor_gives_no_verdict(monkeypatch):
