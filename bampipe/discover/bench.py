@@ -31,6 +31,8 @@ from bampipe.trials.residuals import Evidence, problem_of
 
 Array = NDArray[np.float64]
 
+_AT_LIMIT = 1e-3
+"""Share of the limit of the timing within which a fit that is held by it ends."""
 _STEPS_OF_TIMING = 4
 """Most Gauss-Newton steps of a fit that starts at the right parameters."""
 
@@ -76,7 +78,7 @@ class Bench:
         step, sd = float(found.p[-1]), float(np.sqrt(found.covariance[-1, -1]))
         late_s = trials.late_s + step
         s = self.settings
-        if abs(step) < s.timing_sd * sd or abs(late_s) + s.limit_sd * sd > trials.limit_s:
+        if abs(step) < s.timing_sd * sd or abs(late_s) >= (1.0 - _AT_LIMIT) * trials.limit_s:
             return self
         return replace(self, trials=open_trials(late_s))
 
