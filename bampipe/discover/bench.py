@@ -25,14 +25,13 @@ from bampipe.discover.scorer import Score, Scorer
 from bampipe.discover.settings import Settings
 from bampipe.estimate.least_squares import fit
 from bampipe.physics.recipe import Recipe
+from bampipe.trials.bias import remove_bias
 from bampipe.trials.measured import MeasuredTrials
 from bampipe.trials.noise_floor import FLOOR_SEED, floor_replays
 from bampipe.trials.residuals import Evidence, problem_of
 
 Array = NDArray[np.float64]
 
-_AT_LIMIT = 1e-3
-"""Share of the limit of the timing within which a fit that is held by it ends."""
 _STEPS_OF_TIMING = 4
 """Most Gauss-Newton steps of a fit that starts at the right parameters."""
 
@@ -63,23 +62,31 @@ class Bench:
         """The same with inputs moved by the timing that a model with more effects gives them.
 
         A lean model takes a part of what it lacks for inputs sampled late; kept, that part would
-        look like a delay as soon as the rest is found.
+        look like a delay as soon as the rest is found. A drive that holds its command acts half a
+        sample late, which a fit finds on either side of that limit.
         """
         trials, system = self.trials, evidence.system
         if trials.limit_s == 0.0 or not set(evidence.free).isdisjoint(system.delays):
             return self
         problem = problem_of(system, trials.motions, trials.band, timing=True)
+        wide = replace(problem, lower=_wider(problem.lower), upper=_wider(problem.upper))
         found = fit(
-            problem,
+            wide,
             np.append(evidence.p, 0.0),
             trials=evidence.folds.fitted_trials,
             most_iterations=_STEPS_OF_TIMING,
         )
         step, sd = float(found.p[-1]), float(np.sqrt(found.covariance[-1, -1]))
-        late_s = trials.late_s + step
-        s = self.settings
-        if abs(step) < s.timing_sd * sd or abs(late_s) >= (1.0 - _AT_LIMIT) * trials.limit_s:
+        if abs(trials.late_s + step) > trials.limit_s:
+            # What filters make of a change of direction looks late, too.
+            straight = remove_bias(
+                trials.sensors, trials.kinematics, system, trials.motions, wide, found
+            )
+            step = float(straight.p[-1])
+        late_s, s = trials.late_s + step, self.settings
+        if abs(step) < s.timing_sd * sd or abs(late_s) - s.limit_sd * sd > trials.limit_s:
             return self
+        late_s = float(np.clip(late_s, -trials.limit_s, trials.limit_s))
         return replace(self, trials=open_trials(late_s))
 
     def fit(self, recipe: Recipe, start: Array) -> Evidence:
@@ -182,3 +189,8 @@ class Bench:
         """Candidates whose gain could be worth having: what chance gives only lowers it."""
         least = self.settings.worth
         return [n for n, s in scores.items() if np.any(s.gain / scorer.independent_samples > least)]
+
+
+def _wider(bound: Array) -> Array:
+    """Bounds of the parameters, the last one, of the timing, twice as far."""
+    return np.append(bound[:-1], 2.0 * bound[-1])

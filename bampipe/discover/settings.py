@@ -48,7 +48,8 @@ class Settings:
             leaving it out altogether would compare extrapolations; of what several trials determine
             it keeps a few hundredths of a degree of freedom.
         timing_sd: standard deviations by which a model with more effects must find another timing
-            of the inputs for that to be taken.
+            of the inputs for that to be taken; limit_sd: and by which it must lie beyond half a
+            sample, the lateness of a drive that holds its command, to be a delay.
         predictable: least share of the residual of an axis above its floor that a flexible
             regressor must predict, beyond chance, for it to lack something.
         surely: error over floor beyond which it lacks something, predictable or not.
@@ -113,6 +114,7 @@ class Settings:
     worth_without_second: float = 0.5
     held_out_weight: float = 0.05
     timing_sd: float = 3.0
+    limit_sd: float = 2.0
     predictable: float = 0.05
     surely: float = 2.0
     explained: float = 0.5
