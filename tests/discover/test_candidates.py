@@ -87,7 +87,13 @@ NAMED = [
     pytest.param(
         "bam", 53, "upper_stop:yaw", ("return_spring:yaw", "lower_stop:yaw"), marks=pytest.mark.long
     ),
-    ("bam", 54, "friction_by_pose:yaw-extension", ("friction_by_pose:yaw-pitch", "stribeck:yaw")),
+    pytest.param(
+        "bam",
+        54,
+        "friction_by_pose:yaw-extension",
+        ("friction_by_pose:yaw-pitch", "stribeck:yaw"),
+        marks=pytest.mark.long,
+    ),
     ("wrist", 56, "unbalance:a", ("force_bias:a", "torque_ripple:a", "return_spring:a")),
     ("damper", 57, "upper_stop:piston", ("return_spring:piston", "quadratic_drag:piston")),
     ("axis", 58, "maxwell_slip:carriage", ("presliding:carriage", "stribeck:carriage")),

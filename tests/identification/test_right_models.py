@@ -30,6 +30,7 @@ def test_friction_that_fades_with_speed_is_found_and_not_refused(tmp_path):
     assert judged["axes"]["extension"]["estimate"] == "accepted"
 
 
+@pytest.mark.long
 def test_an_effect_that_is_not_there_does_not_count_as_identified(tmp_path):
     run, _ = record_run(tmp_path, "axis", 19)
     found, _ = extended(run, "stribeck:carriage")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from independent_runs import record_trials
 
 from bampipe.data.run_folder import RunFolder
@@ -43,6 +44,7 @@ def identified(root, **conditions) -> tuple[IdentifyResult, dict[str, float]]:
     return run.read(IdentifyResult, "right"), truth
 
 
+@pytest.mark.long
 def test_intervals_hold_friction_that_truly_stops_the_arm(tmp_path) -> None:
     result, truth = identified(tmp_path, creep=False)
     found = {name: result.parameters[name] for name in truth}
