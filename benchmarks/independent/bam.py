@@ -235,7 +235,7 @@ def _move(m, laws, wanted, wanted_rate, log_at, braked):
             if i != loose:
                 load[i] += push_along(laws[i], half[i], memory[i])
         if loose >= 0:
-            # Hand and arm on one side of the play, encoder, friction and reducer on the other.
+            # Hand and arm on one side of the play; encoder, friction, brake, reducer on the other.
             gap = half[loose] - (drive_q + 0.5 * h * drive_v)
             if abs(gap) > 0.5 * m.gap:
                 pressed = gap - np.sign(gap) * 0.5 * m.gap
@@ -262,6 +262,8 @@ def _move(m, laws, wanted, wanted_rate, log_at, braked):
                     law, memory[i], free, drive_v, h, REDUCER, drive_q, user[i], across, half[2]
                 )
                 new = free + impulse / REDUCER
+                if drag > 0.0:
+                    new = np.sign(new) * max(abs(new) - drag * h / REDUCER, 0.0)
                 remember(law, memory[i], drive_q, 0.5 * (drive_v + new), h)
                 drive_q += 0.5 * h * (drive_v + new)
                 drive_v = new
