@@ -19,6 +19,8 @@ _TAKEN = frozenset(
 _FROM_A_MOTOR = frozenset(["effort", "torque", "tau"])
 _DRIVE = "drive = true                        # from a motor; false: from a force sensor\n"
 _PRESCRIBED = "prescribed = true                   # guess: a test bench gives the stroke\n"
+_FASTEST_S = 2e-4
+"""Time in which viscous friction stops the least mass that a simulation is asked to follow, s."""
 _YIELDS = 2e-3
 
 
@@ -136,8 +138,10 @@ coulomb = {{ unit = "{axis.torque}", {coulomb}, lower = 0.0 }}  # guess
 
 
 def _inertia(axis: Axis, coil: bool, found: Driven) -> str:
-    # A mass near zero under friction is a motion that no simulation can follow.
+    # A mass near zero under friction is a motion that no simulation can follow. Where force is
+    # nearly all friction the guess of the mass is not worth much: friction has the last word.
     least = 0.02 * found.inertia if found.inertia > 0.0 else 0.1 if axis.linear else 1e-5
+    least = min(least, _FASTEST_S * found.viscous) if found.viscous > 0.0 else least
     least = max(least, 0.3) if coil and axis.linear else least
     prior, sd = _prior(found.inertia)
     values = (prior, sd, f"lower = {_rounded(least):g}")
