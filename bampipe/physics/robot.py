@@ -306,8 +306,8 @@ def _impossible(joint: Joint) -> Iterator[str]:
         yield f"{joint.name}: a negative moment of inertia (principal moments {shown} kg.m2)"
     elif moments[2] > (moments[0] + moments[1]) * (1.0 + _TRIANGLE):
         yield (
-            f"{joint.name}: an inertia that no body has (principal moments {shown} kg.m2: the"
-            " largest exceeds the sum of the others)"
+            f"{joint.name}: an inertia whose largest moment exceeds the sum of the others"
+            f" (principal moments {shown} kg.m2)"
         )
     elif joint.mass == 0.0 and moments[2] > 0.0:
         yield f"{joint.name}: an inertia without a mass"

@@ -357,21 +357,25 @@ def _sentences(
                 f"{column}: too little weight and inertia act on {c.name} to tell its sign"
             )
             continue
-        size = f"{drive.share:.2g} ± {drive.error:.1g}"
-        shown = f"{column} is {size} times what the drawing requires"
+        size = abs(drive.share)
+        said = []
         if drive.share < 0.0:
-            lines.append(f"{shown}: its sign is turned; or that of {c.name} is the wrong one")
-        elif device.force_unit == "A":
-            agreed.append(f"{c.name} {1.0 / drive.share:.3g} N.m/A")
-        elif drive.share >= 1.0 / LEAST_AT_JOINT:
-            lines.append(f"{shown}: another unit, or bodies that are not drawn")
-        elif drive.share <= LEAST_AT_JOINT:
-            lines.append(
-                f"{shown}: another unit, or the torque of a motor with a reduction of about"
-                f" {1.0 / drive.share:.3g}"
+            said.append(f"its sign is turned; or that of {c.name} is the wrong one")
+        if device.force_unit == "A":
+            agreed.append(f"{c.name} {1.0 / size:.3g} N.m/A")
+        elif size >= 1.0 / LEAST_AT_JOINT:
+            said.append("another unit, or bodies that are not drawn")
+        elif size <= LEAST_AT_JOINT:
+            said.append(
+                f"another unit, or the torque of a motor with a reduction of about {1.0 / size:.3g}"
             )
-        else:
-            agreed.append(f"{c.name} {drive.share:.2f}")
+        elif not said:
+            agreed.append(f"{c.name} {size:.2f}")
+        if said:
+            lines.append(
+                f"{column} is {drive.share:.2g} ± {drive.error:.1g} times what the drawing"
+                f" requires: {'; and '.join(said)}"
+            )
     if agreed and device.force_unit == "A":
         lines.append(
             f"torque constants by weight and inertia as drawn, and no better than these:"

@@ -168,7 +168,7 @@ def test_impossible_bodies_are_named() -> None:
     assert wrong is not None
     first, second, third = wrong.impossible
     assert first == "j0: a mass of -1 kg"
-    assert "the largest exceeds the sum" in second
+    assert "largest moment exceeds the sum" in second
     assert "a negative moment of inertia" in third
 
 

@@ -94,6 +94,14 @@ def test_signs_and_reductions_are_tested_against_weight_and_inertia(tmp_path: Pa
     assert float(size.rpartition(" ")[2]) == pytest.approx(100.0, rel=0.1)
 
 
+def test_a_turned_drive_on_the_side_of_the_motor_has_its_reduction_said_too(tmp_path: Path) -> None:
+    write_log(tmp_path, gains=(1.0, -0.01))
+    (said,) = about(proposed(tmp_path), "tau2")
+    assert "its sign is turned; or that of elbow is the wrong one" in said
+    assert "the torque of a motor with a reduction of about" in said
+    assert float(said.rpartition(" ")[2]) == pytest.approx(100.0, rel=0.1)
+
+
 def test_a_position_beyond_the_range_that_the_drives_agree_with_is_said(tmp_path: Path) -> None:
     write_log(tmp_path, swing=8.0)
     assert any("is the range of the drawing right?" in line for line in proposed(tmp_path).check)
