@@ -139,7 +139,7 @@ def _reasons(rows: list[dict[str, object]], where: str) -> list[InputError]:
 def _impossible(device: Device) -> list[str]:
     """What no body can have among the numbers of a robot's drawing."""
     found = device.robot.impossible if device.robot is not None else []
-    return [f"drawing of {line}" for line in found]
+    return [f"no body has what is drawn: {line}" for line in found]
 
 
 def _device(session: Session) -> Device:
