@@ -218,6 +218,16 @@ def _swap_by_replay(
     return likely, extend_set(bench, fewer, scores[likely[0]])
 
 
+def contest_of(
+    bench: Bench, found: FittedSet, name: str, rivals: Sequence[str]
+) -> tuple[Contender, ...]:
+    """Those who contend for the place of an effect of a set, itself first."""
+    fewer = reduce_set(bench, found, name)
+    others = [r for r in rivals if r not in found.added]
+    scores = bench.scores(fewer.recipe, fewer.evidence.p, [name, *others])
+    return tuple(sorted(weigh(fewer, name, scores), key=lambda c: c.effect != name))
+
+
 def comes_close(one: Contender, mine: Contender, s: Settings) -> bool:
     """Whether an effect comes close to the one found, by any score in which that gains at all."""
     pairs = [(one.score, mine.score), (one.score_without_second, mine.score_without_second)]

@@ -12,7 +12,14 @@ from bampipe.discover.bench import Bench
 from bampipe.discover.chance import Progress, Replicate, candidates_of
 from bampipe.discover.influence import SampleRange, error_without_second
 from bampipe.discover.level import Level
-from bampipe.discover.polish import FittedSet, extend_set, is_superfluous, polish, reduce_set
+from bampipe.discover.polish import (
+    FittedSet,
+    contest_of,
+    extend_set,
+    is_superfluous,
+    polish,
+    reduce_set,
+)
 from bampipe.discover.rivals import Choice, choose
 from bampipe.discover.scorer import Score, Scorer
 from bampipe.discover.settings import Settings
@@ -176,11 +183,19 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
     rivals = {name: _rivals(first, name, groups.get(name, ()), s) for name in current.added}
     polished = polish(bench, current, rivals, lambda _, what: progress(0.8, what))
     found, contests = polished.found, polished.contests
-    if found.added != current.added:
-        steps.append(_step(found))
     progress(0.85, "replaying the final model for its noise floor")
     same = known.replicates if found is current else ()
-    final = bench.floor_replicas(found.recipe, found.evidence, found.replayed, same)
+    try:
+        final = bench.floor_replicas(found.recipe, found.evidence, found.replayed, same)
+    except Runaway:
+        if found is current:
+            raise
+        # A rival that scored better has no mechanism that could have it: as found, then.
+        found = current
+        contests = {name: contest_of(bench, found, name, rivals[name]) for name in found.added}
+        final = bench.floor_replicas(found.recipe, found.evidence, found.replayed, known.replicates)
+    if found.added != current.added:
+        steps.append(_step(found))
     axes = initial.system.coordinates
     # Beside others, an effect has been replayed again, and what it was chosen by is out of date.
     alone = choices.get(found.added[0]) if len(found.added) == 1 else None
