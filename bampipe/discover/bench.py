@@ -156,23 +156,22 @@ class Bench:
         evidence: Evidence,
         p: Array,
         asked: Sequence[str],
-        sign_width: float = 1.0,
+        replayed: Recipe | None = None,
     ) -> Level:
         """Chance level of candidates against a fitted model, on the replays of its noise floor.
 
         Args:
             recipe: the model; evidence: its fit; p: parameters that are replayed, (n_p,).
             asked: candidates that are learned at once.
-            sign_width: of what is replayed, times that of the model which is fitted to it.
+            replayed: another model with the same parameters, which is replayed in its place.
         """
-        replayed = recipe if sign_width == 1.0 else recipe.with_sign_widths(sign_width)
         again = (recipe, evidence.p)
         # Where nothing gains, the search is at its end: these are the replays of the final model.
         last = not asked
 
         def replay(names: Sequence[str], first: int, count: int) -> list[Replicate]:
             return self.replicas(
-                replayed,
+                replayed or recipe,
                 p,
                 count,
                 names,

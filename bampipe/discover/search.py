@@ -142,7 +142,8 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
     while len(current.added) + len(dropped) < s.most_effects:
         evidence = current.evidence
         significant, likely = _weigh(bench, scores, known, evidence)
-        significant = _beyond_stops(bench, current, scores, known, significant)
+        significant, doubted = _beyond_stops(bench, current, scores, significant)
+        likely |= doubted
         if not significant:
             break
         chosen = choose(bench, significant, known, current.recipe, evidence, scores, report_step)
@@ -410,27 +411,34 @@ def _beyond_stops(
     bench: Bench,
     current: FittedSet,
     scores: Mapping[str, Score],
-    level: Level,
     significant: Sequence[tuple[float, str]],
-) -> list[tuple[float, str]]:
+) -> tuple[list[tuple[float, str]], dict[str, tuple[float, Array]]]:
     """Those of the significant candidates that beat replays which truly stand still, too.
 
     A machine whose friction stops it goes through a reversal otherwise than a replay that creeps
     within its sign width: play and compliance explain the difference, which is none of the machine.
+
+    Returns:
+        Those, as they came; and of the others p-value and gain in log error by axis where they are
+        likely.
     """
     s = bench.settings
     names = [name for _, name in significant]
-    if not names:
-        return []
+    stopping = current.recipe.with_sign_widths(s.still_width)
+    if not names or stopping == current.recipe:
+        return list(significant), {}
     try:
         still = bench.level(
-            current.recipe, current.evidence, current.replayed, names, s.still_width
+            current.recipe, current.evidence, current.replayed, names, replayed=stopping
         )
         still.ask(scores, names)
     except Runaway:
-        return list(significant)
-    return [
-        (excess, name)
-        for excess, name in significant
-        if still.p_value(scores[name]) < s.significance
-    ]
+        return list(significant), {}
+    p_value = {name: still.p_value(scores[name]) for name in names}
+    samples = current.scorer.independent_samples
+    doubted = {
+        name: (p, np.asarray(still.excess(scores[name]) / samples))
+        for name, p in p_value.items()
+        if s.significance <= p < s.likely
+    }
+    return [(e, name) for e, name in significant if p_value[name] < s.significance], doubted
