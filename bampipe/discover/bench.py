@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from bampipe.discover.chance import (
     Pool,
     PrepareTask,
+    Progress,
     Replicate,
     ReplicateTask,
     ScoreTask,
@@ -52,11 +53,16 @@ class Bench:
     pool: Pool
     names: tuple[str, ...]
 
-    def prepare(self, recipe: Recipe) -> None:
-        """Derive and compile every candidate, each in one worker only."""
+    def prepare(self, recipe: Recipe, progress: Progress) -> None:
+        """Derive and compile every candidate, each in one worker only.
+
+        Args:
+            recipe: the model; progress: called with the share done and a message.
+        """
         parts = 4 * self.settings.jobs
         tasks = [PrepareTask(recipe, self.names[k::parts]) for k in range(parts)]
-        list(self.pool(prepare, tasks))
+        for done, _ in enumerate(self.pool(prepare, tasks)):
+            progress(done / parts, "preparing the candidates")
 
     def retimed(self, evidence: Evidence) -> Bench:
         """The same with inputs moved by the timing that a model with more effects gives them.

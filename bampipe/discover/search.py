@@ -120,7 +120,7 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
     """
     s = bench.settings
     progress(0.0, "preparing the candidates")
-    bench.prepare(base)
+    bench.prepare(base, lambda share, what: progress(0.04 * share, what))
     initial = bench.fit(base, start)
     progress(0.05, "scoring every candidate on the measured trials")
     first = bench.scores(base, initial.p, bench.names)
@@ -142,8 +142,9 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
     while len(current.added) + len(dropped) < s.most_effects:
         evidence = current.evidence
         significant, likely = _weigh(bench, scores, known, evidence)
-        significant, doubted = _beyond_stops(bench, current, scores, significant)
-        likely |= doubted
+        significant, doubted = _beyond_stops(bench, current, scores, known, significant)
+        refused += [_refused_for_stops(current, scores[name]) for name in doubted]
+        likely |= {n: found for n, found in doubted.items() if found[0] < s.likely}
         if not significant:
             break
         chosen = choose(bench, significant, known, current.recipe, evidence, scores, report_step)
@@ -363,6 +364,18 @@ def _refusal(
     )
 
 
+def _refused_for_stops(before: FittedSet, score: Score) -> RefusedEffect:
+    """A candidate that helps on the measured trials as it does on replays that stand still."""
+    axis = int(np.argmax(score.gain))
+    return RefusedEffect(
+        effect=score.name,
+        axis=before.evidence.system.coordinates[axis],
+        held_out_rmse_before=before.evidence.held_out_rmse[axis],
+        held_out_rmse_after=before.scorer.comparable_error(score)[axis],
+        why="stops",
+    )
+
+
 def _weigh(
     bench: Bench,
     scores: Mapping[str, Score],
@@ -411,6 +424,7 @@ def _beyond_stops(
     bench: Bench,
     current: FittedSet,
     scores: Mapping[str, Score],
+    level: Level,
     significant: Sequence[tuple[float, str]],
 ) -> tuple[list[tuple[float, str]], dict[str, tuple[float, Array]]]:
     """The significant candidates from the first on that beats replays which truly stand still, too.
@@ -419,8 +433,7 @@ def _beyond_stops(
     within its sign width: play and compliance explain the difference, which is none of the machine.
 
     Returns:
-        Those, as they came; and of the ones before, p-value and gain in log error by axis where
-        they are likely.
+        Those, as they came; and of the ones before, p-value and gain in log error by axis.
     """
     s, kept = bench.settings, list(significant)
     doubted: dict[str, tuple[float, Array]] = {}
@@ -435,12 +448,12 @@ def _beyond_stops(
         while kept:
             name = kept[0][1]
             still.ask(scores, [name])
-            p_value = still.p_value(scores[name])
-            if p_value < s.significance:
+            p_value, excess = still.p_value(scores[name]), still.excess(scores[name])
+            share = float(excess.sum() / level.excess(scores[name]).sum())
+            if p_value < s.significance and share > s.still_share:
                 break
-            if p_value < s.likely:
-                gain = still.excess(scores[name]) / current.scorer.independent_samples
-                doubted[name] = (p_value, np.asarray(gain))
+            gain = excess / current.scorer.independent_samples
+            doubted[name] = (max(p_value, s.significance), np.asarray(gain))
             kept.pop(0)
     except Runaway:
         return list(significant), {}

@@ -34,8 +34,8 @@ def _parts(axis: str, i: int, found: Diagnosis, unit: str, s: Settings) -> list[
     parts = [f"{name}: {_verdict(a, found, unit)}."]
     parts += _rivals(axis, a, found, unit, s)
     parts += _transients(axis, found)
+    parts += _refused(axis, found, unit, a.remains)
     if a.remains:
-        parts += _refused(axis, found, unit)
         left = f"{_no_effect(found)} explains what is left; its shape" if a.effects else "Its shape"
         judged = found.evidence if a.effects else found.initial
         parts.append(f"{left}: {describe(judged, i, s)}.")
@@ -170,16 +170,19 @@ def _transients(axis: str, found: Diagnosis) -> list[str]:
     ]
 
 
-def _refused(axis: str, found: Diagnosis, unit: str) -> list[str]:
-    """The candidates that beat chance by their score and are not kept, and why."""
+def _refused(axis: str, found: Diagnosis, unit: str, remains: bool) -> list[str]:
+    """The candidates that beat chance by their score and are not kept, and why.
+
+    Where nothing ``remains`` only those for stops: at their floor others need no reason.
+    """
     said = []
     for one in found.refused:
-        if one.axis != axis:
+        if one.axis != axis or not (remains or one.why == "stops"):
             continue
         before, after = one.held_out_rmse_before, one.held_out_rmse_after
         rest, left = one.without_worst_second_before, one.without_worst_second_after
         aside = ""
-        if one.why == "held_out" and left * before > after * rest:
+        if one.why == "held_out" and rest and left and left * before > after * rest:
             before, after, aside = rest, left, " but for the worst second"
         numbers = f"{three(before)} to {three(after)} {unit}{aside}"
         if one.why == "scale":
@@ -188,6 +191,11 @@ def _refused(axis: str, found: Diagnosis, unit: str) -> list[str]:
         elif one.why == "replays":
             why = f"would take the held-out error from {numbers}, but replays with it give no floor"
             why += " that this could be judged by"
+        elif one.why == "stops":
+            why = (
+                f"would take the held-out error from {numbers}, but replays that truly stand still"
+            )
+            why += " at reversals explain that without it"
         elif after < before:
             why = f"beats chance by its score, but takes the held-out error only from {numbers}"
         else:

@@ -144,7 +144,7 @@ class TransientCandidate(Record):
 
 
 class RefusedEffect(Record):
-    """A candidate that beats chance by its score, was added for that, and is not kept."""
+    """A candidate that beats chance by its score, and is not kept."""
 
     effect: str
     axis: str
@@ -152,12 +152,15 @@ class RefusedEffect(Record):
     held_out_rmse_after: Size = Field(
         description="With it, fitted, as if it left both sides of the equation at their size"
     )
-    without_worst_second_before: Size = Field(description="The same but for the worst second")
-    without_worst_second_after: Size
-    why: Literal["held_out", "replays", "scale"] = Field(
+    without_worst_second_before: Size | None = Field(
+        default=None, description="The same but for the worst second; null where it was not fitted"
+    )
+    without_worst_second_after: Size | None = None
+    why: Literal["held_out", "replays", "scale", "stops"] = Field(
         description="It does too little on held-out trials; or replays with it give no floor that "
         "an error could be judged by; or it leaves next to nothing of what the force does, so that "
-        "all forces become small together"
+        "all forces become small together; or replays that truly stand still at reversals give it "
+        "most of its gain as well"
     )
 
 

@@ -212,6 +212,15 @@ def test_what_beats_chance_and_is_refused_is_said(monkeypatch, after, without, w
     assert "lag:x" not in say(monkeypatch, fine, refused=(one,))
 
 
+def test_what_stopping_replays_explain_is_said_where_nothing_is_missing(monkeypatch):
+    """The ranking shows a candidate that halves the error beside "nothing is missing"."""
+    one = RefusedEffect(
+        effect="lag:x", axis="joint", held_out_rmse_before=1.0, held_out_rmse_after=0.5, why="stops"
+    )
+    said = say(monkeypatch, finding("nothing_missing", 1.0, 1.0, 1.0), refused=(one,))
+    assert "from 1.00 to 0.500 N.m, but replays that truly stand still at reversals" in said
+
+
 def test_odds_are_given_where_no_replay_looks_like_the_measurement(monkeypatch):
     axis = finding("missing", 1.0, 0.1, 0.1, effects=("a:joint",), explained_by_effects=1.0)
     contest = (
