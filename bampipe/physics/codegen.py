@@ -208,7 +208,7 @@ def _printed(value: Any) -> tuple[str, frozenset[Any]]:
 def _block(results: Sequence[Any], steps: Sequence[tuple[Any, Any]] = ()) -> _Block:
     """The text of ``results``, with those of ``steps`` in front that they need."""
     printer = _Printer()
-    used: set[Any] = set().union(*(sp.sympify(e).free_symbols for e in results))
+    used: set[Any] = set().union(*(sp.sympify(e, strict=True).free_symbols for e in results))
     needed = []
     for name, value in reversed(steps):
         if name in used:
@@ -254,7 +254,8 @@ def portable_expressions(
     numbers = {symbol: sp.Float(value) for symbol, value in parameters.items()}
     numbers |= dict.fromkeys(e.w, sp.S.Zero)
     required = [
-        sp.sympify(f - o).xreplace(numbers) for f, o in zip(e.dynamics, e.other, strict=True)
+        sp.sympify(f - o, strict=True).xreplace(numbers)
+        for f, o in zip(e.dynamics, e.other, strict=True)
     ]
     steps = [(name, value.xreplace(numbers)) for name, value in e.steps]
     block = _block(required, steps)
@@ -356,12 +357,12 @@ def _encoder_readings(e: Equations) -> list[Any]:
     """
     truth, offset = [*e.q, *e.qd], [*e.offset, *e.offset_rate]
     moved = {s for s, o in zip(truth, offset, strict=True) if o != 0}
-    steps = 6 if any(sp.sympify(o).free_symbols & moved for o in offset) else 1
+    steps = 6 if any(sp.sympify(o, strict=True).free_symbols & moved for o in offset) else 1
     readings = truth
     for _ in range(steps):
         reading = dict(zip(truth, readings, strict=True))
         readings = [
-            t - sp.sympify(o).subs(reading, simultaneous=True)
+            t - sp.sympify(o, strict=True).subs(reading, simultaneous=True)
             for t, o in zip(truth, offset, strict=True)
         ]
     return readings
@@ -451,7 +452,7 @@ def memory_source(e: Equations) -> tuple[str, dict[str, list[int]]]:
     others = [set(e.z) - {z} for z in e.z]
     coupled = any(r.free_symbols & o for r, o in zip(e.rates, others, strict=True))
     groups = {"q": e.q, "qd": e.qd, "u": e.u, "p": e.p}
-    used = set().union(*(sp.sympify(rate).free_symbols for rate in e.rates))
+    used = set().union(*(sp.sympify(rate, strict=True).free_symbols for rate in e.rates))
     uses = {g: [i for i, s in enumerate(some) if s in used] for g, some in groups.items()}
     numbered = {
         groups[g][i]: sp.Symbol(f"{g}_{k:03d}", real=True)
@@ -463,7 +464,7 @@ def memory_source(e: Equations) -> tuple[str, dict[str, list[int]]]:
     states = [numbered[z] for z in e.z]
 
     def renamed(expressions: Sequence[Any]) -> list[Any]:
-        return [sp.sympify(x).xreplace(numbered) for x in expressions]
+        return [sp.sympify(x, strict=True).xreplace(numbered) for x in expressions]
 
     if coupled or any(slope.free_symbols & set(e.z) for slope in slopes):
         groups_of = {**passed, "z": states}

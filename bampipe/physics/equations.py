@@ -78,5 +78,7 @@ def contribution(full: Equations, bare: Equations) -> list[Any]:
             (m - n) * a for m, n, a in zip(full.mass[i], bare.mass[i], full.qdd, strict=True)
         )
         force = full.applied[i] - bare.applied[i] + full.other[i] - bare.other[i]
-        added.append(sp.sympify(force - (full.bias[i] - bare.bias[i]) - inertia).subs(quiet))
+        added.append(
+            sp.sympify(force - (full.bias[i] - bare.bias[i]) - inertia, strict=True).subs(quiet)
+        )
     return added

@@ -241,7 +241,7 @@ def build(
     import sympy as sp
 
     def walk(node: ast.AST) -> Any:
-        value = sp.sympify(combine(node))
+        value = sp.sympify(combine(node), strict=True)
         if value.is_number and not _bounded(value):
             raise InputError(
                 f"{ast.unparse(node)[:60]!r} is not a real number below {MAX_NUMBER:g}",

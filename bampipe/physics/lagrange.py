@@ -29,7 +29,7 @@ _INFINITE = (sp.nan, sp.oo, -sp.oo, sp.zoo, sp.I)
 
 def allow(what: str, exprs: list[Any], allowed: list[Any], words: str) -> None:
     """Raise InputError unless ``exprs`` use ``allowed`` symbols only and can be computed."""
-    for expr in map(sp.sympify, exprs):
+    for expr in (sp.sympify(e, strict=True) for e in exprs):
         if expr.free_symbols - set(allowed):
             raise InputError(f"{what} may depend on {words} only")
         odd = [f for f in expr.atoms(sp.Function, sp.Derivative) if not isinstance(f, _PRINTABLE)]

@@ -122,7 +122,7 @@ def _templates(model: Model, labels: Sequence[str]) -> dict[str, Any]:
     sign = sp.Function("sgn")
 
     def text(expr: Any) -> str:
-        plain = sp.sympify(expr).subs(quiet)
+        plain = sp.sympify(expr, strict=True).subs(quiet)
         # A factor of 1.0 says nothing, and 2.0 no more than 2.
         plain = plain.xreplace({f: sp.Integer(f) for f in plain.atoms(sp.Float) if f == int(f)})
         for rate in e.qd:

@@ -117,7 +117,7 @@ def _split(
     for expr in (e.kinetic, e.potential) if model.device.robot is None else ():
         factors += _factors(expr - expr.subs(dict.fromkeys(motion, 0)), motion, set(names))
     for expr in (*e.applied, *e.other, *e.rates, *e.offset):
-        factors += _factors(sp.sympify(expr).subs(quiet), motion, set(names))
+        factors += _factors(sp.sympify(expr, strict=True).subs(quiet), motion, set(names))
     known: set[Any] = set()
     while True:
         left = _distinct([_stripped(f, known) for f in factors])
@@ -232,6 +232,6 @@ def _slope_source(model: Model, e: Equations, pivots: Sequence[str]) -> str:
         residual = a + o - f
         for name in pivots:
             slope = sp.diff(residual, constant_symbol(name))
-            slopes.append(sp.sympify(slope).subs(quiet).subs(numbers))
+            slopes.append(sp.sympify(slope, strict=True).subs(quiet).subs(numbers))
     groups = {"q": e.q, "qd": e.qd, "qdd": e.qdd, "z": e.z, "u": e.u, "p": e.p}
     return function_source("slopes", groups, slopes, e.steps)

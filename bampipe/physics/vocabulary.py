@@ -115,7 +115,7 @@ class Vocabulary:
 
     def sgn(self, argument: Any) -> Any:
         """Sign, smoothed over the axes' widths where the argument is a rate or a sum of rates."""
-        width, rest = sp.S.Zero, sp.sympify(argument)
+        width, rest = sp.S.Zero, sp.sympify(argument, strict=True)
         for c, rate in zip(self.model.device.coordinates, self.qd, strict=True):
             share = sp.diff(argument, rate)
             if not share.is_number:
