@@ -102,8 +102,8 @@ def unit(text: str) -> RecordedUnit | None:
         if prefix in _PREFIXES and rest in _PREFIXED:
             base = _BASE[rest]
             return RecordedUnit(base.si, base.scale * _PREFIXES[prefix])
-    steps = _STEPS.fullmatch(plain)
-    one = unit(steps["unit"]) if steps else None
-    if steps is None or one is None or one.offset or not float(steps["number"]):
-        return None
-    return RecordedUnit(one.si, float(steps["number"]) * one.scale)
+    if steps := _STEPS.fullmatch(plain):
+        one, count = unit(steps["unit"]), float(steps["number"])
+        if one is not None and one.offset == 0.0 and count > 0.0:
+            return RecordedUnit(one.si, count * one.scale)
+    return None

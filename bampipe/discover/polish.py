@@ -28,7 +28,6 @@ from bampipe.trials.residuals import Evidence, residual_and_memory
 
 Array = NDArray[np.float64]
 
-
 _LEAST_SLOPE = 1e-6
 """Of a residual by its force, where a sample has none: its logarithm stays finite."""
 
@@ -172,9 +171,7 @@ def _swap_by_score(
             found, contests = fewer, {}
             waiting = list(found.added)
             continue
-        others = [r for r in rivals.get(name, ()) if r not in found.added]
-        scores = bench.scores(fewer.recipe, fewer.evidence.p, [name, *others])
-        contest = weigh(fewer, name, scores)
+        scores, contest = _contest(bench, found, fewer, name, rivals.get(name, ()))
         best = contest[0] if contest else None
         # An effect that is alone has been compared with its rivals by replays already.
         if len(found.added) > 1 and best and best.effect != name and name not in swapped:
@@ -186,7 +183,7 @@ def _swap_by_score(
                     found, contests = other, {}
                     waiting = list(found.added)
                     continue
-        contests[name] = tuple(sorted(contest, key=lambda c: c.effect != name))
+        contests[name] = _itself_first(contest, name)
     return found, contests
 
 
@@ -222,10 +219,21 @@ def contest_of(
     bench: Bench, found: FittedSet, name: str, rivals: Sequence[str]
 ) -> tuple[Contender, ...]:
     """Those who contend for the place of an effect of a set, itself first."""
-    fewer = reduce_set(bench, found, name)
+    contest = _contest(bench, found, reduce_set(bench, found, name), name, rivals)[1]
+    return _itself_first(contest, name)
+
+
+def _contest(
+    bench: Bench, found: FittedSet, fewer: FittedSet, name: str, rivals: Sequence[str]
+) -> tuple[dict[str, Score], list[Contender]]:
+    """Scores of an effect of a set and its rivals against the set without it, and the contest."""
     others = [r for r in rivals if r not in found.added]
     scores = bench.scores(fewer.recipe, fewer.evidence.p, [name, *others])
-    return tuple(sorted(weigh(fewer, name, scores), key=lambda c: c.effect != name))
+    return scores, weigh(fewer, name, scores)
+
+
+def _itself_first(contest: Sequence[Contender], name: str) -> tuple[Contender, ...]:
+    return tuple(sorted(contest, key=lambda c: c.effect != name))
 
 
 def comes_close(one: Contender, mine: Contender, s: Settings) -> bool:

@@ -23,6 +23,7 @@ from bampipe.discover.polish import (
 from bampipe.discover.rivals import Choice, choose
 from bampipe.discover.scorer import Score, Scorer
 from bampipe.discover.settings import Settings
+from bampipe.discover.stops import StoppingReplays
 from bampipe.estimate.simulation import Runaway
 from bampipe.physics.recipe import Recipe
 from bampipe.results.diagnose import Contender, RefusedEffect, SearchStep
@@ -128,11 +129,12 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
     current, scores = FittedSet(base, (), initial, bench.trials, start), dict(first)
     asked = bench.gaining(first, current.scorer)
     level = bench.level(base, initial, current.replayed, asked)
+    stops = StoppingReplays(bench, current)
     choices: dict[str, Choice] = {}
     additions: dict[str, Addition] = {}
     dropped: set[str] = set()
     transient: dict[str, SampleRange] = {}
-    refused: list[RefusedEffect] = []
+    refused: dict[str, RefusedEffect] = {}
     steps = [_step(current)]
     known = level
 
@@ -142,8 +144,8 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
     while len(current.added) + len(dropped) < s.most_effects:
         evidence = current.evidence
         significant, likely = _weigh(bench, scores, known, evidence)
-        significant, doubted = _beyond_stops(bench, current, scores, known, significant)
-        refused += [_refused_for_stops(current, scores[name]) for name in doubted]
+        significant, doubted = stops.first_beyond(scores, known, significant)
+        refused |= {name: stops.refusal(scores[name]) for name in doubted}
         likely |= {n: found for n, found in doubted.items() if found[0] < s.likely}
         if not significant:
             break
@@ -171,11 +173,12 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
         if sound is None:
             # It resembles what is missing in these trials, but no mechanism could have it.
             dropped.add(chosen.winner)
-            refused.append(_refusal(chosen.winner, addition, current, wider, s))
+            refused[chosen.winner] = _refusal(chosen.winner, addition, current, wider, s)
             scores = {name: score for name, score in scores.items() if name != chosen.winner}
             continue
         dropped |= {*current.added, chosen.winner} - {*wider.added}
         bench, current, (scores, known) = timed, wider, sound
+        stops = StoppingReplays(bench, current)
         choices[chosen.winner] = chosen
         additions[chosen.winner] = addition
         steps.append(_step(current))
@@ -208,7 +211,7 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
         bench.trials, base, initial, level, first, found,
         {n: polished.alike.get(n, groups.get(n, ())) for n in found.added},
         unlike, misfit, contests, main, additions, likely, transient,
-        tuple(r for r in refused if r.effect not in found.added), tuple(steps), cut_short,
+        tuple(r for name, r in refused.items() if name not in found.added), tuple(steps), cut_short,
         tuple(final),
     )  # fmt: skip
 
@@ -364,18 +367,6 @@ def _refusal(
     )
 
 
-def _refused_for_stops(before: FittedSet, score: Score) -> RefusedEffect:
-    """A candidate that helps on the measured trials as it does on replays that stand still."""
-    axis = int(np.argmax(score.gain))
-    return RefusedEffect(
-        effect=score.name,
-        axis=before.evidence.system.coordinates[axis],
-        held_out_rmse_before=before.evidence.held_out_rmse[axis],
-        held_out_rmse_after=before.scorer.comparable_error(score)[axis],
-        why="stops",
-    )
-
-
 def _weigh(
     bench: Bench,
     scores: Mapping[str, Score],
@@ -418,43 +409,3 @@ def _weigh(
         elif p_value < s.likely:
             likely[name] = (p_value, np.asarray(gain))
     return sorted(found, reverse=True), likely
-
-
-def _beyond_stops(
-    bench: Bench,
-    current: FittedSet,
-    scores: Mapping[str, Score],
-    level: Level,
-    significant: Sequence[tuple[float, str]],
-) -> tuple[list[tuple[float, str]], dict[str, tuple[float, Array]]]:
-    """The significant candidates from the first on that beats replays which truly stand still, too.
-
-    A machine whose friction stops it goes through a reversal otherwise than a replay that creeps
-    within its sign width: play and compliance explain the difference, which is none of the machine.
-
-    Returns:
-        Those, as they came; and of the ones before, p-value and gain in log error by axis.
-    """
-    s, kept = bench.settings, list(significant)
-    doubted: dict[str, tuple[float, Array]] = {}
-    stopping = current.recipe.with_sign_widths(s.still_width)
-    if not kept or stopping == current.recipe:
-        return kept, doubted
-    # The rest are weighed against the first that passes: to ask it alone is a third of the work.
-    try:
-        still = bench.level(
-            current.recipe, current.evidence, current.replayed, [kept[0][1]], replayed=stopping
-        )
-        while kept:
-            name = kept[0][1]
-            still.ask(scores, [name])
-            p_value, excess = still.p_value(scores[name]), still.excess(scores[name])
-            share = float(excess.sum() / level.excess(scores[name]).sum())
-            if p_value < s.significance and share > s.still_share:
-                break
-            gain = excess / current.scorer.independent_samples
-            doubted[name] = (max(p_value, s.significance), np.asarray(gain))
-            kept.pop(0)
-    except Runaway:
-        return list(significant), {}
-    return kept, doubted

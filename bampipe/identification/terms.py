@@ -54,9 +54,9 @@ def describe_terms(evidence: Evidence, p: Array, covariance: Covariance, model: 
     """Return the equations of a model with its numbers, and the curve of each term.
 
     A curve is the force that the term takes: the residual of the model without it minus that of the
-    model, in bins of the variable that explains most of its variance. Nothing is low-passed: what
-    was measured cancels, and a force low-passed against a motion that is not would bend. Of a long
-    session, trials drawn from all are binned (`draw_trials`).
+    model, in bins of the variable that explains most of its variance. Nothing is low-pass filtered:
+    measured forces cancel in the difference, and filtering the force alone would distort the curve.
+    Of a long session, trials drawn from all are binned (`draw_trials`).
 
     Args:
         evidence: of the model on its trials; p: its parameters as published, (n_p,).

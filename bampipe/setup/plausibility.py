@@ -133,25 +133,22 @@ class _Fitted:
 
 def _with_pose(evidence: Evidence, posed: Sequence[int]) -> _Fitted:
     """The fit with a torque over the position of the axes ``posed`` beside the device."""
-    system, free = evidence.system, list(evidence.free)
-    columns = [_pose_columns(evidence, k, posed) for k in range(len(evidence.residual))]
-    nothing = [np.zeros_like(residual) for residual in evidence.residual]
-    sums = evidence.sums.bordered(evidence.jacobian, columns, nothing, evidence.residual)
-    normal, more = np.einsum("q,kqij->ij", evidence.weight, sums.xx), columns[0].shape[2]
-    # The device may have a constant of its own, and a short travel shows no more than a line.
-    ridge = np.append(np.zeros(len(free)), _RIDGE * np.diag(normal)[len(free) :])
-    step = np.zeros(len(free) + more)
+    free, weight, sums = list(evidence.free), evidence.weight, evidence.sums
+    step, more = np.zeros(len(free)), np.zeros(0)
     if posed:
-        wide = np.full(more, np.inf)
+        columns = [_pose_columns(evidence, k, posed) for k in range(len(evidence.residual))]
+        nothing = [np.zeros_like(residual) for residual in evidence.residual]
+        sums = sums.bordered(evidence.jacobian, columns, nothing, evidence.residual)
+        # The device may have a constant of its own, and a short travel shows no more than a line.
+        more = _RIDGE * np.einsum("q,kqii->i", weight, sums.xx)[len(free) :]
         part = sums.subset(evidence.folds.fitted_trials)
+        ridge, wide = np.append(step, more), np.full(more.size, np.inf)
         step = replace(part, precision=part.precision + ridge).solve(
-            evidence.weight, np.append(evidence.lower, -wide), np.append(evidence.upper, wide)
+            weight, np.append(evidence.lower, -wide), np.append(evidence.upper, wide)
         )
-    prior_sd = np.array([system.parameters[i].sd for i in free])
-    normal += np.diag(ridge)
-    normal[: len(free), : len(free)] += np.diag(
-        1.0 / np.maximum(VAGUE * prior_sd, np.finfo(float).tiny) ** 2
-    )
+    prior_sd = np.array([evidence.system.parameters[i].sd for i in free])
+    vague = 1.0 / np.maximum(VAGUE * prior_sd, np.finfo(float).tiny) ** 2
+    normal = np.einsum("q,kqij->ij", weight, sums.xx) + np.diag(np.append(vague, more))
     p, sd = evidence.p.copy(), np.zeros(len(evidence.p))
     p[free] += step[: len(free)]
     sd[free] = np.sqrt(np.diag(np.linalg.inv(normal)))[: len(free)]

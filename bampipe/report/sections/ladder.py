@@ -179,8 +179,8 @@ def _caption(rungs: Sequence[Rung], axes: Sequence[str]) -> str:
     parts = []
     for axis in axes:
         sound = [rung for rung in rungs if axis not in rung.refused] or rungs
-        before, after = (rung.held_out_rmse.get(axis) for rung in (rungs[0], sound[-1]))
-        if before and after and axis not in rungs[0].refused:
+        before, after = (rung.sound_error(axis) for rung in (rungs[0], sound[-1]))
+        if before and after:
             change = 100.0 * (after / before - 1.0)
             verb = "falls" if change <= -1.0 else "rises" if change >= 1.0 else ""
             # A fall by 100 % would leave nothing.

@@ -1,0 +1,88 @@
+"""Replays that truly stand still where the machine turns round: what they explain is not missing.
+
+A machine whose friction stops it goes through a reversal otherwise than a replay that creeps within
+its sign width: play and compliance explain the difference, which is none of the machine.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.discover.bench import Bench
+from bampipe.discover.level import Level
+from bampipe.discover.polish import FittedSet
+from bampipe.discover.scorer import Score
+from bampipe.estimate.simulation import Runaway
+from bampipe.results.diagnose import RefusedEffect
+
+Array = NDArray[np.float64]
+
+
+class StoppingReplays:
+    """Replays of one fitted model with a narrow sign width, made once they are asked for."""
+
+    def __init__(self, bench: Bench, current: FittedSet) -> None:
+        """Take a session and the model of it that is searched for more."""
+        self._bench, self._current = bench, current
+        self._narrow = current.recipe.with_sign_widths(bench.settings.still_width)
+        self._made: Level | None = None
+
+    def _level(self, name: str) -> Level:
+        """The chance level on these replays; ``name``: a candidate that is learned at once."""
+        if self._made is None:
+            now = self._current
+            self._made = self._bench.level(
+                now.recipe, now.evidence, now.replayed, [name], replayed=self._narrow
+            )
+        return self._made
+
+    def first_beyond(
+        self,
+        scores: Mapping[str, Score],
+        level: Level,
+        significant: Sequence[tuple[float, str]],
+    ) -> tuple[list[tuple[float, str]], dict[str, tuple[float, Array]]]:
+        """The significant candidates from the first on that beats these replays, too.
+
+        Args:
+            scores: against the model; level: chance on its own replays.
+            significant: candidates that beat it, with their excess, best first.
+
+        Returns:
+            Those, as they came; and of the ones before, p-value and gain in log error by axis. All
+            of them where no width is declared, as of a robot, or the replays run away.
+        """
+        s, kept = self._bench.settings, list(significant)
+        doubted: dict[str, tuple[float, Array]] = {}
+        if self._narrow == self._current.recipe:
+            return kept, doubted
+        # The rest are weighed against the first that passes: alone, it is a third of the work.
+        try:
+            while kept:
+                name = kept[0][1]
+                still = self._level(name)
+                still.ask(scores, [name])
+                p_value, excess = still.p_value(scores[name]), still.excess(scores[name])
+                share = float(excess.sum() / level.excess(scores[name]).sum())
+                if p_value < s.significance and share > s.still_share:
+                    break
+                gain = excess / self._current.scorer.independent_samples
+                doubted[name] = (max(p_value, s.significance), np.asarray(gain))
+                kept.pop(0)
+        except Runaway:
+            return list(significant), {}
+        return kept, doubted
+
+    def refusal(self, score: Score) -> RefusedEffect:
+        """A candidate that helps on the measured trials as it does on these replays."""
+        evidence, axis = self._current.evidence, int(np.argmax(score.gain))
+        return RefusedEffect(
+            effect=score.name,
+            axis=evidence.system.coordinates[axis],
+            held_out_rmse_before=evidence.held_out_rmse[axis],
+            held_out_rmse_after=self._current.scorer.comparable_error(score)[axis],
+            why="stops",
+        )

@@ -1,0 +1,72 @@
+"""Candidates held against replays that truly stand still at reversals."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from bampipe.discover.settings import Settings
+from bampipe.discover.stops import StoppingReplays
+
+GAINS = {"compliance": 100.0, "delay": 60.0, "thinning": 30.0}
+"""Beyond chance on replays that creep."""
+STILL = {"compliance": 30.0, "delay": 55.0, "thinning": 29.0}
+"""The same on replays that stand still."""
+
+
+def level_of(gains, p_values):
+    return SimpleNamespace(
+        excess=lambda name: np.array([gains[name]]),
+        p_value=lambda name: p_values.get(name, 1e-6),
+        ask=lambda scores, names: None,
+    )
+
+
+def replays(p_values=(), narrow="narrow"):
+    """Replays that make a level of these p-values, and a list of the times it was made."""
+    made = []
+
+    def level(*_, replayed):
+        made.append(replayed)
+        return level_of(STILL, dict(p_values))
+
+    recipe = SimpleNamespace(with_sign_widths=lambda factor: narrow)
+    current = SimpleNamespace(
+        recipe=recipe, evidence=None, replayed=None,
+        scorer=SimpleNamespace(independent_samples=np.array([1000.0])),
+    )  # fmt: skip
+    found = StoppingReplays(SimpleNamespace(settings=Settings(), level=level), current)
+    if narrow is None:
+        found._narrow = recipe
+    return found, made
+
+
+SIGNIFICANT = [(gain, name) for name, gain in GAINS.items()]
+SCORES = {name: name for name in GAINS}
+
+
+def test_what_keeps_less_than_half_of_its_gain_is_passed_over() -> None:
+    found, made = replays()
+    for _ in range(2):  # the model is the same: its replays are made once
+        kept, doubted = found.first_beyond(SCORES, level_of(GAINS, {}), SIGNIFICANT)
+        assert [name for _, name in kept] == ["delay", "thinning"]
+        (p_value, gain) = doubted.pop("compliance")
+        assert p_value == Settings().significance
+        assert gain == pytest.approx(0.03)
+        assert doubted == {}
+    assert made == ["narrow"]
+
+
+def test_what_such_replays_have_by_chance_is_passed_over() -> None:
+    found, _ = replays({"delay": 0.2})
+    kept, doubted = found.first_beyond(SCORES, level_of(GAINS, {}), SIGNIFICANT)
+    assert [name for _, name in kept] == ["thinning"]
+    assert doubted["delay"][0] == 0.2
+
+
+def test_without_a_declared_width_nothing_is_replayed() -> None:
+    found, made = replays(narrow=None)
+    assert found.first_beyond(SCORES, level_of(GAINS, {}), SIGNIFICANT) == (SIGNIFICANT, {})
+    assert made == []
