@@ -54,12 +54,14 @@ class Generated:
     sources: Mapping[str, str]
 
     def module(self, name: str) -> ModuleType:
-        """Return the module ``name``, executed once a process."""
+        """Return the module ``name``, executed once a process, after those that it imports."""
         path = self._path(name)
-        # Named by what is in it: models with the same text share what is compiled from it.
-        title = f"bampipe_generated_{path.stem}"
+        title = module_title(name, self.sources[name])
         if title in sys.modules:
             return sys.modules[title]
+        for other, source in self.sources.items():
+            if other != name and f"from {module_title(other, source)} " in self.sources[name]:
+                self.module(other)
         module = ModuleType(title)
         module.__file__ = str(path)
         vars(module)["__sources__"] = _GENERATOR
@@ -91,6 +93,14 @@ class Generated:
         }
         content["hash"] = digest_content(content)
         _write(self.folder / f"meta_{self.key}.json", json.dumps(content, sort_keys=True))
+
+
+def module_title(name: str, source: str) -> str:
+    """Name under which the module ``name`` of a model is imported by others of the same model.
+
+    It is named by what is in it: models with the same text share what is compiled from it.
+    """
+    return f"bampipe_generated_{_stem(name, digest_bytes(source.encode()))}"
 
 
 def load(key: str, generate: Callable[[], tuple[dict[str, Any], Mapping[str, str]]]) -> Generated:
@@ -134,7 +144,11 @@ def _read(folder: Path, key: str) -> Generated | None:
 
 def _source_path(folder: Path, name: str, digest: str) -> Path:
     """Where the source of a module is, whose hash is ``digest``."""
-    return folder / f"{name}_{digest[:24]}.py"
+    return folder / f"{_stem(name, digest)}.py"
+
+
+def _stem(name: str, digest: str) -> str:
+    return f"{name}_{digest[:24]}"
 
 
 def folder_of_user() -> Path:

@@ -95,9 +95,9 @@ class Bench:
         late_s = float(np.clip(late_s, -trials.limit_s, trials.limit_s))
         return replace(self, trials=open_trials(late_s))
 
-    def fit(self, recipe: Recipe, start: Array) -> Evidence:
-        """Least squares of a model on the measured trials."""
-        return fit_trials(self.trials, recipe, start)
+    def fit(self, recipe: Recipe, start: Array, like: Evidence | None = None) -> Evidence:
+        """Least squares of a model on the measured trials; see `fit_trials`."""
+        return fit_trials(self.trials, recipe, start, like)
 
     def replicas(
         self,

@@ -100,9 +100,15 @@ def _make_room(built: dict[str, Any]) -> None:
         built.clear()
 
 
-def fit_trials(trials: MeasuredTrials, recipe: Recipe, start: Array) -> Evidence:
-    """Least squares of the model of ``recipe`` on the measured trials."""
-    return gather_evidence(system_of(recipe), trials.motions, trials.band, start, trials.folds)
+def fit_trials(
+    trials: MeasuredTrials, recipe: Recipe, start: Array, like: Evidence | None = None
+) -> Evidence:
+    """Least squares of the model of ``recipe`` on the measured trials.
+
+    What a model ``like`` it has in common with it, fitted to the same, is not computed again.
+    """
+    system = system_of(recipe)
+    return gather_evidence(system, trials.motions, trials.band, start, trials.folds, like=like)
 
 
 def candidates_of(recipe: Recipe, names: Sequence[str]) -> list[Candidate]:

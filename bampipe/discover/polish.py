@@ -97,14 +97,14 @@ class FittedSet:
 def extend_set(bench: Bench, known: FittedSet, score: Score) -> FittedSet:
     """Fit the set with one effect more, from where it was scored."""
     wider = replace(known.recipe, effects=(*known.recipe.effects, score.name))
-    fitted = bench.fit(wider, with_effect(wider, known.evidence, score))
+    fitted = bench.fit(wider, with_effect(wider, known.evidence, score), known.evidence)
     return FittedSet(wider, (*known.added, score.name), fitted, bench.trials)
 
 
 def reduce_set(bench: Bench, known: FittedSet, name: str) -> FittedSet:
     """Fit the set without one of its effects."""
     fewer = replace(known.recipe, effects=tuple(e for e in known.recipe.effects if e != name))
-    fitted = bench.fit(fewer, without_effect(fewer, known.evidence))
+    fitted = bench.fit(fewer, without_effect(fewer, known.evidence), known.evidence)
     kept = tuple(n for n in known.added if n != name)
     return FittedSet(fewer, kept, fitted, bench.trials)
 

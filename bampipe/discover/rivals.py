@@ -147,7 +147,7 @@ def replay_rivals(
     for k, name in enumerate(rivals):
         progress(0.5, f"replaying {name} and what may be mistaken for it")
         wider = replace(recipe, effects=(*recipe.effects, name))
-        fitted = bench.fit(wider, with_effect(wider, evidence, scores[name]))
+        fitted = bench.fit(wider, with_effect(wider, evidence, scores[name]), evidence)
         try:
             replicas = bench.replicas(
                 wider, fitted.p, s.rival_replicates, rivals, (2, k),

@@ -25,6 +25,7 @@ from bampipe.discover.scorer import Score, Scorer
 from bampipe.discover.settings import Settings
 from bampipe.discover.stops import StoppingReplays
 from bampipe.estimate.simulation import Runaway
+from bampipe.lists import join_names
 from bampipe.physics.recipe import Recipe
 from bampipe.results.diagnose import Contender, RefusedEffect, SearchStep
 from bampipe.results.standing import AT_FLOOR, standing
@@ -154,35 +155,35 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
         scores = {n: score for n, score in scores.items() if n not in chosen.transient}
         if not chosen.winner:
             continue
-        score = scores[chosen.winner]
-        addition = Addition(score, known.p_value(score), known.excess(score), current.scorer)
-        wider = extend_set(bench, current, score)
-        for earlier in wider.added[:-1]:
-            # What resembles the missing effect may come first: it takes a little of several others.
-            less = reduce_set(bench, wider, earlier)
-            if is_superfluous(wider, less, s):
-                wider = less
-        out = {*wider.added, *current.added, *dropped, *transient}
-        timed = bench.retimed(wider.evidence)
-        if timed is not bench:
-            fitted = timed.fit(wider.recipe, wider.evidence.p)
-            wider = replace(wider, evidence=fitted, trials=timed.trials)
-        rest = [n for n in bench.names if n not in out]
-        promised = score.gain / current.scorer.independent_samples
-        sound = _sound_level(timed, current, wider, promised, known, scores, rest)
-        if sound is None:
+        joined = [chosen]
+        beside = _choose_beside(bench, stops, current, chosen.winner, significant, known, scores)
+        for other in beside:
+            transient |= other.transient
+            if other.winner:
+                joined.append(other)
+        del joined[s.most_effects - len(current.added) - len(dropped) :]
+        scores = {n: score for n, score in scores.items() if n not in transient}
+        out = {*dropped, *transient}
+        grown = _grow(bench, current, joined, known, scores, out)
+        if grown.level is None and len(joined) > 1:
+            # Whichever of them it is: each has a turn of its own.
+            joined = [chosen]
+            grown = _grow(bench, current, joined, known, scores, out)
+        made = {c.winner: _as_addition(scores[c.winner], known, current) for c in joined}
+        if grown.level is None:
             # It resembles what is missing in these trials, but no mechanism could have it.
-            dropped.add(chosen.winner)
-            refused[chosen.winner] = _refusal(chosen.winner, addition, current, wider, s)
-            scores = {name: score for name, score in scores.items() if name != chosen.winner}
+            name = chosen.winner
+            dropped.add(name)
+            refused[name] = _refusal(name, made[name], current, grown.found, s)
+            scores = {n: score for n, score in scores.items() if n != name}
             continue
-        dropped |= {*current.added, chosen.winner} - {*wider.added}
-        bench, current, (scores, known) = timed, wider, sound
+        dropped |= {*current.added, *made} - {*grown.found.added}
+        bench, current, scores, known = grown.bench, grown.found, grown.scores, grown.level
         stops = StoppingReplays(bench, current)
-        choices[chosen.winner] = chosen
-        additions[chosen.winner] = addition
-        steps.append(_step(current))
-        report_step(0.0, f"added {chosen.winner}, looking for more")
+        choices |= {choice.winner: choice for choice in joined}
+        additions |= made
+        steps += grown.steps
+        report_step(0.0, f"added {join_names(made)}, looking for more")
     cut_short = len(current.added) + len(dropped) >= s.most_effects
     progress(0.8, "weighing each effect beside its rivals")
     groups = {name: choices[name].alike for name in choices}
@@ -216,6 +217,123 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
     )  # fmt: skip
 
 
+@dataclass(frozen=True)
+class _Grown:
+    """A set with one effect more, or several, and how candidates stand against it.
+
+    Attributes:
+        bench: the session, timed as the wider model wants it.
+        found: that model, fitted, without what has become superfluous.
+        steps: the sets on the way there.
+        scores: of the candidates that are left.
+        level: their chance level; None if no mechanism could have what was added.
+    """
+
+    bench: Bench
+    found: FittedSet
+    steps: tuple[SearchStep, ...]
+    scores: dict[str, Score]
+    level: Level | None
+
+
+def _as_addition(score: Score, known: Level, current: FittedSet) -> Addition:
+    return Addition(score, known.p_value(score), known.excess(score), current.scorer)
+
+
+def _axes_of(current: FittedSet, name: str) -> frozenset[int]:
+    """Axes whose equation a candidate changes: all of them if it moves what the sensors read."""
+    item = candidates_of(current.recipe, (name,))[0]
+    system = item.system
+    return frozenset(range(len(system.coordinates)) if system.moves_sensors else system.touched)
+
+
+def _choose_beside(
+    bench: Bench,
+    stops: StoppingReplays,
+    current: FittedSet,
+    winner: str,
+    significant: Sequence[tuple[float, str]],
+    level: Level,
+    scores: Mapping[str, Score],
+) -> list[Choice]:
+    """Choose what else to add at once: the best on axes that what is added leaves alone.
+
+    One after the other they would be found as well, each after a round of replays. Only what beats
+    chance beyond doubt comes along; the others are weighed anew.
+    """
+    s = bench.settings
+    taken = _axes_of(current, winner)
+    made: list[Choice] = []
+    waiting = [
+        (excess, name)
+        for excess, name in significant
+        if level.p_value(scores[name]) < s.significance / s.close
+    ]
+    while waiting:
+        waiting = [
+            (excess, name)
+            for excess, name in waiting
+            if not any(name in choice.transient for choice in made)
+            and taken.isdisjoint(_axes_of(current, name))
+        ]
+        passing, _ = stops.first_beyond(scores, level, waiting)
+        if not passing:
+            break
+        choice = choose(
+            bench, passing, level, current.recipe, current.evidence, scores, lambda *_: None
+        )
+        made.append(choice)
+        if choice.winner:
+            taken |= _axes_of(current, choice.winner)
+    return made
+
+
+def _grow(
+    bench: Bench,
+    current: FittedSet,
+    joined: Sequence[Choice],
+    known: Level,
+    known_scores: Mapping[str, Score],
+    out: set[str],
+) -> _Grown:
+    """Add the winners of ``joined``, drop what has become superfluous, and weigh all others anew.
+
+    Args:
+        bench: the session; current: the model that they are added to.
+        known, known_scores: chance level and scores of the candidates against it.
+        out: candidates that are not weighed again.
+    """
+    s, names = bench.settings, [choice.winner for choice in joined]
+    wider, steps = current, []
+    for k, name in enumerate(names):
+        score = known_scores[name]
+        # What the first does to the model's own parameters is in the fit when the next one comes.
+        wider = extend_set(bench, wider, replace(score, shift=score.shift[:0]) if k else score)
+        if k < len(names) - 1:
+            steps.append(_step(wider))
+    for earlier in (n for n in wider.added if n != names[0]):
+        # What resembles the missing effect may come first: it takes a little of several others.
+        less = reduce_set(bench, wider, earlier)
+        if is_superfluous(wider, less, s):
+            wider = less
+    timed = bench.retimed(wider.evidence)
+    if timed is not bench:
+        fitted = timed.fit(wider.recipe, wider.evidence.p)
+        wider = replace(wider, evidence=fitted, trials=timed.trials)
+    out = {*out, *wider.added, *current.added, *names}
+    rest = [n for n in bench.names if n not in out]
+    count = current.scorer.independent_samples
+    every = range(len(current.error))
+    promised = [
+        (sorted(_axes_of(current, n)) if len(names) > 1 else every, known_scores[n].gain / count)
+        for n in names
+        if n in wider.added
+    ]
+    sound = _sound_level(timed, current, wider, promised, known, known_scores, rest)
+    scores, level = sound or ({}, None)
+    return _Grown(timed, wider, (*steps, _step(wider)), scores, level)
+
+
 def _step(known: FittedSet) -> SearchStep:
     axes = known.evidence.system.coordinates
     errors = dict(zip(axes, known.evidence.held_out_rmse, strict=True))
@@ -236,20 +354,28 @@ def _sound_level(
     bench: Bench,
     before: FittedSet,
     after: FittedSet,
-    promised: Array,
+    promised: Sequence[tuple[Sequence[int], Array]],
     known: Level,
     known_scores: Mapping[str, Score],
     names: Sequence[str],
 ) -> tuple[dict[str, Score], Level] | None:
-    """Scores of ``names`` against a model with one effect more, and their chance level.
+    """Scores of ``names`` against a model with more effects, and their chance level.
 
     What a model with the first effects leaves by chance may look like another one: every model has
-    a chance level of its own. None if no mechanism could have the effect; the trials that the fit
-    has not seen are asked first, for replays cost more. What was known of a candidate that acts on
-    axes which the effect left as they were still holds.
+    a chance level of its own. None if no mechanism could have what was added; the trials that the
+    fit has not seen are asked first, for replays cost more. What was known of a candidate that acts
+    on axes which it left as they were still holds.
+
+    Args:
+        bench: the session; before, after: the model without and with what was added.
+        promised: for each effect that was added, the axes that it was for, and the drop in log
+            error by its score, by axis.
+        known, known_scores: chance level and scores of candidates against the model without.
+        names: candidates.
     """
     s = bench.settings
-    if collapses(before, after, s) or not _carries_over(before, after, promised, s):
+    carried = all(_carries_over(before, after, drop, axes, s) for axes, drop in promised)
+    if collapses(before, after, s) or not carried:
         return None
     evidence = after.evidence
     error, error_before = after.scorer.base_error, before.scorer.base_error
@@ -324,8 +450,10 @@ def collapses(before: FittedSet, after: FittedSet, s: Settings) -> bool:
     return bool((after.slope_by_force < s.least_slope * before.slope_by_force).any())
 
 
-def _carries_over(before: FittedSet, after: FittedSet, promised: Array, s: Settings) -> bool:
-    """Whether some axis errs less, by what is worth it, on trials that the fit has not seen at all.
+def _carries_over(
+    before: FittedSet, after: FittedSet, promised: Array, axes: Sequence[int], s: Settings
+) -> bool:
+    """Whether one of ``axes`` errs less, by what is worth it, on trials that the fit has not seen.
 
     They choose no effect, but one that does nothing for them is none, nor is one that keeps next to
     nothing of the drop in log error that its score has ``promised``, by axis. It must stand with
@@ -335,7 +463,7 @@ def _carries_over(before: FittedSet, after: FittedSet, promised: Array, s: Setti
     return any(
         float(np.min(np.log(_held_out(before, axis) / _held_out(after, axis))))
         > max(s.worth, s.carried * promised[axis])
-        for axis in range(len(before.error))
+        for axis in axes
     )
 
 
@@ -352,7 +480,7 @@ def _refusal(
     """Why an effect that was added is not kept, and what it did on the axis that it was for."""
     axis = int(np.argmax(addition.excess))
     promised = addition.score.gain / before.scorer.independent_samples
-    carries = _carries_over(before, after, promised, s)
+    carries = _carries_over(before, after, promised, range(len(before.error)), s)
     first, then = (
         _held_out(known, axis) * before.slope_by_force[axis] for known in (before, after)
     )

@@ -27,15 +27,15 @@ class StoppingReplays:
     def __init__(self, bench: Bench, current: FittedSet) -> None:
         """Take a session and the model of it that is searched for more."""
         self._bench, self._current = bench, current
-        self._narrow = current.recipe.with_sign_widths(bench.settings.still_width)
         self._made: Level | None = None
 
     def _level(self, name: str) -> Level:
         """The chance level on these replays; ``name``: a candidate that is learned at once."""
         if self._made is None:
-            now = self._current
+            now, factor = self._current, self._bench.settings.still_width
+            narrow = now.recipe.with_sign_widths(factor)
             self._made = self._bench.level(
-                now.recipe, now.evidence, now.replayed, [name], replayed=self._narrow
+                now.recipe, now.evidence, now.replayed, [name], replayed=narrow
             )
         return self._made
 
@@ -53,11 +53,11 @@ class StoppingReplays:
 
         Returns:
             Those, as they came; and of the ones before, p-value and gain in log error by axis. All
-            of them where no width is declared, as of a robot, or the replays run away.
+            of them where no width is declared, as of a robot's axes, or the replays run away.
         """
         s, kept = self._bench.settings, list(significant)
         doubted: dict[str, tuple[float, Array]] = {}
-        if self._narrow == self._current.recipe:
+        if self._current.recipe.has_drawn_axes:
             return kept, doubted
         # The rest are weighed against the first that passes: alone, it is a third of the work.
         try:

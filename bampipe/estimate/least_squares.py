@@ -10,7 +10,7 @@ Everything here sees arrays and callables only.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -46,6 +46,19 @@ class Stacked:
     residual: Array
     slope: Array
     used: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class KnownSlopes:
+    """Slopes of the residual that have been taken before, and hold for another fit, too.
+
+    Attributes:
+        by_trial: low-passed and thinned, each (K, n_q, n_free); the columns that hold count.
+        holds: (n_free,) which columns those are.
+    """
+
+    by_trial: Sequence[Array] | Mapping[int, Array]
+    holds: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -131,7 +144,7 @@ def residual_and_slopes(
 
 
 def stacked_residual(
-    problem: Problem, trial: int, p: Array, elsewhere: Stacked | None = None
+    problem: Problem, trial: int, p: Array, known: KnownSlopes | None = None
 ) -> Stacked:
     """Low-pass and thin the residual of one trial and its slope by every free parameter.
 
@@ -139,9 +152,9 @@ def stacked_residual(
         problem: the model as residuals.
         trial: index of the trial.
         p: (np,) parameters at which to linearise.
-        elsewhere: the same trial at other parameters; constant slopes are taken from it.
+        known: slopes that need not be taken again.
     """
-    fresh = np.arange(problem.free.size) if elsewhere is None else np.flatnonzero(~problem.constant)
+    fresh = np.arange(problem.free.size) if known is None else np.flatnonzero(~known.holds)
     base, slopes = residual_and_slopes(problem, trial, p, [int(k) for k in fresh])
     count, n_q, n_free = slopes.shape
     columns = np.concatenate([base[:, :, None], slopes], axis=2).reshape(count, -1)
@@ -150,10 +163,10 @@ def stacked_residual(
     used = find_moving_samples(problem.standstill[trial], problem.band)
     thin *= used[:, :, None]
     slope = np.ascontiguousarray(thin[:, :, 1:])
-    if elsewhere is not None:
-        known = elsewhere.slope.copy()
-        known[:, :, fresh] = slope
-        slope = known
+    if known is not None:
+        whole = known.by_trial[trial].copy()
+        whole[:, :, fresh] = slope
+        slope = whole
     return Stacked(np.ascontiguousarray(thin[:, :, 0]), slope, used)
 
 
@@ -163,6 +176,7 @@ def fit(
     trials: Sequence[int] | None = None,
     most_iterations: int = 30,
     block_s: float = 2.0,
+    known: KnownSlopes | None = None,
 ) -> LeastSquares:
     """Estimate the free parameters by weighted least squares within their bounds.
 
@@ -175,6 +189,7 @@ def fit(
         trials: which trials to use; all by default.
         most_iterations: the most Gauss-Newton steps.
         block_s: length of the blocks of the covariance, s.
+        known: slopes that need not be taken again.
 
     Raises:
         ValueError: there are fewer samples than parameters.
@@ -183,7 +198,7 @@ def fit(
     chosen = list(range(problem.n_trials)) if trials is None else list(trials)
     p = np.array(start, dtype=float)
     p[problem.free] = np.clip(p[problem.free], problem.lower, problem.upper)
-    stacked = [stacked_residual(problem, trial, p) for trial in chosen]
+    stacked = [stacked_residual(problem, trial, p, known) for trial in chosen]
     for trial, s in zip(chosen, stacked, strict=True):
         _require_finite(problem, trial, s, p)
     if sum(len(s.residual) for s in stacked) <= problem.free.size:
@@ -242,10 +257,9 @@ class _Linearised:
             step = value - self.value
             stacked = [Stacked(s.residual + s.slope @ step, s.slope, s.used) for s in self.stacked]
         else:
-            stacked = [
-                stacked_residual(self.problem, trial, p, here)
-                for trial, here in zip(self.trials, self.stacked, strict=True)
-            ]
+            slopes = {k: here.slope for k, here in zip(self.trials, self.stacked, strict=True)}
+            known = KnownSlopes(slopes, self.problem.constant)
+            stacked = [stacked_residual(self.problem, k, p, known) for k in self.trials]
         return replace(self, p=p, stacked=stacked)
 
 
@@ -284,8 +298,9 @@ def _sandwich(problem: Problem, stacked: Sequence[Stacked], block_s: float) -> A
     bread, meat, blocks = np.diag(problem.precision), np.zeros((n_free, n_free)), 0
     for s in stacked:
         slope = s.slope * weight[None, :, None]
-        bread += np.einsum("tqi,tqj->ij", slope, slope)
-        score = np.einsum("tqi,tq->ti", slope, s.residual * weight)
+        flat = slope.reshape(-1, n_free)
+        bread += flat.T @ flat
+        score = ((s.residual * weight)[:, None, :] @ slope)[:, 0]
         for start in range(0, len(score), samples):
             part = score[start : start + samples].sum(axis=0)
             meat += np.outer(part, part)

@@ -144,8 +144,8 @@ class NormalEquations:
             weight: of the squares of each axis, (n_q,).
             lower, upper: (P,); equal where a coefficient is given.
         """
-        normal = np.einsum("kapq,a->pq", self.xx, weight) + np.diag(self.precision)
-        moment = np.einsum("kap,a->p", self.xy, weight) + self.precision * self.known
+        normal = np.tensordot(weight, self.xx.sum(axis=0), 1) + np.diag(self.precision)
+        moment = weight @ self.xy.sum(axis=0) + self.precision * self.known
         return solve_bounded(normal, moment, lower, upper).x
 
     def squares(self, values: Array) -> Array:
@@ -153,12 +153,12 @@ class NormalEquations:
 
         At least what rounding may have left of it: the difference of large sums is never zero.
         """
-        fitted = np.einsum("kapq,p,q->ka", self.xx, values, values)
+        fitted = (self.xx @ values) @ values
         left = self.yy - 2.0 * self.xy @ values + fitted
         if np.any(left < _CANCELLED * self.yy):
             size = np.abs(values)
             terms = self.yy + 2.0 * np.abs(self.xy) @ size
-            terms += np.einsum("kapq,p,q->ka", np.abs(self.xx), size, size)
+            terms += (np.abs(self.xx) @ size) @ size
             left = np.maximum(left, np.finfo(float).eps * terms)
         return np.asarray(left)
 

@@ -205,13 +205,73 @@ def _printed(value: Any) -> tuple[str, frozenset[Any]]:
     return _Printer().doprint(value), frozenset(value.free_symbols)
 
 
-def _block(results: Sequence[Any], steps: Sequence[tuple[Any, Any]] = ()) -> _Block:
-    """The text of ``results``, with those of ``steps`` in front that they need."""
+@dataclass(frozen=True)
+class Bodies:
+    """Compiled functions of a robot's bodies, the same text for all models of the robot.
+
+    Attributes:
+        names: intermediates that they return, in order; none where the device is no robot.
+        source: of the module; empty without names.
+    """
+
+    names: tuple[Any, ...]
+    source: str
+
+
+def bodies_at_state(e: Equations) -> Bodies:
+    """``bodies(x, p)``: what the mass matrix and the bias take from a robot's bodies."""
+    groups = {"x": ([*e.q, *e.qd], "{}"), "p": (e.p, "{}")}
+    return _bodies(e, [*_upper(e), *e.bias], groups, "x, p", "V, V")
+
+
+def bodies_along_motion(e: Equations) -> Bodies:
+    """``bodies(row, q, qd, qdd, p)``: the forces that a robot's bodies require in one sample."""
+    motion = {"q": e.q, "qd": e.qd, "qdd": e.qdd}
+    groups = {name: (symbols, "row, {}") for name, symbols in motion.items()}
+    groups["p"] = (e.p, "{}")
+    return _bodies(e, e.dynamics, groups, "row, q, qd, qdd, p", "types.int64, M, M, M, V")
+
+
+def _bodies(
+    e: Equations,
+    results: Sequence[Any],
+    groups: Mapping[str, tuple[Sequence[Any], str]],
+    arguments: str,
+    kinds: str,
+) -> Bodies:
+    """The function of those of ``e.steps`` that ``results`` take as they are."""
+    wanted: set[Any] = set().union(*(sp.sympify(x, strict=True).free_symbols for x in results))
+    names = tuple(name for name, _ in e.steps if name in wanted)
+    if not names:
+        return Bodies((), "")
+    block = _block(names, e.steps)
+    lines = []
+    for group, (symbols, index) in groups.items():
+        lines += _unpack(group, symbols, block.used, index)
+    lines += [*block.lines, f"return ({', '.join(block.values)},)"]
+    returned = f"types.UniTuple(types.float64, {len(names)})"
+    head = f"\n\n@njit({returned}({kinds}), cache=True, error_model='numpy')"
+    body = "\n    ".join(lines)
+    return Bodies(names, f"{SCALAR_HEADER}{head}\ndef bodies({arguments}):\n    {body}\n")
+
+
+def _upper(e: Equations) -> list[Any]:
+    """Entries of the mass matrix on and above its diagonal, row by row."""
+    return [e.mass[i][j] for i in range(len(e.q)) for j in range(i, len(e.q))]
+
+
+def _block(
+    results: Sequence[Any], steps: Sequence[tuple[Any, Any]] = (), known: Sequence[Any] = ()
+) -> _Block:
+    """The text of ``results``, with those of ``steps`` in front that they need.
+
+    Those in ``known`` have been assigned before.
+    """
     printer = _Printer()
     used: set[Any] = set().union(*(sp.sympify(e, strict=True).free_symbols for e in results))
     needed = []
     for name, value in reversed(steps):
-        if name in used:
+        if name in used and name not in known:
             text, symbols = _printed(value)
             needed.append(f"{name} = {text}")
             used |= symbols
@@ -368,17 +428,21 @@ def _encoder_readings(e: Equations) -> list[Any]:
     return readings
 
 
-def _motion(e: Equations, index: str = "{}") -> list[str]:
-    """Body of the state derivative (eq 14): dx from x, u, p, w."""
+def _motion(e: Equations, index: str = "{}", known: Sequence[Any] = ()) -> list[str]:
+    """Body of the state derivative (eq 14): dx from x, u, p, w.
+
+    Intermediates in ``known`` are returned by ``bodies(x, p)``.
+    """
     n = len(e.q)
     upper = [(i, j) for i in range(n) for j in range(i, n)]
     force = [a + o - h for a, o, h in zip(e.applied_noise, e.other, e.bias, strict=True)]
-    results = [*[e.mass[i][j] for i, j in upper], *force, *e.rates]
-    block = _block([*results, *e.qd], e.steps)
+    results = [*_upper(e), *force, *e.rates]
+    block = _block([*results, *e.qd], e.steps, known)
     values = block.values[: len(results)]
     body = _unpack("x", [*e.q, *e.qd, *e.z], block.used, index)
     for group, symbols in {"u": e.u, "p": e.p, "w": e.w}.items():
         body += _unpack(group, symbols, block.used, index)
+    body += [f"{_returned(known)} = bodies(x, p)"] if known else []
     body += block.lines
     body += [
         f"m_{i}{j} = {v}" for (i, j), v in zip(upper, values, strict=False) if e.mass[i][j] != 0
@@ -387,6 +451,11 @@ def _motion(e: Equations, index: str = "{}") -> list[str]:
     body += _solve(e.mass)
     results = [*map(str, e.qd), *(f"b_{i}" for i in range(n)), *values[len(upper) + n :]]
     return body + [f"dx[{index.format(i)}] = {v}" for i, v in enumerate(results)]
+
+
+def _returned(names: Sequence[Any]) -> str:
+    """The left side of an assignment of a tuple to ``names``."""
+    return "".join(f"{name}, " for name in names).rstrip()
 
 
 def _reading(e: Equations, index: str = "{}") -> list[str]:
@@ -413,28 +482,42 @@ def rows_source(e: Equations, rows: int) -> str:
     return "".join(parts)
 
 
-def scalar_source(e: Equations) -> str:
-    """Source of the compiled functions of one state."""
-    derivative = _compiled("derivative", "x, u, p, w, dx", _motion(e))
-    return SCALAR_HEADER + derivative + _compiled("measure", "x, u, p, y", _reading(e))
+def _header(title: str) -> str:
+    """The head of a module that takes ``bodies`` from the one called ``title``, if any."""
+    return SCALAR_HEADER + (f"from {title} import bodies\n" if title else "")
 
 
-def residual_source(e: Equations) -> str:
-    """Source of the compiled residual along a motion: ``residual(q, qd, qdd, z, u, p, out)``."""
+def scalar_source(e: Equations, bodies: Bodies, title: str = "") -> str:
+    """Source of the compiled functions of one state.
+
+    Args:
+        e: the equations; bodies: `bodies_at_state`; title: of its module.
+    """
+    derivative = _compiled("derivative", "x, u, p, w, dx", _motion(e, known=bodies.names))
+    return _header(title) + derivative + _compiled("measure", "x, u, p, y", _reading(e))
+
+
+def residual_source(e: Equations, bodies: Bodies, title: str = "") -> str:
+    """Source of the compiled residual along a motion: ``residual(q, qd, qdd, z, u, p, out)``.
+
+    Args:
+        e: the equations; bodies: `bodies_along_motion`; title: of its module.
+    """
     quiet = dict.fromkeys(e.w, 0)
     residual = [
         a + o.subs(quiet) - f for a, o, f in zip(e.applied, e.other, e.dynamics, strict=True)
     ]
-    block = _block(residual, e.steps)
+    block = _block(residual, e.steps, bodies.names)
     groups = {"q": e.q, "qd": e.qd, "qdd": e.qdd, "z": e.z, "u": e.u}
     row = [
         line
         for group, symbols in groups.items()
         for line in _unpack(group, symbols, block.used, "row, {}")
     ]
+    row += [f"{_returned(bodies.names)} = bodies(row, q, qd, qdd, p)"] if bodies.names else []
     row += block.lines + [f"out[row, {i}] = {v}" for i, v in enumerate(block.values)]
     body = [*_unpack("p", e.p, block.used), *_loop("for row in range(len(q)):", row)]
-    return SCALAR_HEADER + _compiled(
+    return _header(title) + _compiled(
         "residual", "q, qd, qdd, z, u, p, out", body, kinds="M, M, M, M, M, V, M", options=""
     )
 

@@ -201,6 +201,7 @@ def _derive(model: Model, named_constants: bool) -> Equations:
     linear: list[bool] = []
     products: list[tuple[int, int]] = []
     constant: list[bool] = []
+    unforced: list[bool] = []
     varying = {*d.p.values(), *d.z.values()}
     # An expression has few of a robot's hundred parameters, and sympy is slow to find a slope zero.
     present = [(e, e.free_symbols) for e in residual]
@@ -211,6 +212,7 @@ def _derive(model: Model, named_constants: bool) -> Equations:
         curved = symbol in left and any(sp.diff(slope, symbol) != 0 for slope in slopes)
         linear.append(not curved and symbol not in elsewhere)
         constant.append(linear[i] and not left & varying)
+        unforced.append(constant[i] and left.isdisjoint(d.channel.values()))
         for j, earlier in enumerate([*d.p.values()][:i]):
             if earlier in left and any(sp.diff(slope, earlier) != 0 for slope in slopes):
                 products.append((j, i))
@@ -224,6 +226,7 @@ def _derive(model: Model, named_constants: bool) -> Equations:
         input_map=input_map, rates=rates, initial=initial,
         offset=offset, offset_rate=offset_rate, offset_acceleration=offset_acceleration,
         kinetic=kinetic, potential=potential, linear=linear, products=products, constant=constant,
+        unforced=unforced,
         compensation=compensation(d, potential), delays=delays(d, applied),
     )  # fmt: skip
 
@@ -262,13 +265,19 @@ def _newton_euler(
     text = Text()
     algebra = Algebra.symbols(text)
     inertial = [numbers[k : k + INERTIAL] for k in range(0, len(numbers), INERTIAL)]
-    mass = mass_matrix(algebra, links, inertial, q)
+    still = [0] * len(links)
+    # Names for all of it: one compiled function gives them to every model of this robot.
+    mass = [[text.name(m) for m in row] for row in mass_matrix(algebra, links, inertial, q)]
+    bias, dynamics = (
+        [text.name(f) for f in joint_forces(algebra, links, inertial, q, qd, a, gravity)]
+        for a in (still, qdd)
+    )
     momentum = [sum(m * v for m, v in zip(row, qd, strict=True)) for row in mass]
     return _Bodies(
         text.steps,
         mass,
-        joint_forces(algebra, links, inertial, q, qd, [0] * len(links), gravity),
-        joint_forces(algebra, links, inertial, q, qd, qdd, gravity),
+        bias,
+        dynamics,
         sum(p * v for p, v in zip(momentum, qd, strict=True)) / 2,
         potential_energy(algebra, links, inertial, q, gravity),
     )

@@ -31,7 +31,7 @@ class Equations:
         linear: for each parameter, whether the residual is linear in it.
         products: pairs of parameters, by number, of which the residual has a product.
         constant: for each parameter, whether the slope of the residual by it depends on no
-            parameter and no internal state.
+            parameter and no internal state; unforced: and on no input either.
         compensation: per coordinate, the part of Q_other that balances gravity there: see
             `roles.compensation`; zero where nothing does.
         delays: parameters that shift measured forces in time: see `roles.delays`.
@@ -65,6 +65,7 @@ class Equations:
     linear: list[bool]
     products: list[tuple[int, int]]
     constant: list[bool]
+    unforced: list[bool]
     compensation: list[Any]
     delays: list[str]
 

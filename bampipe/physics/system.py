@@ -42,7 +42,7 @@ class System:
         noise: names of the additive process noise w.
         linear: per parameter, whether the residual is linear in it; of several, see `is_linear_in`.
         constant: per parameter, whether the slope of the residual by it is the same for all
-            parameters along the mechanism's true motion.
+            parameters along the mechanism's true motion; unforced: and whatever the inputs.
         touched: axes whose equation the effects change, measurement effects aside.
         moves_sensors: whether an effect of kind ``measurement`` is present.
         driven: whether what the effects add to the residual depends on the measured force of
@@ -71,6 +71,7 @@ class System:
         self.parameters: tuple[Parameter, ...] = model.parameters
         self.linear: tuple[bool, ...] = tuple(meta["linear"])
         self.constant: tuple[bool, ...] = tuple(meta["constant"])
+        self.unforced: tuple[bool, ...] = tuple(meta["unforced"])
         self._products: list[list[int]] = meta["products"]
         self.touched: tuple[int, ...] = tuple(meta["touched"])
         self.moves_sensors: bool = meta["moves_sensors"]
@@ -346,6 +347,8 @@ def _generate(model: Model) -> tuple[dict[str, Any], dict[str, str]]:
     from bampipe.model_functions import ROWS
     from bampipe.physics.codegen import (
         array_source,
+        bodies_along_motion,
+        bodies_at_state,
         dynamics_source,
         memory_source,
         residual_source,
@@ -368,6 +371,7 @@ def _generate(model: Model) -> tuple[dict[str, Any], dict[str, str]]:
         "linear": equations.linear,
         "products": equations.products,
         "constant": equations.constant,
+        "unforced": equations.unforced,
         "touched": [i for i, e in enumerate(added) if e != 0],
         "moves_sensors": any(e != 0 for e in equations.offset),
         "driven": any(e.has(*forces) for e in added)
@@ -387,10 +391,18 @@ def _generate(model: Model) -> tuple[dict[str, Any], dict[str, str]]:
     sources = {
         "columns": array_source(equations, added),
         "dynamics": dynamics_source(equations),
-        "compiled": scalar_source(equations),
-        "residual": residual_source(equations),
         "rows": rows_source(equations, ROWS),
     }
+    for name, find_bodies, source in (
+        ("compiled", bodies_at_state, scalar_source),
+        ("residual", bodies_along_motion, residual_source),
+    ):
+        bodies = find_bodies(equations)
+        title = ""
+        if bodies.names:
+            sources[f"{name}_bodies"] = bodies.source
+            title = generated_code.module_title(f"{name}_bodies", bodies.source)
+        sources[name] = source(equations, bodies, title)
     if equations.z:
         sources["memory"], facts["memory_uses"] = memory_source(equations)
     return facts, sources

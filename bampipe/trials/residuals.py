@@ -14,10 +14,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from bampipe.estimate.least_squares import Problem, fit, stacked_residual
+from bampipe.estimate.least_squares import KnownSlopes, Problem, fit, stacked_residual
 from bampipe.estimate.low_pass import Band
 from bampipe.estimate.normal_equations import NormalEquations
-from bampipe.estimate.standstill import find_standstill
+from bampipe.estimate.standstill import find_moving_samples, find_standstill
 from bampipe.physics import System
 from bampipe.trials.cache import TrialCache
 from bampipe.trials.folds import Folds
@@ -82,8 +82,12 @@ def problem_of(
         1.0 / parameters[i].sd ** 2 if counts else 0.0
         for i, counts in zip(free, weighed, strict=True)
     ]
+    # Moved in time, inputs change the slopes that they are part of.
+    constant = system.unforced if timing else system.constant
+    same = [constant[i] and not system.moves_sensors for i in free]
     if timing:
         half = 0.5 / band.rate_hz
+        same = [*same, False]
         precision, known = [*precision, 0.0], [*known, 0.0]
         free, lower, upper, step = [*free, n], [*lower, -half], [*upper, half], [*step, half]
     return Problem(
@@ -94,9 +98,7 @@ def problem_of(
         upper=np.array(upper),
         step=np.array(step),
         linear=system.is_linear_in([i for i in free if i < n]),
-        constant=np.array(
-            [not timing and not system.moves_sensors and system.constant[i] for i in free]
-        ),
+        constant=np.array(same),
         band=band,
         standstill=TrialCache(lambda k: _standstill(motions[k], system, band), len(motions), len),
         precision=np.array(precision),
@@ -269,12 +271,13 @@ class Evidence:
             return self.folds.solve(self.sums, self.weight, self.lower, self.upper)
         problem = problem_of(self.system, self.motions, self.band)
         start, free = np.append(self.p, 0.0), list(self.free)
+        known = KnownSlopes(self.jacobian, problem.constant)
         steps: dict[int, Array] = {}
         for group in sorted(set(self.folds.groups)):
             others = [k for k in self.folds.fitted_trials if self.folds.groups[k] != group]
             steps[group] = np.zeros(len(free))
             if len(others) < len(self.folds.fitted_trials):
-                refit = fit(problem, start, trials=others, most_iterations=_REFITS)
+                refit = fit(problem, start, others, _REFITS, known=known)
                 steps[group] = refit.p[free] - self.p[free]
         return tuple(steps[group] for group in self.folds.groups)
 
@@ -331,6 +334,7 @@ def gather_evidence(
     folds: Folds,
     *,
     most_iterations: int = 12,
+    like: Evidence | None = None,
 ) -> Evidence:
     """Fit a model to the fitted trials by least squares and linearise it there on all.
 
@@ -338,17 +342,22 @@ def gather_evidence(
         system: the model; motions: the trials; band: the low-pass.
         start: parameters to start from, (n_p,); folds: which trials are fitted.
         most_iterations: the most Gauss-Newton steps.
+        like: a model with some more effects or some less, where that has been fitted: slopes that
+            are the same for both are taken from it.
 
     Raises:
         ValueError: fewer samples than parameters.
     """
     problem = problem_of(system, motions, band)
     fitted = folds.fitted_trials
-    found = fit(problem, np.append(start, 0.0), trials=fitted, most_iterations=most_iterations)
+    known = None
+    if like is not None and like.motions is motions and like.band == band:
+        known = _common_slopes(like, system, problem)
+    found = fit(problem, np.append(start, 0.0), fitted, most_iterations, known=known)
     stacked = dict(zip(fitted, found.stacked, strict=True))
     for trial in range(len(motions)):
         if trial not in stacked:
-            stacked[trial] = stacked_residual(problem, trial, found.p)
+            stacked[trial] = stacked_residual(problem, trial, found.p, known)
     value = found.p[problem.free]
     order = range(len(motions))
     return Evidence(
@@ -367,3 +376,30 @@ def gather_evidence(
         problem.precision,
         problem.known - value,
     )
+
+
+def _common_slopes(like: Evidence, system: System, problem: Problem) -> KnownSlopes | None:
+    """The slopes by parameters that two models share and that are the same for both.
+
+    A slope that no parameter changes is that of the model without any effect. None are where other
+    samples stand still for the one than for the other, as where a brake counts.
+    """
+    still = (find_moving_samples(s, problem.band) for s in problem.standstill)
+    if not all(np.array_equal(a, b) for a, b in zip(still, like.used, strict=True)):
+        return None
+    held = {like.system.parameters[i].name: k for k, i in enumerate(like.free)}
+    constant = like.system.constant
+    moved = like.system.moves_sensors
+    source = [held.get(system.parameters[i].name, -1) for i in problem.free]
+    holds = [
+        k >= 0 and not moved and constant[like.free[k]] and bool(here)
+        for k, here in zip(source, problem.constant, strict=True)
+    ]
+    places = np.flatnonzero(holds)
+    taken = [source[k] for k in places]
+    slopes = []
+    for jacobian in like.jacobian:
+        columns = np.zeros((*jacobian.shape[:2], problem.free.size))
+        columns[:, :, places] = jacobian[:, :, taken]
+        slopes.append(columns)
+    return KnownSlopes(slopes, np.array(holds))

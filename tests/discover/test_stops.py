@@ -24,7 +24,7 @@ def level_of(gains, p_values):
     )
 
 
-def replays(p_values=(), narrow="narrow"):
+def replays(p_values=(), drawn=False):
     """Replays that make a level of these p-values, and a list of the times it was made."""
     made = []
 
@@ -32,15 +32,12 @@ def replays(p_values=(), narrow="narrow"):
         made.append(replayed)
         return level_of(STILL, dict(p_values))
 
-    recipe = SimpleNamespace(with_sign_widths=lambda factor: narrow)
+    recipe = SimpleNamespace(with_sign_widths=lambda factor: "narrow", has_drawn_axes=drawn)
     current = SimpleNamespace(
         recipe=recipe, evidence=None, replayed=None,
         scorer=SimpleNamespace(independent_samples=np.array([1000.0])),
     )  # fmt: skip
-    found = StoppingReplays(SimpleNamespace(settings=Settings(), level=level), current)
-    if narrow is None:
-        found._narrow = recipe
-    return found, made
+    return StoppingReplays(SimpleNamespace(settings=Settings(), level=level), current), made
 
 
 SIGNIFICANT = [(gain, name) for name, gain in GAINS.items()]
@@ -67,6 +64,6 @@ def test_what_such_replays_have_by_chance_is_passed_over() -> None:
 
 
 def test_without_a_declared_width_nothing_is_replayed() -> None:
-    found, made = replays(narrow=None)
+    found, made = replays(drawn=True)
     assert found.first_beyond(SCORES, level_of(GAINS, {}), SIGNIFICANT) == (SIGNIFICANT, {})
     assert made == []
