@@ -6,9 +6,10 @@ from scipy.signal import butter, sosfiltfilt
 from sessions import BAND, RATE, TRUTH, bam, folds, made
 
 from bampipe.discover.chance import system_of
+from bampipe.estimate.least_squares import stacked_residual
 from bampipe.estimate.low_pass import Band
 from bampipe.trials.motion import Motion
-from bampipe.trials.residuals import gather_evidence
+from bampipe.trials.residuals import gather_evidence, problem_of
 
 
 def test_thinning_equals_the_library_filter_away_from_the_ends():
@@ -65,6 +66,39 @@ def test_slopes_are_those_of_the_last_parameters_after_a_nonlinear_fit():
     anew = gather_evidence(system, session.motions, BAND, found.p, session.folds, most_iterations=0)
     for carried, fresh in zip(found.jacobian, anew.jacobian, strict=True):
         np.testing.assert_allclose(carried, fresh, rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("timing", [False, True])
+def test_slopes_that_are_called_constant_are_the_same_at_other_parameters(timing):
+    """With the inputs moved in time, too, where their timing is estimated."""
+    recipe = bam(["presliding:yaw", "force_gain:x"])
+    session = made(recipe, {"presliding.yaw.force": 0.8, "presliding.yaw.distance": 0.03}, trials=1)
+    system = system_of(recipe)
+    problem = problem_of(system, session.motions, BAND, timing=timing)
+    here, there = np.append(system.prior, 0.0), np.append(1.3 * system.prior, 0.0)
+    there[-1] = 0.4 / RATE if timing else 0.0
+    slopes = [stacked_residual(problem, 0, p).slope for p in (here, there)]
+    assert problem.constant.any() and not problem.constant.all()
+    for k in np.flatnonzero(problem.constant):
+        scale = np.abs(slopes[0][:, :, k]).max()
+        np.testing.assert_allclose(slopes[0][:, :, k], slopes[1][:, :, k], atol=1e-7 * scale)
+
+
+@pytest.mark.parametrize("effects", [["stribeck:yaw"], ["brake_lag"], ["encoder_scale:yaw"]])
+def test_a_fit_that_takes_slopes_from_a_model_like_it_is_the_same(effects):
+    session = made(bam(), {}, trials=2)
+    narrow, wide = system_of(bam()), system_of(bam(effects))
+    given = session.motions, BAND
+    like = gather_evidence(narrow, *given, narrow.prior, session.folds)
+    for system, other in (
+        (wide, like),
+        (narrow, gather_evidence(wide, *given, wide.prior, session.folds)),
+    ):
+        alone = gather_evidence(system, *given, system.prior, session.folds)
+        found = gather_evidence(system, *given, system.prior, session.folds, like=other)
+        for one, two in zip(found.jacobian, alone.jacobian, strict=True):
+            np.testing.assert_allclose(one, two, rtol=1e-5, atol=1e-7 * np.abs(two).max())
+        np.testing.assert_allclose(found.held_out_rmse, alone.held_out_rmse, rtol=1e-6)
 
 
 def test_standstill_is_left_out_and_quick_reversals_stay():

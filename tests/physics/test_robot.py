@@ -129,6 +129,18 @@ def test_every_function_equals_that_of_pinocchio(joints: int) -> None:
         assert np.abs(rate[joints:] - expected[k]).max() < 1e-10 * np.abs(expected[k]).max()
 
 
+def test_all_models_of_a_robot_take_its_bodies_from_the_same_compiled_text() -> None:
+    device = random_robot(3, 5)
+    first = device.coordinates[0].name
+    some = [compile_model(Model(device, effects)) for effects in ((), (f"stribeck:{first}",))]
+    for kind in ("compiled_bodies", "residual_bodies"):
+        assert len({system._code.sources[kind] for system in some}) == 1
+    for kind in ("compiled", "residual"):
+        texts = [system._code.sources[kind] for system in some]
+        assert len(set(texts)) == 2
+        assert not any("inertia" in text or "r_9 =" in text for text in texts)
+
+
 def test_the_columns_of_the_inertial_numbers_add_up_to_the_forces() -> None:
     device = random_robot(4, seed=9)
     assert device.robot is not None
