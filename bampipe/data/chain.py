@@ -483,11 +483,13 @@ def _only_end(
         others = [above[longest].child, *ends]
         levels = zip(*(chains[link] for link in others), strict=False)
         common = [level[0] for level in takewhile(lambda level: len(set(level)) == 1, levels)]
+        stem = next((j.child for j in joints if common and j.name == common[-1]), "")
         raise Branches(
             f"the joints branch; chains end at {join_names(others, _MANY)}",
             where=where,
-            remedy='choose one: base = "..." and tip = "..." in [robot]',
-            stem=next((j.child for j in joints if common and j.name == common[-1]), ""),
+            remedy='choose one: base = "..." and tip = "..." in [robot]'
+            + (f'; tip = "{stem}" ends before they branch' if stem else ""),
+            stem=stem,
         )
     return longest
 

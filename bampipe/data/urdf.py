@@ -31,11 +31,7 @@ def urdf_tree(root: ElementTree.Element, path: Path) -> Tree:
     values = (value for part in parts for inner in part.iter() for value in inner.attrib.values())
     macros = any(str(element.tag).startswith(_XACRO) for element in root.iter())
     if macros or any("${" in value for value in values):
-        raise InputError(
-            "a xacro file: macros that are no URDF yet",
-            where=where,
-            remedy=f"expand it first: xacro {path.name} > {path.name.partition('.')[0]}.urdf",
-        )
+        raise unexpanded(path)
     bodies: dict[str, Body] = {}
     for link in root.iterfind("link"):
         name = _name(link, where)
@@ -43,6 +39,15 @@ def urdf_tree(root: ElementTree.Element, path: Path) -> Tree:
             raise InputError(f"two links are called {name!r}", where=where)
         bodies[name] = _body(link, where)
     return Tree(bodies, [_joint(entry, where) for entry in root.iterfind("joint")])
+
+
+def unexpanded(path: Path) -> InputError:
+    """The error that a file is written in macros."""
+    return InputError(
+        "a xacro file: macros that are no URDF yet",
+        where=str(path),
+        remedy=f"expand it first: xacro {path.name} > {path.name.partition('.')[0]}.urdf",
+    )
 
 
 def _name(element: ElementTree.Element, where: str) -> str:
