@@ -229,7 +229,7 @@ def _object_to(parameters: Sequence[Parameter], found: _Fitted) -> tuple[Array, 
         prior = np.array([parameters[i].prior for i in known])
         sd = np.array([parameters[i].sd for i in known])
         covariance = found.covariance[np.ix_(known, known)] / np.outer(sd, sd)
-        objections[known], usual = _joint_objections((found.p[known] - prior) / sd, covariance)
+        objections[known], usual = _joint_objections(found.p[known] / sd, prior / sd, covariance)
     return objections, usual
 
 
@@ -238,19 +238,25 @@ def _objection(item: Parameter, value: float, margin: float) -> float:
     return 0.5 * min(distance_from_prior(item, nearest) ** 2, FARTHEST**2)
 
 
-def _joint_objections(distance: Array, covariance: Array) -> tuple[Array, float]:
+def _joint_objections(found: Array, prior: Array, covariance: Array) -> tuple[Array, float]:
     """Objections to parameters of which the trials only show combinations, (n,).
 
     Each alone can be what it is expected to be, as the mass of one link can at the cost of the
-    next, and all together not: so the combinations are judged, in their deviations.
+    next, and all together not: so the combinations are judged, in their deviations. These are
+    wider where no factor brings what is found and what is expected closer than they say (Birge
+    1932): the trials may lack something else than the right units.
 
     Args:
-        distance: of each from its prior, in deviations of that; covariance: of the fit, likewise.
+        found, prior: in deviations of the prior; covariance: of the fit, likewise.
 
     Returns:
         The objections, and what they sum up to on average where all is well.
     """
     variance, directions = np.linalg.eigh(covariance)
     shown = 1.0 / (1.0 + CERTAIN**2 * np.maximum(variance, 0.0))
-    each = 0.5 * np.minimum((directions.T @ distance) ** 2 * shown, FARTHEST**2)
+    said, expected = directions.T @ found, directions.T @ prior
+    factor = (shown * said) @ expected / max((shown * expected) @ expected, np.finfo(float).tiny)
+    apart = float(shown @ (said - factor * expected) ** 2)
+    birge = min(1.0, float(shown.sum()) / apart) if apart > 0.0 else 1.0
+    each = 0.5 * np.minimum(birge * shown * (said - expected) ** 2, FARTHEST**2)
     return directions**2 @ each, 0.5 * float(shown.sum())

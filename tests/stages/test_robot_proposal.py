@@ -228,6 +228,9 @@ def test_a_drive_that_was_not_logged_is_asked_for_and_the_other_stays_where_it_i
     proposal = proposed(tmp_path)
     assert proposal.fill_in == ["the column of torque_shoulder in N.m"]
     assert f'torque_elbow = {{ column = "{names[1]}"' in proposal.session
+    with pytest.raises(InputError, match="fill in the name of the column") as caught:
+        read_session(tmp_path)
+    assert "channels.torque_shoulder.column" in str(caught.value)
 
 
 def test_a_xacro_file_beside_the_logs_is_to_be_expanded(tmp_path: Path) -> None:
