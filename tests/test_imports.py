@@ -56,7 +56,9 @@ LAWS = {
     "next_trial": law(
         "numpy scipy", "errors lists results physics estimate trials identification discover"
     ),
-    "declarations": law("numpy pydantic", "errors files schema stages.base results physics data"),
+    "declarations": law(
+        "numpy pydantic", "errors files lists schema stages.base results physics data"
+    ),
     "simulator": law(
         "numpy scipy pandas pyarrow numba pydantic",
         "errors files schema results progress physics estimate data",

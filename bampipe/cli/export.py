@@ -26,9 +26,9 @@ def export(
 ) -> None:
     """Write an identified model for other programs.
 
-    json: the device and its effects, every parameter with its uncertainty. urdf: the bodies and
-    the friction of a robot's joints. mjcf: the same with its drives' inertia, for MuJoCo. python,
-    c: one self-contained function of inverse dynamics.
+    json: the device and its effects, every parameter with its uncertainty. urdf: the robot's own
+    URDF, bodies and friction as identified. mjcf: the same with its drives' inertia, for MuJoCo.
+    python, c: one self-contained function of inverse dynamics.
 
     Example: bampipe export 2026-10-03_s01 --as c --out inverse_dynamics.c
     """

@@ -6,8 +6,9 @@ Bodies on fixed joints, and on joints beside the chain, are joined to the link t
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import takewhile
 from typing import Any
 
@@ -22,6 +23,8 @@ from bampipe.lists import join_names
 Array = NDArray[np.float64]
 
 _MOVING = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
+_ROUNDING = 1e-6
+"""Share of the largest second moment of mass by which one may be below zero."""
 _MANY = 8
 """Most names that a message lists."""
 
@@ -106,10 +109,21 @@ class Body:
         center = (self.mass * self.center + other.mass * other.center) / mass
         return Body(mass, center, self.about(center) + other.about(center))
 
+    def without(self, other: Body) -> Body:
+        """What is left when a part of it is taken off."""
+        return self.joined(Body(-other.mass, other.center, -other.inertia))
+
     def about(self, point: Array) -> Array:
         """Inertia about a point, (3, 3)."""
         r = self.center - point
         return self.inertia + self.mass * ((r @ r) * np.eye(3) - np.outer(r, r))
+
+    @property
+    def is_possible(self) -> bool:
+        """Whether a distribution of mass has these numbers."""
+        spread = 0.5 * np.trace(self.inertia) * np.eye(3) - self.inertia
+        moments = np.linalg.eigvalsh(spread)
+        return self.mass >= 0.0 and bool(moments[0] >= -_ROUNDING * abs(moments[2]))
 
     def table(self) -> dict[str, Any]:
         """As of a joint in a device file."""
@@ -207,6 +221,146 @@ def select_chain(
     return replace(found, notes=(*found.notes, *tree.notes), gravity=gravity)
 
 
+@dataclass(frozen=True)
+class _Carriage:
+    """What the links of a chain carry.
+
+    Attributes:
+        bodies: by link, in its frame; joints: all; moving: those of the chain that move.
+    """
+
+    bodies: Mapping[str, Body]
+    joints: Sequence[TreeJoint]
+    moving: Sequence[TreeJoint]
+
+    @cached_property
+    def _behind(self) -> Mapping[str, Sequence[TreeJoint]]:
+        """By link, the joints on it that the chain does not move."""
+        starts = {joint.child for joint in self.moving}
+        found: dict[str, list[TreeJoint]] = {}
+        for joint in self.joints:
+            if joint.child not in starts:
+                found.setdefault(joint.parent, []).append(joint)
+        return found
+
+    def body_on(self, link: str) -> Body:
+        """The body of a link with all that is fixed to it or held still on it, in its frame."""
+        total = self.bodies[link]
+        for joint in self._behind.get(link, ()):
+            total = total.joined(self.body_on(joint.child).moved(joint.turn, joint.offset))
+        return total
+
+    def held_on(self, link: str) -> Iterator[TreeJoint]:
+        """The joints held still on a link and what is on it, of those that carry mass."""
+        for joint in self._behind.get(link, ()):
+            if joint.kind != "fixed" and self._mass_on(joint.child) > 0.0:
+                yield joint
+            yield from self.held_on(joint.child)
+
+    def fixed_on(self, link: str) -> Iterator[str]:
+        """The links fixed to a link, one on another."""
+        for joint in self._behind.get(link, ()):
+            if joint.kind == "fixed":
+                yield joint.child
+                yield from self.fixed_on(joint.child)
+
+    def body_held_on(self, link: str) -> Body:
+        """The part of `body_on` that is behind joints held still, in the frame of the link."""
+        total = Body()
+        for joint in self._behind.get(link, ()):
+            fixed = joint.kind == "fixed"
+            part = self.body_held_on(joint.child) if fixed else self.body_on(joint.child)
+            total = total.joined(part.moved(joint.turn, joint.offset))
+        return total
+
+    def _mass_on(self, link: str) -> float:
+        behind = self._behind.get(link, ())
+        return self.bodies[link].mass + sum(self._mass_on(joint.child) for joint in behind)
+
+
+def put_bodies(
+    tree: Tree, base: str, tip: str, bodies: Mapping[str, Body], limits: Mapping[str, DriveLimits]
+) -> Tree:
+    """The tree with other bodies and limits on the joints of a chain, the same to its motion.
+
+    What was joined to make the body of a joint is parted again: links on fixed joints get no mass,
+    which is in that of the link behind the joint; those on joints that are held keep theirs, which
+    is taken off there.
+
+    Args:
+        tree: from which the chain was selected.
+        base, tip: of the chain.
+        bodies, limits: by joint of the chain.
+    """
+    above = {joint.child: joint for joint in tree.joints}
+    moving = [joint for joint in _path(base, tip, above, "") if joint.kind != "fixed"]
+    carriage = _Carriage(tree.bodies, tree.joints, moving)
+    placed = dict(tree.bodies)
+    named = {joint.name: identifier(joint.name) for joint in moving}
+    for joint in moving:
+        own = bodies[named[joint.name]]
+        placed[joint.child] = own.without(carriage.body_held_on(joint.child))
+        placed |= {link: Body() for link in carriage.fixed_on(joint.child)}
+    joints = [
+        replace(joint, limits=limits[named[joint.name]]) if joint.name in named else joint
+        for joint in tree.joints
+    ]
+    return replace(tree, bodies=placed, joints=joints)
+
+
+def hold_beside(tree: Tree, base: str, tip: str) -> Tree:
+    """The part of the tree on ``base``, fixed what does not move from there to ``tip``.
+
+    Joints come parents first.
+    """
+    above = {joint.child: joint for joint in tree.joints}
+    moving = {joint.child for joint in _path(base, tip, above, "")}
+    joints: list[TreeJoint] = []
+    links = [base]
+    for link in links:
+        for joint in tree.joints:
+            if joint.parent == link:
+                kind = joint.kind if joint.child in moving else "fixed"
+                joints.append(replace(joint, kind=kind))
+                links.append(joint.child)
+    return replace(tree, bodies={link: tree.bodies[link] for link in links}, joints=joints)
+
+
+def tree_of_tables(tables: Mapping[str, Mapping[str, Any]]) -> Tree:
+    """Links and joints of the tables of ``[robot.joints]``: ``base``, and one link a joint."""
+    bodies, joints = {"base": Body()}, []
+    for name, table in tables.items():
+        center = np.array(table.get("center", (0.0,) * 3), dtype=float)
+        link, after = f"{name}_link", table.get("after")
+        bodies[link] = Body(
+            float(table.get("mass", 0.0)), center, symmetric(table.get("inertia", (0.0,) * 6))
+        )
+        roll, pitch, yaw = (float(v) for v in table.get("rotation", (0.0,) * 3))
+        joints.append(
+            TreeJoint(
+                name,
+                str(table["kind"]),
+                f"{after}_link" if after else "base",
+                link,
+                Rotation.from_euler("xyz", (roll, pitch, yaw)).as_matrix(),
+                np.array(table.get("position", (0.0,) * 3), dtype=float),
+                (roll, pitch, yaw),
+                [float(v) for v in table.get("axis", (0.0, 0.0, 1.0))],
+                DriveLimits(),
+            )
+        )
+    return Tree(bodies, joints)
+
+
+def fixed_joint(name: str, parent: str, child: str, turn: Array, offset: Array) -> TreeJoint:
+    """A joint that does not move, between two links."""
+    roll, pitch, yaw = (float(v) for v in Rotation.from_matrix(turn).as_euler("xyz"))
+    axis = [0.0, 0.0, 1.0]
+    return TreeJoint(
+        name, "fixed", parent, child, turn, offset, (roll, pitch, yaw), axis, DriveLimits()
+    )
+
+
 def _chain(
     base: str,
     tip: str,
@@ -215,31 +369,10 @@ def _chain(
     joints: list[TreeJoint],
     where: str,
 ) -> Chain:
-    below: dict[str, list[TreeJoint]] = {}
-    for joint in joints:
-        below.setdefault(joint.parent, []).append(joint)
     moving = [joint for joint in path_up if joint.kind != "fixed"]
     if not moving:
         raise InputError(f"no joint moves between {base!r} and {tip!r}", where=where)
-    starts = {joint.child for joint in moving}
-    held: list[str] = []
-
-    def carried(link: str) -> Body:
-        """The body of a link with all that is fixed to it or held still on it."""
-        total = bodies[link]
-        for joint in below.get(link, ()):
-            if joint.child in starts:
-                continue
-            if joint.kind != "fixed" and bodies_below(joint.child) > 0.0:
-                held.append(joint.name)
-            part = carried(joint.child)
-            total = total.joined(part.moved(joint.turn, joint.offset))
-        return total
-
-    def bodies_below(link: str) -> float:
-        own = bodies[link].mass
-        return own + sum(bodies_below(joint.child) for joint in below.get(link, ()))
-
+    carriage = _Carriage(bodies, joints, moving)
     found: dict[str, dict[str, Any]] = {}
     limits: dict[str, DriveLimits] = {}
     turn, offset, before = np.eye(3), np.zeros(3), ""
@@ -250,7 +383,7 @@ def _chain(
         if joint.kind == "fixed":
             fixed_between = True
             continue
-        name = _identifier(joint.name)
+        name = identifier(joint.name)
         if name in found:
             raise InputError(f"two joints are called {name!r}", where=where)
         angles = Rotation.from_matrix(turn).as_euler("xyz") if fixed_between else joint.angles
@@ -261,18 +394,19 @@ def _chain(
             "axis": joint.axis,
             "effort": max(joint.limits.effort, 0.0),
             "velocity": max(joint.limits.velocity, 0.0),
-            **carried(joint.child).table(),
+            **carriage.body_on(joint.child).table(),
         }
         found[name] = {"after": before, **table} if before else table
         limits[name] = joint.limits
         turn, offset, before, fixed_between = np.eye(3), np.zeros(3), name, False
     notes = []
+    held = [joint.name for start in moving for joint in carriage.held_on(start.child)]
     if held:
         notes.append(f"held at zero beside the chain: {join_names(held, _MANY)}")
     return Chain(found, limits, base, tip, tuple(notes))
 
 
-def _identifier(name: str) -> str:
+def identifier(name: str) -> str:
     """The joint's name as expressions can use it."""
     text = re.sub(r"\W", "_", name, flags=re.ASCII)
     return text if text[:1].isalpha() else f"joint_{text}"
@@ -349,11 +483,13 @@ def _only_end(
         others = [above[longest].child, *ends]
         levels = zip(*(chains[link] for link in others), strict=False)
         common = [level[0] for level in takewhile(lambda level: len(set(level)) == 1, levels)]
+        stem = next((j.child for j in joints if common and j.name == common[-1]), "")
         raise Branches(
             f"the joints branch; chains end at {join_names(others, _MANY)}",
             where=where,
-            remedy='choose one: base = "..." and tip = "..." in [robot]',
-            stem=next((j.child for j in joints if common and j.name == common[-1]), ""),
+            remedy='choose one: base = "..." and tip = "..." in [robot]'
+            + (f'; tip = "{stem}" ends before they branch' if stem else ""),
+            stem=stem,
         )
     return longest
 

@@ -7,16 +7,27 @@ are those of its joints; what the file says itself stands.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from bampipe.data.chain import DriveLimits, symmetric
+from bampipe.data.chain import (
+    Body,
+    DriveLimits,
+    Tree,
+    fixed_joint,
+    symmetric,
+    tree_of_tables,
+)
 from bampipe.data.robot_file import read_chain
 from bampipe.errors import InputError
 from bampipe.files import read_toml
+
+Array = NDArray[np.float64]
 
 _UNITS = {"revolute": ("rad", "N.m", "kg.m2"), "prismatic": ("m", "N", "kg")}
 _FRICTION_SHARE = 0.1
@@ -55,15 +66,8 @@ def complete_device(table: dict[str, Any], folder: Path, where: str) -> dict[str
     robot = dict(robot)
     limits: Mapping[str, DriveLimits] = {}
     source = ""
-    name = robot.get("urdf")
-    if isinstance(name, str) and "joints" not in robot:
-        file = Path(name)
-        if file.is_absolute() or ".." in file.parts:
-            raise InputError(
-                f"path '{name}' leaves the folder of the device file",
-                where=f"{where}: robot.urdf",
-                remedy="copy the robot's file beside the device file",
-            )
+    file = _robot_file(robot, where)
+    if file is not None:
         payload = robot.get("payload")
         chain = read_chain(
             folder / file,
@@ -99,6 +103,44 @@ def complete_device(table: dict[str, Any], folder: Path, where: str) -> dict[str
     return {**filled, **table, "robot": robot}
 
 
+def find_robot_file(path: Path) -> Path | None:
+    """The URDF or MJCF that a device file takes its joints from; None where there is none."""
+    robot = read_toml(path).get("robot")
+    file = _robot_file(robot, str(path)) if isinstance(robot, Mapping) else None
+    return path.parent / file if file is not None else None
+
+
+def _robot_file(robot: Mapping[str, Any], where: str) -> Path | None:
+    name = robot.get("urdf")
+    if not isinstance(name, str) or "joints" in robot:
+        return None
+    file = Path(name)
+    if file.is_absolute() or ".." in file.parts:
+        raise InputError(
+            f"path '{name}' leaves the folder of the device file",
+            where=f"{where}: robot.urdf",
+            remedy="copy the robot's file beside the device file",
+        )
+    return file
+
+
+def tree_of_robot(robot: Mapping[str, Any]) -> Tree:
+    """Links and joints of a complete table ``[robot]`` without a file; every DH frame is a link."""
+    tree = tree_of_tables(robot["joints"])
+    bodies, joints = dict(tree.bodies), list(tree.joints)
+    for name, row in robot.get("dh", {}).items():
+        frame = f"{name}_frame"
+        bodies[frame] = Body()
+        joints.append(fixed_joint(f"{name}_to_frame", f"{name}_link", frame, *_frame_of_row(row)))
+    return replace(tree, bodies=bodies, joints=joints)
+
+
+def _frame_of_row(row: Mapping[str, Any]) -> tuple[Array, Array]:
+    """Rotation and place of a row's frame, seen from where its joint is."""
+    d, a, alpha = (float(row.get(key, 0.0)) for key in ("d", "a", "alpha"))
+    return Rotation.from_euler("x", alpha).as_matrix(), np.array([a, 0.0, d])
+
+
 def _from_dh(rows: Mapping[str, Any]) -> dict[str, dict[str, Any]] | None:
     """Joints of a table of Denavit and Hartenberg; None where a row is not well formed.
 
@@ -110,13 +152,12 @@ def _from_dh(rows: Mapping[str, Any]) -> dict[str, dict[str, Any]] | None:
         if not isinstance(row, Mapping):
             return None
         try:
-            d, a, alpha, zero = (float(row.get(k, 0.0)) for k in ("d", "a", "alpha", "offset"))
+            zero = float(row.get("offset", 0.0))
+            twist, behind = _frame_of_row(row)
             center = np.array(row.get("center", (0.0,) * 3), dtype=float).reshape(3)
             six = np.array(row.get("inertia", (0.0,) * 6), dtype=float).reshape(6)
         except (TypeError, ValueError):
             return None
-        twist = Rotation.from_euler("x", alpha).as_matrix()
-        behind = np.array([a, 0.0, d])
         inertia = symmetric(six)
         placed = turn @ Rotation.from_euler("z", zero).as_matrix()
         found[name] = {

@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
-from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -30,53 +29,67 @@ _BUILDS = ("include", "replicate", "composite", "flexcomp", "attach", "frame")
 _FLAT = 'write it out flat: mj_saveLastXML, with saveinertial="true" in <compiler>'
 
 
-def mjcf_text(
-    name: str,
-    joints: Mapping[str, Mapping[str, Any]],
-    limits: Mapping[str, DriveLimits],
-    gravity: Sequence[float],
-    comment: str,
-) -> str:
-    """An MJCF of joints and bodies without shapes, one body and one motor a joint.
+def mjcf_text(name: str, tree: Tree, gravity: Sequence[float], comment: str) -> str:
+    """An MJCF of bodies and joints without shapes, one body a link, one motor a joint that moves.
 
     Args:
-        name: of the robot.
-        joints: by name, tables as of ``[robot.joints]``, the bodies' numbers in them.
-        limits: by name: range, effort, damping, friction and inertia of the drive.
-        gravity: in the base's frame, m/s2.
+        name: of the robot; tree: its links and joints, parents first.
+        gravity: in the frame of the link at the root, m/s2.
         comment: what to say at its head.
     """
     root = ElementTree.Element("mujoco", model=name)
     ElementTree.SubElement(root, "compiler", angle="radian", inertiafromgeom="false")
     ElementTree.SubElement(root, "option", gravity=number_list(gravity))
-    bodies = {"": ElementTree.SubElement(root, "worldbody")}
+    world = ElementTree.SubElement(root, "worldbody")
     actuators = ElementTree.SubElement(root, "actuator")
-    for joint, table in joints.items():
-        x, y, z, w = Rotation.from_euler("xyz", table["rotation"]).as_quat()
+    carried = {joint.child for joint in tree.joints}
+    (stem,) = (link for link in tree.bodies if link not in carried)
+    bodies = {stem: world}
+    if stem != _WORLD:
+        bodies[stem] = ElementTree.SubElement(world, "body", name=stem)
+        _write_inertial(bodies[stem], tree.bodies[stem])
+    for joint in tree.joints:
+        x, y, z, w = Rotation.from_matrix(joint.turn).as_quat()
         body = ElementTree.SubElement(
-            bodies[table.get("after") or ""], "body", name=f"{joint}_link",
-            pos=number_list(table["position"]), quat=number_list((w, x, y, z)),
+            bodies[joint.parent], "body", name=joint.child,
+            pos=number_list(joint.offset), quat=number_list((w, x, y, z)),
         )  # fmt: skip
-        bodies[joint] = body
-        xx, xy, xz, yy, yz, zz = table["inertia"]
-        ElementTree.SubElement(
-            body, "inertial", pos=number_list(table["center"]),
-            mass=number_list([table["mass"]]), fullinertia=number_list((xx, yy, zz, xy, xz, yz)),
-        )  # fmt: skip
-        own = limits[joint]
-        moves = ElementTree.SubElement(
-            body, "joint", name=joint, type=_KINDS[table["kind"]],
-            axis=number_list(table["axis"]), damping=number_list([own.damping]),
-            frictionloss=number_list([own.friction]), armature=number_list([own.armature]),
-        )  # fmt: skip
-        motor = ElementTree.SubElement(actuators, "motor", name=f"drive_{joint}", joint=joint)
-        if own.lower < own.upper:
-            moves.set("limited", "true")
-            moves.set("range", number_list((own.lower, own.upper)))
-        if own.effort > 0.0:
-            motor.set("ctrllimited", "true")
-            motor.set("ctrlrange", number_list((-own.effort, own.effort)))
+        bodies[joint.child] = body
+        _write_inertial(body, tree.bodies[joint.child])
+        if joint.kind != "fixed":
+            _write_joint(body, actuators, joint)
     return document(root, comment)
+
+
+def _write_inertial(element: ElementTree.Element, body: Body) -> None:
+    """Give a body its mass; readers other than MuJoCo want to be told that there is none."""
+    (xx, xy, xz), (_, yy, yz), (_, _, zz) = body.inertia
+    inertial = ElementTree.SubElement(
+        element, "inertial", pos=number_list(body.center), mass=number_list([body.mass])
+    )
+    if body.inertia.any():
+        inertial.set("fullinertia", number_list((xx, yy, zz, xy, xz, yz)))
+    else:
+        inertial.set("diaginertia", "0 0 0")
+
+
+def _write_joint(
+    body: ElementTree.Element, actuators: ElementTree.Element, joint: TreeJoint
+) -> None:
+    own = joint.limits
+    kind = "prismatic" if joint.kind == "prismatic" else "revolute"
+    moves = ElementTree.SubElement(
+        body, "joint", name=joint.name, type=_KINDS[kind], axis=number_list(joint.axis),
+        damping=number_list([own.damping]), frictionloss=number_list([own.friction]),
+        armature=number_list([own.armature]),
+    )  # fmt: skip
+    motor = ElementTree.SubElement(actuators, "motor", name=f"drive_{joint.name}", joint=joint.name)
+    if own.lower < own.upper:
+        moves.set("limited", "true")
+        moves.set("range", number_list((own.lower, own.upper)))
+    if own.effort > 0.0:
+        motor.set("ctrllimited", "true")
+        motor.set("ctrlrange", number_list((-own.effort, own.effort)))
 
 
 class _Reader:

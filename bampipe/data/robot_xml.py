@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from contextlib import suppress
+from io import BytesIO
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -15,8 +17,12 @@ DEEPEST = 200
 """Most elements inside one another, and most links one behind another."""
 
 
-def read_xml(path: Path) -> ElementTree.Element:
+def read_xml(path: Path, to_write: bool = False) -> ElementTree.Element:
     """The root of an XML file.
+
+    Args:
+        path: of the file.
+        to_write: whether it is written again: comments are kept, and prefixes of namespaces.
 
     Raises:
         InputError: no XML, one with a document type or entities, or too deep.
@@ -26,18 +32,28 @@ def read_xml(path: Path) -> ElementTree.Element:
     if b"<!ENTITY" in text or b"<!DOCTYPE" in text:
         raise InputError("a robot's file has no document type or entities", where=where)
     try:
-        root = ElementTree.fromstring(text)
+        builder = ElementTree.TreeBuilder(insert_comments=to_write)
+        root = ElementTree.fromstring(text, ElementTree.XMLParser(target=builder))
     except ElementTree.ParseError as error:
         line = error.position[0]
         raise InputError(
             f"not XML: {str(error).partition(':')[0]}", where=f"{where}, line {line}"
         ) from error
+    if to_write:
+        _keep_prefixes(text)
     level, depth = [root], 0
     while level := [inner for element in level for inner in element]:
         depth += 1
         if depth > DEEPEST:
             raise InputError(f"elements are nested more than {DEEPEST} deep", where=where)
     return root
+
+
+def _keep_prefixes(text: bytes) -> None:
+    """Have the namespaces of a text written with the prefixes that they have there."""
+    for _, (prefix, name) in ElementTree.iterparse(BytesIO(text), events=("start-ns",)):
+        with suppress(ValueError):  # ns1 and the like, which are given anew
+            ElementTree.register_namespace(prefix, name)
 
 
 def numbers(
@@ -60,11 +76,13 @@ def numbers(
     return found
 
 
-def document(root: ElementTree.Element, comment: str) -> str:
-    """The text of a file, a comment at its head unless that is empty."""
-    if comment:
-        root.insert(0, ElementTree.Comment(f" {comment.replace('--', '- -')} "))
-    ElementTree.indent(root)
+def document(root: ElementTree.Element, comment: str, indented: bool = True) -> str:
+    """The text of a file with a comment at its head; ``indented``, or spaced as it is."""
+    head = ElementTree.Comment(f" {comment.replace('--', '- -')} ")
+    head.tail = root.text
+    root.insert(0, head)
+    if indented:
+        ElementTree.indent(root)
     return f'<?xml version="1.0"?>\n{ElementTree.tostring(root, encoding="unicode")}\n'
 
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -12,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from bampipe.data.chain import Body, DriveLimits, Tree, TreeJoint, symmetric
-from bampipe.data.robot_xml import document, number_list, numbers
+from bampipe.data.robot_xml import document, number_list, numbers, read_xml
 from bampipe.errors import InputError
 
 Array = NDArray[np.float64]
@@ -33,11 +31,7 @@ def urdf_tree(root: ElementTree.Element, path: Path) -> Tree:
     values = (value for part in parts for inner in part.iter() for value in inner.attrib.values())
     macros = any(str(element.tag).startswith(_XACRO) for element in root.iter())
     if macros or any("${" in value for value in values):
-        raise InputError(
-            "a xacro file: macros that are no URDF yet",
-            where=where,
-            remedy=f"expand it first: xacro {path.name} > {path.name.partition('.')[0]}.urdf",
-        )
+        raise unexpanded(path)
     bodies: dict[str, Body] = {}
     for link in root.iterfind("link"):
         name = _name(link, where)
@@ -45,6 +39,15 @@ def urdf_tree(root: ElementTree.Element, path: Path) -> Tree:
             raise InputError(f"two links are called {name!r}", where=where)
         bodies[name] = _body(link, where)
     return Tree(bodies, [_joint(entry, where) for entry in root.iterfind("joint")])
+
+
+def unexpanded(path: Path) -> InputError:
+    """The error that a file is written in macros."""
+    return InputError(
+        "a xacro file: macros that are no URDF yet",
+        where=str(path),
+        remedy=f"expand it first: xacro {path.name} > {path.name.partition('.')[0]}.urdf",
+    )
 
 
 def _name(element: ElementTree.Element, where: str) -> str:
@@ -102,48 +105,82 @@ def _joint(entry: ElementTree.Element, where: str) -> TreeJoint:
     return TreeJoint(name, kind, ends[0], ends[1], turn, offset, shown, axis, limits)
 
 
-def urdf_text(
-    name: str,
-    joints: Mapping[str, Mapping[str, Any]],
-    limits: Mapping[str, DriveLimits],
-    comment: str = "",
-) -> str:
-    """A URDF of joints and bodies, one link a joint, without shapes.
+def urdf_text(name: str, tree: Tree, comment: str) -> str:
+    """A URDF of links and joints, without shapes.
 
     Args:
-        name: of the robot.
-        joints: by name, tables as of ``[robot.joints]``, the bodies' numbers in them.
-        limits: by name: range, effort, velocity, damping and friction.
-        comment: what to say at its head.
+        name: of the robot; tree: its links and joints; comment: what to say at its head.
     """
     robot = ElementTree.Element("robot", name=name)
-    ElementTree.SubElement(robot, "link", name="base")
-    for joint, table in joints.items():
-        link = ElementTree.SubElement(robot, "link", name=f"{joint}_link")
-        inertial = ElementTree.SubElement(link, "inertial")
-        ElementTree.SubElement(inertial, "origin", xyz=number_list(table["center"]), rpy="0 0 0")
-        ElementTree.SubElement(inertial, "mass", value=repr(float(table["mass"])))
-        keys = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-        moments = {k: repr(float(v)) for k, v in zip(keys, table["inertia"], strict=True)}
-        ElementTree.SubElement(inertial, "inertia", moments)
-        own = limits[joint]
-        bounded = own.lower < own.upper
-        kind = str(table["kind"])
-        if kind == "revolute" and not bounded:
-            kind = "continuous"
-        entry = ElementTree.SubElement(robot, "joint", name=joint, type=kind)
+    for link, body in tree.bodies.items():
+        _put_inertial(ElementTree.SubElement(robot, "link", name=link), body)
+    for joint in tree.joints:
+        own = joint.limits
+        moves, bounded = joint.kind != "fixed", own.lower < own.upper
+        kind = "continuous" if joint.kind == "revolute" and not bounded else joint.kind
+        entry = ElementTree.SubElement(robot, "joint", name=joint.name, type=kind)
         ElementTree.SubElement(
-            entry, "origin", xyz=number_list(table["position"]), rpy=number_list(table["rotation"])
+            entry, "origin", xyz=number_list(joint.offset), rpy=number_list(joint.angles)
         )
-        after = table.get("after")
-        ElementTree.SubElement(entry, "parent", link=f"{after}_link" if after else "base")
-        ElementTree.SubElement(entry, "child", link=f"{joint}_link")
-        ElementTree.SubElement(entry, "axis", xyz=number_list(table["axis"]))
-        ElementTree.SubElement(
-            entry, "limit", lower=repr(own.lower), upper=repr(own.upper),
-            effort=repr(own.effort or _UNLIMITED), velocity=repr(own.velocity or _UNLIMITED),
-        )  # fmt: skip
-        ElementTree.SubElement(
-            entry, "dynamics", damping=repr(own.damping), friction=repr(own.friction)
-        )
+        ElementTree.SubElement(entry, "parent", link=joint.parent)
+        ElementTree.SubElement(entry, "child", link=joint.child)
+        if moves:
+            ElementTree.SubElement(entry, "axis", xyz=number_list(joint.axis))
+            ElementTree.SubElement(
+                entry, "limit", lower=repr(own.lower), upper=repr(own.upper),
+                effort=repr(own.effort or _UNLIMITED), velocity=repr(own.velocity or _UNLIMITED),
+            )  # fmt: skip
+            _put_losses(entry, own)
     return document(robot, comment)
+
+
+def changed_urdf(path: Path, before: Tree, after: Tree, comment: str) -> str:
+    """The text of a URDF with other bodies and losses, all else as it is.
+
+    Args:
+        path: of the URDF; before: as it was read from there; after: as it shall be.
+        comment: what to say at its head.
+
+    Raises:
+        InputError: the file cannot be read.
+    """
+    robot = read_xml(path, to_write=True)
+    for link in robot.iterfind("link"):
+        name = str(link.get("name"))
+        if after.bodies[name] is not before.bodies[name]:
+            _put_inertial(link, after.bodies[name])
+    for entry, old, new in zip(robot.iterfind("joint"), before.joints, after.joints, strict=True):
+        if new.limits is not old.limits:
+            _put_losses(entry, new.limits)
+    return document(robot, comment, indented=False)
+
+
+def _put_inertial(link: ElementTree.Element, body: Body) -> None:
+    """Give a link the mass of a body, and none where that has none."""
+    inertial = link.find("inertial")
+    if body.mass == 0.0 and not body.inertia.any():
+        if inertial is not None:
+            link.remove(inertial)
+        return
+    if inertial is None:
+        inertial = ElementTree.SubElement(link, "inertial")
+        inertial.tail = "\n"
+    origin = {"xyz": number_list(body.center), "rpy": "0 0 0"}
+    keys = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+    moments = zip(keys, body.inertia[np.triu_indices(3)], strict=True)
+    inertia = {key: repr(float(value)) for key, value in moments}
+    mass = {"value": repr(float(body.mass))}
+    for tag, numbers_of in (("origin", origin), ("mass", mass), ("inertia", inertia)):
+        _entry(inertial, tag).attrib.update(numbers_of)
+
+
+def _put_losses(entry: ElementTree.Element, limits: DriveLimits) -> None:
+    """Give a joint damping and friction."""
+    dynamics = {"damping": repr(limits.damping), "friction": repr(limits.friction)}
+    _entry(entry, "dynamics").attrib.update(dynamics)
+
+
+def _entry(element: ElementTree.Element, tag: str) -> ElementTree.Element:
+    """The inner element of a tag; a new one where there is none."""
+    found = element.find(tag)
+    return ElementTree.SubElement(element, tag) if found is None else found

@@ -3,28 +3,43 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bampipe.data.chain import Body, DriveLimits, symmetric
+from bampipe.data.chain import (
+    Body,
+    DriveLimits,
+    Tree,
+    hold_beside,
+    identifier,
+    put_bodies,
+    symmetric,
+)
+from bampipe.data.device_file import tree_of_robot
 from bampipe.data.mjcf import mjcf_text
+from bampipe.data.robot_file import read_tree
+from bampipe.data.robot_xml import number_list, read_xml
 from bampipe.data.run_folder import RunFolder
-from bampipe.data.urdf import urdf_text
+from bampipe.data.urdf import changed_urdf, urdf_text
 from bampipe.declarations.model_file import identified, load_model
 from bampipe.errors import InputError
 from bampipe.files import json_text
+from bampipe.lists import join_names
 from bampipe.physics import System, compile_model
-from bampipe.physics.newton_euler import INERTIAL
 from bampipe.physics.portable import portable_source
-from bampipe.physics.robot import Robot
+from bampipe.physics.robot import INERTIAL_NAMES, Robot
 from bampipe.results.identify import IdentifyResult
 
 Array = NDArray[np.float64]
 Form = Literal["json", "urdf", "mjcf", "python", "c"]
 FORMS: tuple[Form, ...] = get_args(Form)
+DRAWING = "ingest/robot.xml"
+"""The URDF or MJCF that a session brought."""
+_UPRIGHT = (0.0, 0.0, -9.81)
 
 
 def export_model(run: RunFolder, name: str, form: Form) -> str:
@@ -32,9 +47,9 @@ def export_model(run: RunFolder, name: str, form: Form) -> str:
 
     Args:
         run: the run folder; name: of the model.
-        form: json, device, parameters and uncertainties; urdf, the bodies and joint friction of a
-            robot; mjcf, these and the inertia of its drives, for MuJoCo; python or c, a
-            self-contained function of inverse dynamics.
+        form: json, device, parameters and uncertainties; urdf, the robot's own URDF with bodies and
+            joint friction as identified; mjcf, these and the inertia of its drives, for MuJoCo;
+            python or c, a self-contained function of inverse dynamics.
 
     Raises:
         InputError: the model is not identified, or cannot be written in this form.
@@ -70,62 +85,157 @@ def _json(run: RunFolder, name: str, system: System, p: Array) -> str:
 
 
 def _urdf(run: RunFolder, system: System, p: Array) -> str:
-    _, joints, limits = _bodies_on_joints(run, system, p)
-    comment = _head(system, ["drives' inertia"])
-    return urdf_text(system.model.device.name, joints, limits, comment)
+    drawn, robot = _drawn(run, system, p), _robot(run, system)
+    drives = _drive_inertia(system, p)
+    shown = ", ".join(
+        f"{joint} {own:.6g}" for joint, own in zip(system.coordinates, np.diag(drives), strict=True)
+    )
+    lacks = [f"drives' inertia at their joints, kg.m2 or kg ({shown})"] if drives.any() else []
+    if tuple(robot.gravity) != _UPRIGHT:
+        lacks.append(f"gravity in the frame of {drawn.base} ({number_list(robot.gravity)})")
+    comment = _head(system, drawn, [*lacks, *_coupled(robot, drives)])
+    if drawn.file is not None and drawn.is_urdf:
+        return changed_urdf(drawn.file, drawn.before, drawn.after, comment)
+    return urdf_text(system.model.device.name, drawn.flat, comment)
 
 
 def _mjcf(run: RunFolder, system: System, p: Array) -> str:
-    robot, joints, limits = _bodies_on_joints(run, system, p)
-    # What is left of the inertia when no body has any is the drives'.
+    drawn, robot = _drawn(run, system, p), _robot(run, system)
+    comment = _head(system, drawn, _coupled(robot, _drive_inertia(system, p)))
+    return mjcf_text(system.model.device.name, drawn.flat, robot.gravity, comment)
+
+
+def _head(system: System, drawn: _Drawn, lacks: Sequence[str]) -> str:
+    """Where a model comes from, where its masses are, and what of it is not in the text."""
+    lacks = [*lacks, *(item.name for item in system.model.effects)]
+    parts = ["identified by bampipe", *drawn.notes]
+    return "; ".join([*parts, f"not in it: {', '.join(lacks)}"] if lacks else parts)
+
+
+def _coupled(robot: Robot, drives: Array) -> list[str]:
+    """What motors do that turn with several joints."""
+    lacks = []
+    if np.any(np.abs(drives - np.diag(np.diag(drives))) > 0.0):
+        lacks.append("inertia by which drives couple joints")
+    shared = [name for name, motor in robot.motors.items() if len(motor.turns) > 1]
+    return lacks + ([f"friction of motors of several joints ({', '.join(shared)})"] * bool(shared))
+
+
+@dataclass(frozen=True)
+class _Drawn:
+    """A robot's links and joints as they were drawn, and as they were identified.
+
+    Attributes:
+        file: copy of the drawing in the run folder, None where the device file has the joints.
+        is_urdf: whether that is a URDF.
+        before, after: all links and joints, as drawn and with what was identified.
+        flat: of ``after``, what the model has: the part on the base, joints beside the chain fixed.
+        base: link that stands still.
+        notes: what is where other than in the drawing, one clause each.
+    """
+
+    file: Path | None
+    is_urdf: bool
+    before: Tree
+    after: Tree
+    flat: Tree
+    base: str
+    notes: tuple[str, ...]
+
+
+def _drawn(run: RunFolder, system: System, p: Array) -> _Drawn:
+    robot = _robot(run, system)
+    bodies, limits = _identified_joints(robot, system, p)
+    if not run.exists(DRAWING):
+        table = dict(system.model.device.declaration["robot"])
+        before = tree_of_robot(table)
+        links = {f"{joint}_link": body for joint, body in bodies.items()}
+        joints = [replace(j, limits=limits.get(j.name, j.limits)) for j in before.joints]
+        after = replace(before, bodies={**before.bodies, **links}, joints=joints)
+        return _Drawn(None, False, before, after, after, "base", ())
+    file = run.path(DRAWING)
+    before = read_tree(file)
+    after = put_bodies(before, robot.base, robot.tip, bodies, limits)
+    notes = []
+    emptied = [link for link in before.bodies if _lost(before.bodies[link], after.bodies[link])]
+    if emptied:
+        notes.append(
+            f"the mass of what is fixed to a link is in that link, not in {join_names(emptied)}"
+        )
+    if robot.payload is not None:
+        notes.append(f"the payload of {robot.payload.mass:g} kg is in the last link that moves")
+    overdrawn = _overdrawn(bodies, after)
+    if overdrawn:
+        notes.append(
+            f"no body has what is left for {join_names(overdrawn)}: what hangs there beside the"
+            " chain is drawn too heavy"
+        )
+    return _Drawn(
+        file=file,
+        is_urdf=read_xml(file).tag == "robot",
+        before=before,
+        after=after,
+        flat=hold_beside(after, robot.base, robot.tip),
+        base=robot.base,
+        notes=tuple(notes),
+    )
+
+
+def _lost(before: Body, after: Body) -> bool:
+    """Whether a body is there no more."""
+    return before.mass != 0.0 and after.mass == 0.0 and not after.inertia.any()
+
+
+def _overdrawn(identified: Mapping[str, Body], after: Tree) -> list[str]:
+    """Links that are no body once what joints beside the chain carry, as drawn, is taken off."""
+    links = {identifier(joint.name): joint.child for joint in after.joints}
+    return [
+        links[joint]
+        for joint, body in identified.items()
+        if body.is_possible and not after.bodies[links[joint]].is_possible
+    ]
+
+
+def _drive_inertia(system: System, p: Array) -> Array:
+    """What is left of the mass matrix when no body has any inertia, (n, n)."""
+    robot = system.model.device.robot
+    assert robot is not None
     without = p.copy()
     inertial = {item.name for item in robot.parameters}
     without[[item.name in inertial for item in system.parameters]] = 0.0
-    (drives,) = system.mass_matrix(np.zeros((1, len(joints))), without)
-    limits = {
-        joint: replace(limits[joint], armature=float(own))
-        for joint, own in zip(system.coordinates, np.diag(drives), strict=True)
-    }
-    coupled = np.any(np.abs(drives - np.diag(np.diag(drives))) > 0.0)
-    comment = _head(system, ["inertia by which drives couple joints"] if coupled else [])
-    gravity = [float(v) for v in robot.gravity]
-    return mjcf_text(system.model.device.name, joints, limits, gravity, comment)
+    (drives,) = system.mass_matrix(np.zeros((1, len(system.coordinates))), without)
+    return np.asarray(drives)
 
 
-def _head(system: System, lacks: Sequence[str]) -> str:
-    """Where a model comes from and what of it is not in the text."""
-    lacks = [*lacks, *(item.name for item in system.model.effects)]
-    return "identified by bampipe" + (f"; not in it: {', '.join(lacks)}" if lacks else "")
-
-
-def _bodies_on_joints(
-    run: RunFolder, system: System, p: Array
-) -> tuple[Robot, dict[str, dict[str, Any]], dict[str, DriveLimits]]:
-    """The robot, tables of its joints with identified bodies, and limits with their friction.
+def _robot(run: RunFolder, system: System) -> Robot:
+    """The robot of a device.
 
     Raises:
-        InputError: the device is no robot.
+        InputError: the device is none.
     """
     device = system.model.device
-    robot = device.robot
-    if robot is None:
+    if device.robot is None:
         others = (f for f in FORMS if f not in ("urdf", "mjcf"))
         raise InputError(
             f"device {device.name!r} is no robot: it has no bodies on joints",
             where=str(run.root),
             remedy=f"choose another form: {', '.join(others)}",
         )
+    return device.robot
+
+
+def _identified_joints(
+    robot: Robot, system: System, p: Array
+) -> tuple[dict[str, Body], dict[str, DriveLimits]]:
+    """Bodies by joint, and what the joints' drives can do, their friction and inertia in it."""
     value = {item.name: float(p[i]) for i, item in enumerate(system.parameters)}
-    joints, limits = {}, {}
-    for joint, declared in zip(
-        robot.joints, device.declaration["robot"]["joints"].values(), strict=True
-    ):
-        numbers = np.array(
-            [value[q.name] for q in robot.parameters if q.name.endswith(f".{joint.name}")]
+    drives = dict(zip(system.coordinates, np.diag(_drive_inertia(system, p)), strict=True))
+    bodies, limits = {}, {}
+    for joint in robot.joints:
+        bodies[joint.name] = _body(
+            np.array([value[f"{name}.{joint.name}"] for name in INERTIAL_NAMES])
         )
-        assert numbers.size == INERTIAL
-        joints[joint.name] = {**_BARE, **declared, **_body(numbers)}
-        lower, upper = device.limits.get(joint.name, (0.0, 0.0))
+        lower, upper = system.model.device.limits.get(joint.name, (0.0, 0.0))
         limits[joint.name] = DriveLimits(
             lower,
             upper,
@@ -133,18 +243,14 @@ def _bodies_on_joints(
             joint.velocity,
             damping=max(value.get(f"viscous.{joint.name}", 0.0), 0.0),
             friction=max(value.get(f"coulomb.{joint.name}", 0.0), 0.0),
+            armature=float(drives[joint.name]),
         )
-    return robot, joints, limits
+    return bodies, limits
 
 
-_BARE: Mapping[str, Any] = {
-    "position": (0.0, 0.0, 0.0), "rotation": (0.0, 0.0, 0.0), "axis": (0.0, 0.0, 1.0),
-}  # fmt: skip
-
-
-def _body(numbers: Array) -> dict[str, Any]:
+def _body(numbers: Array) -> Body:
     """Mass, centre and inertia about it, of the ten numbers about the joint."""
     mass = float(numbers[0])
     center = numbers[1:4] / mass if mass != 0.0 else np.zeros(3)
     inertia = symmetric(numbers[4:]) - Body(mass, center).about(np.zeros(3))
-    return Body(mass, center, inertia).table()
+    return Body(mass, center, inertia)

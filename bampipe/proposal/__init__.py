@@ -73,15 +73,16 @@ def propose(folder: Path, device: str = "") -> ProposedSession:
     match = Matcher(found, clock.t, set(clock.columns))
     if chosen is None:
         chosen = new_device(folder, match, notes)
-        several = len([c for c in found.of("position") if not c.is_constant])
-        if several > 1:
+        positions = len([c for c in found.of("position") if not c.is_constant])
+        if positions > 1:
             notes.check.append(
-                f"{several} columns are positions: of a robot? put its URDF beside the logs"
+                f"{positions} columns are positions: of a robot? put its URDF beside the logs"
             )
     elif chosen.device.robot is not None:
+        several = len(chosen.device.robot.joints) > 1
         columns = find_robot_columns(chosen.device, chosen.device.robot, found, clock.t, notes)
         chosen = _with_guessed_motors(folder, chosen, columns)
-        match.joints = columns.columns
+        match.joints, match.of_robot = columns.columns, several
         match.turned, match.gears = columns.turned, columns.gears
         _check_robot(chosen, columns, notes)
     encoders, axes = encoders_table(chosen.device, match, notes)

@@ -14,6 +14,7 @@ from bampipe.data.chain import Branches
 from bampipe.data.device_file import complete_device, read_device_file
 from bampipe.data.robot_xml import read_xml
 from bampipe.data.survey import Survey, SurveyedColumn, words
+from bampipe.data.urdf import unexpanded
 from bampipe.errors import InputError
 from bampipe.estimate.white_noise import counting_step, white_noise_sd
 from bampipe.files import read_toml
@@ -96,12 +97,15 @@ def _robot(folder: Path, found: Survey) -> ChosenDevice | None:
     Where joints branch, as fingers do, it ends before them.
 
     Raises:
-        InputError: the file cannot be used, or there are several.
+        InputError: the file cannot be used, is a xacro file, or there are several.
     """
     urdfs = sorted(folder.glob("*.urdf")) or [
         path for path in sorted(folder.glob("*.xml")) if _is_mjcf(path)
     ]
     if not urdfs:
+        macros = next(iter(sorted(folder.glob("*.xacro"))), None)
+        if macros is not None:
+            raise unexpanded(macros)
         return None
     if len(urdfs) > 1:
         raise InputError(

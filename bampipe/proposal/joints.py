@@ -7,7 +7,7 @@ with a column for every joint count, so no joint gets what is left over from ano
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from bampipe.data.survey import Survey, SurveyedColumn
@@ -42,10 +42,12 @@ class Pairing:
 
     Attributes:
         positions, drives: groups that fit, the likeliest first; of drives one a motor.
+        some_drives: where no group has all drives, by input those of the group with the most.
     """
 
     positions: tuple[Group, ...]
     drives: tuple[Group, ...]
+    some_drives: Mapping[str, SurveyedColumn]
 
 
 def pair_joints(device: Device, found: Survey) -> Pairing:
@@ -54,7 +56,30 @@ def pair_joints(device: Device, found: Survey) -> Pairing:
     motors = [re.sub(r"^(torque|current)_", "", name) for name in device.forces]
     roles = ("current", "force") if device.force_unit == "A" else ("force", "current")
     drives = [group for role in roles for group in _groups(motors, found.of(role))]
-    return Pairing(tuple(_groups(joints, found.of("position"))), tuple(drives))
+    positions = _groups(joints, found.of("position"))
+    some: dict[str, SurveyedColumn] = {}
+    if not drives and positions:
+        incomplete = [
+            g for role in roles for g in _incomplete(motors, found.of(role), positions[0])
+        ]
+        most = max(incomplete, key=len, default={})
+        some = {name: most[m] for name, m in zip(device.forces, motors, strict=True) if m in most}
+    return Pairing(tuple(positions), tuple(drives), some)
+
+
+def _incomplete(
+    names: Sequence[str], columns: Sequence[SurveyedColumn], positions: Group
+) -> Iterator[Mapping[str, SurveyedColumn]]:
+    """Groups with columns for some of ``names``: by their names, or numbered as ``positions``."""
+    split = {column.name: _tokens(column.name) for column in (*columns, *positions.columns)}
+    said = {name: _tokens(name) for name in names}
+    yield from _named_alike(said, columns, split).values()
+    for numbered in _numbered_alike(positions.columns, split).values():
+        if len(numbered) == len(names):
+            of_number = dict(zip(sorted(numbered), names, strict=True))
+            for group in _numbered_alike(columns, split).values():
+                if group.keys() <= of_number.keys():
+                    yield {of_number[number]: column for number, column in group.items()}
 
 
 def _groups(names: Sequence[str], columns: Sequence[SurveyedColumn]) -> list[Group]:
@@ -81,6 +106,15 @@ def _groups(names: Sequence[str], columns: Sequence[SurveyedColumn]) -> list[Gro
 def _by_name(
     said: dict[str, Tokens], columns: Sequence[SurveyedColumn], split: dict[str, Tokens]
 ) -> Iterator[Group]:
+    for group in _named_alike(said, columns, split).values():
+        if len(group) == len(said):
+            yield Group(tuple(group[name] for name in said), named=True)
+
+
+def _named_alike(
+    said: dict[str, Tokens], columns: Sequence[SurveyedColumn], split: dict[str, Tokens]
+) -> dict[Tokens, dict[str, SurveyedColumn]]:
+    """Columns by name of the joint, those together whose names are alike but for it."""
     groups: dict[Tokens, dict[str, SurveyedColumn]] = {}
     # Of names that contain one another, such as wrist and wrist_roll, the longest that is there.
     for column in columns:
@@ -89,15 +123,22 @@ def _by_name(
             if rest is not None:
                 groups.setdefault(rest, {}).setdefault(name, column)
                 break
-    for group in groups.values():
-        if len(group) == len(said):
-            yield Group(tuple(group[name] for name in said), named=True)
+    return groups
 
 
 def _by_number(
     count: int, columns: Sequence[SurveyedColumn], split: dict[str, Tokens]
 ) -> Iterator[Group]:
     """Groups whose names differ by one number only, in its order."""
+    for group in _numbered_alike(columns, split).values():
+        if len(group) == count:
+            yield Group(tuple(group[number] for number in sorted(group)), named=count == 1)
+
+
+def _numbered_alike(
+    columns: Sequence[SurveyedColumn], split: dict[str, Tokens]
+) -> dict[Tokens, dict[int, SurveyedColumn]]:
+    """Columns by a number in their names, those together whose names are alike but for it."""
     groups: dict[Tokens, dict[int, SurveyedColumn]] = {}
     for column in columns:
         tokens = split[column.name]
@@ -105,9 +146,7 @@ def _by_number(
             if token.isdigit():
                 alike = (*tokens[:place], _JOINT, *tokens[place + 1 :])
                 groups.setdefault(alike, {}).setdefault(int(token), column)
-    for group in groups.values():
-        if len(group) == count:
-            yield Group(tuple(group[number] for number in sorted(group)), named=count == 1)
+    return groups
 
 
 def _tokens(name: str) -> Tokens:

@@ -33,6 +33,7 @@ class Matcher:
         joints: columns of a robot's joints and drives, by name of joint or input; of what stands
             there no other column is thought.
         turned: inputs that are logged with the other sign.
+        of_robot: whether the device is a robot of several joints.
         gears: joints whose position is that of a motor, which turns so often for one of theirs.
     """
 
@@ -42,6 +43,7 @@ class Matcher:
     joints: Mapping[str, SurveyedColumn] = field(default_factory=dict)
     turned: frozenset[str] = frozenset()
     gears: Mapping[str, float] = field(default_factory=dict)
+    of_robot: bool = False
 
     def named(self, name: str, *roles: str) -> SurveyedColumn | None:
         """The column that has the words of ``name``, of one of the roles."""
@@ -105,6 +107,8 @@ class Matcher:
         named = exact or self.named(name, role) or self.named(name.removeprefix("force_"), role)
         if named is not None and named in free:
             return named, ""
+        if self.of_robot:  # a column left over is another joint's as well as this one's
+            return None, ""
         fitting = [c for c in free if c.role == role and not c.is_constant and (si or not c.unit)]
         if len(fitting) == 1 and _compatible(fitting[0], si):
             return fitting[0], ""

@@ -38,6 +38,8 @@ _DRAWN = 0.05
 """Weight of the size of the drawn bodies beside the shape of the drives."""
 _MOST_LEFT = 0.05
 """Of the drives' variance: what a drawing with the right reductions leaves at most."""
+_DOUBTED = 0.01
+"""The same: what positions leave whose unit is guessed, before those of motors are tried."""
 _OTHER_UNITS = {"rad": ("deg", np.pi / 180.0), "m": ("mm", 1e-3)}
 
 
@@ -109,11 +111,14 @@ def find_robot_columns(
         columns |= dict(zip(_joints(device), positions.columns, strict=True))
     if drives is not None:
         columns |= dict(zip(device.forces, drives.columns, strict=True))
+    else:
+        columns |= pairing.some_drives
     if positions is None or drives is None:
         return RobotColumns(columns, {})
     judged = _judge(device, robot, positions, drives, t)
     beyond = _beyond_range(device, positions, of_joint=bool(judged) and _fits(judged))
-    if judged and not robot.motors and not _fits(judged):
+    guessed = positions is not pairing.positions[0] and bool(judged) and _left(judged) > _DOUBTED
+    if judged and not robot.motors and (guessed or not _fits(judged)):
         # Hundreds without a unit are degrees, or radians of a motor.
         geared = [
             (group, fitted)
@@ -122,7 +127,8 @@ def find_robot_columns(
         ]
         if geared:
             group, (ratio, by_motor) = min(geared, key=lambda item: _left(item[1][1]))
-            return _geared(device, columns, group, ratio, by_motor, notes)
+            if not _fits(judged) or _left(by_motor) < _BETTER * _left(judged):
+                return _geared(device, columns, group, ratio, by_motor, notes)
     notes.check += beyond
     if not judged or (beyond and not _fits(judged)):
         return RobotColumns(columns, {})
@@ -130,14 +136,14 @@ def find_robot_columns(
         other = _in_alphabetical_order(device, positions), _in_alphabetical_order(device, drives)
         turned = _judge(device, robot, *other, t)
         if turned and _left(turned) < _BETTER * _left(judged):
+            notes.check.append(
+                "columns stand in the alphabetical order of the joints' names, since weight and"
+                f" inertia as drawn explain {1.0 - _left(turned):.1%} of the drives that way,"
+                f" {max(1.0 - _left(judged), 0.0):.1%} in the order of the chain"
+            )
             judged = turned
             columns |= dict(zip(_joints(device), other[0].columns, strict=True))
             columns |= dict(zip(device.forces, other[1].columns, strict=True))
-            notes.check.append(
-                "columns stand in the alphabetical order of the joints' names, since weight and"
-                f" inertia as drawn explain {1.0 - _left(turned):.0%} of the drives that way,"
-                f" {max(1.0 - _left(judged), 0.0):.0%} in the order of the chain"
-            )
     by_input = dict(zip(device.forces, judged, strict=True))
     notes.check += _sentences(device, columns, by_input)
     return RobotColumns(columns, by_input)

@@ -46,12 +46,15 @@ class Plausibility:
         moving: share of the samples in which each axis moves, (n_q,).
         p: parameters, (n_p,).
         objections: half the squared distance of each from its prior, in its deviations, (n_p,).
+        usual: what they sum up to where all is well: each of many numbers that are known as data
+            are is off by its deviation.
     """
 
     error: Array
     moving: Array
     p: Array
     objections: Array
+    usual: float = 0.0
 
     @property
     def worst_error(self) -> float:
@@ -93,11 +96,7 @@ def judge_setup(
         share = np.where(moving >= LEAST_MOVING, share, 1.0)
     if not np.isfinite(share).all():
         return None
-    objections = [
-        _objection(item, value, CERTAIN * spread)
-        for item, value, spread in zip(system.parameters, found.p, found.sd, strict=True)
-    ]
-    return Plausibility(share, moving, found.p, np.array(objections))
+    return Plausibility(share, moving, found.p, *_object_to(system.parameters, found))
 
 
 def axes_without_pose(system: System, motions: Sequence[Motion]) -> list[int]:
@@ -121,14 +120,14 @@ def _follows(system: System, motions: Sequence[Motion], p: Array, axis: int) -> 
 
 @dataclass(frozen=True)
 class _Fitted:
-    """Error by axis, (n_q,), parameters, (n_p,), and their standard deviations, (n_p,).
+    """Error by axis, (n_q,), parameters, (n_p,), and their covariance, (n_p, n_p).
 
-    The deviations are as if samples were independent, and zero of what is held.
+    The covariance is as if samples were independent, and zero of what is held.
     """
 
     error: Array
     p: Array
-    sd: Array
+    covariance: Array
 
 
 def _with_pose(evidence: Evidence, posed: Sequence[int]) -> _Fitted:
@@ -146,13 +145,28 @@ def _with_pose(evidence: Evidence, posed: Sequence[int]) -> _Fitted:
         step = replace(part, precision=part.precision + ridge).solve(
             weight, np.append(evidence.lower, -wide), np.append(evidence.upper, wide)
         )
-    prior_sd = np.array([evidence.system.parameters[i].sd for i in free])
-    vague = 1.0 / np.maximum(VAGUE * prior_sd, np.finfo(float).tiny) ** 2
-    normal = np.einsum("q,kqij->ij", weight, sums.xx) + np.diag(np.append(vague, more))
-    p, sd = evidence.p.copy(), np.zeros(len(evidence.p))
+    p, covariance = evidence.p.copy(), np.zeros((len(evidence.p),) * 2)
     p[free] += step[: len(free)]
-    sd[free] = np.sqrt(np.diag(np.linalg.inv(normal)))[: len(free)]
-    return _Fitted(np.sqrt(sums.mean_square(step)), p, sd)
+    prior_sd = np.array([evidence.system.parameters[i].sd for i in free])
+    size = np.append(
+        np.maximum(prior_sd, np.finfo(float).tiny), np.sqrt(_RIDGE / np.maximum(more, _RIDGE))
+    )
+    least = np.append(np.full(len(free), VAGUE**-2.0), np.full(more.size, _RIDGE))
+    normal = np.einsum("q,kqij->ij", weight, sums.xx)
+    inverse = _inverse(normal * np.outer(size, size), least) * np.outer(size, size)
+    covariance[np.ix_(free, free)] = inverse[: len(free), : len(free)]
+    return _Fitted(np.sqrt(sums.mean_square(step)), p, covariance)
+
+
+def _inverse(normal: Array, least: Array) -> Array:
+    """The inverse of ``normal``, (n, n), with ``least`` on its diagonal, (n,).
+
+    Of the bodies of a robot many combinations do not show, to which rounding may give less than
+    nothing.
+    """
+    values, directions = np.linalg.eigh(normal + np.diag(least))
+    inverse = directions / np.maximum(values, least.min()) @ directions.T
+    return np.asarray(inverse)
 
 
 def _pose_columns(evidence: Evidence, trial: int, posed: Sequence[int]) -> Array:
@@ -183,7 +197,8 @@ def distance_from_prior(item: Parameter, value: float) -> float:
     """How far a value is from what the device file expects, in deviations of that.
 
     What cannot be negative and is expected to be something is compared by its logarithm: a tenth
-    is as far as ten times.
+    is as far as ten times. Where nothing is expected of it, its deviation is no more than a size
+    that is thinkable: each doubling beyond that is one more.
     """
     if item.fixed or item.sd == 0.0:
         return 0.0
@@ -191,9 +206,57 @@ def distance_from_prior(item: Parameter, value: float) -> float:
         if value <= 0.0:
             return -FARTHEST
         return math.log(value / item.prior) / math.log1p(item.sd / item.prior)
+    if item.lower >= 0.0 and item.prior == 0.0 and value > 0.0:
+        return math.log2(1.0 + value / item.sd)
     return (value - item.prior) / item.sd
+
+
+def _object_to(parameters: Sequence[Parameter], found: _Fitted) -> tuple[Array, float]:
+    """Half the squared distance of each parameter from its prior, (n_p,); what is usual of all.
+
+    Numbers that are known as data are, such as those of drawn bodies, are taken together.
+    """
+    spread = CERTAIN * np.sqrt(np.diag(found.covariance))
+    objections = np.array(
+        [
+            _objection(item, value, margin)
+            for item, value, margin in zip(parameters, found.p, spread, strict=True)
+        ]
+    )
+    usual = 0.0
+    known = [i for i, p in enumerate(parameters) if p.weighed and not p.fixed and p.sd > 0.0]
+    if known:
+        prior = np.array([parameters[i].prior for i in known])
+        sd = np.array([parameters[i].sd for i in known])
+        covariance = found.covariance[np.ix_(known, known)] / np.outer(sd, sd)
+        objections[known], usual = _joint_objections(found.p[known] / sd, prior / sd, covariance)
+    return objections, usual
 
 
 def _objection(item: Parameter, value: float, margin: float) -> float:
     nearest = min(max(item.prior, value - margin), value + margin)
     return 0.5 * min(distance_from_prior(item, nearest) ** 2, FARTHEST**2)
+
+
+def _joint_objections(found: Array, prior: Array, covariance: Array) -> tuple[Array, float]:
+    """Objections to parameters of which the trials only show combinations, (n,).
+
+    Each alone can be what it is expected to be, as the mass of one link can at the cost of the
+    next, and all together not: so the combinations are judged, in their deviations. These are
+    wider where no factor brings what is found and what is expected closer than they say (Birge
+    1932): the trials may lack something else than the right units.
+
+    Args:
+        found, prior: in deviations of the prior; covariance: of the fit, likewise.
+
+    Returns:
+        The objections, and what they sum up to on average where all is well.
+    """
+    variance, directions = np.linalg.eigh(covariance)
+    shown = 1.0 / (1.0 + CERTAIN**2 * np.maximum(variance, 0.0))
+    said, expected = directions.T @ found, directions.T @ prior
+    factor = (shown * said) @ expected / max((shown * expected) @ expected, np.finfo(float).tiny)
+    apart = float(shown @ (said - factor * expected) ** 2)
+    birge = min(1.0, float(shown.sum()) / apart) if apart > 0.0 else 1.0
+    each = 0.5 * np.minimum(birge * shown * (said - expected) ** 2, FARTHEST**2)
+    return directions**2 @ each, 0.5 * float(shown.sum())

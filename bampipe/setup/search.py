@@ -34,7 +34,8 @@ SUSPICIOUS_ERROR = 0.4
 """Error, as a share of the applied force, from which other set-ups are tried. Right ones
 stand below 0.15 with any one effect hidden, a gravity compensator that lags behind at 0.36."""
 SUSPICIOUS_PRIORS = 5.0
-"""Sum of objections from which other set-ups are tried: two parameters beyond two deviations."""
+"""Sum of objections, beyond the usual, from which other set-ups are tried: two parameters beyond
+two deviations."""
 LEAST_GAIN = 7.0
 """Score that setting a mistake right must gain: the error of one axis falls to 42 %, say. Of sound
 sessions no other set-up gains more than 5.0, of mistaken ones the right one at least 7.9."""
@@ -175,7 +176,7 @@ class CorrectionSearch:
         if now is None or now.error.max() > SUSPICIOUS_ERROR:
             return True
         most = LEAST_GAIN_PLACEHOLDER if placeholders else SUSPICIOUS_PRIORS
-        return bool(now.objections.sum() > most)
+        return bool(now.objections.sum() - now.usual > most)
 
     def _is_explained(self, finding: Finding, last: Plausibility) -> bool:
         spoilt = spoilt_axes(finding)

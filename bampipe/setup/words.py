@@ -102,6 +102,9 @@ def describe_size(correction: Correction) -> str:
 
 def _scale(correction: Correction, session: IngestResult) -> str:
     fixes = dict.fromkeys(_scale_fix(name, correction, session) for name in correction.signals)
+    channels = [f"channels.{name}" for name in correction.signals if name in session.channels]
+    if len(channels) == len(correction.signals) > 1:
+        fixes = {f"multiply scale of {join_names(channels)} by {number(correction.factor)}": None}
     unit = _si(correction, session)
     like = ""
     if correction.unit and unit:

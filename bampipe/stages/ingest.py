@@ -18,7 +18,7 @@ import pyarrow as pa
 from pydantic import Field
 from pydantic.dataclasses import dataclass as checked_dataclass
 
-from bampipe.data.device_file import read_device_file
+from bampipe.data.device_file import find_robot_file, read_device_file
 from bampipe.data.quality import CleaningLimits, CleanTrial, clean
 from bampipe.data.readers import read_trial
 from bampipe.data.run_folder import INGESTED, MOVING, RunFolder
@@ -43,7 +43,7 @@ from bampipe.trials.sensors import RecordNoise, settle_encoder, settle_force
 
 SUMMARY = "Read a session's raw logs, check and repair the trials, bring them to SI units"
 INPUTS: tuple[str, ...] = ()
-OUTPUTS = (*INGESTED, "ingest/device*.toml")
+OUTPUTS = (*INGESTED, "ingest/device*.toml", "ingest/robot*.xml")
 
 RATE_TOLERANCE = 0.02
 """The announced sample rate is used where the time stamps agree with it this well."""
@@ -116,6 +116,9 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
             file.write_bytes(session.device_file.read_bytes())
         else:  # with all that its URDF says: the run folder stands on its own
             file.write_text(toml_text(device.declaration), encoding="utf-8")
+            drawing = find_robot_file(session.device_file)
+            if drawing is not None:  # an export gives it back
+                (out / "ingest/robot.xml").write_bytes(drawing.read_bytes())
     notes = [*description.sensor_warnings, *(line.sentence for line in description.mains_hum)]
     notes += _impossible(device)
     notes += [f"{place}: its source still says `fill in`" for place in description.placeholders]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -147,7 +148,9 @@ def test_numbers_without_names_may_count_joints_in_alphabetical_order(tmp_path: 
     order = {name: place for place, name in enumerate(sorted(NAMES[:4]))}
     assert positions == {name: f"position[{place}]" for name, place in order.items()}
     assert drives == {name: f"effort[{place}]" for name, place in order.items()}
-    assert any("alphabetical order" in line for line in proposal.check)
+    (said,) = (line for line in proposal.check if "alphabetical order" in line)
+    here, there = (float(share) for share in re.findall(r"([\d.]+)%", said))
+    assert here > 95.0 > there
 
 
 def test_degrees_and_millimetres_of_numbered_joints(tmp_path: Path) -> None:
@@ -199,6 +202,42 @@ def test_radians_of_a_motor_are_not_taken_for_degrees_of_its_joint(tmp_path: Pat
     encoders = read_session(tmp_path / "log").encoders
     assert [encoder.stated_unit for encoder in encoders] == ["rad"] * 3
     np.testing.assert_allclose([e.gear_ratio for e in encoders], truth["ratio"], rtol=0.05)
+
+
+def test_many_radians_of_a_motor_are_no_degrees_though_these_stay_in_the_range(
+    tmp_path: Path,
+) -> None:
+    """A hundred turns read as degrees are 1.7 times the joint's angle."""
+    write_log(tmp_path, gains=(0.01, 0.01))
+    table = pd.read_csv(tmp_path / "log.csv")
+    table[["q1", "q2"]] *= 100.0
+    table.to_csv(tmp_path / "log.csv", index=False)
+    proposed(tmp_path)
+    encoders = read_session(tmp_path).encoders
+    assert [encoder.stated_unit for encoder in encoders] == ["rad"] * 2
+    np.testing.assert_allclose([e.gear_ratio for e in encoders], 100.0, rtol=0.03)
+
+
+@pytest.mark.parametrize("names", [("tau1", "tau2"), ("effort_shoulder", "effort_elbow")])
+def test_a_drive_that_was_not_logged_is_asked_for_and_the_other_stays_where_it_is(
+    tmp_path: Path, names: tuple[str, str]
+) -> None:
+    write_log(tmp_path)
+    table = pd.read_csv(tmp_path / "log.csv").drop(columns="tau1")
+    table.rename(columns={"tau2": names[1]}).to_csv(tmp_path / "log.csv", index=False)
+    proposal = proposed(tmp_path)
+    assert proposal.fill_in == ["the column of torque_shoulder in N.m"]
+    assert f'torque_elbow = {{ column = "{names[1]}"' in proposal.session
+    with pytest.raises(InputError, match="fill in the name of the column") as caught:
+        read_session(tmp_path)
+    assert "channels.torque_shoulder.column" in str(caught.value)
+
+
+def test_a_xacro_file_beside_the_logs_is_to_be_expanded(tmp_path: Path) -> None:
+    write_log(tmp_path)
+    (tmp_path / "arm.urdf").rename(tmp_path / "arm.urdf.xacro")
+    with pytest.raises(InputError, match=r"macros that are no URDF yet; expand it first: xacro"):
+        propose(tmp_path)
 
 
 FINGERS = """<link name="left"/><link name="right"/>

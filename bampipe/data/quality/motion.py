@@ -24,7 +24,8 @@ def refuse_wrong_motion(table: TrialTable, columns: dict[str, np.ndarray]) -> No
                 raise table.fault(
                     "never changes while other axes move: frozen",
                     column=encoder.column,
-                    remedy="check the encoder's cable",
+                    remedy="check the encoder's cable; an axis held in all trials is none of the"
+                    " device: make a robot's joint fixed in its file",
                 )
         return
     encoder = next(e for e in session.encoders if e.axis == entry.locked_axis)

@@ -46,7 +46,22 @@ ChannelName = Annotated[
     AfterValidator(_name),
     Field(json_schema_extra={"pattern": "^[A-Za-z][A-Za-z0-9_]*$"}),
 ]
-Column = Annotated[Text, Field(description="A column (or MATLAB variable) of the trial files")]
+
+
+def _filled_in(column: str) -> str:
+    if column == "?":
+        raise fault(
+            'found "?", which `bampipe init` leaves for what it could not tell',
+            remedy="fill in the name of the column; every input of the device has to be logged",
+        )
+    return column
+
+
+Column = Annotated[
+    Text,
+    AfterValidator(_filled_in),
+    Field(description="A column (or MATLAB variable) of the trial files"),
+]
 Uncertainty = Annotated[float, Field(ge=0, lt=1)]
 Columns = Annotated[Distinct[Column], Field(min_length=1, description="Columns of the trial files")]
 

@@ -1,0 +1,95 @@
+"""The scale of a robot's drives is known by its bodies; how much friction there is, is a guess."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from bampipe.data.device_file import complete_device
+from bampipe.estimate.low_pass import Band
+from bampipe.physics import Model, System, compile_model
+from bampipe.physics.registry import device_from
+from bampipe.setup.search import CorrectionSearch, Finding
+from bampipe.trials.folds import Folds
+from bampipe.trials.motion import Motion
+from bampipe.trials.signals import Change, Signals
+
+RATE = 100.0
+JOINTS = ("one", "two", "three", "four")
+OFF = np.array([1.15, 0.9, 1.2, 0.85])
+"""Of the drawn numbers, what the bodies truly have."""
+
+
+@cache
+def arm() -> System:
+    joints = {
+        name: {
+            "kind": "revolute", "position": [0.0, 0.0, 0.3], "rotation": [1.3, 0.0, 0.4],
+            "mass": 4.0 - k, "center": [0.05, -0.04, 0.15],
+            "inertia": [0.03, 0.0, 0.0, 0.03, 0.0, 0.01], "effort": 80.0, "velocity": 2.2,
+        } | ({"after": JOINTS[k - 1]} if k else {})
+        for k, name in enumerate(JOINTS)
+    }  # fmt: skip
+    table = {"name": "arm", "robot": {"joints": joints}}
+    return compile_model(Model(device_from(complete_device(table, None, ""))))  # type: ignore[arg-type]
+
+
+def motions(factor: float, viscous: float) -> list[Motion]:
+    """Two trials whose torques read ``factor`` times too much."""
+    system = arm()
+    p = system.prior
+    for i, item in enumerate(system.parameters):
+        short, _, name = item.name.rpartition(".")
+        if short.startswith(("mass", "first", "inertia")) and not item.fixed:
+            p[i] *= OFF[JOINTS.index(name)]
+        elif short in ("viscous", "coulomb"):
+            p[i] = viscous if short == "viscous" else 4.0
+    found = []
+    for seed in range(2):
+        rng = np.random.default_rng(seed)
+        t = np.arange(0.0, 8.0, 1.0 / RATE)
+        rate = 2.0 * np.pi * rng.uniform(0.1, 0.5, (3, 4))
+        angle = rate[:, None] * t[:, None] + rng.uniform(0.0, 6.0, (3, 1, 4))
+        size = np.array([0.7, 0.4, 0.2])[:, None, None]
+        q = (size * np.sin(angle)).sum(axis=0)
+        qd = (size * rate[:, None] * np.cos(angle)).sum(axis=0)
+        qdd = -(size * rate[:, None] ** 2 * np.sin(angle)).sum(axis=0)
+        none = np.zeros((len(t), 0)), np.zeros((len(t), len(system.inputs)))
+        torque = factor * system.required(q, qd, qdd, *none, p)
+        torque += factor * rng.normal(0.0, 0.1, torque.shape)
+        channels = {f"torque_{name}": torque[:, k] for k, name in enumerate(JOINTS)}
+        found.append(Motion(f"t{seed}", t, q, qd, qdd, np.full_like(qd, 1e-4), channels))
+    return found
+
+
+def find_mistakes(given: list[Motion]) -> tuple[Finding, ...]:
+    forces = tuple(f"torque_{name}" for name in JOINTS)
+    units = ("rad",) * 4 + ("N.m",) * 4
+    eye, none = np.eye(8), np.zeros(8)
+    signals = Signals(JOINTS, forces, (), (), units, units, eye, none, 0.0 * eye, none)
+    folds = Folds.of_trials(["t0", "t1"], [], ["t0", "t1"])
+    search = CorrectionSearch(arm(), given, Band(RATE, (10.0,) * 4), folds, signals)
+    return search.find_mistakes(search.judge(Change.none(8)), ())
+
+
+@pytest.mark.parametrize("viscous", [2.0, 9.0])
+def test_much_friction_is_no_mistake_of_units(viscous: float) -> None:
+    assert find_mistakes(motions(1.0, viscous)) == ()
+
+
+def test_reductions_that_are_known_badly_are_no_mistake_of_units() -> None:
+    """Bodies come out wrong in shape, more in what few motions show than their spread says."""
+    gears = np.array([1.1, 1.0, 1.0, 0.9])
+    given = [
+        replace(m, q=m.q * gears, qd=m.qd * gears, qdd=m.qdd * gears) for m in motions(1.0, 9.0)
+    ]
+    assert find_mistakes(given) == ()
+
+
+def test_torques_of_another_unit_are_named() -> None:
+    (found,) = find_mistakes(motions(4.0, 2.0))
+    assert found.correction.kind == "scale" and len(found.correction.signals) == 4
+    assert found.correction.factor == pytest.approx(0.25)
