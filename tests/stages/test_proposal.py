@@ -107,6 +107,43 @@ def test_a_fine_encoder_allows_a_narrow_sign(tmp_path, step: float, width: float
     assert axis.get("sign_width") == width
 
 
+@pytest.mark.parametrize(
+    ("column", "role"),
+    [
+        ("command (N.m)", "force"),
+        ("torque_cmd", "force"),
+        ("i_ref", "current"),
+        ("soll [V]", "voltage"),
+    ],
+)
+def test_where_only_the_command_was_logged_it_is_the_input(tmp_path, column: str, role: str):
+    log = joint_log(1)
+    names = {"stamp": "time [s]", "joint_angle": "angle [deg]", "motor_current": column}
+    table = np.column_stack([log[name] for name in names])
+    np.savetxt(
+        tmp_path / "a.csv",
+        table,
+        fmt="%.6f",
+        delimiter=",",
+        header=",".join(names.values()),
+        comments="",
+    )
+    session, proposal = proposed(tmp_path)
+    assert proposal.fill_in == [] and f"driven by a {role}" in proposal.device
+    assert "drive = true" in proposal.device
+    inputs = session.get("channels") or {"force": {"column": session["force"]["columns"][0]}}
+    assert [given["column"] for given in inputs.values()] == [column]
+
+
+def test_a_measured_current_comes_before_the_one_commanded(tmp_path):
+    log = joint_log(1)
+    log["target_current"] = np.roll(log["motor_current"], -1)
+    table = np.column_stack(list(log.values()))
+    np.savetxt(tmp_path / "a.txt", table, fmt="%.6f", header=" ".join(log))
+    session, _ = proposed(tmp_path)
+    assert session["channels"]["motor_current"]["column"] == "motor_current"
+
+
 def test_a_damper_with_a_coil(tmp_path):
     write_damper_logs(tmp_path / "damper")
     session, proposal = proposed(tmp_path / "damper")
