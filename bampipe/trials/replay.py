@@ -285,7 +285,7 @@ def _stored_motion(path: Path) -> Motion:
             if name.startswith("channel ")
         }
         arrays = {name: stored[name] for name in _ARRAYS}
-        rest = stored["rest"] if "rest" in stored else None
+        rest = stored.get("rest")
         return Motion(trial_id=str(stored["trial_id"]), channels=channels, rest=rest, **arrays)
 
 
