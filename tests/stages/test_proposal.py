@@ -382,3 +382,59 @@ def test_the_position_of_another_joint_is_no_force(tmp_path):
     session, _ = proposed(tmp_path / "a")
     assert session["encoders"]["carriage"]["column"] == "pos_mm"
     assert session["force"]["columns"] == ["load_cell_N"]
+
+
+def test_a_force_that_is_not_there_is_asked_for_where_it_is_read(tmp_path, command: Command):
+    """A line under [channels] would be refused by the name of the device's own input."""
+    t = 0.01 * np.arange(2000)
+    table = np.column_stack([t, np.sin(t), np.full_like(t, 1.25)])
+    header = "time [s],position [rad],current [A]"
+    np.savetxt(tmp_path / "a.csv", table, fmt="%.6f", delimiter=",", header=header, comments="")
+    session, proposal = proposed(tmp_path)
+    assert proposal.fill_in == ["the column of force_drive in N.m"]
+    assert session["force"] == {"columns": ["?"], "components": ["drive"], "unit": "N.m"}
+    code, _, err = command("ingest", tmp_path)
+    assert code == 2 and "no column '?'; it has time [s], position [rad], current [A]" in err
+
+
+def test_why_a_time_is_no_clock_is_said(tmp_path):
+    log = joint_log(1)
+    log["stamp"][1::4] = log["stamp"][:-1:4][: len(log["stamp"][1::4])]
+    np.savetxt(
+        tmp_path / "a.txt", np.column_stack(list(log.values())), fmt="%.6f", header=" ".join(log)
+    )
+    _, proposal = proposed(tmp_path)
+    (line,) = (line for line in proposal.check if "samples are counted" in line)
+    assert re.search(r"stamp does not change at \d+ of \d+ steps", line)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ("header", "found 't', expected a number; the header once more: several recordings in one"),
+        ("time", "row 1002, column 't': time starts again once; several recordings in one file?"),
+        ("still", "is sound; a.csv and 1 more: declared free, but never moves"),
+    ],
+)
+def test_what_is_wrong_with_a_log_is_said_in_one_line(tmp_path, command: Command, change, said):
+    t = 0.01 * np.arange(2000)
+    rows = [f"{a:.2f},{np.sin(a):.6f},{np.cos(a):.4f}" for a in t]
+    if change == "header":
+        rows.insert(1000, "t,angle_rad,torque_nm")
+    elif change == "time":
+        rows = rows[:1000] + rows[:1000]
+    else:
+        rows = [
+            f"{a:.2f},{1e-5 * (k % (3 + k // 1200)):.6f},{np.cos(a):.4f}" for k, a in enumerate(t)
+        ]
+    (tmp_path / "a.csv").write_text("t,angle_rad,torque_nm\n" + "\n".join(rows) + "\n")
+    code, _, err = command("init", tmp_path)
+    if code == 0:
+        text = (tmp_path / "session.toml").read_text().partition("[[trials]]")[0]
+        trials = "".join(
+            f'[[trials]]\nfile = "a.csv"\nkind = "free"\n{cut}\n'
+            for cut in ("end_s = 9.0", "start_s = 9.0")
+        )
+        (tmp_path / "session.toml").write_text(text + trials)
+        code, _, err = command("ingest", tmp_path, "--quiet")
+    assert code == 2 and said in err and len(err.splitlines()) == 1, err
