@@ -108,7 +108,9 @@ def _table(*lines: str) -> tuple[str, ...]:
 
 
 def _stamped_rate(rate_hz: float, notes: Notes) -> str:
-    note = notes.guess(f"{rate_hz:g} Hz, from the time stamps")
+    slowest, fastest = guesses.RATES_HZ
+    doubt = "" if slowest <= rate_hz <= fastest else "; motion is not logged so: is its unit right?"
+    note = notes.guess(f"{rate_hz:g} Hz, from the time stamps{doubt}")
     return f"sample_rate_hz = {rate_hz:g}{note}"
 
 

@@ -438,3 +438,16 @@ def test_what_is_wrong_with_a_log_is_said_in_one_line(tmp_path, command: Command
         (tmp_path / "session.toml").write_text(text + trials)
         code, _, err = command("ingest", tmp_path, "--quiet")
     assert code == 2 and said in err and len(err.splitlines()) == 1, err
+
+
+def test_a_rate_at_which_no_motion_is_logged_is_doubted(tmp_path):
+    """Microseconds under a header that says milliseconds."""
+    t = np.arange(2000)
+    table = np.column_stack([1e4 * t, np.sin(0.01 * t), np.cos(0.01 * t)])
+    header = "t [ms],angle [rad],torque [N.m]"
+    np.savetxt(tmp_path / "a.csv", table, fmt="%.6f", delimiter=",", header=header, comments="")
+    _, proposal = proposed(tmp_path)
+    assert (
+        "0.1 Hz, from the time stamps; motion is not logged so: is its unit right?"
+        in proposal.check
+    )
