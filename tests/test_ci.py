@@ -127,6 +127,29 @@ def test_checks_that_failed_are_counted_and_said(tmp_path: Path) -> None:
     assert [v.state for v in gates.judge_gates(gate, tmp_path, "base", tmp_path)] == ["passed"]
 
 
+def test_a_gate_advises_on_what_the_word_says(tmp_path: Path) -> None:
+    """Far below its floor an error says nothing of the model: the floor is wrong."""
+    for name in ("default", "strict", "diagnose"):
+        (gate,) = (g for g in pipeline.load(name).gates if g.judged_by == "axes.*.standing")
+        said = {}
+        for error, word in ((0.3, "floor_implausible"), (3.0, "above_floor"), (1.0, "at_floor")):
+            axis = {"held_out_rmse": error, "noise_floor": 1.0, "standing": word}
+            write(tmp_path / "models/base/validate.json", {"axes": {"yaw": axis}})
+            (found,) = gates.judge_gates(gate, tmp_path, "base", tmp_path)
+            said[word] = found.message
+        assert "cannot be judged" in said["floor_implausible"]
+        assert "something is missing" not in said["floor_implausible"]
+        assert gate.advice in said["above_floor"] and said["at_floor"] == "1, at floor"
+    with pytest.raises(InputError, match="'advice_on' without 'judged_by'"):
+        raise next(
+            iter(
+                Gate(name="x", result="a.json", value="b", max=1.0)
+                .model_copy(update={"advice_on": {"bad": "mend it"}})
+                .cross_faults()
+            )
+        )
+
+
 def test_every_command_takes_the_best_confirmed_model(
     tmp_path: Path, command: Callable[..., tuple[int, str, str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +27,10 @@ _WORDS = {
     "position": "pos position angle theta phi psi q enc encoder disp displacement x stroke winkel"
     " weg lage hub joint deflection yaw pitch extension carriage counts",
 }
+REFERENCE_WORDS = frozenset(_WORDS["reference"].split())
+"""Words for what a controller asks for rather than what was measured."""
+DRIVERS = ("force", "current", "voltage")
+"""Roles of what may drive an axis."""
 _BY_UNIT = {
     "s": "time", "datetime": "time", "rad": "position", "m": "position", "rad/s": "velocity",
     "m/s": "velocity", "N": "force", "N.m": "force", "A": "current", "V": "voltage",
@@ -153,7 +157,32 @@ def _columns(
         found.append(
             SurveyedColumn(column, said, role, _unit(column, said, role), raw.columns[column])
         )
-    return tuple(found), raw.remarks
+    return _with_commands(found), raw.remarks
+
+
+def _with_commands(columns: list[SurveyedColumn]) -> tuple[SurveyedColumn, ...]:
+    """The columns, with commanded forces, currents or voltages for inputs if none was measured.
+
+    Many controllers log what they ask of the drive and nothing of what it gives. Beside a measured
+    one, the command is a reference like that of a position.
+    """
+    if any(column.role in DRIVERS for column in columns):
+        return tuple(columns)
+    return tuple(
+        replace(column, role=role)
+        if column.role == "reference" and (role := _role_apart(column)) in DRIVERS
+        else column
+        for column in columns
+    )
+
+
+def _role_apart(column: SurveyedColumn) -> str:
+    """The role that the unit or the rest of the name gives to a reference."""
+    known = unit(column.stated)
+    if known is not None and known.si in _BY_UNIT:
+        return _BY_UNIT[known.si]
+    said = set(words(column.name)) - REFERENCE_WORDS
+    return next((role for role in DRIVERS if said & set(_WORDS[role].split())), "")
 
 
 def words(name: str) -> list[str]:

@@ -67,12 +67,17 @@ class Gate(Declaration):
     )
     optional: bool = Field(default=False, description="A result that is not there passes")
     advice: str = Field(default="", description="What to do where the gate does not pass")
+    advice_on: dict[str, Text] = Field(
+        default={}, description="Other advice for some words of judged_by, by word"
+    )
 
     def cross_faults(self) -> Iterator[InputError]:
         if self.max is None and self.min is None and not self.judged_by:
             yield InputError("neither 'max' nor 'min'", remedy="give the limit, or 'judged_by'")
         if bool(self.judged_by) != bool(self.passes):
             yield InputError("'judged_by' and 'passes' go together", remedy="give both, or neither")
+        if self.advice_on and not self.judged_by:
+            yield InputError("'advice_on' without 'judged_by'", remedy="give the path of the word")
 
 
 class BaseModelTable(Declaration):

@@ -16,9 +16,10 @@ REST_S = 0.03
 """A rest is longer than this, s, beyond what a change of direction takes by itself."""
 REST_SPEED = 5.0
 """Speed below which an axis may rest, in standard deviations of the velocity."""
-_BRAKED_SPEED = 10.0
-"""The same where a brake is commanded: it may hold the axis for a moment at each reversal, and what
-it holds then is a hundred times the friction. A smoothed velocity rings at such a stop."""
+_RINGING_SPEED = 10.0
+"""The same where a smoothed velocity rings, as it does at a stop: to and fro, where a machine that
+turns round does so once. So does one whose brake is commanded, however shortly: the brake may hold
+the axis for a moment at each reversal, and what it holds then is a hundred times the friction."""
 _REACH = 0.02
 """Share that a rest may have in a low-passed sample before the sample is left out."""
 
@@ -29,8 +30,9 @@ def find_standstill(
     """Tell where an axis stands still.
 
     An axis rests where its velocity stays within five of its standard deviations, where its sign
-    is noise, for longer than 0.03 s beyond what it takes to turn round; where its brake is on,
-    within ten, however shortly. How friction builds up in a slow turn is seen nowhere else.
+    is noise, for longer than 0.03 s beyond what it takes to turn round; from the first to the last
+    of several changes of sign within ten, for as long; where its brake is on, within ten, however
+    shortly. How friction builds up in a slow turn is seen nowhere else.
 
     Args:
         qd: (T, n_q) velocity; qd_sd: (T, n_q) or (n_q,) its standard deviation; rate_hz: of the
@@ -41,15 +43,35 @@ def find_standstill(
         (T, n_q).
     """
     slow = REST_SPEED * np.broadcast_to(qd_sd, qd.shape)
-    still = np.abs(qd) < slow
+    ringing = _RINGING_SPEED * np.broadcast_to(qd_sd, qd.shape)
+    still = np.zeros(qd.shape, dtype=bool)
     longest = int(REST_S * rate_hz)
-    for column, v, limit in zip(still.T, qd.T, slow.T, strict=True):
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], column.astype(int), [0]])))
-        for start, end in zip(edges[::2], edges[1::2], strict=True):
-            column[start:end] = end - start - _turning(v, limit, start, end) > longest
+    for column, v, limit, loose in zip(still.T, qd.T, slow.T, ringing.T, strict=True):
+        for start, end in [*_runs(np.abs(v) < limit), *_ringing(v, loose)]:
+            if end - start - _turning(v, limit, start, end) > longest:
+                column[start:end] = True
     if braked is not None:
-        still |= (np.abs(qd) < _BRAKED_SPEED * qd_sd) & braked
+        still |= (np.abs(qd) < ringing) & braked
     return still
+
+
+def _runs(chosen: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """First sample and the one after the last of every run of chosen samples."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], chosen.astype(int), [0]])))
+    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+
+
+def _ringing(v: Array, limit: Array) -> list[tuple[int, int]]:
+    """Where a velocity (T,) within a limit (T,) goes to and fro.
+
+    From the sample before the first change of sign to the one after the last.
+    """
+    found = []
+    for start, end in _runs(np.abs(v) < limit):
+        turns = start + np.flatnonzero(np.diff(np.sign(v[start:end])))
+        if len(turns) > 1:
+            found.append((int(turns[0]), int(turns[-1]) + 2))
+    return found
 
 
 def _turning(v: Array, limit: Array, start: int, end: int) -> float:

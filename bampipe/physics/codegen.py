@@ -63,9 +63,13 @@ V = types.float64[::1]
 
 MEMORY_LOOP = '''
 
-@njit(types.void(M, M, M, V, V, V, types.int64, M), cache=True, error_model='numpy')
+@njit(types.float64(M, M, M, V, V, V, types.int64, M), cache=True, error_model='numpy')
 def memory(q, qd, u, p, t, z0, steps, out):
-    """RK4 along the samples of a motion, everything linear between samples; fills out (T, n_z)."""
+    """RK4 along the samples of a motion, everything linear between samples; fills out (T, n_z).
+
+    Returns the largest product of a step and the rate at which a state decays in it.
+    """
+    fastest = 0.0
     n = len(z0)
     k1, k2, k3, k4 = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
     z, at = z0.copy(), np.empty(n)
@@ -90,13 +94,19 @@ def memory(q, qd, u, p, t, z0, steps, out):
                 for j in range(n):
                     at[j] = z[j] + 0.5 * h * k2[j]
                 memory_rate(a, b, c, p, at, k3)
+                moved, turned = 0.0, 0.0
                 for j in range(n):
                     at[j] = z[j] + h * k3[j]
+                    moved += abs(k2[j] - k1[j])
+                    turned += abs(k3[j] - k2[j])
+                if 2.0 * turned > fastest * moved and turned > 1e-12 * moved:
+                    fastest = 2.0 * turned / moved
             else:
                 memory_rate(a, b, c, p, at, k4)
                 for j in range(n):
                     z[j] += h / 6.0 * (k1[j] + 2.0 * k2[j] + 2.0 * k3[j] + k4[j])
         out[i + 1] = z
+    return fastest
 '''
 
 
@@ -104,9 +114,12 @@ def memory(q, qd, u, p, t, z0, steps, out):
 # and for c changing linearly where b depends on parameters alone. However stiff, it stays stable.
 LINEAR_MEMORY_LOOP = '''
 
-@njit(types.void(M, M, M, V, V, V, types.int64, M), cache=True, error_model='numpy')
+@njit(types.float64(M, M, M, V, V, V, types.int64, M), cache=True, error_model='numpy')
 def memory(q, qd, u, p, t, z0, steps, out):
-    """Exponential steps along the samples of a motion, everything linear between samples."""
+    """Exponential steps along the samples of a motion, everything linear between samples.
+
+    Returns 0: however fast a state decays, such steps follow it.
+    """
     n = len(z0)
     c0, b0, c1, b1 = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
     z, x, v, w = z0.copy(), q[0].copy(), qd[0].copy(), u[0].copy()
@@ -136,6 +149,7 @@ def memory(q, qd, u, p, t, z0, steps, out):
                 z[j] = z[j] * (1.0 + k * mean) + h * added
                 c0[j], b0[j] = c1[j], b1[j]
         out[i + 1] = z
+    return 0.0
 '''
 
 

@@ -88,9 +88,19 @@ def _counted(found: Survey, notes: Notes) -> ProposedClock:
         note = notes.guess(f"counted; {name} sets the rate")
         rate = f"sample_rate_hz = {1.0 / step_s:g}"
         return ProposedClock(step_s * samples, (name,), _table(f'unit = "samples"{note}'), rate)
-    note = notes.guess("no column increases like a time")
+    stamps = next((column for column in found.of("time") if not column.is_constant), None)
+    why = "no column increases like a time" if stamps is None else _describe_stamps(stamps)
+    note = notes.guess(f"samples are counted: {why}")
     rate = f'sample_rate_hz = "{UNKNOWN}"' + notes.ask("sample_rate_hz, the true rate")
     return ProposedClock(samples / _LIKELY_RATE_HZ, (), _table(f'unit = "samples"{note}'), rate)
+
+
+def _describe_stamps(column: SurveyedColumn) -> str:
+    """Why the stamps of a column that is called a time are none."""
+    steps = np.diff(column.values[np.isfinite(column.values)])
+    falls, stops = int(np.sum(steps < 0)), int(np.sum(steps == 0))
+    what = f"falls at {falls}" if falls > stops else f"does not change at {stops}"
+    return f"{column.name} {what} of {len(steps)} steps"
 
 
 def _table(*lines: str) -> tuple[str, ...]:
@@ -98,7 +108,9 @@ def _table(*lines: str) -> tuple[str, ...]:
 
 
 def _stamped_rate(rate_hz: float, notes: Notes) -> str:
-    note = notes.guess(f"{rate_hz:g} Hz, from the time stamps")
+    slowest, fastest = guesses.RATES_HZ
+    doubt = "" if slowest <= rate_hz <= fastest else "; motion is not logged so: is its unit right?"
+    note = notes.guess(f"{rate_hz:g} Hz, from the time stamps{doubt}")
     return f"sample_rate_hz = {rate_hz:g}{note}"
 
 

@@ -30,7 +30,10 @@ def input_tables(
     lines = []
     sensed = all(name.startswith("force_") for name in device.forces)
     forces = [column for name in device.forces if (column := given[name][0]) is not None]
-    if sensed and forces and len(forces) == len(device.forces):
+    if sensed and not forces:
+        lines += _open_force_table(device, notes)
+        wanted = dict(device.channels)
+    elif sensed and len(forces) == len(device.forces):
         match.used |= {column.name for column in forces}
         lines += _force_table(device, forces, given[device.forces[0]][1], notes)
         wanted = dict(device.channels)
@@ -48,6 +51,20 @@ def _force_table(
         f"columns = [{names}]",
         f"components = [{components}]",
         *_force_unit(device, columns, why, notes),
+        "",
+    ]
+
+
+def _open_force_table(device: Device, notes: Notes) -> list[str]:
+    """The lines of a force table of which no column could be found."""
+    unknown = ", ".join([quoted(UNKNOWN)] * len(device.forces))
+    components = ", ".join(quoted(name) for name in device.components)
+    which = " and ".join(device.forces)
+    return [
+        "[force]",
+        f"columns = [{unknown}]" + notes.ask(f"the column of {which} in {device.force_unit}"),
+        f"components = [{components}]",
+        f'unit = "{device.force_unit}"',
         "",
     ]
 

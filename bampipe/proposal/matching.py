@@ -9,11 +9,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from bampipe.data import guesses
-from bampipe.data.survey import Survey, SurveyedColumn, words
+from bampipe.data.survey import DRIVERS, Survey, SurveyedColumn, words
 from bampipe.proposal.positions import travelled
-
-DRIVERS = ("force", "current", "voltage")
-"""Roles of what may drive an axis."""
 
 _DRIVEN = 0.5
 """Share of a column that the motion must explain for it to pass as what drives it."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from bampipe.data.guesses import Driven
-from bampipe.data.survey import words
+from bampipe.data.survey import REFERENCE_WORDS, words
 from bampipe.proposal.starter_input import Axis, Drive, Input, input_of
 
 _TAKEN = frozenset(
@@ -16,7 +16,7 @@ _TAKEN = frozenset(
         *("header", "feedback", "percent"),
     ]
 )
-_FROM_A_MOTOR = frozenset(["effort", "torque", "tau"])
+_FROM_A_MOTOR = REFERENCE_WORDS | {"effort", "torque", "tau"}
 _DRIVE = "drive = true                        # from a motor; false: from a force sensor\n"
 _PRESCRIBED = "prescribed = true                   # guess: a test bench gives the stroke\n"
 _FASTEST_S = 2e-4

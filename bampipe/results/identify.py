@@ -13,8 +13,8 @@ Method = Literal["ukf", "least-squares", "output-error"]
 """How parameters are estimated."""
 
 LACKS_TIMING = (
-    "the model lacks something that shifts the force in time, such as a delay, a lag or friction"
-    " that builds up"
+    "the model lacks something that shifts the force in time, such as a delay, a lag, a command"
+    " held from sample to sample or friction that builds up"
 )
 """What a timing at its limit points to."""
 METHODS_IN_WORDS: dict[Method, str] = {

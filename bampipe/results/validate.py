@@ -17,7 +17,9 @@ class AxisError(Record):
     rmse: Size = Field(description="Parameters as identified")
     rmse_without_friction: Size
     held_out_rmse: Size = Field(description="Each trial by the fit to the others")
-    published_rmse: Size = Field(description="Parameters as published, on the same trials")
+    published_rmse: Size = Field(
+        description="Parameters and timing as published, on the same trials"
+    )
     relative_error_percent: Size = Field(
         description="100 rmse / root mean square of the measured torque"
     )

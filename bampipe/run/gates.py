@@ -39,13 +39,17 @@ def _number(value: object) -> float | None:
 
 
 def _found(
-    gate: Gate, key: str, passed: bool, value: float | None, parts: Sequence[str]
+    gate: Gate, key: str, passed: bool, value: float | None, parts: Sequence[str], word: str = ""
 ) -> GateVerdict:
-    """Return what came of ``gate`` for ``key``: ``parts`` in one line, and advice if it fails."""
+    """Return what came of ``gate`` for ``key``: ``parts`` in one line, and advice if it fails.
+
+    The advice is that for ``word``, where the gate has one.
+    """
     from bampipe.results.run import GateVerdict
 
     state: GateState = "passed" if passed else "failed" if gate.level == "fail" else "warned"
-    parts = [*parts, gate.advice] if gate.advice and not passed else parts
+    advice = gate.advice_on.get(word, gate.advice)
+    parts = [*parts, advice] if advice and not passed else parts
     return GateVerdict(gate=gate.name, key=key, state=state, value=value, message="; ".join(parts))
 
 
@@ -114,7 +118,7 @@ def _judge_word(gate: Gate, key: str, value: float | None, word: object) -> Gate
     """Return the verdict that a stage stored as a word; ``value`` is shown beside it."""
     number = "no number" if value is None else f"{value:.4g}"
     text = f"{number}, {str(word).replace('_', ' ')}"
-    return _found(gate, key, word in gate.passes, value, [text])
+    return _found(gate, key, word in gate.passes, value, [text], str(word))
 
 
 def _judge_number(gate: Gate, key: str, value: float) -> GateVerdict:

@@ -19,6 +19,10 @@ from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion
 from bampipe.trials.signals import Change, Signals
 
+_FARTHEST = {"rotary": (62.8, "degrees"), "linear": (20.0, "millimetres")}
+"""By kind: ten turns, rad, and a long hall, m, which an axis rarely moves through while it is
+logged; and the unit that such a number usually is in."""
+
 
 def inspect_setup(
     system: System, session: IngestResult, motions: Sequence[Motion], band: Band, folds: Folds
@@ -50,6 +54,7 @@ def inspect_setup(
         for axis, entry in axes.items()
         if entry.state == "hardly_moves"
     ]
+    warnings += _describe_travel(system, motions)
     if held is not None and search.over_position is not None:
         warnings += describe_lack(system, held, search.over_position)
     named = " ".join(mistake.sentence for mistake in mistakes)
@@ -65,6 +70,21 @@ def inspect_setup(
         tested=search.tested,
         axes=axes,
     )
+
+
+def _describe_travel(system: System, motions: Sequence[Motion]) -> list[str]:
+    """Say which axes move farther than machines do, as in degrees that pass for radians."""
+    ends = np.array([[motion.q.min(axis=0), motion.q.max(axis=0)] for motion in motions])
+    travel = ends[:, 1].max(axis=0) - ends[:, 0].min(axis=0)
+    found = []
+    for coordinate, size in zip(system.model.device.coordinates, travel, strict=True):
+        most, meant = _FARTHEST[coordinate.kind]
+        if size > most:
+            found.append(
+                f"{coordinate.name} moves through {size:.3g} {coordinate.unit}: is its position in"
+                f" {meant}?"
+            )
+    return found
 
 
 def _axis(

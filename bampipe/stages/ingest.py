@@ -6,6 +6,7 @@ cannot be trusted is set aside with a reason (file, row, column), and the others
 
 from __future__ import annotations
 
+import re
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -126,16 +127,19 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
 
 
 def _reasons(rows: list[dict[str, object]], where: str) -> list[InputError]:
-    """Return why trials were set aside: each reason once, with the first file it holds for."""
-    files: dict[str, list[str]] = {}
+    """Return why trials were set aside: each kind of reason once, as of the first it holds for.
+
+    Reasons that differ by numbers alone, such as rows and sizes, are of one kind.
+    """
+    found: dict[str, list[tuple[str, str]]] = {}
     for row in rows:
-        reason = str(row["reason"]).removeprefix(f"{row['file']}: ")
-        files.setdefault(reason, []).append(str(row["file"]))
+        name = str(row["file"])
+        reason = str(row["reason"]).removeprefix(f"{name}: ")
+        kind = re.sub(r"\d+(\.\d+)?(e[+-]\d+)?", "", reason.replace(name, ""))
+        found.setdefault(kind, []).append((name, reason))
     return [
-        InputError(
-            f"{names[0]}{f' and {len(names) - 1} more' if names[1:] else ''}: {reason}", where=where
-        )
-        for reason, names in files.items()
+        InputError(f"{name}{f' and {len(more)} more' if more else ''}: {reason}", where=where)
+        for (name, reason), *more in found.values()
     ]
 
 

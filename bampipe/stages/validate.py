@@ -46,7 +46,7 @@ from bampipe.trials.noise_floor import (
 )
 from bampipe.trials.reading import held_out_trials, read_motions, require_sound_motions
 from bampipe.trials.replay import UNLIKE, StandIn
-from bampipe.trials.residuals import Evidence, gather_evidence
+from bampipe.trials.residuals import Evidence, ModelOnTrial, gather_evidence
 
 SUMMARY = "Predicted against measured torque and force, on trials that the fit has not seen"
 INPUTS = (*INGESTED, *FILTERED, *IDENTIFIED_MODEL)
@@ -127,7 +127,10 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     require_sound_motions(system, trials.motions)
     progress(0.1, "held-out fits")
     evidence = gather_evidence(system, trials.motions, trials.band, p, trials.folds)
-    compared = [_compare(evidence, number, p) for number in range(len(trials.motions))]
+    timing = estimates.input_timing
+    # Parameters found with the inputs late are those of inputs that late, known for sure or not.
+    late_s = timing.estimate - trials.late_s if timing is not None else 0.0
+    compared = [_compare(evidence, number, p, late_s) for number in range(len(trials.motions))]
     expected = np.ones(len(system.coordinates))
     if np.any(_published_rmse(compared) > REFUSAL_RATIO * evidence.held_out_rmse):
         expected = _expected_ratio(evidence, trials, p, config.seed)
@@ -235,9 +238,15 @@ def _expected_ratio(evidence: Evidence, trials: MeasuredTrials, p: Array, seed: 
     return np.maximum(_published_rmse(replayed) / np.maximum(again.held_out_rmse, 1e-300), 1.0)
 
 
-def _compare(evidence: Evidence, number: int, p: Array) -> _Compared:
-    """Compare one trial with the model as published, held out, and without friction."""
+def _compare(evidence: Evidence, number: int, p: Array, late_s: float = 0.0) -> _Compared:
+    """Compare one trial with the model as published, held out, and without friction.
+
+    Args:
+        evidence: the model, fitted; number: of the trial; p: the published parameters.
+        late_s: published timing of the inputs, as far as it is not taken off the trials.
+    """
     system, motion = evidence.system, evidence.motions[number]
+    timed = [motion.with_input_timing(late_s)]
     dry = (effect for effect in system.model.effects if effect.effect.is_dry_friction)
     strengths = {item.name for effect in dry for item in effect.parameters if item.strength}
     frictionless = p.copy()
@@ -250,7 +259,7 @@ def _compare(evidence: Evidence, number: int, p: Array) -> _Compared:
     applied = system.applied(motion.q, motion.qd, motion.qdd, z, u, p)
     force = [system.inputs.index(name) for name in system.model.device.forces]
     rows = band.thinned_rows(len(motion.t))
-    residual = band.thin(evidence.unfiltered_residual(number, p))
+    residual = band.thin(ModelOnTrial(system, p, timed).residual)
     push = np.linalg.pinv(system.input_map(motion.q[rows], u[rows], p))
     return _Compared(
         trial_id=motion.trial_id,
@@ -259,7 +268,7 @@ def _compare(evidence: Evidence, number: int, p: Array) -> _Compared:
         measured=band.thin(applied),
         residual=residual,
         residual_held_out=evidence.held_out_residual(number),
-        residual_without_friction=band.thin(evidence.unfiltered_residual(number, frictionless)),
+        residual_without_friction=band.thin(ModelOnTrial(system, frictionless, timed).residual),
         force=band.thin_input(u[:, force]),
         force_residual=np.einsum("tfq,tq->tf", push, residual),
         judged=folds.judged[number] and not folds.nothing_held_out,

@@ -40,6 +40,8 @@ class Motion:
         q, qd, qdd: (T, n_q), rad or m and derivatives.
         qd_sd: standard deviation of the velocities, (T, n_q).
         channels: inputs of the device and their time derivatives by name, each (T,).
+        rest: (T, n_q) where the axes of the trial that this one replays stand still, None for a
+            measured trial.
     """
 
     trial_id: str
@@ -49,6 +51,7 @@ class Motion:
     qdd: Array
     qd_sd: Array
     channels: Mapping[str, Array]
+    rest: NDArray[np.bool_] | None = None
     _columns: dict[tuple[str, ...], Array] = field(default_factory=dict, repr=False, compare=False)
 
     def inputs(self, names: Sequence[str]) -> Array:

@@ -30,7 +30,7 @@ from bampipe.physics.device import derivative
 from bampipe.trials.cache import MOST_SAMPLES, TrialCache
 from bampipe.trials.kinematics import Kinematics
 from bampipe.trials.motion import Motion, Recording, n_samples, trial_sizes
-from bampipe.trials.residuals import ModelOnTrial
+from bampipe.trials.residuals import ModelOnTrial, standstill_of
 from bampipe.trials.sensors import Sensors
 
 Array = NDArray[np.float64]
@@ -88,6 +88,15 @@ class StandIn:
             return follow_motion(self.system, self.p, self.motions[trial], self.rate_hz)
 
         return TrialCache(follow, len(self.motions), lambda course: len(course.q))
+
+    @cached_property
+    def rests(self) -> TrialCache[NDArray[np.bool_]]:
+        """Where the axes of each trial stand still, (T, n_q)."""
+
+        def find_rest(trial: int) -> NDArray[np.bool_]:
+            return standstill_of(self.motions[trial], self.system, self.rate_hz)
+
+        return TrialCache(find_rest, len(self.motions), len)
 
 
 def follow_motion(system: System, p: Array, motion: Motion, rate_hz: float) -> Course:
@@ -204,7 +213,8 @@ def replay_motion(
     system, course = stand_in.system, stand_in.courses[trial]
     recording = read_by_sensors(system, stand_in.motions[trial], *course, sensors, rng)
     wanted = system.inputs if alone else None
-    return kinematics.observe(recording, system.model.device.forces, wanted)
+    motion = kinematics.observe(recording, system.model.device.forces, wanted)
+    return replace(motion, rest=stand_in.rests[trial])
 
 
 def replay_motions(
@@ -252,6 +262,8 @@ def store_motions(motions: Iterator[Motion]) -> Sequence[Motion]:
             arrays: dict[str, Any] = {f"channel {name}": x for name, x in motion.channels.items()}
             for name in _ARRAYS:
                 arrays[name] = getattr(motion, name)
+            if motion.rest is not None:
+                arrays["rest"] = motion.rest
             with temporary_space():
                 np.savez(folder / f"{count - 1}.npz", trial_id=motion.trial_id, **arrays)
     except BaseException:
@@ -273,7 +285,8 @@ def _stored_motion(path: Path) -> Motion:
             if name.startswith("channel ")
         }
         arrays = {name: stored[name] for name in _ARRAYS}
-        return Motion(trial_id=str(stored["trial_id"]), channels=channels, **arrays)
+        rest = stored.get("rest")
+        return Motion(trial_id=str(stored["trial_id"]), channels=channels, rest=rest, **arrays)
 
 
 def _reference(

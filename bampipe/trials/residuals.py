@@ -100,20 +100,27 @@ def problem_of(
         linear=system.is_linear_in([i for i in free if i < n]),
         constant=np.array(same),
         band=band,
-        standstill=TrialCache(lambda k: _standstill(motions[k], system, band), len(motions), len),
+        standstill=TrialCache(
+            lambda k: standstill_of(motions[k], system, band.rate_hz), len(motions), len
+        ),
         precision=np.array(precision),
         known=np.array(known),
     )
 
 
-def _standstill(motion: Motion, system: System, band: Band) -> NDArray[np.bool_]:
-    """Which samples stand still, (T, n_q)."""
+def standstill_of(motion: Motion, system: System, rate_hz: float) -> NDArray[np.bool_]:
+    """Which samples stand still, (T, n_q).
+
+    A replay leaves out what the trial does as well: where the machine rests for just long enough
+    and the replay for just not, the load that friction balances would pass for an error.
+    """
     u = motion.inputs(system.inputs)
     brakes = [system.model.device.brakes.get(axis) for axis in system.coordinates]
     braked = [
         name in system.inputs and bool(u[:, system.inputs.index(name)].any()) for name in brakes
     ]
-    return find_standstill(motion.qd, motion.qd_sd, band.rate_hz, np.array(braked))
+    still = find_standstill(motion.qd, motion.qd_sd, rate_hz, np.array(braked))
+    return still if motion.rest is None else still | motion.rest
 
 
 def residual_and_memory(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -184,3 +186,9 @@ def test_a_date_that_could_be_two_is_refused(tmp_path):
         read(tmp_path, "when,x\n03/10/2026 10:12,1\n", ("when", "x"), datetimes={"when": ""})
     assert "row 2: found '03/10/2026 10:12'" in str(caught.value)
     assert "give its form" in str(caught.value)
+
+
+def test_dates_and_times_are_told_from_numbers_and_text(tmp_path: Path) -> None:
+    rows = "".join(f"2026-10-03 10:12:{k:02d}.125;{k},5;run {k};10:12:{k:02d}\n" for k in range(9))
+    (tmp_path / "a.csv").write_text("stamp;q;note;clock\n" + rows)
+    assert columns_of(tmp_path / "a.csv", name="a.csv") == {"stamp": "datetime", "q": ""}

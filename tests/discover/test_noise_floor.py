@@ -124,3 +124,20 @@ def test_replays_differ_by_noise_alone_and_share_what_was_simulated(
                 known.inputs(evidence.system.inputs), again.inputs(evidence.system.inputs)
             )
     assert not np.array_equal(shared[0][0].q, shared[1][0].q)
+
+
+def test_a_replay_leaves_out_the_moments_at_which_the_machine_stands_still(fitted) -> None:
+    trials, evidence = fitted
+    motion = trials.motions[0]
+    rest = np.zeros(motion.q.shape, dtype=bool)
+    rest[200:240] = True
+    stand_in = StandIn(
+        evidence.system, evidence.p, [replace(motion, rest=rest)], trials.sensors.rate_hz
+    )
+    replayed = replay_motion(
+        stand_in, 0, trials.sensors, trials.kinematics, np.random.default_rng(1)
+    )
+    still = problem_of(evidence.system, [replayed], trials.band).standstill[0]
+    assert still[rest].all() and 0.0 < still.mean() < 0.5
+    (stored,) = replay.store_motions(iter([replayed]))
+    np.testing.assert_array_equal(stored.rest, replayed.rest)

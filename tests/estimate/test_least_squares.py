@@ -152,6 +152,23 @@ def test_a_slow_change_of_direction_is_no_rest() -> None:
     np.testing.assert_array_equal(still, np.abs(rests) < 5e-3)
 
 
+@pytest.mark.parametrize("rate", [100.0, 1000.0])
+def test_a_rest_is_seen_through_the_ringing_of_a_smoothed_velocity(rate: float) -> None:
+    """It comes to rest slowly, stays for 60 ms and breaks away, which a smoother foretells."""
+    t = np.arange(-1.0, 1.0, 1.0 / rate)
+    slowing = np.where(t < -0.06, -np.minimum(7e-3 - 0.5 * (t + 0.06), 0.1), 0.0)
+    leaving = -8.0 * np.maximum(t, 0.0)
+    rings = np.where((t > -0.06) & (t < 0.0), 7.5e-3 * np.sin(2 * np.pi * (t + 0.06) / 0.04), 0.0)
+    qd = (slowing + rings + leaving)[:, None]
+    still = find_standstill(qd, np.full_like(qd, 1e-3), rate)[:, 0]
+    middle = (t > -0.045) & (t < -0.005)
+    assert still[middle].all() and not still[np.abs(t + 0.03) > 0.05].any()
+    # Noise on a turn of a machine at its usual speed is no such ringing.
+    rng = np.random.default_rng(1)
+    turn = (2.0 * t + 1e-3 * rng.standard_normal(t.size))[:, None]
+    assert not find_standstill(turn, np.full_like(turn, 1e-3), rate).any()
+
+
 def test_no_sample_between_two_that_a_rest_reaches_counts() -> None:
     """The low-passed rest passes zero there, which makes none of its friction small."""
     band = Band(RATE, (8.0,), 0.1)

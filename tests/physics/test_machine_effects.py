@@ -287,3 +287,22 @@ def test_a_quantised_or_smooth_command_is_not_switched() -> None:
     response = 1.0 + (np.sin(w * t) - w * lag * np.cos(w * t)) / (1.0 + (w * lag) ** 2)
     for read in (sine, np.round(sine / 0.01) * 0.01):
         np.testing.assert_allclose(delivered(read, lag)[500:], response[500:], atol=5e-3)
+
+
+@pytest.mark.parametrize("symmetry", [0.5, 1.0])
+@pytest.mark.parametrize("distance", [1e-6, 2e-5, 1e-3])
+def test_a_hysteresis_over_next_to_nothing_stays_within_its_bounds(distance, symmetry):
+    """It is passed many times between two samples; at its end it is the sign of the velocity."""
+    system = compile_model(Model(registry.device("magnetic_damper"), ["hysteresis:piston"]))
+    names = [item.name for item in system.parameters]
+    p = system.prior.copy()
+    p[names.index("hysteresis.piston.distance")] = distance
+    p[names.index("hysteresis.piston.symmetry")] = symmetry
+    t = np.arange(0.0, 1.0, 1e-3)
+    x, v = 1e-2 * np.sin(31.4 * t)[:, None], 0.314 * np.cos(31.4 * t)[:, None]
+    u = np.zeros((len(t), len(system.inputs)))
+    z = system.memory(x, v, np.gradient(v, t, axis=0), u, p, t)[:, 0]
+    assert np.abs(z).max() <= 1.0 + 1e-9
+    settled = (np.abs(v[:, 0]) > 0.25) & (t > 0.1)
+    tolerance = 0.06 if distance > 1e-4 else 0.01
+    np.testing.assert_allclose(z[settled], np.sign(v[settled, 0]), atol=tolerance)

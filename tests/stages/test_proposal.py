@@ -107,6 +107,43 @@ def test_a_fine_encoder_allows_a_narrow_sign(tmp_path, step: float, width: float
     assert axis.get("sign_width") == width
 
 
+@pytest.mark.parametrize(
+    ("column", "role"),
+    [
+        ("command (N.m)", "force"),
+        ("torque_cmd", "force"),
+        ("i_ref", "current"),
+        ("soll [V]", "voltage"),
+    ],
+)
+def test_where_only_the_command_was_logged_it_is_the_input(tmp_path, column: str, role: str):
+    log = joint_log(1)
+    names = {"stamp": "time [s]", "joint_angle": "angle [deg]", "motor_current": column}
+    table = np.column_stack([log[name] for name in names])
+    np.savetxt(
+        tmp_path / "a.csv",
+        table,
+        fmt="%.6f",
+        delimiter=",",
+        header=",".join(names.values()),
+        comments="",
+    )
+    session, proposal = proposed(tmp_path)
+    assert proposal.fill_in == [] and f"driven by a {role}" in proposal.device
+    assert "drive = true" in proposal.device
+    inputs = session.get("channels") or {"force": {"column": session["force"]["columns"][0]}}
+    assert [given["column"] for given in inputs.values()] == [column]
+
+
+def test_a_measured_current_comes_before_the_one_commanded(tmp_path):
+    log = joint_log(1)
+    log["target_current"] = np.roll(log["motor_current"], -1)
+    table = np.column_stack(list(log.values()))
+    np.savetxt(tmp_path / "a.txt", table, fmt="%.6f", header=" ".join(log))
+    session, _ = proposed(tmp_path)
+    assert session["channels"]["motor_current"]["column"] == "motor_current"
+
+
 def test_a_damper_with_a_coil(tmp_path):
     write_damper_logs(tmp_path / "damper")
     session, proposal = proposed(tmp_path / "damper")
@@ -345,3 +382,72 @@ def test_the_position_of_another_joint_is_no_force(tmp_path):
     session, _ = proposed(tmp_path / "a")
     assert session["encoders"]["carriage"]["column"] == "pos_mm"
     assert session["force"]["columns"] == ["load_cell_N"]
+
+
+def test_a_force_that_is_not_there_is_asked_for_where_it_is_read(tmp_path, command: Command):
+    """A line under [channels] would be refused by the name of the device's own input."""
+    t = 0.01 * np.arange(2000)
+    table = np.column_stack([t, np.sin(t), np.full_like(t, 1.25)])
+    header = "time [s],position [rad],current [A]"
+    np.savetxt(tmp_path / "a.csv", table, fmt="%.6f", delimiter=",", header=header, comments="")
+    session, proposal = proposed(tmp_path)
+    assert proposal.fill_in == ["the column of force_drive in N.m"]
+    assert session["force"] == {"columns": ["?"], "components": ["drive"], "unit": "N.m"}
+    code, _, err = command("ingest", tmp_path)
+    assert code == 2 and "no column '?'; it has time [s], position [rad], current [A]" in err
+
+
+def test_why_a_time_is_no_clock_is_said(tmp_path):
+    log = joint_log(1)
+    log["stamp"][1::4] = log["stamp"][:-1:4][: len(log["stamp"][1::4])]
+    np.savetxt(
+        tmp_path / "a.txt", np.column_stack(list(log.values())), fmt="%.6f", header=" ".join(log)
+    )
+    _, proposal = proposed(tmp_path)
+    (line,) = (line for line in proposal.check if "samples are counted" in line)
+    assert re.search(r"stamp does not change at \d+ of \d+ steps", line)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ("header", "found 't', expected a number; the header once more: several recordings in one"),
+        ("time", "row 1002, column 't': time starts again once; several recordings in one file?"),
+        ("still", "is sound; a.csv and 1 more: declared free, but never moves"),
+    ],
+)
+def test_what_is_wrong_with_a_log_is_said_in_one_line(tmp_path, command: Command, change, said):
+    t = 0.01 * np.arange(2000)
+    rows = [f"{a:.2f},{np.sin(a):.6f},{np.cos(a):.4f}" for a in t]
+    if change == "header":
+        rows.insert(1000, "t,angle_rad,torque_nm")
+    elif change == "time":
+        rows = rows[:1000] + rows[:1000]
+    else:
+        rows = [
+            f"{a:.2f},{1e-5 * (k % (3 + k // 1200)):.6f},{np.cos(a):.4f}" for k, a in enumerate(t)
+        ]
+    (tmp_path / "a.csv").write_text("t,angle_rad,torque_nm\n" + "\n".join(rows) + "\n")
+    code, _, err = command("init", tmp_path)
+    if code == 0:
+        text = (tmp_path / "session.toml").read_text().partition("[[trials]]")[0]
+        trials = "".join(
+            f'[[trials]]\nfile = "a.csv"\nkind = "free"\n{cut}\n'
+            for cut in ("end_s = 9.0", "start_s = 9.0")
+        )
+        (tmp_path / "session.toml").write_text(text + trials)
+        code, _, err = command("ingest", tmp_path, "--quiet")
+    assert code == 2 and said in err and len(err.splitlines()) == 1, err
+
+
+def test_a_rate_at_which_no_motion_is_logged_is_doubted(tmp_path):
+    """Microseconds under a header that says milliseconds."""
+    t = np.arange(2000)
+    table = np.column_stack([1e4 * t, np.sin(0.01 * t), np.cos(0.01 * t)])
+    header = "t [ms],angle [rad],torque [N.m]"
+    np.savetxt(tmp_path / "a.csv", table, fmt="%.6f", delimiter=",", header=header, comments="")
+    _, proposal = proposed(tmp_path)
+    assert (
+        "0.1 Hz, from the time stamps; motion is not logged so: is its unit right?"
+        in proposal.check
+    )

@@ -136,6 +136,15 @@ def test_wrong_parameters_show(simulated: RunFolder, tmp_path: Path) -> None:
     assert wrong["yaw"]["held_out_rmse"] == pytest.approx(right["yaw"]["held_out_rmse"], rel=1e-4)
 
 
+def test_parameters_are_judged_with_the_timing_that_they_were_found_with(tmp_path: Path) -> None:
+    """Forces a sample off: the timing ends at half of that, and is part of what is published."""
+    content = validated(identified(simulated_run(tmp_path, late=1)))
+    assert any("input timing" in check for check in content["failed_checks"])
+    for axis, entry in content["axes"].items():
+        assert entry["estimate"] == "accepted", (axis, entry)
+        assert entry["published_rmse"] < 0.95 * entry["held_out_rmse"], (axis, entry)
+
+
 def test_residuals_add_up_and_repeat(simulated: RunFolder, tmp_path: Path) -> None:
     hashes = []
     for folder in ("one", "two"):

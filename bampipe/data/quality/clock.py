@@ -92,15 +92,26 @@ def drop_backward_stamps(table: TrialTable) -> None:
     counts = int(repeated.sum()), int(behind.sum()) + int(ahead.sum())
     if sum(counts) > _few(table, total):
         at = int(np.argmax(repeated | behind))
+        starts = 1 + np.flatnonzero(np.diff(t) < 0.0)
+        if len(starts) <= _few(table, total) and counts[1] > counts[0]:
+            raise table.fault(
+                f"time starts again {in_times(len(starts))}",
+                column=table.clock,
+                at=int(starts[0]),
+                remedy="several recordings in one file? put each into a file of its own",
+            )
         if counts[1] > counts[0]:
             raise table.fault(
                 f"time runs backwards: {counts[1]} of {total} stamps are not after those before",
                 column=table.clock,
                 at=at,
-                remedy="two recordings in one file?",
+                remedy="is this the time column?",
             )
         raise table.fault(
-            f"{counts[0]} of {total} time stamps are repeated", column=table.clock, at=at
+            f"{counts[0]} of {total} time stamps are repeated",
+            column=table.clock,
+            at=at,
+            remedy='log them more finely; of evenly sampled rows, [time] unit = "samples" counts',
         )
     table.keep(~(repeated | behind))
     if counts[0]:

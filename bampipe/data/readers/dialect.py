@@ -26,6 +26,8 @@ _POINT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?\Z")
 _COMMA = re.compile(r"[-+]?(\d+,\d*|,\d+)([eE][-+]?\d+)?\Z")
 _THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2}(,\d{3})+\Z")
 _GROUPED = re.compile(r"[-+]?(\d{1,3}(,\d{3})+\.\d*|\d{1,3}(\.\d{3})+,\d*)\Z")
+_MOMENT = re.compile(r"\s*\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d([.,]\d+)?(Z|[+-]\d\d:?\d\d)?\s*\Z")
+"""Date and time as of ISO 8601."""
 _UNIT = re.compile(r"[\[(]?\s*(?=.*[A-Za-z%°Ωµμ1\-])[A-Za-z0-9%°Ωµμ./*^²³· _\-]{0,16}\s*[\])]?\Z")
 _NAME_WITH_UNIT = re.compile(r"(?P<name>.*?)\s*[\[(]\s*(?P<unit>[^\[\]()]{1,16}?)\s*[\])]\s*\Z")
 _REMARK = re.compile(r"\s*(#|%|//|\"#)+\s?")
@@ -115,21 +117,30 @@ def find_layout(head: bytes, columns: Sequence[str], dialect: Dialect, name: str
     return TableLayout(delimiter, decimal, tuple(header), number, start, tuple(remarks), units)
 
 
-def numeric_columns(head: bytes, layout: TableLayout) -> tuple[str, ...]:
-    """Names of the columns that hold numbers in nearly all of the first lines."""
-    good: Counter[int] = Counter()
+def readable_columns(head: bytes, layout: TableLayout) -> dict[str, bool]:
+    """Columns that hold numbers, or dates and times, in most of the first lines.
+
+    Returns:
+        Their names, and whether it is dates and times.
+    """
+    numbers: Counter[int] = Counter()
+    moments: Counter[int] = Counter()
     rows = 0
     for line in _lines(head, "")[: layout.first_line + _TRIED]:
         if line.number < layout.first_line or not line.text.strip():
             continue
         rows += 1
         row = cells(line.text, layout.delimiter)
-        good.update(n for n, cell in enumerate(row) if _is_number(cell, layout.decimal))
-    return tuple(
-        name
+        numbers.update(n for n, cell in enumerate(row) if _is_number(cell, layout.decimal))
+        moments.update(n for n, cell in enumerate(row) if _MOMENT.match(cell))
+    return {
+        name: moments[n] > numbers[n]
         for n, name in enumerate(layout.header)
-        if name and rows and good[n] > 0.5 * rows and layout.header.count(name) == 1
-    )
+        if name
+        and rows
+        and max(numbers[n], moments[n]) > 0.5 * rows
+        and layout.header.count(name) == 1
+    }
 
 
 def _is_number(cell: str, decimal: str) -> bool:

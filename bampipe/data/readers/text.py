@@ -91,7 +91,7 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
 
 
 def columns(path: Path, name: str) -> dict[str, str]:
-    """Names and units of the columns that hold numbers.
+    """Names and units of the columns of numbers, or of moments (unit "datetime").
 
     Raises:
         InputError: as :func:`read`.
@@ -100,7 +100,8 @@ def columns(path: Path, name: str) -> dict[str, str]:
         head = _head(stream, name)
     layout = dialects.find_layout(head, (), Dialect(), name)
     return {
-        column: layout.units.get(column, "") for column in dialects.numeric_columns(head, layout)
+        column: "datetime" if is_moment else layout.units.get(column, "")
+        for column, is_moment in dialects.readable_columns(head, layout).items()
     }
 
 
@@ -288,12 +289,17 @@ def _fault(stream: BinaryIO, message: str, layout: TableLayout, name: str) -> In
     other = "," if layout.decimal == "." else "."
     sign = re.fullmatch(rf"\s*[-+]?\d+{re.escape(other)}\d+\s*", value)
     at = f", row {_line(stream, layout, int(row_number))}" if row_number else ""
+    remedy = ""
+    if sign:
+        remedy = f"export with one decimal sign; '{layout.decimal}' was taken from the first rows"
+    elif value.strip().strip('"') == column:
+        remedy = (
+            "the header once more: several recordings in one file? put each into one of its own"
+        )
     return InputError(
         f"found '{shown}', expected a number",
         where=f"{name}{at}, column '{column}'",
-        remedy=f"export with one decimal sign; '{layout.decimal}' was taken from the first rows"
-        if sign
-        else "",
+        remedy=remedy,
     )
 
 
