@@ -12,7 +12,7 @@ from bampipe.next_trial.choice import Tried
 from bampipe.next_trial.discrimination import Contest, Sums
 from bampipe.next_trial.motion import Rehearsal
 from bampipe.next_trial.precision import Precision
-from bampipe.next_trial.primitives import Primitive
+from bampipe.next_trial.primitives import Primitive, find_beyond
 from bampipe.next_trial.words import describe
 from bampipe.results.next import ExpectedConfusion, ExpectedSd, Move, Proposal
 from bampipe.trials.motion import Motion
@@ -54,6 +54,9 @@ class Forecast:
         pose = {
             axes[i].name: float(design.pose[i]) for i in range(len(axes)) if i not in design.strokes
         }
+        farther, faster = (
+            tuple(axes[i].name for i in found) for found in find_beyond(design, self.rehearsal.seen)
+        )
         return Proposal(
             sentence=describe(design, self.rehearsal.seen, device),
             seconds=design.seconds,
@@ -66,6 +69,8 @@ class Forecast:
             # Of a model that lacks something, uncertainties are not worth a forecast.
             sd={} if self.contest else self._sd(added, design.seconds),
             confusion=self._confusion(tried.motions),
+            farther=farther,
+            faster=faster,
         )
 
     def _sd(self, added: Sequence[Array], seconds: float) -> dict[str, ExpectedSd]:

@@ -12,6 +12,7 @@ from bampipe.results.next import Detectable, Proposal, Purpose
 _SHOWN = 3
 """Parameters or effects that a sentence names."""
 _LIMITS = Settings()
+_UNTRIED = " That takes the model to hold beyond what the trials at hand have shown."
 
 
 @dataclass(frozen=True)
@@ -31,19 +32,27 @@ def explain_proposal(
         purpose: of the trial; parameter: the one that it is for, "" for all.
         best: the proposal; table: by effect, from which size on trials show it.
     """
+    why, expected = _explain(purpose, parameter, best, table)
+    return Reasons(why, expected + (_UNTRIED if best.farther or best.faster else ""))
+
+
+def _explain(
+    purpose: Purpose, parameter: str, best: Proposal, table: Mapping[str, Detectable]
+) -> tuple[str, str]:
+    """Why, and what is expected as far as the model goes."""
     if purpose == "decision":
         return _decision(best)
     if purpose == "sensitivity":
-        return Reasons(_unseen(table), _detected(table) or _narrowed(parameter, best))
+        return _unseen(table), _detected(table) or _narrowed(parameter, best)
     most = (
         f"says most of `{parameter}`"
         if parameter
         else "adds most to what is known of all parameters together"
     )
-    return Reasons(f"Of the motions tried, this one {most}.", _narrowed(parameter, best))
+    return f"Of the motions tried, this one {most}.", _narrowed(parameter, best)
 
 
-def _decision(best: Proposal) -> Reasons:
+def _decision(best: Proposal) -> tuple[str, str]:
     pair = max(best.confusion, key=lambda pair: pair.weight * pair.before)
     before, after = _chance(pair.before), _chance(pair.after)
     expected = (
@@ -52,11 +61,11 @@ def _decision(best: Proposal) -> Reasons:
         else f"No trial tried tells them apart: the chance would be {after} after this one. A wider"
         " motion, or another load, may."
     )
-    return Reasons(
+    why = (
         f"These trials do not distinguish {pair.between[0]} from {pair.between[1]}: the chance of"
-        f" confusing them is {before}.",
-        expected,
+        f" confusing them is {before}."
     )
+    return why, expected
 
 
 def _unseen(table: Mapping[str, Detectable]) -> str:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
 from bampipe.lists import join_names
-from bampipe.next_trial.primitives import GENTLE, PEAK, Envelope, Primitive, Stroke
+from bampipe.next_trial.primitives import PEAK, Envelope, Primitive, Stroke, find_beyond
 from bampipe.physics.device import Device
 
 _SLOW, _FAST = 0.12, 0.45
@@ -18,7 +19,7 @@ def describe(design: Primitive, seen: Envelope, device: Device) -> str:
     """Say what to do in one sentence."""
     axes = device.coordinates
     first = design.axis
-    beside = [i for i, one in design.strokes.items() if i != first and _is_gentle(one, seen, i)]
+    beside = [i for i, one in design.strokes.items() if one.gentle]
     strokes = {i: one for i, one in design.strokes.items() if i not in beside}
     names = [axes[i].name for i in strokes]
     ends = [_ends(one, axes[i].unit) for i, one in strokes.items()]
@@ -47,11 +48,20 @@ def describe(design: Primitive, seen: Envelope, device: Device) -> str:
     for name, level in (design.levels or {}).items():
         unit = device.channels[name]
         text += f"; with {name} held at {level:.3g} {unit}".rstrip()
+    farther, faster = ([axes[i].name for i in group] for group in find_beyond(design, seen))
+    if farther or faster:
+        text += _beyond(farther, faster)
     return text + "."
 
 
-def _is_gentle(stroke: Stroke, seen: Envelope, axis: int) -> bool:
-    return bool(stroke.high - stroke.low <= (2.0 * GENTLE + 0.01) * (seen.high - seen.low)[axis])
+def _beyond(farther: Sequence[str], faster: Sequence[str]) -> str:
+    """What a design asks of the machine that no trial at hand has asked."""
+    if farther and faster and set(farther) == set(faster):
+        text = f"{join_names(farther)} farther and faster"
+    else:
+        parts = (farther, "farther"), (faster, "faster")
+        text = " and ".join(f"{join_names(names)} {how}" for names, how in parts if names)
+    return f"; this takes {text} than so far" + (": try the way slowly first" if farther else "")
 
 
 def _about(stroke: Stroke, unit: str) -> str:

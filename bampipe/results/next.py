@@ -63,6 +63,8 @@ class Proposal(Record):
         default={}, description="By parameter; none where the model lacks something"
     )
     confusion: tuple[ExpectedConfusion, ...] = ()
+    farther: Names = Field(default=(), description="Axes moved farther than in the trials at hand")
+    faster: Names = Field(default=(), description="Axes moved faster than there")
 
 
 class Detectable(Record):

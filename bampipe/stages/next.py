@@ -124,7 +124,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     floor = _floor(run, config.model, diagnosed, evidence)
     fitted = [trials.motions[k] for k in trials.folds.fitted_trials]
     noise = sensor_noise(trials.sensors, system, fitted, p, FilterChoice())
-    seen = Envelope.of_trials(trials.motions, model.device)
+    seen = Envelope.of_trials(trials.motions, system, p)
     rehearsal = Rehearsal(system, p, trials.sensors, trials.kinematics, seen, config.seed)
     precision = Precision.of_trials(system, fitted, trials.band, p, found, noise)
     contest, blindness = None, None
