@@ -53,7 +53,7 @@ class Rehearsal:
     def record(self, design: Primitive, version: int) -> Motion:
         """One version of a design, recorded; 0 is followed exactly, `HASTY` hardly at all."""
         rng = np.random.default_rng([self.seed, 1 + version])
-        given = design if version == 0 else _as_followed(design, self.seen, rng, version == HASTY)
+        given = design if version == 0 else follow_roughly(design, self.seen, rng, version == HASTY)
         t = np.arange(int(design.seconds * self.sensors.rate_hz)) / self.sensors.rate_hz
         return self._observe(*self._path(given, t, rng, exact=version == 0), given, rng)
 
@@ -118,7 +118,7 @@ class Rehearsal:
         return motion
 
 
-def _as_followed(
+def follow_roughly(
     design: Primitive, seen: Envelope, rng: np.random.Generator, hastily: bool
 ) -> Primitive:
     """A design as a person follows it: other speeds and turns, no farther than any design."""

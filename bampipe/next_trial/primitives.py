@@ -109,7 +109,7 @@ class Envelope:
             bounds: (n_q, 2) range of each axis, infinite where none is stated.
             speeds: (n_q,) highest speed, NaN where none is known.
         """
-        stated = np.isfinite(bounds).all(axis=1)
+        stated = np.isfinite(bounds[:, 0]) & np.isfinite(bounds[:, 1])
         bounds = np.where(stated[:, None], bounds, np.column_stack([self.low, self.high]))
         margin = _MARGIN * (bounds[:, 1] - bounds[:, 0]) * stated
         low = np.minimum(self.low, bounds[:, 0] + margin)

@@ -175,7 +175,8 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
             if entry.after > goal.sd[precision.names.index(name)]:
                 tried += rank(_worth("precision", name, forecast, None), False, 0.92)[:1]
         plan = record_plan(forecast, goal, plan_trials(forecast, tried, goal))
-    reasons = explain_proposal(chosen, parameter, best, table)
+    unlimited = [axis for axis in system.coordinates if axis not in model.device.limits]
+    reasons = explain_proposal(chosen, parameter, best, table, unlimited)
     result = NextResult(
         model=config.model,
         purpose=chosen,
