@@ -9,7 +9,8 @@ Sessions come from simulators that share no code with bampipe. A proposal is fol
 somebody who follows well, and by somebody who covers half the range at twice the speed; beside it,
 one more trial of the motion at hand of the same length is recorded. With ``--timid``, that motion
 is confined to where two effects look alike; ``--trials`` and ``--seconds`` say how much of it there
-is. Precision is asked of the worst-known parameter, or with ``--of all`` of all together.
+is, ``--added`` how long the trial more is. Precision is asked of the worst-known parameter, or with
+``--of all`` of all together.
 """
 
 from __future__ import annotations
@@ -132,9 +133,11 @@ def worst_known(run: bampipe.Run) -> str:
 
 def ways_on(conditions: Conditions, path: Path) -> dict[str, Conditions]:
     """One trial more: the proposal in ``path`` followed well, sloppily, or the motion at hand."""
-    more = {"trials": (conditions.trials or 0) + 1}
-    at_hand = {"tasks": (*conditions.tasks, conditions.tasks[0])} if conditions.tasks else more
     well, sloppy = Task.read(path), Task.read(path, reach=0.5, haste=2.0)
+    at_hand: dict[str, object] = {"trials": (conditions.trials or 0) + 1}
+    if conditions.tasks:
+        again = replace(conditions.tasks[0], seconds=well.seconds)
+        at_hand = {"tasks": (*conditions.tasks, again)}
     return {
         "well": replace(conditions, tasks=(*conditions.tasks, well)),
         "sloppy": replace(conditions, tasks=(*conditions.tasks, sloppy)),
@@ -142,11 +145,13 @@ def ways_on(conditions: Conditions, path: Path) -> dict[str, Conditions]:
     }
 
 
-def measure_precision(machine: str, conditions: Conditions, seeds: range, of_all: bool) -> None:
+def measure_precision(
+    machine: str, conditions: Conditions, seeds: range, added_s: float, of_all: bool
+) -> None:
     """Print forecast over actual uncertainties, and the gain against free and sloppy motion.
 
     Args:
-        machine, conditions, seeds: of the sessions.
+        machine, conditions, seeds: of the sessions; added_s: length of the trial more.
         of_all: whether the trial is for all parameters, and not for the worst-known one.
     """
     ratios: dict[str, list[float]] = {"asked": [], "all": []}
@@ -160,7 +165,7 @@ def measure_precision(machine: str, conditions: Conditions, seeds: range, of_all
             target = worst_known(run)
             start = time.perf_counter()
             purpose = "precision" if of_all else target
-            found, path = propose(run, purpose=purpose, seconds=conditions.seconds)
+            found, path = propose(run, purpose=purpose, seconds=added_s)
             lasted.append(time.perf_counter() - start)
             then = {
                 kind: known_of(*run_of(root / kind, machine, seed, {}, chosen))
@@ -244,8 +249,13 @@ def ambiguous_sessions(
                 print(f"{one.machine} {seed} {one.effect}: at once {said}", flush=True)
 
 
-def measure_decision(hidden: Sequence[Hidden], seeds: range) -> None:
-    """Print what the diagnosis says after the proposed trial, and after one more free trial."""
+def measure_decision(hidden: Sequence[Hidden], seeds: range, added_s: float | None) -> None:
+    """Print what the diagnosis says after the proposed trial, and after one more free trial.
+
+    Args:
+        hidden: effects and sessions; seeds: of these.
+        added_s: length of the trial more; that of the trials at hand where it is None.
+    """
     counts = {kind: Counter[str]() for kind in ("well", "sloppy", "free")}
     cases = 0
     with tempfile.TemporaryDirectory() as name:
@@ -253,7 +263,9 @@ def measure_decision(hidden: Sequence[Hidden], seeds: range) -> None:
         for one, seed, run in ambiguous_sessions(root, hidden, seeds):
             head = f"{one.machine} {seed} {one.effect}"
             try:
-                found, path = propose(run, purpose="decision", seconds=one.conditions.seconds)
+                found, path = propose(
+                    run, purpose="decision", seconds=added_s or one.conditions.seconds
+                )
             except InputError as error:
                 print(f"{head}: {error}", flush=True)
                 continue
@@ -287,7 +299,10 @@ def main() -> int:
     parser.add_argument("--of", choices=("worst", "all"), default="worst", help="parameters")
     parser.add_argument("--trials", type=int, help="how many timid trials; 2 by default")
     parser.add_argument("--seconds", type=float, help="of each timid trial; 8 by default")
+    parser.add_argument("--added", type=float, help="s, of the trial more; else as at hand")
     given = parser.parse_args()
+    if not given.timid and (given.trials or given.seconds or given.added):
+        parser.error("--trials, --seconds and --added go with --timid")
     seeds = range(given.seeds[0], given.seeds[1] + 1)
     if given.timid:
         machine, either, motion = TIMID[given.timid]
@@ -298,11 +313,14 @@ def main() -> int:
     if given.what == "precision":
         if not given.timid:
             machine, timid = given.machine, USUAL[given.machine]
-        measure_precision(machine, timid, seeds, given.of == "all")
+        added_s = given.added or timid.seconds
+        measure_precision(machine, timid, seeds, added_s, given.of == "all")
     elif given.timid:
-        measure_decision([Hidden(machine, effect, timid) for effect in either], seeds)
+        hidden = [Hidden(machine, effect, timid) for effect in either]
+        measure_decision(hidden, seeds, given.added)
     else:
-        measure_decision([Hidden(machine, e, POOR[machine]) for machine, e in HIDDEN], seeds)
+        hidden = [Hidden(machine, effect, POOR[machine]) for machine, effect in HIDDEN]
+        measure_decision(hidden, seeds, None)
     return 0
 
 
