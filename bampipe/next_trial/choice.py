@@ -45,12 +45,17 @@ class Tried:
     Attributes:
         design: the primitive.
         worth: the quantile by which designs are ranked.
-        motions: its versions.
+        motions: its versions, that of somebody hasty last.
     """
 
     design: Primitive
     worth: float
     motions: tuple[Motion, ...]
+
+    @property
+    def usual(self) -> tuple[Motion, ...]:
+        """The versions that are expected; the hasty one is only guarded against."""
+        return self.motions[:-1]
 
 
 def rank_designs(

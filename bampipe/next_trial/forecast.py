@@ -50,7 +50,8 @@ class Forecast:
         system, design = self.rehearsal.system, tried.design
         device = system.model.device
         axes = device.coordinates
-        added = [self.precision.of_motion(motion) for motion in tried.motions]
+        added = [self.precision.of_motion(motion) for motion in tried.usual]
+        hasty = self.precision.of_motion(tried.motions[-1])
         pose = {
             axes[i].name: float(design.pose[i]) for i in range(len(axes)) if i not in design.strokes
         }
@@ -67,21 +68,22 @@ class Forecast:
             worth=tried.worth,
             information_gain=float(np.median([self.precision.gain(one) for one in added])),
             # Of a model that lacks something, uncertainties are not worth a forecast.
-            sd={} if self.contest else self._sd(added, design.seconds),
-            confusion=self._confusion(tried.motions),
+            sd={} if self.contest else self._sd(added, hasty, design.seconds),
+            confusion=self._confusion(tried.usual),
             farther=farther,
             faster=faster,
         )
 
-    def _sd(self, added: Sequence[Array], seconds: float) -> dict[str, ExpectedSd]:
+    def _sd(self, added: Sequence[Array], hasty: Array, seconds: float) -> dict[str, ExpectedSd]:
         system, found = self.rehearsal.system, self.precision
         after = np.array([found.sd_with(one, seconds) for one in added])
+        every = np.vstack([after, found.sd_with(hasty, seconds)])
         units = {q.name: q.unit for q in system.parameters}
         return {
             name: ExpectedSd(
                 before=found.sd[k],
                 after=float(np.median(after[:, k])),
-                after_at_worst=float(np.quantile(after[:, k], 0.9)),
+                after_at_worst=float(np.quantile(every[:, k], 0.9)),
                 unit=units[name],
             )
             for k, name in enumerate(found.names)

@@ -37,8 +37,12 @@ _WORTHWHILE = 1.1
 """Of range or speed seen: from there on it is worth going beyond."""
 _NOTABLE = 0.02
 """Of range or speed: by so much a design exceeds them before it is said to."""
-_SPANS = {"whole": (0.0, 1.0), "middle": (0.33, 0.67), "lower": (0.0, 0.4), "upper": (0.6, 1.0)}
-"""Ends of the strokes, as shares of the range of the trials."""
+_SPANS = {
+    "whole": (0.0, 1.0), "middle": (0.33, 0.67), "lower": (0.0, 0.4), "upper": (0.6, 1.0),
+    "low end": (0.0, 0.2), "high end": (0.8, 1.0),
+}  # fmt: skip
+"""Ends of the strokes, as shares of the range of the trials. Half of a stroke near the end is as
+far away from elsewhere as all of it: that somebody covers only half of it costs little."""
 _SMALL = (0.45, 0.55)
 _REST_S = 1.0
 GENTLE = 0.12

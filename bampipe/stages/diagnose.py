@@ -277,7 +277,7 @@ def _with_suggestion(
         seen.movable,
         with_rests=True,
     )[0]
-    now, sums = contest.contrasts(at_hand), [contest.sums([motion]) for motion in tried.motions]
+    now, sums = contest.contrasts(at_hand), [contest.sums([motion]) for motion in tried.usual]
     then = [contest.contrasts(at_hand + new, new) for new in sums]
     weights = contest.weights()
     pair = max(weights, key=lambda pair: weights[pair] * now[pair].confusion)

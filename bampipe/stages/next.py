@@ -296,7 +296,7 @@ def _worth(
 
 def _sensitivity(blindness: Blindness, best: Tried) -> dict[str, Detectable]:
     """The smallest strength of each effect that shows, without and with the best trial."""
-    after = np.median([blindness.factors_with([motion]) for motion in best.motions], axis=0)
+    after = np.median([blindness.factors_with([motion]) for motion in best.usual], axis=0)
     axes = blindness.contest.system.coordinates
     return {
         found.rival.name: Detectable(
