@@ -114,8 +114,8 @@ class Precision:
         A published one is what the estimator believes, times how much more blocks of time scatter
         than it believes they do, but never less. That scatter is taken with few blocks, and is
         uncertain accordingly: what it is of one parameter is held against what it is of all.
-        Methods disagree by what each makes of noise that the motion hardly exceeds, which is
-        another thing in every trial: that shrinks as the rest does.
+        Methods disagree by what each makes of noise that the motion at hand hardly exceeds: the
+        estimate is a mean by information, in which a trial that does exceed it dilutes that.
 
         Args:
             added: (m, m) information of the trials; seconds: of them together.
@@ -126,14 +126,16 @@ class Precision:
             for matrix in (self.information, self.information + added)
         )
         blocks = self.blocks + max(1, int(seconds / _BLOCK_S))
-        apart = self.systematic**2 + self.lasting**2
-        statistical = np.sqrt(np.maximum(self.sd**2 - apart, 1e-300))
+        rest = self.systematic**2 + self.lasting**2
+        statistical = np.sqrt(np.maximum(self.sd**2 - rest, 1e-300))
         scatter = np.log(statistical / self.formal_sd / self._few(self.blocks))
         trust = _ALIKE**2 / (_ALIKE**2 + 0.5 / max(self.blocks - len(self.information), 1))
         scatter = np.exp(scatter.mean() + trust * (scatter - scatter.mean()))
-        shrinks = np.sqrt(after / before)
-        noise = self.formal_sd * np.maximum(scatter * self._few(blocks), 1.0)
-        return np.asarray(np.hypot(shrinks * np.hypot(noise, self.systematic), self.lasting))
+        share = after / before
+        formal = self.formal_sd * np.sqrt(share)
+        noise = formal * np.maximum(scatter * self._few(blocks), 1.0)
+        apart = np.hypot(share * self.systematic, self.lasting)
+        return np.asarray(np.hypot(noise, apart))
 
     def _few(self, blocks: int) -> float:
         """By how much few blocks widen a standard deviation."""

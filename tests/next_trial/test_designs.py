@@ -258,13 +258,13 @@ def test_what_few_blocks_widen_goes_with_more_of_them():
     assert few.sd_with(nothing, 1000.0)[0] == pytest.approx(0.01, rel=0.02)
 
 
-def test_what_methods_disagree_by_shrinks_and_what_a_calibration_leaves_open_stays():
+def test_what_methods_disagree_by_is_diluted_and_what_a_calibration_leaves_open_stays():
     known = made_precision(np.sqrt(0.01**2 + 0.04**2 + 0.02**2), 0.01, 10_000, 0.04, 0.02)
     nothing, much = np.zeros((2, 2)), 1e6 * known.information
     assert known.sd_with(nothing, 0.0)[0] == pytest.approx(known.sd[0], rel=1e-3)
     assert known.sd_with(much, 20.0)[0] == pytest.approx(0.02, rel=1e-3)
     threefold = known.sd_with(3.0 * known.information, 20.0)[0]
-    assert threefold**2 == pytest.approx((0.01**2 + 0.04**2) / 4.0 + 0.02**2, rel=1e-3)
+    assert threefold**2 == pytest.approx(0.01**2 / 4.0 + 0.04**2 / 16.0 + 0.02**2, rel=1e-3)
 
 
 def contest_of(odds: list[float], floor: float = 1.0) -> Contest:
