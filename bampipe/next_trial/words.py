@@ -68,8 +68,14 @@ def _about(stroke: Stroke, unit: str) -> str:
     """Around where an axis is moved, and how far."""
     middle, half = 0.5 * (stroke.low + stroke.high), 0.5 * (stroke.high - stroke.low)
     if unit == "rad":
-        return f"{math.degrees(middle):.0f}° ± {math.degrees(half):.0f}°".replace("-", "−")
-    return f"{1e3 * middle:.0f} ± {1e3 * half:.0f} mm".replace("-", "−")
+        text = f"{_rounded(math.degrees(middle), 0)}° ± {_rounded(math.degrees(half), 0)}°"
+        return text.replace("-", "−")
+    return f"{_rounded(1e3 * middle, 0)} ± {_rounded(1e3 * half, 0)} mm".replace("-", "−")
+
+
+def _rounded(value: float, digits: int) -> str:
+    """A number with so many digits behind the point, and without the sign of a zero."""
+    return f"{round(value, digits) + 0.0:.{digits}f}"
 
 
 def _pace(stroke: Stroke, seen: Envelope, axis: int) -> str:
@@ -82,12 +88,12 @@ def _pace(stroke: Stroke, seen: Envelope, axis: int) -> str:
 def _ends(stroke: Stroke, unit: str) -> str:
     """Where to turn: degrees or millimetres first, for a person; the unit of the files after."""
     if unit == "rad":
-        low, high = math.degrees(stroke.low), math.degrees(stroke.high)
-        text = f"between {low:.0f}° and {high:.0f}° ({stroke.low:.2f} to {stroke.high:.2f} rad)"
-        return text.replace("-", "−")
-    low, high = 1e3 * stroke.low, 1e3 * stroke.high
-    digits = 0 if high - low > 10.0 else 2
-    return f"between {low:.{digits}f} and {high:.{digits}f} mm".replace("-", "−")
+        low, high = (_rounded(math.degrees(end), 0) for end in (stroke.low, stroke.high))
+        radians = f"{_rounded(stroke.low, 2)} to {_rounded(stroke.high, 2)} rad"
+        return f"between {low}° and {high}° ({radians})".replace("-", "−")
+    digits = 0 if stroke.high - stroke.low > 0.01 else 2
+    low, high = (_rounded(1e3 * end, digits) for end in (stroke.low, stroke.high))
+    return f"between {low} and {high} mm".replace("-", "−")
 
 
 def _times(stroke: Stroke) -> str:

@@ -189,6 +189,15 @@ def test_a_sentence_says_where_how_fast_and_how_long():
     assert " mm" in said
 
 
+def test_a_zero_has_no_sign():
+    said = describe(
+        Primitive({0: Stroke(-0.002, 0.4, 0.5, 1.0)}, SEEN.usual, 20.0),
+        SEEN,
+        registry.device("bam"),
+    )
+    assert "between 0° and 23° (0.00 to 0.40 rad)" in said
+
+
 def test_a_sentence_says_what_goes_beyond_the_trials_at_hand():
     device, seen = registry.device("bam"), TIMID.within(LIMITS, np.full(3, 20.0))
     far, fast = Stroke(-1.0, 1.0, 0.5, 1.0), Stroke(0.1, 0.4, 3.0, 4.0)
