@@ -1,13 +1,16 @@
 """Whether the trial that `bampipe next` proposes gives what was forecast, on sessions never seen.
 
     python benchmarks/next_trials.py precision --machine joint --seeds 5001 5010
+    python benchmarks/next_trials.py precision --timid drag-thinning --trials 4 --seconds 15
     python benchmarks/next_trials.py decision --seeds 5101 5110
     python benchmarks/next_trials.py decision --timid lag-delay --seeds 5201 5202
 
 Sessions come from simulators that share no code with bampipe. A proposal is followed there by
 somebody who follows well, and by somebody who covers half the range at twice the speed; beside it,
 one more trial of the motion at hand of the same length is recorded. With ``--timid``, that motion
-is confined to where two effects look alike.
+is confined to where two effects look alike; ``--trials`` and ``--seconds`` say how much of it there
+is, ``--added`` how long the trial more is. Precision is asked of the worst-known parameter, or with
+``--of all`` of all together.
 """
 
 from __future__ import annotations
@@ -15,6 +18,7 @@ from __future__ import annotations
 import argparse
 import sys
 import tempfile
+import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -85,14 +89,15 @@ stages = ["ingest", "filter", "identify", "validate"]
 
 def run_of(
     folder: Path, machine: str, seed: int, effects: Mapping[str, float], conditions: Conditions
-) -> bampipe.Run:
-    """Record a session into ``folder``, identify and validate it."""
+) -> tuple[bampipe.Run, dict[str, float]]:
+    """Record a session into ``folder``, identify and validate it; the run, and the truth."""
     folder.mkdir()
-    independent.record(machine, folder / machine, seed, effects, conditions)
+    truth = independent.record(machine, folder / machine, seed, effects, conditions)
     (folder / "short.toml").write_text(PIPELINE)
-    return bampipe.run_session(
+    run = bampipe.run_session(
         folder / machine, runs=folder / "runs", pipeline=str(folder / "short.toml")
     )
+    return run, truth["parameters"]
 
 
 def propose(run: bampipe.Run, **settings: object) -> tuple[NextResult, Path]:
@@ -102,10 +107,22 @@ def propose(run: bampipe.Run, **settings: object) -> tuple[NextResult, Path]:
     return NextResult.read(path), path
 
 
-def sds(run: bampipe.Run) -> dict[str, float]:
-    """Published standard deviations."""
-    found = IdentifyResult.read(run.root / IdentifyResult.file("base"))
-    return {name: entry.sd for name, entry in found.parameters.items()}
+@dataclass(frozen=True)
+class Known:
+    """What a session says of the parameters: published standard deviations, and true errors."""
+
+    sd: dict[str, float]
+    error: dict[str, float]
+
+
+def known_of(run: bampipe.Run, truth: Mapping[str, float]) -> Known:
+    """What ``run`` says of the parameters of which the truth is known."""
+    found = IdentifyResult.read(run.root / IdentifyResult.file("base")).parameters
+    named = {name: entry for name, entry in found.items() if name in truth}
+    return Known(
+        {name: entry.sd for name, entry in named.items()},
+        {name: abs(entry.estimate - truth[name]) for name, entry in named.items()},
+    )
 
 
 def worst_known(run: bampipe.Run) -> str:
@@ -116,9 +133,11 @@ def worst_known(run: bampipe.Run) -> str:
 
 def ways_on(conditions: Conditions, path: Path) -> dict[str, Conditions]:
     """One trial more: the proposal in ``path`` followed well, sloppily, or the motion at hand."""
-    more = {"trials": (conditions.trials or 0) + 1}
-    at_hand = {"tasks": (*conditions.tasks, conditions.tasks[0])} if conditions.tasks else more
     well, sloppy = Task.read(path), Task.read(path, reach=0.5, haste=2.0)
+    at_hand: dict[str, object] = {"trials": (conditions.trials or 0) + 1}
+    if conditions.tasks:
+        again = replace(conditions.tasks[0], seconds=well.seconds)
+        at_hand = {"tasks": (*conditions.tasks, again)}
     return {
         "well": replace(conditions, tasks=(*conditions.tasks, well)),
         "sloppy": replace(conditions, tasks=(*conditions.tasks, sloppy)),
@@ -126,39 +145,74 @@ def ways_on(conditions: Conditions, path: Path) -> dict[str, Conditions]:
     }
 
 
-def measure_precision(machine: str, conditions: Conditions, seeds: range) -> None:
-    """Print forecast over actual uncertainties, and the gain against free and sloppy motion."""
-    ratios, free_sd, free_gain, sloppy_gain = [], [], [], []
+def measure_precision(
+    machine: str, conditions: Conditions, seeds: range, added_s: float, of_all: bool
+) -> None:
+    """Print forecast over actual uncertainties, and the gain against free and sloppy motion.
+
+    Args:
+        machine, conditions, seeds: of the sessions; added_s: length of the trial more.
+        of_all: whether the trial is for all parameters, and not for the worst-known one.
+    """
+    ratios: dict[str, list[float]] = {"asked": [], "all": []}
+    narrower: dict[str, list[float]] = {"well": [], "sloppy": []}
+    shares, errors, lasted = [], [], []
     for seed in seeds:
         with tempfile.TemporaryDirectory() as name:
             root = Path(name)
-            run = run_of(root / "now", machine, seed, {}, conditions)
-            before = sds(run)
+            run, truth = run_of(root / "now", machine, seed, {}, conditions)
+            before = known_of(run, truth)
             target = worst_known(run)
-            found, path = propose(run, purpose=target, seconds=conditions.seconds)
-            followed = {
-                kind: sds(run_of(root / kind, machine, seed, {}, chosen))
+            start = time.perf_counter()
+            purpose = "precision" if of_all else target
+            found, path = propose(run, purpose=purpose, seconds=added_s)
+            lasted.append(time.perf_counter() - start)
+            then = {
+                kind: known_of(*run_of(root / kind, machine, seed, {}, chosen))
                 for kind, chosen in ways_on(conditions, path).items()
             }
-            forecast = found.proposals[0].sd
-            ratios += [followed["well"][n] / forecast[n].after for n in forecast]
-            gain = {k: sd[target] ** -2 - before[target] ** -2 for k, sd in followed.items()}
-            free_sd.append(followed["free"][target] / followed["well"][target])
-            free_gain.append(gain["well"] / gain["free"])
-            sloppy_gain.append(gain["sloppy"] / gain["well"])
-            print(
-                f"{machine} {seed} {target}: now {before[target]:.3g}, forecast"
-                f" {forecast[target].after:.3g}, well {followed['well'][target]:.3g}, sloppy"
-                f" {followed['sloppy'][target]:.3g}, free {followed['free'][target]:.3g}",
-                flush=True,
-            )
-    within = np.mean([1 / 1.3 < ratio < 1.3 for ratio in ratios])
-    print(
-        f"{machine}: {len(ratios)} uncertainties, {100 * within:.0f} % within 1.3 of the forecast"
-    )
-    print(f"sd after a free trial, over that after the proposed: median {np.median(free_sd):.2f}")
-    print(f"information added, over that of a free trial: median {np.median(free_gain):.2f}")
-    print(f"of it when followed sloppily: median {np.median(sloppy_gain):.2f}")
+        forecast = found.proposals[0].sd
+        names = list(before.sd)
+        judged = names if of_all else [target]
+        came = {name: then["well"].sd[name] / forecast[name].after for name in names}
+        ratios["all"] += came.values()
+        ratios["asked"] += [came[name] for name in judged]
+        for kind, list_of in narrower.items():
+            list_of.append(mean_ratio(then["free"].sd, then[kind].sd, judged))
+        gain = {k: np.log(mean_ratio(before.sd, one.sd, judged)) for k, one in then.items()}
+        shares.append(gain["sloppy"] / gain["well"])
+        errors += [[one.error[n] / one.sd[n] for n in judged] for one in then.values()]
+        print(f"{machine} {seed}: {found.sentence}")
+        print(
+            f"  {target}: now {before.sd[target]:.3g}, forecast {forecast[target].after:.3g}; "
+            + ", ".join(
+                f"{kind} {one.sd[target]:.3g} (off by {one.error[target]:.2g})"
+                for kind, one in then.items()
+            ),
+            flush=True,
+        )
+        print(
+            f"  sd after a free trial over that after the proposed {narrower['well'][-1]:.2f},"
+            f" followed sloppily {narrower['sloppy'][-1]:.2f}",
+            flush=True,
+        )
+    for which, values in ratios.items():
+        inside = sum(1 / 1.3 < ratio < 1.3 for ratio in values)
+        print(f"{which}: {inside} of {len(values)} uncertainties within 1.3 of the forecast")
+    for kind, list_of in narrower.items():
+        print(
+            f"sd after a free trial, over that after the proposed followed {kind}: median"
+            f" {np.median(list_of):.2f}, from {min(list_of):.2f} to {max(list_of):.2f}"
+        )
+    print(f"share of the fall of log sd when followed sloppily: median {np.median(shares):.2f}")
+    apart = np.concatenate(errors)
+    print(f"errors beyond two published sd: {np.sum(apart > 2.0)} of {apart.size}")
+    print(f"seconds of a proposal: at most {max(lasted):.1f}")
+
+
+def mean_ratio(above: Mapping[str, float], below: Mapping[str, float], names: list[str]) -> float:
+    """Geometric mean over ``names`` of one number over another."""
+    return float(np.exp(np.mean([np.log(above[name] / below[name]) for name in names])))
 
 
 def verdict(run: bampipe.Run, truth: str) -> str:
@@ -187,7 +241,7 @@ def ambiguous_sessions(
     for seed in seeds:
         for one in hidden:
             folder = root / f"{one.machine}-{one.effect.replace(':', '.')}-{seed}"
-            run = run_of(folder, one.machine, seed, {one.effect: 1.0}, one.conditions)
+            run, _ = run_of(folder, one.machine, seed, {one.effect: 1.0}, one.conditions)
             said = verdict(run, one.effect)
             if said == "undecided":
                 yield one, seed, run
@@ -195,8 +249,13 @@ def ambiguous_sessions(
                 print(f"{one.machine} {seed} {one.effect}: at once {said}", flush=True)
 
 
-def measure_decision(hidden: Sequence[Hidden], seeds: range) -> None:
-    """Print what the diagnosis says after the proposed trial, and after one more free trial."""
+def measure_decision(hidden: Sequence[Hidden], seeds: range, added_s: float | None) -> None:
+    """Print what the diagnosis says after the proposed trial, and after one more free trial.
+
+    Args:
+        hidden: effects and sessions; seeds: of these.
+        added_s: length of the trial more; that of the trials at hand where it is None.
+    """
     counts = {kind: Counter[str]() for kind in ("well", "sloppy", "free")}
     cases = 0
     with tempfile.TemporaryDirectory() as name:
@@ -204,7 +263,9 @@ def measure_decision(hidden: Sequence[Hidden], seeds: range) -> None:
         for one, seed, run in ambiguous_sessions(root, hidden, seeds):
             head = f"{one.machine} {seed} {one.effect}"
             try:
-                found, path = propose(run, purpose="decision", seconds=one.conditions.seconds)
+                found, path = propose(
+                    run, purpose="decision", seconds=added_s or one.conditions.seconds
+                )
             except InputError as error:
                 print(f"{head}: {error}", flush=True)
                 continue
@@ -213,9 +274,10 @@ def measure_decision(hidden: Sequence[Hidden], seeds: range) -> None:
             said = {}
             for kind, chosen in ways_on(one.conditions, path).items():
                 folder = root / f"{kind}-{cases}"
-                after = run_of(folder, one.machine, seed, {one.effect: 1.0}, chosen)
+                after, _ = run_of(folder, one.machine, seed, {one.effect: 1.0}, chosen)
                 said[kind] = verdict(after, one.effect)
                 counts[kind][said[kind].partition(" ")[0]] += 1
+            print(f"{head}: {found.sentence}")
             print(
                 f"{head}: {' or '.join(pair.between)}, confusion"
                 f" {pair.before:.2f} to {pair.after:.2f}; {said}",
@@ -234,16 +296,31 @@ def main() -> int:
     parser.add_argument(
         "--timid", choices=sorted(TIMID), help="confined motion, by pair of effects"
     )
+    parser.add_argument("--of", choices=("worst", "all"), default="worst", help="parameters")
+    parser.add_argument("--trials", type=int, help="how many timid trials; 2 by default")
+    parser.add_argument("--seconds", type=float, help="of each timid trial; 8 by default")
+    parser.add_argument("--added", type=float, help="s, of the trial more; else as at hand")
     given = parser.parse_args()
+    if not given.timid and (given.trials or given.seconds or given.added):
+        parser.error("--trials, --seconds and --added go with --timid")
     seeds = range(given.seeds[0], given.seeds[1] + 1)
-    if given.what == "precision":
-        machine, _, motion = TIMID[given.timid] if given.timid else (given.machine, (), None)
-        measure_precision(machine, motion or USUAL[machine], seeds)
-    elif given.timid:
+    if given.timid:
         machine, either, motion = TIMID[given.timid]
-        measure_decision([Hidden(machine, effect, motion) for effect in either], seeds)
+        first = motion.tasks[0]
+        task = replace(first, seconds=given.seconds or first.seconds)
+        tasks = (task,) * (given.trials or len(motion.tasks))
+        timid = replace(motion, seconds=task.seconds, tasks=tasks)
+    if given.what == "precision":
+        if not given.timid:
+            machine, timid = given.machine, USUAL[given.machine]
+        added_s = given.added or timid.seconds
+        measure_precision(machine, timid, seeds, added_s, given.of == "all")
+    elif given.timid:
+        hidden = [Hidden(machine, effect, timid) for effect in either]
+        measure_decision(hidden, seeds, given.added)
     else:
-        measure_decision([Hidden(machine, e, POOR[machine]) for machine, e in HIDDEN], seeds)
+        hidden = [Hidden(machine, effect, POOR[machine]) for machine, effect in HIDDEN]
+        measure_decision(hidden, seeds, None)
     return 0
 
 

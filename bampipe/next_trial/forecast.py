@@ -12,7 +12,7 @@ from bampipe.next_trial.choice import Tried
 from bampipe.next_trial.discrimination import Contest, Sums
 from bampipe.next_trial.motion import Rehearsal
 from bampipe.next_trial.precision import Precision
-from bampipe.next_trial.primitives import Primitive
+from bampipe.next_trial.primitives import Primitive, find_beyond
 from bampipe.next_trial.words import describe
 from bampipe.results.next import ExpectedConfusion, ExpectedSd, Move, Proposal
 from bampipe.trials.motion import Motion
@@ -50,10 +50,14 @@ class Forecast:
         system, design = self.rehearsal.system, tried.design
         device = system.model.device
         axes = device.coordinates
-        added = [self.precision.of_motion(motion) for motion in tried.motions]
+        added = [self.precision.of_motion(motion) for motion in tried.usual]
+        hasty = self.precision.of_motion(tried.motions[-1])
         pose = {
             axes[i].name: float(design.pose[i]) for i in range(len(axes)) if i not in design.strokes
         }
+        farther, faster = (
+            tuple(axes[i].name for i in found) for found in find_beyond(design, self.rehearsal.seen)
+        )
         return Proposal(
             sentence=describe(design, self.rehearsal.seen, device),
             seconds=design.seconds,
@@ -64,19 +68,22 @@ class Forecast:
             worth=tried.worth,
             information_gain=float(np.median([self.precision.gain(one) for one in added])),
             # Of a model that lacks something, uncertainties are not worth a forecast.
-            sd={} if self.contest else self._sd(added, design.seconds),
-            confusion=self._confusion(tried.motions),
+            sd={} if self.contest else self._sd(added, hasty, design.seconds),
+            confusion=self._confusion(tried.usual),
+            farther=farther,
+            faster=faster,
         )
 
-    def _sd(self, added: Sequence[Array], seconds: float) -> dict[str, ExpectedSd]:
+    def _sd(self, added: Sequence[Array], hasty: Array, seconds: float) -> dict[str, ExpectedSd]:
         system, found = self.rehearsal.system, self.precision
         after = np.array([found.sd_with(one, seconds) for one in added])
+        every = np.vstack([after, found.sd_with(hasty, seconds)])
         units = {q.name: q.unit for q in system.parameters}
         return {
             name: ExpectedSd(
                 before=found.sd[k],
                 after=float(np.median(after[:, k])),
-                after_at_worst=float(np.quantile(after[:, k], 0.9)),
+                after_at_worst=float(np.quantile(every[:, k], 0.9)),
                 unit=units[name],
             )
             for k, name in enumerate(found.names)

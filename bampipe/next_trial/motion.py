@@ -53,7 +53,7 @@ class Rehearsal:
     def record(self, design: Primitive, version: int) -> Motion:
         """One version of a design, recorded; 0 is followed exactly, `HASTY` hardly at all."""
         rng = np.random.default_rng([self.seed, 1 + version])
-        given = design if version == 0 else _as_followed(design, self.seen, rng, version == HASTY)
+        given = design if version == 0 else follow_roughly(design, self.seen, rng, version == HASTY)
         t = np.arange(int(design.seconds * self.sensors.rate_hz)) / self.sensors.rate_hz
         return self._observe(*self._path(given, t, rng, exact=version == 0), given, rng)
 
@@ -118,11 +118,11 @@ class Rehearsal:
         return motion
 
 
-def _as_followed(
+def follow_roughly(
     design: Primitive, seen: Envelope, rng: np.random.Generator, hastily: bool
 ) -> Primitive:
-    """A design as a person follows it: other speeds and turns, within what has been seen."""
-    strokes = {}
+    """A design as a person follows it: other speeds and turns, no farther than any design."""
+    strokes, (lowest, highest) = {}, seen.reach
     for axis, stroke in design.strokes.items():
         speed = 2.0 if hastily else 1.0 + rng.uniform(-_SPEED, _SPEED)
         share = 0.5 if hastily else 1.0 + rng.uniform(-_RANGE, _RANGE)
@@ -131,8 +131,8 @@ def _as_followed(
         middle = 0.5 * (stroke.low + stroke.high) + rng.uniform(-room, room)
         strokes[axis] = replace(
             stroke,
-            low=max(middle - 0.5 * width, float(seen.low[axis])),
-            high=min(middle + 0.5 * width, float(seen.high[axis])),
+            low=max(middle - 0.5 * width, float(lowest[axis])),
+            high=min(middle + 0.5 * width, float(highest[axis])),
             slow=speed * stroke.slow,
             fast=speed * stroke.fast,
         )

@@ -110,10 +110,10 @@ def _trimmed(forecast: Forecast, chosen: list[_Option], goal: Goal) -> list[_Opt
 
 def _option(forecast: Forecast, tried: Tried) -> _Option:
     """A design by the version whose information is the median one."""
-    added = [forecast.precision.of_motion(motion) for motion in tried.motions]
+    added = [forecast.precision.of_motion(motion) for motion in tried.usual]
     order = np.argsort([forecast.precision.gain(one) for one in added])
-    middle = int(order[len(order) // 2])
-    sums = forecast.contest.sums([tried.motions[middle]]) if forecast.contest else None
+    middle = int(order[(len(order) - 1) // 2])
+    sums = forecast.contest.sums([tried.usual[middle]]) if forecast.contest else None
     return _Option(tried.design, added[middle], sums)
 
 

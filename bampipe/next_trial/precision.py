@@ -33,8 +33,9 @@ class Precision:
         names: of the estimated parameters, in order.
         sd: (n,) published standard deviations.
         formal_sd: (n,) those of the estimator alone, were noise as it assumes.
-        lasting: (n,) the part of ``sd`` that no further trial like these takes away: of sensors
-            known so well only, and where methods disagree.
+        systematic: (n,) the part of ``sd`` by which methods disagree.
+        lasting: (n,) the part that no further trial takes away: of sensors known so well only, and
+            of friction that is smoothed.
         blocks: of time in the trials at hand, of which the scatter is in ``sd``.
         information: (m, m) of the trials at hand with what was assumed beforehand; the timing of
             the inputs last where it is estimated, m is then n + 1.
@@ -44,6 +45,7 @@ class Precision:
     names: tuple[str, ...]
     sd: Array
     formal_sd: Array
+    systematic: Array
     lasting: Array
     blocks: int
     information: Array
@@ -88,10 +90,7 @@ class Precision:
         names = [system.parameters[i].name for i in problem.free if i < len(p)]
         prior = np.array([assumed[i] if i < len(p) else problem.upper[-1] for i in problem.free])
         entries = [identified.parameters[name] for name in names]
-        lasting = [
-            np.linalg.norm([e.systematic_sd or 0, e.smoothing_sd or 0, e.calibration_sd or 0])
-            for e in entries
-        ]
+        lasting = [np.hypot(e.smoothing_sd or 0.0, e.calibration_sd or 0.0) for e in entries]
         total = np.sum([of_motion(motion) for motion in motions], axis=0)
         total += np.diag(1.0 / np.maximum(prior, 1e-300) ** 2)
         formal = np.sqrt(np.diag(_covariance(total))[: len(names)])
@@ -102,6 +101,7 @@ class Precision:
             tuple(names),
             np.array([e.sd for e in entries]),
             formal,
+            np.array([e.systematic_sd or 0.0 for e in entries]),
             np.array(lasting),
             sum(_blocks_of(motion) for motion in motions),
             np.asarray(total),
@@ -114,6 +114,8 @@ class Precision:
         A published one is what the estimator believes, times how much more blocks of time scatter
         than it believes they do, but never less. That scatter is taken with few blocks, and is
         uncertain accordingly: what it is of one parameter is held against what it is of all.
+        Methods disagree by what each makes of noise that the motion at hand hardly exceeds: the
+        estimate is a mean by information, in which a trial that does exceed it dilutes that.
 
         Args:
             added: (m, m) information of the trials; seconds: of them together.
@@ -124,14 +126,16 @@ class Precision:
             for matrix in (self.information, self.information + added)
         )
         blocks = self.blocks + max(1, int(seconds / _BLOCK_S))
-        statistical = np.sqrt(np.maximum(self.sd**2 - self.lasting**2, 1e-300))
+        rest = self.systematic**2 + self.lasting**2
+        statistical = np.sqrt(np.maximum(self.sd**2 - rest, 1e-300))
         scatter = np.log(statistical / self.formal_sd / self._few(self.blocks))
         trust = _ALIKE**2 / (_ALIKE**2 + 0.5 / max(self.blocks - len(self.information), 1))
         scatter = np.exp(scatter.mean() + trust * (scatter - scatter.mean()))
-        formal = self.formal_sd * np.sqrt(after / before)
-        return np.asarray(
-            np.hypot(formal * np.maximum(scatter * self._few(blocks), 1.0), self.lasting)
-        )
+        share = after / before
+        formal = self.formal_sd * np.sqrt(share)
+        noise = formal * np.maximum(scatter * self._few(blocks), 1.0)
+        apart = np.hypot(share * self.systematic, self.lasting)
+        return np.asarray(np.hypot(noise, apart))
 
     def _few(self, blocks: int) -> float:
         """By how much few blocks widen a standard deviation."""

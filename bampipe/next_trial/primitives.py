@@ -1,4 +1,4 @@
-"""Trials that a person can record: strokes of some axes, within what has been moved before."""
+"""Trials that a person can record: strokes of some axes, within what machine and person can do."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bampipe.physics.device import Device
+from bampipe.physics import System
 from bampipe.trials.motion import Motion
 
 Array = NDArray[np.float64]
@@ -19,13 +19,30 @@ squared, see `PEAK_ACCELERATION` (Flash and Hogan 1985)."""
 PEAK_ACCELERATION = 5.77
 _FEWEST_STROKES = 3
 """In a trial: a sweep too slow for so many is made shorter."""
-_SPEEDS = {"slow": (0.02, 0.08), "moderate": (0.15, 0.35), "fast": (0.35, 0.6)}
+_HIGHEST = 0.6
+_SPEEDS = {"slow": (0.02, 0.08), "moderate": (0.15, 0.35), "fast": (0.35, _HIGHEST)}
 """Bands of the highest speed of each stroke, as shares of the speed seen in the trials: people
 hurry, and whether the model describes what is faster than anything seen is not known."""
 _ACCELERATION = 0.25
 """Share of the acceleration seen, likewise."""
-_SPANS = {"whole": (0.0, 1.0), "middle": (0.33, 0.67), "lower": (0.0, 0.4), "upper": (0.6, 1.0)}
-"""Ends of the strokes, as shares of the range of the trials."""
+_MARGIN = 0.05
+"""Of the range that the device states, from which designs beyond what has been seen keep away."""
+_FASTER = 2.0
+"""Of the highest speed seen: no design is faster, whatever the device allows."""
+_OF_LIMIT = 0.5
+"""Of the speed that the device allows: somebody at twice the speed of a design keeps to it."""
+_HAND_SPEED = 1.0
+"""Of a grip, m/s: hands that reach for something are about so fast (Flash and Hogan 1985)."""
+_WORTHWHILE = 1.1
+"""Of range or speed seen: from there on it is worth going beyond."""
+_NOTABLE = 0.02
+"""Of range or speed: by so much a design exceeds them before it is said to."""
+_SPANS = {
+    "whole": (0.0, 1.0), "middle": (0.33, 0.67), "lower": (0.0, 0.4), "upper": (0.6, 1.0),
+    "low end": (0.0, 0.2), "high end": (0.8, 1.0),
+}  # fmt: skip
+"""Ends of the strokes, as shares of the range of the trials. Half of a stroke near the end is as
+far away from elsewhere as all of it: that somebody covers only half of it costs little."""
 _SMALL = (0.45, 0.55)
 _REST_S = 1.0
 GENTLE = 0.12
@@ -46,6 +63,7 @@ class Envelope:
         speed: (n_q,), rad/s or m/s; acceleration: (n_q,), per s squared.
         field: brake command over speed in the viscous trials by axis, (n_q,); zero without them.
         levels: lowest, usual and highest value of each further channel.
+        wider: the same with what the device allows beyond; None where it allows nothing more.
     """
 
     low: Array
@@ -55,10 +73,16 @@ class Envelope:
     acceleration: Array
     field: Array
     levels: Mapping[str, tuple[float, float, float]]
+    wider: Envelope | None = None
 
     @classmethod
-    def of_trials(cls, motions: Sequence[Motion], device: Device) -> Envelope:
-        """The envelope of ``motions``, within the limits of the device."""
+    def of_trials(cls, motions: Sequence[Motion], system: System, p: Array) -> Envelope:
+        """The envelope of ``motions``, within the limits of the device.
+
+        Args:
+            motions: the trials at hand; system: the model; p: (n_p,) its parameters.
+        """
+        device = system.model.device
         axes = [c.name for c in device.coordinates]
         q, qd, qdd = (
             np.concatenate([getattr(motion, name) for motion in motions])
@@ -72,17 +96,67 @@ class Envelope:
             values = np.concatenate([motion.channels[name] for motion in motions])
             least, usual, most = np.quantile(values, [0.05, 0.5, 0.95])
             levels[name] = (float(least), float(usual), float(most))
-        return cls(
+        seen = cls(
             low, np.maximum(high, low), np.clip(np.median(q, axis=0), low, high),
             np.quantile(np.abs(qd), 0.99, axis=0), np.quantile(np.abs(qdd), 0.99, axis=0),
             np.array([_field_of(motions, device.brakes.get(a), i) for i, a in enumerate(axes)]),
             levels,
         )  # fmt: skip
+        return seen.within(bounds, _speed_limits(motions, system, p))
+
+    def within(self, bounds: Array, speeds: Array) -> Envelope:
+        """The same with what limits of the device allow beyond.
+
+        Faster motion may have the acceleration seen, and no more.
+
+        Args:
+            bounds: (n_q, 2) range of each axis, infinite where none is stated.
+            speeds: (n_q,) highest speed, NaN where none is known.
+        """
+        stated = np.isfinite(bounds[:, 0]) & np.isfinite(bounds[:, 1])
+        bounds = np.where(stated[:, None], bounds, np.column_stack([self.low, self.high]))
+        margin = _MARGIN * (bounds[:, 1] - bounds[:, 0]) * stated
+        low = np.minimum(self.low, bounds[:, 0] + margin)
+        high = np.maximum(self.high, bounds[:, 1] - margin)
+        far = high - low > _WORTHWHILE * (self.high - self.low)
+        highest = np.fmin(_FASTER * self.speed, _OF_LIMIT * speeds) * np.isfinite(speeds)
+        fast = np.nan_to_num(highest) > _WORTHWHILE * _HIGHEST * self.speed
+        if not (far | fast).any():
+            return self
+        wider = replace(
+            self,
+            low=np.where(far, low, self.low),
+            high=np.where(far, high, self.high),
+            speed=np.where(fast, highest / _HIGHEST, self.speed),
+            acceleration=np.where(fast, self.acceleration / _ACCELERATION, self.acceleration),
+        )
+        return replace(self, wider=wider)
+
+    @property
+    def reach(self) -> tuple[Array, Array]:
+        """Lowest and highest positions of all designs, each (n_q,)."""
+        farthest = self.wider or self
+        return farthest.low, farthest.high
 
     @property
     def movable(self) -> list[int]:
         """Axes that the trials have moved."""
         return [i for i in range(len(self.low)) if self.high[i] > self.low[i] and self.speed[i] > 0]
+
+
+def _speed_limits(motions: Sequence[Motion], system: System, p: Array) -> Array:
+    """Highest speed of each axis, (n_q,): of the device, or of a hand; NaN where none is known."""
+    device = system.model.device
+    known = [device.speed_limits.get(axis, np.nan) for axis in system.coordinates]
+    if device.drive or device.prescribed or device.force_unit != "N":
+        return np.array(known)
+    # A force at the grip acts on an axis by the lever by which the axis moves the grip.
+    levers = [
+        np.linalg.norm(system.input_map(m.q, m.inputs(system.inputs), p), axis=2) for m in motions
+    ]
+    longest = np.quantile(np.concatenate(levers), 0.99, axis=0)
+    by_hand = np.where(longest > 0.0, _HAND_SPEED / np.maximum(longest, 1e-12), np.nan)
+    return np.where(np.isnan(known), by_hand, known)
 
 
 def _field_of(motions: Sequence[Motion], brake: str | None, axis: int) -> float:
@@ -105,6 +179,7 @@ class Stroke:
         low, high: where it turns, rad or m.
         slow, fast: band of the highest speed of each stroke, rad/s or m/s.
         rest_s: pause at each turn, s.
+        gentle: whether it is only there so that the axis does not rest.
     """
 
     low: float
@@ -112,6 +187,7 @@ class Stroke:
     slow: float
     fast: float
     rest_s: float = 0.0
+    gentle: bool = False
 
 
 @dataclass(frozen=True)
@@ -143,46 +219,76 @@ def list_primitives(
 ) -> list[Primitive]:
     """Primitives about ``axes``; all other axes move gently about their usual place.
 
-    What rests tells nothing, and estimators that use it all the same believe too much of it.
+    Within what has been seen first, then those that leave it as far as the device allows. What
+    rests tells nothing, and estimators that use it all the same believe too much of it.
     """
+    found = _list_within(seen, seen, seconds, axes, with_rests)
+    if seen.wider is not None:
+        others = _list_within(seen.wider, seen, seconds, axes, with_rests)
+        found += [design for design in others if any(find_beyond(design, seen, _HIGHEST))]
+    return found
+
+
+def find_beyond(
+    design: Primitive, seen: Envelope, share: float = 1.0
+) -> tuple[list[int], list[int]]:
+    """The axes that go farther than has been seen, and those faster than a share of its speed."""
+    slack = _NOTABLE * (seen.high - seen.low)
+    farther = [
+        i
+        for i, stroke in design.strokes.items()
+        if stroke.low < seen.low[i] - slack[i] or stroke.high > seen.high[i] + slack[i]
+    ]
+    faster = [
+        i
+        for i, stroke in design.strokes.items()
+        if stroke.fast > (share + _NOTABLE) * float(seen.speed[i])
+    ]
+    return farther, faster
+
+
+def _list_within(
+    reach: Envelope, seen: Envelope, seconds: float, axes: Sequence[int], with_rests: bool
+) -> list[Primitive]:
+    """Primitives within ``reach``; what moves gently stays within ``seen``."""
     found = [
-        _join(seen, [_strokes_of(seen, seconds, axis, span, band) for axis in seen.movable])
+        _join([_strokes_of(reach, seconds, axis, span, band) for axis in seen.movable])
         for band in _SPEEDS.values()
         for span in (_SPANS["whole"], _SMALL)
         if len(seen.movable) > 1
     ]
     for axis in axes:
         own = [
-            _strokes_of(seen, seconds, axis, span, band)
+            _strokes_of(reach, seconds, axis, span, band)
             for span in _SPANS.values()
             for band in _SPEEDS.values()
         ]
         own += [
-            _strokes_of(seen, seconds, axis, _SMALL, _SPEEDS[name]) for name in ("slow", "fast")
+            _strokes_of(reach, seconds, axis, _SMALL, _SPEEDS[name]) for name in ("slow", "fast")
         ]
         if with_rests:
             wide = [
-                _strokes_of(seen, seconds, axis, _SPANS["whole"], _SPEEDS[name])
+                _strokes_of(reach, seconds, axis, _SPANS["whole"], _SPEEDS[name])
                 for name in ("moderate", "fast")
             ]
             own += [replace(one, strokes=_with_rests(one.strokes)) for one in wide]
         others = [i for i in seen.movable if i != axis]
         gentle = [_gentle(seen, seconds, i, seen.usual[i]) for i in others]
-        found += [_join(seen, [one, *gentle]) for one in own]
+        found += [_join([one, *gentle]) for one in own]
         for other in others:
             # One of them over all of its range.
             beside = [
-                _strokes_of(seen, seconds, i, _SPANS["whole"], _SPEEDS["moderate"])
+                _strokes_of(reach, seconds, i, _SPANS["whole"], _SPEEDS["moderate"])
                 if i == other
                 else _gentle(seen, seconds, i, seen.usual[i])
                 for i in others
             ]
-            whole = _strokes_of(seen, seconds, axis, _SPANS["whole"], _SPEEDS["moderate"])
-            found.append(_join(seen, [whole, *beside]))
+            whole = _strokes_of(reach, seconds, axis, _SPANS["whole"], _SPEEDS["moderate"])
+            found.append(_join([whole, *beside]))
     return found
 
 
-def _join(seen: Envelope, parts: Sequence[Primitive]) -> Primitive:
+def _join(parts: Sequence[Primitive]) -> Primitive:
     """All at once; the first is what it is about."""
     strokes = {axis: stroke for part in parts for axis, stroke in part.strokes.items()}
     return replace(parts[0], strokes=strokes)
@@ -196,7 +302,9 @@ def _gentle(seen: Envelope, seconds: float, axis: int, middle: float) -> Primiti
     """Small easy strokes about a place."""
     share = (middle - seen.low[axis]) / (seen.high[axis] - seen.low[axis])
     ends = np.clip([share - GENTLE, share + GENTLE], 0.0, 1.0)
-    return _strokes_of(seen, seconds, axis, (float(ends[0]), float(ends[1])), _SPEEDS["moderate"])
+    span = float(ends[0]), float(ends[1])
+    found = _strokes_of(seen, seconds, axis, span, _SPEEDS["moderate"])
+    return replace(found, strokes={axis: replace(found.strokes[axis], gentle=True)})
 
 
 def _strokes_of(
@@ -225,10 +333,12 @@ def _strokes_of(
 def vary_surroundings(seen: Envelope, given: Primitive) -> Iterator[Primitive]:
     """The same design with other axes elsewhere, with brakes, and at other levels of channels."""
     for axis in list(given.strokes)[1:]:
-        for share in _POSES:
-            middle = float(seen.low[axis] + share * (seen.high[axis] - seen.low[axis]))
-            moved = _gentle(seen, given.seconds, axis, middle).strokes
-            yield replace(given, strokes={**given.strokes, **moved})
+        for reach in [seen] if seen.wider is None else [seen, seen.wider]:
+            low, high = float(reach.low[axis]), float(reach.high[axis])
+            if reach is seen or high - low > float(seen.high[axis] - seen.low[axis]):
+                for share in _POSES:
+                    moved = _gentle(reach, given.seconds, axis, low + share * (high - low)).strokes
+                    yield replace(given, strokes={**given.strokes, **moved})
     if seen.field.any():
         for field in _FIELDS:
             yield replace(given, field=field)

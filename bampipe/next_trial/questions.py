@@ -49,6 +49,9 @@ def find_ambiguity(found: DiagnoseResult) -> Ambiguity | None:
         known = {c.effect: c.odds for c in contest if c.odds > 0.0}
         ranked = {row.effect: row.score for row in found.ranking}
         alike = {name, *found.groups.get(name, ())}
+        if len(known) > 1:
+            # Replays tell the others from it, however close their scores are.
+            scores = {o: score for o, score in scores.items() if o in known or o in alike}
         scores |= {other: ranked[other] for other in alike - {*scores} if other in ranked}
         if len(scores) < 2 or max(scores.values()) <= 0.0:
             continue

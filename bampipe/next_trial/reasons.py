@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from bampipe.discover.settings import Settings
@@ -12,6 +12,7 @@ from bampipe.results.next import Detectable, Proposal, Purpose
 _SHOWN = 3
 """Parameters or effects that a sentence names."""
 _LIMITS = Settings()
+_UNTRIED = " This forecast takes the model to hold beyond what the trials at hand have shown."
 
 
 @dataclass(frozen=True)
@@ -23,39 +24,66 @@ class Reasons:
 
 
 def explain_proposal(
-    purpose: Purpose, parameter: str, best: Proposal, table: Mapping[str, Detectable]
+    purpose: Purpose,
+    parameter: str,
+    best: Proposal,
+    table: Mapping[str, Detectable],
+    unlimited: Sequence[str],
 ) -> Reasons:
     """Say why a trial is proposed and what it is expected to give.
 
     Args:
         purpose: of the trial; parameter: the one that it is for, "" for all.
         best: the proposal; table: by effect, from which size on trials show it.
+        unlimited: axes of which the device states no range, so that nothing wider was tried.
     """
+    why, expected = _explain(purpose, parameter, best, table, unlimited)
+    return Reasons(why, expected + (_UNTRIED if best.farther or best.faster else ""))
+
+
+def _explain(
+    purpose: Purpose,
+    parameter: str,
+    best: Proposal,
+    table: Mapping[str, Detectable],
+    unlimited: Sequence[str],
+) -> tuple[str, str]:
+    """Why, and what is expected as far as the model goes."""
     if purpose == "decision":
-        return _decision(best)
+        return _decision(best, unlimited)
     if purpose == "sensitivity":
-        return Reasons(_unseen(table), _detected(table) or _narrowed(parameter, best))
+        return _unseen(table), _detected(table) or _narrowed(parameter, best)
     most = (
         f"says most of `{parameter}`"
         if parameter
         else "adds most to what is known of all parameters together"
     )
-    return Reasons(f"Of the motions tried, this one {most}.", _narrowed(parameter, best))
+    return f"Of the motions tried, this one {most}.", _narrowed(parameter, best)
 
 
-def _decision(best: Proposal) -> Reasons:
+def _decision(best: Proposal, unlimited: Sequence[str]) -> tuple[str, str]:
     pair = max(best.confusion, key=lambda pair: pair.weight * pair.before)
     before, after = _chance(pair.before), _chance(pair.after)
     expected = (
         f"The chance of confusing them is expected to fall from {before} to {after}."
         if pair.after < _LIMITS.lowered * pair.before
-        else f"No trial tried tells them apart: the chance would be {after} after this one. A wider"
-        " motion, or another load, may."
+        else f"No trial tried tells them apart: the chance would be {after} after this one."
+        f" {_remedy(unlimited)}"
     )
-    return Reasons(
+    why = (
         f"These trials do not distinguish {pair.between[0]} from {pair.between[1]}: the chance of"
-        f" confusing them is {before}.",
-        expected,
+        f" confusing them is {before}."
+    )
+    return why, expected
+
+
+def _remedy(unlimited: Sequence[str]) -> str:
+    """What may tell apart what no design does."""
+    if not unlimited:
+        return "Another load may."
+    return (
+        f"Another load may, or a wider motion: the device file states no [limits] of"
+        f" {join_names(unlimited, _SHOWN)}, so that none was tried."
     )
 
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
 from bampipe.lists import join_names
-from bampipe.next_trial.primitives import GENTLE, PEAK, Envelope, Primitive, Stroke
+from bampipe.next_trial.primitives import PEAK, Envelope, Primitive, Stroke, find_beyond
 from bampipe.physics.device import Device
 
 _SLOW, _FAST = 0.12, 0.45
@@ -18,7 +19,7 @@ def describe(design: Primitive, seen: Envelope, device: Device) -> str:
     """Say what to do in one sentence."""
     axes = device.coordinates
     first = design.axis
-    beside = [i for i, one in design.strokes.items() if i != first and _is_gentle(one, seen, i)]
+    beside = [i for i, one in design.strokes.items() if one.gentle]
     strokes = {i: one for i, one in design.strokes.items() if i not in beside}
     names = [axes[i].name for i in strokes]
     ends = [_ends(one, axes[i].unit) for i, one in strokes.items()]
@@ -47,19 +48,34 @@ def describe(design: Primitive, seen: Envelope, device: Device) -> str:
     for name, level in (design.levels or {}).items():
         unit = device.channels[name]
         text += f"; with {name} held at {level:.3g} {unit}".rstrip()
+    farther, faster = ([axes[i].name for i in group] for group in find_beyond(design, seen))
+    if farther or faster:
+        text += _beyond(farther, faster)
     return text + "."
 
 
-def _is_gentle(stroke: Stroke, seen: Envelope, axis: int) -> bool:
-    return bool(stroke.high - stroke.low <= (2.0 * GENTLE + 0.01) * (seen.high - seen.low)[axis])
+def _beyond(farther: Sequence[str], faster: Sequence[str]) -> str:
+    """What a design asks of the machine that no trial at hand has asked."""
+    if farther and faster and set(farther) == set(faster):
+        text = f"{join_names(farther)} farther and faster"
+    else:
+        parts = (farther, "farther"), (faster, "faster")
+        text = " and ".join(f"{join_names(names)} {how}" for names, how in parts if names)
+    return f"; this takes {text} than so far" + (": try the way slowly first" if farther else "")
 
 
 def _about(stroke: Stroke, unit: str) -> str:
     """Around where an axis is moved, and how far."""
     middle, half = 0.5 * (stroke.low + stroke.high), 0.5 * (stroke.high - stroke.low)
     if unit == "rad":
-        return f"{math.degrees(middle):.0f}° ± {math.degrees(half):.0f}°".replace("-", "−")
-    return f"{1e3 * middle:.0f} ± {1e3 * half:.0f} mm".replace("-", "−")
+        text = f"{_rounded(math.degrees(middle), 0)}° ± {_rounded(math.degrees(half), 0)}°"
+        return text.replace("-", "−")
+    return f"{_rounded(1e3 * middle, 0)} ± {_rounded(1e3 * half, 0)} mm".replace("-", "−")
+
+
+def _rounded(value: float, digits: int) -> str:
+    """A number with so many digits behind the point, and without the sign of a zero."""
+    return f"{round(value, digits) + 0.0:.{digits}f}"
 
 
 def _pace(stroke: Stroke, seen: Envelope, axis: int) -> str:
@@ -72,12 +88,12 @@ def _pace(stroke: Stroke, seen: Envelope, axis: int) -> str:
 def _ends(stroke: Stroke, unit: str) -> str:
     """Where to turn: degrees or millimetres first, for a person; the unit of the files after."""
     if unit == "rad":
-        low, high = math.degrees(stroke.low), math.degrees(stroke.high)
-        text = f"between {low:.0f}° and {high:.0f}° ({stroke.low:.2f} to {stroke.high:.2f} rad)"
-        return text.replace("-", "−")
-    low, high = 1e3 * stroke.low, 1e3 * stroke.high
-    digits = 0 if high - low > 10.0 else 2
-    return f"between {low:.{digits}f} and {high:.{digits}f} mm".replace("-", "−")
+        low, high = (_rounded(math.degrees(end), 0) for end in (stroke.low, stroke.high))
+        radians = f"{_rounded(stroke.low, 2)} to {_rounded(stroke.high, 2)} rad"
+        return f"between {low}° and {high}° ({radians})".replace("-", "−")
+    digits = 0 if stroke.high - stroke.low > 0.01 else 2
+    low, high = (_rounded(1e3 * end, digits) for end in (stroke.low, stroke.high))
+    return f"between {low} and {high} mm".replace("-", "−")
 
 
 def _times(stroke: Stroke) -> str:

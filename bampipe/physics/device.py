@@ -21,6 +21,7 @@ from bampipe.schema import (
     Distinct,
     NamedDeclaration,
     NotNegative,
+    Positive,
     Several,
     Text,
     read,
@@ -136,6 +137,7 @@ class Limits(Declaration):
 
     lower: PhysicalNumber = Field(description="Least position, rad or m")
     upper: PhysicalNumber = Field(description="Largest position, rad or m")
+    speed: Positive | None = Field(default=None, description="Highest speed, rad/s or m/s")
 
     def cross_faults(self) -> Iterator[InputError]:
         if not self.lower < self.upper:
@@ -193,7 +195,9 @@ class Device(Declaration):
         default=(), alias="parameters", description="Other numbers to estimate"
     )
     ranges: dict[Name, Limits] = Field(
-        default={}, alias="limits", description="Range that the simulator stays in, by coordinate"
+        default={},
+        alias="limits",
+        description="Range that the simulator and proposed trials stay in, by coordinate",
     )
     controller: Controller | None = Field(
         default=None, description="How the force was commanded, for free runs"
@@ -262,6 +266,12 @@ class Device(Declaration):
     def limits(self) -> Mapping[str, tuple[float, float]]:
         """Range of each coordinate that has one, rad or m."""
         return {axis: (entry.lower, entry.upper) for axis, entry in self.ranges.items()}
+
+    @property
+    def speed_limits(self) -> Mapping[str, float]:
+        """Highest speed of each coordinate of which one is known, rad/s or m/s."""
+        drawn = {j.name: j.velocity for j in self.robot.joints if j.velocity} if self.robot else {}
+        return drawn | {axis: e.speed for axis, e in self.ranges.items() if e.speed is not None}
 
     def cross_faults(self) -> Iterator[InputError]:
         missing = [key for key in _NEEDED if key not in self.model_fields_set]

@@ -29,7 +29,7 @@ class ExpectedSd(Record):
     """Standard deviation of one parameter."""
 
     before: Size = Field(description="As published")
-    after: Size = Field(description="Median over versions of the trial")
+    after: Size = Field(description="Median of those who follow it")
     after_at_worst: Size = Field(description="Of nine trials in ten")
     unit: str
 
@@ -40,7 +40,7 @@ class ExpectedConfusion(Record):
     between: Names
     weight: Share = Field(description="Box-Hill weight of the pair: product of the odds")
     before: Share
-    after: Share = Field(description="Median over versions of the trial")
+    after: Share = Field(description="Median of those who follow it")
     distance_before: Size = Field(description="Expected log likelihood ratio, nats")
     distance_after: Size
     left: dict[str, Size] = Field(
@@ -63,6 +63,8 @@ class Proposal(Record):
         default={}, description="By parameter; none where the model lacks something"
     )
     confusion: tuple[ExpectedConfusion, ...] = ()
+    farther: Names = Field(default=(), description="Axes moved farther than in the trials at hand")
+    faster: Names = Field(default=(), description="Axes moved faster than there")
 
 
 class Detectable(Record):

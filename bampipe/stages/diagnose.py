@@ -266,7 +266,7 @@ def _with_suggestion(
     contest = make_contest(trials, recipe, p, asked, values, floor)
     if contest is None:
         return result
-    seen = Envelope.of_trials(trials.motions, system.model.device)
+    seen = Envelope.of_trials(trials.motions, system, p)
     rehearsal = Rehearsal(system, p, trials.sensors, trials.kinematics, seen, settings.seed)
     fitted = [trials.motions[k] for k in trials.folds.fitted_trials]
     at_hand = contest.sums(fitted)
@@ -277,7 +277,7 @@ def _with_suggestion(
         seen.movable,
         with_rests=True,
     )[0]
-    now, sums = contest.contrasts(at_hand), [contest.sums([motion]) for motion in tried.motions]
+    now, sums = contest.contrasts(at_hand), [contest.sums([motion]) for motion in tried.usual]
     then = [contest.contrasts(at_hand + new, new) for new in sums]
     weights = contest.weights()
     pair = max(weights, key=lambda pair: weights[pair] * now[pair].confusion)

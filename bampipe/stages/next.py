@@ -124,7 +124,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     floor = _floor(run, config.model, diagnosed, evidence)
     fitted = [trials.motions[k] for k in trials.folds.fitted_trials]
     noise = sensor_noise(trials.sensors, system, fitted, p, FilterChoice())
-    seen = Envelope.of_trials(trials.motions, model.device)
+    seen = Envelope.of_trials(trials.motions, system, p)
     rehearsal = Rehearsal(system, p, trials.sensors, trials.kinematics, seen, config.seed)
     precision = Precision.of_trials(system, fitted, trials.band, p, found, noise)
     contest, blindness = None, None
@@ -175,7 +175,8 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
             if entry.after > goal.sd[precision.names.index(name)]:
                 tried += rank(_worth("precision", name, forecast, None), False, 0.92)[:1]
         plan = record_plan(forecast, goal, plan_trials(forecast, tried, goal))
-    reasons = explain_proposal(chosen, parameter, best, table)
+    unlimited = [axis for axis in system.coordinates if axis not in model.device.limits]
+    reasons = explain_proposal(chosen, parameter, best, table, unlimited)
     result = NextResult(
         model=config.model,
         purpose=chosen,
@@ -295,7 +296,7 @@ def _worth(
 
 def _sensitivity(blindness: Blindness, best: Tried) -> dict[str, Detectable]:
     """The smallest strength of each effect that shows, without and with the best trial."""
-    after = np.median([blindness.factors_with([motion]) for motion in best.motions], axis=0)
+    after = np.median([blindness.factors_with([motion]) for motion in best.usual], axis=0)
     axes = blindness.contest.system.coordinates
     return {
         found.rival.name: Detectable(

@@ -92,6 +92,9 @@ inertia = {{ unit = "kg.m2", prior = 2.0, sd = 3.0, lower = 0.05 }}
 moment = {{ unit = "N.m", prior = 20.0, sd = 20.0 }}
 moment_across = {{ unit = "N.m", prior = 0.0, sd = 20.0 }}
 offset = {{ unit = "N.m", prior = 0.0, sd = 5.0 }}
+
+[limits]
+joint = {{ lower = -1.5, upper = 1.5, speed = 3.0 }}
 """
 
 

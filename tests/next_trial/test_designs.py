@@ -2,24 +2,30 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from bampipe.estimate.low_pass import Band
+from bampipe.next_trial.choice import rank_designs
 from bampipe.next_trial.discrimination import Contest, Rival, Sums
-from bampipe.next_trial.motion import Rehearsal, stroke_path
+from bampipe.next_trial.motion import Rehearsal, follow_roughly, stroke_path
 from bampipe.next_trial.precision import Precision
 from bampipe.next_trial.primitives import (
     Envelope,
     Primitive,
     Stroke,
+    find_beyond,
     list_primitives,
     vary_surroundings,
 )
+from bampipe.next_trial.reasons import explain_proposal
 from bampipe.next_trial.words import describe
-from bampipe.physics import registry
+from bampipe.physics import Model, compile_model, registry
+from bampipe.results.next import ExpectedConfusion, Proposal
+from bampipe.trials.motion import Motion
 
 SEEN = Envelope(
     low=np.array([-0.7, -0.4, 0.8]),
@@ -32,13 +38,24 @@ SEEN = Envelope(
 )
 
 
-def every_design() -> list[Primitive]:
-    first = list_primitives(SEEN, 20.0, [0, 1, 2], with_rests=True)
-    return [*first, *(other for one in first for other in vary_surroundings(SEEN, one))]
+NOTHING_STATED = np.tile([-np.inf, np.inf], (3, 1)), np.full(3, np.nan)
+LIMITS = np.array([[-2.0, 2.0], [-1.2, 1.2], [0.75, 1.45]])
+TIMID = replace(
+    SEEN,
+    low=np.array([0.1, 0.0, 0.8]),
+    high=np.array([0.4, 0.2, 1.4]),
+    usual=np.array([0.25, 0.05, 1.1]),
+)
 
 
-def test_no_design_leaves_what_the_trials_have_shown():
-    designs = every_design()
+def every_design(seen: Envelope) -> list[Primitive]:
+    first = list_primitives(seen, 20.0, [0, 1, 2], with_rests=True)
+    return [*first, *(other for one in first for other in vary_surroundings(seen, one))]
+
+
+def test_where_the_device_states_nothing_no_design_leaves_what_the_trials_have_shown():
+    assert SEEN.within(*NOTHING_STATED) is SEEN
+    designs = every_design(SEEN)
     assert len(designs) > 100
     for design in designs:
         for axis, stroke in design.strokes.items():
@@ -47,6 +64,86 @@ def test_no_design_leaves_what_the_trials_have_shown():
             hardest = 5.7735 * stroke.fast**2 / 1.875**2 / (stroke.high - stroke.low)
             assert hardest <= SEEN.acceleration[axis]
         assert 0.0 <= design.field <= 1.0
+
+
+def test_designs_go_beyond_as_far_as_the_device_allows_and_no_farther():
+    speeds = np.array([20.0, 1.0, np.nan])
+    seen = TIMID.within(LIMITS, speeds)
+    designs = every_design(seen)
+    fastest = np.zeros(3)
+    for design in designs:
+        for axis, stroke in design.strokes.items():
+            low, high = LIMITS[axis]
+            margin = 0.05 * (high - low) - 1e-9
+            assert min(low + margin, seen.low[axis]) <= stroke.low < stroke.high
+            assert stroke.high <= max(high - margin, seen.high[axis])
+            hardest = 5.7735 * stroke.fast**2 / 1.875**2 / (stroke.high - stroke.low)
+            assert hardest <= 1.001 * seen.acceleration[axis]
+            fastest[axis] = max(fastest[axis], stroke.fast)
+        farther, faster = find_beyond(design, seen)
+        # An axis whose range is nearly seen, and whose speed nobody states, stays as it was.
+        assert 2 not in (*farther, *faster)
+    # Twice what was seen of yaw; half of what is stated of pitch is less than was seen of it.
+    assert seen.speed[0] < fastest[0] <= 2.0 * seen.speed[0]
+    assert fastest[1] == pytest.approx(0.6 * seen.speed[1])
+    assert fastest[2] == pytest.approx(0.6 * seen.speed[2])
+    inside = list_primitives(TIMID, 20.0, [0, 1, 2], with_rests=True)
+    assert list_primitives(seen, 20.0, [0, 1, 2], with_rests=True)[: len(inside)] == inside
+
+
+@pytest.mark.parametrize(("pays", "first_is_beyond"), [(1.5, True), (1.02, False)])
+def test_going_beyond_what_has_been_seen_has_to_pay(pays, first_is_beyond):
+    seen = TIMID.within(LIMITS, np.full(3, 20.0))
+    rehearsal = SimpleNamespace(
+        seen=seen,
+        sensors=SimpleNamespace(rate_hz=10.0),
+        system=SimpleNamespace(parameters=("mass",)),
+        record=lambda design, version: design,
+    )
+
+    def worth(design: Primitive) -> float:
+        return pays if any(find_beyond(design, seen)) else 1.0
+
+    tried = rank_designs(rehearsal, worth, 20.0, [0, 1, 2], with_rests=True)
+    are_beyond = [any(find_beyond(one.design, seen)) for one in tried]
+    assert are_beyond[0] is first_is_beyond
+    # Who does not want to go there finds another one.
+    assert not all(are_beyond)
+    assert next(one.worth for one in tried if any(find_beyond(one.design, seen))) == pays
+
+
+def test_who_follows_roughly_stays_within_the_device_too():
+    system = SimpleNamespace(coordinates=("a", "b", "c"))
+    seen = TIMID.within(LIMITS, np.full(3, np.nan))
+    rehearsal = Rehearsal(system, np.zeros(0), None, None, seen, 0)
+    lowest, highest = seen.reach
+    for design in list_primitives(seen, 20.0, [0], with_rests=False)[-8:]:
+        for version in range(1, 9):
+            followed = follow_roughly(design, rehearsal.seen, np.random.default_rng(version), False)
+            for axis, stroke in followed.strokes.items():
+                assert lowest[axis] <= stroke.low < stroke.high <= highest[axis]
+
+
+def test_a_hand_moves_no_faster_than_hands_do():
+    system = compile_model(Model(registry.device("bam")))
+    t = np.arange(500) / 100.0
+    slow = 0.1 * np.sin(t)
+    q = np.column_stack([slow, slow, 1.0 + slow])
+    qd = np.column_stack([0.3 * np.cos(t), 3.0 * np.cos(t), 0.1 * np.cos(t)])
+    channels = {"t": t} | {
+        name: np.zeros(t.size)
+        for name in system.inputs
+        if name != "t" and name not in system.coordinates
+    }
+    motion = Motion("t01", t, q, qd, np.ones_like(q), np.zeros_like(q), channels)
+    seen = Envelope.of_trials([motion], system, system.prior)
+    assert seen.wider is not None
+    highest = 0.6 * seen.wider.speed
+    # At the end of a rod of 1.1 m, half a metre a second.
+    assert highest[0] == pytest.approx(0.5 / 1.1, rel=0.02)
+    # Twice what was seen, where that is less; and what was seen, where that is more.
+    assert highest[2] == pytest.approx(0.2, rel=0.01)
+    assert seen.wider.speed[1] == seen.speed[1]
 
 
 def test_no_axis_rests_unless_the_design_says_so():
@@ -92,11 +189,68 @@ def test_a_sentence_says_where_how_fast_and_how_long():
     assert " mm" in said
 
 
-def made_precision(sd: float, formal: float, blocks: int) -> Precision:
+def test_a_zero_has_no_sign():
+    said = describe(
+        Primitive({0: Stroke(-0.002, 0.4, 0.5, 1.0)}, SEEN.usual, 20.0),
+        SEEN,
+        registry.device("bam"),
+    )
+    assert "between 0° and 23° (0.00 to 0.40 rad)" in said
+
+
+def test_a_sentence_says_what_goes_beyond_the_trials_at_hand():
+    device, seen = registry.device("bam"), TIMID.within(LIMITS, np.full(3, 20.0))
+    far, fast = Stroke(-1.0, 1.0, 0.5, 1.0), Stroke(0.1, 0.4, 3.0, 4.0)
+    gentle = {1: Stroke(0.05, 0.1, 0.1, 0.2, gentle=True), 2: Stroke(0.9, 1.0, 0.1, 0.2)}
+    for stroke, ending in (
+        (far, "; this takes yaw farther than so far: try the way slowly first."),
+        (fast, "; this takes yaw faster than so far."),
+        (replace(far, fast=4.0), "; this takes yaw farther and faster than so far: try the way"),
+    ):
+        assert ending in describe(Primitive({0: stroke, **gentle}, seen.usual, 20.0), seen, device)
+    both = Primitive({0: fast, 1: Stroke(-0.9, -0.5, 0.1, 0.2, gentle=True)}, seen.usual, 20.0)
+    said = describe(both, seen, device)
+    assert "this takes pitch farther and yaw faster than so far: try the way slowly first" in said
+    assert "keep pitch moving gently, −40° ± 11°" in said
+    near = list_primitives(TIMID, 20.0, [0], with_rests=False)[6]
+    assert "than so far" not in describe(near, seen, device)
+
+
+def made_proposal(after: float, farther: tuple[str, ...] = ()) -> Proposal:
+    pair = ExpectedConfusion(
+        between=("force_gain:x", "base_tilt"), weight=1.0, before=0.4, after=after,
+        distance_before=0.1, distance_after=9.0, left={"yaw": 1.0},
+    )  # fmt: skip
+    return Proposal(
+        sentence="Move yaw.", seconds=20.0, moves={}, pose={}, worth=-after, information_gain=0.0,
+        confusion=(pair,), farther=farther,
+    )  # fmt: skip
+
+
+def test_a_forecast_beyond_the_trials_at_hand_is_said_to_be_the_models():
+    said = explain_proposal("decision", "", made_proposal(0.01, ("yaw",)), {}, ()).expected
+    assert said.startswith("The chance of confusing them is expected to fall from 40 % to")
+    assert said.endswith("takes the model to hold beyond what the trials at hand have shown.")
+    assert "beyond" not in explain_proposal("decision", "", made_proposal(0.01), {}, ()).expected
+
+
+def test_where_nothing_decides_it_is_said_what_was_not_tried():
+    said = explain_proposal("decision", "", made_proposal(0.39), {}, ["yaw", "pitch"]).expected
+    assert said.endswith(
+        "the device file states no [limits] of yaw and pitch, so that none was tried."
+    )
+    said = explain_proposal("decision", "", made_proposal(0.39), {}, []).expected
+    assert said.endswith("39 % after this one. Another load may.")
+
+
+def made_precision(
+    sd: float, formal: float, blocks: int, apart: float = 0.0, lasting: float = 0.0
+) -> Precision:
     information = np.diag([1.0 / formal**2, 1.0])
     return Precision(
-        ("mass",), np.array([sd]), np.array([formal]), np.zeros(1), blocks, information, lambda m: m
-    )
+        ("mass",), np.array([sd]), np.array([formal]), np.array([apart]), np.array([lasting]),
+        blocks, information, lambda m: m,
+    )  # fmt: skip
 
 
 def test_twice_the_information_narrows_an_uncertainty_by_the_root_of_two():
@@ -111,6 +265,15 @@ def test_what_few_blocks_widen_goes_with_more_of_them():
     nothing = np.zeros((2, 2))
     assert few.sd_with(nothing, 0.0)[0] < few.sd[0]
     assert few.sd_with(nothing, 1000.0)[0] == pytest.approx(0.01, rel=0.02)
+
+
+def test_what_methods_disagree_by_is_diluted_and_what_a_calibration_leaves_open_stays():
+    known = made_precision(np.sqrt(0.01**2 + 0.04**2 + 0.02**2), 0.01, 10_000, 0.04, 0.02)
+    nothing, much = np.zeros((2, 2)), 1e6 * known.information
+    assert known.sd_with(nothing, 0.0)[0] == pytest.approx(known.sd[0], rel=1e-3)
+    assert known.sd_with(much, 20.0)[0] == pytest.approx(0.02, rel=1e-3)
+    threefold = known.sd_with(3.0 * known.information, 20.0)[0]
+    assert threefold**2 == pytest.approx(0.01**2 / 4.0 + 0.04**2 / 16.0 + 0.02**2, rel=1e-3)
 
 
 def contest_of(odds: list[float], floor: float = 1.0) -> Contest:
