@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from bampipe.discover.bench import Bench
 from bampipe.discover.chance import Progress, candidates_of
 from bampipe.discover.influence import largest_second, largest_trial, score_without
-from bampipe.discover.rivals import plausible, replay_rivals
+from bampipe.discover.rivals import plausible, replay_rivals, without_mere_offsets
 from bampipe.discover.scorer import Score, Scorer
 from bampipe.discover.settings import Settings
 from bampipe.discover.start import with_effect, without_effect
@@ -211,7 +211,9 @@ def _swap_by_replay(
         # None looks like the measurement: those that do no worse are no less likely.
         likely = [n for n in close if misfits[n] <= misfits[mine.effect]] + [mine.effect]
     if mine.effect in likely:
-        return likely, None
+        alike = [n for n in likely if n != mine.effect]
+        known = fewer.recipe, fewer.evidence, scores
+        return [mine.effect, *without_mere_offsets(bench, *known, alike)], None
     return likely, extend_set(bench, fewer, scores[likely[0]])
 
 

@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.discover.bench import Bench
+from bampipe.discover.candidates import Candidate
 from bampipe.discover.chance import Progress, candidates_of
+from bampipe.discover.columns import added_columns
 from bampipe.discover.influence import SampleRange, largest_second, score_without
 from bampipe.discover.level import Level
 from bampipe.discover.scorer import Score, Scorer
@@ -118,7 +120,40 @@ def choose(
     if plain != winner:
         alike = (winner, *[n for n in alike if n != plain])
         winner = plain
+    alike = without_mere_offsets(bench, recipe, evidence, scores, alike)
     return Choice(winner, alike[: s.most_alike], transient)
+
+
+def without_mere_offsets(
+    bench: Bench,
+    recipe: Recipe,
+    evidence: Evidence,
+    scores: Mapping[str, Score],
+    alike: Sequence[str],
+) -> tuple[str, ...]:
+    """Those of ``alike`` that add more than a constant: a spring of no stiffness is no spring.
+
+    Args:
+        bench: the session.
+        recipe, evidence: the model without any of them, fitted.
+        scores: of them against it; alike: those that fit as well as another.
+    """
+    return tuple(
+        item.name
+        for item in candidates_of(recipe, alike)
+        if not _is_mere_offset(evidence, item, scores[item.name], bench.settings)
+    )
+
+
+def _is_mere_offset(evidence: Evidence, item: Candidate, score: Score, s: Settings) -> bool:
+    """Whether nearly all that an effect adds to the residual is its offset."""
+    moving = [not item.parameters[i].offset for i in item.linear_indices]
+    if all(moving):
+        return False
+    columns, _ = added_columns(evidence, item, score.values[list(item.searched_indices)])
+    parts = np.concatenate(columns) * score.values[list(item.linear_indices)]
+    whole, rest = (float(np.sum(parts[:, :, which].sum(axis=2) ** 2)) for which in (..., moving))
+    return rest < s.idle**2 * whole
 
 
 def replay_rivals(

@@ -81,6 +81,8 @@ class Settings:
             called the same, as of a spring, or opposite, as of friction.
         bump_height: share of the largest mean residual from which on a place belongs to a bump;
             bump_width: share of the range up to which it is one, and not a broad change.
+        idle: share of what an effect adds, as a root mean square, that must be more than its offset
+            for it to be a rival of effects that add a constant.
         most_alike: the most effects that are said to be no different from the one found.
         draft_replicates: replays on which a formula is searched as on the measurement, twice as
             many more where the decision is close; draft_significance: chance of a formula where
@@ -144,6 +146,7 @@ class Settings:
     mentioned_share: float = 0.005
     bump_height: float = 0.5
     bump_width: float = 1.0 / 3.0
+    idle: float = 0.1
     most_alike: int = 2
     draft_replicates: int = 6
     draft_significance: float = 0.01

@@ -40,6 +40,9 @@ class Parameter(NamedDeclaration):
         default=math.inf, allow_inf_nan=True, description="Physical bound"
     )
     strength: bool = Field(default=False, description="The effect is absent where this is 0")
+    offset: bool = Field(
+        default=False, description="Where it is all that an effect adds, that is a mere constant"
+    )
     fixed: bool = Field(default=False, description="Held at its prior, never estimated")
     weighed: bool = Field(
         default=False,

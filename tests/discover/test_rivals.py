@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
+from sessions import bam, made
 
+from bampipe.discover.chance import candidates_of, fit_trials, system_of
 from bampipe.discover.polish import comes_close
-from bampipe.discover.rivals import _misfit, plausible
+from bampipe.discover.rivals import _misfit, plausible, without_mere_offsets
+from bampipe.discover.scorer import Scorer
 from bampipe.discover.settings import Settings
 from bampipe.results.diagnose import Contender
 
@@ -63,3 +68,28 @@ def test_a_rival_is_close_by_any_score(rival, close):
 
 def test_a_score_that_gains_nothing_is_no_measure_of_closeness():
     assert not comes_close(contender(0.0, 0.0), contender(137.0, -311.0), S)
+
+
+@pytest.mark.parametrize(
+    ("hidden", "values", "alike"),
+    [
+        (
+            "force_bias:z",
+            {"force_bias.z.bias": 1.0},
+            ("force_bias:z", "asymmetric_coulomb:extension"),
+        ),
+        (
+            "return_spring:extension",
+            {"return_spring.extension.stiffness": 12.0, "return_spring.extension.offset": 12.6},
+            ("force_bias:z", "return_spring:extension", "asymmetric_coulomb:extension"),
+        ),
+    ],
+)
+def test_a_spring_of_no_stiffness_is_no_rival_of_a_bias(hidden, values, alike):
+    session, recipe = made(bam([hidden]), values, trials=2), bam()
+    evidence = fit_trials(session, recipe, system_of(recipe).prior)
+    names = ["force_bias:z", "return_spring:extension", "asymmetric_coulomb:extension"]
+    scores = {c.name: Scorer(evidence).score(c) for c in candidates_of(recipe, names)}
+    bench = SimpleNamespace(settings=S)
+    found = without_mere_offsets(bench, recipe, evidence, scores, names)
+    assert found == alike
