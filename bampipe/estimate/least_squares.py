@@ -298,9 +298,8 @@ def _sandwich(problem: Problem, stacked: Sequence[Stacked], block_s: float) -> A
     bread, meat, blocks = np.diag(problem.precision), np.zeros((n_free, n_free)), 0
     for s in stacked:
         slope = s.slope * weight[None, :, None]
-        flat = slope.reshape(-1, n_free)
-        bread += flat.T @ flat
-        score = ((s.residual * weight)[:, None, :] @ slope)[:, 0]
+        bread += np.einsum("tqi,tqj->ij", slope, slope)
+        score = np.einsum("tqi,tq->ti", slope, s.residual * weight)
         for start in range(0, len(score), samples):
             part = score[start : start + samples].sum(axis=0)
             meat += np.outer(part, part)
