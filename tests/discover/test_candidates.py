@@ -10,9 +10,9 @@ from independent_runs import device_of, record_trials
 
 from bampipe.discover.candidates import build_candidate_model, compile_candidate
 from bampipe.discover.chance import fit_trials, system_of
+from bampipe.discover.growth import collapses
 from bampipe.discover.polish import FittedSet
 from bampipe.discover.scorer import Scorer
-from bampipe.discover.search import collapses
 from bampipe.discover.settings import Settings
 from bampipe.discover.start import search_start
 from bampipe.physics import registry

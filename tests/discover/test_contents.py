@@ -9,8 +9,8 @@ import pytest
 from sessions import BAND, KINEMATICS, SENSORS, folds, made
 
 from bampipe.discover import chance
+from bampipe.discover.growth import _keeps_the_floor
 from bampipe.discover.scorer import Scorer
-from bampipe.discover.search import _keeps_the_floor
 from bampipe.discover.settings import Settings
 from bampipe.discover.shape import worst_windows
 from bampipe.physics import registry

@@ -5,8 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from bampipe.discover import search as search_of
-from bampipe.discover import verdict
+from bampipe.discover import growth, verdict
 from bampipe.discover.settings import Settings
 from bampipe.results.diagnose import Stretch
 
@@ -66,11 +65,11 @@ def test_what_is_added_and_refused_stands_with_what_it_did(monkeypatch, error, w
             scorer=SimpleNamespace(independent_samples=np.array([100.0])),
         )  # fmt: skip
 
-    monkeypatch.setattr(search_of, "error_without_second", lambda e, axis: (None, e.rest))
+    monkeypatch.setattr(growth, "error_without_second", lambda e, axis: (None, e.rest))
     score = SimpleNamespace(gain=np.array([60.0]))
     addition = SimpleNamespace(score=score, excess=np.array([60.0]))
     before, after = fitted(1.0, 0.9, 1.0), fitted(error, without, slope)
-    found = search_of._refusal("lag:x", addition, before, after, Settings())
+    found = growth.describe_refusal("lag:x", addition, before, after, Settings())
     assert (found.axis, found.why) == ("elbow", why)
     assert (found.held_out_rmse_before, found.held_out_rmse_after) == (1.0, error / slope)
     assert found.without_worst_second_after == without / slope
