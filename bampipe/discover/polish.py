@@ -212,8 +212,8 @@ def _swap_by_replay(
         likely = [n for n in close if misfits[n] <= misfits[mine.effect]] + [mine.effect]
     if mine.effect in likely:
         alike = [n for n in likely if n != mine.effect]
-        known = fewer.recipe, fewer.evidence, scores
-        return [mine.effect, *without_mere_offsets(bench, *known, alike)], None
+        rivals = without_mere_offsets(fewer.recipe, fewer.evidence, scores, alike, bench.settings)
+        return [mine.effect, *rivals], None
     return likely, extend_set(bench, fewer, scores[likely[0]])
 
 

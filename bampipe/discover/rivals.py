@@ -120,28 +120,28 @@ def choose(
     if plain != winner:
         alike = (winner, *[n for n in alike if n != plain])
         winner = plain
-    alike = without_mere_offsets(bench, recipe, evidence, scores, alike)
+    alike = without_mere_offsets(recipe, evidence, scores, alike, s)
     return Choice(winner, alike[: s.most_alike], transient)
 
 
 def without_mere_offsets(
-    bench: Bench,
     recipe: Recipe,
     evidence: Evidence,
     scores: Mapping[str, Score],
     alike: Sequence[str],
+    s: Settings,
 ) -> tuple[str, ...]:
     """Those of ``alike`` that add more than a constant: a spring of no stiffness is no spring.
 
     Args:
-        bench: the session.
         recipe, evidence: the model without any of them, fitted.
         scores: of them against it; alike: those that fit as well as another.
+        s: what share of an effect must be more than its offset.
     """
     return tuple(
         item.name
         for item in candidates_of(recipe, alike)
-        if not _is_mere_offset(evidence, item, scores[item.name], bench.settings)
+        if not _is_mere_offset(evidence, item, scores[item.name], s)
     )
 
 

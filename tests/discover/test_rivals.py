@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 from sessions import bam, made
@@ -90,6 +88,5 @@ def test_a_spring_of_no_stiffness_is_no_rival_of_a_bias(hidden, values, alike):
     evidence = fit_trials(session, recipe, system_of(recipe).prior)
     names = ["force_bias:z", "return_spring:extension", "asymmetric_coulomb:extension"]
     scores = {c.name: Scorer(evidence).score(c) for c in candidates_of(recipe, names)}
-    bench = SimpleNamespace(settings=S)
-    found = without_mere_offsets(bench, recipe, evidence, scores, names)
+    found = without_mere_offsets(recipe, evidence, scores, names, S)
     assert found == alike
