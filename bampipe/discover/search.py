@@ -19,6 +19,7 @@ from bampipe.discover.growth import (
     record_step,
 )
 from bampipe.discover.influence import SampleRange
+from bampipe.discover.insufficient import insufficient_rivals
 from bampipe.discover.level import Level
 from bampipe.discover.polish import FittedSet, contest_of, polish
 from bampipe.discover.rivals import Choice, choose
@@ -32,6 +33,7 @@ from bampipe.results.diagnose import Contender, RefusedEffect, SearchStep
 from bampipe.results.standing import AT_FLOOR
 from bampipe.trials.folds import HELD_OUT
 from bampipe.trials.measured import MeasuredTrials
+from bampipe.trials.noise_floor import NoiseFloor
 from bampipe.trials.residuals import Evidence
 
 Array = NDArray[np.float64]
@@ -50,7 +52,8 @@ class Search:
         found: the model with every effect found, fitted.
         groups: for each effect found, in order, the others that these trials cannot tell from it.
         unlike: where one effect is found and no replay looks like the measurement, neither its own
-            nor those of its rivals: these rivals.
+            nor those of its rivals: these rivals, but for those that leave an axis above the floor
+            where the effect found does not.
         misfit: mean squared z of the likest of those replays, else 1.
         contests: for each, those who contend for its place, itself first.
         main: for each, the axis on which it helps most.
@@ -191,10 +194,17 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
     alone = choices.get(found.added[0]) if len(found.added) == 1 else None
     unlike, misfit = (alone.unlike, alone.misfit) if alone else ((), 1.0)
     main = {name: axes.index(c[0].axis) for name, c in contests.items() if c}
+    alike = {n: polished.alike.get(n, groups.get(n, ())) for n in found.added}
+    floor = NoiseFloor.of_errors([r.held_out_rmse for r in final])
+    for name in main:
+        # Where replays say nothing of which it is, what each leaves does.
+        unsettled = (*unlike, *(alike[name] if name in polished.unlike else ()))
+        behind = insufficient_rivals(bench, found, name, main[name], unsettled, floor)
+        alike[name] = tuple(n for n in alike[name] if n not in behind)
+        unlike = tuple(n for n in unlike if n not in behind)
     return Search(
         bench.trials, base, initial, level, first, found,
-        {n: polished.alike.get(n, groups.get(n, ())) for n in found.added},
-        unlike, misfit, contests, main, additions, likely, transient,
+        alike, unlike, misfit, contests, main, additions, likely, transient,
         tuple(r for name, r in refused.items() if name not in found.added), tuple(steps), cut_short,
         tuple(final),
     )  # fmt: skip
