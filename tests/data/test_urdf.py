@@ -247,6 +247,12 @@ def test_motors_by_current_have_torque_constants(tmp_path: Path) -> None:
             "[robot.motors.two]\nturns = { shoulder_pan = 1.0 }\n",
             "some motors have a torque_constant and some have none",
         ),
+        (
+            "[robot.motors.one]\nturns = { elbow = 1.0 }\ntorque_constant = 1.0\n"
+            "torque_constant_sd = 0.1\n[robot.motors.two]\nturns = { shoulder_pan = 1.0 }\n"
+            "torque_constant = 1.0\ntorque_constant_sd = 0.2\n",
+            "every torque constant is estimated, which leaves the scale of all masses open",
+        ),
     ],
 )
 def test_wrong_motors_are_refused(motors: str, what: str, tmp_path: Path) -> None:
