@@ -286,8 +286,9 @@ class System:
     def memory(self, q: Array, qd: Array, qdd: Array, u: Array, p: Array, t: Array) -> Array:
         """Internal states along a measured motion of one trial, (T, n_z).
 
-        Integrated by RK4 with inputs interpolated linearly between samples, in finer steps where
-        a state would run away. A command or channel that is switched holds until the sample that
+        Integrated by RK4, or by exponential steps where its rate is linear in the state, along
+        rates that are cubic between samples and inputs that are linear, in finer steps where a
+        state would run away. A command or channel that is switched holds until the sample that
         first shows its new value.
 
         Args:
@@ -296,7 +297,7 @@ class System:
         """
         if not self.memory_names:
             return np.zeros((len(q), 0))
-        a, b, _ = self.true_motion(q, qd, qdd, u, p)
+        a, b, c = self.true_motion(q, qd, qdd, u, p)
         z0 = self.initial_memory(a[0], u[0], p)
         switched = self._switched(u)
         at = np.flatnonzero(switched.any(axis=1))
@@ -304,9 +305,15 @@ class System:
             # One more row at the time of the switch, with the values before it.
             held = np.where(switched[at], u[at - 1], u[at])
             u = np.insert(u, at, held, axis=0)
-            a, b, t = (np.insert(x, at, x[at], axis=0) for x in (a, b, t))
-        groups = {"q": a, "qd": b, "u": u, "p": p}
-        columns = [x[..., self._memory_uses[group]] for group, x in groups.items()]
+            a, b, c, t = (np.insert(x, at, x[at], axis=0) for x in (a, b, c, t))
+        uses = self._memory_uses
+        columns = [
+            a[:, uses["q"]],
+            b[:, uses["qd"]],
+            c[:, uses["qd"]],
+            u[:, uses["u"]],
+            p[uses["p"]],
+        ]
         arrays = [np.ascontiguousarray(x, dtype=np.float64) for x in (*columns, t)]
         out = np.empty((len(t), len(z0)))
         module = self._code.module("memory")
