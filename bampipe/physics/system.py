@@ -21,6 +21,9 @@ if TYPE_CHECKING:  # it brings sympy, which few need
 Array = NDArray[np.float64]
 _MEMORY_STEPS = (3, 12, 48, 192)
 """Steps a sample tried in turn, until a stiff state is integrated without running away."""
+_STIFF_STEPS = 24
+"""Exponential steps a sample, stable ones, in place of more than these, where no state depends on
+another. A hysteresis passed 600 times between two samples is 1 % off, 60 times 0.1 %."""
 _STABLE = 2.5
 """Largest product of a step and the rate at which a state decays for which RK4 is stable, with a
 margin: it is up to 2.78 (Hairer and Wanner, Solving Ordinary Differential Equations II, IV.2)."""
@@ -318,7 +321,11 @@ class System:
         out = np.empty((len(t), len(z0)))
         module = self._code.module("memory")
         least = 0.0
+        stiff = getattr(module, "stiff_memory", None)
         for steps in _MEMORY_STEPS:
+            if stiff is not None and max(steps, least) > _STIFF_STEPS:
+                stiff(*arrays, z0, _STIFF_STEPS, out)
+                break
             if steps < least and steps < _MEMORY_STEPS[-1]:
                 continue
             fastest = module.memory(*arrays, z0, steps, out)
