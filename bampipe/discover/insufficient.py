@@ -43,11 +43,11 @@ def insufficient_rivals(
     mine = error_without_second(found.evidence, axis)[1]
     if not rivals or is_above(mine):
         return frozenset()
-    fewer = reduce_set(bench, found, name)
+    fewer = reduce_set(found, name)
     scores = bench.scores(fewer.recipe, fewer.evidence.p, list(rivals))
     behind = set()
     for rival, score in scores.items():
-        other = extend_set(bench, fewer, score)
+        other = extend_set(fewer, score)
         # What makes both sides of the equation small must not look like a small error.
         scale = float(found.slope_by_force[axis] / other.slope_by_force[axis])
         error = scale * error_without_second(other.evidence, axis)[1]
