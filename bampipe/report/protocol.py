@@ -32,8 +32,7 @@ def protocol_sheet(plan: Plan, session: str, model: str) -> bytes:
     trials = Table("Trials", ("", "What to do", "Files"), rows, "lll", (0.0, 3.0, 1.0))
     blocks: list[Block] = [Paragraph(plan.sentence), trials]
     if plan.sd:
-        entries = {name: (entry, entry.asked) for name, entry in plan.sd.items()}
-        blocks.append(sd_table("Standard deviations", "asked", entries))
+        blocks.append(sd_table("Standard deviations", plan.sd))
     if plan.confusion:
         heads = ("Effects", "now", "expected")
         blocks.append(confusion_table("Chance of confusion", heads, plan.confusion))

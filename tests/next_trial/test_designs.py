@@ -24,7 +24,8 @@ from bampipe.next_trial.primitives import (
 from bampipe.next_trial.reasons import explain_proposal
 from bampipe.next_trial.words import describe
 from bampipe.physics import Model, compile_model, registry
-from bampipe.results.next import ExpectedConfusion, Proposal
+from bampipe.results.forecast import compare_forecast
+from bampipe.results.next import ExpectedConfusion, ExpectedSd, NextResult, Proposal
 from bampipe.trials.motion import Motion
 
 SEEN = Envelope(
@@ -228,18 +229,36 @@ def made_proposal(after: float, farther: tuple[str, ...] = ()) -> Proposal:
 
 
 def test_a_forecast_beyond_the_trials_at_hand_is_said_to_be_the_models():
-    said = explain_proposal("decision", "", made_proposal(0.01, ("yaw",)), {}, ()).expected
+    said = explain_proposal("decision", "", made_proposal(0.01, ("yaw",)), {}, (), ()).expected
     assert said.startswith("The chance of confusing them is expected to fall from 40 % to")
     assert said.endswith("takes the model to hold beyond what the trials at hand have shown.")
-    assert "beyond" not in explain_proposal("decision", "", made_proposal(0.01), {}, ()).expected
+    assert (
+        "beyond" not in explain_proposal("decision", "", made_proposal(0.01), {}, (), ()).expected
+    )
+
+
+def test_what_a_model_lacks_is_said_to_count_as_noise():
+    wide = ExpectedSd(before=0.05, after=0.005, low=0.002, high=0.01, unit="kg")
+    sharp = ExpectedSd(before=0.05, after=0.005, low=0.0045, high=0.006, unit="kg")
+    best = made_proposal(0.1).model_copy(update={"sd": {"mass": wide, "moment": sharp}})
+    said = explain_proposal("precision", "", best, {}, (), ()).expected
+    assert said == (
+        "Expected: `mass` ± 0.002 to 0.01 kg, now ± 0.05; `moment` ± 0.005 kg, now ± 0.05"
+        " (eight cases in ten)."
+    )
+    said = explain_proposal("precision", "", best, {}, (), ("yaw", "pitch")).expected
+    assert "The error of yaw and pitch is above the noise floor" in said
+    # Where effects compete, no uncertainty is forecast, and nothing need be said of it.
+    said = explain_proposal("decision", "", made_proposal(0.01), {}, (), ("yaw",)).expected
+    assert "noise floor" not in said
 
 
 def test_where_nothing_decides_it_is_said_what_was_not_tried():
-    said = explain_proposal("decision", "", made_proposal(0.39), {}, ["yaw", "pitch"]).expected
+    said = explain_proposal("decision", "", made_proposal(0.39), {}, ["yaw", "pitch"], ()).expected
     assert said.endswith(
         "the device file states no [limits] of yaw and pitch, so that none was tried."
     )
-    said = explain_proposal("decision", "", made_proposal(0.39), {}, []).expected
+    said = explain_proposal("decision", "", made_proposal(0.39), {}, [], ()).expected
     assert said.endswith("39 % after this one. Another load may.")
 
 
@@ -272,8 +291,44 @@ def test_what_methods_disagree_by_is_diluted_and_what_a_calibration_leaves_open_
     nothing, much = np.zeros((2, 2)), 1e6 * known.information
     assert known.sd_with(nothing, 0.0)[0] == pytest.approx(known.sd[0], rel=1e-3)
     assert known.sd_with(much, 20.0)[0] == pytest.approx(0.02, rel=1e-3)
-    threefold = known.sd_with(3.0 * known.information, 20.0)[0]
-    assert threefold**2 == pytest.approx(0.01**2 / 4.0 + 0.04**2 / 16.0 + 0.02**2, rel=1e-3)
+    threefold = known.expect(3.0 * known.information, 20.0)
+    noise = 0.01**2 / 4.0 + 0.02**2
+    # At least it is diluted; mostly it goes, for a method that was misled is found out.
+    assert threefold.high[0] ** 2 > noise + (0.04 / 4.0) ** 2
+    assert threefold.median[0] ** 2 == pytest.approx(noise + (0.04 / 16.0) ** 2, rel=1e-3)
+    assert threefold.low[0] ** 2 < noise
+
+
+def test_a_forecast_is_a_number_after_many_blocks_and_a_range_after_few():
+    much = np.diag([1e6, 0.0])
+    for blocks, is_sharp in ((5000, True), (24, False)):
+        known = made_precision(0.01, 0.01, blocks)
+        found = known.expect(much / blocks, 16.0 if blocks < 100 else 1e4)
+        forecast = ExpectedSd(
+            before=0.01, after=found.median[0], low=found.low[0], high=found.high[0], unit="kg"
+        )
+        assert forecast.is_sharp == is_sharp
+        assert (" to " in forecast.number) != is_sharp
+
+
+@pytest.mark.parametrize(
+    ("came", "said"),
+    [
+        (0.004, "within what was forecast."),
+        (0.001, "less than forecast."),
+        (0.02, "more than forecast."),
+    ],
+)
+def test_what_came_is_held_against_a_range(came, said):
+    wide = ExpectedSd(before=0.05, after=0.005, low=0.002, high=0.01, unit="kg")
+    proposed = NextResult(
+        model="base", purpose="precision", trials=("t1",), sentence="Move yaw.", why="",
+        expected="", proposals=(made_proposal(0.1).model_copy(update={"sd": {"mass": wide}}),),
+    )  # fmt: skip
+    identified = SimpleNamespace(trials=("t1", "t2"), parameters={"mass": SimpleNamespace(sd=came)})
+    line = compare_forecast(proposed, identified, None)[0]
+    assert line.startswith("`mass`: ± 0.002 to 0.01 kg was forecast with trial t2, ± 0.0")
+    assert line.endswith(said)
 
 
 def contest_of(odds: list[float], floor: float = 1.0) -> Contest:
