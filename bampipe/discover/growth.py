@@ -93,7 +93,7 @@ def choose_companions(
     waiting = [
         (excess, name)
         for excess, name in significant
-        if level.p_value(scores[name]) < s.significance / s.close
+        if name in scores and level.p_value(scores[name]) < s.significance / s.close
     ]
     while waiting:
         waiting = [
@@ -134,13 +134,15 @@ def grow_set(
     for k, name in enumerate(names):
         score = known_scores[name]
         # What the first does to the model's own parameters is in the fit when the next one comes.
-        wider = extend_set(bench, wider, replace(score, shift=score.shift[:0]) if k else score)
+        wider = extend_set(wider, replace(score, shift=score.shift[:0]) if k else score)
         if k < len(names) - 1:
             steps.append(record_step(wider))
+    if collapses(current, wider, s):
+        return GrownSet(bench, wider, (), {}, None)
     for earlier in (n for n in wider.added if n != names[0]):
         # What resembles the missing effect may come first: it takes a little of several others.
-        less = reduce_set(bench, wider, earlier)
-        if is_superfluous(wider, less, s):
+        less = reduce_set(wider, earlier)
+        if is_superfluous(wider.error, less.error, s):
             wider = less
     timed = bench.retimed(wider.evidence)
     if timed is not bench:
@@ -195,7 +197,7 @@ def _sound_level(
     """
     s = bench.settings
     carried = all(_carries_over(before, after, drop, axes, s) for axes, drop in promised)
-    if collapses(before, after, s) or not carried:
+    if not carried:
         return None
     evidence = after.evidence
     error, error_before = after.scorer.base_error, before.scorer.base_error

@@ -25,12 +25,11 @@ def test_an_effect_that_fails_where_it_helps_most_is_missing_nowhere(monkeypatch
         initial=evidence(1.0, 1.0), evidence=evidence(shoulder_after, 0.3), selected=("gain",),
         main={"gain": 0}, final=(replay,) * 4, level=SimpleNamespace(replicates=(replay,) * 4),
         groups={"gain": ()}, contests={}, steps=(), cut_short=False, first={}, transient={},
-        refused=(),
+        refused=(), explainable=np.full(2, 0.2), explainable_after=np.full(2, 0.2),
     )  # fmt: skip
     second = SimpleNamespace(stretch=Stretch(trial_id="t01", t_start=0.0, t_end=1.0))
     monkeypatch.setattr(verdict, "_reach", lambda *_: {0, 1})
     monkeypatch.setattr(verdict, "_odds_of_group", lambda *_: {"gain": 1.0})
-    monkeypatch.setattr(verdict, "explainable_share", lambda *_: 0.2)
     monkeypatch.setattr(verdict, "rank", lambda *_: ())
     monkeypatch.setattr(
         verdict, "error_without_second", lambda e, axis: (second, float(e.held_out_rmse[axis]))
