@@ -182,6 +182,18 @@ class Precision:
         """By how much few blocks widen a standard deviation."""
         return float(np.sqrt(blocks / max(blocks - len(self.information), 1)))
 
+    def worth(self, added: Array, seconds: float, parameter: str = "") -> float:
+        """What trials are worth, nats: for one parameter, or where none is named for all.
+
+        Args:
+            added: (m, m) information of the trials; seconds: of them together.
+            parameter: whose standard deviation counts, by the fall of its logarithm.
+        """
+        if not parameter:
+            return self.gain(added)
+        place = self.names.index(parameter)
+        return float(np.log(self.sd[place] / self.sd_with(added, seconds)[place]))
+
     def gain(self, added: Array) -> float:
         """Half the drop of the log determinant of the covariance of all parameters, nats."""
         n = len(self.names)

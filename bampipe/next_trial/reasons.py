@@ -30,6 +30,7 @@ def explain_proposal(
     table: Mapping[str, Detectable],
     unlimited: Sequence[str],
     lacking: Sequence[str],
+    better: str,
 ) -> Reasons:
     """Say why a trial is proposed and what it is expected to give.
 
@@ -38,8 +39,15 @@ def explain_proposal(
         best: the proposal; table: by effect, from which size on trials show it.
         unlimited: axes of which the device states no range, so that nothing wider was tried.
         lacking: axes whose held-out error is above the noise floor.
+        better: trial at hand the like of which says more, "" if none.
     """
     why, expected = _explain(purpose, parameter, best, table, unlimited)
+    if better:
+        what = f"`{parameter}`" if parameter else "the parameters"
+        expected += (
+            f" Moving freely as in trial {better} for as long would say more of {what}: rather"
+            " record that."
+        )
     if best.farther or best.faster:
         expected += _UNTRIED
     if best.sd and lacking:

@@ -146,5 +146,8 @@ class NextResult(Result):
     why: str
     expected: str = Field(description="What it is expected to give")
     proposals: tuple[Proposal, ...] = Field(description="Best first")
+    better_at_hand: str = Field(
+        default="", description="Trial at hand the like of which says more than the first proposal"
+    )
     sensitivity: dict[str, Detectable] = Field(default={}, description="By effect of the library")
     plan: Plan | None = None

@@ -177,7 +177,10 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         plan = record_plan(forecast, goal, plan_trials(forecast, tried, goal))
     unlimited = [axis for axis in system.coordinates if axis not in model.device.limits]
     lacking = _lacking(run, config.model, diagnosed)
-    reasons = explain_proposal(chosen, parameter, best, table, unlimited, lacking)
+    better = ""
+    if chosen == "precision":
+        better = _better_at_hand(precision, fitted, parameter, config.seconds, tried[0])
+    reasons = explain_proposal(chosen, parameter, best, table, unlimited, lacking, better)
     result = NextResult(
         model=config.model,
         purpose=chosen,
@@ -187,6 +190,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         why=reasons.why,
         expected=reasons.expected,
         proposals=proposals,
+        better_at_hand=better,
         sensitivity=table,
         plan=plan,
     )
@@ -299,15 +303,27 @@ def _worth(
             return float(np.sum(np.log(now / then)))
 
         return shown
-    if parameter:
-        place = precision.names.index(parameter)
-        return lambda motion: float(
-            np.log(
-                precision.sd[place]
-                / precision.sd_with(precision.of_motion(motion), motion.t[-1])[place]
-            )
-        )
-    return lambda motion: precision.gain(precision.of_motion(motion))
+    return lambda motion: precision.worth(
+        precision.of_motion(motion), float(motion.t[-1]), parameter
+    )
+
+
+def _better_at_hand(
+    precision: Precision, fitted: Sequence[Motion], parameter: str, seconds: float, best: Tried
+) -> str:
+    """The trial at hand the like of which, so long, says more than a design does; "" if none.
+
+    Args:
+        precision: what is known; fitted: the trials at hand; parameter: that counts, "" for all.
+        seconds: length of a trial; best: the design.
+    """
+    values = {}
+    for motion in fitted:
+        share = seconds / float(motion.t[-1] - motion.t[0])
+        added = share * precision.of_motion(motion)
+        values[trial_of_block(motion.trial_id)] = precision.worth(added, seconds, parameter)
+    most = max(values, key=lambda name: values[name])
+    return most if values[most] > best.worth else ""
 
 
 def _sensitivity(blindness: Blindness, best: Tried) -> dict[str, Detectable]:
