@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
+from bampipe.errors import InputError
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.next import AS_FORECAST, ExpectedSd, NextResult
@@ -16,12 +18,19 @@ _SHOWN = 3
 def read_forecasts(root: Path, model: str) -> tuple[NextResult, ...]:
     """Return the forecasts of a model's trials: that of the last proposal first, then earlier ones.
 
+    What another version of bampipe forecast in other terms cannot be held against what came, and is
+    left out: a new proposal takes its place.
+
     Args:
         root: the run folder; model: what was proposed for.
     """
     last, folder = root / NextResult.file(model), root / NextResult.EARLIER.format(model=model)
     paths = [*([last] if last.is_file() else []), *sorted(folder.glob("*.json"))]
-    return tuple(NextResult.read(path) for path in paths)
+    found = []
+    for path in paths:
+        with suppress(InputError):
+            found.append(NextResult.read(path))
+    return tuple(found)
 
 
 def find_open(forecasts: Sequence[NextResult], proposed: NextResult) -> tuple[NextResult, ...]:

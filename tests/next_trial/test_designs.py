@@ -24,7 +24,7 @@ from bampipe.next_trial.primitives import (
 from bampipe.next_trial.reasons import explain_proposal
 from bampipe.next_trial.words import describe
 from bampipe.physics import Model, compile_model, registry
-from bampipe.results.forecast import compare_forecast
+from bampipe.results.forecast import compare_forecast, read_forecasts
 from bampipe.results.next import ExpectedConfusion, ExpectedSd, NextResult, Proposal
 from bampipe.stages.next import _better_at_hand
 from bampipe.trials.motion import Motion
@@ -235,6 +235,19 @@ def test_a_forecast_beyond_the_trials_at_hand_is_said_to_be_the_models():
     assert said.endswith("takes the model to hold beyond what the trials at hand have shown.")
     said = explain_proposal("decision", "", made_proposal(0.01), {}, (), (), "").expected
     assert "beyond" not in said
+
+
+def test_a_forecast_in_the_terms_of_another_version_does_not_stop_a_new_proposal(tmp_path):
+    wide = ExpectedSd(before=0.05, after=0.005, low=0.002, high=0.01, unit="kg")
+    found = NextResult(
+        model="base", purpose="precision", trials=("t1",), sentence="Move yaw.", why="",
+        expected="", proposals=(made_proposal(0.1).model_copy(update={"sd": {"mass": wide}}),),
+    )  # fmt: skip
+    path = tmp_path / NextResult.file("base")
+    found.write(tmp_path)
+    assert read_forecasts(tmp_path, "base") == (found,)
+    path.write_text(path.read_text().replace('"low"', '"after_at_worst"'))
+    assert read_forecasts(tmp_path, "base") == ()
 
 
 def test_what_a_model_lacks_is_said_to_count_as_noise():
