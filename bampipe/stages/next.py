@@ -211,7 +211,9 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         # typst is slow to import: only here
         from bampipe.report.protocol import protocol_sheet
 
-        sheet = protocol_sheet(plan, run.read(IngestResult).session_id, config.model)
+        by_hand = not (model.device.drive or model.device.prescribed)
+        session = run.read(IngestResult).session_id
+        sheet = protocol_sheet(plan, session, config.model, by_hand)
         (out / f"models/{config.model}/protocol.pdf").write_bytes(sheet)
     return _summary(result, followed)
 

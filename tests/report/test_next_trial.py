@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 from bampipe.report.document import Callout, Table
 from bampipe.report.protocol import protocol_sheet
-from bampipe.report.sections import next_trial
+from bampipe.report.sections import diagnosis, next_trial
 from bampipe.results.next import ExpectedSd, NextResult, Plan
 
 MOVE = {"low": -0.4, "high": 0.4, "slow": 0.02, "fast": 0.1, "unit": "rad"}
@@ -50,6 +50,7 @@ def results_with(found: NextResult | None) -> SimpleNamespace:
     return SimpleNamespace(
         read=lambda kind, model="": found if kind is NextResult else None,
         root=SimpleNamespace(name="s01"),
+        models=("base",),
     )
 
 
@@ -69,6 +70,15 @@ def test_the_section_says_what_to_do_and_what_went_unseen():
     assert [row[0] for row in sensitivity.rows] == ["`force_bias:x`", "`stribeck:yaw`"]
     assert sensitivity.rows[0][1:4:2] == ("–", "–")
     assert sensitivity.rows[1][3:6] == ("2.0", "0.50", "1.0")
+
+
+def test_beside_nothing_missing_stands_what_the_trials_would_not_have_shown():
+    asked = diagnosis._unseen(results_with(NextResult.model_validate(FOUND)), "base")
+    assert asked == (
+        "These trials would not have shown stribeck:yaw below 2 N.m. The table under What to record"
+        " next has every effect."
+    )
+    assert "`bampipe next s01` says" in diagnosis._unseen(results_with(None), "base")
 
 
 def test_where_one_number_cannot_be_trusted_a_range_is_shown():
@@ -93,6 +103,8 @@ def test_the_protocol_sheet_is_the_same_pdf_again():
             },
         }
     )  # fmt: skip
-    sheet = protocol_sheet(plan, "s01", "base")
+    sheet = protocol_sheet(plan, "s01", "base", by_hand=True)
     assert sheet.startswith(b"%PDF")
-    assert sheet == protocol_sheet(plan, "s01", "base")
+    assert sheet == protocol_sheet(plan, "s01", "base", by_hand=True)
+    # A machine without a handle is not asked to let go of it.
+    assert sheet != protocol_sheet(plan, "s01", "base", by_hand=False)
