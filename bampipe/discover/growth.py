@@ -18,7 +18,7 @@ from bampipe.discover.scorer import Score, Scorer
 from bampipe.discover.settings import Settings
 from bampipe.discover.stops import StoppingReplays
 from bampipe.estimate.simulation import Runaway
-from bampipe.results.diagnose import RefusedEffect, SearchStep
+from bampipe.results.diagnose import RefusalReason, RefusedEffect, SearchStep
 from bampipe.results.standing import standing
 from bampipe.trials.noise_floor import NoiseFloor
 
@@ -306,12 +306,16 @@ def describe_refusal(
     first, then = (
         _held_out(known, axis) * before.slope_by_force[axis] for known in (before, after)
     )
+    collapsed, runs_away = collapses(before, after, s), bool(then[0] > s.runs_away * first[0])
+    why: RefusalReason = (
+        "scale" if collapsed else "replays" if carries else "runs_away" if runs_away else "held_out"
+    )
     return RefusedEffect(
         effect=name,
         axis=before.evidence.system.coordinates[axis],
         held_out_rmse_before=first[0],
-        held_out_rmse_after=then[0],
+        held_out_rmse_after=None if runs_away else then[0],
         without_worst_second_before=first[1],
-        without_worst_second_after=then[1],
-        why="scale" if collapses(before, after, s) else "replays" if carries else "held_out",
+        without_worst_second_after=None if runs_away else then[1],
+        why=why,
     )
