@@ -197,8 +197,27 @@ def test_derivatives_of_the_force_reach_beyond_the_band(
 def test_no_trial_to_differentiate(tmp_path: Path) -> None:
     frames = {"a": free_trial(0)[0]}
     run = write_ingested(tmp_path / "run", frames, {"a": ("locked", "yaw")}, AXES)
-    with pytest.raises(InputError, match="no free or viscous trial"):
+    with pytest.raises(InputError, match=r'no free or viscous trial among 1: .*kind = "free"'):
         run_stage(run)
+
+
+def test_trials_too_short_to_differentiate_are_said_with_their_size(tmp_path: Path) -> None:
+    whole = free_trial(0)[0]
+    frames = {"a": whole.head(20), "b": whole.head(31)}
+    run = write_ingested(tmp_path / "run", frames, dict.fromkeys(frames, ("free", "")), AXES)
+    said = (
+        "none of the 2 free and viscous trials is long enough: a holds 20 sound samples, of which"
+    )
+    with pytest.raises(InputError, match=said):
+        run_stage(run)
+
+
+def test_one_trial_too_short_is_noted(tmp_path: Path) -> None:
+    whole = free_trial(0)[0]
+    frames = {"a": whole, "b": whole.head(31)}
+    run = write_ingested(tmp_path / "run", frames, dict.fromkeys(frames, ("free", "")), AXES)
+    summary = stage.execute(run, run.root, configure("filter", {}), silent)
+    assert summary["notes"] == ["b: not used: 31 sound samples, of which 32 are needed"]
 
 
 def test_same_bytes(run: RunFolder) -> None:
