@@ -98,7 +98,9 @@ class WorstSecond(Record):
     trial: str
     start_s: Size = Field(description="Since the start of the trial, s")
     parameter: str
-    move: float = Field(description="Change of it without that second, in standard deviations")
+    move: float = Field(
+        description="Change of it without that second, in standard deviations that the rest leaves"
+    )
     sentence: str = Field(
         default="", description="In words, where it stands out as a transient or an outlier does"
     )
