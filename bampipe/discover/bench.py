@@ -15,11 +15,13 @@ from bampipe.discover.chance import (
     Replicate,
     ReplicateTask,
     ScoreTask,
+    ShareTask,
     fit_trials,
     open_trials,
     prepare,
     run_replicate,
     run_scores,
+    run_share,
 )
 from bampipe.discover.level import Level
 from bampipe.discover.scorer import Score, Scorer
@@ -35,6 +37,8 @@ Array = NDArray[np.float64]
 
 _STEPS_OF_TIMING = 4
 """Most Gauss-Newton steps of a fit that starts at the right parameters."""
+_PARTS = 6
+"""Tasks a process into which candidates are divided: one may take as long as a hundred others."""
 
 
 @dataclass(frozen=True)
@@ -147,7 +151,7 @@ class Bench:
 
     def scores(self, recipe: Recipe, p: Array, names: Sequence[str]) -> dict[str, Score]:
         """Scores of candidates against a model on the measured trials."""
-        parts = 2 * self.settings.jobs
+        parts = min(_PARTS * self.settings.jobs, len(names))
         late_s = self.trials.late_s
         tasks = [ScoreTask(recipe, p, tuple(names[k::parts]), late_s) for k in range(parts)]
         merged: dict[str, Score] = {}
@@ -155,6 +159,12 @@ class Bench:
             merged |= found
         # In the order of the names, whatever the number of jobs: ties in the ranking keep it.
         return {name: merged[name] for name in names if name in merged}
+
+    def shares(self, recipe: Recipe, p: Array) -> Array:
+        """Explainable share of a fitted model on the measured trials, by axis, (n_q,)."""
+        axes = range(len(recipe.model().device.coordinates))
+        tasks = [ShareTask(recipe, p, axis, self.trials.late_s) for axis in axes]
+        return np.array(list(self.pool(run_share, tasks)))
 
     def level(
         self,

@@ -60,6 +60,7 @@ def _open(trials: MeasuredTrials | None) -> None:
     global _open_trials, _timed_trials, _stand_in
     _open_trials = _timed_trials = trials
     _stand_in = None
+    _linearised.clear()
 
 
 def open_trials(late_s: float | None = None) -> MeasuredTrials:
@@ -109,6 +110,23 @@ def fit_trials(
     """
     system = system_of(recipe)
     return gather_evidence(system, trials.motions, trials.band, start, trials.folds, like=like)
+
+
+_linearised: dict[tuple[str, bytes, float | None], Evidence] = {}
+"""What was linearised last in this process: the next task is mostly about the same."""
+
+
+def linearise(recipe: Recipe, p: Array, late_s: float | None) -> Evidence:
+    """The model of ``recipe`` at parameters ``p``, (n_p,), on the measured trials."""
+    system = system_of(recipe)
+    key = system.model.key, p.tobytes(), late_s
+    if key not in _linearised:
+        trials = open_trials(late_s)
+        _linearised.clear()
+        _linearised[key] = gather_evidence(
+            system, trials.motions, trials.band, p, trials.folds, most_iterations=0
+        )
+    return _linearised[key]
 
 
 def candidates_of(recipe: Recipe, names: Sequence[str]) -> list[Candidate]:
@@ -217,14 +235,24 @@ class ScoreTask:
 
 def run_scores(task: ScoreTask) -> dict[str, Score]:
     """Score candidates against the measured session."""
-    trials = open_trials(task.late_s)
-    evidence = gather_evidence(
-        system_of(task.recipe), trials.motions, trials.band, task.evidence_p, trials.folds,
-        most_iterations=1,
-    )  # fmt: skip
-    scorer = Scorer(evidence)
+    scorer = Scorer(linearise(task.recipe, task.evidence_p, task.late_s))
     found = {c.name: scorer.score(c) for c in candidates_of(task.recipe, task.names)}
     return {name: score for name, score in found.items() if score is not None}
+
+
+@dataclass(frozen=True)
+class ShareTask:
+    """The explainable share of one axis of a fitted model."""
+
+    recipe: Recipe
+    p: Array
+    axis: int
+    late_s: float | None = None
+
+
+def run_share(task: ShareTask) -> float:
+    """Find it on the measured session."""
+    return explainable_share(linearise(task.recipe, task.p, task.late_s), task.axis)
 
 
 Progress = Callable[[float, str], None]

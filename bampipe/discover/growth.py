@@ -18,7 +18,7 @@ from bampipe.discover.scorer import Score, Scorer
 from bampipe.discover.settings import Settings
 from bampipe.discover.stops import StoppingReplays
 from bampipe.estimate.simulation import Runaway
-from bampipe.results.diagnose import RefusedEffect, SearchStep
+from bampipe.results.diagnose import RefusalReason, RefusedEffect, SearchStep
 from bampipe.results.standing import standing
 from bampipe.trials.noise_floor import NoiseFloor
 
@@ -93,7 +93,7 @@ def choose_companions(
     waiting = [
         (excess, name)
         for excess, name in significant
-        if level.p_value(scores[name]) < s.significance / s.close
+        if name in scores and level.p_value(scores[name]) < s.significance / s.close
     ]
     while waiting:
         waiting = [
@@ -134,13 +134,15 @@ def grow_set(
     for k, name in enumerate(names):
         score = known_scores[name]
         # What the first does to the model's own parameters is in the fit when the next one comes.
-        wider = extend_set(bench, wider, replace(score, shift=score.shift[:0]) if k else score)
+        wider = extend_set(wider, replace(score, shift=score.shift[:0]) if k else score)
         if k < len(names) - 1:
             steps.append(record_step(wider))
+    if collapses(current, wider, s):
+        return GrownSet(bench, wider, (), {}, None)
     for earlier in (n for n in wider.added if n != names[0]):
         # What resembles the missing effect may come first: it takes a little of several others.
-        less = reduce_set(bench, wider, earlier)
-        if is_superfluous(wider, less, s):
+        less = reduce_set(wider, earlier)
+        if is_superfluous(wider.error, less.error, s):
             wider = less
     timed = bench.retimed(wider.evidence)
     if timed is not bench:
@@ -195,7 +197,7 @@ def _sound_level(
     """
     s = bench.settings
     carried = all(_carries_over(before, after, drop, axes, s) for axes, drop in promised)
-    if collapses(before, after, s) or not carried:
+    if not carried:
         return None
     evidence = after.evidence
     error, error_before = after.scorer.base_error, before.scorer.base_error
@@ -304,12 +306,16 @@ def describe_refusal(
     first, then = (
         _held_out(known, axis) * before.slope_by_force[axis] for known in (before, after)
     )
+    collapsed, runs_away = collapses(before, after, s), bool(then[0] > s.runs_away * first[0])
+    why: RefusalReason = (
+        "scale" if collapsed else "replays" if carries else "runs_away" if runs_away else "held_out"
+    )
     return RefusedEffect(
         effect=name,
         axis=before.evidence.system.coordinates[axis],
         held_out_rmse_before=first[0],
-        held_out_rmse_after=then[0],
+        held_out_rmse_after=None if runs_away else then[0],
         without_worst_second_before=first[1],
-        without_worst_second_after=then[1],
-        why="scale" if collapses(before, after, s) else "replays" if carries else "held_out",
+        without_worst_second_after=None if runs_away else then[1],
+        why=why,
     )

@@ -88,26 +88,30 @@ class Level:
         """
         s = self._settings
         self._complete(names, len(self.replicates))
-        if not self._is_clear(scores, names):
+        if not all(self._is_clear(scores[n]) for n in self._deciding(scores, names)):
             self._complete(names, s.replicates)
         low, high = s.significance / s.close, s.significance * s.close
         close = [
             name
-            for name in names
+            for name in self._deciding(scores, names)
             if len(self._gains[name]) == s.replicates and low < self.p_value(scores[name]) < high
         ]
         self._complete(close, s.most_replicates)
 
-    def _is_clear(self, scores: Mapping[str, Score], names: Sequence[str]) -> bool:
-        """Whether the best of ``names``, and what comes near it, beat chance beyond doubt.
+    def _is_clear(self, score: Score) -> bool:
+        """Whether a candidate beats chance beyond doubt."""
+        return self.p_value(score) < self._settings.significance / self._settings.close
 
-        The others wait: once the best is part of the model they are weighed anew.
+    def _deciding(self, scores: Mapping[str, Score], names: Sequence[str]) -> list[str]:
+        """Those of ``names`` on which it hangs what is added: all, unless one is clear.
+
+        Then those that come near the best of the clear ones. The others wait: once it is part of
+        the model they are weighed anew.
         """
-        s = self._settings
         excess = {name: float(self.excess(scores[name]).sum()) for name in names}
-        near = s.rival_share * max(excess.values(), default=0.0)
-        contending = [name for name in names if excess[name] >= near]
-        return all(self.p_value(scores[n]) < s.significance / s.close for n in contending)
+        clear = [excess[name] for name in names if self._is_clear(scores[name])]
+        near = self._settings.rival_share * max(clear, default=-np.inf)
+        return [name for name in names if excess[name] >= near]
 
     def p_value(self, score: Score) -> float:
         """Chance that any candidate scores this high with nothing missing (Bonferroni).

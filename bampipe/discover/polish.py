@@ -14,7 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.discover.bench import Bench
-from bampipe.discover.chance import Progress, candidates_of
+from bampipe.discover.chance import (
+    Progress,
+    candidates_of,
+    fit_trials,
+    linearise,
+    open_trials,
+)
 from bampipe.discover.influence import largest_second, largest_trial, score_without
 from bampipe.discover.rivals import plausible, replay_rivals, without_mere_offsets
 from bampipe.discover.scorer import Score, Scorer
@@ -94,24 +100,69 @@ class FittedSet:
         )
 
 
-def extend_set(bench: Bench, known: FittedSet, score: Score) -> FittedSet:
+def extend_set(known: FittedSet, score: Score) -> FittedSet:
     """Fit the set with one effect more, from where it was scored."""
     wider = replace(known.recipe, effects=(*known.recipe.effects, score.name))
-    fitted = bench.fit(wider, with_effect(wider, known.evidence, score), known.evidence)
-    return FittedSet(wider, (*known.added, score.name), fitted, bench.trials)
+    start = with_effect(wider, known.evidence, score)
+    fitted = fit_trials(known.trials, wider, start, known.evidence)
+    return FittedSet(wider, (*known.added, score.name), fitted, known.trials)
 
 
-def reduce_set(bench: Bench, known: FittedSet, name: str) -> FittedSet:
+def reduce_set(known: FittedSet, name: str) -> FittedSet:
     """Fit the set without one of its effects."""
     fewer = replace(known.recipe, effects=tuple(e for e in known.recipe.effects if e != name))
-    fitted = bench.fit(fewer, without_effect(fewer, known.evidence), known.evidence)
-    kept = tuple(n for n in known.added if n != name)
-    return FittedSet(fewer, kept, fitted, bench.trials)
+    start = without_effect(fewer, known.evidence)
+    fitted = fit_trials(known.trials, fewer, start, known.evidence)
+    return FittedSet(fewer, tuple(n for n in known.added if n != name), fitted, known.trials)
 
 
-def is_superfluous(known: FittedSet, without: FittedSet, s: Settings) -> bool:
-    """Whether the error on every axis stays, but for what is not worth an effect."""
-    return bool(np.all(np.log(without.error / known.error) < s.worth))
+def is_superfluous(error: Array, without: Array, s: Settings) -> bool:
+    """Whether the error (n_q,) on every axis stays, but for what is not worth an effect."""
+    return bool(np.all(np.log(without / error) < s.worth))
+
+
+@dataclass(frozen=True)
+class LeaveOutTask:
+    """An effect of a set that is left out, and weighed beside its rivals.
+
+    Attributes:
+        recipe, p: the set, and its parameters as fitted.
+        name: the effect; rivals: others for its place.
+        late_s: time by which inputs were sampled after positions.
+    """
+
+    recipe: Recipe
+    p: Array
+    name: str
+    rivals: tuple[str, ...]
+    late_s: float | None
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """What a set is without one effect.
+
+    Attributes:
+        error: that of the `FittedSet` without it, (n_q,).
+        scores: of the effect and its rivals against that.
+        contest: the same, best first; see `weigh`.
+    """
+
+    error: Array
+    scores: dict[str, Score]
+    contest: list[Contender]
+
+
+def run_leave_out(task: LeaveOutTask) -> LeftOut:
+    """Fit a set without one of its effects, and weigh what may take its place."""
+    evidence = linearise(task.recipe, task.p, task.late_s)
+    fewer = reduce_set(FittedSet(task.recipe, (), evidence, open_trials(task.late_s)), task.name)
+    found = {
+        item.name: fewer.scorer.score(item)
+        for item in candidates_of(fewer.recipe, (task.name, *task.rivals))
+    }
+    scores = {name: score for name, score in found.items() if score is not None}
+    return LeftOut(fewer.error, scores, weigh(fewer, task.name, scores))
 
 
 @dataclass(frozen=True)
@@ -143,10 +194,10 @@ def polish(
     """
     swapped: set[str] = set()
     while True:
-        found, contests = _swap_by_score(bench, found, rivals, swapped)
+        found, left_out = _swap_by_score(bench, found, rivals, swapped)
         alike: dict[str, tuple[str, ...]] = {}
         for name in found.added:
-            likely, other = _swap_by_replay(bench, found, contests[name], progress)
+            likely, other = _swap_by_replay(bench, found, name, left_out[name], progress)
             if other is not None and name not in swapped:
                 swapped |= {name, likely[0]}
                 found = other
@@ -154,41 +205,44 @@ def polish(
             if likely:
                 alike[name] = tuple(n for n in likely if n != name)
         else:
+            contests = {name: _itself_first(out, name) for name, out in left_out.items()}
             return Polished(found, contests, alike)
 
 
 def _swap_by_score(
     bench: Bench, found: FittedSet, rivals: Mapping[str, Sequence[str]], swapped: set[str]
-) -> tuple[FittedSet, dict[str, tuple[Contender, ...]]]:
+) -> tuple[FittedSet, dict[str, LeftOut]]:
     """Drop and swap effects by their scores; ``swapped`` holds those that were, for good."""
     s = bench.settings
-    contests: dict[str, tuple[Contender, ...]] = {}
-    waiting = list(found.added)
-    while waiting:
-        name = waiting.pop(0)
-        fewer = reduce_set(bench, found, name)
-        if len(found.added) > 1 and is_superfluous(found, fewer, s):
-            found, contests = fewer, {}
-            waiting = list(found.added)
-            continue
-        scores, contest = _contest(bench, found, fewer, name, rivals.get(name, ()))
-        best = contest[0] if contest else None
-        # An effect that is alone has been compared with its rivals by replays already.
-        if len(found.added) > 1 and best and best.effect != name and name not in swapped:
-            mine = next(c for c in contest if c.effect == name)
-            if _beats(best, mine, s):
-                other = extend_set(bench, fewer, scores[best.effect])
-                if np.sum(np.log(other.error / found.error)) < 0.0:
-                    swapped |= {name, best.effect}
-                    found, contests = other, {}
-                    waiting = list(found.added)
-                    continue
-        contests[name] = _itself_first(contest, name)
-    return found, contests
+    while True:
+        left_out: dict[str, LeftOut] = {}
+        tasks = [_leave_out(found, name, rivals.get(name, ())) for name in found.added]
+        for name, out in zip(found.added, bench.pool(run_leave_out, tasks), strict=True):
+            if len(found.added) > 1 and is_superfluous(found.error, out.error, s):
+                found = reduce_set(found, name)
+                break
+            best = out.contest[0] if out.contest else None
+            # An effect that is alone has been compared with its rivals by replays already.
+            if len(found.added) > 1 and best and best.effect != name and name not in swapped:
+                mine = next(c for c in out.contest if c.effect == name)
+                if _beats(best, mine, s):
+                    other = extend_set(reduce_set(found, name), out.scores[best.effect])
+                    if np.sum(np.log(other.error / found.error)) < 0.0:
+                        swapped |= {name, best.effect}
+                        found = other
+                        break
+            left_out[name] = out
+        else:
+            return found, left_out
+
+
+def _leave_out(found: FittedSet, name: str, rivals: Sequence[str]) -> LeaveOutTask:
+    others = tuple(r for r in rivals if r not in found.added)
+    return LeaveOutTask(found.recipe, found.evidence.p, name, others, found.trials.late_s)
 
 
 def _swap_by_replay(
-    bench: Bench, found: FittedSet, contest: Sequence[Contender], progress: Progress
+    bench: Bench, found: FittedSet, name: str, out: LeftOut, progress: Progress
 ) -> tuple[list[str], FittedSet | None]:
     """Compare an effect of a set with its close rivals by replays, beside the others of the set.
 
@@ -196,46 +250,33 @@ def _swap_by_replay(
         Those that these trials do not tell apart, none where none comes close, and the set with
         the first of them where the effect itself is not among them.
     """
-    if len(found.added) < 2 or not contest:
+    if len(found.added) < 2 or not out.contest:
         return [], None
-    mine, *others = contest
-    close = [c.effect for c in others if comes_close(c, mine, bench.settings)]
+    s, (mine, *others) = bench.settings, _itself_first(out, name)
+    close = [c.effect for c in others if comes_close(c, mine, s)]
     if not close:
         return [], None
-    fewer = reduce_set(bench, found, mine.effect)
-    scores = bench.scores(fewer.recipe, fewer.evidence.p, [mine.effect, *close])
+    fewer = reduce_set(found, name)
+    scores = {n: out.scores[n] for n in (name, *close)}
     axis = fewer.evidence.system.coordinates.index(mine.axis)
     misfits = replay_rivals(bench, fewer.recipe, fewer.evidence, scores, axis, progress)
-    likely = plausible(misfits, bench.settings)
+    likely = plausible(misfits, s)
     if not likely:
         # None looks like the measurement: those that do no worse are no less likely.
-        likely = [n for n in close if misfits[n] <= misfits[mine.effect]] + [mine.effect]
-    if mine.effect in likely:
-        alike = [n for n in likely if n != mine.effect]
-        rivals = without_mere_offsets(fewer.recipe, fewer.evidence, scores, alike, bench.settings)
-        return [mine.effect, *rivals], None
-    return likely, extend_set(bench, fewer, scores[likely[0]])
+        likely = [n for n in close if misfits[n] <= misfits[name]] + [name]
+    if name in likely:
+        alike = [n for n in likely if n != name]
+        return [name, *without_mere_offsets(fewer.recipe, fewer.evidence, scores, alike, s)], None
+    return likely, extend_set(fewer, scores[likely[0]])
 
 
-def contest_of(
-    bench: Bench, found: FittedSet, name: str, rivals: Sequence[str]
-) -> tuple[Contender, ...]:
+def contest_of(found: FittedSet, name: str, rivals: Sequence[str]) -> tuple[Contender, ...]:
     """Those who contend for the place of an effect of a set, itself first."""
-    contest = _contest(bench, found, reduce_set(bench, found, name), name, rivals)[1]
-    return _itself_first(contest, name)
+    return _itself_first(run_leave_out(_leave_out(found, name, rivals)), name)
 
 
-def _contest(
-    bench: Bench, found: FittedSet, fewer: FittedSet, name: str, rivals: Sequence[str]
-) -> tuple[dict[str, Score], list[Contender]]:
-    """Scores of an effect of a set and its rivals against the set without it, and the contest."""
-    others = [r for r in rivals if r not in found.added]
-    scores = bench.scores(fewer.recipe, fewer.evidence.p, [name, *others])
-    return scores, weigh(fewer, name, scores)
-
-
-def _itself_first(contest: Sequence[Contender], name: str) -> tuple[Contender, ...]:
-    return tuple(sorted(contest, key=lambda c: c.effect != name))
+def _itself_first(out: LeftOut, name: str) -> tuple[Contender, ...]:
+    return tuple(sorted(out.contest, key=lambda c: c.effect != name))
 
 
 def comes_close(one: Contender, mine: Contender, s: Settings) -> bool:

@@ -19,8 +19,8 @@ def rank(search: Search, selected: Sequence[str]) -> list[RankedEffect]:
 
     Selected effects are held against the model that they were added to, others against the model
     as given: what a second effect does may not show before the first is there. What was added and
-    refused stands with what it did then, whatever its score had promised. The parameters of
-    selected ones are those of the final model, free of the bias that filters give a fit.
+    refused stands with what it did then, whatever its score had promised, unless it ran away. The
+    parameters of selected ones are those of the final model, free of the bias that filters give.
     """
     names = (q.name for q in search.evidence.system.parameters)
     final = dict(zip(names, search.found.replayed, strict=True))
@@ -50,7 +50,8 @@ def rank(search: Search, selected: Sequence[str]) -> list[RankedEffect]:
         if name in refused:
             known = refused[name]
             axis = system.coordinates.index(known.axis)
-            before, after = known.held_out_rmse_before, known.held_out_rmse_after
+            before = known.held_out_rmse_before
+            after = after if known.held_out_rmse_after is None else known.held_out_rmse_after
         group = next(({g, *r} - {name} for g, r in search.groups.items() if name in (g, *r)), set())
         own = [q.name for q in _own_parameters(search.recipe, name)]
         scored = dict(zip(own, score.values, strict=True))

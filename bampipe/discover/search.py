@@ -62,6 +62,8 @@ class Search:
         steps: the sets tried, in order.
         cut_short: whether it ended at `Settings.most_effects`.
         final: replays of the final model, with explainable shares.
+        explainable, explainable_after: explainable share of the residual by axis, of the model as
+            given and of the final one.
     """
 
     trials: MeasuredTrials
@@ -82,6 +84,8 @@ class Search:
     steps: tuple[SearchStep, ...]
     cut_short: bool
     final: tuple[Replicate, ...]
+    explainable: Array
+    explainable_after: Array
 
     @property
     def selected(self) -> tuple[str, ...]:
@@ -109,6 +113,7 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
     initial = bench.fit(base, start)
     progress(0.05, "scoring every candidate on the measured trials")
     first = bench.scores(base, initial.p, bench.names)
+    explainable = bench.shares(base, initial.p)
     progress(0.15, "replaying the model for chance levels")
     current, scores = FittedSet(base, (), initial, bench.trials, start), dict(first)
     asked = bench.gaining(first, current.scorer)
@@ -127,8 +132,14 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
 
     while len(current.added) + len(dropped) < s.most_effects:
         evidence = current.evidence
-        significant, likely = _weigh(bench, scores, known, evidence)
-        significant, doubted = stops.first_beyond(scores, known, significant)
+        doubted: dict[str, tuple[float, Array]] = {}
+        while True:
+            left = {name: score for name, score in scores.items() if name not in doubted}
+            significant, likely = _weigh(bench, left, known, evidence)
+            significant, more = stops.first_beyond(left, known, significant)
+            doubted |= more
+            if not more:
+                break
         refused |= {name: stops.refusal(scores[name]) for name in doubted}
         likely |= {n: found for n, found in doubted.items() if found[0] < s.likely}
         if not significant:
@@ -182,7 +193,7 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
             raise
         # A rival that scored better has no mechanism that could have it: as found, then.
         found = current
-        contests = {name: contest_of(bench, found, name, rivals[name]) for name in found.added}
+        contests = {name: contest_of(found, name, rivals[name]) for name in found.added}
         final = bench.floor_replicas(found.recipe, found.evidence, found.replayed, known.replicates)
     if found.added != current.added:
         steps.append(record_step(found))
@@ -196,7 +207,8 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
         {n: polished.alike.get(n, groups.get(n, ())) for n in found.added},
         unlike, misfit, contests, main, additions, likely, transient,
         tuple(r for name, r in refused.items() if name not in found.added), tuple(steps), cut_short,
-        tuple(final),
+        tuple(final), explainable,
+        bench.shares(found.recipe, found.evidence.p) if found.added else explainable,
     )  # fmt: skip
 
 

@@ -182,12 +182,15 @@ def _refused(axis: str, found: Diagnosis, unit: str, remains: bool) -> list[str]
         before, after = one.held_out_rmse_before, one.held_out_rmse_after
         rest, left = one.without_worst_second_before, one.without_worst_second_after
         aside = ""
-        if one.why == "held_out" and rest and left and left * before > after * rest:
+        if one.why == "held_out" and after and rest and left and left * before > after * rest:
             before, after, aside = rest, left, " but for the worst second"
-        numbers = f"{three(before)} to {three(after)} {unit}{aside}"
+        numbers = f"{three(before)} to {three(after)} {unit}{aside}" if after is not None else ""
         if one.why == "scale":
             why = "fits best where next to nothing is left of what the applied force does, which"
             why += " makes every error small"
+        elif after is None:
+            why = "beats chance by its score, but, fitted without one of the trials, runs away on"
+            why += " it: another trial like that could decide"
         elif one.why == "replays":
             why = f"would take the held-out error from {numbers}, but replays with it give no floor"
             why += " that this could be judged by"

@@ -35,6 +35,8 @@ class Settings:
             a geometric mean on every axis.
         carried: least share of the drop of log error by its score that an effect must show on
             trials that its fit has not seen at all.
+        runs_away: held-out error with an effect over that without from which on its refits are said
+            to run away: no figure that says anything of the effect.
         share: least share of what exceeds the floor on one axis, in the mean square, that an effect
             must remove in its turn: on a measured machine something always remains, and many
             effects take a little of it.
@@ -113,6 +115,7 @@ class Settings:
     unmoved: float = 0.01
     least_slope: float = 0.2
     carried: float = 0.25
+    runs_away: float = 10.0
     share: float = 0.15
     above_floor_sd: float = 2.0
     shrunken: float = 0.4

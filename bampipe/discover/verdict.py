@@ -15,11 +15,9 @@ from bampipe.discover.ranking import rank
 from bampipe.discover.scorer import Scorer
 from bampipe.discover.search import Search
 from bampipe.discover.settings import Settings
-from bampipe.discover.shape import explainable_share
 from bampipe.results.diagnose import AxisVerdict, Contender, TransientCandidate, Verdict
 from bampipe.results.standing import FLOOR_WRONG, standing
 from bampipe.trials.noise_floor import NoiseFloor
-from bampipe.trials.residuals import Evidence
 
 
 def conclude(search: Search, s: Settings) -> Diagnosis:
@@ -43,13 +41,10 @@ def conclude(search: Search, s: Settings) -> Diagnosis:
         for axis in axes
     ]
     by_chance = [float(shares[:, axis].max()) for axis in axes]
-
-    def beyond_chance(evidence: Evidence) -> list[float]:
-        known = [explainable_share(evidence, axis) for axis in axes]
-        return [_share_beyond_chance(known[axis], by_chance[axis]) for axis in axes]
-
-    given = beyond_chance(search.initial)
-    share = beyond_chance(evidence) if search.selected else given
+    given, share = (
+        [_share_beyond_chance(float(known[axis]), by_chance[axis]) for axis in axes]
+        for known in (search.explainable, search.explainable_after)
+    )
     seconds = [error_without_second(evidence, axis) for axis in axes]
     lacking = [
         standing(rest, float(floor.level[axis]), float(floor.sd[axis])) == "above_floor"

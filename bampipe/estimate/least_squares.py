@@ -95,14 +95,11 @@ class Problem:
 
 
 @dataclass(frozen=True)
-class LeastSquares:
-    """Fitted parameters and what they rest on.
+class Minimum:
+    """Where a descent to the least squares ended.
 
     Attributes:
         p: (np,) parameters, those not free as given.
-        covariance: (n_free, n_free) sandwich estimate: blocks of time are independent, samples
-            within one are not.
-        residual_sd: (n_q,) root mean square of the low-passed residual.
         stacked: by trial, linearised at ``p``.
         iterations: Gauss-Newton steps taken.
         converged: whether the last step no longer changed the fit.
@@ -110,12 +107,24 @@ class LeastSquares:
     """
 
     p: Array
-    covariance: Array
-    residual_sd: Array
     stacked: tuple[Stacked, ...]
     iterations: int
     converged: bool
     at_bound: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class LeastSquares(Minimum):
+    """Fitted parameters and what they rest on.
+
+    Attributes:
+        covariance: (n_free, n_free) sandwich estimate: blocks of time are independent, samples
+            within one are not.
+        residual_sd: (n_q,) root mean square of the low-passed residual.
+    """
+
+    covariance: Array
+    residual_sd: Array
 
 
 def residual_and_slopes(
@@ -176,9 +185,35 @@ def fit(
     trials: Sequence[int] | None = None,
     most_iterations: int = 30,
     block_s: float = 2.0,
-    known: KnownSlopes | None = None,
 ) -> LeastSquares:
-    """Estimate the free parameters by weighted least squares within their bounds.
+    """Estimate the free parameters as `minimise` does, and how far they are to be trusted.
+
+    Args:
+        problem, start, trials, most_iterations: as for `minimise`.
+        block_s: length of the blocks of the covariance, s.
+
+    Raises:
+        ValueError, InputError: as `minimise`.
+    """
+    found = minimise(problem, start, trials, most_iterations)
+    return LeastSquares(
+        **vars(found),
+        covariance=_sandwich(problem, found.stacked, block_s),
+        residual_sd=_scatter(found.stacked),
+    )
+
+
+def minimise(
+    problem: Problem,
+    start: Array,
+    trials: Sequence[int] | None = None,
+    most_iterations: int = 30,
+    *,
+    known: KnownSlopes | None = None,
+    at_start: Sequence[Stacked] | None = None,
+    tolerance: float = 1e-10,
+) -> Minimum:
+    """Find the free parameters that leave the least squares, weighted by axis, within their bounds.
 
     Each axis is weighted by the scatter of its own residual, which is iterated; parameters in
     which the residual is not linear are found by Gauss-Newton with halved steps.
@@ -188,8 +223,9 @@ def fit(
         start: (np,) parameters to start from.
         trials: which trials to use; all by default.
         most_iterations: the most Gauss-Newton steps.
-        block_s: length of the blocks of the covariance, s.
         known: slopes that need not be taken again.
+        at_start: these trials linearised at ``start``, where they have been.
+        tolerance: change of the cost, the negative log likelihood a sample, at which it ends.
 
     Raises:
         ValueError: there are fewer samples than parameters.
@@ -198,19 +234,16 @@ def fit(
     chosen = list(range(problem.n_trials)) if trials is None else list(trials)
     p = np.array(start, dtype=float)
     p[problem.free] = np.clip(p[problem.free], problem.lower, problem.upper)
-    stacked = [stacked_residual(problem, trial, p, known) for trial in chosen]
+    stacked = at_start or [stacked_residual(problem, trial, p, known) for trial in chosen]
     for trial, s in zip(chosen, stacked, strict=True):
         _require_finite(problem, trial, s, p)
     if sum(len(s.residual) for s in stacked) <= problem.free.size:
         raise ValueError("fewer samples than parameters")
     start_at = _Linearised(problem, chosen, p, stacked)
-    found = descend(start_at, problem.lower, problem.upper, most_iterations)
-    last = found.last
-    return LeastSquares(
-        p=last.p,
-        covariance=_sandwich(problem, last.stacked, block_s),
-        residual_sd=_scatter(last.stacked),
-        stacked=tuple(last.stacked),
+    found = descend(start_at, problem.lower, problem.upper, most_iterations, tolerance)
+    return Minimum(
+        p=found.last.p,
+        stacked=tuple(found.last.stacked),
         iterations=found.iterations,
         converged=found.converged,
         at_bound=found.at_bound,

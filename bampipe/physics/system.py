@@ -21,6 +21,9 @@ if TYPE_CHECKING:  # it brings sympy, which few need
 Array = NDArray[np.float64]
 _MEMORY_STEPS = (3, 12, 48, 192)
 """Steps a sample tried in turn, until a stiff state is integrated without running away."""
+_STIFF_STEPS = 24
+"""Exponential steps a sample, stable ones, in place of more than these, where no state depends on
+another. A hysteresis passed 600 times between two samples is 1 % off, 60 times 0.1 %."""
 _STABLE = 2.5
 """Largest product of a step and the rate at which a state decays for which RK4 is stable, with a
 margin: it is up to 2.78 (Hairer and Wanner, Solving Ordinary Differential Equations II, IV.2)."""
@@ -286,8 +289,9 @@ class System:
     def memory(self, q: Array, qd: Array, qdd: Array, u: Array, p: Array, t: Array) -> Array:
         """Internal states along a measured motion of one trial, (T, n_z).
 
-        Integrated by RK4 with inputs interpolated linearly between samples, in finer steps where
-        a state would run away. A command or channel that is switched holds until the sample that
+        Integrated by RK4, or by exponential steps where its rate is linear in the state, along
+        rates that are cubic between samples and inputs that are linear, in finer steps where a
+        state would run away. A command or channel that is switched holds until the sample that
         first shows its new value.
 
         Args:
@@ -296,7 +300,7 @@ class System:
         """
         if not self.memory_names:
             return np.zeros((len(q), 0))
-        a, b, _ = self.true_motion(q, qd, qdd, u, p)
+        a, b, c = self.true_motion(q, qd, qdd, u, p)
         z0 = self.initial_memory(a[0], u[0], p)
         switched = self._switched(u)
         at = np.flatnonzero(switched.any(axis=1))
@@ -304,14 +308,24 @@ class System:
             # One more row at the time of the switch, with the values before it.
             held = np.where(switched[at], u[at - 1], u[at])
             u = np.insert(u, at, held, axis=0)
-            a, b, t = (np.insert(x, at, x[at], axis=0) for x in (a, b, t))
-        groups = {"q": a, "qd": b, "u": u, "p": p}
-        columns = [x[..., self._memory_uses[group]] for group, x in groups.items()]
+            a, b, c, t = (np.insert(x, at, x[at], axis=0) for x in (a, b, c, t))
+        uses = self._memory_uses
+        columns = [
+            a[:, uses["q"]],
+            b[:, uses["qd"]],
+            c[:, uses["qd"]],
+            u[:, uses["u"]],
+            p[uses["p"]],
+        ]
         arrays = [np.ascontiguousarray(x, dtype=np.float64) for x in (*columns, t)]
         out = np.empty((len(t), len(z0)))
         module = self._code.module("memory")
         least = 0.0
+        stiff = getattr(module, "stiff_memory", None)
         for steps in _MEMORY_STEPS:
+            if stiff is not None and max(steps, least) > _STIFF_STEPS:
+                stiff(*arrays, z0, _STIFF_STEPS, out)
+                break
             if steps < least and steps < _MEMORY_STEPS[-1]:
                 continue
             fastest = module.memory(*arrays, z0, steps, out)

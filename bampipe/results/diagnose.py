@@ -143,21 +143,26 @@ class TransientCandidate(Record):
     second: Stretch
 
 
+RefusalReason = Literal["held_out", "runs_away", "replays", "scale", "stops"]
+
+
 class RefusedEffect(Record):
     """A candidate that beats chance by its score, and is not kept."""
 
     effect: str
     axis: str
     held_out_rmse_before: Size = Field(description="Of the model that it was added to")
-    held_out_rmse_after: Size = Field(
-        description="With it, fitted, as if it left both sides of the equation at their size"
+    held_out_rmse_after: Size | None = Field(
+        description="With it, fitted, as if it left both sides of the equation at their size; null "
+        "where it runs away"
     )
     without_worst_second_before: Size | None = Field(
         default=None, description="The same but for the worst second; null where it was not fitted"
     )
     without_worst_second_after: Size | None = None
-    why: Literal["held_out", "replays", "scale", "stops"] = Field(
-        description="It does too little on held-out trials; or replays with it give no floor that "
+    why: RefusalReason = Field(
+        description="It does too little on held-out trials; or, fitted without one of them, runs "
+        "away there; or replays with it give no floor that "
         "an error could be judged by; or it leaves next to nothing of what the force does, so that "
         "all forces become small together; or replays that truly stand still at reversals give it "
         "most of its gain as well"

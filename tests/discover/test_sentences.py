@@ -196,6 +196,7 @@ def test_a_rival_about_as_likely_is_named_in_the_verdict(monkeypatch):
         (1.02, 0.60, "held_out", "does not lower the held-out error (1.00 to 1.02 N.m): it is not"),
         (0.20, 0.10, "replays", "from 1.00 to 0.200 N.m, but replays with it give no floor"),
         (1e-5, 1e-5, "scale", "lag:x fits best where next to nothing is left of what the applied"),
+        (None, None, "runs_away", "its score, but, fitted without one of the trials, runs away"),
     ],
 )
 def test_what_beats_chance_and_is_refused_is_said(monkeypatch, after, without, why, said):
