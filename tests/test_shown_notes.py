@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from bampipe.cli import show
+from bampipe.results.identify import EffectEstimate
 
 
 def step(name: str, **summary: Any) -> Any:
@@ -36,3 +37,15 @@ def test_notes_of_the_logs_and_a_second_that_stands_out_are_said(
         "note: t02: not used: 20 sound samples",
         "note: The second from 5.1 s of trial t02 on moves `mass`.",
     ]
+
+
+def test_an_effect_that_is_not_identified_is_said(capsys: pytest.CaptureFixture[str]) -> None:
+    why = "`stribeck.joint.force` is 18 \u00b1 46 N.m, an interval larger than itself"
+    show.unidentified(
+        {
+            "play:joint": EffectEstimate(identified=True),
+            "stribeck:joint": EffectEstimate(identified=False, reasons=(why,)),
+        }
+    )
+    said = f"note: `stribeck:joint` does not count as identified: {why}.\n"
+    assert capsys.readouterr().out == said

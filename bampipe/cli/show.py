@@ -19,6 +19,7 @@ from bampipe.run.request import Outcome
 
 if TYPE_CHECKING:
     from bampipe.results.compare import Rung
+    from bampipe.results.identify import EffectEstimate
 
 LARGEST_TABLE = 40
 WIDEST_CELL = 60
@@ -338,6 +339,13 @@ def _standing_out(content: Mapping[str, object]) -> None:
     worst = influence.get("worst_second") if isinstance(influence, dict) else None
     if worst and worst.get("sentence"):
         say(f"note: {worst['sentence']}")
+
+
+def unidentified(effects: Mapping[str, EffectEstimate]) -> None:
+    """Print which effects of a model do not count as identified, and why."""
+    for name, found in effects.items():
+        if not found.identified:
+            say(f"note: {found.describe(name)}")
 
 
 def _counting(model: str) -> None:

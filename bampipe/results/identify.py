@@ -122,6 +122,12 @@ class EffectEstimate(Record):
     identified: bool
     reasons: Names = Field(default=(), description="Why it does not count as identified")
 
+    def describe(self, name: str) -> str:
+        """Say that it does not count as identified, and why; "" where it does."""
+        if self.identified:
+            return ""
+        return f"`{name}` does not count as identified: {'; '.join(self.reasons)}."
+
 
 class InputTiming(Record):
     """Time by which forces were sampled after positions, within half a sample."""
