@@ -247,7 +247,8 @@ def test_of_very_many_trials_some_choose_the_bandwidth(tmp_path: Path) -> None:
     path = run.path("ingest/samples.parquet")
 
     def chosen(path: Path, budget: int) -> list[list[float]]:
-        records = stage._tuning_records(path, names, tuple(AXES), 500.0, budget)["yaw"]
+        found, _ = stage._tuning_records(path, names, tuple(AXES), 500.0, budget)
+        records = found["yaw"]
         assert all(x.base is None and seen.base is None for x, seen in records), "whole trials kept"
         assert all(len(x) == budget // len(records) for x, _ in records)
         return [[float(x[0]), float(x[1])] for x, _ in records]
