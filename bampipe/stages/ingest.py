@@ -383,9 +383,17 @@ def _typical_hum(
 
 def _measure_noise(noise: dict[str, list[RecordNoise]], trial: CleanTrial) -> None:
     """Note what a trial says of the noise of its encoders (``q_<axis>``) and inputs."""
-    for name, values in trial.columns.items():
-        if not name.startswith("brake_"):
-            noise[name].append(RecordNoise.of(np.asarray(values, dtype=float), trial.t))
+    columns = {
+        name: np.asarray(values, dtype=float)
+        for name, values in trial.columns.items()
+        if not name.startswith("brake_")
+    }
+    readings = {name: x for name, x in columns.items() if name.startswith("q_")}
+    inputs = {name: x for name, x in columns.items() if name not in readings}
+    found = {name: RecordNoise.of(x, trial.t) for name, x in readings.items()}
+    found |= RecordNoise.of_inputs(inputs, [*readings.values()], trial.t)
+    for name, one in found.items():
+        noise[name].append(one)
 
 
 def _row(entry: TrialEntry, trial: CleanTrial | None, reason: str) -> dict[str, object]:
