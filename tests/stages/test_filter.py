@@ -258,7 +258,8 @@ def test_of_very_many_trials_some_choose_the_bandwidth(tmp_path: Path) -> None:
     assert chosen(path, 10_000) == list(first.values())
     frames |= {name: frames[name][:20] for name in "ae"}
     short = write_ingested(tmp_path / "short", frames, {n: ("free", None) for n in names}, AXES)
-    records = stage._tuning_records(
+    found, refused = stage._tuning_records(
         short.path("ingest/samples.parquet"), names, tuple(AXES), 500.0, 4000
-    )["yaw"]
-    assert [x[:2].tolist() for x, _ in records] == [first["b"]]
+    )
+    assert [x[:2].tolist() for x, _ in found["yaw"]] == [first["b"]]
+    assert set(refused) == {"a", "e"}
