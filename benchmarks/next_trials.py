@@ -7,7 +7,9 @@
 
 Sessions come from simulators that share no code with bampipe. A proposal is followed there by
 somebody who follows well, and by somebody who covers half the range at twice the speed; beside it,
-one more trial of the motion at hand of the same length is recorded. With ``--timid``, that motion
+one more trial of the motion at hand of the same length is recorded. ``decision`` does so wherever a
+diagnosis is not right at once, be it undecided or mistaken, with what `bampipe next` proposes then
+by itself. With ``--timid``, that motion
 is confined to where two effects look alike; ``--trials`` and ``--seconds`` say how much of it there
 is, ``--added`` how long the trial more is. Precision is asked of the worst-known parameter, or with
 ``--of all`` of all together.
@@ -30,7 +32,6 @@ from independent.person import Task
 from independent.sensors import Conditions
 
 import bampipe
-from bampipe.errors import InputError
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.next import NextResult
@@ -154,7 +155,8 @@ def measure_precision(
         machine, conditions, seeds: of the sessions; added_s: length of the trial more.
         of_all: whether the trial is for all parameters, and not for the worst-known one.
     """
-    ratios: dict[str, list[float]] = {"asked": [], "all": []}
+    ratios: dict[str, list[float]] = {"asked": [], "all": [], "said as a number": []}
+    in_range: list[bool] = []
     narrower: dict[str, list[float]] = {"well": [], "sloppy": []}
     shares, errors, lasted = [], [], []
     for seed in seeds:
@@ -176,6 +178,10 @@ def measure_precision(
         judged = names if of_all else [target]
         came = {name: then["well"].sd[name] / forecast[name].after for name in names}
         ratios["all"] += came.values()
+        ratios["said as a number"] += [came[name] for name in names if forecast[name].is_sharp]
+        in_range += [
+            forecast[name].low <= then["well"].sd[name] <= forecast[name].high for name in names
+        ]
         ratios["asked"] += [came[name] for name in judged]
         for kind, list_of in narrower.items():
             list_of.append(mean_ratio(then["free"].sd, then[kind].sd, judged))
@@ -184,7 +190,7 @@ def measure_precision(
         errors += [[one.error[n] / one.sd[n] for n in judged] for one in then.values()]
         print(f"{machine} {seed}: {found.sentence}")
         print(
-            f"  {target}: now {before.sd[target]:.3g}, forecast {forecast[target].after:.3g}; "
+            f"  {target}: now {before.sd[target]:.3g}, forecast {forecast[target].number}; "
             + ", ".join(
                 f"{kind} {one.sd[target]:.3g} (off by {one.error[target]:.2g})"
                 for kind, one in then.items()
@@ -199,6 +205,7 @@ def measure_precision(
     for which, values in ratios.items():
         inside = sum(1 / 1.3 < ratio < 1.3 for ratio in values)
         print(f"{which}: {inside} of {len(values)} uncertainties within 1.3 of the forecast")
+    print(f"all: {sum(in_range)} of {len(in_range)} between the ends of the forecast")
     for kind, list_of in narrower.items():
         print(
             f"sd after a free trial, over that after the proposed followed {kind}: median"
@@ -234,19 +241,18 @@ class Hidden:
     conditions: Conditions
 
 
-def ambiguous_sessions(
+def unresolved_sessions(
     root: Path, hidden: Sequence[Hidden], seeds: range
-) -> Iterator[tuple[Hidden, int, bampipe.Run]]:
-    """Sessions that the diagnosis leaves undecided; what it says of the others is printed."""
+) -> Iterator[tuple[Hidden, int, bampipe.Run, str]]:
+    """Sessions of which the diagnosis is not right at once, with what it says."""
     for seed in seeds:
         for one in hidden:
             folder = root / f"{one.machine}-{one.effect.replace(':', '.')}-{seed}"
             run, _ = run_of(folder, one.machine, seed, {one.effect: 1.0}, one.conditions)
             said = verdict(run, one.effect)
-            if said == "undecided":
-                yield one, seed, run
-            else:
-                print(f"{one.machine} {seed} {one.effect}: at once {said}", flush=True)
+            print(f"{one.machine} {seed} {one.effect}: at once {said}", flush=True)
+            if said != "right":
+                yield one, seed, run, said
 
 
 def measure_decision(hidden: Sequence[Hidden], seeds: range, added_s: float | None) -> None:
@@ -256,36 +262,36 @@ def measure_decision(hidden: Sequence[Hidden], seeds: range, added_s: float | No
         hidden: effects and sessions; seeds: of these.
         added_s: length of the trial more; that of the trials at hand where it is None.
     """
-    counts = {kind: Counter[str]() for kind in ("well", "sloppy", "free")}
+    ways = ("well", "sloppy", "free")
+    counts: dict[str, dict[str, Counter[str]]] = {}
     cases = 0
     with tempfile.TemporaryDirectory() as name:
         root = Path(name)
-        for one, seed, run in ambiguous_sessions(root, hidden, seeds):
+        for one, seed, run, at_once in unresolved_sessions(root, hidden, seeds):
             head = f"{one.machine} {seed} {one.effect}"
-            try:
-                found, path = propose(
-                    run, purpose="decision", seconds=added_s or one.conditions.seconds
-                )
-            except InputError as error:
-                print(f"{head}: {error}", flush=True)
-                continue
+            start = time.perf_counter()
+            found, path = propose(run, seconds=added_s or one.conditions.seconds)
+            lasted, best = time.perf_counter() - start, found.proposals[0]
             cases += 1
-            pair = max(found.proposals[0].confusion, key=lambda c: c.weight * c.before)
+            told = counts.setdefault(at_once.partition(" ")[0], {kind: Counter() for kind in ways})
             said = {}
             for kind, chosen in ways_on(one.conditions, path).items():
                 folder = root / f"{kind}-{cases}"
                 after, _ = run_of(folder, one.machine, seed, {one.effect: 1.0}, chosen)
                 said[kind] = verdict(after, one.effect)
-                counts[kind][said[kind].partition(" ")[0]] += 1
-            print(f"{head}: {found.sentence}")
-            print(
-                f"{head}: {' or '.join(pair.between)}, confusion"
-                f" {pair.before:.2f} to {pair.after:.2f}; {said}",
-                flush=True,
-            )
-    print(f"{cases} undecided sessions; after one more trial:")
-    for kind, count in counts.items():
-        print(f"  {kind}: {dict(count)}")
+                told[kind][said[kind].partition(" ")[0]] += 1
+            print(f"{head}: for {found.purpose}, {lasted:.0f} s: {found.sentence}")
+            for pair in best.confusion:
+                between = " or ".join(pair.between)
+                print(f"  {between}: confusion {pair.before:.2f} to {pair.after:.2f}")
+            if one.effect in found.sensitivity:
+                seen = found.sensitivity[one.effect]
+                print(f"  smallest {seen.smallest} to {seen.with_proposal}, typical {seen.typical}")
+            print(f"  {said}", flush=True)
+    for at_once, told in counts.items():
+        print(f"where the diagnosis at once {at_once}, after one more trial:")
+        for kind, count in told.items():
+            print(f"  {kind}: {dict(count)}")
 
 
 def main() -> int:

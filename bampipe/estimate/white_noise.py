@@ -25,6 +25,9 @@ _FEWEST = 200
 """Samples below which noise is not measured."""
 _STRETCHES, _STRETCH = 8, 2000
 """A longer record is looked at in so many stretches of so many samples: enough for 1 %."""
+_LAGS = range(-1, 16)
+"""Samples by which a controller may be behind the readings that it acts on; or the log ahead."""
+_FEEDBACK_ORDER, _FEEDBACK_ROWS = 3, 16000
 _REACHES, _OFF_GRID = (1.5, 10.0, 100.0), 0.05
 """Multiples of a step up to which it is found ever more exactly; how far off values may be."""
 
@@ -62,6 +65,29 @@ def slow_noise_sd(record: Array, t: Array, step: float = 0.0) -> float:
         clear = _without_lines(record[part], t[part], LOWEST_LINE / every)
         found.append(_difference_noise(clear[::every], t[part][::every]))
     return _without_dither(float(np.median(found)), step)
+
+
+def without_feedback(records: Array, readings: Array) -> Array:
+    """What in ``records`` (T, n) does not follow ``readings`` of encoders (T, n_q), (T', n).
+
+    A controller makes its force of the readings, their rounding included, and that acts on the
+    machine: it is no noise. What is linear in the last readings is found by least squares on
+    differences, in which the rounding stands and the motion does not. At most 16,000 samples from
+    the middle are looked at.
+    """
+    first = max(0, (len(records) - _FEEDBACK_ROWS) // 2)
+    part = slice(first, first + _FEEDBACK_ROWS)
+    records, readings = records[part], readings[part]
+    ends = slice(_LAGS.stop, len(records) + _LAGS.start)
+    lagged = np.hstack([np.roll(readings - readings[0], lag, axis=0) for lag in _LAGS])[ends]
+    rest = records[ends]
+    changes, wanted = (np.diff(x, _FEEDBACK_ORDER, axis=0) for x in (lagged, rest))
+    sound = np.isfinite(changes).all(axis=1) & np.isfinite(wanted).all(axis=1)
+    if np.count_nonzero(sound) < max(_FEWEST, 10 * lagged.shape[1]):
+        return rest
+    size = np.maximum(np.sqrt(np.mean(changes[sound] ** 2, axis=0)), 1e-300)
+    weights = np.linalg.lstsq(changes[sound] / size, wanted[sound], rcond=1e-10)[0]
+    return np.asarray(rest - (lagged / size) @ weights)
 
 
 def _dithered(record: Array, step: float) -> Array:

@@ -51,7 +51,6 @@ class Forecast:
         device = system.model.device
         axes = device.coordinates
         added = [self.precision.of_motion(motion) for motion in tried.usual]
-        hasty = self.precision.of_motion(tried.motions[-1])
         pose = {
             axes[i].name: float(design.pose[i]) for i in range(len(axes)) if i not in design.strokes
         }
@@ -68,23 +67,22 @@ class Forecast:
             worth=tried.worth,
             information_gain=float(np.median([self.precision.gain(one) for one in added])),
             # Of a model that lacks something, uncertainties are not worth a forecast.
-            sd={} if self.contest else self._sd(added, hasty, design.seconds),
+            sd={} if self.contest else self._sd(added, design.seconds),
             confusion=self._confusion(tried.usual),
             farther=farther,
             faster=faster,
         )
 
-    def _sd(self, added: Sequence[Array], hasty: Array, seconds: float) -> dict[str, ExpectedSd]:
+    def _sd(self, added: Sequence[Array], seconds: float) -> dict[str, ExpectedSd]:
         system, found = self.rehearsal.system, self.precision
-        after = np.array([found.sd_with(one, seconds) for one in added])
-        every = np.vstack([after, found.sd_with(hasty, seconds)])
+        expected = [found.expect(one, seconds) for one in added]
+        low = np.min([one.low for one in expected], axis=0)
+        median = np.median([one.median for one in expected], axis=0)
+        high = np.max([one.high for one in expected], axis=0)
         units = {q.name: q.unit for q in system.parameters}
         return {
             name: ExpectedSd(
-                before=found.sd[k],
-                after=float(np.median(after[:, k])),
-                after_at_worst=float(np.quantile(every[:, k], 0.9)),
-                unit=units[name],
+                before=found.sd[k], after=median[k], low=low[k], high=high[k], unit=units[name]
             )
             for k, name in enumerate(found.names)
         }

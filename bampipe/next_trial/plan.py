@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from bampipe.next_trial.choice import Tried
 from bampipe.next_trial.discrimination import Sums
 from bampipe.next_trial.forecast import NOTHING, Forecast, describe_moves
+from bampipe.next_trial.precision import Expected
 from bampipe.next_trial.primitives import Primitive
 from bampipe.next_trial.words import describe
 from bampipe.results.next import Plan, PlannedConfusion, PlannedSd, PlannedTrial
@@ -61,13 +62,13 @@ class TrialPlan:
 
     Attributes:
         designs: what to do.
-        sd: (n,) standard deviations expected in the end.
+        sd: standard deviations expected in the end.
         confusion: chance of confusing each pair of rivals in the end.
         is_enough: whether the goal is reached.
     """
 
     designs: tuple[Primitive, ...]
-    sd: Array
+    sd: Expected
     confusion: dict[tuple[int, int], float]
     is_enough: bool
 
@@ -119,8 +120,8 @@ def _option(forecast: Forecast, tried: Tried) -> _Option:
 
 def _outcome(
     forecast: Forecast, chosen: Sequence[_Option]
-) -> tuple[Array, dict[tuple[int, int], float]]:
-    """Standard deviations (n,) and chances of confusion, with ``chosen`` trials recorded."""
+) -> tuple[Expected, dict[tuple[int, int], float]]:
+    """Standard deviations and chances of confusion, with ``chosen`` trials recorded."""
     precision, contest, sums = forecast.precision, forecast.contest, forecast.at_hand
     added = np.zeros_like(precision.information)
     for one in chosen:
@@ -128,7 +129,8 @@ def _outcome(
         if sums is not None and one.sums is not None:
             sums = sums + one.sums
     seconds = sum(one.design.seconds for one in chosen)
-    sd = precision.sd_with(added, seconds) if chosen else precision.sd
+    now = precision.sd
+    sd = precision.expect(added, seconds) if chosen else Expected(now, now, now)
     if contest is None or sums is None:
         return sd, {}
     return sd, {pair: found.confusion for pair, found in contest.contrasts(sums).items()}
@@ -137,7 +139,7 @@ def _outcome(
 def _distance(forecast: Forecast, chosen: Sequence[_Option], goal: Goal) -> float:
     """How far trials are from the goal: sum of the logarithms of what is too large, nats."""
     sd, confusion = _outcome(forecast, chosen)
-    far = float(np.sum(np.maximum(np.log(sd / goal.sd), 0.0)))
+    far = float(np.sum(np.maximum(np.log(sd.median / goal.sd), 0.0)))
     return far + sum(max(float(np.log(c / goal.confusion)), 0.0) for c in confusion.values())
 
 
@@ -174,7 +176,12 @@ def record_plan(forecast: Forecast, goal: Goal, found: TrialPlan) -> Plan:
         if forecast.contest is not None
         else {
             name: PlannedSd(
-                before=precision.sd[k], after=found.sd[k], asked=goal.sd[k], unit=units[name]
+                before=precision.sd[k],
+                after=found.sd.median[k],
+                low=found.sd.low[k],
+                high=found.sd.high[k],
+                asked=goal.sd[k],
+                unit=units[name],
             )
             for k, name in enumerate(precision.names)
         },

@@ -23,6 +23,21 @@ Array = NDArray[np.float64]
 _BLOCK_S = FilterChoice.block_s
 _ALIKE = 0.2
 """How far the scatter of blocks beyond what an estimator believes differs between parameters."""
+_EIGHT_OF_TEN = 1.28
+"""Standard deviations of a normal distribution on either side that hold eight of ten."""
+_LACKING = 2.0
+"""Uncertainties by the residual over those by the sensors, from which on the model lacks more than
+the sensors leave, and the residual counts as noise."""
+
+
+@dataclass(frozen=True)
+class Expected:
+    """Standard deviations that are expected, each (n,): what comes lies between ``low`` and
+    ``high`` in eight of ten cases."""
+
+    low: Array
+    median: Array
+    high: Array
 
 
 @dataclass(frozen=True)
@@ -61,10 +76,11 @@ class Precision:
         identified: IdentifyResult,
         noise: Noise,
     ) -> Precision:
-        """What the trials at hand say, by the noise that the published estimate has.
+        """What the trials at hand say.
 
-        The filter's uncertainty is that of a regression in the coloured noise of the sensors; that
-        of least squares has the scatter of the residual in its band.
+        The uncertainty of an estimate is that of a regression in the coloured noise of the sensors,
+        whatever method made it; where least squares leave far more than the sensors do, it has
+        the scatter of the residual in its band.
 
         Args:
             system: the model; motions: the trials that were fitted; band: of residuals.
@@ -73,15 +89,16 @@ class Precision:
         """
         timed = identified.input_timing.limit > 0.0
         full = np.append(p, identified.input_timing.estimate)
-        by_filter = identified.method == "ukf"
         scatter = identified.residual_sd or {}
         weight = np.array([scatter.get(axis, 1.0) ** -2.0 for axis in system.coordinates])
         weight *= band.independent_share
 
-        def of_motion(motion: Motion) -> Array:
+        def by_sensors(motion: Motion) -> Array:
             problem = problem_of(system, [motion], band, timing=timed)
-            if by_filter:
-                return find_information(system, motion, problem, 0, full, noise)
+            return find_information(system, motion, problem, 0, full, noise)
+
+        def by_residual(motion: Motion) -> Array:
+            problem = problem_of(system, [motion], band, timing=timed)
             slope = stacked_residual(problem, 0, full).slope
             return np.asarray(np.einsum("tap,taq,a->pq", slope, slope, weight))
 
@@ -89,14 +106,23 @@ class Precision:
         assumed = np.array([q.sd for q in system.parameters])
         names = [system.parameters[i].name for i in problem.free if i < len(p)]
         prior = np.array([assumed[i] if i < len(p) else problem.upper[-1] for i in problem.free])
+        before = np.diag(1.0 / np.maximum(prior, 1e-300) ** 2)
         entries = [identified.parameters[name] for name in names]
         lasting = [np.hypot(e.smoothing_sd or 0.0, e.calibration_sd or 0.0) for e in entries]
-        total = np.sum([of_motion(motion) for motion in motions], axis=0)
-        total += np.diag(1.0 / np.maximum(prior, 1e-300) ** 2)
-        formal = np.sqrt(np.diag(_covariance(total))[: len(names)])
-        if by_filter:
-            known = zip(entries, formal, strict=True)
-            formal = np.array([e.filter_sd or found for e, found in known])
+
+        def known_by(of_motion: Callable[[Motion], Array]) -> tuple[Array, Array]:
+            """Information of the trials at hand, and the standard deviations that it leaves."""
+            total = np.sum([of_motion(motion) for motion in motions], axis=0) + before
+            return np.asarray(total), np.sqrt(np.diag(_covariance(total))[: len(names)])
+
+        of_motion: Callable[[Motion], Array] = by_sensors
+        total, formal = known_by(by_sensors)
+        if identified.method == "ukf":
+            formal = np.array([e.filter_sd or sd for e, sd in zip(entries, formal, strict=True)])
+        elif scatter:
+            other, by_scatter = known_by(by_residual)
+            if np.exp(np.mean(np.log(by_scatter / formal))) > _LACKING:
+                of_motion, total, formal = by_residual, other, by_scatter
         return cls(
             tuple(names),
             np.array([e.sd for e in entries]),
@@ -104,18 +130,24 @@ class Precision:
             np.array([e.systematic_sd or 0.0 for e in entries]),
             np.array(lasting),
             sum(_blocks_of(motion) for motion in motions),
-            np.asarray(total),
+            total,
             of_motion,
         )
 
     def sd_with(self, added: Array, seconds: float) -> Array:
-        """Standard deviations, (n,), once there are trials more.
+        """Standard deviations, (n,), that are expected once there are trials more."""
+        return self.expect(added, seconds).median
 
-        A published one is what the estimator believes, times how much more blocks of time scatter
-        than it believes they do, but never less. That scatter is taken with few blocks, and is
-        uncertain accordingly: what it is of one parameter is held against what it is of all.
+    def expect(self, added: Array, seconds: float) -> Expected:
+        """What will be published once there are trials more.
+
+        A published standard deviation is what the estimator believes, times how much more blocks
+        of time scatter than it believes they do. That scatter is taken with few blocks, now and
+        then again, and is uncertain accordingly: what it is of one parameter is held against what
+        it is of all, and the blocks that tell most then are those of the trial that adds most.
         Methods disagree by what each makes of noise that the motion at hand hardly exceeds: the
-        estimate is a mean by information, in which a trial that does exceed it dilutes that.
+        estimate is a mean by information, in which a trial that does exceed it dilutes that at
+        least. Mostly it goes beside such a trial, for a method that was misled is found out.
 
         Args:
             added: (m, m) information of the trials; seconds: of them together.
@@ -125,21 +157,42 @@ class Precision:
             np.diag(_covariance(matrix))[:n]
             for matrix in (self.information, self.information + added)
         )
-        blocks = self.blocks + max(1, int(seconds / _BLOCK_S))
+        share, new = after / before, max(1, int(seconds / _BLOCK_S))
         rest = self.systematic**2 + self.lasting**2
         statistical = np.sqrt(np.maximum(self.sd**2 - rest, 1e-300))
         scatter = np.log(statistical / self.formal_sd / self._few(self.blocks))
-        trust = _ALIKE**2 / (_ALIKE**2 + 0.5 / max(self.blocks - len(self.information), 1))
-        scatter = np.exp(scatter.mean() + trust * (scatter - scatter.mean()))
-        share = after / before
-        formal = self.formal_sd * np.sqrt(share)
-        noise = formal * np.maximum(scatter * self._few(blocks), 1.0)
-        apart = np.hypot(share * self.systematic, self.lasting)
-        return np.asarray(np.hypot(noise, apart))
+        chance = 0.5 / max(self.blocks - len(self.information), 1)
+        trust = _ALIKE**2 / (_ALIKE**2 + chance)
+        scatter = scatter.mean() + trust * (scatter - scatter.mean())
+        telling = np.maximum(share * self.blocks + (1.0 - share) * new, 1.0)
+        wide = _EIGHT_OF_TEN * np.sqrt(trust * chance + chance / n + 0.5 / telling)
+        least = self.formal_sd * np.sqrt(share)
+        noise = least * np.exp(scatter) * self._few(self.blocks + new)
+        low, median, high = (
+            np.hypot(np.hypot(size, disagreement), self.lasting)
+            for size, disagreement in (
+                (noise * np.exp(-wide), 0.0),
+                (np.maximum(noise, least), share**2 * self.systematic),
+                (np.maximum(noise * np.exp(wide), least), share * self.systematic),
+            )
+        )
+        return Expected(low, median, high)
 
     def _few(self, blocks: int) -> float:
         """By how much few blocks widen a standard deviation."""
         return float(np.sqrt(blocks / max(blocks - len(self.information), 1)))
+
+    def worth(self, added: Array, seconds: float, parameter: str = "") -> float:
+        """What trials are worth, nats: for one parameter, or where none is named for all.
+
+        Args:
+            added: (m, m) information of the trials; seconds: of them together.
+            parameter: whose standard deviation counts, by the fall of its logarithm.
+        """
+        if not parameter:
+            return self.gain(added)
+        place = self.names.index(parameter)
+        return float(np.log(self.sd[place] / self.sd_with(added, seconds)[place]))
 
     def gain(self, added: Array) -> float:
         """Half the drop of the log determinant of the covariance of all parameters, nats."""

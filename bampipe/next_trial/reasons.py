@@ -29,6 +29,8 @@ def explain_proposal(
     best: Proposal,
     table: Mapping[str, Detectable],
     unlimited: Sequence[str],
+    lacking: Sequence[str],
+    better: str,
 ) -> Reasons:
     """Say why a trial is proposed and what it is expected to give.
 
@@ -36,9 +38,24 @@ def explain_proposal(
         purpose: of the trial; parameter: the one that it is for, "" for all.
         best: the proposal; table: by effect, from which size on trials show it.
         unlimited: axes of which the device states no range, so that nothing wider was tried.
+        lacking: axes whose held-out error is above the noise floor.
+        better: trial at hand the like of which says more, "" if none.
     """
     why, expected = _explain(purpose, parameter, best, table, unlimited)
-    return Reasons(why, expected + (_UNTRIED if best.farther or best.faster else ""))
+    if better:
+        what = f"`{parameter}`" if parameter else "the parameters"
+        expected += (
+            f" Moving freely as in trial {better} for as long would say more of {what}: rather"
+            " record that."
+        )
+    if best.farther or best.faster:
+        expected += _UNTRIED
+    if best.sd and lacking:
+        expected += (
+            f" The error of {join_names(lacking, _SHOWN)} is above the noise floor: what the model"
+            " lacks there counts as noise in these uncertainties."
+        )
+    return Reasons(why, expected)
 
 
 def _explain(
@@ -128,11 +145,12 @@ def _narrowed(parameter: str, best: Proposal) -> str:
     falls = {name: sd.after / sd.before for name, sd in best.sd.items() if sd.before > 0.0}
     names = [parameter] if parameter else sorted(falls, key=lambda name: falls[name])[:_SHOWN]
     parts = [
-        f"`{name}` from ± {best.sd[name].before:.2g} to ± {best.sd[name].after:.2g}"
-        f" {best.sd[name].unit}".rstrip()
+        f"`{name}` ± {entry.number} {entry.unit}".rstrip() + f", now ± {entry.before:.2g}"
         for name in names
+        for entry in (best.sd[name],)
     ]
-    return f"Expected: {'; '.join(parts)}."
+    wide = any(not best.sd[name].is_sharp for name in names)
+    return f"Expected: {'; '.join(parts)}" + (" (eight cases in ten)." if wide else ".")
 
 
 def _chance(value: float) -> str:

@@ -3,27 +3,34 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
+from bampipe.errors import InputError
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.identify import IdentifyResult
-from bampipe.results.next import NextResult
+from bampipe.results.next import AS_FORECAST, ExpectedSd, NextResult
 
 _SHOWN = 3
 """Parameters that are compared: those for which the forecast promised most."""
-_AS_FORECAST = 1.3
-"""Factor within which an uncertainty came as forecast."""
 
 
 def read_forecasts(root: Path, model: str) -> tuple[NextResult, ...]:
     """Return the forecasts of a model's trials: that of the last proposal first, then earlier ones.
+
+    What another version of bampipe forecast in other terms cannot be held against what came, and is
+    left out: a new proposal takes its place.
 
     Args:
         root: the run folder; model: what was proposed for.
     """
     last, folder = root / NextResult.file(model), root / NextResult.EARLIER.format(model=model)
     paths = [*([last] if last.is_file() else []), *sorted(folder.glob("*.json"))]
-    return tuple(NextResult.read(path) for path in paths)
+    found = []
+    for path in paths:
+        with suppress(InputError):
+            found.append(NextResult.read(path))
+    return tuple(found)
 
 
 def find_open(forecasts: Sequence[NextResult], proposed: NextResult) -> tuple[NextResult, ...]:
@@ -82,12 +89,10 @@ def compare_forecast(
     for name in names:
         if name in identified.parameters:
             forecast, came = best.sd[name], identified.parameters[name].sd
-            ratio = came / forecast.after if forecast.after > 0.0 else 1.0
-            kept = 1.0 / _AS_FORECAST <= ratio <= _AS_FORECAST
             said.append(
-                f"`{name}`: ± {forecast.after:.2g} {forecast.unit} was forecast with trial"
+                f"`{name}`: ± {forecast.number} {forecast.unit} was forecast with trial"
                 f" {', '.join(new)}, ± {came:.2g} came (± {forecast.before:.2g} before)"
-                + ("." if kept else f": {ratio:.2g} times the forecast.")
+                + _verdict(forecast, came)
             )
     for pair in best.confusion[:_SHOWN]:
         first, second = pair.between
@@ -105,3 +110,14 @@ def compare_forecast(
         else:
             said.append(f"{forecast_text}; the trials still do not distinguish them.")
     return tuple(said)
+
+
+def _verdict(forecast: ExpectedSd, came: float) -> str:
+    """How an uncertainty that came stands to what was forecast, as the end of a sentence."""
+    if forecast.is_sharp:
+        ratio = came / forecast.after if forecast.after > 0.0 else 1.0
+        kept = 1.0 / AS_FORECAST <= ratio <= AS_FORECAST
+        return "." if kept else f": {ratio:.2g} times the forecast."
+    if came < forecast.low:
+        return ": less than forecast."
+    return ": more than forecast." if came > forecast.high else ": within what was forecast."

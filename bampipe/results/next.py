@@ -13,6 +13,9 @@ Purpose = Literal["precision", "decision", "sensitivity"]
 """What a trial is for: smaller uncertainties, one effect distinguished from others, effects shown
 that the trials at hand would not have shown."""
 
+AS_FORECAST = 1.3
+"""Factor within which an uncertainty came as forecast."""
+
 
 class Move(Record):
     """Back and forth of one axis."""
@@ -26,12 +29,23 @@ class Move(Record):
 
 
 class ExpectedSd(Record):
-    """Standard deviation of one parameter."""
+    """Standard deviation of one parameter, without and with new trials."""
 
     before: Size = Field(description="As published")
-    after: Size = Field(description="Median of those who follow it")
-    after_at_worst: Size = Field(description="Of nine trials in ten")
+    after: Size = Field(description="Median")
+    low: Size = Field(description="What comes lies between this and")
+    high: Size = Field(description="this, in eight of ten cases")
     unit: str
+
+    @property
+    def is_sharp(self) -> bool:
+        """Whether one number says it: both ends are within `AS_FORECAST` of the median."""
+        return self.high <= AS_FORECAST * self.after and self.after <= AS_FORECAST * self.low
+
+    @property
+    def number(self) -> str:
+        """What is forecast without its unit: one number where it can be trusted, else a range."""
+        return f"{self.after:.2g}" if self.is_sharp else f"{self.low:.2g} to {self.high:.2g}"
 
 
 class ExpectedConfusion(Record):
@@ -89,13 +103,10 @@ class PlannedTrial(Record):
     moves: dict[str, Move] = Field(description="By axis; the first is the one that it is about")
 
 
-class PlannedSd(Record):
-    """Standard deviation of one parameter, without and with the trials of a plan."""
+class PlannedSd(ExpectedSd):
+    """The same with the trials of a plan, beside what is asked."""
 
-    before: Size
-    after: Size
     asked: Size
-    unit: str
 
 
 class PlannedConfusion(Record):
@@ -135,5 +146,8 @@ class NextResult(Result):
     why: str
     expected: str = Field(description="What it is expected to give")
     proposals: tuple[Proposal, ...] = Field(description="Best first")
+    better_at_hand: str = Field(
+        default="", description="Trial at hand the like of which says more than the first proposal"
+    )
     sensitivity: dict[str, Detectable] = Field(default={}, description="By effect of the library")
     plan: Plan | None = None

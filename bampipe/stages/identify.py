@@ -33,6 +33,7 @@ from bampipe.identification.method_choice import (
     choose,
     describe_methods,
     judge,
+    prefer_steady,
     tabulate_methods,
     widen,
 )
@@ -187,6 +188,8 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
             with suppress(InputError):
                 judged.append(judge(squares, folds, by_output_error(_MOST_SAMPLES)))
                 chosen = choose(system, judged)
+    if method == "auto":
+        chosen = prefer_steady(system, judged, chosen)
     recipe = read_recipe(run, config.model, system.model)
     estimate = with_smoothing(widen(system, judged, chosen, squares), recipe)
     if estimate.method == "least-squares":

@@ -19,7 +19,7 @@ from bampipe.identification.filter_choice import FilterChoice
 from bampipe.identification.sensor_noise import sensor_noise
 from bampipe.next_trial.choice import Tried, Worth, rank_designs
 from bampipe.next_trial.forecast import Forecast
-from bampipe.next_trial.motion import Rehearsal
+from bampipe.next_trial.motion import TRAJECTORY_HZ, Rehearsal
 from bampipe.next_trial.plan import Goal, plan_trials, record_plan
 from bampipe.next_trial.precision import Precision
 from bampipe.next_trial.primitives import Envelope
@@ -32,12 +32,12 @@ from bampipe.next_trial.questions import (
 from bampipe.next_trial.reasons import explain_proposal
 from bampipe.physics import compile_model
 from bampipe.progress import Progress
-from bampipe.results.diagnose import DiagnoseResult
+from bampipe.results.diagnose import AxisVerdict, DiagnoseResult
 from bampipe.results.forecast import find_open, read_forecasts
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.ingest import IngestResult
 from bampipe.results.next import Detectable, NextResult, Plan, Purpose
-from bampipe.results.validate import ValidateResult
+from bampipe.results.validate import JudgedError, ValidateResult
 from bampipe.schema import STRICT, Count
 from bampipe.trials.measured import read_measured_trials, trial_of_block
 from bampipe.trials.motion import Motion
@@ -176,7 +176,11 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
                 tried += rank(_worth("precision", name, forecast, None), False, 0.92)[:1]
         plan = record_plan(forecast, goal, plan_trials(forecast, tried, goal))
     unlimited = [axis for axis in system.coordinates if axis not in model.device.limits]
-    reasons = explain_proposal(chosen, parameter, best, table, unlimited)
+    lacking = _lacking(run, config.model, diagnosed)
+    better = ""
+    if chosen == "precision":
+        better = _better_at_hand(precision, fitted, parameter, config.seconds, tried[0])
+    reasons = explain_proposal(chosen, parameter, best, table, unlimited, lacking, better)
     result = NextResult(
         model=config.model,
         purpose=chosen,
@@ -186,24 +190,32 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         why=reasons.why,
         expected=reasons.expected,
         proposals=proposals,
+        better_at_hand=better,
         sensitivity=table,
         plan=plan,
     )
     result.write(out)
     _write_earlier(run, out, result)
+    followed = ""
     if model.device.robot is not None:
         # A controller follows positions, where a person follows a sentence.
         t, q = rehearsal.trajectory(tried[0].design)
-        head = ",".join(["t", *system.coordinates])
-        path = out / f"models/{config.model}/trajectory.csv"
-        np.savetxt(path, np.column_stack([t, q]), "%.6f", ",", header=head, comments="")
+        head, file = ",".join(["t", *system.coordinates]), f"models/{config.model}/trajectory.csv"
+        path = np.column_stack([t, q])
+        np.savetxt(out / file, path, "%.6f", ",", header=head, comments="")
+        followed = (
+            f"{file} of the run has the positions of the joints along it, {TRAJECTORY_HZ:g} a"
+            " second; check them for collisions, of which the model knows none."
+        )
     if plan is not None:
         # typst is slow to import: only here
         from bampipe.report.protocol import protocol_sheet
 
-        sheet = protocol_sheet(plan, run.read(IngestResult).session_id, config.model)
+        by_hand = not (model.device.drive or model.device.prescribed)
+        session = run.read(IngestResult).session_id
+        sheet = protocol_sheet(plan, session, config.model, by_hand)
         (out / f"models/{config.model}/protocol.pdf").write_bytes(sheet)
-    return _summary(result)
+    return _summary(result, followed)
 
 
 def _write_earlier(run: RunFolder, out: Path, result: NextResult) -> None:
@@ -252,6 +264,16 @@ def _floor(
     return np.maximum(found, 1e-12)
 
 
+def _lacking(run: RunFolder, model: str, diagnosed: DiagnoseResult | None) -> list[str]:
+    """Axes whose held-out error is above the noise floor."""
+    entries: Mapping[str, AxisVerdict | JudgedError] = {}
+    if diagnosed is not None:
+        entries = diagnosed.axes
+    elif run.exists(ValidateResult.file(model)):
+        entries = run.read(ValidateResult, model).axes
+    return [axis for axis, entry in entries.items() if entry.standing == "above_floor"]
+
+
 def _goal(config: Config, estimates: Array, is_complete: bool) -> Goal:
     """What a plan is to reach; no uncertainty of parameters where the model lacks something."""
     asked = np.where(is_complete & (estimates != 0.0), config.sd * np.abs(estimates), np.inf)
@@ -283,15 +305,27 @@ def _worth(
             return float(np.sum(np.log(now / then)))
 
         return shown
-    if parameter:
-        place = precision.names.index(parameter)
-        return lambda motion: float(
-            np.log(
-                precision.sd[place]
-                / precision.sd_with(precision.of_motion(motion), motion.t[-1])[place]
-            )
-        )
-    return lambda motion: precision.gain(precision.of_motion(motion))
+    return lambda motion: precision.worth(
+        precision.of_motion(motion), float(motion.t[-1]), parameter
+    )
+
+
+def _better_at_hand(
+    precision: Precision, fitted: Sequence[Motion], parameter: str, seconds: float, best: Tried
+) -> str:
+    """The trial at hand the like of which, so long, says more than a design does; "" if none.
+
+    Args:
+        precision: what is known; fitted: the trials at hand; parameter: that counts, "" for all.
+        seconds: length of a trial; best: the design.
+    """
+    values = {}
+    for motion in fitted:
+        share = seconds / float(motion.t[-1] - motion.t[0])
+        added = share * precision.of_motion(motion)
+        values[trial_of_block(motion.trial_id)] = precision.worth(added, seconds, parameter)
+    most = max(values, key=lambda name: values[name])
+    return most if values[most] > best.worth else ""
 
 
 def _sensitivity(blindness: Blindness, best: Tried) -> dict[str, Detectable]:
@@ -311,14 +345,18 @@ def _sensitivity(blindness: Blindness, best: Tried) -> dict[str, Detectable]:
     }
 
 
-def _summary(result: NextResult) -> dict[str, object]:
-    """The sentence first, then why and what for; the runners-up beside their worth."""
+def _summary(result: NextResult, followed: str) -> dict[str, object]:
+    """The sentence first, then why and what for; the runners-up beside their worth.
+
+    Args:
+        result: what is proposed; followed: where a robot's controller finds it, "" without one.
+    """
     planned = [f"plan: {result.plan.sentence}"] if result.plan is not None else []
     return {
         "headline": result.sentence,
         "why": result.why,
         "expected": result.expected,
-        "notes": [result.why, result.expected, *planned],
+        "notes": [result.why, result.expected, *planned, *([followed] if followed else [])],
         "purpose": result.purpose,
         "proposals": [
             {"worth": one.worth, "sentence": one.sentence} for one in result.proposals[:_SHOWN]

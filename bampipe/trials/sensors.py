@@ -5,21 +5,36 @@ What a session file states is a claim; the samples themselves say how noisy they
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bampipe.estimate.white_noise import counting_step, slow_noise_sd, white_noise_sd
+from bampipe.estimate.white_noise import (
+    counting_step,
+    slow_noise_sd,
+    white_noise_sd,
+    without_feedback,
+)
 from bampipe.results.ingest import IngestResult
 
 Array = NDArray[np.float64]
 
 _COLOURED = 2.0
 """Factor from which on the noise of a thinned record is more than that of the whole one."""
+_FOLLOWS = 0.5
+"""Share of its noise that is left of a force without what follows the encoders' readings, below
+which a controller makes the rest. Of the white noise of handles, load cells, motor currents and a
+measured arm 0.98 or more is left, of a command by gains on counts and their differences 0.003."""
 DISAGREEMENT = 2.0
 """Factor between stated and measured noise beyond which a warning is given."""
+_COUNTS_SPAN = 16.0
+"""Counts that a converter's readings span at least: fewer tell nothing from a reading in tens."""
+_MIDDLES = (2.0**9, 2.0**11, 2.0**13, 2.0**15)
+"""Counts at which converters of 10 to 16 bits stand where a bipolar sensor carries nothing."""
+_NEAR_MIDDLE = 0.05
+"""Share of that by which an unloaded sensor is off it, as offsets and preload go."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +60,27 @@ class RecordNoise:
         step = counting_step(record)
         slow = float("nan") if stamps is None else slow_noise_sd(record, stamps, step)
         return cls(step, white_noise_sd(record, stamps, step), slow)
+
+    @classmethod
+    def of_inputs(
+        cls, records: Mapping[str, Array], readings: Sequence[Array], t: Array
+    ) -> dict[str, RecordNoise]:
+        """Measure inputs by name, each (T,), recorded beside ``readings`` of encoders, each (T,).
+
+        What a controller makes of the readings acts on the machine, and is no noise.
+        """
+        found = {name: cls.of(record, t) for name, record in records.items()}
+        if not records or not readings:
+            return found
+        rest = without_feedback(np.column_stack([*records.values()]), np.column_stack(readings))
+        # Stamps that jitter are of no use where readings are taken sample by sample.
+        stamps = np.arange(len(rest), dtype=np.float64) * float(np.median(np.diff(t)))
+        for (name, whole), column in zip(found.items(), rest.T, strict=True):
+            left = cls.of(column, stamps)
+            white = left.white_sd if left.white_sd < _FOLLOWS * whole.white_sd else whole.white_sd
+            slow = left.slow_sd if left.slow_sd < _FOLLOWS * whole.slow_sd else whole.slow_sd
+            found[name] = replace(whole, white_sd=white, slow_sd=slow)
+        return found
 
 
 @dataclass(frozen=True)
@@ -147,6 +183,22 @@ def _typical_noise(records: Sequence[RecordNoise], stated: float | None) -> floa
 def _lower_quartile(values: Sequence[float]) -> float | None:
     finite = [value for value in values if np.isfinite(value)]
     return float(np.quantile(finite, 0.25)) if finite else None
+
+
+def looks_like_counts(readings: Array) -> bool:
+    """Whether readings of a force (T,) are rather counts of a converter than in their unit.
+
+    Whole numbers, none negative, that stay farther from zero than they span or about the middle of
+    a converter's range: a force that a machine is moved by comes near zero, and is no whole number.
+    """
+    known = readings[np.isfinite(readings)]
+    if not known.size or np.mean(np.abs(known - np.rint(known)) < 1e-6) < 0.95:
+        return False
+    low, middle, high = float(known.min()), float(np.median(known)), float(known.max())
+    if low < 0.0 or high - low < _COUNTS_SPAN:
+        return False
+    about = any(abs(middle / m - 1.0) < _NEAR_MIDDLE and high < 2.0 * m for m in _MIDDLES)
+    return about or middle > high - low
 
 
 @dataclass(frozen=True)

@@ -55,3 +55,18 @@ def test_noise_of_a_record_in_counts(noise):
     found = RecordNoise.of(np.round(smooth + noise * rng.normal(size=t.size)), t)
     assert found.step == 1.0
     assert found.white_sd == pytest.approx(np.hypot(noise, 1.0 / np.sqrt(12.0)), rel=0.15)
+
+
+@pytest.mark.parametrize("read_noise", [0.0, 0.01])
+def test_what_a_controller_makes_of_counts_is_no_noise(read_noise):
+    """Gains on counts and their differences, two samples late; a load that knows nothing of it."""
+    rng = np.random.default_rng(3)
+    t = np.arange(6000) / 500.0
+    counts = np.floor((np.sin(4.4 * t) + 0.3 * np.sin(11.0 * t)) / 4e-4) * 4e-4
+    wanted = 60.0 * counts + 1500.0 * np.diff(counts, prepend=counts[0])
+    command = 80.0 * np.sin(4.0 * t) - np.roll(wanted, 2) + read_noise * rng.normal(size=t.size)
+    load = 3.0 * np.sin(5.0 * t) + 0.05 * rng.normal(size=t.size)
+    found = RecordNoise.of_inputs({"command": command, "load": load}, [counts], t)
+    assert RecordNoise.of(command, t).white_sd > 0.1
+    assert found["command"].white_sd == pytest.approx(read_noise, rel=0.2, abs=1e-3)
+    assert found["load"] == RecordNoise.of(load, t)

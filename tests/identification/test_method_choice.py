@@ -6,13 +6,17 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from independent.person import Task
 from independent_runs import record_run
 
 from bampipe.estimate.least_squares import Problem
 from bampipe.estimate.low_pass import Band
 from bampipe.files import read_json
 from bampipe.identification.estimates import Estimate
-from bampipe.identification.method_choice import Judged, choose
+from bampipe.identification.method_choice import Judged, choose, prefer_steady
+
+TIMID = Task({"joint": {"low": -0.3, "high": 0.3, "slow": 0.34, "fast": 0.4}}, {}, 15.0)
+"""Strokes that hardly leave the middle."""
 
 
 def result(run, stage):
@@ -55,8 +59,8 @@ def test_machines_that_stand_still_are_published_right(tmp_path, machine, seed):
     assert all(a["estimate"] == "accepted" for a in result(run, "validate")["axes"].values())
 
 
-def judged(method, error, value, *doubts):
-    """One parameter by one method, known to 0.1, and its held-out error."""
+def judged(method, error, value, *doubts, sd=0.1):
+    """One parameter by one method, and its held-out error."""
     one = np.ones(1)
     problem = Problem(
         lambda trial, p: one, 1, np.array([0]), -one, one, one, True, one > 0.0,
@@ -64,7 +68,7 @@ def judged(method, error, value, *doubts):
     )  # fmt: skip
     return Judged(
         Estimate(
-            method, np.array([value, 0.0]), problem, np.array([[0.01]]), one > 2.0, (), doubts, (),
+            method, np.array([value, 0.0]), problem, np.array([[sd**2]]), one > 2.0, (), doubts, (),
             {}, lambda: None,
         ),
         error * one,
@@ -87,6 +91,37 @@ def test_the_filter_is_published_where_it_predicts_as_well(filtered, squares, pu
     system = SimpleNamespace(coordinates=("slide",), undriven=())
     both = [judged("ukf", *filtered), judged("least-squares", *squares)]
     assert choose(system, both) == published
+
+
+@pytest.mark.parametrize(
+    ("scattered", "error", "doubts", "published"),
+    [
+        (0.12, 1.0, (), 0),
+        (0.4, 1.0, (), 1),  # thrown off: its blocks scatter
+        (0.4, 1.3, (), 0),  # least squares predict worse
+        (0.4, 1.0, ("no bias was taken off",), 0),
+    ],
+)
+def test_a_filter_that_scatters_is_not_the_more_precise(scattered, error, doubts, published):
+    system = SimpleNamespace(coordinates=("slide",), undriven=())
+    both = [
+        judged("ukf", 1.0, 5.0, sd=scattered), judged("least-squares", error, 5.0, *doubts)
+    ]  # fmt: skip
+    assert choose(system, both) == 0
+    assert prefer_steady(system, both, 0) == published
+
+
+def test_after_one_reversal_threw_the_filter_off_least_squares_are_published(tmp_path):
+    """Its uncertainty was seven times that of least squares, and its errors five times theirs."""
+    run, truth = record_run(tmp_path, "joint", 8003, trials=0, seconds=15.0, tasks=(TIMID,) * 4)
+    found = result(run, "identify")
+    assert found["method"] == "least-squares"
+    for name, value in truth.items():
+        entry = found["parameters"][name]
+        assert abs(entry["estimate"] - value) < 3.0 * entry["sd"], name
+    for name in ("moment_across", "offset"):
+        entry = found["parameters"][name]
+        assert entry["sd"] < 2.0 * entry["bound_sd"], name
 
 
 def test_an_axis_that_nothing_drives_has_no_say():

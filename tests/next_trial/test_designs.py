@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from bampipe.estimate.low_pass import Band
-from bampipe.next_trial.choice import rank_designs
+from bampipe.next_trial.choice import Tried, rank_designs
 from bampipe.next_trial.discrimination import Contest, Rival, Sums
 from bampipe.next_trial.motion import Rehearsal, follow_roughly, stroke_path
 from bampipe.next_trial.precision import Precision
@@ -24,7 +24,9 @@ from bampipe.next_trial.primitives import (
 from bampipe.next_trial.reasons import explain_proposal
 from bampipe.next_trial.words import describe
 from bampipe.physics import Model, compile_model, registry
-from bampipe.results.next import ExpectedConfusion, Proposal
+from bampipe.results.forecast import compare_forecast, read_forecasts
+from bampipe.results.next import ExpectedConfusion, ExpectedSd, NextResult, Proposal
+from bampipe.stages.next import _better_at_hand
 from bampipe.trials.motion import Motion
 
 SEEN = Envelope(
@@ -228,18 +230,54 @@ def made_proposal(after: float, farther: tuple[str, ...] = ()) -> Proposal:
 
 
 def test_a_forecast_beyond_the_trials_at_hand_is_said_to_be_the_models():
-    said = explain_proposal("decision", "", made_proposal(0.01, ("yaw",)), {}, ()).expected
+    said = explain_proposal("decision", "", made_proposal(0.01, ("yaw",)), {}, (), (), "").expected
     assert said.startswith("The chance of confusing them is expected to fall from 40 % to")
     assert said.endswith("takes the model to hold beyond what the trials at hand have shown.")
-    assert "beyond" not in explain_proposal("decision", "", made_proposal(0.01), {}, ()).expected
+    said = explain_proposal("decision", "", made_proposal(0.01), {}, (), (), "").expected
+    assert "beyond" not in said
+
+
+def test_a_forecast_in_the_terms_of_another_version_does_not_stop_a_new_proposal(tmp_path):
+    wide = ExpectedSd(before=0.05, after=0.005, low=0.002, high=0.01, unit="kg")
+    found = NextResult(
+        model="base", purpose="precision", trials=("t1",), sentence="Move yaw.", why="",
+        expected="", proposals=(made_proposal(0.1).model_copy(update={"sd": {"mass": wide}}),),
+    )  # fmt: skip
+    path = tmp_path / NextResult.file("base")
+    found.write(tmp_path)
+    assert read_forecasts(tmp_path, "base") == (found,)
+    path.write_text(path.read_text().replace('"low"', '"after_at_worst"'))
+    assert read_forecasts(tmp_path, "base") == ()
+
+
+def test_what_a_model_lacks_is_said_to_count_as_noise():
+    wide = ExpectedSd(before=0.05, after=0.005, low=0.002, high=0.01, unit="kg")
+    sharp = ExpectedSd(before=0.05, after=0.005, low=0.0045, high=0.006, unit="kg")
+    best = made_proposal(0.1).model_copy(update={"sd": {"mass": wide, "moment": sharp}})
+    said = explain_proposal("precision", "", best, {}, (), (), "").expected
+    assert said == (
+        "Expected: `mass` ± 0.002 to 0.01 kg, now ± 0.05; `moment` ± 0.005 kg, now ± 0.05"
+        " (eight cases in ten)."
+    )
+    said = explain_proposal("precision", "", best, {}, (), ("yaw", "pitch"), "").expected
+    assert "The error of yaw and pitch is above the noise floor" in said
+    # Where effects compete, no uncertainty is forecast, and nothing need be said of it.
+    said = explain_proposal("decision", "", made_proposal(0.01), {}, (), ("yaw",), "t03").expected
+    assert "noise floor" not in said
+    assert said.endswith(
+        "Moving freely as in trial t03 for as long would say more of the parameters: rather record"
+        " that."
+    )
 
 
 def test_where_nothing_decides_it_is_said_what_was_not_tried():
-    said = explain_proposal("decision", "", made_proposal(0.39), {}, ["yaw", "pitch"]).expected
+    said = explain_proposal(
+        "decision", "", made_proposal(0.39), {}, ["yaw", "pitch"], (), ""
+    ).expected
     assert said.endswith(
         "the device file states no [limits] of yaw and pitch, so that none was tried."
     )
-    said = explain_proposal("decision", "", made_proposal(0.39), {}, []).expected
+    said = explain_proposal("decision", "", made_proposal(0.39), {}, [], (), "").expected
     assert said.endswith("39 % after this one. Another load may.")
 
 
@@ -260,6 +298,26 @@ def test_twice_the_information_narrows_an_uncertainty_by_the_root_of_two():
     assert known.gain(known.information) == pytest.approx(0.5 * np.log(2.0))
 
 
+def test_what_trials_are_worth_for_one_parameter_is_the_fall_of_its_logarithm():
+    known = made_precision(0.01, 0.01, 10_000)
+    much = 3.0 * known.information
+    assert known.worth(much, 20.0, "mass") == pytest.approx(np.log(2.0), rel=1e-3)
+    assert known.worth(much, 20.0) == known.gain(much)
+
+
+def test_a_trial_at_hand_that_says_more_than_a_design_is_named():
+    known = made_precision(0.01, 0.01, 10_000)
+    weak, strong = (
+        SimpleNamespace(trial_id=name, t=np.array([0.0, 10.0]), size=size)
+        for name, size in (("t01", 0.1), ("t02", 1.0))
+    )
+    known = replace(known, of_motion=lambda motion: motion.size * known.information)
+    # Twice as long, it says twice as much.
+    for worth, named in ((0.5 * np.log(2.9), "t02"), (0.5 * np.log(3.1), "")):
+        best = Tried(None, worth, ())
+        assert _better_at_hand(known, [weak, strong], "", 20.0, best) == named
+
+
 def test_what_few_blocks_widen_goes_with_more_of_them():
     few = made_precision(0.01 * np.sqrt(6 / 4), 0.01, 6)
     nothing = np.zeros((2, 2))
@@ -272,8 +330,44 @@ def test_what_methods_disagree_by_is_diluted_and_what_a_calibration_leaves_open_
     nothing, much = np.zeros((2, 2)), 1e6 * known.information
     assert known.sd_with(nothing, 0.0)[0] == pytest.approx(known.sd[0], rel=1e-3)
     assert known.sd_with(much, 20.0)[0] == pytest.approx(0.02, rel=1e-3)
-    threefold = known.sd_with(3.0 * known.information, 20.0)[0]
-    assert threefold**2 == pytest.approx(0.01**2 / 4.0 + 0.04**2 / 16.0 + 0.02**2, rel=1e-3)
+    threefold = known.expect(3.0 * known.information, 20.0)
+    noise = 0.01**2 / 4.0 + 0.02**2
+    # At least it is diluted; mostly it goes, for a method that was misled is found out.
+    assert threefold.high[0] ** 2 > noise + (0.04 / 4.0) ** 2
+    assert threefold.median[0] ** 2 == pytest.approx(noise + (0.04 / 16.0) ** 2, rel=1e-3)
+    assert threefold.low[0] ** 2 < noise
+
+
+def test_a_forecast_is_a_number_after_many_blocks_and_a_range_after_few():
+    much = np.diag([1e6, 0.0])
+    for blocks, is_sharp in ((5000, True), (24, False)):
+        known = made_precision(0.01, 0.01, blocks)
+        found = known.expect(much / blocks, 16.0 if blocks < 100 else 1e4)
+        forecast = ExpectedSd(
+            before=0.01, after=found.median[0], low=found.low[0], high=found.high[0], unit="kg"
+        )
+        assert forecast.is_sharp == is_sharp
+        assert (" to " in forecast.number) != is_sharp
+
+
+@pytest.mark.parametrize(
+    ("came", "said"),
+    [
+        (0.004, "within what was forecast."),
+        (0.001, "less than forecast."),
+        (0.02, "more than forecast."),
+    ],
+)
+def test_what_came_is_held_against_a_range(came, said):
+    wide = ExpectedSd(before=0.05, after=0.005, low=0.002, high=0.01, unit="kg")
+    proposed = NextResult(
+        model="base", purpose="precision", trials=("t1",), sentence="Move yaw.", why="",
+        expected="", proposals=(made_proposal(0.1).model_copy(update={"sd": {"mass": wide}}),),
+    )  # fmt: skip
+    identified = SimpleNamespace(trials=("t1", "t2"), parameters={"mass": SimpleNamespace(sd=came)})
+    line = compare_forecast(proposed, identified, None)[0]
+    assert line.startswith("`mass`: ± 0.002 to 0.01 kg was forecast with trial t2, ± 0.0")
+    assert line.endswith(said)
 
 
 def contest_of(odds: list[float], floor: float = 1.0) -> Contest:

@@ -78,7 +78,7 @@ def test_what_is_undecided_is_decided_after_the_proposed_trial(tmp_path):
     # Who asks for a parameter gets its forecast, whatever is open.
     narrow, _ = propose(run, purpose="viscous.joint", seconds=8.0)
     assert narrow.proposals[0].confusion == ()
-    assert narrow.expected.startswith("Expected: `viscous.joint` from ±")
+    assert narrow.expected.startswith("Expected: `viscous.joint` ± ")
 
 
 @pytest.mark.long

@@ -6,8 +6,8 @@ from types import SimpleNamespace
 
 from bampipe.report.document import Callout, Table
 from bampipe.report.protocol import protocol_sheet
-from bampipe.report.sections import next_trial
-from bampipe.results.next import NextResult, Plan
+from bampipe.report.sections import diagnosis, next_trial
+from bampipe.results.next import ExpectedSd, NextResult, Plan
 
 MOVE = {"low": -0.4, "high": 0.4, "slow": 0.02, "fast": 0.1, "unit": "rad"}
 SENTENCE = "Move yaw slowly back and forth between −23° and 23°, for 20 s."
@@ -28,7 +28,7 @@ FOUND = {
             "information_gain": 0.4,
             "sd": {
                 "coulomb.yaw": {
-                    "before": 0.01, "after": 0.005, "after_at_worst": 0.006, "unit": "N.m"
+                    "before": 0.01, "after": 0.005, "low": 0.0042, "high": 0.006, "unit": "N.m"
                 }
             },
         }
@@ -50,6 +50,7 @@ def results_with(found: NextResult | None) -> SimpleNamespace:
     return SimpleNamespace(
         read=lambda kind, model="": found if kind is NextResult else None,
         root=SimpleNamespace(name="s01"),
+        models=("base",),
     )
 
 
@@ -63,11 +64,28 @@ def test_the_section_says_what_to_do_and_what_went_unseen():
     assert isinstance(first, Callout)
     assert first.text == SENTENCE
     sd, sensitivity = (block for block in section.blocks if isinstance(block, Table))
-    assert sd.rows == (("`coulomb.yaw`", "0.010", "0.0050", "0.0060", "N·m"),)
+    assert sd.rows == (("`coulomb.yaw`", "0.010", "0.0050", "N·m"),)
+    assert not sd.note
     # What no trial shows stands first, with a dash.
     assert [row[0] for row in sensitivity.rows] == ["`force_bias:x`", "`stribeck:yaw`"]
     assert sensitivity.rows[0][1:4:2] == ("–", "–")
     assert sensitivity.rows[1][3:6] == ("2.0", "0.50", "1.0")
+
+
+def test_beside_nothing_missing_stands_what_the_trials_would_not_have_shown():
+    asked = diagnosis._unseen(results_with(NextResult.model_validate(FOUND)), "base")
+    assert asked == (
+        "These trials would not have shown stribeck:yaw below 2 N.m. The table under What to record"
+        " next has every effect."
+    )
+    assert "`bampipe next s01` says" in diagnosis._unseen(results_with(None), "base")
+
+
+def test_where_one_number_cannot_be_trusted_a_range_is_shown():
+    entry = FOUND["proposals"][0]["sd"]["coulomb.yaw"] | {"low": 0.002, "high": 0.009}
+    table = next_trial.sd_table("Expected", {"coulomb.yaw": ExpectedSd.model_validate(entry)})
+    assert table.rows == (("`coulomb.yaw`", "0.010", "0.0020 to 0.0090", "N·m"),)
+    assert "eight of ten" in table.note
 
 
 def test_the_protocol_sheet_is_the_same_pdf_again():
@@ -77,9 +95,16 @@ def test_the_protocol_sheet_is_the_same_pdf_again():
             "seconds": 60.0,
             "is_enough": True,
             "trials": [{"sentence": SENTENCE, "seconds": 20.0, "times": 3, "moves": {"yaw": MOVE}}],
-            "sd": {"coulomb.yaw": {"before": 0.01, "after": 0.004, "asked": 0.005, "unit": "N.m"}},
+            "sd": {
+                "coulomb.yaw": {
+                    "before": 0.01, "after": 0.004, "low": 0.0035, "high": 0.005, "asked": 0.005,
+                    "unit": "N.m",
+                }
+            },
         }
-    )
-    sheet = protocol_sheet(plan, "s01", "base")
+    )  # fmt: skip
+    sheet = protocol_sheet(plan, "s01", "base", by_hand=True)
     assert sheet.startswith(b"%PDF")
-    assert sheet == protocol_sheet(plan, "s01", "base")
+    assert sheet == protocol_sheet(plan, "s01", "base", by_hand=True)
+    # A machine without a handle is not asked to let go of it.
+    assert sheet != protocol_sheet(plan, "s01", "base", by_hand=False)

@@ -21,6 +21,7 @@ from bampipe.report.document import (
     Table,
 )
 from bampipe.report.results import Results
+from bampipe.report.sections import next_trial
 from bampipe.results.compare import CompareResult
 from bampipe.results.diagnose import (
     AxisVerdict,
@@ -30,6 +31,7 @@ from bampipe.results.diagnose import (
     WorstWindow,
 )
 from bampipe.results.draft import DraftResult
+from bampipe.results.next import NextResult
 
 Maps = Mapping[str, ResidualMap]
 TITLE = "Diagnosis"
@@ -74,6 +76,8 @@ def _model(
         blocks.append(_ranking(results, found.ranking))
     if lacking:
         blocks += _next(results, model, found)
+    else:
+        blocks.append(Paragraph(_unseen(results, model)))
     if found.suggested_trial is not None:
         words = found.suggested_trial.sentence
         blocks.append(Callout("note", "A trial that would tell more", words))
@@ -86,6 +90,18 @@ def _model(
     if windows:
         blocks.append(_windows(results, windows))
     return blocks
+
+
+def _unseen(results: Results, model: str) -> str:
+    """What these trials would not have shown, beside that nothing is missing."""
+    proposed = results.read(NextResult, model)
+    if proposed is not None and proposed.sensitivity:
+        return f"{proposed.why} The table under {next_trial.TITLE} has every effect."
+    option = f" --model {model}" if len(results.models) > 1 else ""
+    return (
+        "How large an effect could be and go unnoticed in these trials, and which trial would show"
+        f" it: `bampipe next {results.root.name}{option}` says."
+    )
 
 
 def _next(results: Results, model: str, found: DiagnoseResult) -> list[Block]:

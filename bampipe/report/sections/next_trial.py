@@ -46,10 +46,7 @@ def section(results: Results) -> Section | None:
         blocks.append(
             sd_table(
                 "Standard deviation of each parameter, now and once the trial has been recorded",
-                "in nine of ten",
-                {name: (entry, entry.after_at_worst) for name, entry in best.sd.items()},
-                "In nine of ten: of the ways in which people follow such a sentence, nine are "
-                "better.",
+                best.sd,
             )
         )
     if found.sensitivity:
@@ -72,28 +69,33 @@ def confusion_table(
     return Table(title, heads, rows, "lrr")
 
 
-def sd_table(
-    title: str,
-    third: str,
-    entries: Mapping[str, tuple[ExpectedSd | PlannedSd, float]],
-    note: str = "",
-) -> Table:
+def sd_table(title: str, entries: Mapping[str, ExpectedSd]) -> Table:
     """Return the standard deviations of parameters, without and with new trials.
 
     Args:
-        title: of the table; third: head of the column beside the two; note: below it.
-        entries: by parameter, with the number of that column.
+        title: of the table; entries: by parameter; of a plan, what is asked is shown, too.
     """
+    asked = [e.asked for e in entries.values() if isinstance(e, PlannedSd)]
     rows = tuple(
         (
             f"`{name}`",
-            *(wording.significant(value, 2) for value in (entry.before, entry.after, more)),
+            wording.significant(entry.before, 2),
+            _expected(entry),
+            *([wording.significant(asked[k], 2)] if asked else []),
             wording.unit(entry.unit),
         )
-        for name, (entry, more) in entries.items()
+        for k, (name, entry) in enumerate(entries.items())
     )
-    heads = ("Parameter", "now", "expected", third, "Unit")
-    return Table(title, heads, rows, "lrrrl", note=note)
+    heads = ("Parameter", "now", "expected", *(["asked"] if asked else []), "Unit")
+    note = "A range, where one number cannot be trusted: eight of ten lie in it."
+    wide = not all(entry.is_sharp for entry in entries.values())
+    return Table(title, heads, rows, "lrrrl" if asked else "lrrl", note=note if wide else "")
+
+
+def _expected(entry: ExpectedSd) -> str:
+    """What is forecast: one number where it can be trusted, else a range."""
+    values = (entry.after,) if entry.is_sharp else (entry.low, entry.high)
+    return " to ".join(wording.significant(value, 2) for value in values)
 
 
 def _sensitivity(table: Mapping[str, Detectable]) -> Table:
