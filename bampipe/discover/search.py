@@ -101,7 +101,7 @@ class Search:
     @property
     def floor(self) -> NoiseFloor:
         """Noise floor of the final model, by either kind of replay."""
-        return _floor_of(self.final, self.still)
+        return _floor_of(self.evidence, self.final, self.still)
 
     @property
     def evidence(self) -> Evidence:
@@ -215,7 +215,7 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
     main = {name: axes.index(c[0].axis) for name, c in contests.items() if c}
     alike = {n: polished.alike.get(n, groups.get(n, ())) for n in found.added}
     still = bench.still_replicas(found.recipe, found.evidence, found.replayed, final)
-    floor = _floor_of(final, still)
+    floor = _floor_of(found.evidence, final, still)
     for name in main:
         # Where replays say nothing of which it is, what each leaves does.
         unsettled = (*unlike, *(alike[name] if name in polished.unlike else ()))
@@ -231,12 +231,15 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
     )  # fmt: skip
 
 
-def _floor_of(creeping: Sequence[Replicate], still: Sequence[Replicate]) -> NoiseFloor:
+def _floor_of(
+    evidence: Evidence, creeping: Sequence[Replicate], still: Sequence[Replicate]
+) -> NoiseFloor:
     """Noise floor by replays that creep where the motion turns round, and others, if there are."""
     floor = NoiseFloor.of_errors([replay.held_out_rmse for replay in creeping])
     if not still:
         return floor
-    return floor.larger(NoiseFloor.of_errors([replay.held_out_rmse for replay in still]))
+    other = NoiseFloor.of_errors([replay.held_out_rmse for replay in still])
+    return floor.raised(other, evidence.held_out_rmse)
 
 
 def _rivals(

@@ -49,8 +49,8 @@ def _creeping(a: AxisVerdict, unit: str) -> list[str]:
     if a.creeping_floor is None:
         return []
     return [
-        "The floor is that of replays that stand still where the motion turns round; those that"
-        f" creep, as the device's sign_width says, leave {three(a.creeping_floor)} {unit}. With a"
+        "The floor is that of a machine that stands still where it turns round; replays that creep"
+        f" there, as the device's sign_width says, leave {three(a.creeping_floor)} {unit}. With a"
         " smaller sign_width more would show."
     ]
 

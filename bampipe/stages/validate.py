@@ -207,13 +207,13 @@ def _with_still_replays(
         )
     except InputError:
         return floor, []
-    either, system = floor.larger(still), evidence.system
+    either, system = floor.raised(still, evidence.held_out_rmse), evidence.system
     raised = np.flatnonzero(either.level > AT_FLOOR * floor.level)
     return either, [
         f"{system.coordinates[i]}: replays that stand still where the motion turns round leave"
         f" {significant(still.level[i])} {system.torque_units[i]}, those that creep as `sign_width`"
-        f" says {significant(floor.level[i])}: the former is the noise floor. A smaller"
-        " `sign_width` in the device file lets more be seen."
+        f" says {significant(floor.level[i])}: the noise floor is {significant(either.level[i])}."
+        " A smaller `sign_width` in the device file lets more be seen."
         for i in raised
     ]
 

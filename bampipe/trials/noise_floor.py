@@ -65,13 +65,14 @@ class NoiseFloor:
         level = np.median(found, axis=0)
         return cls(level, _SD_OF_DEVIATION * np.median(np.abs(found - level), axis=0), len(found))
 
-    def larger(self, other: NoiseFloor) -> NoiseFloor:
-        """By axis the larger of two floors: a machine may be like either kind of replay."""
-        more = other.level > self.level
-        level, sd = (
-            np.where(more, b, a) for a, b in ((self.level, other.level), (self.sd, other.sd))
-        )
-        return NoiseFloor(level, sd, self.replays)
+    def raised(self, other: NoiseFloor, error: Array) -> NoiseFloor:
+        """The floor of a machine that may be like either kind of replay, or in between.
+
+        By axis as near to the error (n_q,) that it left as the two allow.
+        """
+        level = np.clip(error, self.level, np.maximum(self.level, other.level))
+        sd = np.where(level > self.level, other.sd, self.sd)
+        return NoiseFloor(np.asarray(level), sd, self.replays)
 
     def is_exceeded(self, error: Array) -> bool:
         """Whether the error (n_q,) of some axis is above it."""

@@ -256,7 +256,7 @@ def test_a_wrong_floor_gives_no_verdict(monkeypatch):
 
 def test_a_floor_of_replays_that_stand_still_is_said_to_be_one(monkeypatch):
     axis = finding("nothing_missing", 0.42, 0.42, 0.39)
-    assert "stand still" not in say(monkeypatch, axis)
+    assert "stands still" not in say(monkeypatch, axis)
     still = axis.model_copy(update={"creeping_floor": 0.0964})
     said = say(monkeypatch, still)
-    assert "those that creep, as the device's sign_width says, leave 0.0964 N.m." in said
+    assert "replays that creep there, as the device's sign_width says, leave 0.0964 N.m." in said
