@@ -23,10 +23,11 @@ Array = NDArray[np.float64]
 
 _COLOURED = 2.0
 """Factor from which on the noise of a thinned record is more than that of the whole one."""
-_FOLLOWS = 0.5
+_FOLLOWS = 0.8
 """Share of its noise that is left of a force without what follows the encoders' readings, below
 which a controller makes the rest. Of the white noise of handles, load cells, motor currents and a
-measured arm 0.98 or more is left, of a command by gains on counts and their differences 0.003."""
+measured arm 0.98 or more is left, of a command by gains on counts and their differences 0.003;
+where the log keeps every second to tenth sample of the controller, 0.5 to 0.76."""
 DISAGREEMENT = 2.0
 """Factor between stated and measured noise beyond which a warning is given."""
 
@@ -61,7 +62,8 @@ class RecordNoise:
     ) -> dict[str, RecordNoise]:
         """Measure inputs by name, each (T,), recorded beside ``readings`` of encoders, each (T,).
 
-        What a controller makes of the readings acts on the machine, and is no noise.
+        What a controller makes of the readings acts on the machine, and is no noise. Of a log that
+        keeps some of its samples only, the rest is left: pulses from readings that are not logged.
         """
         found = {name: cls.of(record, t) for name, record in records.items()}
         if not records or not readings:
@@ -70,10 +72,13 @@ class RecordNoise:
         # Stamps that jitter are of no use where readings are taken sample by sample.
         stamps = np.arange(len(rest), dtype=np.float64) * float(np.median(np.diff(t)))
         for (name, whole), column in zip(found.items(), rest.T, strict=True):
-            left = cls.of(column, stamps)
-            white = left.white_sd if left.white_sd < _FOLLOWS * whole.white_sd else whole.white_sd
-            slow = left.slow_sd if left.slow_sd < _FOLLOWS * whole.slow_sd else whole.slow_sd
-            found[name] = replace(whole, white_sd=white, slow_sd=slow)
+            record = records[name][np.isfinite(records[name])]
+            column = column[np.isfinite(column)]
+            left, all_of_it = (white_noise_sd(x, pulsed=True) for x in (column, record))
+            if not left < _FOLLOWS * all_of_it:
+                continue
+            slow = slow_noise_sd(column, stamps[: column.size], counting_step(column))
+            found[name] = replace(whole, white_sd=left, slow_sd=min(slow, whole.slow_sd))
         return found
 
 
