@@ -40,11 +40,13 @@ class RecordNoise:
         step: of its counts, 0.0 where its values lie on no grid.
         white_sd: standard deviation of its white noise; slow_sd: of noise that reaches over several
             samples, or of a signal that is as fast. NaN where the record is too short.
+        pulsed: whether the noise is a controller's, which depends on the motion.
     """
 
     step: float
     white_sd: float
     slow_sd: float
+    pulsed: bool = False
 
     @classmethod
     def of(cls, record: Array, t: Array | None = None) -> RecordNoise:
@@ -69,16 +71,12 @@ class RecordNoise:
         if not records or not readings:
             return found
         rest = without_feedback(np.column_stack([*records.values()]), np.column_stack(readings))
-        # Stamps that jitter are of no use where readings are taken sample by sample.
-        stamps = np.arange(len(rest), dtype=np.float64) * float(np.median(np.diff(t)))
         for (name, whole), column in zip(found.items(), rest.T, strict=True):
-            record = records[name][np.isfinite(records[name])]
-            column = column[np.isfinite(column)]
-            left, all_of_it = (white_noise_sd(x, pulsed=True) for x in (column, record))
-            if not left < _FOLLOWS * all_of_it:
-                continue
-            slow = slow_noise_sd(column, stamps[: column.size], counting_step(column))
-            found[name] = replace(whole, white_sd=left, slow_sd=min(slow, whole.slow_sd))
+            left, all_of_it = (
+                white_noise_sd(x[np.isfinite(x)], pulsed=True) for x in (column, records[name])
+            )
+            if left < _FOLLOWS * all_of_it:
+                found[name] = replace(whole, white_sd=left, pulsed=True)
         return found
 
 
@@ -169,7 +167,11 @@ def _typical_noise(records: Sequence[RecordNoise], stated: float | None) -> floa
 
     Noise over several samples counts where it is clearly more than that of neighbouring ones, and
     what is stated does not speak for the latter: nothing else distinguishes a fast signal from it.
+    What a controller makes of counts differs from trial to trial, and its mean square counts.
     """
+    pulses = [r.white_sd for r in records if r.pulsed]
+    if 2 * len(pulses) > len(records):
+        return float(np.sqrt(np.mean(np.square(pulses))))
     white = _lower_quartile([record.white_sd for record in records])
     slow = _lower_quartile([record.slow_sd for record in records])
     if white is None or slow is None or slow <= _COLOURED * white:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -86,5 +88,8 @@ def test_pulses_of_a_controller_whose_log_keeps_every_fourth_sample_are_noise():
     assert RecordNoise.of(every, t[few]).white_sd < 0.3 * pulses.std()
     # Half of it follows the reading at the same instant.
     assert found.white_sd == pytest.approx(pulses.std() / np.sqrt(2.0), rel=0.15)
+    calm = replace(found, white_sd=0.1 * found.white_sd)
+    settled = settle_force("command", "N.m", None, [found, calm, calm]).noise_sd
+    assert settled == pytest.approx(found.white_sd * np.sqrt(1.02 / 3.0))
     whole = RecordNoise.of_inputs({"command": command}, [counts], t)["command"]
     assert whole.white_sd == pytest.approx(0.02, rel=0.1)
