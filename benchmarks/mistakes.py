@@ -1,10 +1,11 @@
 """Set-up mistakes in sessions of the independent simulators: how many are named, and how rightly.
 
-    python benchmarks/mistakes.py bam joint axis damper --seeds 3
+    python benchmarks/mistakes.py bam joint axis damper arm --seeds 3
     python benchmarks/mistakes.py joint --only "degrees for radians"
 
 Each session is recorded soundly, then its session file or its logs are spoilt as a person would.
-It goes through ingest and filter; a line says what was named, then comes a table.
+It goes through ingest and filter; a line says what was named, then comes a table. Of an arm,
+`bampipe init` proposes the session before its logs are spoilt.
 """
 
 from __future__ import annotations
@@ -23,16 +24,20 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from independent import MACHINES, record
+from independent import MACHINES, arm, record
 from independent.sensors import Conditions
 
 import bampipe
+from bampipe.proposal import propose, write_proposal
 
 PIPELINE = """schema = "bampipe.pipeline/1"
 name = "mistakes"
 stages = ["ingest", "filter"]
 """
 DEGREES = 180.0 / math.pi
+ARM = "ZYY"
+"""Axes of the joints of an arm."""
+JOINTS = arm.NAMES[: len(ARM)]
 FORCES = "force_x+force_y+force_z"
 SHORT = {
     "bam": Conditions(trials=4, seconds=10.0, rate_hz=250.0, viscous_trials=1),
@@ -80,10 +85,10 @@ def scale_column(column: str, factor: float, offset: float = 0.0) -> Callable[[P
     """Return what writes ``factor * column + offset`` in place of a column of every log."""
 
     def spoil(folder: Path) -> None:
-        for file in sorted(folder.glob("trials/*.csv")):
+        for file in sorted(folder.rglob("*.csv")):
             frame = pd.read_csv(file)
             frame[column] = frame[column] * factor + offset
-            frame.to_csv(file, index=False, float_format="%.9g", lineterminator="\n")
+            frame.to_csv(file, index=False, float_format="%.14g", lineterminator="\n")
 
     return spoil
 
@@ -102,10 +107,10 @@ def exchange_headers(one: str, other: str) -> Callable[[Path], None]:
     """Return what exchanges two columns of every log."""
 
     def spoil(folder: Path) -> None:
-        for file in sorted(folder.glob("trials/*.csv")):
+        for file in sorted(folder.rglob("*.csv")):
             frame = pd.read_csv(file)
             frame[[one, other]] = frame[[other, one]].to_numpy()
-            frame.to_csv(file, index=False, float_format="%.9g", lineterminator="\n")
+            frame.to_csv(file, index=False, float_format="%.14g", lineterminator="\n")
 
     return spoil
 
@@ -153,6 +158,25 @@ def identity(matrix: list[list[float]]) -> list[list[float]]:
 def per_unit(axis: str, factor: float) -> Callable[[Path], None]:
     """Return what multiplies the counts of one unit of an axis."""
     return scale_number(rf"\n{axis} = .*counts_per_unit = ", factor)
+
+
+def position(joint: str) -> str:
+    """Return the column of a joint's position in the logs of the arm."""
+    return f"/joint_states/{joint}/position"
+
+
+def effort(joint: str) -> str:
+    """Return the column of a joint's drive in the logs of the arm."""
+    return f"/joint_states/{joint}/effort"
+
+
+def record_session(machine: str, folder: Path, seed: int, effects: Mapping[str, float]) -> None:
+    """Write a session of a machine, without a mistake."""
+    if machine != "arm":
+        record(machine, folder, seed, effects, SHORT[machine])
+        return
+    arm.record_logs(folder, seed, ARM, effects, style="joint_states", seconds=8.0)
+    write_proposal(folder, propose(folder))
 
 
 SOUND = Mistake(lambda folder: None, "")
@@ -250,6 +274,37 @@ MISTAKES: Mapping[str, Mapping[str, Mistake]] = {
         ),
         "clock in milliseconds for seconds": Mistake(scale_column("t", 1000.0), "clock:"),
     },
+    "arm": {
+        "encoder of the elbow reversed": Mistake(
+            scale_column(position("elbow"), -1.0), "sign:elbow"
+        ),
+        "drive of the shoulder reversed": Mistake(
+            scale_column(effort("shoulder"), -1.0), "sign:torque_shoulder"
+        ),
+        "positions exchanged": Mistake(
+            exchange_headers(position("shoulder"), position("elbow")), "exchange:shoulder+elbow"
+        ),
+        "drives exchanged": Mistake(
+            exchange_headers(effort("shoulder"), effort("elbow")),
+            "exchange:torque_shoulder+torque_elbow",
+        ),
+        "degrees for radians": Mistake(
+            do_all(*(scale_column(position(joint), DEGREES) for joint in JOINTS)),
+            f"scale:{'+'.join(JOINTS)}",
+        ),
+        "degrees for radians, one joint": Mistake(
+            scale_column(position("elbow"), DEGREES), "scale:elbow"
+        ),
+        "torque of the motor for that of the joint": Mistake(
+            scale_column(effort("elbow"), 0.01), "scale:torque_elbow"
+        ),
+        "shoulder counted from the vertical": Mistake(
+            scale_column(position("shoulder"), 1.0, 0.5 * math.pi), "zero:shoulder"
+        ),
+        "clock in milliseconds for seconds": Mistake(
+            scale_column("/joint_states/header/stamp", 1000.0), "clock:"
+        ),
+    },
 }  # fmt: skip
 
 
@@ -294,7 +349,7 @@ def run_case(case: Case) -> Outcome:
         root = Path(name)
         folder = root / "session"
         strengths = dict.fromkeys(case.effects, 1.0)
-        record(case.machine, folder, case.seed, strengths, SHORT[case.machine])
+        record_session(case.machine, folder, case.seed, strengths)
         mistake.spoil(folder)
         (root / "mistakes.toml").write_text(PIPELINE)
         begun = time.perf_counter()
@@ -358,6 +413,14 @@ def write_table(outcomes: Sequence[Outcome]) -> str:
     return "\n".join(lines)
 
 
+def hidden_in(machine: str) -> tuple[str, ...]:
+    """Return the effects that a simulator can hide; those of the arm on one joint each."""
+    if machine == "arm":
+        single = [name for name in arm.EFFECTS if name != "friction_of_sum"]
+        return (*(f"{name}:shoulder" for name in single), "friction_of_sum:shoulder-elbow")
+    return (*MACHINES[machine].EFFECTS, *MACHINES[machine].UNKNOWN)
+
+
 def main(arguments: Sequence[str]) -> None:
     """Run the cases asked for, print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -371,8 +434,7 @@ def main(arguments: Sequence[str]) -> None:
     for machine in options.machine:
         for seed in range(options.first_seed, options.first_seed + options.seeds):
             if options.sound:
-                hidden = (*MACHINES[machine].EFFECTS, *MACHINES[machine].UNKNOWN)
-                cases += [Case(machine, "", seed, effects) for effects in ((), *zip(hidden))]
+                cases += [Case(machine, "", seed, e) for e in ((), *zip(hidden_in(machine)))]
             else:
                 names = options.only or list(MISTAKES[machine])
                 cases += [Case(machine, name, seed) for name in names]

@@ -127,6 +127,7 @@ def extend(
     """
     from bampipe.api import loop
     from bampipe.results.compare import CompareResult
+    from bampipe.results.identify import IdentifyResult
 
     batch.limit_threads(1)
     effects = others or []
@@ -159,6 +160,7 @@ def extend(
         return
     show.say(f"{root}: {last}")
     show.summary(ladder)
+    show.unidentified(RunFolder(root).read(IdentifyResult, last).effects)
     name = places.next_to(root, runs)
     asked = f"bampipe diagnose {name}{RunFolder(root).model_option(last)}"
     advise(quiet, json, after_loop(root, last, name) if auto else asked)

@@ -19,6 +19,7 @@ from bampipe.run.request import Outcome
 
 if TYPE_CHECKING:
     from bampipe.results.compare import Rung
+    from bampipe.results.identify import EffectEstimate
 
 LARGEST_TABLE = 40
 WIDEST_CELL = 60
@@ -318,8 +319,9 @@ def outcome(result: Outcome) -> None:
         table(["step", "state", "time", ""], rows)
     for step in result.steps:
         trials(step.summary)
-        if step.step == "ingest":
+        if step.step in ("ingest", "filter"):
             _lines(step.summary, "notes", "note")
+        _standing_out(step.summary)
     shown = [verdict for verdict in result.verdicts if verdict.state != "absent"]
     if shown:
         say("")
@@ -329,6 +331,21 @@ def outcome(result: Outcome) -> None:
         )
     if result.model and any(":" in step.step for step in result.steps):
         _counting(result.model)
+
+
+def _standing_out(content: Mapping[str, object]) -> None:
+    """Print which second of a trial moves an identified parameter as none should, if one does."""
+    influence = content.get("influence")
+    worst = influence.get("worst_second") if isinstance(influence, dict) else None
+    if worst and worst.get("sentence"):
+        say(f"note: {worst['sentence']}")
+
+
+def unidentified(effects: Mapping[str, EffectEstimate]) -> None:
+    """Print which effects of a model do not count as identified, and why."""
+    for name, found in effects.items():
+        if not found.identified:
+            say(f"note: {found.describe(name)}")
 
 
 def _counting(model: str) -> None:

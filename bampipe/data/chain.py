@@ -25,6 +25,8 @@ Array = NDArray[np.float64]
 _MOVING = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
 _ROUNDING = 1e-6
 """Share of the largest second moment of mass by which one may be below zero."""
+UPRIGHT = (0.0, 0.0, -9.81)
+"""Gravity where nothing else is said, m/s2."""
 _MANY = 8
 """Most names that a message lists."""
 
@@ -79,6 +81,7 @@ class Chain:
         base, tip: the links.
         notes: what was left out or joined, one sentence each.
         gravity: in the base's frame, m/s2; None where it is not known.
+        gravity_note: where that is from, or why it is not known, if that is not plain.
     """
 
     joints: Mapping[str, dict[str, Any]]
@@ -87,6 +90,7 @@ class Chain:
     tip: str
     notes: tuple[str, ...]
     gravity: tuple[float, float, float] | None = None
+    gravity_note: str = ""
 
 
 @dataclass
@@ -216,9 +220,37 @@ def select_chain(
             symmetric(payload.get("inertia", (0.0,) * 6)),
         )
         bodies[tip] = bodies[tip].joined(held)
-    gravity = tree.gravity if base not in above else None
+    gravity, said = gravity_at(tree, base)
     found = _chain(base, tip, path_up, bodies, joints, where)
-    return replace(found, notes=(*found.notes, *tree.notes), gravity=gravity)
+    return replace(found, notes=(*found.notes, *tree.notes), gravity=gravity, gravity_note=said)
+
+
+def gravity_at(tree: Tree, base: str) -> tuple[tuple[float, float, float] | None, str]:
+    """Gravity in the frame of a link, m/s2, and a clause where joints on the way to it turn it.
+
+    The root of a URDF stands upright. None where that goes for the link as well, or where a joint
+    above it can tilt it.
+    """
+    above = {joint.child: joint for joint in tree.joints}
+    root, way = base, list[TreeJoint]()
+    while root in above:
+        way.insert(0, above[root])
+        root = above[root].parent
+    if not way:
+        return tree.gravity, ""
+    start = np.array(tree.gravity or UPRIGHT)
+    down, least = start, _ROUNDING * float(np.linalg.norm(start))
+    for joint in way:
+        down = joint.turn.T @ down
+        turns = joint.kind not in ("fixed", "prismatic")
+        about_it = joint.kind in _MOVING and np.abs(np.cross(joint.axis, down)).max() <= least
+        if turns and not about_it:
+            return None, f"gravity taken along -z of {base}, which {joint.name} can tilt"
+    if tree.gravity is None and np.abs(down - start).max() <= least:
+        return None, ""
+    x, y, z = (float(v) for v in np.where(np.abs(down) <= least, 0.0, down))
+    said = f"gravity ({x:.4g}, {y:.4g}, {z:.4g}) m/s2 in the frame of {base}, from that of {root}"
+    return (x, y, z), said
 
 
 @dataclass(frozen=True)

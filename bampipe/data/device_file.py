@@ -76,10 +76,12 @@ def complete_device(table: dict[str, Any], folder: Path, where: str) -> dict[str
             payload if isinstance(payload, Mapping) else None,
         )
         robot |= {"joints": dict(chain.joints), "base": chain.base, "tip": chain.tip}
-        if chain.gravity is not None:
-            robot.setdefault("gravity", list(chain.gravity))
+        notes = list(chain.notes)
+        if "gravity" not in robot:
+            notes += [chain.gravity_note] if chain.gravity_note else []
+            robot |= {"gravity": list(chain.gravity)} if chain.gravity else {}
         limits = chain.limits
-        source = "; ".join([f"{file.name}, {chain.base} to {chain.tip}", *chain.notes])
+        source = "; ".join([f"{file.name}, {chain.base} to {chain.tip}", *notes])
     if isinstance(robot.get("dh"), Mapping) and "joints" not in robot:
         robot["joints"] = _from_dh(robot["dh"])
     joints = robot.get("joints")

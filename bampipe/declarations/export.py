@@ -11,9 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.data.chain import (
+    UPRIGHT,
     Body,
     DriveLimits,
     Tree,
+    gravity_at,
     hold_beside,
     identifier,
     put_bodies,
@@ -39,7 +41,6 @@ Form = Literal["json", "urdf", "mjcf", "python", "c"]
 FORMS: tuple[Form, ...] = get_args(Form)
 DRAWING = "ingest/robot.xml"
 """The URDF or MJCF that a session brought."""
-_UPRIGHT = (0.0, 0.0, -9.81)
 
 
 def export_model(run: RunFolder, name: str, form: Form) -> str:
@@ -91,7 +92,9 @@ def _urdf(run: RunFolder, system: System, p: Array) -> str:
         f"{joint} {own:.6g}" for joint, own in zip(system.coordinates, np.diag(drives), strict=True)
     )
     lacks = [f"drives' inertia at their joints, kg.m2 or kg ({shown})"] if drives.any() else []
-    if tuple(robot.gravity) != _UPRIGHT:
+    given_back = drawn.file is not None and drawn.is_urdf
+    said = gravity_at(drawn.before, drawn.base)[0] if given_back else None
+    if not np.allclose(robot.gravity, said or UPRIGHT):
         lacks.append(f"gravity in the frame of {drawn.base} ({number_list(robot.gravity)})")
     comment = _head(system, drawn, [*lacks, *_coupled(robot, drives)])
     if drawn.file is not None and drawn.is_urdf:

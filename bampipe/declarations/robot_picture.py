@@ -152,4 +152,7 @@ def _names(placed: Sequence[_Placed], view: _View) -> list[str]:
 
 
 def _text(x: float, y: float, words: str) -> str:
-    return f'<text x="{x:.1f}" y="{y:.1f}" fill="{_INK}">{escape(words)}</text>'
+    return (
+        f'<text x="{x:.1f}" y="{y:.1f}" fill="{_INK}" stroke="white" stroke-width="3"'
+        f' paint-order="stroke">{escape(words)}</text>'
+    )

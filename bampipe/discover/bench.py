@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -27,10 +28,11 @@ from bampipe.discover.level import Level
 from bampipe.discover.scorer import Score, Scorer
 from bampipe.discover.settings import Settings
 from bampipe.estimate.least_squares import fit
+from bampipe.estimate.simulation import Runaway
 from bampipe.physics.recipe import Recipe
 from bampipe.trials.bias import remove_bias
 from bampipe.trials.measured import MeasuredTrials
-from bampipe.trials.noise_floor import FLOOR_SEED, floor_replays
+from bampipe.trials.noise_floor import FLOOR_SEED, STILL_WIDTH, NoiseFloor, floor_replays
 from bampipe.trials.residuals import Evidence, problem_of
 
 Array = NDArray[np.float64]
@@ -148,6 +150,24 @@ class Bench:
         if len(known) >= count and all(replay.share.size for replay in known[:count]):
             return list(known[:count])
         return self.replicas(recipe, p, count, (), (FLOOR_SEED,), share=True, analysed=again)
+
+    def still_replicas(
+        self, recipe: Recipe, evidence: Evidence, p: Array, creeping: Sequence[Replicate]
+    ) -> list[Replicate]:
+        """Replays of a model that stands still where it turns round, as many as of one that creeps.
+
+        None where these leave as much as was measured, where no width is declared, or where the
+        narrow ones run away.
+        """
+        floor = NoiseFloor.of_errors([replay.held_out_rmse for replay in creeping])
+        if recipe.has_drawn_axes or not floor.is_exceeded(evidence.held_out_rmse):
+            return []
+        narrow, again = recipe.with_sign_widths(STILL_WIDTH), (recipe, evidence.p)
+        with suppress(Runaway):
+            return self.replicas(
+                narrow, p, len(creeping), (), (FLOOR_SEED,), share=True, analysed=again
+            )
+        return []
 
     def scores(self, recipe: Recipe, p: Array, names: Sequence[str]) -> dict[str, Score]:
         """Scores of candidates against a model on the measured trials."""

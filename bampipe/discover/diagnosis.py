@@ -68,6 +68,9 @@ def diagnose(
     progress(0.95, "holding the final model against its floor in another band")
     final = searched.found
     bands = judge_in_other_band(searched.trials, final.evidence, final.replayed, settings)
+    # There replays creep: where ones that stand still are the floor, they say nothing.
+    creeping = (axis.creeping_floor is None for axis in found.axes)
+    bands = tuple(b if holds else None for b, holds in zip(bands, creeping, strict=True))
     found = _with_each_axis(found, "other_band", bands)
     return _with_each_axis(found, "sentence", axis_sentences(found, settings))
 

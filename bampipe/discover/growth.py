@@ -18,6 +18,7 @@ from bampipe.discover.scorer import Score, Scorer
 from bampipe.discover.settings import Settings
 from bampipe.discover.stops import StoppingReplays
 from bampipe.estimate.simulation import Runaway
+from bampipe.physics.recipe import Recipe
 from bampipe.results.diagnose import RefusalReason, RefusedEffect, SearchStep
 from bampipe.results.standing import standing
 from bampipe.trials.noise_floor import NoiseFloor
@@ -66,9 +67,9 @@ def record_addition(score: Score, known: Level, current: FittedSet) -> Addition:
     return Addition(score, known.p_value(score), known.excess(score), current.scorer)
 
 
-def _find_changed_axes(current: FittedSet, name: str) -> frozenset[int]:
+def find_changed_axes(recipe: Recipe, name: str) -> frozenset[int]:
     """Axes whose equation a candidate changes: all of them if it moves what the sensors read."""
-    item = candidates_of(current.recipe, (name,))[0]
+    item = candidates_of(recipe, (name,))[0]
     system = item.system
     return frozenset(range(len(system.coordinates)) if system.moves_sensors else system.touched)
 
@@ -88,7 +89,7 @@ def choose_companions(
     chance beyond doubt comes along; the others are weighed anew.
     """
     s = bench.settings
-    taken = _find_changed_axes(current, winner)
+    taken = find_changed_axes(current.recipe, winner)
     made: list[Choice] = []
     waiting = [
         (excess, name)
@@ -100,7 +101,7 @@ def choose_companions(
             (excess, name)
             for excess, name in waiting
             if not any(name in choice.transient for choice in made)
-            and taken.isdisjoint(_find_changed_axes(current, name))
+            and taken.isdisjoint(find_changed_axes(current.recipe, name))
         ]
         passing, _ = stops.first_beyond(scores, level, waiting)
         if not passing:
@@ -110,7 +111,7 @@ def choose_companions(
         )
         made.append(choice)
         if choice.winner:
-            taken |= _find_changed_axes(current, choice.winner)
+            taken |= find_changed_axes(current.recipe, choice.winner)
     return made
 
 
@@ -154,7 +155,7 @@ def grow_set(
     every = range(len(current.error))
     promised = [
         (
-            sorted(_find_changed_axes(current, n)) if len(names) > 1 else every,
+            sorted(find_changed_axes(current.recipe, n)) if len(names) > 1 else every,
             known_scores[n].gain / count,
         )
         for n in names

@@ -53,8 +53,8 @@ def judge_in_other_band(
     try:
         replays = [
             replay_evidence(
-                stand_in, measured.p, trials.sensors, trials.kinematics, band, trials.folds,
-                (settings.seed, FLOOR_SEED, k),
+                stand_in, evidence.system, measured.p, trials.sensors, trials.kinematics, band,
+                trials.folds, (settings.seed, FLOOR_SEED, k),
             )
             for k in range(settings.other_band_replicates)
         ]  # fmt: skip

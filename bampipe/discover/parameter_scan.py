@@ -25,6 +25,10 @@ _ENOUGH = 0.5
 """Fall of the cost, a log likelihood, that a next value must promise."""
 _NEAR = 0.1
 """Of the widest gap beside the least, how near to that another value is tried."""
+_LARGEST_RISE = 30.0
+"""Logarithm of a mean square over the least one, beyond which it is as large as can be."""
+_LEAST_LEFT = 1e-3
+"""Share of a mean square that is thought to be left where a parabola promises to take all."""
 _STARTS = (0.5, 0.8)
 """Shares of their ranges at which several searched parameters start, one after the other: a sharp
 resonance is missed between the points of a grid, one that is damped well shows from afar."""
@@ -36,7 +40,11 @@ other, so that between two of them a fit gains at most a little more than at the
 
 
 def scan_parameters(
-    cost: Cost, ranges: Sequence[SearchRange], hopeless: float, has_columns: bool
+    cost: Cost,
+    ranges: Sequence[SearchRange],
+    hopeless: float,
+    has_columns: bool,
+    count: float = np.inf,
 ) -> tuple[list[float], float] | None:
     """Best values of the searched parameters, and their cost; None if one never matters.
 
@@ -47,20 +55,26 @@ def scan_parameters(
         cost: of the fit; ranges: of the parameters.
         hopeless: a cost above this after a scan ends the search.
         has_columns: whether columns can be compared.
+        count: of independent samples: a cost is that many logarithms of a mean square.
     """
     starts = _STARTS if len(ranges) > 1 else _STARTS[:1]
-    found = [_scan_in_turn(cost, ranges, share, hopeless, has_columns) for share in starts]
+    found = [_scan_in_turn(cost, ranges, share, hopeless, has_columns, count) for share in starts]
     return found[int(np.argmin([each[1] if each is not None else np.inf for each in found]))]
 
 
 def _scan_in_turn(
-    cost: Cost, ranges: Sequence[SearchRange], start: float, hopeless: float, has_columns: bool
+    cost: Cost,
+    ranges: Sequence[SearchRange],
+    start: float,
+    hopeless: float,
+    has_columns: bool,
+    count: float,
 ) -> tuple[list[float], float] | None:
     """The same, with every one at a share ``start`` of its range to begin with."""
     at, least = [r.within(start) for r in ranges], -np.inf
     for _ in range(min(len(ranges), 2)):
         for k in range(len(ranges)):
-            found = _scan_one(cost, at, k, ranges, hopeless, has_columns)
+            found = _scan_one(cost, at, k, ranges, hopeless, has_columns, count)
             if found is None:
                 return None
             at[k], least = found
@@ -76,6 +90,7 @@ def _scan_one(
     ranges: Sequence[SearchRange],
     hopeless: float,
     has_columns: bool,
+    samples: float,
 ) -> tuple[float, float] | None:
     """Best value of parameter ``k``, the others held, and its cost; None if it never matters."""
 
@@ -109,13 +124,20 @@ def _scan_one(
     least, best = costs[j], grid[j]
     if has_columns and least > hopeless + _FAR:
         return float(best), float(least)
-    return _narrow(cost_of, grid, costs)
+    return _narrow(cost_of, grid, costs, samples)
 
 
 def _narrow(
-    cost_of: Callable[[float], tuple[float, Array] | None], grid: list[float], costs: list[float]
+    cost_of: Callable[[float], tuple[float, Array] | None],
+    grid: list[float],
+    costs: list[float],
+    samples: float,
 ) -> tuple[float, float]:
-    """The least cost around the best point of a grid, by parabolas through three points."""
+    """The least cost around the best point of a grid, by parabolas through three points.
+
+    Through the mean squares: near its best value what a shape leaves grows with the square of how
+    far it is off, and the logarithm of that has a notch which no parabola resembles.
+    """
     by_ratio = grid[0] > 0.0
     x = [float(np.log(value)) if by_ratio else value for value in grid]
     value_at = dict(zip(x, grid, strict=True))
@@ -123,7 +145,7 @@ def _narrow(
     for tried in range(_NARROWINGS):
         j = int(np.argmin(costs))
         near = slice(max(j - 1, 0), j + 2)
-        u, promised = _vertex(x[near], costs[near])
+        u, promised = _vertex(x[near], costs[near], samples)
         if tried >= _FEWEST_NARROWINGS and max(promised, gained) < _ENOUGH:
             break
         value = float(np.exp(u)) if by_ratio else u
@@ -138,7 +160,7 @@ def _narrow(
     return value_at[x[j]], costs[j]
 
 
-def _vertex(x: Sequence[float], costs: Sequence[float]) -> tuple[float, float]:
+def _vertex(x: Sequence[float], costs: Sequence[float], samples: float) -> tuple[float, float]:
     """Where to look next around the least of two or three costs, and the fall to expect there.
 
     The vertex of the parabola through three; the middle of the widest gap where there is none, and
@@ -150,16 +172,31 @@ def _vertex(x: Sequence[float], costs: Sequence[float]) -> tuple[float, float]:
     middle = 0.5 * (x[best] + x[widest])
     if len(x) < 3 or not np.isfinite(costs).all():
         return middle, 0.25 * float(max(costs) - min(costs))
-    (a, b, c), (f, g, h) = x, costs
+    (a, b, c), (f, g, h) = x, _over_the_least(costs, samples)
     curvature = ((h - g) / (c - b) - (g - f) / (b - a)) / (c - a)
     if curvature <= 0.0:
         return middle, 0.0
     slope = (g - f) / (b - a) + curvature * (b - a)
     step = -0.5 * slope / curvature
-    promised = curvature * step**2
+    promised = _fall_of_cost(curvature * step**2, samples)
     if abs(step) < _NEAR * gaps[widest]:
         return b + _NEAR * (x[widest] - b), promised
     return b + step, promised
+
+
+def _over_the_least(costs: Sequence[float], samples: float) -> list[float]:
+    """By how much each mean square exceeds the least one, in its own size times ``samples``."""
+    over = [cost - min(costs) for cost in costs]
+    if not np.isfinite(samples):
+        return over
+    return [samples * float(np.expm1(min(rise / samples, _LARGEST_RISE))) for rise in over]
+
+
+def _fall_of_cost(fall: float, samples: float) -> float:
+    """The same of a fall of the least mean square, as a fall of the cost."""
+    if not np.isfinite(samples):
+        return fall
+    return -samples * float(np.log1p(-min(fall / samples, 1.0 - _LEAST_LEFT)))
 
 
 def _similarity(a: Array, b: Array) -> float:

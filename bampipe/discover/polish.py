@@ -174,11 +174,14 @@ class Polished:
         contests: by effect, those who contend for its place: itself first, then its rivals.
         alike: by effect that was replayed beside the others, rivals that these trials cannot tell
             from it.
+        unlike: effects of which neither replays nor those of their rivals look like the
+            measurement: `alike` has those that do no worse.
     """
 
     found: FittedSet
     contests: Mapping[str, tuple[Contender, ...]]
     alike: Mapping[str, tuple[str, ...]]
+    unlike: frozenset[str]
 
 
 def polish(
@@ -196,17 +199,20 @@ def polish(
     while True:
         found, left_out = _swap_by_score(bench, found, rivals, swapped)
         alike: dict[str, tuple[str, ...]] = {}
+        unlike = set()
         for name in found.added:
-            likely, other = _swap_by_replay(bench, found, name, left_out[name], progress)
+            likely, other, resembles = _swap_by_replay(bench, found, name, left_out[name], progress)
             if other is not None and name not in swapped:
                 swapped |= {name, likely[0]}
                 found = other
                 break
             if likely:
                 alike[name] = tuple(n for n in likely if n != name)
+            if not resembles:
+                unlike.add(name)
         else:
             contests = {name: _itself_first(out, name) for name, out in left_out.items()}
-            return Polished(found, contests, alike)
+            return Polished(found, contests, alike, frozenset(unlike))
 
 
 def _swap_by_score(
@@ -243,31 +249,34 @@ def _leave_out(found: FittedSet, name: str, rivals: Sequence[str]) -> LeaveOutTa
 
 def _swap_by_replay(
     bench: Bench, found: FittedSet, name: str, out: LeftOut, progress: Progress
-) -> tuple[list[str], FittedSet | None]:
+) -> tuple[list[str], FittedSet | None, bool]:
     """Compare an effect of a set with its close rivals by replays, beside the others of the set.
 
     Returns:
-        Those that these trials do not tell apart, none where none comes close, and the set with
-        the first of them where the effect itself is not among them.
+        Those that these trials do not tell apart, none where none comes close; the set with the
+        first of them where the effect itself is not among them; and whether replays of any look
+        like the measurement.
     """
     if len(found.added) < 2 or not out.contest:
-        return [], None
+        return [], None, True
     s, (mine, *others) = bench.settings, _itself_first(out, name)
     close = [c.effect for c in others if comes_close(c, mine, s)]
     if not close:
-        return [], None
+        return [], None, True
     fewer = reduce_set(found, name)
     scores = {n: out.scores[n] for n in (name, *close)}
     axis = fewer.evidence.system.coordinates.index(mine.axis)
     misfits = replay_rivals(bench, fewer.recipe, fewer.evidence, scores, axis, progress)
     likely = plausible(misfits, s)
-    if not likely:
+    resembles = bool(likely)
+    if not resembles:
         # None looks like the measurement: those that do no worse are no less likely.
         likely = [n for n in close if misfits[n] <= misfits[name]] + [name]
     if name in likely:
         alike = [n for n in likely if n != name]
-        return [name, *without_mere_offsets(fewer.recipe, fewer.evidence, scores, alike, s)], None
-    return likely, extend_set(fewer, scores[likely[0]])
+        rivals = without_mere_offsets(fewer.recipe, fewer.evidence, scores, alike, s)
+        return [name, *rivals], None, resembles
+    return likely, extend_set(fewer, scores[likely[0]]), resembles
 
 
 def contest_of(found: FittedSet, name: str, rivals: Sequence[str]) -> tuple[Contender, ...]:

@@ -151,6 +151,7 @@ class Scorer:
             ranges,
             hopeless,
             has_columns=bool(item.linear_indices),
+            count=float(self.independent_samples[list(item.system.touched)].sum()) or np.inf,
         )
         if found is None:
             return None

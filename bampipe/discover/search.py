@@ -14,11 +14,13 @@ from bampipe.discover.growth import (
     Addition,
     choose_companions,
     describe_refusal,
+    find_changed_axes,
     grow_set,
     record_addition,
     record_step,
 )
 from bampipe.discover.influence import SampleRange
+from bampipe.discover.insufficient import insufficient_rivals
 from bampipe.discover.level import Level
 from bampipe.discover.polish import FittedSet, contest_of, polish
 from bampipe.discover.rivals import Choice, choose
@@ -32,6 +34,7 @@ from bampipe.results.diagnose import Contender, RefusedEffect, SearchStep
 from bampipe.results.standing import AT_FLOOR
 from bampipe.trials.folds import HELD_OUT
 from bampipe.trials.measured import MeasuredTrials
+from bampipe.trials.noise_floor import NoiseFloor
 from bampipe.trials.residuals import Evidence
 
 Array = NDArray[np.float64]
@@ -50,7 +53,8 @@ class Search:
         found: the model with every effect found, fitted.
         groups: for each effect found, in order, the others that these trials cannot tell from it.
         unlike: where one effect is found and no replay looks like the measurement, neither its own
-            nor those of its rivals: these rivals.
+            nor those of its rivals: these rivals, but for those that leave an axis above the floor
+            where the effect found does not.
         misfit: mean squared z of the likest of those replays, else 1.
         contests: for each, those who contend for its place, itself first.
         main: for each, the axis on which it helps most.
@@ -61,7 +65,8 @@ class Search:
         refused: candidates that beat chance and were added, but not kept.
         steps: the sets tried, in order.
         cut_short: whether it ended at `Settings.most_effects`.
-        final: replays of the final model, with explainable shares.
+        final: replays of the final model, with explainable shares; still: the same of one that
+            stands still where it turns round, where those leave less than was measured.
         explainable, explainable_after: explainable share of the residual by axis, of the model as
             given and of the final one.
     """
@@ -84,6 +89,7 @@ class Search:
     steps: tuple[SearchStep, ...]
     cut_short: bool
     final: tuple[Replicate, ...]
+    still: tuple[Replicate, ...]
     explainable: Array
     explainable_after: Array
 
@@ -91,6 +97,11 @@ class Search:
     def selected(self) -> tuple[str, ...]:
         """Effects found, in order."""
         return self.found.added
+
+    @property
+    def floor(self) -> NoiseFloor:
+        """Noise floor of the final model, by either kind of replay."""
+        return _floor_of(self.final, self.still)
 
     @property
     def evidence(self) -> Evidence:
@@ -181,7 +192,7 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
     cut_short = len(current.added) + len(dropped) >= s.most_effects
     progress(0.8, "weighing each effect beside its rivals")
     groups = {name: choices[name].alike for name in choices}
-    rivals = {name: _rivals(first, name, groups.get(name, ()), s) for name in current.added}
+    rivals = {name: _rivals(base, first, name, groups.get(name, ()), s) for name in current.added}
     polished = polish(bench, current, rivals, lambda _, what: progress(0.8, what))
     found, contests = polished.found, polished.contests
     progress(0.85, "replaying the final model for its noise floor")
@@ -202,22 +213,44 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
     alone = choices.get(found.added[0]) if len(found.added) == 1 else None
     unlike, misfit = (alone.unlike, alone.misfit) if alone else ((), 1.0)
     main = {name: axes.index(c[0].axis) for name, c in contests.items() if c}
+    alike = {n: polished.alike.get(n, groups.get(n, ())) for n in found.added}
+    still = bench.still_replicas(found.recipe, found.evidence, found.replayed, final)
+    floor = _floor_of(final, still)
+    for name in main:
+        # Where replays say nothing of which it is, what each leaves does.
+        unsettled = (*unlike, *(alike[name] if name in polished.unlike else ()))
+        behind = insufficient_rivals(bench, found, name, main[name], unsettled, floor)
+        alike[name] = tuple(n for n in alike[name] if n not in behind)
+        unlike = tuple(n for n in unlike if n not in behind)
     return Search(
         bench.trials, base, initial, level, first, found,
-        {n: polished.alike.get(n, groups.get(n, ())) for n in found.added},
-        unlike, misfit, contests, main, additions, likely, transient,
+        alike, unlike, misfit, contests, main, additions, likely, transient,
         tuple(r for name, r in refused.items() if name not in found.added), tuple(steps), cut_short,
-        tuple(final), explainable,
+        tuple(final), tuple(still), explainable,
         bench.shares(found.recipe, found.evidence.p) if found.added else explainable,
     )  # fmt: skip
 
 
-def _rivals(first: Mapping[str, Score], name: str, alike: Sequence[str], s: Settings) -> list[str]:
-    """Candidates that help the model as given on the axis where ``name`` does, best first."""
+def _floor_of(creeping: Sequence[Replicate], still: Sequence[Replicate]) -> NoiseFloor:
+    """Noise floor by replays that creep where the motion turns round, and others, if there are."""
+    floor = NoiseFloor.of_errors([replay.held_out_rmse for replay in creeping])
+    if not still:
+        return floor
+    return floor.larger(NoiseFloor.of_errors([replay.held_out_rmse for replay in still]))
+
+
+def _rivals(
+    base: Recipe, first: Mapping[str, Score], name: str, alike: Sequence[str], s: Settings
+) -> list[str]:
+    """Candidates that help the model as given on the axis where ``name`` does, best first.
+
+    What acts on other axes alone helps there by what it does to parameters that they share.
+    """
     if name not in first:
         return list(alike)
     axis = int(np.argmax(first[name].gain))
     others = [n for n in first if n != name and first[n].gain[axis] > 0.0]
+    others = [n for n in others if axis in find_changed_axes(base, n)]
     others.sort(key=lambda n: -float(first[n].gain[axis]))
     return [*alike, *(n for n in others[: s.most_rivals] if n not in alike)]
 

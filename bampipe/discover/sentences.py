@@ -41,7 +41,18 @@ def _parts(axis: str, i: int, found: Diagnosis, unit: str, s: Settings) -> list[
         parts.append(f"{left}: {describe(judged, i, s)}.")
     elif a.standing == "above_floor":
         parts.append(_excused(a, unit))
-    return parts + _other_band(a)
+    return parts + _creeping(a, unit) + _other_band(a)
+
+
+def _creeping(a: AxisVerdict, unit: str) -> list[str]:
+    """Where the floor is that of replays that stand still, what those that creep leave."""
+    if a.creeping_floor is None:
+        return []
+    return [
+        "The floor is that of replays that stand still where the motion turns round; those that"
+        f" creep, as the device's sign_width says, leave {three(a.creeping_floor)} {unit}. With a"
+        " smaller sign_width more would show."
+    ]
 
 
 def _other_band(a: AxisVerdict) -> list[str]:

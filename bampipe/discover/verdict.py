@@ -16,7 +16,7 @@ from bampipe.discover.scorer import Scorer
 from bampipe.discover.search import Search
 from bampipe.discover.settings import Settings
 from bampipe.results.diagnose import AxisVerdict, Contender, TransientCandidate, Verdict
-from bampipe.results.standing import FLOOR_WRONG, standing
+from bampipe.results.standing import AT_FLOOR, FLOOR_WRONG, standing
 from bampipe.trials.noise_floor import NoiseFloor
 
 
@@ -24,9 +24,9 @@ def conclude(search: Search, s: Settings) -> Diagnosis:
     """Say of each axis whether something is missing, and whether what was found explains it."""
     evidence = search.evidence
     before, after = search.initial.held_out_rmse, evidence.held_out_rmse
-    floor = NoiseFloor.of_errors([r.held_out_rmse for r in search.final])
+    floor, creeping = search.floor, NoiseFloor.of_errors([r.held_out_rmse for r in search.final])
     bare_floor = NoiseFloor.of_errors([r.held_out_rmse for r in search.level.replicates]).level
-    shares = np.array([r.share for r in search.final])
+    shares = np.array([r.share for r in (*search.final, *search.still)])
     reach = {n: _reach(search, n, s.worth) for n in search.selected}
     odds = {n: _odds_of_group(search, n, s) for n in search.selected}
     axes = range(len(before))
@@ -54,6 +54,7 @@ def conclude(search: Search, s: Settings) -> Diagnosis:
     fails = [lacking[axis] and explained[axis] < s.explained for axis in axes]
     # What explains too little where it helps most was not found, whatever it does elsewhere.
     weak = {n for n in search.selected if fails[search.main[n]]}
+    raised = floor.level > AT_FLOOR * creeping.level
     findings = []
     for axis in axes:
         level, scatter = float(floor.level[axis]), float(floor.sd[axis])
@@ -86,6 +87,7 @@ def conclude(search: Search, s: Settings) -> Diagnosis:
                 rmse_after=after[axis],
                 noise_floor=level,
                 noise_floor_sd=scatter,
+                creeping_floor=creeping.level[axis] if raised[axis] else None,
                 standing=against_floor,
                 worst_second=worst.stretch,
                 rmse_without_worst_second=but_for_it,

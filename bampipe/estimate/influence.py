@@ -21,8 +21,9 @@ class RemovedStretch:
 
     Attributes:
         trial: its number among those fitted; start_s: since the start of the trial, s.
-        move: (n_free,) change of the parameters without it, in their standard deviations.
-        typical: (n_free,) scatter of that over all stretches, by its median.
+        move: (n_free,) change of the parameters without it, in the standard deviations that the
+            rest leaves them.
+        typical: (n_free,) what a stretch changes that tells as much, by the median over all.
     """
 
     trial: int
@@ -36,7 +37,9 @@ def find_worst_stretch(
 ) -> RemovedStretch:
     """Return the stretch without which some parameter would move most.
 
-    To first order: the inverse of all information times the score of the stretch (Cook 1977).
+    To first order: the inverse of all information times the score of the stretch (Cook 1977). A
+    stretch that alone makes the scatter of a sandwich would hide in it, and moves by no more than
+    one of its deviations; so its own part is taken off, down to what typical stretches scatter.
 
     Args:
         problem: as fitted; found: the fit to its trials; length_s: of a stretch, s.
@@ -45,24 +48,30 @@ def find_worst_stretch(
     samples = max(1, round(length_s * band.rate_hz / band.step))
     weight = 1.0 / np.maximum(found.residual_sd, 1e-150)
     information = np.diag(problem.precision)
-    scores: list[Array] = []
-    places: list[tuple[int, int]] = []
-    for trial, stacked in enumerate(found.stacked):
+    for stacked in found.stacked:
         slope = stacked.slope * weight[None, :, None]
         information += np.einsum("tqi,tqj->ij", slope, slope)
-        score = np.einsum("tqi,tq->ti", slope, stacked.residual * weight)
-        starts = np.arange(0, len(score), samples)
-        scores.append(np.add.reduceat(score, starts, axis=0))
-        places += [(trial, int(start)) for start in starts]
-    sd = np.sqrt(np.diag(found.covariance))
     inverse = np.linalg.pinv(information, hermitian=True)
+    sd = np.sqrt(np.diag(found.covariance))
+    parts: list[Array] = []
+    shares: list[Array] = []
+    places: list[tuple[int, int]] = []
+    for trial, stacked in enumerate(found.stacked):
+        slope = stacked.slope * weight[None, :, None] @ inverse
+        starts = np.arange(0, len(slope), samples)
+        part = np.einsum("tqi,tq->ti", slope, stacked.residual * weight)
+        parts.append(np.add.reduceat(part, starts, axis=0))
+        shares.append(np.add.reduceat(np.sum(slope**2, axis=1), starts, axis=0))
+        places += [(trial, int(start)) for start in starts]
+    # What white noise of its size would make of each stretch, as the typical one scatters.
     with np.errstate(divide="ignore", invalid="ignore"):
-        moves = np.nan_to_num(np.concatenate(scores) @ inverse / sd, posinf=0.0, neginf=0.0)
+        moves = np.nan_to_num(np.concatenate(parts) / sd, posinf=0.0, neginf=0.0)
+        expected = np.nan_to_num(np.sqrt(np.concatenate(shares)) / sd, posinf=0.0)
+        size = np.where(expected > 0.0, np.abs(moves) / expected, np.nan)
+        typical = _SD_OF_MEDIAN * np.nanmedian(size, axis=0) * expected
+        rest = np.sqrt(np.maximum(1.0 - moves**2, np.minimum(np.sum(typical**2, axis=0), 1.0)))
+        moves, typical = (np.nan_to_num(each / rest, posinf=0.0) for each in (moves, typical))
     worst = int(np.argmax(np.abs(moves).max(axis=1)))
     trial, start = places[worst]
-    return RemovedStretch(
-        trial,
-        band.margin_s + start * band.step / band.rate_hz,
-        moves[worst],
-        _SD_OF_MEDIAN * np.median(np.abs(moves), axis=0),
-    )
+    start_s = band.margin_s + start * band.step / band.rate_hz
+    return RemovedStretch(trial, start_s, moves[worst], typical[worst])

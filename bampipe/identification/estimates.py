@@ -43,10 +43,10 @@ MOST_SHOWN = 24
 _STRETCH_S = 1.0
 _STATES = 500_000
 """Samples, spread over all, that the typical uncertainty of a state is taken from."""
-_MOVES, _OUTLYING = 1.0, 6.0
-"""Standard deviations by which the worst second moves a parameter, and times what a typical one
-does, from which on it is said: of hundreds of seconds of Gaussian noise, the worst moves it by 3 to
-4 times the typical."""
+_MOVES, _OUTLYING = 2.0, 15.0
+"""Standard deviations by which the worst second moves a parameter, and times what noise makes of a
+second that tells as much, from which on it is said. Of 32 sound sessions none reaches the first,
+where friction turns round 1.9 at most; a second in which the sensor is dead reaches 3.5 and 35."""
 
 
 @dataclass(frozen=True)
@@ -230,11 +230,7 @@ def collect_result(
         identifiability=identifiability,
         base_parameters=base_parameters,
         notes=(
-            *(
-                f"`{name}` does not count as identified: {'; '.join(found.reasons)}."
-                for name, found in effects.items()
-                if not found.identified
-            ),
+            *filter(None, (found.describe(name) for name, found in effects.items())),
             *([_describe_limit(timing)] if timing.is_at_limit else []),
             *filter(None, [influence.worst_second.sentence]),
             *notes,
@@ -280,8 +276,8 @@ def _assess_influence(
             parameter=names[place],
             move=move,
             sentence=f"The second from {worst.start_s:.1f} s of trial {trial} on moves"
-            f" `{names[place]}` by {abs(move):.1f} standard deviations of least squares, a typical"
-            f" one by {worst.typical[place]:.2g}: look there for a transient or an outlier."
+            f" `{names[place]}` by {abs(move):.1f} standard deviations that the rest leaves it, a"
+            f" typical one by {worst.typical[place]:.2g}: look there for a transient or an outlier."
             if stands_out
             else "",
         ),

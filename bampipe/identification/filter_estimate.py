@@ -29,6 +29,7 @@ from bampipe.identification.filter_run import (
     build_filter_model,
     choose_stride,
     clear_of_reversal_mask,
+    likelier,
     load_filter_trial,
     run_filter,
 )
@@ -337,26 +338,24 @@ def _repeat_until_settled(
     settings: FilterSettings,
     run_from: Callable[[Sequence[Attempt], FilterSettings], FilterRun],
 ) -> FilterRun:
-    """Filter again around the answer, as long as that moves it and makes the readings likelier.
+    """Filter again around the answer until that no longer moves it.
 
     One pass takes the model as straight across all that it did not know when it began; where the
-    model is nonlinear, that leaves its mark on the answer. A start this wide of an answer adds a
-    hundredth to what is known of it.
+    model is nonlinear, that leaves its mark on the answer, and on the likelihood, which therefore
+    does not say which of two passes to believe. Passes from different starts settle at one place.
+    Where none does, the likeliest counts. A start this wide of an answer adds a hundredth to what
+    is known of it.
     """
-    first = found.passes
-    for _ in range(_REPEATS):
-        finer = settings.longest_step < found.settings.longest_step
-        value, slope = model.to_physical(found.theta)
-        sd = np.sqrt(np.diag(found.covariance))
+    best = last = found
+    for repeats in range(1, 1 + _REPEATS):
+        value, slope = model.to_physical(last.theta)
+        sd = np.sqrt(np.diag(last.covariance))
         try:
             again = run_from([(value, _AROUND * slope * sd, 1.0)], settings)
         except MotionLost:
             break
-        if again.log_likelihood < found.log_likelihood and not finer:
-            break
-        stays = np.all(np.abs(again.theta - found.theta) < sd)
-        repeats = found.repeats + 1
-        found = replace(again, restarts=found.restarts, repeats=repeats, first=first)
-        if stays:
-            break
-    return found
+        again = replace(again, restarts=found.restarts, repeats=repeats, first=found.passes)
+        if np.all(np.abs(again.theta - last.theta) < sd):
+            return again
+        best, last = likelier(best, again), again
+    return best

@@ -37,6 +37,10 @@ _COARSE = 300.0
 _LARGEST_NIS = 10.0
 """Mean normalised innovation squared from which on the filter is taken to have lost the motion."""
 
+_AS_LIKELY = 30.0
+"""Difference of log-likelihoods up to which two runs are as likely: so much the width of a start
+costs a run, a few for each parameter, and rounding may decide between them."""
+
 STRETCH_S = 0.05
 """Innovations are averaged over this long: from sample to sample the counts of an encoder are no
 noise, and what a model lacks acts at the pace of a hand."""
@@ -280,7 +284,8 @@ def run_filter(
     A filter that trusts its model far from the truth does not find back. The first trial is
     filtered with much process noise, which adds next to no information, and filtered again at
     the end in its own right. Where the model is nonlinear in its parameters, a filter can
-    follow the motion with wrong parameters: then the likeliest of several attempts counts.
+    follow the motion with wrong parameters: then the likeliest of several attempts counts, the
+    first of those that are as likely.
 
     Args:
         model, trials, settings: as `filter_trials` takes them.
@@ -299,7 +304,8 @@ def run_filter(
     order = (*range(1, len(trials)), 0)
     failure: tuple[int, FilterFailure] | None = None
     found: FilterRun | None = None
-    following: list[FilterRun] = []
+    kept: FilterRun | None = None
+    following = 0
     for restarts, (value, sd, factor) in enumerate(attempts):
         mean, spread = model.to_estimated(value, sd)
         level = replace(settings, noise_sd=factor * settings.noise_sd)
@@ -330,11 +336,12 @@ def run_filter(
         if not _is_lost(passes[-1]):
             if agrees(found):
                 return found
-            following.append(found)
-            if len(following) == rivals:
+            kept = found if kept is None else likelier(kept, found)
+            following += 1
+            if following == rivals:
                 break
-    if following:
-        return max(following, key=lambda each: each.log_likelihood)
+    if kept is not None:
+        return kept
     if found is not None:
         raise _not_followed_error(found, lost_error, axes)
     if failure is None:
@@ -344,6 +351,11 @@ def run_filter(
     raise lost_error(
         f"the filter lost the motion of trial {{}} at {t:.2f} s: {error.reason}", place
     )
+
+
+def likelier(one: FilterRun, other: FilterRun) -> FilterRun:
+    """Return the other run where it is likelier by more than starts and rounding, else the one."""
+    return other if other.log_likelihood > one.log_likelihood + _AS_LIKELY else one
 
 
 def _is_lost(one: Pass) -> bool:

@@ -31,6 +31,7 @@ def explain_proposal(
     unlimited: Sequence[str],
     lacking: Sequence[str],
     better: str,
+    missing: Sequence[str] = (),
 ) -> Reasons:
     """Say why a trial is proposed and what it is expected to give.
 
@@ -40,6 +41,7 @@ def explain_proposal(
         unlimited: axes of which the device states no range, so that nothing wider was tried.
         lacking: axes whose held-out error is above the noise floor.
         better: trial at hand the like of which says more, "" if none.
+        missing: effects that the diagnosis found and the model does not have.
     """
     why, expected = _explain(purpose, parameter, best, table, unlimited)
     if better:
@@ -50,7 +52,12 @@ def explain_proposal(
         )
     if best.farther or best.faster:
         expected += _UNTRIED
-    if best.sd and lacking:
+    if best.sd and missing:
+        expected += (
+            f" By the diagnosis the model lacks {join_names(missing, _SHOWN)}: add that first"
+            " (`bampipe extend`), for these are the uncertainties of a model without."
+        )
+    elif best.sd and lacking:
         expected += (
             f" The error of {join_names(lacking, _SHOWN)} is above the noise floor: what the model"
             " lacks there counts as noise in these uncertainties."

@@ -194,6 +194,13 @@ class Robot(Declaration):
                 where="motors",
                 remedy="log the current of all, or the torque of all",
             )
+        motors = self.motors.values()
+        if motors and all(motor.torque_constant_sd is not None for motor in motors):
+            yield InputError(
+                "every torque constant is estimated, which leaves the scale of all masses open",
+                where="motors",
+                remedy="leave out torque_constant_sd where the constant is known best",
+            )
 
     @cached_property
     def links(self) -> tuple[Link, ...]:

@@ -10,6 +10,8 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from bampipe.data.survey import survey
 from bampipe.errors import InputError
 from bampipe.files import write_text
@@ -126,7 +128,13 @@ def _with_guessed_motors(folder: Path, chosen: ChosenDevice, columns: RobotColum
     of_motor = [size * ratio for size, ratio in zip(sizes, turns, strict=True)]
     if chosen.device.force_unit == "A":
         found = zip(joints, turns, of_motor, strict=True)
-        return with_motors(folder, chosen, {j: (n, 1.0 / size) for j, n, size in found})
+        guessed = {j: (n, 1.0 / size) for j, n, size in found}
+        # Where most is carried, errors of single bodies count least.
+        size = {
+            joint: float(np.nanstd(columns.columns[name].values) / abs(drive.share))
+            for joint, (name, drive) in zip(joints, columns.drives.items(), strict=True)
+        }
+        return with_motors(folder, chosen, guessed, max(size, key=lambda joint: size[joint]))
     if columns.gears and all(LEAST_AT_JOINT < size < 1.0 / LEAST_AT_JOINT for size in of_motor):
         return with_motors(folder, chosen, {j: (columns.gears.get(j, 1.0), None) for j in joints})
     if not columns.gears and all(size < LEAST_AT_JOINT for size in sizes):

@@ -132,14 +132,21 @@ def _robot(folder: Path, found: Survey) -> ChosenDevice | None:
 
 
 def with_motors(
-    folder: Path, chosen: ChosenDevice, motors: Mapping[str, tuple[float, float | None]]
+    folder: Path,
+    chosen: ChosenDevice,
+    motors: Mapping[str, tuple[float, float | None]],
+    reference: str = "",
 ) -> ChosenDevice:
     """A new device file of a robot with a table for each motor.
 
     Args:
         folder: of the logs; chosen: the robot.
         motors: by joint, turns for one of the joint and, where currents are logged, N.m/A.
+        reference: of constants that the drawing suggests, the joint whose constant the others are
+            estimated by.
     """
+    robot = chosen.device.robot
+    uncertainty = robot.uncertainty if robot is not None else 0.0
     text = chosen.text.partition("\n[robot.motors")[0]
     for joint, (turns, constant) in motors.items():
         text += f"\n[robot.motors.{joint}]\nturns = {{ {joint} = {turns:.3g} }}"
@@ -147,6 +154,9 @@ def with_motors(
         if constant is not None:
             gears = ", gears included" if turns == 1.0 else ""
             text += f"\ntorque_constant = {constant:.3g}  # guess: N.m/A{gears}"
+            if reference and joint != reference:
+                text += f"\ntorque_constant_sd = {uncertainty * constant:.2g}"
+                text += "  # estimated; leave out with that of the data sheet"
         text += "\n"
     return replace(chosen, text=text, device=_complete(folder, text))
 

@@ -385,7 +385,8 @@ def _sentences(
     if agreed and device.force_unit == "A":
         lines.append(
             f"torque constants by weight and inertia as drawn, and no better than these:"
-            f" {', '.join(agreed)}; put in those of the data sheet, gears included"
+            f" {', '.join(agreed)}; put in those of the data sheet, gears included, or have them"
+            " estimated by that of one"
         )
     elif agreed:
         lines.append(

@@ -31,6 +31,8 @@ def find_failed_checks(
     for name, sd in session.force.noise_sd.items():
         if sd == 0.0:
             yield f"{name}: the noise of its samples is not known"
+    for name in session.force.look_like_counts:
+        yield f"{name}: its readings look like counts of a converter, not like {session.force.unit}"
     published = identified.methods.get(identified.method)
     doubts = published.doubts if published else ()
     yield from (f"estimate by {METHODS_IN_WORDS[identified.method]}: {doubt}" for doubt in doubts)

@@ -45,6 +45,11 @@ class AxisVerdict(Record):
     rmse_after: Size = Field(description="With what was found")
     noise_floor: Size
     noise_floor_sd: Size
+    creeping_floor: Size | None = Field(
+        default=None,
+        description="Of replays that creep where the motion turns round, where that of ones that "
+        "stand still there is clearly larger, and the noise floor",
+    )
     standing: Standing = Field(description="rmse_after against noise_floor")
     worst_second: Stretch = Field(description="Where the residual with what was found is largest")
     rmse_without_worst_second: Size = Field(

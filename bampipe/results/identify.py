@@ -98,7 +98,9 @@ class WorstSecond(Record):
     trial: str
     start_s: Size = Field(description="Since the start of the trial, s")
     parameter: str
-    move: float = Field(description="Change of it without that second, in standard deviations")
+    move: float = Field(
+        description="Change of it without that second, in standard deviations that the rest leaves"
+    )
     sentence: str = Field(
         default="", description="In words, where it stands out as a transient or an outlier does"
     )
@@ -119,6 +121,12 @@ class EffectEstimate(Record):
 
     identified: bool
     reasons: Names = Field(default=(), description="Why it does not count as identified")
+
+    def describe(self, name: str) -> str:
+        """Say that it does not count as identified, and why; "" where it does."""
+        if self.identified:
+            return ""
+        return f"`{name}` does not count as identified: {'; '.join(self.reasons)}."
 
 
 class InputTiming(Record):

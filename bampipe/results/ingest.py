@@ -48,6 +48,9 @@ class ForceChannels(Record):
     crosstalk_sd: Size = Field(
         default=0.0, description="That of how much of another component each shows, as a share"
     )
+    look_like_counts: Names = Field(
+        default=(), description="Channels whose readings are rather counts of a converter"
+    )
 
 
 class RecordedChannel(Record):
@@ -114,7 +117,8 @@ class IngestResult(Result):
     axes: dict[str, EncoderChannel] = Field(min_length=1)
     force: ForceChannels
     sensor_warnings: Names = Field(
-        description="Where stated and measured noise or resolution disagree by more than twice"
+        description="Where stated and measured noise or resolution disagree by more than twice, or"
+        " readings are rather counts"
     )
     mains_hum: tuple[MainsHum, ...] = ()
     brakes: dict[str, RecordedChannel]

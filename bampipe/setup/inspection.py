@@ -8,6 +8,7 @@ import numpy as np
 
 from bampipe.errors import InputError
 from bampipe.estimate.low_pass import Band
+from bampipe.lists import join_names
 from bampipe.physics import System
 from bampipe.results.ingest import IngestResult
 from bampipe.results.setup import AxisSetup, PossibleMistake, SetupMistake, SetupResult
@@ -22,6 +23,8 @@ from bampipe.trials.signals import Change, Signals
 _FARTHEST = {"rotary": (62.8, "degrees"), "linear": (20.0, "millimetres")}
 """By kind: ten turns, rad, and a long hall, m, which an axis rarely moves through while it is
 logged; and the unit that such a number usually is in."""
+_MANY = 8
+"""Most names that a message lists."""
 
 
 def inspect_setup(
@@ -148,7 +151,7 @@ def _require_scale(system: System, motions: Sequence[Motion]) -> None:
             sizes.append(np.abs(system.residual(motion.q, motion.qd, motion.qdd, z, u, p)).max())
         if not sizes[0] <= 1e-12 * sizes[1]:
             return
-    names = ", ".join(system.parameters[i].name for i in free)
+    names = join_names((system.parameters[i].name for i in free), _MANY)
     raise InputError(
         f"the scale of its equation is undetermined: with {names} all at zero, nothing is left to"
         " explain",

@@ -46,6 +46,7 @@ a band of 17 Hz ended, they were 17 %: a delay of 2 ms came out 5 % too long, at
 _HIGHEST_CUTOFF = 0.2
 """Of the sampling rate."""
 _SHORTEST = 32
+"""Samples of a trial, the least that can be differentiated."""
 _TUNING_PART = 2000
 """Least length, samples, of the parts that the bandwidth is chosen from, where trials are many."""
 
@@ -128,13 +129,9 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     ids = [str(name) for name in wanted["trial_id"]]
 
     progress(0.0, "choosing the bandwidth")
-    records = _tuning_records(samples, ids, tuple(axes), rate, config.tuning_samples)
+    records, refused = _tuning_records(samples, ids, tuple(axes), rate, config.tuning_samples)
     if not any(records.values()):
-        raise InputError(
-            "no free or viscous trial to differentiate",
-            where=str(run.root),
-            remedy="look at ingest/trials.parquet for the reasons",
-        )
+        raise _nothing_to_differentiate(run, trials, refused)
     choices = {
         axis: _choose(axis, records[axis], rate, axes[axis].resolution or 0.0, config)
         for axis in axes
@@ -162,7 +159,35 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     free = set(trials.loc[trials["kind"] == MOVING[0], "trial_id"]) - held_out_trials(run)
     setup = _inspect(system, out, session, names, free, bands)
     setup.write(out)
-    return result.write(out) | {"setup": list(setup.lines)}
+    notes = [f"{name}: not used: {reason}" for name, reason in written.skipped.items()]
+    return result.write(out) | {"setup": list(setup.lines), "notes": notes}
+
+
+def _nothing_to_differentiate(
+    run: RunFolder, trials: pd.DataFrame, refused: Mapping[str, str]
+) -> InputError:
+    """Say why no trial can be differentiated: the kinds that there are, or that all are short."""
+    if refused:
+        name, reason = next(iter(refused.items()))
+        return InputError(
+            f"none of the {len(refused)} free and viscous trials is long enough: {name} holds"
+            f" {reason}",
+            where=str(run.root),
+            remedy="record longer trials, or at a higher rate",
+        )
+    moving = trials[trials["kind"].isin(MOVING)]
+    if len(moving):
+        first = moving.iloc[0]
+        return InputError(
+            f"every free and viscous trial is set aside: {first['trial_id']}: {first['reason']}",
+            where=str(run.root),
+            remedy="the others are in the report, and in ingest/trials.parquet",
+        )
+    return InputError(
+        f"no free or viscous trial among {len(trials)}: nothing to identify from",
+        where=str(run.root),
+        remedy='record trials in which the machine moves, kind = "free" in session.toml',
+    )
 
 
 def _write_motions(
@@ -227,15 +252,19 @@ def _load(samples: Path, trial_id: str, rate: float) -> _Trial | str:
     sound = frame.drop(columns="trial_id").notna().all(axis=1).to_numpy()
     frame = frame[sound]
     if len(frame) < _SHORTEST:
-        return f"only {len(frame)} sound samples; {_SHORTEST} are needed"
+        return f"{len(frame)} sound samples, of which {_SHORTEST} are needed"
     return _Trial(trial_id, uniform_grid(frame["t"].to_numpy(dtype=np.float64), rate), frame)
 
 
 def _tuning_records(
     samples: Path, ids: Sequence[str], axes: tuple[str, ...], rate: float, budget: int
-) -> dict[str, list[tuple[Array, Flags]]]:
-    """Return, per axis, the first parts of trials as positions and flags of samples seen."""
+) -> tuple[dict[str, list[tuple[Array, Flags]]], dict[str, str]]:
+    """Return, per axis, the first parts of trials as positions and flags of samples seen.
+
+    And of the trials looked at, why those without a part have none.
+    """
     records: dict[str, list[tuple[Array, Flags]]] = {axis: [] for axis in axes}
+    refused: dict[str, str] = {}
     most = max(budget // _TUNING_PART, 1)
     spread = np.unique(np.linspace(0, len(ids) - 1, min(len(ids), most)).round().astype(int))
     rest = np.setdiff1d(np.arange(len(ids)), spread)
@@ -245,12 +274,13 @@ def _tuning_records(
             break
         trial = _load(samples, ids[place], rate)
         if isinstance(trial, str):
+            refused[ids[place]] = trial
             continue
         for axis in axes:
             position = trial.grid.resample(trial.frame[f"q_{axis}"].to_numpy(dtype=np.float64))
             # Copies: a view would keep the whole trial.
             records[axis].append((position[:share].copy(), trial.observed[:share].copy()))
-    return records
+    return records, refused
 
 
 def _choose(

@@ -40,7 +40,12 @@ from bampipe.results.ingest import (
     RecordedChannel,
 )
 from bampipe.schema import STRICT
-from bampipe.trials.sensors import RecordNoise, settle_encoder, settle_force
+from bampipe.trials.sensors import (
+    RecordNoise,
+    looks_like_counts,
+    settle_encoder,
+    settle_force,
+)
 
 SUMMARY = "Read a session's raw logs, check and repair the trials, bring them to SI units"
 INPUTS: tuple[str, ...] = ()
@@ -84,6 +89,8 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     reasons = _refused(session)
     noise: dict[str, list[RecordNoise]] = defaultdict(list)
     hum: dict[str, list[dict[float, float]]] = defaultdict(list)
+    units = _force_units(session, device)
+    counts: dict[str, list[tuple[float, float] | None]] = defaultdict(list)
     total, measured = len(session.trials), 0
     with ParquetAppender(out / "ingest/samples.parquet") as samples:
         for number, entry in enumerate(session.trials):
@@ -93,6 +100,8 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
             except InputError as error:
                 rows.append(_row(entry, None, str(error)))
                 continue
+            for name, unit in units.items():
+                counts[name].append(_counts(trial.columns[name] / unit))
             _remove_hum(hum, trial)
             rows.append(_row(entry, trial, ""))
             _append(samples, entry, trial)
@@ -109,7 +118,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     trials = _trials_table(rows)
     write_parquet(out / "ingest/trials.parquet", trials)
     rate = _rate(session, trials)
-    description = _description(session, device, rate, noise, hum)
+    description = _description(session, device, rate, noise, hum, counts)
     description.write(out)
     if session.device_file is not None:
         file = out / "ingest/device.toml"
@@ -314,6 +323,47 @@ def _remove_hum(hum: dict[str, list[dict[float, float]]], trial: CleanTrial) -> 
             hum[name].append(found)
 
 
+def _force_units(session: Session, device: Device) -> dict[str, float]:
+    """One raw unit, in SI, of the forces that are logged in a unit in which none counts whole."""
+    units: dict[str, float] = {}
+    if session.force and not session.force.volts:
+        gains = np.diag(np.array(session.force.calibration))
+        units |= dict(zip(session.force.names, gains, strict=True))
+    units |= {each.name: each.scale for each in session.channels if each.offset == 0.0}
+    return {name: unit for name, unit in units.items() if name in device.forces and unit >= 1.0}
+
+
+def _counts(readings: np.ndarray) -> tuple[float, float] | None:
+    """The range of readings that look like counts of a converter; None for others."""
+    if not looks_like_counts(readings):
+        return None
+    return float(readings.min()), float(readings.max())
+
+
+def _count_warnings(
+    session: Session, device: Device, counts: Mapping[str, list[tuple[float, float] | None]]
+) -> dict[str, str]:
+    """A sentence for each channel that looks like counts in most of its trials."""
+    said = {}
+    for name, ranges in counts.items():
+        found = [each for each in ranges if each is not None]
+        if 2 * len(found) <= len(ranges):
+            continue
+        low, high = min(each[0] for each in found), max(each[1] for each in found)
+        in_force = session.force is not None and name in session.force.names
+        said[name] = (
+            f"{name}: whole numbers from {low:.0f} to {high:.0f} look like counts of a converter,"
+            f" not like {device.channels.get(name, device.force_unit)}; if so, "
+            + (
+                'give [force] unit = "V", calibration_n_per_v with the force of one count, and'
+                " zero_v with the reading without load"
+                if in_force
+                else f"give scale and offset under channels.{name}"
+            )
+        )
+    return said
+
+
 def _typical_hum(
     hum: Mapping[str, list[dict[float, float]]], device: Device
 ) -> tuple[MainsHum, ...]:
@@ -386,6 +436,7 @@ def _description(
     rate: float,
     noise: Mapping[str, list[RecordNoise]],
     hum: Mapping[str, list[dict[float, float]]],
+    counts: Mapping[str, list[tuple[float, float] | None]],
 ) -> IngestResult:
     """Return what session.json says, the sensors settled."""
     force = session.force
@@ -398,6 +449,7 @@ def _description(
         name: settle_force(name, device.force_unit, stated, noise.get(name, []))
         for name in device.forces
     }
+    counted = _count_warnings(session, device, counts)
     own = session.device_file is not None
     return IngestResult(
         session_id=session.session_id,
@@ -440,9 +492,11 @@ def _description(
             raw_unit=force.raw_unit if force else "",
             gain_sd=force.gain_sd if force else 0.0,
             crosstalk_sd=force.crosstalk_sd if force else 0.0,
+            look_like_counts=tuple(counted),
         ),
-        sensor_warnings=tuple(
-            sensor.warning for sensor in (*encoders.values(), *forces.values()) if sensor.warning
+        sensor_warnings=(
+            *(each.warning for each in (*encoders.values(), *forces.values()) if each.warning),
+            *counted.values(),
         ),
         mains_hum=_typical_hum(hum, device),
         brakes={

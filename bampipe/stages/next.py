@@ -180,7 +180,8 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     better = ""
     if chosen == "precision":
         better = _better_at_hand(precision, fitted, parameter, config.seconds, tried[0])
-    reasons = explain_proposal(chosen, parameter, best, table, unlimited, lacking, better)
+    missing = diagnosed.selected if diagnosed is not None else ()
+    reasons = explain_proposal(chosen, parameter, best, table, unlimited, lacking, better, missing)
     result = NextResult(
         model=config.model,
         purpose=chosen,

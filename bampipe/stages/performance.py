@@ -66,7 +66,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     handle = _handle(run, system, p, reach, config.points) if at_handle else None
     return PerformanceResult(
         model=config.model,
-        headline=_headline(handle) if handle else "No handle on this device.",
+        headline=_headline(handle, device.prescribed) if handle else "No handle on this device.",
         constants={
             name: DeviceConstant(
                 value=item.value, unit=item.unit, source=item.source, description=item.description
@@ -175,11 +175,14 @@ def _range(values: Array, unit: str) -> Range:
     return Range(lower=values.min(), upper=values.max(), unit=unit)
 
 
-def _headline(handle: Handle) -> str:
+def _headline(handle: Handle, prescribed: bool) -> str:
+    """Say it in one line; on a test bench nobody holds a handle."""
     swept = handle.workspace
-    parts = [f"workspace moved through {swept.value:.2g} {swept.unit}"]
+    what, where = ("stroke", "load cell") if prescribed else ("workspace moved through", "handle")
+    parts = [f"{what} {swept.value:.2g} {swept.unit}"]
     for name in ("stiffness", "friction", "inertia"):
         found = getattr(handle, name)
         if found is not None:
-            parts.append(f"{name} {found.lower:.3g} to {found.upper:.3g} {found.unit}")
-    return "At the handle: " + ", ".join(parts)
+            low, high = f"{found.lower:.3g}", f"{found.upper:.3g}"
+            parts.append(f"{name} {low if low == high else f'{low} to {high}'} {found.unit}")
+    return f"At the {where}: " + ", ".join(parts)

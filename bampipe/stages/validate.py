@@ -14,17 +14,19 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 
 from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
 from bampipe.data.store import ParquetAppender, read_parquet
-from bampipe.declarations.model_file import IDENTIFIED_MODEL, identified, load_model
+from bampipe.declarations.model_file import IDENTIFIED_MODEL, identified, load_model, read_recipe
 from bampipe.errors import InputError
 from bampipe.identification.drift import find_drift
 from bampipe.identification.free_run import free_runs
 from bampipe.identification.terms import describe_terms
 from bampipe.physics import System, compile_model
+from bampipe.physics.recipe import Recipe
 from bampipe.progress import Progress
 from bampipe.results.checks import find_failed_checks
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.ingest import IngestResult
-from bampipe.results.standing import standing
+from bampipe.results.rounding import significant
+from bampipe.results.standing import AT_FLOOR, standing
 from bampipe.results.validate import (
     AxisError,
     ForceError,
@@ -38,6 +40,7 @@ from bampipe.trials.folds import HELD_OUT, Folds
 from bampipe.trials.measured import MeasuredTrials, read_measured_trials, trial_of_block
 from bampipe.trials.motion import Motion
 from bampipe.trials.noise_floor import (
+    STILL_WIDTH,
     NoiseFloor,
     find_noise_floor,
     floor_replays,
@@ -113,7 +116,8 @@ class _Compared:
 
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
     """Compare one identified model with all free trials, and those in a viscous field."""
-    system = compile_model(load_model(run, config.model))
+    model = load_model(run, config.model)
+    system = compile_model(model)
     p = identified(run, config.model, system)
     estimates = run.read(IdentifyResult, config.model)
     trials = read_measured_trials(run, system, timing=estimates.input_timing)
@@ -157,6 +161,14 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
             )
         except InputError as error:
             notes.append(f"No noise floor: simulating the fitted model failed ({error}).")
+    recipe = read_recipe(run, config.model, model)
+    if (
+        floor is not None
+        and floor.is_exceeded(evidence.held_out_rmse)
+        and not recipe.has_drawn_axes
+    ):
+        floor, said = _with_still_replays(evidence, trials, replayed, floor, recipe, config.seed)
+        notes += said
     free: FreeRun | None = None
     if config.free_run and not trials.blocks:
         progress(0.8, "free runs")
@@ -177,6 +189,33 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     return _result(run, system, trials, compared, expected, floor, free, notes, estimates).write(
         out
     )
+
+
+def _with_still_replays(
+    evidence: Evidence,
+    trials: MeasuredTrials,
+    p: Array,
+    floor: NoiseFloor,
+    recipe: Recipe,
+    seed: int,
+) -> tuple[NoiseFloor, list[str]]:
+    """The floor of a machine that creeps or stands still where it turns round, and what to say."""
+    narrow = compile_model(recipe.with_sign_widths(STILL_WIDTH).model())
+    try:
+        still = find_noise_floor(
+            evidence, p, trials.sensors, trials.kinematics, seed, floor.replays, replayed=narrow
+        )
+    except InputError:
+        return floor, []
+    either, system = floor.larger(still), evidence.system
+    raised = np.flatnonzero(either.level > AT_FLOOR * floor.level)
+    return either, [
+        f"{system.coordinates[i]}: replays that stand still where the motion turns round leave"
+        f" {significant(still.level[i])} {system.torque_units[i]}, those that creep as `sign_width`"
+        f" says {significant(floor.level[i])}: the former is the noise floor. A smaller"
+        " `sign_width` in the device file lets more be seen."
+        for i in raised
+    ]
 
 
 def _run_freely(
@@ -227,7 +266,7 @@ def _expected_ratio(evidence: Evidence, trials: MeasuredTrials, p: Array, seed: 
     published = StandIn(evidence.system, p, evidence.motions, trials.sensors.rate_hz)
     try:
         again = replay_evidence(
-            published, evidence.p, trials.sensors, trials.kinematics,
+            published, evidence.system, evidence.p, trials.sensors, trials.kinematics,
             evidence.band, evidence.folds, (seed, _EXPECTED_SEED),
         )  # fmt: skip
     except InputError:

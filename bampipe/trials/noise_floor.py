@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 
 from bampipe.estimate.least_squares import fit
 from bampipe.estimate.low_pass import Band
+from bampipe.physics import System
+from bampipe.results.standing import standing
 from bampipe.trials.bias import remove_bias
 from bampipe.trials.draw import ENOUGH_SAMPLES, draw_trials
 from bampipe.trials.folds import Folds
@@ -32,6 +34,10 @@ _LIKELY = 1.5
 filtering does to its readings the fit takes on, they do not."""
 _SD_OF_DEVIATION = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation."""
+STILL_WIDTH = 1.0 / 32.0
+"""Sign width, times the device's, of replays that stand still where the motion turns round. On an
+axis at 1 kHz whose friction stops it, they leave 0.94 of the error where an eighth of the width
+leaves 0.80 and the width itself 0.23."""
 MOST_REPLAYS = 6
 """Replays are repeated until they hold `ENOUGH_SAMPLES`, but no oftener than this: the floor of a
 session of forty thousand samples is then known to about 1 %, and longer ones need fewer."""
@@ -59,6 +65,19 @@ class NoiseFloor:
         level = np.median(found, axis=0)
         return cls(level, _SD_OF_DEVIATION * np.median(np.abs(found - level), axis=0), len(found))
 
+    def larger(self, other: NoiseFloor) -> NoiseFloor:
+        """By axis the larger of two floors: a machine may be like either kind of replay."""
+        more = other.level > self.level
+        level, sd = (
+            np.where(more, b, a) for a, b in ((self.level, other.level), (self.sd, other.sd))
+        )
+        return NoiseFloor(level, sd, self.replays)
+
+    def is_exceeded(self, error: Array) -> bool:
+        """Whether the error (n_q,) of some axis is above it."""
+        stands = map(standing, error.tolist(), self.level.tolist(), self.sd.tolist())
+        return "above_floor" in stands
+
 
 def floor_replays(motions: Sequence[Motion]) -> int:
     """How many replays of these trials give the floor."""
@@ -68,6 +87,7 @@ def floor_replays(motions: Sequence[Motion]) -> int:
 
 def replay_evidence(
     stand_in: StandIn,
+    system: System,
     start: Array,
     sensors: Sensors,
     kinematics: Kinematics,
@@ -75,9 +95,9 @@ def replay_evidence(
     folds: Folds,
     seed: Sequence[int],
 ) -> Evidence:
-    """Replay all trials by a model and fit it to them, from ``start`` on."""
+    """Replay all trials by a model and fit ``system``, its like, to them, from ``start`` on."""
     replays = replay_motions(stand_in, sensors, kinematics, seed, alone=True)
-    return gather_evidence(stand_in.system, replays, band, start, folds)
+    return gather_evidence(system, replays, band, start, folds)
 
 
 def parameters_to_replay(
@@ -120,6 +140,7 @@ def find_noise_floor(
     seed: int,
     count: int,
     progress: Callable[[int], None] = lambda done: None,
+    replayed: System | None = None,
 ) -> NoiseFloor:
     """Return the held-out error that the fitted model leaves when it is the truth.
 
@@ -131,19 +152,22 @@ def find_noise_floor(
         evidence: the model, fitted; p: `parameters_to_replay`.
         sensors, kinematics: of the session.
         seed: the user's; count: of replays; progress: called with how many are done.
+        replayed: another model with the same parameters, which is replayed in its place.
 
     Raises:
         Runaway: the simulated motion grows without bounds.
     """
     chosen = _choose_trials(evidence)
     motions = [evidence.motions[number] for number in chosen]
-    stand_in = StandIn(evidence.system, p, motions, sensors.rate_hz)
+    system = evidence.system
+    stand_in = StandIn(replayed or system, p, motions, sensors.rate_hz)
     folds = evidence.folds.subset(chosen)
     errors = []
     for k in range(count):
         found = replay_evidence(
-            stand_in, evidence.p, sensors, kinematics, evidence.band, folds, (seed, FLOOR_SEED, k)
-        )
+            stand_in, system, evidence.p, sensors, kinematics, evidence.band, folds,
+            (seed, FLOOR_SEED, k),
+        )  # fmt: skip
         errors.append(found.held_out_rmse)
         progress(k + 1)
     return NoiseFloor.of_errors(errors)

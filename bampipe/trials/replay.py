@@ -16,6 +16,7 @@ import weakref
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -47,6 +48,8 @@ _JUMPS = 0.8
 """Share of the jump of friction at a reversal that drives make within one sample, from which on
 controllers give the motion. Simulated arms along a smooth path make 0.93 to 0.99 of it, one whose
 controller acts at 250 Hz 0.07 to 0.93, two measured arms 0.01 to 0.14."""
+_LATEST = 8
+"""Samples by which a drive may act after its log says so, and its jumps stand in the log before."""
 _FEW_REVERSALS = 5
 FOLLOWED_HZ = 10.0
 """Highest frequency of the motion to follow where encoder and handle move apart."""
@@ -147,15 +150,21 @@ def _jumps(fitted: ModelOnTrial, u: Array) -> bool:
     """Whether the drives of a robot jump, within a sample, as friction does where a joint turns.
 
     Between two samples nothing says when they do: driven by such a log, a model would stick for as
-    long as that, and be rougher than the machine.
+    long as that, and be rougher than the machine. Of a drive that acts late they stand earlier in
+    the log, spread over two samples.
     """
     system, motion = fitted.system, fitted.motion
     forces = [system.inputs.index(name) for name in system.model.device.forces]
     given = np.einsum("tqf,tf->tq", system.input_map(motion.q, u, fitted.p), u[:, forces])
     logged, needed = np.diff(given, axis=0), np.diff(given - fitted.residual, axis=0)
     turns = np.diff(np.sign(motion.qd), axis=0) != 0.0
-    made = np.sum(needed * logged * turns, axis=0)
-    whole = np.sum(needed**2 * turns, axis=0)
+    wanted, count = needed * turns, len(turns)
+    whole = np.sum(needed * wanted, axis=0)
+    earlier = [
+        np.sum(wanted[lag:] * logged[: count - lag], axis=0) for lag in range(min(_LATEST, count))
+    ]
+    late = [first + second for first, second in pairwise(earlier[1:])]
+    made = np.max([earlier[0], *late], axis=0)
     known = (turns.sum(axis=0) >= _FEW_REVERSALS) & (whole > 0.0)
     return bool(known.any() and np.all(made[known] > _JUMPS * whole[known]))
 

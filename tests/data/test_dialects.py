@@ -116,6 +116,10 @@ def test_what_was_found_is_said(tmp_path):
         ("t;x;n\n1,234.5;2;3\n", "row 2, column 't': '1,234.5' groups its digits in thousands"),
         ("t;x;n\n1.234,5;2;3\n", "'1.234,5' groups its digits in thousands"),
         ("t,x,n\n0,1,2,5,3\n0,2,2,5,3\n", "row 2: 5 cells, where the header has 3; decimal"),
+        ("t,x,n\n10:00:00,01,2,5\n", "row 2: 4 cells, where the header has 3; the comma in '10:"),
+        ("t;x;n\n10:00:00,01;2;5\n", "found '10:00:00,01', expected a number; is it the time?"),
+        ("t,x,n\n0,OL,5\n", "row 2, column 'x': found 'OL', expected a number; if that means no"),
+        ("t,x,n\n0,1 V,5\n", "row 2, column 'x': found '1 V', expected a number; export numbers"),
         ("t;x\n0,1;2\n", "row 1: no column 'n'"),
         ("0;1;2\n1;2;3\n", "no header: the first line holds numbers"),
         (table(";", ",") + "0,41;1.5;3\n0,42;1,5;3\n", "'1.5' in row 42 a point"),
@@ -191,4 +195,20 @@ def test_a_date_that_could_be_two_is_refused(tmp_path):
 def test_dates_and_times_are_told_from_numbers_and_text(tmp_path: Path) -> None:
     rows = "".join(f"2026-10-03 10:12:{k:02d}.125;{k},5;run {k};10:12:{k:02d}\n" for k in range(9))
     (tmp_path / "a.csv").write_text("stamp;q;note;clock\n" + rows)
-    assert columns_of(tmp_path / "a.csv", name="a.csv") == {"stamp": "datetime", "q": ""}
+    found = columns_of(tmp_path / "a.csv", name="a.csv")
+    assert found == {"stamp": "datetime", "q": "", "clock": "datetime"}
+
+
+def test_times_of_day_need_no_form_and_pass_midnight(tmp_path):
+    stamps = ["9:59:59,990", "10:00:00,010", "23:59:59,990", "", "0:00:00,010"]
+    text = "when;q\n" + "".join(f"{stamp};{n}\n" for n, stamp in enumerate(stamps))
+    trial = read(tmp_path, text, ("when", "q"), datetimes={"when": ""})
+    expected = [0.0, 0.02, 50400.0, np.nan, 50400.02]
+    np.testing.assert_allclose(trial.columns["when"], expected, rtol=1e-12)
+    assert columns_of(tmp_path / "a.csv", name="a.csv") == {"when": "datetime", "q": ""}
+
+
+def test_what_means_no_reading_can_be_said(tmp_path):
+    text = table().replace("0.010,0.0300", "0.010,ovf").replace("0.020,0.0600", "0.020,n/a")
+    trial = read(tmp_path, text, dialect=Dialect(missing=("ovf",)))
+    assert np.isnan(trial.columns["x"][1:3]).all() and np.isfinite(trial.columns["x"][3:]).all()

@@ -247,6 +247,12 @@ def test_motors_by_current_have_torque_constants(tmp_path: Path) -> None:
             "[robot.motors.two]\nturns = { shoulder_pan = 1.0 }\n",
             "some motors have a torque_constant and some have none",
         ),
+        (
+            "[robot.motors.one]\nturns = { elbow = 1.0 }\ntorque_constant = 1.0\n"
+            "torque_constant_sd = 0.1\n[robot.motors.two]\nturns = { shoulder_pan = 1.0 }\n"
+            "torque_constant = 1.0\ntorque_constant_sd = 0.2\n",
+            "every torque constant is estimated, which leaves the scale of all masses open",
+        ),
     ],
 )
 def test_wrong_motors_are_refused(motors: str, what: str, tmp_path: Path) -> None:
@@ -276,6 +282,47 @@ def test_a_table_of_denavit_and_hartenberg_is_the_same_robot(tmp_path: Path) -> 
     p = systems[0].prior
     one, other = (s.required(q, qd, qdd, z, u, np.append(p[:6], s.prior[6:])) for s in systems)
     np.testing.assert_allclose(one, other, atol=1e-12)
+
+
+TILT = """<joint name="{name}" type="{kind}"><origin xyz="0 0 1" rpy="{rpy}"/>
+<parent link="world"/><child link="base"/><axis xyz="{axis}"/></joint>"""
+
+
+@pytest.mark.parametrize(
+    ("kind", "rpy", "axis", "gravity", "said"),
+    [
+        ("fixed", "0 0 0", "0 0 1", None, ""),
+        ("fixed", "0 0 1.2", "0 0 1", None, ""),
+        ("prismatic", "0 0 0", "1 0 0", None, ""),
+        ("fixed", "1.5707963267948966 0 0", "0 0 1", (0.0, -9.81, 0.0), "in the frame of base"),
+        ("fixed", "0 0.5 0", "0 0 1", (9.81 * np.sin(0.5), 0.0, -9.81 * np.cos(0.5)), "world"),
+        ("continuous", "0 0 0", "0 0 2", None, ""),
+        ("continuous", "0 0 0", "1 0 0", None, "along -z of base, which mount can tilt"),
+        ("floating", "0 0 0", "0 0 1", None, "along -z of base, which mount can tilt"),
+    ],
+)
+def test_gravity_is_that_of_the_root_above_the_base(
+    tmp_path: Path,
+    kind: str,
+    rpy: str,
+    axis: str,
+    gravity: tuple[float, float, float] | None,
+    said: str,
+) -> None:
+    mount = TILT.format(name="mount", kind=kind, rpy=rpy, axis=axis)
+    chain = read_chain(write(tmp_path, *ARM, '<link name="world"/>', mount), base="base")
+    assert chain.gravity == (None if gravity is None else pytest.approx(gravity))
+    assert said in chain.gravity_note and bool(said) == bool(chain.gravity_note)
+    head = 'name = "arm"\n[robot]\nurdf = "arm.urdf"\nbase = "base"\n'
+    path = tmp_path / "device.toml"
+    path.write_text(head)
+    device = device_from(read_device_file(path))
+    assert device.robot is not None and said in device.declaration["source"]
+    assert device.robot.gravity == pytest.approx(gravity or (0.0, 0.0, -9.81))
+    path.write_text(head + "gravity = [0.0, 9.81, 0.0]\n")
+    given = device_from(read_device_file(path))
+    assert given.robot is not None and "gravity" not in given.declaration["source"]
+    assert given.robot.gravity == (0.0, 9.81, 0.0)
 
 
 def test_a_session_depends_on_its_urdf(tmp_path: Path) -> None:

@@ -213,6 +213,17 @@ def test_the_dynamics_are_those_of_the_identified_model(
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
 
 
+def test_a_base_that_a_fixed_joint_tilts_has_the_gravity_of_the_root(tmp_path: Path) -> None:
+    device = DEVICE.replace("tip =", 'base = "base plate"\ntip =')
+    tilted = identify(tmp_path, {"cell.urdf": URDF, "device.toml": device})
+    text = export_model(tilted.run, "base", "urdf")
+    assert "gravity" not in text.partition("<material")[0]
+    model = read_by_pinocchio(text, "urdf", tmp_path, list(MOVING))
+    motions = random_motions(3)
+    expected = tilted.required(*motions, drives=False)
+    np.testing.assert_allclose(forces(model, motions, [2]), expected, rtol=1e-9, atol=1e-9)
+
+
 def test_a_urdf_is_given_back_with_its_names_frames_and_shapes(cell: Identified) -> None:
     text = export_model(cell.run, "base", "urdf")
     before, after = ElementTree.fromstring(URDF), ElementTree.fromstring(text)

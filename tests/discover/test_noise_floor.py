@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -141,3 +142,23 @@ def test_a_replay_leaves_out_the_moments_at_which_the_machine_stands_still(fitte
     assert still[rest].all() and 0.0 < still.mean() < 0.5
     (stored,) = replay.store_motions(iter([replayed]))
     np.testing.assert_array_equal(stored.rest, replayed.rest)
+
+
+def test_a_machine_that_stands_still_is_held_against_replays_that_do(tmp_path: Path) -> None:
+    """An axis at 1 kHz, whose friction stops it, and a device that lets it creep at 0.25 mm/s."""
+    trials, recipe, _ = record_trials(tmp_path, "axis", 88201, trials=2, seconds=8.0)
+    system = system_of(recipe)
+    evidence = gather_evidence(system, trials.motions, trials.band, system.prior, trials.folds)
+    narrow = system_of(recipe.with_sign_widths(noise_floor.STILL_WIDTH))
+    creeping, still = (
+        find_noise_floor(
+            evidence, evidence.p, trials.sensors, trials.kinematics, 0, 2, replayed=replayed
+        )
+        for replayed in (system, narrow)
+    )
+    error = evidence.held_out_rmse
+    assert creeping.is_exceeded(error)
+    either = creeping.larger(still)
+    assert not either.is_exceeded(error)
+    np.testing.assert_array_equal(either.level, still.level)
+    np.testing.assert_array_equal(still.larger(creeping).level, still.level)

@@ -9,7 +9,7 @@ from bampipe.discover.parameter_scan import scan_parameters
 from bampipe.discover.ranges import SearchRange
 
 
-def scan(cost_of, by_ratio, least=0.002, most=0.12):
+def scan(cost_of, by_ratio, least=0.002, most=0.12, count=np.inf):
     """Value and cost found, and how many values were tried."""
     tried = []
 
@@ -17,7 +17,7 @@ def scan(cost_of, by_ratio, least=0.002, most=0.12):
         tried.append(values[0])
         return cost_of(values[0]), np.ones((3, 1))
 
-    found = scan_parameters(cost, [SearchRange(least, most, by_ratio)], np.inf, True)
+    found = scan_parameters(cost, [SearchRange(least, most, by_ratio)], np.inf, True, count)
     return found[0][0], found[1], len(tried)
 
 
@@ -34,6 +34,20 @@ def test_a_sharp_minimum_is_found_to_a_unit_of_log_likelihood(by_ratio, best):
     assert cost < 1.0
     assert value == pytest.approx(best, rel=0.01)
     assert tried <= 16
+
+
+@pytest.mark.parametrize("by_ratio", [True, False])
+@pytest.mark.parametrize("left", [0.2, 0.05, 0.01])
+@pytest.mark.parametrize("best", [0.0032, 0.0163, 0.087])
+def test_the_notch_of_an_effect_that_explains_all_is_found(by_ratio, left, best):
+    """A quiet sensor: a delay that is right leaves a hundredth of what its absence leaves."""
+
+    def cost_of(value):
+        return 365.0 * np.log((value / best - 1.0) ** 2 + left**2)
+
+    _, cost, tried = scan(cost_of, by_ratio, count=365.0)
+    assert cost - cost_of(best) < 1.0
+    assert tried <= 18
 
 
 @pytest.mark.parametrize("by_ratio", [True, False])

@@ -6,12 +6,15 @@ import numpy as np
 import pytest
 from sessions import bam, made
 
-from bampipe.discover.chance import candidates_of, fit_trials, system_of
-from bampipe.discover.polish import comes_close
+from bampipe.discover.bench import Bench
+from bampipe.discover.chance import candidates_of, fit_trials, system_of, workers
+from bampipe.discover.insufficient import insufficient_rivals
+from bampipe.discover.polish import FittedSet, comes_close
 from bampipe.discover.rivals import _misfit, plausible, without_mere_offsets
 from bampipe.discover.scorer import Scorer
 from bampipe.discover.settings import Settings
 from bampipe.results.diagnose import Contender
+from bampipe.trials.noise_floor import NoiseFloor
 
 S = Settings()
 BLUR = 10.0
@@ -90,3 +93,30 @@ def test_a_spring_of_no_stiffness_is_no_rival_of_a_bias(hidden, values, alike):
     scores = {c.name: Scorer(evidence).score(c) for c in candidates_of(recipe, names)}
     found = without_mere_offsets(recipe, evidence, scores, names, S)
     assert found == alike
+
+
+def test_a_rival_that_leaves_an_error_is_none_where_the_effect_found_leaves_none():
+    """A stop takes some of a spring's torque; a direction's friction takes all of a bias's."""
+    bias, spring, friction, stop = (
+        "force_bias:z", "return_spring:yaw", "asymmetric_coulomb:extension", "upper_stop:yaw"
+    )  # fmt: skip
+    hidden = {
+        "force_bias.z.bias": 1.0,
+        "return_spring.yaw.stiffness": 12.0,
+        "return_spring.yaw.offset": 3.0,
+    }
+    session = made(bam([bias, spring]), hidden, trials=2)
+    recipe = bam([bias, spring])
+    with workers(session, 1) as pool:
+        bench = Bench(session, Settings(jobs=1), pool, (friction, stop))
+        evidence = bench.fit(recipe, system_of(recipe).prior)
+        found = FittedSet(recipe, (bias, spring), evidence, session)
+        error = evidence.held_out_rmse
+        at_floor, above = (NoiseFloor(level, 0.0 * error, 1) for level in (error, 0.5 * error))
+
+        def behind(name: str, axis: int, rival: str, floor: NoiseFloor) -> frozenset[str]:
+            return insufficient_rivals(bench, found, name, axis, [rival], floor)
+
+        assert behind(spring, 0, stop, at_floor) == {stop}
+        assert behind(bias, 2, friction, at_floor) == set()
+        assert behind(spring, 0, stop, above) == set()

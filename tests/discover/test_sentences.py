@@ -252,3 +252,11 @@ def test_a_wrong_floor_gives_no_verdict(monkeypatch):
     axis = finding("undecided", 1.0, 0.3, 1.0, effects=("a:joint",))
     said = say(monkeypatch, axis)
     assert "no verdict can be trusted" in said and "is missing" not in said
+
+
+def test_a_floor_of_replays_that_stand_still_is_said_to_be_one(monkeypatch):
+    axis = finding("nothing_missing", 0.42, 0.42, 0.39)
+    assert "stand still" not in say(monkeypatch, axis)
+    still = axis.model_copy(update={"creeping_floor": 0.0964})
+    said = say(monkeypatch, still)
+    assert "those that creep, as the device's sign_width says, leave 0.0964 N.m." in said

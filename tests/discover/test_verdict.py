@@ -8,6 +8,7 @@ import pytest
 from bampipe.discover import growth, verdict
 from bampipe.discover.settings import Settings
 from bampipe.results.diagnose import Stretch
+from bampipe.trials.noise_floor import NoiseFloor
 
 AXES = ("shoulder", "elbow")
 
@@ -21,11 +22,13 @@ def test_an_effect_that_fails_where_it_helps_most_is_missing_nowhere(monkeypatch
         return SimpleNamespace(held_out_rmse=np.array(error), system=system)
 
     replay = SimpleNamespace(held_out_rmse=np.array([0.1, 0.1]), share=np.zeros(2))
+    floor = NoiseFloor.of_errors([replay.held_out_rmse] * 4)
     search = SimpleNamespace(
         initial=evidence(1.0, 1.0), evidence=evidence(shoulder_after, 0.3), selected=("gain",),
         main={"gain": 0}, final=(replay,) * 4, level=SimpleNamespace(replicates=(replay,) * 4),
         groups={"gain": ()}, contests={}, steps=(), cut_short=False, first={}, transient={},
-        refused=(), explainable=np.full(2, 0.2), explainable_after=np.full(2, 0.2),
+        refused=(), still=(), floor=floor,
+        explainable=np.full(2, 0.2), explainable_after=np.full(2, 0.2),
     )  # fmt: skip
     second = SimpleNamespace(stretch=Stretch(trial_id="t01", t_start=0.0, t_end=1.0))
     monkeypatch.setattr(verdict, "_reach", lambda *_: {0, 1})

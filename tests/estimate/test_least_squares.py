@@ -260,10 +260,11 @@ def test_the_second_with_a_transient_is_found() -> None:
     worst = find_worst_stretch(hit, found)
     assert worst.trial == 1
     assert worst.start_s <= 4.65 < worst.start_s + 1.0
-    # What the fit without the bump would be, to first order.
+    # Where the fit without the bump is; the scatter of a sandwich is all the bump's, and hides it.
     clean = (fit(inner, TRUTH).p - found.p) / np.sqrt(np.diag(found.covariance))
+    assert np.all(np.abs(clean) < 1.0)
+    np.testing.assert_array_equal(np.sign(worst.move), np.sign(clean))
     place = int(np.argmax(np.abs(worst.move)))
-    assert worst.move[place] == pytest.approx(clean[place], rel=0.3)
-    assert abs(worst.move[place]) > 6.0 * worst.typical[place]
+    assert abs(worst.move[place]) > max(2.0, 6.0 * worst.typical[place])
     undisturbed = find_worst_stretch(inner, fit(inner, TRUTH))
     assert np.all(np.abs(undisturbed.move) < 6.0 * undisturbed.typical)

@@ -262,6 +262,9 @@ def test_what_a_model_lacks_is_said_to_count_as_noise():
     said = explain_proposal("precision", "", best, {}, (), ("yaw", "pitch"), "").expected
     assert "The error of yaw and pitch is above the noise floor" in said
     # Where effects compete, no uncertainty is forecast, and nothing need be said of it.
+    said = explain_proposal("precision", "", best, {}, (), ("yaw",), "", ["lag:x"]).expected
+    assert "By the diagnosis the model lacks lag:x: add that first" in said
+    assert "noise floor" not in said
     said = explain_proposal("decision", "", made_proposal(0.01), {}, (), ("yaw",), "t03").expected
     assert "noise floor" not in said
     assert said.endswith(

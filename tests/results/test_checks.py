@@ -57,6 +57,11 @@ def test_a_sound_model_fails_none() -> None:
         ("session", {"axes": {"yaw": {"unit": "rad", "resolution": 0.0}}}, "yaw: resolution"),
         ("session", {"force": {"noise_sd": {"force_x": 0.0}}}, "force_x: the noise"),
         (
+            "session",
+            {"force": {"noise_sd": {"force_x": 0.5}, "unit": "N", "look_like_counts": ["force_x"]}},
+            "force_x: its readings look like counts of a converter, not like N",
+        ),
+        (
             "fit",
             {"methods": {"ukf": {"doubts": ["it lost the motion"]}}},
             "by the unscented filter: it lost the motion",

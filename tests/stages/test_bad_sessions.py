@@ -393,7 +393,8 @@ ASIDE: dict[str, tuple[Damage, str]] = {
     "time and encoder swapped": (swapped("time_us", "enc_yaw"), "column 'time_us'"),
     "text in a cell": (
         cell(30, "enc_pitch", "oops"),
-        r"^trials/t01.csv, row 30, column 'enc_pitch': found 'oops', expected a number$",
+        r"^trials/t01.csv, row 30, column 'enc_pitch': found 'oops', expected a number; "
+        r'if that means no reading, say missing = \["oops"\] under \[csv\]$',
     ),
     "hexadecimal in a cell": (cell(31, "enc_pitch", "0x1F"), "row 31, .*found '0x1F'"),
     "a row too short": (line(500, lambda s: s.rsplit(",", 2)[0]), "row 500: 8 cells"),

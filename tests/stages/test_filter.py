@@ -197,8 +197,27 @@ def test_derivatives_of_the_force_reach_beyond_the_band(
 def test_no_trial_to_differentiate(tmp_path: Path) -> None:
     frames = {"a": free_trial(0)[0]}
     run = write_ingested(tmp_path / "run", frames, {"a": ("locked", "yaw")}, AXES)
-    with pytest.raises(InputError, match="no free or viscous trial"):
+    with pytest.raises(InputError, match=r'no free or viscous trial among 1: .*kind = "free"'):
         run_stage(run)
+
+
+def test_trials_too_short_to_differentiate_are_said_with_their_size(tmp_path: Path) -> None:
+    whole = free_trial(0)[0]
+    frames = {"a": whole.head(20), "b": whole.head(31)}
+    run = write_ingested(tmp_path / "run", frames, dict.fromkeys(frames, ("free", "")), AXES)
+    said = (
+        "none of the 2 free and viscous trials is long enough: a holds 20 sound samples, of which"
+    )
+    with pytest.raises(InputError, match=said):
+        run_stage(run)
+
+
+def test_one_trial_too_short_is_noted(tmp_path: Path) -> None:
+    whole = free_trial(0)[0]
+    frames = {"a": whole, "b": whole.head(31)}
+    run = write_ingested(tmp_path / "run", frames, dict.fromkeys(frames, ("free", "")), AXES)
+    summary = stage.execute(run, run.root, configure("filter", {}), silent)
+    assert summary["notes"] == ["b: not used: 31 sound samples, of which 32 are needed"]
 
 
 def test_same_bytes(run: RunFolder) -> None:
@@ -228,7 +247,8 @@ def test_of_very_many_trials_some_choose_the_bandwidth(tmp_path: Path) -> None:
     path = run.path("ingest/samples.parquet")
 
     def chosen(path: Path, budget: int) -> list[list[float]]:
-        records = stage._tuning_records(path, names, tuple(AXES), 500.0, budget)["yaw"]
+        found, _ = stage._tuning_records(path, names, tuple(AXES), 500.0, budget)
+        records = found["yaw"]
         assert all(x.base is None and seen.base is None for x, seen in records), "whole trials kept"
         assert all(len(x) == budget // len(records) for x, _ in records)
         return [[float(x[0]), float(x[1])] for x, _ in records]
@@ -238,7 +258,8 @@ def test_of_very_many_trials_some_choose_the_bandwidth(tmp_path: Path) -> None:
     assert chosen(path, 10_000) == list(first.values())
     frames |= {name: frames[name][:20] for name in "ae"}
     short = write_ingested(tmp_path / "short", frames, {n: ("free", None) for n in names}, AXES)
-    records = stage._tuning_records(
+    found, refused = stage._tuning_records(
         short.path("ingest/samples.parquet"), names, tuple(AXES), 500.0, 4000
-    )["yaw"]
-    assert [x[:2].tolist() for x, _ in records] == [first["b"]]
+    )
+    assert [x[:2].tolist() for x, _ in found["yaw"]] == [first["b"]]
+    assert set(refused) == {"a", "e"}

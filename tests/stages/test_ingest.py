@@ -7,6 +7,7 @@ import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -147,13 +148,16 @@ lower = 0.1
 """
 
 
-def sled(unit: str = "N") -> Made:
-    """A device of the lab's own: one axis in mm, a motor force in N, time in s, one channel."""
+def sled(unit: str = "N", motor: Callable[[np.ndarray], np.ndarray] = lambda force: force) -> Made:
+    """A device of the lab's own: one axis in mm, a motor force in N, time in s, one channel.
+
+    ``motor`` makes the column of the force of a force of +-1 N.
+    """
     t = np.arange(1000) / 500.0
     table = {
         "t": t,
         "pos": 200.0 * np.sin(2 * np.pi * t),
-        "motor": np.sin(4 * np.pi * t),
+        "motor": motor(np.sin(4 * np.pi * t)),
         "heat": 20.0 + t,
     }
     session = {
@@ -200,6 +204,31 @@ def test_a_number_that_was_to_be_filled_in_is_named(tmp_path):
     content = read_json(tmp_path / "out/ingest/session.json")
     assert content["placeholders"] == ["device.constants.ratio"]
     assert summary["notes"] == ["device.constants.ratio: its source still says `fill in`"]
+
+
+@pytest.mark.parametrize(
+    ("unit", "offset", "size", "counts"),
+    [("N", 2050.0, 240.0, True), ("N", 2600.0, 240.0, True), ("N", 2048.0, 1900.0, True),
+     ("N", 300.0, 240.0, False), ("N", 0.0, 240.0, False), ("mN", 2050.0, 240.0, False),
+     ("N", 2050.0, 6.0, False)],
+)  # fmt: skip
+def test_a_force_in_counts_of_a_converter_is_said(tmp_path, unit, offset, size, counts):
+    made = sled(unit, lambda force: np.rint(offset + size * force))
+    summary = run_ingest(made.write(tmp_path / "session"), tmp_path / "out")
+    said = [note for note in summary["notes"] if "counts of a converter" in note]
+    content = read_json(tmp_path / "out/ingest/session.json")
+    assert content["force"].get("look_like_counts", []) == (["force_motor"] if counts else [])
+    assert said == [note for note in content["sensor_warnings"] if "converter" in note]
+    assert len(said) == counts
+    if counts:
+        low, high = offset - size, offset + size
+        assert f"force_motor: whole numbers from {low:.0f} to {high:.0f} look" in said[0]
+        assert '[force] unit = "V", calibration_n_per_v with the force of one count' in said[0]
+
+
+def test_a_force_of_large_but_broken_numbers_is_none_in_counts(tmp_path):
+    made = sled("N", lambda force: 2050.0 + 240.0 * force)
+    assert run_ingest(made.write(tmp_path / "session"), tmp_path / "out")["notes"] == []
 
 
 def test_a_force_in_another_unit_than_the_device_takes(tmp_path):

@@ -14,6 +14,7 @@ import bampipe
 from bampipe.data.device_file import read_device_file
 from bampipe.data.session import read_session
 from bampipe.errors import InputError
+from bampipe.files import read_json
 from bampipe.physics import Model, compile_model, registry
 from bampipe.proposal import ProposedSession, propose, write_proposal
 
@@ -173,6 +174,27 @@ def test_torque_constants_are_proposed_by_the_drawing(tmp_path: Path) -> None:
     assert device.robot is not None
     constants = [motor.torque_constant for motor in device.robot.motors.values()]
     np.testing.assert_allclose(constants, truth["constants"], rtol=0.1)
+
+
+@pytest.mark.slow
+def test_all_torque_constants_but_one_are_estimated(tmp_path: Path) -> None:
+    """A drawing that is off gives constants that are off, each by its own: drives would lack it."""
+    truth = arm.record_logs(tmp_path / "log", 6, "ZYYX", style="controller", drawing_error=0.15)
+    paired(tmp_path / "log")
+    device = registry.device_from(read_device_file(tmp_path / "log/device.toml"))
+    assert device.robot is not None
+    motors = device.robot.motors
+    (known,) = [k for k, m in enumerate(motors.values()) if m.torque_constant_sd is None]
+    bampipe.run_session(tmp_path / "log", runs=tmp_path / "runs", last="identify")
+    found = read_json(tmp_path / "runs/log/models/base/identify.json")["parameters"]
+    guesses = np.array([motor.torque_constant for motor in motors.values()])
+    estimates = [
+        found[f"torque_constant_{name}"]["estimate"] if k != known else guesses[k]
+        for k, name in enumerate(motors)
+    ]
+    scale, estimated = (x / np.array(truth["constants"]) for x in (guesses, estimates))
+    assert np.ptp(scale) > 0.05
+    np.testing.assert_allclose(estimated, scale[known], rtol=0.01)
 
 
 def test_reductions_of_a_log_from_the_motors_side_follow_from_the_drawing(tmp_path: Path) -> None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 from identified_run import recorded_run
+from independent_runs import record_run
 from run_folders import SESSIONS
 
 from bampipe.data.run_folder import RunFolder
@@ -106,6 +108,14 @@ def test_a_session_without_a_field_says_so(run: RunFolder) -> None:
 def test_a_setting_of_performance_that_makes_no_sense_is_refused() -> None:
     with pytest.raises(InputError, match=r"performance\.points: found 1, expected 2 or more"):
         configure("performance", {"points": 1})
+
+
+def test_performance_of_a_damper_is_that_at_its_load_cell(tmp_path: Path) -> None:
+    found, _ = record_run(tmp_path, "damper", 4)
+    folder = RunFolder(found.root)
+    performance.execute(folder, folder.root, performance.Config(), silent)
+    said = read_json(folder.path("models/base/performance.json"))["headline"]
+    assert re.fullmatch(r"At the load cell: stroke \S+ m, friction \S+ N, inertia \S+ kg", said)
 
 
 def test_performance_at_the_handle(run: RunFolder) -> None:

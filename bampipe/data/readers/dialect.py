@@ -13,12 +13,13 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+from bampipe.data.readers.moments import is_moment
 from bampipe.data.readers.trial import Dialect, check_columns
 from bampipe.data.units import unit
 from bampipe.errors import InputError
 
 HEAD = 1 << 16
-NULLS = ("", "nan", "NaN", "NAN", "NA", "N/A", "#N/A", "null", "NULL", "None")
+NULLS = ("", "nan", "NaN", "NAN", "NA", "N/A", "n/a", "#N/A", "null", "NULL", "None")
 """Cells that mean: no number here."""
 
 DELIMITERS = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", " ": "blanks"}
@@ -26,8 +27,6 @@ _POINT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?\Z")
 _COMMA = re.compile(r"[-+]?(\d+,\d*|,\d+)([eE][-+]?\d+)?\Z")
 _THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2}(,\d{3})+\Z")
 _GROUPED = re.compile(r"[-+]?(\d{1,3}(,\d{3})+\.\d*|\d{1,3}(\.\d{3})+,\d*)\Z")
-_MOMENT = re.compile(r"\s*\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d([.,]\d+)?(Z|[+-]\d\d:?\d\d)?\s*\Z")
-"""Date and time as of ISO 8601."""
 _UNIT = re.compile(r"[\[(]?\s*(?=.*[A-Za-z%°Ωµμ1\-])[A-Za-z0-9%°Ωµμ./*^²³· _\-]{0,16}\s*[\])]?\Z")
 _NAME_WITH_UNIT = re.compile(r"(?P<name>.*?)\s*[\[(]\s*(?P<unit>[^\[\]()]{1,16}?)\s*[\])]\s*\Z")
 _REMARK = re.compile(r"\s*(#|%|//|\"#)+\s?")
@@ -132,7 +131,7 @@ def readable_columns(head: bytes, layout: TableLayout) -> dict[str, bool]:
         rows += 1
         row = cells(line.text, layout.delimiter)
         numbers.update(n for n, cell in enumerate(row) if _is_number(cell, layout.decimal))
-        moments.update(n for n, cell in enumerate(row) if _MOMENT.match(cell))
+        moments.update(n for n, cell in enumerate(row) if is_moment(cell))
     return {
         name: moments[n] > numbers[n]
         for n, name in enumerate(layout.header)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 
 import numpy as np
@@ -12,6 +13,15 @@ from bampipe.errors import InputError
 NANOSECONDS = 1_000_000_000
 LONGEST = 256
 """Characters of the longest text that is taken for a date and time."""
+_DAY = 86_400 * NANOSECONDS
+_MOMENT = re.compile(r"\s*\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d([.,]\d+)?(Z|[+-]\d\d:?\d\d)?\s*\Z")
+"""Date and time as of ISO 8601."""
+_OF_DAY = re.compile(r"\s*\d{1,2}:\d\d:\d\d([.,]\d+)?\s*\Z")
+
+
+def is_moment(cell: str) -> bool:
+    """Whether a text is a date and time, or a time of day, that needs no form."""
+    return bool(_MOMENT.match(cell) or _OF_DAY.match(cell))
 
 
 def nanoseconds(
@@ -21,7 +31,7 @@ def nanoseconds(
 
     Args:
         values: text, or numpy datetime64.
-        form: as of ``strptime``; "" for ISO 8601.
+        form: as of ``strptime``; "" for ISO 8601 or times of day, which are of 1970-01-01.
         where: file and column, for messages.
         first_row: number of the first row, for messages.
 
@@ -34,10 +44,15 @@ def nanoseconds(
     if longest > LONGEST:
         raise InputError(f"a text of {longest} characters, expected a date and time", where=where)
     text = pd.Series(values, dtype="string").str.strip()
+    plain = text
     if not form:
-        text = text.str.replace(",", ".")  # ISO 8601 takes either as decimal sign
+        plain = text.str.replace(",", ".")  # ISO 8601 takes either as decimal sign
+        of_day = plain.str.match(_OF_DAY).fillna(False)
+        plain = plain.mask(
+            of_day, "1970-01-01T" + plain.str.replace(r"^(\d):", r"0\1:", regex=True)
+        )
     try:
-        moments = pd.to_datetime(text, format=form or "ISO8601", utc=True, errors="coerce")
+        moments = pd.to_datetime(plain, format=form or "ISO8601", utc=True, errors="coerce")
     except (ValueError, OverflowError) as error:
         raise InputError(
             f"'{form}' is no form of a date and time", where=where, remedy="as of strptime"
@@ -55,7 +70,7 @@ def nanoseconds(
 
 
 def seconds(moments: np.ndarray) -> np.ndarray:
-    """Seconds since the first moment, (T,) float64, NaN where missing.
+    """Seconds since the first moment, (T,) float64, NaN where missing; midnight is no step back.
 
     Args:
         moments: from :func:`nanoseconds`.
@@ -64,6 +79,10 @@ def seconds(moments: np.ndarray) -> np.ndarray:
     known = np.flatnonzero(~missing)
     if len(known) == 0:
         return np.full(len(moments), np.nan)
+    if moments[known].min() >= 0 and moments[known].max() < _DAY:  # times of day
+        days = np.zeros(len(moments), dtype=np.int64)
+        days[known[1:]] = np.cumsum(np.diff(moments[known]) < -0.9 * _DAY)
+        moments = moments + days * _DAY
     # Whole numbers first: a double has no room for 1 us since 1970.
     since = (moments - moments[known[0]]) / NANOSECONDS
     return np.where(missing, np.nan, since)

@@ -6,7 +6,6 @@ A value inside another is named by its path: ``state.q[0]`` is the first item of
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -67,7 +66,7 @@ def columns(path: Path, name: str) -> dict[str, str]:
     for column, cell in leaves(_first(samples, name)):
         if isinstance(cell, int | float):
             found[column] = ""
-        elif isinstance(cell, str) and re.match(r"\d{4}-\d\d-\d\d[T ]\d\d:", cell):
+        elif isinstance(cell, str) and moments.is_moment(cell):
             found[column] = "datetime"
     return found | {c: "" for c in constants if c not in found}
 

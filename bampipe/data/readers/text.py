@@ -202,7 +202,7 @@ def _read_samples(
             convert_options=pa_csv.ConvertOptions(
                 column_types=kinds,
                 include_columns=list(kinds),
-                null_values=list(NULLS),
+                null_values=[*NULLS, *wanted.dialect.missing],
                 strings_can_be_null=True,
                 decimal_point=layout.decimal,
             ),
@@ -270,13 +270,21 @@ def _fault(stream: BinaryIO, message: str, layout: TableLayout, name: str) -> In
     if torn:
         row, expected, actual, text = int(torn[1]), int(torn[2]), int(torn[3]), torn[4]
         commas = actual > expected and re.fullmatch(r'[\s"0-9,+-]*', text)
+        clock = re.search(r"\d+:\d\d:\d\d,\d+", text) if layout.delimiter == "," else None
+        remedy = "the line is damaged"
+        if commas:
+            remedy = (
+                "decimal commas? export with semicolons between columns, or points as decimal sign"
+            )
+        elif clock and actual > expected:
+            remedy = (
+                f"the comma in '{clock[0]}' separates columns, too: export with semicolons between"
+                " columns, or a point before the fraction of a second"
+            )
         return InputError(
             f"{actual} cells, where the header has {expected}",
             where=f"{name}, row {_line(stream, layout, row)}",
-            remedy="decimal commas? export with semicolons between columns, or points as decimal"
-            " sign"
-            if commas
-            else "the line is damaged",
+            remedy=remedy,
         )
     cell = re.search(
         r"In CSV column #(\d+): (?:Row #(\d+): )?.*invalid value '(.*)'", message, re.DOTALL
@@ -296,6 +304,12 @@ def _fault(stream: BinaryIO, message: str, layout: TableLayout, name: str) -> In
         remedy = (
             "the header once more: several recordings in one file? put each into one of its own"
         )
+    elif moments.is_moment(value):
+        remedy = 'is it the time? then say unit = "datetime" under [time]'
+    elif shown == value and re.fullmatch(r"[^\d\"\\]+", value.strip()):
+        remedy = f'if that means no reading, say missing = ["{value.strip()}"] under [csv]'
+    elif re.fullmatch(r"[-+]?[\d.,]+(e[-+]?\d+)?\s+[^\d\s]\S*", value.strip(), re.IGNORECASE):
+        remedy = "export numbers without their units"
     return InputError(
         f"found '{shown}', expected a number",
         where=f"{name}{at}, column '{column}'",

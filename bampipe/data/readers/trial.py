@@ -29,6 +29,9 @@ class Dialect(Declaration):
     names: Distinct[Text] = Field(
         default=(), description="Names of the columns, for files without a header"
     )
+    missing: Distinct[Text] = Field(
+        default=(), description='What a cell says that holds no reading, such as "ovf"'
+    )
 
 
 @dataclass(frozen=True)
