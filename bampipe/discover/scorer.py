@@ -14,13 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.discover.candidates import Candidate
-from bampipe.discover.columns import added_columns
+from bampipe.discover.columns import added_columns, added_residual
 from bampipe.discover.parameter_scan import scan_parameters
 from bampipe.discover.ranges import MachineScale
 from bampipe.discover.settings import Settings
 from bampipe.estimate.normal_equations import NormalEquations
+from bampipe.trials.draw import draw_trials
 from bampipe.trials.folds import Folds
-from bampipe.trials.residuals import Evidence
+from bampipe.trials.motion import trial_sizes
+from bampipe.trials.residuals import Evidence, ModelOnTrial
 
 Array = NDArray[np.float64]
 
@@ -28,6 +30,11 @@ _SHARES = (1.0, 0.9, 0.8, 0.65, 0.5, 0.35, 0.2, 0.1, 0.05)
 """Shares of the least-squares strength tried where an effect weakens what the force does."""
 _DIVERGED = 1e30
 """An internal state that is too stiff to be integrated at the sampling rate ends above this."""
+
+_PROBE, _PROBE_SEED = 1e-3, 5
+"""Noise that is put on a force to see what is left of it, over the force's own variation."""
+_LEAST_PASSED = 1e-6
+"""Of the mean square of that noise; less counts as this."""
 
 
 @dataclass(frozen=True)
@@ -222,8 +229,12 @@ class Scorer:
         problem = self._join(item, searched)
         if problem is None:
             return None
-        _, left = self._fit(item, problem.sums)
-        return self._cost(left), problem.columns
+        solution, left = self._fit(item, problem.sums)
+        cost = self._cost(left)
+        if item.system.remembers_force:
+            values = self._values_of(item, searched, solution)
+            cost -= 2.0 * float(self.independent_samples @ self._passed_noise(item, values))
+        return cost, problem.columns
 
     def _fit(self, item: Candidate, sums: NormalEquations) -> tuple[Array, Array]:
         """Coefficients of the joint fit, reweighted once, and the mean square left, (n_q,)."""
@@ -244,10 +255,8 @@ class Scorer:
         solution, left = self._fit(item, sums)
         weight = _weight(left)
         folds, (lower, upper) = self._folds_for(item), self._bounds(item)
-        values = np.array([p.prior for p in item.parameters])
-        values[list(item.searched_indices)] = searched
+        values = self._values_of(item, searched, solution)
         start = len(self.evidence.free)
-        values[list(item.linear_indices)] = solution[start:]
 
         def error_within(lower: Array, upper: Array) -> Array:
             steps = folds.solve(sums, weight, lower, upper, Settings().held_out_weight)
@@ -255,7 +264,12 @@ class Scorer:
 
         if not item.system.driven:
             error = error_within(lower, upper)
-            gain = self.independent_samples * np.log(self.base_error / error)
+            gain = np.log(self.base_error / error)
+            if item.system.remembers_force:
+                gain += self._passed_noise(item, values)
+                if self.independent_samples @ gain < Settings().worth_searching:
+                    return self._score_at_zero(item)
+            gain = self.independent_samples * gain
             return Score(item.name, error, values, solution[:start], gain)
         best = None
         for share in _SHARES if item.linear_indices else (1.0,):
@@ -279,6 +293,52 @@ class Scorer:
         if self.independent_samples @ best.gain < Settings().worth_searching:
             return self._score_at_zero(item)
         return replace(best, gain=self.independent_samples * best.gain)
+
+    def _values_of(self, item: Candidate, searched: Array, solution: Array) -> Array:
+        """Values of its parameters, of the searched ones and the coefficients of the joint fit."""
+        values = np.array([p.prior for p in item.parameters])
+        values[list(item.searched_indices)] = searched
+        values[list(item.linear_indices)] = solution[len(self.evidence.free) :]
+        return values
+
+    def _passed_noise(self, item: Candidate, values: Array) -> Array:
+        """Log of the share of white noise of the forces that is left with the effect, (n_q,).
+
+        At most zero. What remembers a force, as a lag does, averages its noise out, and the
+        error falls although nothing is explained: how noisy the force is need not be known.
+        """
+        e, system, probed = self.evidence, item.system, self._probed
+        p = np.concatenate([e.p[: len(system.parameters) - len(values)], values])
+        noise, passed = [], []
+        for base, shaken in probed.values():
+            noise.append(shaken.residual - base.residual)
+            change = added_residual(item, p, shaken) - added_residual(item, p, base)
+            passed.append(noise[-1] + change)
+        used = [e.used[trial] for trial in probed]
+
+        def sum_of_squares(rows: Sequence[Array]) -> Array:
+            thin = e.band.thin_trials(rows, range(len(system.coordinates)))
+            squares = [np.sum(x**2 * u, axis=0) for x, u in zip(thin, used, strict=True)]
+            return np.asarray(np.sum(squares, axis=0))
+
+        whole = sum_of_squares(noise)
+        share = sum_of_squares(passed) / np.where(whole > 0.0, whole, 1.0)
+        share = np.where(whole > 0.0, np.clip(share, _LEAST_PASSED, 1.0), 1.0)
+        return np.asarray(0.5 * np.log(share))
+
+    @cached_property
+    def _probed(self) -> dict[int, tuple[ModelOnTrial, ModelOnTrial]]:
+        """The model on some trials, by number, as measured and with noise put on the forces."""
+        e, found = self.evidence, {}
+        for trial in draw_trials(trial_sizes(e.motions)):
+            motion, rng = e.motions[trial], np.random.default_rng([_PROBE_SEED, trial])
+            noisy = {}
+            for name in e.system.model.device.forces:
+                force = motion.channels[name]
+                noisy[name] = force + _PROBE * np.std(force) * rng.normal(size=force.size)
+            shaken = ModelOnTrial(e.system, e.p, [motion.with_channels(noisy)])
+            found[int(trial)] = e.fitted[trial], shaken
+        return found
 
     def _sensitivity(self, item: Candidate, values: Array) -> Array:
         """Mean of log |d residual / d force| with the effect over without it, by axis, (n_q,)."""

@@ -21,6 +21,9 @@ _SLOWEST_HZ = 100.0
 """A sensor's own low-pass keeps noise out of neighbouring samples that acts at the frequencies of
 the motion all the same. Thinned to this rate, a record shows that noise."""
 _NORMAL_MEDIAN = 0.6744897501960817
+_CUT = 2.0
+"""Multiple of the magnitude below which nine in ten differences lie at which larger ones are cut:
+3.3 standard deviations of a normal distribution."""
 _FEWEST = 200
 """Samples below which noise is not measured."""
 _STRETCHES, _STRETCH = 8, 2000
@@ -32,7 +35,9 @@ _REACHES, _OFF_GRID = (1.5, 10.0, 100.0), 0.05
 """Multiples of a step up to which it is found ever more exactly; how far off values may be."""
 
 
-def white_noise_sd(record: Array, t: Array | None = None, step: float = 0.0) -> float:
+def white_noise_sd(
+    record: Array, t: Array | None = None, step: float = 0.0, *, pulsed: bool = False
+) -> float:
     """Standard deviation of the white noise on a record (T,) of a signal that is otherwise smooth.
 
     From the median absolute difference, which resists spikes and steps; NaN for records too short
@@ -42,8 +47,10 @@ def white_noise_sd(record: Array, t: Array | None = None, step: float = 0.0) -> 
         record: samples.
         t: (T,) their time stamps, s, which need not be uniform; a uniform record needs none.
         step: of its counts, 0.0 where its values lie on no grid.
+        pulsed: whether the noise comes in pulses, as a controller makes them of counts: a median
+            sees next to nothing of those, and their mean square counts, single spikes cut.
     """
-    return _without_dither(_difference_noise(_dithered(record, step), t), step)
+    return _without_dither(_difference_noise(_dithered(record, step), t, pulsed), step)
 
 
 def slow_noise_sd(record: Array, t: Array, step: float = 0.0) -> float:
@@ -100,14 +107,14 @@ def _without_dither(noise: float, step: float) -> float:
     return float(np.sqrt(np.maximum(noise**2 - step**2 / 12.0, 0.0)))
 
 
-def _difference_noise(record: Array, t: Array | None) -> float:
+def _difference_noise(record: Array, t: Array | None, pulsed: bool = False) -> float:
     """Least over several orders of the noise that differences of a record show."""
     if record.size < _FEWEST:
         return float("nan")
     if record.size > _STRETCHES * _STRETCH:
         starts = np.linspace(0, record.size - _STRETCH, _STRETCHES).astype(int)
         parts = (slice(start, start + _STRETCH) for start in starts)
-        some = [_difference_noise(record[p], None if t is None else t[p]) for p in parts]
+        some = [_difference_noise(record[p], None if t is None else t[p], pulsed) for p in parts]
         return float(np.median(some))
     stamps = np.arange(record.size, dtype=float) if t is None else t / float(np.median(np.diff(t)))
     record = _without_lines(record, stamps, LOWEST_LINE)
@@ -124,11 +131,17 @@ def _difference_noise(record: Array, t: Array | None) -> float:
         if order < _LOWEST_ORDER:
             continue
         size = np.abs(differences) / np.sqrt(np.sum(weights**2, axis=0))
-        typical = float(np.median(size)) / _NORMAL_MEDIAN
+        typical = _cut_rms(size) if pulsed else float(np.median(size)) / _NORMAL_MEDIAN
         if typical == 0.0:  # more than half the differences are zero: coarse steps
             typical = float(np.sqrt(np.mean(np.square(size))))
         found.append(typical)
     return float(min(found))
+
+
+def _cut_rms(size: Array) -> float:
+    """Root mean square of magnitudes (n,), those far beyond nine in ten of them cut."""
+    most = _CUT * float(np.quantile(size, 0.9))
+    return float(np.sqrt(np.mean(np.square(np.minimum(size, most)))))
 
 
 def _without_lines(record: Array, t: Array, lowest: float) -> Array:

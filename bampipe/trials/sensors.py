@@ -23,10 +23,11 @@ Array = NDArray[np.float64]
 
 _COLOURED = 2.0
 """Factor from which on the noise of a thinned record is more than that of the whole one."""
-_FOLLOWS = 0.5
+_FOLLOWS = 0.8
 """Share of its noise that is left of a force without what follows the encoders' readings, below
 which a controller makes the rest. Of the white noise of handles, load cells, motor currents and a
-measured arm 0.98 or more is left, of a command by gains on counts and their differences 0.003."""
+measured arm 0.98 or more is left, of a command by gains on counts and their differences 0.003;
+where the log keeps every second to tenth sample of the controller, 0.5 to 0.76."""
 DISAGREEMENT = 2.0
 """Factor between stated and measured noise beyond which a warning is given."""
 _COUNTS_SPAN = 16.0
@@ -45,11 +46,13 @@ class RecordNoise:
         step: of its counts, 0.0 where its values lie on no grid.
         white_sd: standard deviation of its white noise; slow_sd: of noise that reaches over several
             samples, or of a signal that is as fast. NaN where the record is too short.
+        pulsed: whether the noise is a controller's, which depends on the motion.
     """
 
     step: float
     white_sd: float
     slow_sd: float
+    pulsed: bool = False
 
     @classmethod
     def of(cls, record: Array, t: Array | None = None) -> RecordNoise:
@@ -67,19 +70,19 @@ class RecordNoise:
     ) -> dict[str, RecordNoise]:
         """Measure inputs by name, each (T,), recorded beside ``readings`` of encoders, each (T,).
 
-        What a controller makes of the readings acts on the machine, and is no noise.
+        What a controller makes of the readings acts on the machine, and is no noise. Of a log that
+        keeps some of its samples only, the rest is left: pulses from readings that are not logged.
         """
         found = {name: cls.of(record, t) for name, record in records.items()}
         if not records or not readings:
             return found
         rest = without_feedback(np.column_stack([*records.values()]), np.column_stack(readings))
-        # Stamps that jitter are of no use where readings are taken sample by sample.
-        stamps = np.arange(len(rest), dtype=np.float64) * float(np.median(np.diff(t)))
         for (name, whole), column in zip(found.items(), rest.T, strict=True):
-            left = cls.of(column, stamps)
-            white = left.white_sd if left.white_sd < _FOLLOWS * whole.white_sd else whole.white_sd
-            slow = left.slow_sd if left.slow_sd < _FOLLOWS * whole.slow_sd else whole.slow_sd
-            found[name] = replace(whole, white_sd=white, slow_sd=slow)
+            left, all_of_it = (
+                white_noise_sd(x[np.isfinite(x)], pulsed=True) for x in (column, records[name])
+            )
+            if left < _FOLLOWS * all_of_it:
+                found[name] = replace(whole, white_sd=left, pulsed=True)
         return found
 
 
@@ -170,7 +173,11 @@ def _typical_noise(records: Sequence[RecordNoise], stated: float | None) -> floa
 
     Noise over several samples counts where it is clearly more than that of neighbouring ones, and
     what is stated does not speak for the latter: nothing else distinguishes a fast signal from it.
+    What a controller makes of counts differs from trial to trial, and its mean square counts.
     """
+    pulses = [r.white_sd for r in records if r.pulsed]
+    if 2 * len(pulses) > len(records):
+        return float(np.sqrt(np.mean(np.square(pulses))))
     white = _lower_quartile([record.white_sd for record in records])
     slow = _lower_quartile([record.slow_sd for record in records])
     if white is None or slow is None or slow <= _COLOURED * white:

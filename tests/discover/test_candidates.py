@@ -119,3 +119,24 @@ def test_the_right_effect_explains_most_and_has_the_true_size(
     for parameter, value in zip(parameters, right.values, strict=True):
         if parameter.name in truth:
             assert value == pytest.approx(truth[parameter.name], rel=0.12), parameter.name
+
+
+@pytest.mark.parametrize("hidden", [(), ("actuator_lag:current",)])
+def test_a_lag_counts_for_the_signal_and_not_for_the_noise_that_it_averages_out(tmp_path, hidden):
+    quiet, recipe, truth = record_trials(tmp_path, "joint", 4, *hidden)
+    rng, motions = np.random.default_rng(8), []
+    for motion in quiet.motions:
+        force = motion.channels["current"]
+        noise = (0.05 if hidden else 2.0) * force.std() * rng.normal(size=force.size)
+        motions.append(motion.with_channels({"current": force + noise}))
+    noisy = replace(quiet, motions=tuple(motions))
+    scorer = Scorer(fit_trials(noisy, recipe, system_of(recipe).prior))
+    item = compile_candidate(build_candidate_model(recipe.model().device, "actuator_lag:current"))
+    found = scorer.score(item)
+    if hidden:
+        time_constant = truth["actuator_lag.current.time_constant"]
+        assert found.total > 100.0
+        assert found.values[0] == pytest.approx(time_constant, rel=0.05)
+    else:
+        blurred = scorer.score_at(item, np.array([0.1]))
+        assert blurred.total <= 0.0 and found.total == 0.0

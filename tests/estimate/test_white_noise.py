@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -70,3 +72,24 @@ def test_what_a_controller_makes_of_counts_is_no_noise(read_noise):
     assert RecordNoise.of(command, t).white_sd > 0.1
     assert found["command"].white_sd == pytest.approx(read_noise, rel=0.2, abs=1e-3)
     assert found["load"] == RecordNoise.of(load, t)
+
+
+def test_pulses_of_a_controller_whose_log_keeps_every_fourth_sample_are_noise():
+    """A slow motion gives a pulse now and then, of which a median sees nothing."""
+    rng = np.random.default_rng(6)
+    t = np.arange(24000) / 1000.0
+    wanted = 0.3 * np.sin(1.4 * t) + 0.1 * np.sin(3.3 * t)
+    counts = np.floor(wanted / 1.5e-3) * 1.5e-3
+    smooth = 60.0 * (0.01 * np.sin(1.4 * t + 0.3)) - 3.0 * np.gradient(wanted, t)
+    pulses = 3.0 * (np.gradient(wanted, t) - 1000.0 * np.diff(counts, prepend=counts[0]))
+    command = smooth + pulses + 0.02 * rng.normal(size=t.size)
+    every, few = command[::4], slice(None, None, 4)
+    found = RecordNoise.of_inputs({"command": every}, [counts[few]], t[few])["command"]
+    assert RecordNoise.of(every, t[few]).white_sd < 0.3 * pulses.std()
+    # Half of it follows the reading at the same instant.
+    assert found.white_sd == pytest.approx(pulses.std() / np.sqrt(2.0), rel=0.15)
+    calm = replace(found, white_sd=0.1 * found.white_sd)
+    settled = settle_force("command", "N.m", None, [found, calm, calm]).noise_sd
+    assert settled == pytest.approx(found.white_sd * np.sqrt(1.02 / 3.0))
+    whole = RecordNoise.of_inputs({"command": command}, [counts], t)["command"]
+    assert whole.white_sd == pytest.approx(0.02, rel=0.1)
