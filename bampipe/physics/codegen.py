@@ -65,12 +65,17 @@ V = types.float64[::1]
 # period a straight line takes a twentieth off the distance between them.
 BETWEEN = '''
 
-@njit(types.float64(M, M, types.int64, types.int64, types.float64, types.float64))
-def between(x, slope, i, j, h, share):
-    """A column between rows i and i + 1, which are h apart: the cubic with their slopes."""
-    d = x[i + 1, j] - x[i, j]
-    bent = (1.0 - share) * (h * slope[i, j] - d) - share * (h * slope[i + 1, j] - d)
-    return x[i, j] + share * (d + (1.0 - share) * bent)
+@njit(types.void(M, M, M, M, types.int64, types.float64, types.float64, V, V, V))
+def between(q, qd, qdd, u, i, h, share, x, v, w):
+    """Fills x, v, w with positions, rates and inputs between samples i and i + 1, h apart."""
+    for j in range(len(x)):
+        x[j] = q[i, j] + share * (q[i + 1, j] - q[i, j])
+    for j in range(len(v)):
+        d = qd[i + 1, j] - qd[i, j]
+        bent = (1.0 - share) * (h * qdd[i, j] - d) - share * (h * qdd[i + 1, j] - d)
+        v[j] = qd[i, j] + share * (d + (1.0 - share) * bent)
+    for j in range(len(w)):
+        w[j] = u[i, j] + share * (u[i + 1, j] - u[i, j])
 '''
 
 MEMORY_LOOP = '''
@@ -95,12 +100,7 @@ def memory(q, qd, qdd, u, p, t, z0, steps, out):
                 memory_rate(a, b, c, p, z, k1)
                 for j in range(n):
                     at[j] = z[j] + 0.5 * h * k1[j]
-            for j in range(len(a)):
-                a[j] = q[i, j] + share * (q[i + 1, j] - q[i, j])
-            for j in range(len(b)):
-                b[j] = between(qd, qdd, i, j, t[i + 1] - t[i], share)
-            for j in range(len(c)):
-                c[j] = u[i, j] + share * (u[i + 1, j] - u[i, j])
+            between(q, qd, qdd, u, i, t[i + 1] - t[i], share, a, b, c)
             if s % 2 == 0:
                 memory_rate(a, b, c, p, at, k2)
                 for j in range(n):
@@ -142,12 +142,7 @@ def stiff_memory(q, qd, qdd, u, p, t, z0, steps, out):
         h = (t[i + 1] - t[i]) / steps
         for s in range(steps):
             share = (s + 0.5) / steps
-            for j in range(len(x)):
-                x[j] = q[i, j] + share * (q[i + 1, j] - q[i, j])
-            for j in range(len(v)):
-                v[j] = between(qd, qdd, i, j, t[i + 1] - t[i], share)
-            for j in range(len(w)):
-                w[j] = u[i, j] + share * (u[i + 1, j] - u[i, j])
+            between(q, qd, qdd, u, i, t[i + 1] - t[i], share, x, v, w)
             memory_rate(x, v, w, p, z, rate)
             memory_slope(x, v, w, p, z, slope)
             for j in range(n):
@@ -179,12 +174,7 @@ def memory(q, qd, qdd, u, p, t, z0, steps, out):
         h = (t[i + 1] - t[i]) / steps
         for s in range(steps):
             share = (s + 1) / steps
-            for j in range(len(x)):
-                x[j] = q[i, j] + share * (q[i + 1, j] - q[i, j])
-            for j in range(len(v)):
-                v[j] = between(qd, qdd, i, j, t[i + 1] - t[i], share)
-            for j in range(len(w)):
-                w[j] = u[i, j] + share * (u[i + 1, j] - u[i, j])
+            between(q, qd, qdd, u, i, t[i + 1] - t[i], share, x, v, w)
             memory_terms(x, v, w, p, c1, b1)
             for j in range(n):
                 k = 0.5 * h * (b0[j] + b1[j])

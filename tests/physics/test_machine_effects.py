@@ -308,37 +308,33 @@ def test_a_hysteresis_over_next_to_nothing_stays_within_its_bounds(distance, sym
     np.testing.assert_allclose(z[settled], np.sign(v[settled, 0]), atol=tolerance)
 
 
-@pytest.mark.parametrize("effect", ["hysteresis:piston", "presliding:piston"])
-def test_a_state_follows_a_motion_of_eight_samples_a_period(effect):
-    """A straight line between two rates takes a twentieth off the distance between them."""
+def coarse_beside_fine(
+    effect: str, shapes: dict[str, float], hz: float, size: float, step: float, every: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """The state of an effect along a sine, from every so many samples and from all of them."""
     system = compile_model(Model(registry.device("magnetic_damper"), [effect]))
     names = [item.name for item in system.parameters]
     p = system.prior.copy()
-    p[names.index(f"{effect.replace(':', '.')}.distance")] = 2e-3
-    fine = np.arange(0.0, 1.0, 5e-5)
-    u = np.zeros((len(fine), len(system.inputs)))
-    w, size = 2.0 * np.pi * 62.5, 5e-4
-    motion = (size * np.sin(w * fine), size * w * np.cos(w * fine), -size * w**2 * np.sin(w * fine))
+    for shape, value in shapes.items():
+        p[names.index(f"{effect.replace(':', '.')}.{shape}")] = value
+    t, w = np.arange(0.0, 1.0, step), 2.0 * np.pi * hz
+    u = np.zeros((len(t), len(system.inputs)))
+    motion = size * np.sin(w * t), size * w * np.cos(w * t), -size * w**2 * np.sin(w * t)
     columns = [x[:, None] for x in motion]
-    every = slice(None, None, 40)
-    exact = system.memory(*columns, u, p, fine)[every]
-    found = system.memory(*(x[every] for x in columns), u[every], p, fine[every])
+    some = slice(None, None, every)
+    found = system.memory(*(x[some] for x in columns), u[some], p, t[some])
+    return found, system.memory(*columns, u, p, t)[some]
+
+
+@pytest.mark.parametrize("effect", ["hysteresis:piston", "presliding:piston"])
+def test_a_state_follows_a_motion_of_eight_samples_a_period(effect):
+    """A straight line between two rates takes a twentieth off the distance between them."""
+    found, exact = coarse_beside_fine(effect, {"distance": 2e-3}, 62.5, 5e-4, 5e-5, 40)
     np.testing.assert_allclose(found, exact, atol=5e-3 * np.ptp(exact))
 
 
 @pytest.mark.parametrize("symmetry", [0.5, 0.75])
 def test_a_hysteresis_passed_sixty_times_between_two_samples_is_followed(symmetry):
-    system = compile_model(Model(registry.device("magnetic_damper"), ["hysteresis:piston"]))
-    names = [item.name for item in system.parameters]
-    p = system.prior.copy()
-    p[names.index("hysteresis.piston.distance")] = 1e-5
-    p[names.index("hysteresis.piston.symmetry")] = symmetry
-    fine = np.arange(0.0, 1.0, 1e-5)
-    u = np.zeros((len(fine), len(system.inputs)))
-    w, size = 2.0 * np.pi * 20.0, 2.4e-3
-    motion = (size * np.sin(w * fine), size * w * np.cos(w * fine), -size * w**2 * np.sin(w * fine))
-    columns = [x[:, None] for x in motion]
-    every = slice(None, None, 200)
-    exact = system.memory(*columns, u, p, fine)[every]
-    found = system.memory(*(x[every] for x in columns), u[every], p, fine[every])
+    shapes = {"distance": 1e-5, "symmetry": symmetry}
+    found, exact = coarse_beside_fine("hysteresis:piston", shapes, 20.0, 2.4e-3, 1e-5, 200)
     assert np.std(found - exact) < 2e-3
