@@ -66,7 +66,8 @@ class Search:
         steps: the sets tried, in order.
         cut_short: whether it ended at `Settings.most_effects`.
         final: replays of the final model, with explainable shares; still: the same of one that
-            stands still where it turns round, where those leave less than was measured.
+            stands still where it turns round, where those leave less than was measured; floor:
+            noise floor by either kind.
         explainable, explainable_after: explainable share of the residual by axis, of the model as
             given and of the final one.
     """
@@ -90,6 +91,7 @@ class Search:
     cut_short: bool
     final: tuple[Replicate, ...]
     still: tuple[Replicate, ...]
+    floor: NoiseFloor
     explainable: Array
     explainable_after: Array
 
@@ -97,11 +99,6 @@ class Search:
     def selected(self) -> tuple[str, ...]:
         """Effects found, in order."""
         return self.found.added
-
-    @property
-    def floor(self) -> NoiseFloor:
-        """Noise floor of the final model, by either kind of replay."""
-        return _floor_of(self.evidence, self.final, self.still)
 
     @property
     def evidence(self) -> Evidence:
@@ -226,7 +223,7 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
         bench.trials, base, initial, level, first, found,
         alike, unlike, misfit, contests, main, additions, likely, transient,
         tuple(r for name, r in refused.items() if name not in found.added), tuple(steps), cut_short,
-        tuple(final), tuple(still), explainable,
+        tuple(final), tuple(still), floor, explainable,
         bench.shares(found.recipe, found.evidence.p) if found.added else explainable,
     )  # fmt: skip
 
