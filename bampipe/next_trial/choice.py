@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -82,7 +83,7 @@ def rank_designs(
         return worth(rehearsal.record(design, 0))
 
     def follow_hastily(value: float, design: Primitive) -> float:
-        return float(np.quantile([value, worth(rehearsal.record(design, HASTY))], _QUANTILE))
+        return _robust([value, worth(rehearsal.record(design, HASTY))])
 
     designs, is_quick = _list_designs(rehearsal, seconds, axes, with_rests, others)
     finalists = _FINALISTS if is_quick else _OF_FEW
@@ -134,24 +135,29 @@ def find_best_of_each(
     axes: Sequence[int],
     others: Sequence[Primitive] = (),
 ) -> list[Tried]:
-    """The best design by each of several worths; every design is recorded once for them all.
+    """The best designs by each of several worths, each once; all are recorded once for them all.
 
     Args:
         inform: the information (m, m) of a motion; worths: of it, larger is better.
         rehearsal, seconds, axes, others: as of `rank_designs`.
     """
-    designs, _ = _list_designs(rehearsal, seconds, axes, False, others)
+    designs, is_quick = _list_designs(rehearsal, seconds, axes, False, others)
     known = [inform(rehearsal.record(design, 0)) for design in designs]
-    found = []
+    counted = Counter(
+        k
+        for worth in worths
+        for k in sorted(range(len(designs)), key=lambda k: -worth(known[k]))[:_OF_FEW]
+    )
+    # Where that takes long, only the designs that are good by most worths are followed.
+    chosen = [k for k, _ in counted.most_common(None if is_quick else _OF_FEW)]
+    motions = {k: _versions(rehearsal, designs[k]) for k in chosen}
+    informed = {k: [inform(motion) for motion in motions[k]] for k in chosen}
+    found: dict[int, Tried] = {}
     for worth in worths:
-        order = sorted(range(len(designs)), key=lambda k: -worth(known[k]))
-        best = [_follow(rehearsal, designs[k], _after(inform, worth)) for k in order[:_OF_FEW]]
-        found.append(max(best, key=lambda one: one.worth))
-    return found
-
-
-def _after(inform: Callable[[Motion], Array], worth: Callable[[Array], float]) -> Worth:
-    return lambda motion: worth(inform(motion))
+        values = {k: _robust([worth(one) for one in informed[k]]) for k in chosen}
+        best = max(chosen, key=lambda k: values[k])
+        found.setdefault(best, Tried(designs[best], values[best], motions[best]))
+    return list(found.values())
 
 
 def _list_designs(
@@ -170,6 +176,14 @@ def _list_designs(
 
 def _follow(rehearsal: Rehearsal, design: Primitive, worth: Worth) -> Tried:
     """A design as different people follow it."""
-    motions = tuple(rehearsal.record(design, version) for version in _VERSIONS)
-    worths = [worth(motion) for motion in motions]
-    return Tried(design, float(np.quantile(worths, _QUANTILE)), motions)
+    motions = _versions(rehearsal, design)
+    return Tried(design, _robust([worth(motion) for motion in motions]), motions)
+
+
+def _versions(rehearsal: Rehearsal, design: Primitive) -> tuple[Motion, ...]:
+    return tuple(rehearsal.record(design, version) for version in _VERSIONS)
+
+
+def _robust(worths: Sequence[float]) -> float:
+    """What a design is worth on a bad day."""
+    return float(np.quantile(worths, _QUANTILE))
