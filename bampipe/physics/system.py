@@ -238,23 +238,47 @@ class System:
         a, b, c = self.true_motion(q, qd, qdd, u, p)
         return _stack(self._arrays.applied(a.T, b.T, c.T, z.T, u.T, p), len(q))
 
-    def residual(self, q: Array, qd: Array, qdd: Array, z: Array, u: Array, p: Array) -> Array:
+    def residual(
+        self,
+        q: Array,
+        qd: Array,
+        qdd: Array,
+        z: Array,
+        u: Array,
+        p: Array,
+        bodies: Array | None = None,
+    ) -> Array:
         """``applied - required`` for the mechanism's true motion, compiled; (T, n_q), N.m or N.
 
-        Arguments as in `required`, but q, qd, qdd are already what `true_motion` returns.
+        Arguments as in `required`, but q, qd, qdd are already what `true_motion` returns;
+        ``bodies`` is what `body_forces` returns of the same, where that is known.
         """
-        arrays = [np.ascontiguousarray(x, dtype=np.float64) for x in (q, qd, qdd, z, u, p)]
+        if bodies is None:
+            bodies = self.body_forces(q, qd, qdd, p)
+        arrays = [np.ascontiguousarray(x, dtype=np.float64) for x in (q, qd, qdd, bodies, z, u, p)]
         out = np.empty(arrays[0].shape)
         self._residual(*arrays, out)
+        return out
+
+    def body_forces(self, q: Array, qd: Array, qdd: Array, p: Array) -> Array:
+        """What a robot's bodies require along a true motion, (T, joints); (T, 0) of other devices.
+
+        It changes with those of the parameters alone that are numbers of the bodies.
+        """
+        count = self._whole.facts["bodies"]
+        out = np.empty((len(q), count))
+        if count:
+            arrays = [np.ascontiguousarray(x, dtype=np.float64) for x in (q, qd, qdd, p)]
+            self._whole.module("bodies").bodies(*arrays, out)
         return out
 
     @cached_property
     def lasting(self) -> frozenset[int]:
         """Parameters, by number, whose slopes `slopes` gives: most of those in `constant`."""
-        return frozenset(self._whole.facts["lasting"]) | self._of_bodies.keys()
+        return frozenset(self._whole.facts["lasting"]) | self.of_bodies.keys()
 
     @cached_property
-    def _of_bodies(self) -> dict[int, int]:
+    def of_bodies(self) -> dict[int, int]:
         """By number of a parameter, which of all inertial numbers of a robot's bodies it is."""
         robot = self.model.device.robot
         place = {p.name: k for k, p in enumerate(robot.parameters)} if robot else {}
@@ -268,7 +292,7 @@ class System:
             q, qd, qdd, u: as in `residual`.
         """
         found = np.zeros((len(q), len(self.coordinates), len(wanted)))
-        bodies = [(k, self._of_bodies[i]) for k, i in enumerate(wanted) if i in self._of_bodies]
+        bodies = [(k, self.of_bodies[i]) for k, i in enumerate(wanted) if i in self.of_bodies]
         if len(bodies) < len(wanted):
             column = {i: k for k, i in enumerate(wanted)}
             written = self._whole.module("slopes").slopes(q.T, qd.T, qdd.T, u.T)
@@ -472,26 +496,23 @@ def _generate_whole(model: Model) -> tuple[dict[str, Any], dict[str, str]]:
 
     equations = _derive(model)
     slopes, places = slopes_source(equations)
+    along, here = bodies_along_motion(equations), bodies_at_state(equations)
     facts = {
         "slopes": places,
         "lasting": [i for i, by_axis in enumerate(equations.lasting) if by_axis is not None],
         "of_bodies": equations.of_bodies,
+        "bodies": len(along.names),
     }
     sources = {
         "slopes": slopes,
         "dynamics": dynamics_source(equations),
         "rows": rows_source(equations, ROWS),
     }
-    for name, find_bodies, source in (
-        ("compiled", bodies_at_state, scalar_source),
-        ("residual", bodies_along_motion, residual_source),
-    ):
-        bodies = find_bodies(equations)
-        title = ""
-        if bodies.names:
-            sources[f"{name}_bodies"] = bodies.source
-            title = generated_code.module_title(f"{name}_bodies", bodies.source)
-        sources[name] = source(equations, bodies, title)
+    sources["residual"], title = residual_source(equations, along.names), ""
+    if along.names:
+        sources["bodies"], sources["compiled_bodies"] = along.source, here.source
+        title = generated_code.module_title("compiled_bodies", here.source)
+    sources["compiled"] = scalar_source(equations, here, title)
     return facts, sources
 
 

@@ -133,7 +133,7 @@ def test_all_models_of_a_robot_take_its_bodies_from_the_same_compiled_text() -> 
     device = random_robot(3, 5)
     first = device.coordinates[0].name
     some = [compile_model(Model(device, effects)) for effects in ((), (f"stribeck:{first}",))]
-    for kind in ("compiled_bodies", "residual_bodies"):
+    for kind in ("compiled_bodies", "bodies"):
         assert len({system._whole.sources[kind] for system in some}) == 1
     for kind in ("compiled", "residual"):
         texts = [system._whole.sources[kind] for system in some]
