@@ -406,6 +406,22 @@ def array_source(e: Equations, added: Sequence[Any]) -> str:
     return "".join(parts)
 
 
+def slopes_source(e: Equations) -> tuple[str, list[tuple[int, int]]]:
+    """Source of the slopes of the residual over columns that are the same for all parameters.
+
+    Returns:
+        The source, and of each column the parameter and the axis, by number.
+    """
+    groups = {"q": e.q, "qd": e.qd, "qdd": e.qdd, "u": e.u}
+    by_place = {
+        (i, axis): slope
+        for i, by_axis in enumerate(e.lasting)
+        for axis, slope in (by_axis or {}).items()
+    }
+    source = ARRAY_HEADER + function_source("slopes", groups, list(by_place.values()))
+    return source, list(by_place)
+
+
 def dynamics_source(e: Equations) -> str:
     """Source of the functions over columns of the whole mechanism: long where it is a robot."""
     quiet = dict.fromkeys(e.w, 0)

@@ -60,11 +60,13 @@ def problem_of(
     shaping = [i for i, linear in enumerate((*system.linear, False)) if not linear]
     remembered: dict[tuple[int, bytes], Array] = {}
 
+    def inputs_at(motion: Motion, p: Array) -> Array:
+        u = motion.inputs(system.inputs)
+        return u if p[n] == 0.0 else u - p[n] * motion.input_rates(system.inputs)
+
     def residual(trial: int, p: Array) -> Array:
         motion = motions[trial]
-        u = motion.inputs(system.inputs)
-        if p[n] != 0.0:
-            u = u - p[n] * motion.input_rates(system.inputs)
+        u = inputs_at(motion, p)
         # Internal states do not change with what the residual is linear in: of differences by
         # many parameters, those of the last point serve most.
         key = trial, p[shaping].tobytes()
@@ -74,6 +76,16 @@ def problem_of(
                 remembered.clear()
             remembered[key] = z
         return found
+
+    def slopes(trial: int, p: Array, wanted: Sequence[int]) -> tuple[list[int], Array]:
+        numbers = [free[k] for k in wanted]
+        given = [k for k, i in enumerate(numbers) if i in system.lasting]
+        motion = motions[trial]
+        if not given:
+            return given, np.empty((len(motion.q), len(system.coordinates), 0))
+        u = inputs_at(motion, p)
+        true = system.true_motion(motion.q, motion.qd, motion.qdd, u, p[:n])
+        return given, system.slopes([numbers[k] for k in given], *true, u)
 
     parameters = system.parameters
     free = [i for i, item in enumerate(parameters) if not item.fixed and item.name not in held]
@@ -114,6 +126,7 @@ def problem_of(
         ),
         precision=np.array(precision),
         known=np.array(known),
+        slopes=slopes,
     )
 
 
