@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe import generated_code
+from bampipe.physics.device import INPUT_ORDERS, derivative
 from bampipe.physics.model import Model
 from bampipe.physics.newton_euler import INERTIAL
 from bampipe.physics.parameter import Parameter
@@ -89,6 +90,13 @@ class System:
         self.braked: bool = meta["braked"]
         self._commands: list[int] = meta["commands"]
         self._memory_uses: dict[str, list[int]] = meta["memory_uses"]
+
+    @cached_property
+    def forced(self) -> tuple[int, ...]:
+        """Columns of the inputs that hold a force or a time derivative of one."""
+        orders = range(len(INPUT_ORDERS))
+        names = {derivative(f, k) for f in self.model.device.forces for k in orders}
+        return tuple(i for i, name in enumerate(self.inputs) if name in names)
 
     @property
     def prior(self) -> Array:
