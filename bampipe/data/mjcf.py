@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from bampipe.data.chain import Body, DriveLimits, Tree, TreeJoint, symmetric
+from bampipe.data.rigid_body import Body, symmetric
+from bampipe.data.robot_tree import DriveLimits, Tree, TreeJoint
 from bampipe.data.robot_xml import document, number_list, numbers
 from bampipe.errors import InputError, did_you_mean
 from bampipe.lists import join_names

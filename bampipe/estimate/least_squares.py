@@ -35,6 +35,9 @@ _LEAST_STEP = 1e-8
 """Of a difference, as a share of the parameter: half the digits of a number."""
 Residual = Callable[[int, Array], Array]
 """residual(trial, p) -> (T, n_q): unfiltered residual of one trial for parameters p (np,)."""
+Slopes = Callable[[int, Array, Sequence[int]], tuple[Sequence[int], Array]]
+"""slopes(trial, p, wanted) -> some of the free parameters in wanted, by their place there, and the
+unfiltered slopes of the residual by them (T, n_q, n): those that need no difference."""
 
 
 @dataclass(frozen=True)
@@ -82,6 +85,7 @@ class Problem:
         standstill: by trial, (T, n_q) whether an axis stands still; see `find_standstill`.
         precision: (n_free,) of what is known of the parameters beforehand, one over its variance,
             zero where nothing is; known: (n_free,) that.
+        slopes: those by some of the parameters, where they are known; see `Slopes`.
     """
 
     residual: Residual
@@ -96,6 +100,7 @@ class Problem:
     standstill: Sequence[NDArray[np.bool_]]
     precision: Array
     known: Array
+    slopes: Slopes | None = None
 
 
 @dataclass(frozen=True)
@@ -134,7 +139,9 @@ class LeastSquares(Minimum):
 def residual_and_slopes(
     problem: Problem, trial: int, p: Array, columns: Sequence[int] | None = None
 ) -> tuple[Array, Array]:
-    """Unfiltered residual of one trial (T, n_q) and its slopes (T, n_q, n), by differences.
+    """Unfiltered residual of one trial (T, n_q) and its slopes (T, n_q, n).
+
+    By differences where nothing gives the slopes.
 
     Args:
         problem: the model as residuals.
@@ -145,7 +152,12 @@ def residual_and_slopes(
     base = problem.residual(trial, p)
     chosen = range(problem.free.size) if columns is None else columns
     slopes = np.empty((*base.shape, len(chosen)))
-    for column, k in enumerate(chosen):
+    given: Sequence[int] = ()
+    if problem.slopes is not None:
+        given, known = problem.slopes(trial, p, chosen)
+        slopes[:, :, given] = known
+    for column in sorted(set(range(len(chosen))) - set(given)):
+        k = chosen[column]
         index, moved = problem.free[k], p.copy()
         # A replay of a model that lacks much can run far from any prior, where a step is rounding.
         step = max(problem.step[k], _LEAST_STEP * abs(p[index]))
@@ -172,7 +184,11 @@ def stacked_residual(
     count, n_q, n_free = slopes.shape
     columns = np.concatenate([base[:, :, None], slopes], axis=2).reshape(count, -1)
     axes = np.repeat(np.arange(n_q, dtype=np.int64), 1 + n_free)
-    thin = problem.band.thin(columns, axes).reshape(-1, n_q, 1 + n_free)
+    # No body of a robot acts on a joint behind it: half of its columns are empty.
+    some = np.flatnonzero(columns.any(axis=0))
+    flat = np.zeros((len(problem.band.thinned_rows(count)), columns.shape[1]))
+    flat[:, some] = problem.band.thin(columns[:, some], axes[some])
+    thin = flat.reshape(-1, n_q, 1 + n_free)
     used = find_moving_samples(problem.standstill[trial], problem.band)
     thin *= used[:, :, None]
     slope = np.ascontiguousarray(thin[:, :, 1:])

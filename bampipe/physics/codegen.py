@@ -259,10 +259,10 @@ def _printed(value: Any) -> tuple[str, frozenset[Any]]:
 
 @dataclass(frozen=True)
 class Bodies:
-    """Compiled functions of a robot's bodies, the same text for all models of the robot.
+    """A compiled function of a robot's bodies, the same text for all models of the robot.
 
     Attributes:
-        names: intermediates that they return, in order; none where the device is no robot.
+        names: intermediates that it gives, in order; none where the device is no robot.
         source: of the module; empty without names.
     """
 
@@ -272,39 +272,36 @@ class Bodies:
 
 def bodies_at_state(e: Equations) -> Bodies:
     """``bodies(x, p)``: what the mass matrix and the bias take from a robot's bodies."""
-    groups = {"x": ([*e.q, *e.qd], "{}"), "p": (e.p, "{}")}
-    return _bodies(e, [*_upper(e), *e.bias], groups, "x, p", "V, V")
+    names, block = _of_bodies(e, [*_upper(e), *e.bias])
+    if not names:
+        return Bodies((), "")
+    lines = [*_unpack("x", [*e.q, *e.qd], block.used), *_unpack("p", e.p, block.used)]
+    lines += [*block.lines, f"return ({', '.join(block.values)},)"]
+    returned = f"types.UniTuple(types.float64, {len(names)})"
+    head = f"\n\n@njit({returned}(V, V), cache=True, error_model='numpy')"
+    body = "\n    ".join(lines)
+    return Bodies(names, f"{SCALAR_HEADER}{head}\ndef bodies(x, p):\n    {body}\n")
 
 
 def bodies_along_motion(e: Equations) -> Bodies:
-    """``bodies(row, q, qd, qdd, p)``: the forces that a robot's bodies require in one sample."""
-    motion = {"q": e.q, "qd": e.qd, "qdd": e.qdd}
-    groups = {name: (symbols, "row, {}") for name, symbols in motion.items()}
-    groups["p"] = (e.p, "{}")
-    return _bodies(e, e.dynamics, groups, "row, q, qd, qdd, p", "types.int64, M, M, M, V")
-
-
-def _bodies(
-    e: Equations,
-    results: Sequence[Any],
-    groups: Mapping[str, tuple[Sequence[Any], str]],
-    arguments: str,
-    kinds: str,
-) -> Bodies:
-    """The function of those of ``e.steps`` that ``results`` take as they are."""
-    wanted: set[Any] = set().union(*(sp.sympify(x, strict=True).free_symbols for x in results))
-    names = tuple(name for name, _ in e.steps if name in wanted)
+    """``bodies(q, qd, qdd, p, out)``: the forces that a robot's bodies require, (T, names)."""
+    names, block = _of_bodies(e, e.dynamics)
     if not names:
         return Bodies((), "")
-    block = _block(names, e.steps)
-    lines = []
-    for group, (symbols, index) in groups.items():
-        lines += _unpack(group, symbols, block.used, index)
-    lines += [*block.lines, f"return ({', '.join(block.values)},)"]
-    returned = f"types.UniTuple(types.float64, {len(names)})"
-    head = f"\n\n@njit({returned}({kinds}), cache=True, error_model='numpy')"
-    body = "\n    ".join(lines)
-    return Bodies(names, f"{SCALAR_HEADER}{head}\ndef bodies({arguments}):\n    {body}\n")
+    row = []
+    for group, symbols in {"q": e.q, "qd": e.qd, "qdd": e.qdd}.items():
+        row += _unpack(group, symbols, block.used, "row, {}")
+    row += [*block.lines, *(f"out[row, {i}] = {v}" for i, v in enumerate(block.values))]
+    body = [*_unpack("p", e.p, block.used), *_loop("for row in range(len(q)):", row)]
+    source = _compiled("bodies", "q, qd, qdd, p, out", body, kinds="M, M, M, V, M", options="")
+    return Bodies(names, SCALAR_HEADER + source)
+
+
+def _of_bodies(e: Equations, results: Sequence[Any]) -> tuple[tuple[Any, ...], _Block]:
+    """Those of ``e.steps`` that ``results`` take as they are, and their text."""
+    wanted: set[Any] = set().union(*(sp.sympify(x, strict=True).free_symbols for x in results))
+    names = tuple(name for name, _ in e.steps if name in wanted)
+    return names, _block(names, e.steps) if names else _Block(set(), [], [])
 
 
 def _upper(e: Equations) -> list[Any]:
@@ -404,6 +401,22 @@ def array_source(e: Equations, added: Sequence[Any]) -> str:
         ),
     ]
     return "".join(parts)
+
+
+def slopes_source(e: Equations) -> tuple[str, list[tuple[int, int]]]:
+    """Source of the slopes of the residual over columns that are the same for all parameters.
+
+    Returns:
+        The source, and of each column the parameter and the axis, by number.
+    """
+    groups = {"q": e.q, "qd": e.qd, "qdd": e.qdd, "u": e.u}
+    by_place = {
+        (i, axis): slope
+        for i, by_axis in enumerate(e.lasting)
+        for axis, slope in (by_axis or {}).items()
+    }
+    source = ARRAY_HEADER + function_source("slopes", groups, list(by_place.values()))
+    return source, list(by_place)
 
 
 def dynamics_source(e: Equations) -> str:
@@ -534,44 +547,39 @@ def rows_source(e: Equations, rows: int) -> str:
     return "".join(parts)
 
 
-def _header(title: str) -> str:
-    """The head of a module that takes ``bodies`` from the one called ``title``, if any."""
-    return SCALAR_HEADER + (f"from {title} import bodies\n" if title else "")
-
-
 def scalar_source(e: Equations, bodies: Bodies, title: str = "") -> str:
     """Source of the compiled functions of one state.
 
     Args:
         e: the equations; bodies: `bodies_at_state`; title: of its module.
     """
+    header = SCALAR_HEADER + (f"from {title} import bodies\n" if title else "")
     derivative = _compiled("derivative", "x, u, p, w, dx", _motion(e, known=bodies.names))
-    return _header(title) + derivative + _compiled("measure", "x, u, p, y", _reading(e))
+    return header + derivative + _compiled("measure", "x, u, p, y", _reading(e))
 
 
-def residual_source(e: Equations, bodies: Bodies, title: str = "") -> str:
-    """Source of the compiled residual along a motion: ``residual(q, qd, qdd, z, u, p, out)``.
+def residual_source(e: Equations, bodies: Sequence[Any]) -> str:
+    """Source of the compiled residual along a motion: ``residual(q, qd, qdd, b, z, u, p, out)``.
 
     Args:
-        e: the equations; bodies: `bodies_along_motion`; title: of its module.
+        e: the equations; bodies: names of what ``b`` holds, by `bodies_along_motion`.
     """
     quiet = dict.fromkeys(e.w, 0)
     residual = [
         a + o.subs(quiet) - f for a, o, f in zip(e.applied, e.other, e.dynamics, strict=True)
     ]
-    block = _block(residual, e.steps, bodies.names)
-    groups = {"q": e.q, "qd": e.qd, "qdd": e.qdd, "z": e.z, "u": e.u}
+    block = _block(residual, e.steps, bodies)
+    groups = {"q": e.q, "qd": e.qd, "qdd": e.qdd, "b": bodies, "z": e.z, "u": e.u}
     row = [
         line
         for group, symbols in groups.items()
         for line in _unpack(group, symbols, block.used, "row, {}")
     ]
-    row += [f"{_returned(bodies.names)} = bodies(row, q, qd, qdd, p)"] if bodies.names else []
     row += block.lines + [f"out[row, {i}] = {v}" for i, v in enumerate(block.values)]
     body = [*_unpack("p", e.p, block.used), *_loop("for row in range(len(q)):", row)]
-    return _header(title) + _compiled(
-        "residual", "q, qd, qdd, z, u, p, out", body, kinds="M, M, M, M, M, V, M", options=""
-    )
+    kinds = "M, M, M, M, M, M, V, M"
+    arguments = "q, qd, qdd, b, z, u, p, out"
+    return SCALAR_HEADER + _compiled("residual", arguments, body, kinds=kinds, options="")
 
 
 def memory_source(e: Equations) -> tuple[str, dict[str, list[int]]]:

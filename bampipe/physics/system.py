@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe import generated_code
-from bampipe.physics.device import INPUT_ORDERS, Device, derivative
+from bampipe.physics.device import INPUT_ORDERS, derivative
 from bampipe.physics.model import Model
+from bampipe.physics.newton_euler import INERTIAL
 from bampipe.physics.parameter import Parameter
 
 if TYPE_CHECKING:  # it brings sympy, which few need
@@ -28,6 +29,8 @@ _STABLE = 2.5
 """Largest product of a step and the rate at which a state decays for which RK4 is stable, with a
 margin: it is up to 2.78 (Hairer and Wanner, Solving Ordinary Differential Equations II, IV.2)."""
 _RUNAWAY = 1e9
+_TOGETHER = 1024
+"""Samples whose slopes by a robot's bodies are taken at once: as many as a processor keeps near."""
 _STEP_AGAINST_NEIGHBOURS = 8.0
 """A command that changes between two samples this many times more than before and after has been
 switched. Ramps and sines change by at most twice as much from one sample to the next; noise of the
@@ -136,16 +139,22 @@ class System:
         return self._code.module("columns")
 
     @cached_property
+    def _whole(self) -> generated_code.Generated:
+        """Functions of the whole mechanism, which of most candidates for an effect nobody asks."""
+        key = f"{self.model.key}_whole"
+        return generated_code.load(key, lambda: _generate_whole(self.model))
+
+    @cached_property
     def _dynamics(self) -> ModuleType:
-        return self._code.module("dynamics")
+        return self._whole.module("dynamics")
 
     @cached_property
     def _compiled(self) -> ModuleType:
-        return self._code.module("compiled")
+        return self._whole.module("compiled")
 
     @cached_property
     def _residual(self) -> Callable[..., None]:
-        return self._code.module("residual").residual
+        return self._whole.module("residual").residual
 
     @property
     def derivative(self) -> Callable[..., None]:
@@ -159,7 +168,7 @@ class System:
 
     @cached_property
     def _rows(self) -> ModuleType:
-        return self._code.module("rows")
+        return self._whole.module("rows")
 
     @property
     def derivative_rows(self) -> Callable[..., None]:
@@ -237,15 +246,78 @@ class System:
         a, b, c = self.true_motion(q, qd, qdd, u, p)
         return _stack(self._arrays.applied(a.T, b.T, c.T, z.T, u.T, p), len(q))
 
-    def residual(self, q: Array, qd: Array, qdd: Array, z: Array, u: Array, p: Array) -> Array:
+    def residual(
+        self,
+        q: Array,
+        qd: Array,
+        qdd: Array,
+        z: Array,
+        u: Array,
+        p: Array,
+        bodies: Array | None = None,
+    ) -> Array:
         """``applied - required`` for the mechanism's true motion, compiled; (T, n_q), N.m or N.
 
-        Arguments as in `required`, but q, qd, qdd are already what `true_motion` returns.
+        Arguments as in `required`, but q, qd, qdd are already what `true_motion` returns;
+        ``bodies`` is what `body_forces` returns of the same, where that is known.
         """
-        arrays = [np.ascontiguousarray(x, dtype=np.float64) for x in (q, qd, qdd, z, u, p)]
+        if bodies is None:
+            bodies = self.body_forces(q, qd, qdd, p)
+        arrays = [np.ascontiguousarray(x, dtype=np.float64) for x in (q, qd, qdd, bodies, z, u, p)]
         out = np.empty(arrays[0].shape)
         self._residual(*arrays, out)
         return out
+
+    def body_forces(self, q: Array, qd: Array, qdd: Array, p: Array) -> Array:
+        """What a robot's bodies require along a true motion, (T, joints); (T, 0) of other devices.
+
+        It changes with those of the parameters alone that are numbers of the bodies.
+        """
+        count = self._whole.facts["bodies"]
+        out = np.empty((len(q), count))
+        if count:
+            arrays = [np.ascontiguousarray(x, dtype=np.float64) for x in (q, qd, qdd, p)]
+            self._whole.module("bodies").bodies(*arrays, out)
+        return out
+
+    @cached_property
+    def lasting(self) -> frozenset[int]:
+        """Parameters, by number, whose slopes `slopes` gives: most of those in `constant`."""
+        return frozenset(self._whole.facts["lasting"]) | self.of_bodies.keys()
+
+    @cached_property
+    def of_bodies(self) -> dict[int, int]:
+        """By number of a parameter, which of all inertial numbers of a robot's bodies it is."""
+        robot = self.model.device.robot
+        place = {p.name: k for k, p in enumerate(robot.parameters)} if robot else {}
+        return {i: place[self.parameters[i].name] for i in self._whole.facts["of_bodies"]}
+
+    def slopes(self, wanted: Sequence[int], q: Array, qd: Array, qdd: Array, u: Array) -> Array:
+        """Slopes of the residual by parameters on which they do not depend, (T, n_q, n_wanted).
+
+        Args:
+            wanted: numbers of parameters, all in `lasting`.
+            q, qd, qdd, u: as in `residual`.
+        """
+        found = np.zeros((len(q), len(self.coordinates), len(wanted)))
+        bodies = [(k, self.of_bodies[i]) for k, i in enumerate(wanted) if i in self.of_bodies]
+        if len(bodies) < len(wanted):
+            column = {i: k for k, i in enumerate(wanted)}
+            written = self._whole.module("slopes").slopes(q.T, qd.T, qdd.T, u.T)
+            for (i, axis), slope in zip(self._whole.facts["slopes"], written, strict=True):
+                if i in column:
+                    found[:, axis, column[i]] = slope
+        if bodies:
+            robot = self.model.device.robot
+            assert robot is not None
+            for first in range(0, len(q), _TOGETHER):
+                part = slice(first, first + _TOGETHER)
+                forces = robot.columns(q[part], qd[part], qdd[part])
+                for k, number in bodies:
+                    link, place = divmod(number, INERTIAL)
+                    for axis, by_link in enumerate(forces):
+                        found[part, axis, k] -= by_link[link][place]
+        return found
 
     def contribution(self, q: Array, qd: Array, qdd: Array, z: Array, u: Array, p: Array) -> Array:
         """What the model's effects add to the residual of the bare device, (T, n_q).
@@ -377,23 +449,12 @@ def compile_model(model: Model) -> System:
 
 
 def _generate(model: Model) -> tuple[dict[str, Any], dict[str, str]]:
-    """What the generator says of a model, and the source of its modules."""
-    from bampipe.model_functions import ROWS
-    from bampipe.physics.codegen import (
-        array_source,
-        bodies_along_motion,
-        bodies_at_state,
-        dynamics_source,
-        memory_source,
-        residual_source,
-        rows_source,
-        scalar_source,
-    )
-    from bampipe.physics.derivation import derive
+    """What the generator says of a model, and the source of what effects add to a residual."""
+    from bampipe.physics.codegen import array_source, memory_source
     from bampipe.physics.equations import contribution
 
-    equations = derive(model)
-    bare = _derive_bare(model.device) if model.effects else equations
+    equations = _derive(model)
+    bare = _derive(Model(model.device)) if model.effects else equations
     added = contribution(equations, bare)
     channels = dict(zip(equations.inputs, equations.u, strict=True))
     forces = [channels[name] for name in model.device.forces]
@@ -422,36 +483,59 @@ def _generate(model: Model) -> tuple[dict[str, Any], dict[str, str]]:
         ],
         "braked": any(brakes & e.free_symbols for e in (*added, *equations.rates)),
     }
-    sources = {
-        "columns": array_source(equations, added),
-        "dynamics": dynamics_source(equations),
-        "rows": rows_source(equations, ROWS),
-    }
-    for name, find_bodies, source in (
-        ("compiled", bodies_at_state, scalar_source),
-        ("residual", bodies_along_motion, residual_source),
-    ):
-        bodies = find_bodies(equations)
-        title = ""
-        if bodies.names:
-            sources[f"{name}_bodies"] = bodies.source
-            title = generated_code.module_title(f"{name}_bodies", bodies.source)
-        sources[name] = source(equations, bodies, title)
+    sources = {"columns": array_source(equations, added)}
     if equations.z:
         sources["memory"], facts["memory_uses"] = memory_source(equations)
     return facts, sources
 
 
-_bare: dict[str, Equations] = {}
-"""Of the device whose model was derived last: the candidates of a diagnosis share it."""
+def _generate_whole(model: Model) -> tuple[dict[str, Any], dict[str, str]]:
+    """Which slopes are the same everywhere, and the source of the whole mechanism's functions."""
+    from bampipe.model_functions import ROWS
+    from bampipe.physics.codegen import (
+        bodies_along_motion,
+        bodies_at_state,
+        dynamics_source,
+        residual_source,
+        rows_source,
+        scalar_source,
+        slopes_source,
+    )
+
+    equations = _derive(model)
+    slopes, places = slopes_source(equations)
+    along, here = bodies_along_motion(equations), bodies_at_state(equations)
+    facts = {
+        "slopes": places,
+        "lasting": [i for i, by_axis in enumerate(equations.lasting) if by_axis is not None],
+        "of_bodies": equations.of_bodies,
+        "bodies": len(along.names),
+    }
+    sources = {
+        "slopes": slopes,
+        "dynamics": dynamics_source(equations),
+        "rows": rows_source(equations, ROWS),
+    }
+    sources["residual"], title = residual_source(equations, along.names), ""
+    if along.names:
+        sources["bodies"], sources["compiled_bodies"] = along.source, here.source
+        title = generated_code.module_title("compiled_bodies", here.source)
+    sources["compiled"] = scalar_source(equations, here, title)
+    return facts, sources
 
 
-def _derive_bare(device: Device) -> Equations:
-    """Equations of a device without effects."""
+_derived: dict[str, Equations] = {}
+"""By `Model.key`, the last used last."""
+_MOST_DERIVED = 4
+"""The device without effects, which every candidate wants, and those at hand."""
+
+
+def _derive(model: Model) -> Equations:
+    """Equations of a model; those asked for last are kept."""
     from bampipe.physics.derivation import derive
 
-    model = Model(device)
-    if model.key not in _bare:
-        _bare.clear()
-        _bare[model.key] = derive(model)
-    return _bare[model.key]
+    known = _derived.pop(model.key, None) or derive(model)
+    _derived[model.key] = known
+    if len(_derived) > _MOST_DERIVED:
+        del _derived[next(iter(_derived))]
+    return known
