@@ -187,9 +187,6 @@ def estimate_by_filter(
     )
     value, slope = model.to_physical(constrain(model, found.theta, covariance))
     scaled = covariance * np.outer(slope, slope)
-    few = _few_blocks(blocks, model.free.size, choice.block_s)
-    if few:
-        scaled = squares.widen(scaled)
     p = np.append(start, 0.0)
     p[problem.free] = value
     tight = slope * np.sqrt(np.diag(found.covariance))
@@ -217,10 +214,7 @@ def estimate_by_filter(
         covariance=scaled[:count, :count],
         at_bound=at_bound[:count],
         held_out=_leave_out(p, found, model, problem, covariance, folds),
-        doubts=(
-            *_doubts(names, value[:count], at_bound[:count], scaled, squares, nis.mean),
-            *few,
-        ),
+        doubts=_doubts(names, value[:count], at_bound[:count], scaled, squares, nis.mean),
         details=details,
         report=report,
         tabulate=lambda: (
@@ -315,21 +309,6 @@ def _doubts(
         if is_stuck
     ]
     return tuple(doubts)
-
-
-def _few_blocks(blocks: int, parameters: int, block_s: float) -> tuple[str, ...]:
-    """Say where intervals rest on the filter's own word, which is right for white noise alone.
-
-    Of 206 parameters of a joint (five trials of 1.2 s, `benchmarks/independent`, seeds 9931 to
-    9942) such intervals held 77 %, those of least squares 94 %; of 155 of the BAM (three trials of
-    6 s, seeds 9901 to 9904) 90 % and 99 %. So they are no narrower than those of least squares.
-    """
-    if blocks > parameters:
-        return ()
-    return (
-        f"its intervals rest on {blocks} blocks of {block_s:g} s for {parameters} numbers, too few"
-        " to show a scatter",
-    )
 
 
 def _choose_longest_step(found: FilterRun, model: FilterModel, trial: Trial) -> FilterSettings:

@@ -24,9 +24,6 @@ Array = NDArray[np.float64]
 
 SEGMENT_S = 0.5
 """Length of a segment, s: noise of a force moves the motion by less than friction does."""
-_SEGMENTS_A_PARAMETER = 3
-"""Fewer segments a parameter hardly show a scatter: then intervals are no narrower than those of
-least squares. Moments of a joint from ten segments were 4 of their standard deviations off."""
 _LONGEST_STEP = 1e-3
 """Of the integration, s; friction near standstill shortens it further."""
 _POSITION_STEP, _RATE_STEP, _PARAMETER_STEP, _TIMING_STEP = 1e-5, 1e-4, 1e-4, 1e-5
@@ -119,8 +116,6 @@ def estimate_by_output_error(
 
     progress(0.4, "output error")
     found = fit(len(segments), squares.p, 15)
-    if len(_joined(segments)) < _SEGMENTS_A_PARAMETER * problem.free.size:
-        found = replace(found, covariance=squares.widen(found.covariance))
 
     def rows() -> list[dict[str, object]]:
         trace: list[dict[str, object]] = []

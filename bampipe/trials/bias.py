@@ -56,12 +56,6 @@ class UnbiasedFit:
             return self.raw.covariance
         return self.raw.covariance + self.drawn_covariance
 
-    def widen(self, covariance: Array) -> Array:
-        """Return a covariance (n_free, n_free) of the same parameters, by others, no narrower."""
-        sd = np.maximum(np.sqrt(np.diag(covariance)), np.finfo(float).tiny)
-        factor = np.maximum(np.sqrt(np.diag(self.covariance)) / sd, 1.0)
-        return np.asarray(covariance * np.outer(factor, factor))
-
     def gap(self, p: Array) -> Array:
         """Return how far the fit would be from what it is if ``p`` (n_p + 1,) were true, (n_free,).
 
