@@ -63,7 +63,7 @@ def mjcf_text(name: str, tree: Tree, gravity: Sequence[float], comment: str) -> 
 
 
 def _write_inertial(element: ElementTree.Element, body: Body) -> None:
-    """Give a body its mass; readers other than MuJoCo want to be told that there is none."""
+    """Write the inertial element of a body, zeros too: not every parser of MJCF takes none."""
     (xx, xy, xz), (_, yy, yz), (_, _, zz) = body.inertia
     inertial = ElementTree.SubElement(
         element, "inertial", pos=number_list(body.center), mass=number_list([body.mass])

@@ -17,7 +17,7 @@ from bampipe.physics.newton_euler import INERTIAL
 from bampipe.physics.parameter import Parameter
 
 if TYPE_CHECKING:  # it brings sympy, which few need
-    from bampipe.physics.equations import Equations
+    from bampipe.physics.model_code import Generation
 
 Array = NDArray[np.float64]
 _MEMORY_STEPS = (3, 12, 48, 192)
@@ -141,8 +141,13 @@ class System:
     @cached_property
     def _whole(self) -> generated_code.Generated:
         """Functions of the whole mechanism, which of most candidates for an effect nobody asks."""
-        key = f"{self.model.key}_whole"
-        return generated_code.load(key, lambda: _generate_whole(self.model))
+
+        def generate() -> Generation:
+            from bampipe.physics.model_code import whole_code
+
+            return whole_code(self.model)
+
+        return generated_code.load(f"{self.model.key}_whole", generate)
 
     @cached_property
     def _dynamics(self) -> ModuleType:
@@ -445,97 +450,10 @@ def compile_model(model: Model) -> System:
     Raises:
         InputError: an expression of the model is wrong, or the cache cannot be used.
     """
-    return System(model, generated_code.load(model.key, lambda: _generate(model)))
 
+    def generate() -> Generation:
+        from bampipe.physics.model_code import effects_code
 
-def _generate(model: Model) -> tuple[dict[str, Any], dict[str, str]]:
-    """What the generator says of a model, and the source of what effects add to a residual."""
-    from bampipe.physics.codegen import array_source, memory_source
-    from bampipe.physics.equations import contribution
+        return effects_code(model)
 
-    equations = _derive(model)
-    bare = _derive(Model(model.device)) if model.effects else equations
-    added = contribution(equations, bare)
-    channels = dict(zip(equations.inputs, equations.u, strict=True))
-    forces = [channels[name] for name in model.device.forces]
-    brakes = {channels[name] for name in model.device.brakes.values() if name in channels}
-    facts = {
-        "memory": equations.z_names,
-        "inputs": equations.inputs,
-        "noise": equations.noise,
-        "linear": equations.linear,
-        "products": equations.products,
-        "constant": equations.constant,
-        "unforced": equations.unforced,
-        "touched": [i for i, e in enumerate(added) if e != 0],
-        "moves_sensors": any(e != 0 for e in equations.offset),
-        "driven": any(e.has(*forces) for e in added)
-        and not any(e.has(*forces) for e in equations.rates),
-        "compensated": [i for i, e in enumerate(equations.compensation) if e != 0],
-        "delays": equations.delays,
-        "memory_uses": {},
-        "commands": [
-            i
-            for i, u in enumerate(equations.u)
-            if u not in forces
-            and equations.inputs[i] != "t"
-            and any(u in e.free_symbols for e in equations.rates)
-        ],
-        "braked": any(brakes & e.free_symbols for e in (*added, *equations.rates)),
-    }
-    sources = {"columns": array_source(equations, added)}
-    if equations.z:
-        sources["memory"], facts["memory_uses"] = memory_source(equations)
-    return facts, sources
-
-
-def _generate_whole(model: Model) -> tuple[dict[str, Any], dict[str, str]]:
-    """Which slopes are the same everywhere, and the source of the whole mechanism's functions."""
-    from bampipe.model_functions import ROWS
-    from bampipe.physics.codegen import (
-        bodies_along_motion,
-        bodies_at_state,
-        dynamics_source,
-        residual_source,
-        rows_source,
-        scalar_source,
-        slopes_source,
-    )
-
-    equations = _derive(model)
-    slopes, places = slopes_source(equations)
-    along, here = bodies_along_motion(equations), bodies_at_state(equations)
-    facts = {
-        "slopes": places,
-        "lasting": [i for i, by_axis in enumerate(equations.lasting) if by_axis is not None],
-        "of_bodies": equations.of_bodies,
-        "bodies": len(along.names),
-    }
-    sources = {
-        "slopes": slopes,
-        "dynamics": dynamics_source(equations),
-        "rows": rows_source(equations, ROWS),
-    }
-    sources["residual"], title = residual_source(equations, along.names), ""
-    if along.names:
-        sources["bodies"], sources["compiled_bodies"] = along.source, here.source
-        title = generated_code.module_title("compiled_bodies", here.source)
-    sources["compiled"] = scalar_source(equations, here, title)
-    return facts, sources
-
-
-_derived: dict[str, Equations] = {}
-"""By `Model.key`, the last used last."""
-_MOST_DERIVED = 4
-"""The device without effects, which every candidate wants, and those at hand."""
-
-
-def _derive(model: Model) -> Equations:
-    """Equations of a model; those asked for last are kept."""
-    from bampipe.physics.derivation import derive
-
-    known = _derived.pop(model.key, None) or derive(model)
-    _derived[model.key] = known
-    if len(_derived) > _MOST_DERIVED:
-        del _derived[next(iter(_derived))]
-    return known
+    return System(model, generated_code.load(model.key, generate))
