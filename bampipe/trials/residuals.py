@@ -59,7 +59,7 @@ def problem_of(
     n = len(system.parameters)
     # Of differences by many parameters few change the internal states or the bodies' forces.
     states = _Remembered([i for i, linear in enumerate((*system.linear, False)) if not linear])
-    bodies = _Remembered(range(n) if system.moves_sensors else sorted(system.of_bodies))
+    bodies = _Remembered(range(n + 1) if system.moves_sensors else sorted(system.of_bodies))
 
     def inputs_at(motion: Motion, p: Array) -> Array:
         u = motion.inputs(system.inputs)
