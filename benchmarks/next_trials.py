@@ -134,14 +134,18 @@ def worst_known(run: bampipe.Run) -> str:
 
 def ways_on(conditions: Conditions, path: Path) -> dict[str, Conditions]:
     """One trial more: the proposal in ``path`` followed well, sloppily, or the motion at hand."""
-    well, sloppy = Task.read(path), Task.read(path, reach=0.5, haste=2.0)
+    free = conditions.trials or 0
+    well, sloppy = (
+        tuple(task.of_trials(free, conditions.tasks) for task in Task.read(path, **sloppiness))
+        for sloppiness in ({}, {"reach": 0.5, "haste": 2.0})
+    )
     at_hand: dict[str, object] = {"trials": (conditions.trials or 0) + 1}
     if conditions.tasks:
-        again = replace(conditions.tasks[0], seconds=well.seconds)
+        again = replace(conditions.tasks[0], seconds=sum(task.seconds for task in well))
         at_hand = {"tasks": (*conditions.tasks, again)}
     return {
-        "well": replace(conditions, tasks=(*conditions.tasks, well)),
-        "sloppy": replace(conditions, tasks=(*conditions.tasks, sloppy)),
+        "well": replace(conditions, tasks=(*conditions.tasks, *well)),
+        "sloppy": replace(conditions, tasks=(*conditions.tasks, *sloppy)),
         "free": replace(conditions, **at_hand),
     }
 

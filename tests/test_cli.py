@@ -18,12 +18,13 @@ from made_results import filled, write_result
 
 import bampipe
 from bampipe.cli import one_stage, places, show
-from bampipe.cli.next_step import after_loop, after_run
+from bampipe.cli.next_step import after_loop, after_proposal, after_run
 from bampipe.errors import InputError
 from bampipe.results.compare import CompareResult
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.draft import DraftResult
 from bampipe.results.ingest import IngestResult
+from bampipe.results.next import NextResult
 from bampipe.run.events import Event
 from bampipe.run.pipeline import load
 from bampipe.run.status import StepStatus
@@ -561,6 +562,17 @@ def test_after_the_loop_comes_what_its_last_diagnosis_says(
     axes, command = {"yaw": {"verdict": verdict}}, "bampipe draft RUN --model base"
     write_result(ingested, DiagnoseResult, axes=axes, selected=selected, next=command)
     assert after_loop(ingested, "base", "s01") == after
+
+
+def test_what_a_diagnosis_found_comes_before_a_trial_for_the_parameters(ingested: Path) -> None:
+    recorded, command = "record that trial", "bampipe extend RUN stribeck:yaw --model base"
+    write_result(ingested, NextResult, purpose="precision")
+    assert after_proposal(ingested, "base", "s01").startswith(recorded)
+    axes = {"yaw": {"verdict": "missing"}}
+    write_result(ingested, DiagnoseResult, axes=axes, selected=("stribeck:yaw",), next=command)
+    assert after_proposal(ingested, "base", "s01") == command.replace("RUN", "s01")
+    write_result(ingested, NextResult, purpose="decision")
+    assert after_proposal(ingested, "base", "s01").startswith(recorded)
 
 
 def test_what_has_been_drafted_is_not_asked_for_again(ingested: Path) -> None:

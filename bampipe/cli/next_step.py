@@ -48,6 +48,23 @@ def after_loop(root: Path, model: str, name: str) -> str:
     return _after_diagnosis(run, model, found.next).replace("RUN", name)
 
 
+def after_proposal(root: Path, model: str, name: str) -> str:
+    """Return what to do after a trial has been proposed; arguments as for `after_run`.
+
+    What a diagnosis has found comes first, unless the trial is there to decide it.
+    """
+    from bampipe.results.diagnose import DiagnoseResult
+    from bampipe.results.next import NextResult
+
+    run = RunFolder(root)
+    decides = run.read(NextResult, model).purpose == "decision"
+    if not decides and run.exists(DiagnoseResult.file(model)):
+        found = run.read(DiagnoseResult, model)
+        if found.selected:
+            return _after_diagnosis(run, model, found.next).replace("RUN", name)
+    return "record that trial, add it to session.toml, and run the session again"
+
+
 def _after_diagnosis(run: RunFolder, model: str, said: str) -> str:
     """Return what a diagnosis said; where that is to draft and it is done, what came of that."""
     from bampipe.results.draft import DraftResult

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bampipe.cli import places, show
+from bampipe.cli.next_step import after_proposal
 from bampipe.cli.options import StageOptions
 from bampipe.run import batch, record
 from bampipe.run import pipeline as pipelines
@@ -132,12 +133,12 @@ def plain_stage(
         return
     root = places.find_run(run, options.runs)
     given = {name: value for name, value in more.items() if value}
-    one_stage(stage, root, options, model=model, more=given)
+    outcome = one_stage(stage, root, options, model=model, more=given)
     name = places.next_to(root, options.runs)
     if stage == "report":
         command = f"open {root / 'report' / 'report.pdf'}"
     elif stage == "next":
-        command = "record that trial, add it to session.toml, and run the session again"
+        command = after_proposal(root, outcome.steps[0].step.partition(":")[2], name)
     else:
         command = f"bampipe {AFTER[stage]} {name}"
     advise(options.quiet, options.json, command)

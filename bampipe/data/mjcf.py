@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from bampipe.data.chain import Body, DriveLimits, Tree, TreeJoint, symmetric
+from bampipe.data.rigid_body import Body, symmetric
+from bampipe.data.robot_tree import DriveLimits, Tree, TreeJoint
 from bampipe.data.robot_xml import document, number_list, numbers
 from bampipe.errors import InputError, did_you_mean
 from bampipe.lists import join_names
@@ -62,7 +63,7 @@ def mjcf_text(name: str, tree: Tree, gravity: Sequence[float], comment: str) -> 
 
 
 def _write_inertial(element: ElementTree.Element, body: Body) -> None:
-    """Give a body its mass; readers other than MuJoCo want to be told that there is none."""
+    """Write the inertial element of a body, zeros too: not every parser of MJCF takes none."""
     (xx, xy, xz), (_, yy, yz), (_, _, zz) = body.inertia
     inertial = ElementTree.SubElement(
         element, "inertial", pos=number_list(body.center), mass=number_list([body.mass])

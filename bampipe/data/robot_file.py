@@ -6,8 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from bampipe.data.chain import Chain, Tree, select_chain
+from bampipe.data.chain import Chain, select_chain
 from bampipe.data.mjcf import mjcf_tree
+from bampipe.data.robot_tree import Tree
 from bampipe.data.robot_xml import read_xml
 from bampipe.data.urdf import urdf_tree
 from bampipe.errors import InputError

@@ -10,20 +10,19 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from bampipe.data.chain import (
+from bampipe.data.device_file import tree_of_robot
+from bampipe.data.lumping import put_bodies
+from bampipe.data.mjcf import mjcf_text
+from bampipe.data.rigid_body import Body, symmetric
+from bampipe.data.robot_file import read_tree
+from bampipe.data.robot_tree import (
     UPRIGHT,
-    Body,
     DriveLimits,
     Tree,
     gravity_at,
     hold_beside,
     identifier,
-    put_bodies,
-    symmetric,
 )
-from bampipe.data.device_file import tree_of_robot
-from bampipe.data.mjcf import mjcf_text
-from bampipe.data.robot_file import read_tree
 from bampipe.data.robot_xml import number_list, read_xml
 from bampipe.data.run_folder import RunFolder
 from bampipe.data.urdf import changed_urdf, urdf_text

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import boolean, float64, int64, void
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 
 from bampipe.compiled import njit, record_type
 from bampipe.errors import InputError
@@ -29,6 +30,9 @@ _V = float64[::1]
 _M = float64[:, ::1]
 _I = int64[::1]
 _MOST_STEPS = 4000
+_WIDEST_GRID_S = 1e-3
+"""Longest time over which a continuous force may run straight: at a hundred samples a second, a
+straight line takes 3 % off what acts at 10 Hz, and at a thousand 0.03 %."""
 
 
 class Runaway(InputError):
@@ -248,6 +252,7 @@ def simulate(
     width: Array,
     n_noise: int,
     hold: bool = False,
+    smooth: Sequence[int] = (),
     max_step: float = 2.5e-4,
 ) -> Array:
     """Integrate the model from ``x0`` under given inputs, without process noise.
@@ -255,12 +260,13 @@ def simulate(
     Args:
         derivative: compiled f(x, u, p, w, dx), positions first in x, then rates, then states.
         x0: (nx,) state at the first sample.
-        u: (T, nu) inputs at the samples, interpolated linearly in between.
+        u: (T, nu) inputs at the samples, linear in between, but for those that are ``smooth``.
         p: (np,) parameters.
         dt: sampling interval, s.
         width: (n_q,) velocity over which friction changes sign, rad/s or m/s.
         n_noise: length of the model's process noise w.
         hold: keep each input constant over its interval instead.
+        smooth: columns of ``u`` that follow a cubic spline between samples, as forces do.
         max_step: longest integration step, s.
 
     Returns:
@@ -271,8 +277,9 @@ def simulate(
     """
     nobody = np.zeros((0, 0))
     return _integrate(
-        derivative, x0, u, p, dt, nobody, nobody, width, n_noise, max_step, hold=hold
-    )[0]
+        derivative, x0, u, p, dt, nobody, nobody, width, n_noise, max_step, hold=hold,
+        smooth=smooth,
+    )[0]  # fmt: skip
 
 
 def simulate_tracking(
@@ -293,6 +300,7 @@ def simulate_tracking(
     brake: Sequence[int] = (),
     brake_gain: Array | None = None,
     brake_time: float = 0.01,
+    smooth: Sequence[int] = (),
     max_step: float = 2.5e-4,
 ) -> tuple[Array, Array]:
     """Integrate the model under given inputs plus an arm that holds it near a given motion.
@@ -302,8 +310,8 @@ def simulate_tracking(
     the returned inputs, so these with the returned motion are one consistent recording.
 
     Args:
-        derivative, x0, p, dt, width, n_noise, max_step: as in `simulate`.
-        u: (T, nu) inputs without the arm's share; copied, interpolated linearly.
+        derivative, x0, p, dt, width, n_noise, smooth, max_step: as in `simulate`.
+        u: (T, nu) inputs without the arm's share; copied.
         q_ref, qd_ref: (T, n_q) motion that the arm wants.
         force: columns of ``u`` with the handle force, N. They may be fewer than coordinates; the
             arm's force is then the least-squares one.
@@ -325,7 +333,7 @@ def simulate_tracking(
         derivative, x0, u, p, dt, q_ref, qd_ref, width, n_noise, max_step,
         force=force, rate=rate, curvature=curvature, arm=impedance or Impedance(),
         brake=brake if brake_gain is not None else (), brake_gain=brake_gain,
-        brake_time=brake_time,
+        brake_time=brake_time, smooth=smooth,
     )  # fmt: skip
 
 
@@ -349,8 +357,16 @@ def _integrate(
     brake: Sequence[int] = (),
     brake_gain: Array | None = None,
     brake_time: float = 0.01,
+    smooth: Sequence[int] = (),
 ) -> tuple[Array, Array]:
     """Give `_run` its arrays and its memory; return states (T, nx) and inputs (T, nu)."""
+    finer = int(np.ceil(dt / _WIDEST_GRID_S - 1e-6)) if len(smooth) else 1
+    if finer > 1:
+        dt /= finer
+        u = _read_between(u, finer, smooth)
+        everything = range(q_ref.shape[1])
+        q_ref, qd_ref = (_read_between(ref, finer, everything) for ref in (q_ref, qd_ref))
+        brake_gain = None if brake_gain is None else _read_between(brake_gain, finer)
     x = np.zeros((len(u), len(x0)))
     x[0] = x0
     total = np.array(u, dtype=np.float64, order="C")
@@ -373,7 +389,21 @@ def _integrate(
         ),
     )  # fmt: skip
     require_finite(x, dt)
-    return x, total
+    return np.ascontiguousarray(x[::finer]), np.ascontiguousarray(total[::finer])
+
+
+def _read_between(values: Array, finer: int, smooth: Sequence[int] = ()) -> Array:
+    """Columns (T, n) on a grid that is ``finer`` times as fine: linear, or cubic where smooth."""
+    coarse = np.arange(len(values))
+    fine = np.arange((len(values) - 1) * finer + 1) / finer
+    between = np.empty((len(fine), values.shape[1]))
+    for column in range(values.shape[1]):
+        given = values[:, column]
+        if column in smooth and len(values) > 3:
+            between[:, column] = CubicSpline(coarse, given)(fine)
+        else:
+            between[:, column] = np.interp(fine, coarse, given)
+    return between
 
 
 def make_plant(p: Array, n_noise: int, width: Array, max_step: float) -> Plant:

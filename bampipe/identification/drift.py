@@ -154,7 +154,7 @@ def _simulate(system: System, window: _Window, state: Array, end: int) -> Array 
         with contextlib.suppress(Runaway):
             path = simulate(
                 system.derivative, state, window.u[window.at : end + 1], window.p, window.dt,
-                width=width, n_noise=len(system.noise), max_step=step,
+                width=width, n_noise=len(system.noise), smooth=system.forced, max_step=step,
             )  # fmt: skip
             return np.asarray(path[-1])
     return None

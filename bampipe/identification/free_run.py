@@ -139,7 +139,7 @@ def _open(system: System, motion: Motion, p: Array, push: Array | None = None) -
         start[:n] += push
     x = simulate(
         system.derivative, start, u, p[: len(system.parameters)], _interval(motion),
-        width=_width(system), n_noise=len(system.noise),
+        width=_width(system), n_noise=len(system.noise), smooth=system.forced,
     )  # fmt: skip
     readings = np.empty((len(x), 2 * n))
     for i in range(len(x)):

@@ -63,7 +63,8 @@ def cut_segments(system: System, motion: Motion, trial: Trial, p: Array) -> list
             try:
                 states = simulate(
                     system.derivative, x, moved, parameters[:-1], dt,
-                    width=width, n_noise=len(system.noise), max_step=_LONGEST_STEP,
+                    width=width, n_noise=len(system.noise), smooth=system.forced,
+                    max_step=_LONGEST_STEP,
                 )  # fmt: skip
             except InputError:  # a step too far: the fit halves it
                 return np.full((count, n), np.inf)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -26,6 +27,8 @@ _WORK = 2.5e7
 takes seconds, and some are left out."""
 _FEWEST = 12
 _FINALISTS, _OF_FEW = 5, 2
+_FOLLOWED = 4
+"""For each finalist, so many designs are also tried as somebody hasty follows them."""
 _VARIED = 2
 """Of the best, so many are tried in other surroundings."""
 _QUANTILE = 0.1
@@ -65,40 +68,122 @@ def rank_designs(
     axes: Sequence[int],
     with_rests: bool,
     progress: Callable[[float, str], None] = lambda fraction, message: None,
+    others: Sequence[Primitive] = (),
+    least: float = -np.inf,
 ) -> list[Tried]:
     """Try primitives about ``axes`` of so many seconds; the best ones as followed, best first.
 
-    One of them at least stays within what the trials at hand have shown.
+    What is best when it is followed exactly may be worth little to somebody hasty, so that the
+    finalists are those that are good both ways. One of them at least stays within what the trials
+    at hand have shown. ``others`` are tried beside these primitives. Nothing is returned where none
+    is worth ``least`` when it is followed exactly.
     """
-    designs = list_primitives(rehearsal.seen, seconds, axes, with_rests)
-    one = seconds * rehearsal.sensors.rate_hz * len(rehearsal.system.parameters)
-    most = max(_FEWEST, int(_WORK / one))
-    is_quick = len(designs) <= most
+
+    def try_design(design: Primitive) -> float:
+        return worth(rehearsal.record(design, 0))
+
+    def follow_hastily(value: float, design: Primitive) -> float:
+        return _robust([value, worth(rehearsal.record(design, HASTY))])
+
+    designs, is_quick = _list_designs(rehearsal, seconds, axes, with_rests, others)
     finalists = _FINALISTS if is_quick else _OF_FEW
-    designs = designs[:: -(-len(designs) // most)]
-    values = []
+    exact = []
     for k, design in enumerate(designs):
-        progress(0.6 * k / len(designs), f"trying {len(designs)} designs")
-        values.append(worth(rehearsal.record(design, 0)))
-    order = sorted(range(len(designs)), key=lambda k: -values[k])
-    best = [(values[k], designs[k]) for k in order[:finalists]]
+        progress(0.5 * k / len(designs), f"trying {len(designs)} designs")
+        exact.append((try_design(design), design))
+    exact.sort(key=lambda pair: -pair[0])
+    if exact[0][0] < least:
+        varied = (
+            try_design(other)
+            for _, design in exact[: _VARIED * is_quick]
+            for other in vary_surroundings(rehearsal.seen, design)
+        )
+        if all(value < least for value in varied):
+            return []
+    inside = [pair for pair in exact if not any(find_beyond(pair[1], rehearsal.seen))]
+    progress(0.5, "following them hastily")
+    ahead = exact[: _FOLLOWED * finalists]
+    if all(any(find_beyond(design, rehearsal.seen)) for _, design in ahead):
+        ahead += inside[:1]
+    best = [(follow_hastily(*pair), pair[1]) for pair in ahead]
+    best.sort(key=lambda pair: -pair[0])
+    near = next((d for _, d in best if not any(find_beyond(d, rehearsal.seen))), None)
     for _, design in best[: _VARIED * is_quick]:
         for other in vary_surroundings(rehearsal.seen, design):
-            best.append((worth(rehearsal.record(other, 0)), other))
+            best.append((follow_hastily(try_design(other), other), other))
     best.sort(key=lambda pair: -pair[0])
     chosen = [design for _, design in best[:finalists]]
-    inside = [k for k in order if not any(find_beyond(designs[k], rehearsal.seen))]
-    if inside and all(any(find_beyond(design, rehearsal.seen)) for design in chosen):
-        chosen[-1] = designs[inside[0]]
+    if near is not None and all(any(find_beyond(design, rehearsal.seen)) for design in chosen):
+        chosen[-1] = near
     tried = []
     for k, design in enumerate(chosen):
-        progress(0.7 + 0.3 * k / finalists, "following the best ones roughly")
-        motions = tuple(rehearsal.record(design, version) for version in _VERSIONS)
-        worths = [worth(motion) for motion in motions]
-        tried.append(Tried(design, float(np.quantile(worths, _QUANTILE)), motions))
+        progress(0.75 + 0.25 * k / finalists, "following the best ones roughly")
+        tried.append(_follow(rehearsal, design, worth))
     tried.sort(key=lambda one: -one.worth)
     least = tried[0].worth - _CLOSE * abs(tried[0].worth)
-    for k, near in enumerate(tried):
-        if near.worth >= least and not any(find_beyond(near.design, rehearsal.seen)):
-            return [near, *tried[:k], *tried[k + 1 :]]
+    for k, one in enumerate(tried):
+        if one.worth >= least and not any(find_beyond(one.design, rehearsal.seen)):
+            return [one, *tried[:k], *tried[k + 1 :]]
     return tried
+
+
+def find_best_of_each(
+    rehearsal: Rehearsal,
+    inform: Callable[[Motion], Array],
+    worths: Sequence[Callable[[Array], float]],
+    seconds: float,
+    axes: Sequence[int],
+    others: Sequence[Primitive] = (),
+) -> list[Tried]:
+    """The best designs by each of several worths, each once; all are recorded once for them all.
+
+    Args:
+        inform: the information (m, m) of a motion; worths: of it, larger is better.
+        rehearsal, seconds, axes, others: as of `rank_designs`.
+    """
+    designs, is_quick = _list_designs(rehearsal, seconds, axes, False, others)
+    known = [inform(rehearsal.record(design, 0)) for design in designs]
+    counted = Counter(
+        k
+        for worth in worths
+        for k in sorted(range(len(designs)), key=lambda k: -worth(known[k]))[:_OF_FEW]
+    )
+    # Where that takes long, only the designs that are good by most worths are followed.
+    chosen = [k for k, _ in counted.most_common(None if is_quick else _OF_FEW)]
+    motions = {k: _versions(rehearsal, designs[k]) for k in chosen}
+    informed = {k: [inform(motion) for motion in motions[k]] for k in chosen}
+    found: dict[int, Tried] = {}
+    for worth in worths:
+        values = {k: _robust([worth(one) for one in informed[k]]) for k in chosen}
+        best = max(chosen, key=lambda k: values[k])
+        found.setdefault(best, Tried(designs[best], values[best], motions[best]))
+    return list(found.values())
+
+
+def _list_designs(
+    rehearsal: Rehearsal,
+    seconds: float,
+    axes: Sequence[int],
+    with_rests: bool,
+    others: Sequence[Primitive],
+) -> tuple[list[Primitive], bool]:
+    """The designs to try, and whether that takes so little that none was left out."""
+    designs = list_primitives(rehearsal.seen, seconds, axes, with_rests)
+    work = seconds * rehearsal.sensors.rate_hz * len(rehearsal.system.parameters)
+    most = max(_FEWEST, int(_WORK / work))
+    return [*designs[:: -(-len(designs) // most)], *others], len(designs) <= most
+
+
+def _follow(rehearsal: Rehearsal, design: Primitive, worth: Worth) -> Tried:
+    """A design as different people follow it."""
+    motions = _versions(rehearsal, design)
+    return Tried(design, _robust([worth(motion) for motion in motions]), motions)
+
+
+def _versions(rehearsal: Rehearsal, design: Primitive) -> tuple[Motion, ...]:
+    return tuple(rehearsal.record(design, version) for version in _VERSIONS)
+
+
+def _robust(worths: Sequence[float]) -> float:
+    """What a design is worth on a bad day."""
+    return float(np.quantile(worths, _QUANTILE))

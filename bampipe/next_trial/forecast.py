@@ -51,9 +51,7 @@ class Forecast:
         device = system.model.device
         axes = device.coordinates
         added = [self.precision.of_motion(motion) for motion in tried.usual]
-        pose = {
-            axes[i].name: float(design.pose[i]) for i in range(len(axes)) if i not in design.strokes
-        }
+        held = [i for i in range(len(axes)) if i not in design.strokes and not design.example]
         farther, faster = (
             tuple(axes[i].name for i in found) for found in find_beyond(design, self.rehearsal.seen)
         )
@@ -61,7 +59,9 @@ class Forecast:
             sentence=describe(design, self.rehearsal.seen, device),
             seconds=design.seconds,
             moves=describe_moves(design, self.rehearsal),
-            pose=pose,
+            pose={axes[i].name: float(design.pose[i]) for i in held},
+            like=design.example.trial if design.example else "",
+            parts=design.parts,
             brakes=design.field,
             levels=dict(design.levels or {}),
             worth=tried.worth,

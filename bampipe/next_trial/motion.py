@@ -6,12 +6,13 @@ own, and goes through the sensors and filters of the session.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bampipe.next_trial.primitives import PEAK, Envelope, Primitive, Stroke
+from bampipe.next_trial.primitives import PEAK, Envelope, Example, Primitive, Stroke
 from bampipe.physics import System
 from bampipe.physics.device import LAST_ORDER, derivative
 from bampipe.trials.kinematics import Kinematics
@@ -28,6 +29,9 @@ the last two as shares of the range."""
 TRAJECTORY_HZ = 100.0
 HASTY = -1
 """Number of the version of somebody who covers half the range at twice the speed."""
+_FADE_S, _START_S = 2.0, 1.0
+"""In which the end of a trial that is imitated passes into its beginning, and in which a robot that
+imitates it gets under way."""
 _STEPS = 4
 """Of the search for the force, where what the model requires depends on the force itself."""
 
@@ -58,8 +62,12 @@ class Rehearsal:
         return self._observe(*self._path(given, t, rng, exact=version == 0), given, rng)
 
     def trajectory(self, design: Primitive) -> tuple[Array, Array]:
-        """Times (T,), s, and positions (T, n_q) of a design that is followed exactly."""
-        t = np.arange(int(design.seconds * TRAJECTORY_HZ)) / TRAJECTORY_HZ
+        """Times (T,), s, and positions (T, n_q) of one trial that follows a design exactly."""
+        t = np.arange(int(design.part_s * TRAJECTORY_HZ)) / TRAJECTORY_HZ
+        if design.example is not None:
+            # It starts at rest, wherever the trial is cut.
+            started = np.where(t < _START_S, 0.5 * t**2 / _START_S, t - 0.5 * _START_S)
+            return t, example_path(design.example, started)[0]
         rng = np.random.default_rng([self.seed, 1])
         return t, self._path(design, t, rng, exact=True)[0]
 
@@ -67,6 +75,8 @@ class Rehearsal:
         self, design: Primitive, t: Array, rng: np.random.Generator, exact: bool
     ) -> tuple[Array, Array, Array]:
         """Position, velocity and acceleration along a design at times ``t``, each (T, n_q)."""
+        if design.example is not None:
+            return example_path(design.example, t)
         n = len(self.system.coordinates)
         q, qd, qdd = np.tile(design.pose, (t.size, 1)), np.zeros((t.size, n)), np.zeros((t.size, n))
         for axis, stroke in design.strokes.items():
@@ -105,23 +115,35 @@ class Rehearsal:
             u = motion.inputs(system.inputs)
             left, _ = residual_and_memory(system, motion, u, self.p)
             gains = system.input_map(motion.q, u, self.p)
-            excess = np.einsum("tfq,tq->tf", np.linalg.pinv(gains), left)
-            changed = {}
-            for k, name in enumerate(forces):
-                values = motion.channels[name] - excess[:, k]
-                rates = self.kinematics.input_rates(values)
-                changed[name] = values
+            excess = _solve(gains, left)
+            changed = {name: motion.channels[name] - excess[:, k] for k, name in enumerate(forces)}
+            if not system.driven and not system.memory_names:
+                # Nothing else depends on the force: its rates are not needed.
+                return motion.with_channels(changed)
+            for name in forces:
+                rates = self.kinematics.input_rates(changed[name])
                 changed |= {derivative(name, o + 1): rate for o, rate in enumerate(rates)}
             motion = motion.with_channels(changed)
-            if not system.driven and not system.memory_names:
-                break
         return motion
+
+
+def _solve(gains: Array, left: Array) -> Array:
+    """The least forces (T, n_f) that make up for ``left`` (T, n_q) through ``gains``."""
+    if gains.shape[1] == gains.shape[2]:
+        # Some ten times as fast; a pose in which a force does nothing has no solution.
+        with suppress(np.linalg.LinAlgError):
+            return np.asarray(np.linalg.solve(gains, left[..., None])[..., 0])
+    return np.asarray(np.einsum("tfq,tq->tf", np.linalg.pinv(gains), left))
 
 
 def follow_roughly(
     design: Primitive, seen: Envelope, rng: np.random.Generator, hastily: bool
 ) -> Primitive:
     """A design as a person follows it: other speeds and turns, no farther than any design."""
+    if design.example is not None:
+        haste = 2.0 if hastily else 1.0 + rng.uniform(-_SPEED, _SPEED)
+        reach = 0.5 if hastily else 1.0 - rng.uniform(0.0, _RANGE)
+        return replace(design, example=replace(design.example, reach=reach, haste=haste))
     strokes, (lowest, highest) = {}, seen.reach
     for axis, stroke in design.strokes.items():
         speed = 2.0 if hastily else 1.0 + rng.uniform(-_SPEED, _SPEED)
@@ -137,6 +159,40 @@ def follow_roughly(
             fast=speed * stroke.fast,
         )
     return replace(design, strokes=strokes)
+
+
+def example_path(example: Example, t: Array) -> tuple[Array, Array, Array]:
+    """Position, velocity and acceleration, each (T, n_q), of a trial again and again.
+
+    Its end passes smoothly into its beginning.
+
+    Args:
+        example: the trial, and how it is followed; t: (T,) times from 0 on, s.
+    """
+    motion = example.motion
+    record = np.stack([motion.q, motion.qd, motion.qdd])
+    clock = motion.t - motion.t[0]
+    fade = min(_FADE_S, 0.25 * float(clock[-1]))
+    period, rate = float(clock[-1]) - fade, example.haste / example.reach
+    at = (rate * t) % period
+
+    def read(times: Array) -> Array:
+        axes = range(record.shape[2])
+        rows = [[np.interp(times, clock, part[:, i]) for i in axes] for part in record]
+        return np.asarray(rows).transpose(0, 2, 1)
+
+    start, end = read(at), read(np.minimum(at + period, clock[-1]))
+    s = np.minimum(at / fade, 1.0)[:, None]
+    w = s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
+    w_t = 30.0 * s**2 * (1.0 - s) ** 2 / fade
+    w_tt = 60.0 * s * (1.0 - s) * (1.0 - 2.0 * s) / fade**2
+    q, qd, qdd = start - end
+    middle = np.median(motion.q, axis=0)
+    return (
+        middle + example.reach * (end[0] + w * q - middle),
+        example.reach * rate * (end[1] + w * qd + w_t * q),
+        example.reach * rate**2 * (end[2] + w * qdd + 2.0 * w_t * qd + w_tt * q),
+    )
 
 
 def stroke_path(

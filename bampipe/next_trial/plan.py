@@ -160,14 +160,14 @@ def record_plan(forecast: Forecast, goal: Goal, found: TrialPlan) -> Plan:
             for pair, after in found.confusion.items()
         )
     return Plan(
-        sentence=_sentence(len(found.designs), seconds, found.is_enough),
+        sentence=_sentence(sum(design.parts for design in found.designs), seconds, found.is_enough),
         seconds=seconds,
         is_enough=found.is_enough,
         trials=tuple(
             PlannedTrial(
-                sentence=describe(design, seen, system.model.device),
-                seconds=design.seconds,
-                times=times,
+                sentence=describe(_part_of(design), seen, system.model.device),
+                seconds=design.part_s,
+                times=times * design.parts,
                 moves=describe_moves(design, forecast.rehearsal),
             )
             for design, times in _counted(found.designs)
@@ -187,6 +187,11 @@ def record_plan(forecast: Forecast, goal: Goal, found: TrialPlan) -> Plan:
         },
         confusion=confusion,
     )
+
+
+def _part_of(design: Primitive) -> Primitive:
+    """One trial of a design: a sheet has how often it is recorded beside it."""
+    return replace(design, seconds=design.part_s, parts=1)
 
 
 def _counted(designs: Sequence[Primitive]) -> list[tuple[Primitive, int]]:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.physics import System
+from bampipe.trials.measured import trial_of_block
 from bampipe.trials.motion import Motion
 
 Array = NDArray[np.float64]
@@ -19,6 +20,11 @@ squared, see `PEAK_ACCELERATION` (Flash and Hogan 1985)."""
 PEAK_ACCELERATION = 5.77
 _FEWEST_STROKES = 3
 """In a trial: a sweep too slow for so many is made shorter."""
+_PARTS = 2
+"""Trials in which motion is recorded that leaves what has been seen: each trial is judged by what
+the others say, and a trial that is the only one of its kind can be judged by none."""
+_SHORTEST_S = 4.0
+"""Of each of these."""
 _HIGHEST = 0.6
 _SPEEDS = {"slow": (0.02, 0.08), "moderate": (0.15, 0.35), "fast": (0.35, _HIGHEST)}
 """Bands of the highest speed of each stroke, as shares of the speed seen in the trials: people
@@ -191,8 +197,33 @@ class Stroke:
 
 
 @dataclass(frozen=True)
+class Example:
+    """A trial at hand that is imitated.
+
+    Attributes:
+        motion: what was recorded; trial: its name.
+        reach: share of its range that is covered; haste: factor on its speeds.
+    """
+
+    motion: Motion
+    trial: str
+    reach: float = 1.0
+    haste: float = 1.0
+
+    @property
+    def ends(self) -> tuple[Array, Array]:
+        """Lowest and highest positions but for the outermost hundredths, each (n_q,)."""
+        return np.quantile(self.motion.q, 0.01, axis=0), np.quantile(self.motion.q, 0.99, axis=0)
+
+    @property
+    def speed(self) -> Array:
+        """Highest speed but for the fastest hundredth, (n_q,), rad/s or m/s."""
+        return np.asarray(np.quantile(np.abs(self.motion.qd), 0.99, axis=0))
+
+
+@dataclass(frozen=True)
 class Primitive:
-    """One trial that a person can record.
+    """One trial that a person can record, or one in several parts.
 
     Attributes:
         strokes: by number of the axis, those that move; the first is the one that it is about.
@@ -200,6 +231,8 @@ class Primitive:
         seconds: how long.
         field: share of the brake commands of the viscous trials, 0 without brakes.
         levels: values at which further channels are held.
+        parts: trials in which it is recorded, each as long.
+        example: what is imitated where there are no strokes.
     """
 
     strokes: Mapping[int, Stroke]
@@ -207,11 +240,13 @@ class Primitive:
     seconds: float
     field: float = 0.0
     levels: Mapping[str, float] | None = None
+    parts: int = 1
+    example: Example | None = None
 
     @property
-    def axis(self) -> int:
-        """The axis that it is about."""
-        return next(iter(self.strokes))
+    def part_s(self) -> float:
+        """How long each of its trials is, s."""
+        return self.seconds / self.parts
 
 
 def list_primitives(
@@ -224,9 +259,30 @@ def list_primitives(
     """
     found = _list_within(seen, seen, seconds, axes, with_rests)
     if seen.wider is not None:
-        others = _list_within(seen.wider, seen, seconds, axes, with_rests)
-        found += [design for design in others if any(find_beyond(design, seen, _HIGHEST))]
+        part_s = max(seconds / _PARTS, min(seconds, _SHORTEST_S))
+        others = _list_within(seen.wider, seen, part_s, axes, with_rests)
+        found += [
+            _in_parts(replace(design, seconds=seconds), seen)
+            for design in others
+            if any(find_beyond(design, seen, _HIGHEST))
+        ]
     return found
+
+
+def imitate_trials(motions: Sequence[Motion], seen: Envelope, seconds: float) -> list[Primitive]:
+    """Primitives that imitate each of ``motions``; of a trial in blocks, the longest."""
+    examples: dict[str, Example] = {}
+    for motion in sorted(motions, key=lambda motion: -motion.t.size):
+        example = Example(motion, trial_of_block(motion.trial_id))
+        if (example.speed > 0.0).any():
+            examples.setdefault(example.trial, example)
+    return [Primitive({}, seen.usual, seconds, example=examples[name]) for name in sorted(examples)]
+
+
+def _in_parts(design: Primitive, seen: Envelope) -> Primitive:
+    """The same in several trials where it leaves what has been seen, and is long enough."""
+    is_new = any(find_beyond(design, seen)) and design.seconds >= _PARTS * _SHORTEST_S
+    return replace(design, parts=_PARTS if is_new else 1)
 
 
 def find_beyond(
@@ -338,7 +394,7 @@ def vary_surroundings(seen: Envelope, given: Primitive) -> Iterator[Primitive]:
             if reach is seen or high - low > float(seen.high[axis] - seen.low[axis]):
                 for share in _POSES:
                     moved = _gentle(reach, given.seconds, axis, low + share * (high - low)).strokes
-                    yield replace(given, strokes={**given.strokes, **moved})
+                    yield _in_parts(replace(given, strokes={**given.strokes, **moved}), seen)
     if seen.field.any():
         for field in _FIELDS:
             yield replace(given, field=field)

@@ -30,7 +30,6 @@ def explain_proposal(
     table: Mapping[str, Detectable],
     unlimited: Sequence[str],
     lacking: Sequence[str],
-    better: str,
     missing: Sequence[str] = (),
 ) -> Reasons:
     """Say why a trial is proposed and what it is expected to give.
@@ -40,23 +39,22 @@ def explain_proposal(
         best: the proposal; table: by effect, from which size on trials show it.
         unlimited: axes of which the device states no range, so that nothing wider was tried.
         lacking: axes whose held-out error is above the noise floor.
-        better: trial at hand the like of which says more, "" if none.
         missing: effects that the diagnosis found and the model does not have.
     """
     why, expected = _explain(purpose, parameter, best, table, unlimited)
-    if better:
-        what = f"`{parameter}`" if parameter else "the parameters"
-        expected += (
-            f" Moving freely as in trial {better} for as long would say more of {what}: rather"
-            " record that."
-        )
     if best.farther or best.faster:
         expected += _UNTRIED
-    if best.sd and missing:
-        expected += (
-            f" By the diagnosis the model lacks {join_names(missing, _SHOWN)}: add that first"
-            " (`bampipe extend`), for these are the uncertainties of a model without."
+    if best.parts > 1:
+        why += (
+            " It takes more than one trial, because each is judged by what the others say and none"
+            " at hand is like it."
         )
+    if best.sd and missing:
+        why = (
+            f"By the diagnosis the model lacks {join_names(missing, _SHOWN)}: add that first"
+            f" (`bampipe extend`), and ask again. {why}"
+        )
+        expected += " These are the uncertainties of a model that lacks something."
     elif best.sd and lacking:
         expected += (
             f" The error of {join_names(lacking, _SHOWN)} is above the noise floor: what the model"
@@ -75,14 +73,17 @@ def _explain(
     """Why, and what is expected as far as the model goes."""
     if purpose == "decision":
         return _decision(best, unlimited)
-    if purpose == "sensitivity":
-        return _unseen(table), _detected(table) or _narrowed(parameter, best)
     most = (
         f"says most of `{parameter}`"
         if parameter
         else "adds most to what is known of all parameters together"
     )
-    return f"Of the motions tried, this one {most}.", _narrowed(parameter, best)
+    narrowed = _narrowed(parameter, best)
+    if purpose == "sensitivity":
+        shown = _detected(table)
+        # Nothing tried shows more: then it is for the parameters.
+        return _unseen(table) + ("" if shown else f" This one {most}."), shown or narrowed
+    return f"Of the motions tried, this one {most}.", narrowed
 
 
 def _decision(best: Proposal, unlimited: Sequence[str]) -> tuple[str, str]:

@@ -8,7 +8,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from bampipe.lists import join_names
-from bampipe.next_trial.primitives import PEAK, Envelope, Primitive, Stroke, find_beyond
+from bampipe.next_trial.primitives import (
+    PEAK,
+    Envelope,
+    Example,
+    Primitive,
+    Stroke,
+    find_beyond,
+)
 from bampipe.physics.device import Device
 
 _SLOW, _FAST = 0.12, 0.45
@@ -18,7 +25,9 @@ _SLOW, _FAST = 0.12, 0.45
 def describe(design: Primitive, seen: Envelope, device: Device) -> str:
     """Say what to do in one sentence."""
     axes = device.coordinates
-    first = design.axis
+    if design.example is not None:
+        return f"{_imitate(design, design.example, device)}{_with(design, device)}."
+    first = next(iter(design.strokes))
     beside = [i for i, one in design.strokes.items() if one.gentle]
     strokes = {i: one for i, one in design.strokes.items() if i not in beside}
     names = [axes[i].name for i in strokes]
@@ -35,6 +44,8 @@ def describe(design: Primitive, seen: Envelope, device: Device) -> str:
         )
         text = f"Move {join_names(names)} back and forth at once, {each}"
     text += f", for {design.seconds:.3g} s"
+    if design.parts > 1:
+        text += f" in {design.parts} trials of {design.part_s:.3g} s"
     if beside:
         about = join_names(_about(design.strokes[i], axes[i].unit) for i in beside)
         others = join_names(axes[i].name for i in beside)
@@ -42,16 +53,49 @@ def describe(design: Primitive, seen: Envelope, device: Device) -> str:
     still = [i for i in range(len(axes)) if i not in design.strokes]
     if still:
         text += f"; leave {join_names(axes[i].name for i in still)} alone"
-    if design.field:
-        share = "half as strong as" if design.field < 1.0 else "as"
-        text += f"; with the brakes on, {share} in the viscous trials"
-    for name, level in (design.levels or {}).items():
-        unit = device.channels[name]
-        text += f"; with {name} held at {level:.3g} {unit}".rstrip()
+    text += _with(design, device)
     farther, faster = ([axes[i].name for i in group] for group in find_beyond(design, seen))
     if farther or faster:
         text += _beyond(farther, faster)
     return text + "."
+
+
+def _with(design: Primitive, device: Device) -> str:
+    """What else is set, at the end of a sentence."""
+    text = ""
+    if design.field:
+        share = "half as strong as" if design.field < 1.0 else "as"
+        text += f"; with the brakes on, {share} in the viscous trials"
+    for name, level in (design.levels or {}).items():
+        text += f"; with {name} held at {level:.3g} {device.channels[name]}".rstrip()
+    return text
+
+
+def _imitate(design: Primitive, example: Example, device: Device) -> str:
+    """What to do so that a trial becomes like one at hand."""
+    axes = device.coordinates
+    (low, high), speed = example.ends, example.speed
+    moving = [i for i in range(len(axes)) if speed[i] > 0.0 and high[i] > low[i]]
+    each = ", ".join(
+        f"{axes[i].name} {_ends(Stroke(low[i], high[i], 0.0, 0.0), axes[i].unit)}"
+        f" at up to {_speed(speed[i], axes[i].unit)}"
+        for i in moving
+    )
+    return (
+        f"Move {join_names(axes[i].name for i in moving)} as in trial {example.trial}, {each}, for"
+        f" {design.seconds:.3g} s"
+    )
+
+
+def _speed(value: float, unit: str) -> str:
+    if unit == "rad":
+        return f"{_two_figures(math.degrees(value))}°/s"
+    return f"{_two_figures(1e3 * value)} mm/s"
+
+
+def _two_figures(value: float) -> str:
+    """A number rounded to two figures."""
+    return f"{float(f'{value:.2g}'):g}"
 
 
 def _beyond(farther: Sequence[str], faster: Sequence[str]) -> str:

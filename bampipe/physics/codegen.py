@@ -61,136 +61,6 @@ V = types.float64[::1]
 '''
 
 
-# Positions and inputs are linear between samples, rates are not: of a motion with eight samples a
-# period a straight line takes a twentieth off the distance between them.
-BETWEEN = '''
-
-@njit(types.void(M, M, M, M, types.int64, types.float64, types.float64, V, V, V))
-def between(q, qd, qdd, u, i, h, share, x, v, w):
-    """Fills x, v, w with positions, rates and inputs between samples i and i + 1, h apart."""
-    for j in range(len(x)):
-        x[j] = q[i, j] + share * (q[i + 1, j] - q[i, j])
-    for j in range(len(v)):
-        d = qd[i + 1, j] - qd[i, j]
-        bent = (1.0 - share) * (h * qdd[i, j] - d) - share * (h * qdd[i + 1, j] - d)
-        v[j] = qd[i, j] + share * (d + (1.0 - share) * bent)
-    for j in range(len(w)):
-        w[j] = u[i, j] + share * (u[i + 1, j] - u[i, j])
-'''
-
-MEMORY_LOOP = '''
-
-@njit(types.float64(M, M, M, M, V, V, V, types.int64, M), cache=True, error_model='numpy')
-def memory(q, qd, qdd, u, p, t, z0, steps, out):
-    """RK4 along the samples of a motion; fills out (T, n_z).
-
-    Returns the largest product of a step and the rate at which a state decays in it.
-    """
-    fastest = 0.0
-    n = len(z0)
-    k1, k2, k3, k4 = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
-    z, at = z0.copy(), np.empty(n)
-    a, b, c = q[0].copy(), qd[0].copy(), u[0].copy()
-    out[0] = z
-    for i in range(len(t) - 1):
-        h = (t[i + 1] - t[i]) / steps
-        for s in range(2 * steps):
-            share = (s + 1) / (2 * steps)
-            if s % 2 == 0:
-                memory_rate(a, b, c, p, z, k1)
-                for j in range(n):
-                    at[j] = z[j] + 0.5 * h * k1[j]
-            between(q, qd, qdd, u, i, t[i + 1] - t[i], share, a, b, c)
-            if s % 2 == 0:
-                memory_rate(a, b, c, p, at, k2)
-                for j in range(n):
-                    at[j] = z[j] + 0.5 * h * k2[j]
-                memory_rate(a, b, c, p, at, k3)
-                moved, turned = 0.0, 0.0
-                for j in range(n):
-                    at[j] = z[j] + h * k3[j]
-                    moved += abs(k2[j] - k1[j])
-                    turned += abs(k3[j] - k2[j])
-                if 2.0 * turned > fastest * moved and turned > 1e-12 * moved:
-                    fastest = 2.0 * turned / moved
-            else:
-                memory_rate(a, b, c, p, at, k4)
-                for j in range(n):
-                    z[j] += h / 6.0 * (k1[j] + 2.0 * k2[j] + 2.0 * k3[j] + k4[j])
-        out[i + 1] = z
-    return fastest
-'''
-
-
-# Where no state's rate depends on another state: steps that are exact for the rate at the middle of
-# a step, linearised in its state (exponential Rosenbrock-Euler, Hochbruck and Ostermann 2010, Acta
-# Numerica 19). However stiff, it stays stable: a hysteresis over micrometres is passed many times
-# between two samples.
-STIFF_MEMORY_LOOP = '''
-
-@njit(types.float64(M, M, M, M, V, V, V, types.int64, M), cache=True, error_model='numpy')
-def stiff_memory(q, qd, qdd, u, p, t, z0, steps, out):
-    """Exponential steps along the samples of a motion; fills out (T, n_z).
-
-    Returns 0: however fast a state decays, such steps follow it.
-    """
-    n = len(z0)
-    rate, slope = np.empty(n), np.empty(n)
-    z, x, v, w = z0.copy(), q[0].copy(), qd[0].copy(), u[0].copy()
-    out[0] = z
-    for i in range(len(t) - 1):
-        h = (t[i + 1] - t[i]) / steps
-        for s in range(steps):
-            share = (s + 0.5) / steps
-            between(q, qd, qdd, u, i, t[i + 1] - t[i], share, x, v, w)
-            memory_rate(x, v, w, p, z, rate)
-            memory_slope(x, v, w, p, z, slope)
-            for j in range(n):
-                k = h * slope[j]
-                z[j] += h * rate[j] * (1.0 + k / 2.0 if abs(k) < 1e-5 else (exp(k) - 1.0) / k)
-        out[i + 1] = z
-    return 0.0
-'''
-
-
-# A state whose rate is c + b*z, with b of motion and inputs: exact for c and b constant in a step,
-# and for c changing linearly where b depends on parameters alone. However stiff, it stays stable.
-LINEAR_MEMORY_LOOP = '''
-
-@njit(types.float64(M, M, M, M, V, V, V, types.int64, M), cache=True, error_model='numpy')
-def memory(q, qd, qdd, u, p, t, z0, steps, out):
-    """Exponential steps along the samples of a motion; fills out (T, n_z).
-
-    Returns 0: however fast a state decays, such steps follow it.
-    """
-    n = len(z0)
-    c0, b0, c1, b1 = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
-    z, x, v, w = z0.copy(), q[0].copy(), qd[0].copy(), u[0].copy()
-    out[0] = z
-    memory_terms(x, v, w, p, c0, b0)
-    if RAMP and len(v) == 0:
-        steps = 1
-    for i in range(len(t) - 1):
-        h = (t[i + 1] - t[i]) / steps
-        for s in range(steps):
-            share = (s + 1) / steps
-            between(q, qd, qdd, u, i, t[i + 1] - t[i], share, x, v, w)
-            memory_terms(x, v, w, p, c1, b1)
-            for j in range(n):
-                k = 0.5 * h * (b0[j] + b1[j])
-                if abs(k) < 1e-3:
-                    mean, ramp = 1.0 + k / 2.0 + k * k / 6.0, 0.5 + k / 6.0 + k * k / 24.0
-                else:
-                    mean = (exp(k) - 1.0) / k
-                    ramp = (mean - 1.0) / k
-                added = c0[j] * mean + (c1[j] - c0[j]) * (ramp if RAMP else 0.5 * mean)
-                z[j] = z[j] * (1.0 + k * mean) + h * added
-                c0[j], b0[j] = c1[j], b1[j]
-        out[i + 1] = z
-    return 0.0
-'''
-
-
 class _Printer(PythonCodePrinter):  # type: ignore[misc]
     """Prints with bare function names that each header defines in its own way."""
 
@@ -237,7 +107,7 @@ class _Printer(PythonCodePrinter):  # type: ignore[misc]
 
 
 @dataclass(frozen=True)
-class _Block:
+class Block:
     """Straight text that computes results.
 
     Attributes:
@@ -259,10 +129,10 @@ def _printed(value: Any) -> tuple[str, frozenset[Any]]:
 
 @dataclass(frozen=True)
 class Bodies:
-    """Compiled functions of a robot's bodies, the same text for all models of the robot.
+    """A compiled function of a robot's bodies, the same text for all models of the robot.
 
     Attributes:
-        names: intermediates that they return, in order; none where the device is no robot.
+        names: intermediates that it gives, in order; none where the device is no robot.
         source: of the module; empty without names.
     """
 
@@ -272,39 +142,38 @@ class Bodies:
 
 def bodies_at_state(e: Equations) -> Bodies:
     """``bodies(x, p)``: what the mass matrix and the bias take from a robot's bodies."""
-    groups = {"x": ([*e.q, *e.qd], "{}"), "p": (e.p, "{}")}
-    return _bodies(e, [*_upper(e), *e.bias], groups, "x, p", "V, V")
+    names, block = _of_bodies(e, [*_upper(e), *e.bias])
+    if not names:
+        return Bodies((), "")
+    lines = [*unpack("x", [*e.q, *e.qd], block.used), *unpack("p", e.p, block.used)]
+    lines += [*block.lines, f"return ({', '.join(block.values)},)"]
+    returned = f"types.UniTuple(types.float64, {len(names)})"
+    head = f"\n\n@njit({returned}(V, V), cache=True, error_model='numpy')"
+    body = "\n    ".join(lines)
+    return Bodies(names, f"{SCALAR_HEADER}{head}\ndef bodies(x, p):\n    {body}\n")
 
 
 def bodies_along_motion(e: Equations) -> Bodies:
-    """``bodies(row, q, qd, qdd, p)``: the forces that a robot's bodies require in one sample."""
-    motion = {"q": e.q, "qd": e.qd, "qdd": e.qdd}
-    groups = {name: (symbols, "row, {}") for name, symbols in motion.items()}
-    groups["p"] = (e.p, "{}")
-    return _bodies(e, e.dynamics, groups, "row, q, qd, qdd, p", "types.int64, M, M, M, V")
-
-
-def _bodies(
-    e: Equations,
-    results: Sequence[Any],
-    groups: Mapping[str, tuple[Sequence[Any], str]],
-    arguments: str,
-    kinds: str,
-) -> Bodies:
-    """The function of those of ``e.steps`` that ``results`` take as they are."""
-    wanted: set[Any] = set().union(*(sp.sympify(x, strict=True).free_symbols for x in results))
-    names = tuple(name for name, _ in e.steps if name in wanted)
+    """``bodies(q, qd, qdd, p, out)``: the forces that a robot's bodies require, (T, names)."""
+    names, block = _of_bodies(e, e.dynamics)
     if not names:
         return Bodies((), "")
-    block = _block(names, e.steps)
-    lines = []
-    for group, (symbols, index) in groups.items():
-        lines += _unpack(group, symbols, block.used, index)
-    lines += [*block.lines, f"return ({', '.join(block.values)},)"]
-    returned = f"types.UniTuple(types.float64, {len(names)})"
-    head = f"\n\n@njit({returned}({kinds}), cache=True, error_model='numpy')"
-    body = "\n    ".join(lines)
-    return Bodies(names, f"{SCALAR_HEADER}{head}\ndef bodies({arguments}):\n    {body}\n")
+    row = []
+    for group, symbols in {"q": e.q, "qd": e.qd, "qdd": e.qdd}.items():
+        row += unpack(group, symbols, block.used, "row, {}")
+    row += [*block.lines, *(f"out[row, {i}] = {v}" for i, v in enumerate(block.values))]
+    body = [*unpack("p", e.p, block.used), *_loop("for row in range(len(q)):", row)]
+    source = compiled_function(
+        "bodies", "q, qd, qdd, p, out", body, kinds="M, M, M, V, M", options=""
+    )
+    return Bodies(names, SCALAR_HEADER + source)
+
+
+def _of_bodies(e: Equations, results: Sequence[Any]) -> tuple[tuple[Any, ...], Block]:
+    """Those of ``e.steps`` that ``results`` take as they are, and their text."""
+    wanted: set[Any] = set().union(*(sp.sympify(x, strict=True).free_symbols for x in results))
+    names = tuple(name for name, _ in e.steps if name in wanted)
+    return names, print_block(names, e.steps) if names else Block(set(), [], [])
 
 
 def _upper(e: Equations) -> list[Any]:
@@ -312,9 +181,9 @@ def _upper(e: Equations) -> list[Any]:
     return [e.mass[i][j] for i in range(len(e.q)) for j in range(i, len(e.q))]
 
 
-def _block(
+def print_block(
     results: Sequence[Any], steps: Sequence[tuple[Any, Any]] = (), known: Sequence[Any] = ()
-) -> _Block:
+) -> Block:
     """The text of ``results``, with those of ``steps`` in front that they need.
 
     Those in ``known`` have been assigned before.
@@ -329,10 +198,10 @@ def _block(
             used |= symbols
     shared, reduced = sp.cse(list(results), symbols=sp.numbered_symbols("c_"), order="none")
     lines = [f"{name} = {printer.doprint(value)}" for name, value in shared]
-    return _Block(used, [*reversed(needed), *lines], [printer.doprint(v) for v in reduced])
+    return Block(used, [*reversed(needed), *lines], [printer.doprint(v) for v in reduced])
 
 
-def _unpack(group: str, symbols: Sequence[Any], used: set[Any], index: str = "{}") -> list[str]:
+def unpack(group: str, symbols: Sequence[Any], used: set[Any], index: str = "{}") -> list[str]:
     """Assignments of the symbols from their group; ``index`` formats the index."""
     return [f"{s} = {group}[{index.format(i)}]" for i, s in enumerate(symbols) if s in used]
 
@@ -344,9 +213,9 @@ def function_source(
     steps: Sequence[tuple[Any, Any]] = (),
 ) -> str:
     """A function of groups of columns that returns one column a result."""
-    block = _block(results, steps)
+    block = print_block(results, steps)
     body = [
-        line for group, symbols in groups.items() for line in _unpack(group, symbols, block.used)
+        line for group, symbols in groups.items() for line in unpack(group, symbols, block.used)
     ]
     body += [*block.lines, f"return ({''.join(v + ', ' for v in block.values)})"]
     return f"\n\ndef {name}({', '.join(groups)}):\n    " + "\n    ".join(body) + "\n"
@@ -370,7 +239,7 @@ def portable_expressions(
         for f, o in zip(e.dynamics, e.other, strict=True)
     ]
     steps = [(name, value.xreplace(numbers)) for name, value in e.steps]
-    block = _block(required, steps)
+    block = print_block(required, steps)
     return block.lines, block.values, [symbol for symbol in e.u if symbol in block.used]
 
 
@@ -406,6 +275,22 @@ def array_source(e: Equations, added: Sequence[Any]) -> str:
     return "".join(parts)
 
 
+def slopes_source(e: Equations) -> tuple[str, list[tuple[int, int]]]:
+    """Source of the slopes of the residual over columns that are the same for all parameters.
+
+    Returns:
+        The source, and of each column the parameter and the axis, by number.
+    """
+    groups = {"q": e.q, "qd": e.qd, "qdd": e.qdd, "u": e.u}
+    by_place = {
+        (i, axis): slope
+        for i, by_axis in enumerate(e.lasting)
+        for axis, slope in (by_axis or {}).items()
+    }
+    source = ARRAY_HEADER + function_source("slopes", groups, list(by_place.values()))
+    return source, list(by_place)
+
+
 def dynamics_source(e: Equations) -> str:
     """Source of the functions over columns of the whole mechanism: long where it is a robot."""
     quiet = dict.fromkeys(e.w, 0)
@@ -424,7 +309,7 @@ def dynamics_source(e: Equations) -> str:
     return "".join(parts)
 
 
-def _compiled(
+def compiled_function(
     name: str, arguments: str, body: Sequence[str], *, kinds: str = "", options: str = _PASSED
 ) -> str:
     """A compiled function; its arguments are vectors unless ``kinds`` says otherwise."""
@@ -489,11 +374,11 @@ def _motion(e: Equations, index: str = "{}", known: Sequence[Any] = ()) -> list[
     upper = [(i, j) for i in range(n) for j in range(i, n)]
     force = [a + o - h for a, o, h in zip(e.applied_noise, e.other, e.bias, strict=True)]
     results = [*_upper(e), *force, *e.rates]
-    block = _block([*results, *e.qd], e.steps, known)
+    block = print_block([*results, *e.qd], e.steps, known)
     values = block.values[: len(results)]
-    body = _unpack("x", [*e.q, *e.qd, *e.z], block.used, index)
+    body = unpack("x", [*e.q, *e.qd, *e.z], block.used, index)
     for group, symbols in {"u": e.u, "p": e.p, "w": e.w}.items():
-        body += _unpack(group, symbols, block.used, index)
+        body += unpack(group, symbols, block.used, index)
     body += [f"{_returned(known)} = bodies(x, p)"] if known else []
     body += block.lines
     body += [
@@ -513,9 +398,9 @@ def _returned(names: Sequence[Any]) -> str:
 def _reading(e: Equations, index: str = "{}") -> list[str]:
     """Body of the measurement: y from x, u, p."""
     readings = _encoder_readings(e)
-    block = _block(readings)
-    body = _unpack("x", [*e.q, *e.qd], block.used, index)
-    body += _unpack("u", e.u, block.used, index) + _unpack("p", e.p, block.used, index)
+    block = print_block(readings)
+    body = unpack("x", [*e.q, *e.qd], block.used, index)
+    body += unpack("u", e.u, block.used, index) + unpack("p", e.p, block.used, index)
     return body + block.lines + [f"y[{index.format(i)}] = {v}" for i, v in enumerate(block.values)]
 
 
@@ -530,13 +415,10 @@ def rows_source(e: Equations, rows: int) -> str:
         kinds = ", ".join(["types.int64", *["V"] * len(arguments.split(","))])
         options = f"fastmath={{'contract'}}, {_PASSED}"
         body = _loop("for r in range(count):", body)
-        parts.append(_compiled(name, f"count, {arguments}", body, kinds=kinds, options=options))
+        parts.append(
+            compiled_function(name, f"count, {arguments}", body, kinds=kinds, options=options)
+        )
     return "".join(parts)
-
-
-def _header(title: str) -> str:
-    """The head of a module that takes ``bodies`` from the one called ``title``, if any."""
-    return SCALAR_HEADER + (f"from {title} import bodies\n" if title else "")
 
 
 def scalar_source(e: Equations, bodies: Bodies, title: str = "") -> str:
@@ -545,101 +427,44 @@ def scalar_source(e: Equations, bodies: Bodies, title: str = "") -> str:
     Args:
         e: the equations; bodies: `bodies_at_state`; title: of its module.
     """
-    derivative = _compiled("derivative", "x, u, p, w, dx", _motion(e, known=bodies.names))
-    return _header(title) + derivative + _compiled("measure", "x, u, p, y", _reading(e))
+    header = SCALAR_HEADER + (f"from {title} import bodies\n" if title else "")
+    derivative = compiled_function("derivative", "x, u, p, w, dx", _motion(e, known=bodies.names))
+    return header + derivative + compiled_function("measure", "x, u, p, y", _reading(e))
 
 
-def residual_source(e: Equations, bodies: Bodies, title: str = "") -> str:
-    """Source of the compiled residual along a motion: ``residual(q, qd, qdd, z, u, p, out)``.
+def residual_source(e: Equations, bodies: Sequence[Any]) -> str:
+    """Source of the compiled residual along a motion: ``residual(q, qd, qdd, b, z, u, p, out)``.
 
     Args:
-        e: the equations; bodies: `bodies_along_motion`; title: of its module.
+        e: the equations; bodies: names of what ``b`` holds, by `bodies_along_motion`.
     """
     quiet = dict.fromkeys(e.w, 0)
     residual = [
         a + o.subs(quiet) - f for a, o, f in zip(e.applied, e.other, e.dynamics, strict=True)
     ]
-    block = _block(residual, e.steps, bodies.names)
-    groups = {"q": e.q, "qd": e.qd, "qdd": e.qdd, "z": e.z, "u": e.u}
+    block = print_block(residual, e.steps, bodies)
+    groups = {"q": e.q, "qd": e.qd, "qdd": e.qdd, "b": bodies, "z": e.z, "u": e.u}
     row = [
         line
         for group, symbols in groups.items()
-        for line in _unpack(group, symbols, block.used, "row, {}")
+        for line in unpack(group, symbols, block.used, "row, {}")
     ]
-    row += [f"{_returned(bodies.names)} = bodies(row, q, qd, qdd, p)"] if bodies.names else []
     row += block.lines + [f"out[row, {i}] = {v}" for i, v in enumerate(block.values)]
-    body = [*_unpack("p", e.p, block.used), *_loop("for row in range(len(q)):", row)]
-    return _header(title) + _compiled(
-        "residual", "q, qd, qdd, z, u, p, out", body, kinds="M, M, M, M, M, V, M", options=""
-    )
-
-
-def memory_source(e: Equations) -> tuple[str, dict[str, list[int]]]:
-    """Source of the compiled internal states along a motion, and the columns that it takes.
-
-    It knows its columns by number only: the states of an effect have the same text on every joint,
-    which is compiled once.
-
-    Returns:
-        The source, and by group (q, qd, u, p) the numbers of the columns that are passed; those of
-        qdd are those of qd.
-    """
-    slopes = [sp.diff(rate, z) for rate, z in zip(e.rates, e.z, strict=True)]
-    others = [set(e.z) - {z} for z in e.z]
-    coupled = any(r.free_symbols & o for r, o in zip(e.rates, others, strict=True))
-    groups = {"q": e.q, "qd": e.qd, "u": e.u, "p": e.p}
-    used = set().union(*(sp.sympify(rate, strict=True).free_symbols for rate in e.rates))
-    uses = {g: [i for i, s in enumerate(some) if s in used] for g, some in groups.items()}
-    numbered = {
-        groups[g][i]: sp.Symbol(f"{g}_{k:03d}", real=True)
-        for g, places in uses.items()
-        for k, i in enumerate(places)
-    }
-    numbered |= {z: sp.Symbol(f"z_{k:03d}", real=True) for k, z in enumerate(e.z)}
-    passed = {g: [numbered[groups[g][i]] for i in places] for g, places in uses.items()}
-    states = [numbered[z] for z in e.z]
-
-    def renamed(expressions: Sequence[Any]) -> list[Any]:
-        return [sp.sympify(x, strict=True).xreplace(numbered) for x in expressions]
-
-    if coupled or any(slope.free_symbols & set(e.z) for slope in slopes):
-        groups_of = {**passed, "z": states}
-        rate = _memory_function("memory_rate", groups_of, {"dz": renamed(e.rates)})
-        source = SCALAR_HEADER + "import numpy as np\n" + rate + BETWEEN + MEMORY_LOOP
-        if not coupled:
-            slope = _memory_function("memory_slope", groups_of, {"slope": renamed(slopes)})
-            source += slope + STIFF_MEMORY_LOOP
-        return source, uses
-    still = [rate.subs(z, 0) for rate, z in zip(e.rates, e.z, strict=True)]
-    terms = _memory_function("memory_terms", passed, {"c": renamed(still), "b": renamed(slopes)})
-    steady = not any(slope.free_symbols & {*e.q, *e.qd, *e.u} for slope in slopes)
-    head = f"import numpy as np\nRAMP = {steady}\n"
-    return SCALAR_HEADER + head + terms + BETWEEN + LINEAR_MEMORY_LOOP, uses
-
-
-def _memory_function(
-    name: str, groups: Mapping[str, Sequence[Any]], results: Mapping[str, Sequence[Any]]
-) -> str:
-    """A compiled function of groups of columns that fills ``results``."""
-    block = _block([x for part in results.values() for x in part])
-    body = []
-    for group, symbols in groups.items():
-        body += _unpack(group, symbols, block.used)
-    places = [f"{part}[{i}]" for part, parts in results.items() for i in range(len(parts))]
-    body += block.lines
-    body += [f"{place} = {v}" for place, v in zip(places, block.values, strict=True)]
-    return _compiled(name, ", ".join([*groups, *results]), body, options="")
+    body = [*unpack("p", e.p, block.used), *_loop("for row in range(len(q)):", row)]
+    kinds = "M, M, M, M, M, M, V, M"
+    arguments = "q, qd, qdd, b, z, u, p, out"
+    return SCALAR_HEADER + compiled_function("residual", arguments, body, kinds=kinds, options="")
 
 
 def law_source(
     motion: Sequence[Any], given: Sequence[Any], states: Sequence[Any], law: Sequence[Any]
 ) -> str:
     """Source of a compiled control law: ``command(y, r, s, out)``."""
-    block = _block(law)
+    block = print_block(law)
     body = [
         line
         for group, symbols in {"y": motion, "r": given, "s": states}.items()
-        for line in _unpack(group, symbols, block.used)
+        for line in unpack(group, symbols, block.used)
     ]
     body += block.lines + [f"out[{i}] = {v}" for i, v in enumerate(block.values)]
-    return SCALAR_HEADER + _compiled("command", "y, r, s, out", body)
+    return SCALAR_HEADER + compiled_function("command", "y, r, s, out", body)

@@ -69,7 +69,9 @@ def _derive(model: Model, named_constants: bool) -> Equations:
     raw_applied = d.table(device.applied, "applied")
     side = d.table(device.side_load, "side_load")
     forces = [d.channel[f] for f in device.forces]
-    input_map = [[sp.diff(e, f) for f in forces] for e in raw_applied]
+    input_map = [
+        [sp.diff(e, f) if f in e.free_symbols else sp.S.Zero for f in forces] for e in raw_applied
+    ]
 
     signals = ActingInputs(d, model.effects, raw_applied, side)
     applied = [signals.put_in(e) for e in raw_applied]
@@ -202,17 +204,30 @@ def _derive(model: Model, named_constants: bool) -> Equations:
     products: list[tuple[int, int]] = []
     constant: list[bool] = []
     unforced: list[bool] = []
+    lasting: list[dict[int, Any] | None] = []
     varying = {*d.p.values(), *d.z.values()}
     # An expression has few of a robot's hundred parameters, and sympy is slow to find a slope zero.
-    present = [(e, e.free_symbols) for e in residual]
+    present = [(i, e, e.free_symbols) for i, e in enumerate(residual)]
     elsewhere: set[Any] = set().union(*(e.free_symbols for e in [*rates, *moved]))
+    steps = bodies.steps if bodies else []
+    bodily: set[Any] = set().union(*(value.free_symbols for _, value in steps))
+    of_bodies: list[int] = []
+    named, quiet = {name for name, _ in steps}, dict.fromkeys(w, 0)
     for i, symbol in enumerate(d.p.values()):
-        slopes = [sp.diff(e, symbol) for e, symbols in present if symbol in symbols]
+        by_axis = {k: sp.diff(e, symbol) for k, e, symbols in present if symbol in symbols}
+        slopes = list(by_axis.values())
         left: set[Any] = set().union(*(s.free_symbols for s in slopes))
         curved = symbol in left and any(sp.diff(slope, symbol) != 0 for slope in slopes)
         linear.append(not curved and symbol not in elsewhere)
         constant.append(linear[i] and not left & varying)
         unforced.append(constant[i] and left.isdisjoint(d.channel.values()))
+        if symbol in bodily and not by_axis:
+            of_bodies.append(i)
+        lasting.append(
+            {k: s.subs(quiet) for k, s in by_axis.items()}
+            if constant[i] and symbol not in bodily and left.isdisjoint(named)
+            else None
+        )
         for j, earlier in enumerate([*d.p.values()][:i]):
             if earlier in left and any(sp.diff(slope, earlier) != 0 for slope in slopes):
                 products.append((j, i))
@@ -220,13 +235,13 @@ def _derive(model: Model, named_constants: bool) -> Equations:
         q=d.q, qd=d.qd, qdd=d.qdd, z=[*d.z.values()], z_names=z_names,
         u=[d.channel[c] for c in inputs], inputs=inputs,
         p=list(d.p.values()), w=w, noise=noise,
-        steps=bodies.steps if bodies else [],
+        steps=steps,
         mass=mass, bias=bias, dynamics=dynamics, other=other,
         applied=applied, applied_noise=applied_noise,
         input_map=input_map, rates=rates, initial=initial,
         offset=offset, offset_rate=offset_rate, offset_acceleration=offset_acceleration,
         kinetic=kinetic, potential=potential, linear=linear, products=products, constant=constant,
-        unforced=unforced,
+        unforced=unforced, lasting=lasting, of_bodies=of_bodies,
         compensation=compensation(d, potential), delays=delays(d, applied),
     )  # fmt: skip
 

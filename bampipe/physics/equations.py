@@ -32,6 +32,9 @@ class Equations:
         products: pairs of parameters, by number, of which the residual has a product.
         constant: for each parameter, whether the slope of the residual by it depends on no
             parameter and no internal state; unforced: and on no input either.
+        lasting: for each parameter, that slope by axis, None where there is none such or bodies in
+            ``steps`` take part in it.
+        of_bodies: parameters, by number, that stand in ``steps`` alone.
         compensation: per coordinate, the part of Q_other that balances gravity there: see
             `roles.compensation`; zero where nothing does.
         delays: parameters that shift measured forces in time: see `roles.delays`.
@@ -66,6 +69,8 @@ class Equations:
     products: list[tuple[int, int]]
     constant: list[bool]
     unforced: list[bool]
+    lasting: list[dict[int, Any] | None]
+    of_bodies: list[int]
     compensation: list[Any]
     delays: list[str]
 

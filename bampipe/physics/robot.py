@@ -230,12 +230,23 @@ class Robot(Declaration):
         rng = np.random.default_rng(0)
         n = len(self.joints)
         samples = 40 * max(n, 1)
-        q, qd, qdd = (list(rng.uniform(-2.0, 2.0, (n, samples))) for _ in range(3))
-        found = columns(Algebra.numbers(), self.links, q, qd, qdd, _exact(np.array(self.gravity)))
+        found = self.columns(*(rng.uniform(-2.0, 2.0, (n, samples)).T for _ in range(3)))
         table = np.array(
             [[np.broadcast_to(c, samples) for link in row for c in link] for row in found]
         )
         return np.ascontiguousarray(table.transpose(0, 2, 1).reshape(-1, INERTIAL * n))
+
+    def columns(self, q: Array, qd: Array, qdd: Array) -> list[list[list[Any]]]:
+        """What one of each inertial number adds to the joints' forces: [joint][link][number].
+
+        Args:
+            q, qd, qdd: a motion, (T, joints), rad or m and derivatives.
+
+        Returns:
+            Numbers, or (T,) where they differ, N.m or N.
+        """
+        a, b, c = (list(np.ascontiguousarray(x.T)) for x in (q, qd, qdd))
+        return columns(Algebra.numbers(), self.links, a, b, c, gravity_vector(self))
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:

@@ -59,8 +59,12 @@ def delays(d: Vocabulary, applied: list[Any]) -> list[str]:
     """
     own = [p for item in d.model.effects for p in item.parameters]
     absent = {d.p[p.name]: 0 for p in own if not p.fixed}
+    rates = {d.channel[derivative(force, 1)] for force in d.model.device.forces}
     found = []
     for p in own:
+        # Sympy is slow to find a slope zero.
+        if not any(d.p[p.name] in e.free_symbols and rates & e.free_symbols for e in applied):
+            continue
         slope = [sp.diff(e, d.p[p.name]).subs(absent) for e in applied]
         for force in d.model.device.forces:
             rate = d.channel[derivative(force, 1)]

@@ -11,12 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe import generated_code
-from bampipe.physics.device import Device
+from bampipe.physics.device import INPUT_ORDERS, derivative
 from bampipe.physics.model import Model
+from bampipe.physics.newton_euler import INERTIAL
 from bampipe.physics.parameter import Parameter
 
 if TYPE_CHECKING:  # it brings sympy, which few need
-    from bampipe.physics.equations import Equations
+    from bampipe.physics.model_code import Generation
 
 Array = NDArray[np.float64]
 _MEMORY_STEPS = (3, 12, 48, 192)
@@ -28,6 +29,8 @@ _STABLE = 2.5
 """Largest product of a step and the rate at which a state decays for which RK4 is stable, with a
 margin: it is up to 2.78 (Hairer and Wanner, Solving Ordinary Differential Equations II, IV.2)."""
 _RUNAWAY = 1e9
+_TOGETHER = 1024
+"""Samples whose slopes by a robot's bodies are taken at once: as many as a processor keeps near."""
 _STEP_AGAINST_NEIGHBOURS = 8.0
 """A command that changes between two samples this many times more than before and after has been
 switched. Ramps and sines change by at most twice as much from one sample to the next; noise of the
@@ -88,6 +91,13 @@ class System:
         self._commands: list[int] = meta["commands"]
         self._memory_uses: dict[str, list[int]] = meta["memory_uses"]
 
+    @cached_property
+    def forced(self) -> tuple[int, ...]:
+        """Columns of the inputs that hold a force or a time derivative of one."""
+        orders = range(len(INPUT_ORDERS))
+        names = {derivative(f, k) for f in self.model.device.forces for k in orders}
+        return tuple(i for i, name in enumerate(self.inputs) if name in names)
+
     @property
     def prior(self) -> Array:
         """Prior values of the parameters, (n_p,)."""
@@ -129,16 +139,27 @@ class System:
         return self._code.module("columns")
 
     @cached_property
+    def _whole(self) -> generated_code.Generated:
+        """Functions of the whole mechanism, which of most candidates for an effect nobody asks."""
+
+        def generate() -> Generation:
+            from bampipe.physics.model_code import whole_code
+
+            return whole_code(self.model)
+
+        return generated_code.load(f"{self.model.key}_whole", generate)
+
+    @cached_property
     def _dynamics(self) -> ModuleType:
-        return self._code.module("dynamics")
+        return self._whole.module("dynamics")
 
     @cached_property
     def _compiled(self) -> ModuleType:
-        return self._code.module("compiled")
+        return self._whole.module("compiled")
 
     @cached_property
     def _residual(self) -> Callable[..., None]:
-        return self._code.module("residual").residual
+        return self._whole.module("residual").residual
 
     @property
     def derivative(self) -> Callable[..., None]:
@@ -152,7 +173,7 @@ class System:
 
     @cached_property
     def _rows(self) -> ModuleType:
-        return self._code.module("rows")
+        return self._whole.module("rows")
 
     @property
     def derivative_rows(self) -> Callable[..., None]:
@@ -230,15 +251,78 @@ class System:
         a, b, c = self.true_motion(q, qd, qdd, u, p)
         return _stack(self._arrays.applied(a.T, b.T, c.T, z.T, u.T, p), len(q))
 
-    def residual(self, q: Array, qd: Array, qdd: Array, z: Array, u: Array, p: Array) -> Array:
+    def residual(
+        self,
+        q: Array,
+        qd: Array,
+        qdd: Array,
+        z: Array,
+        u: Array,
+        p: Array,
+        bodies: Array | None = None,
+    ) -> Array:
         """``applied - required`` for the mechanism's true motion, compiled; (T, n_q), N.m or N.
 
-        Arguments as in `required`, but q, qd, qdd are already what `true_motion` returns.
+        Arguments as in `required`, but q, qd, qdd are already what `true_motion` returns;
+        ``bodies`` is what `body_forces` returns of the same, where that is known.
         """
-        arrays = [np.ascontiguousarray(x, dtype=np.float64) for x in (q, qd, qdd, z, u, p)]
+        if bodies is None:
+            bodies = self.body_forces(q, qd, qdd, p)
+        arrays = [np.ascontiguousarray(x, dtype=np.float64) for x in (q, qd, qdd, bodies, z, u, p)]
         out = np.empty(arrays[0].shape)
         self._residual(*arrays, out)
         return out
+
+    def body_forces(self, q: Array, qd: Array, qdd: Array, p: Array) -> Array:
+        """What a robot's bodies require along a true motion, (T, joints); (T, 0) of other devices.
+
+        It changes with those of the parameters alone that are numbers of the bodies.
+        """
+        count = self._whole.facts["bodies"]
+        out = np.empty((len(q), count))
+        if count:
+            arrays = [np.ascontiguousarray(x, dtype=np.float64) for x in (q, qd, qdd, p)]
+            self._whole.module("bodies").bodies(*arrays, out)
+        return out
+
+    @cached_property
+    def lasting(self) -> frozenset[int]:
+        """Parameters, by number, whose slopes `slopes` gives: most of those in `constant`."""
+        return frozenset(self._whole.facts["lasting"]) | self.of_bodies.keys()
+
+    @cached_property
+    def of_bodies(self) -> dict[int, int]:
+        """By number of a parameter, which of all inertial numbers of a robot's bodies it is."""
+        robot = self.model.device.robot
+        place = {p.name: k for k, p in enumerate(robot.parameters)} if robot else {}
+        return {i: place[self.parameters[i].name] for i in self._whole.facts["of_bodies"]}
+
+    def slopes(self, wanted: Sequence[int], q: Array, qd: Array, qdd: Array, u: Array) -> Array:
+        """Slopes of the residual by parameters on which they do not depend, (T, n_q, n_wanted).
+
+        Args:
+            wanted: numbers of parameters, all in `lasting`.
+            q, qd, qdd, u: as in `residual`.
+        """
+        found = np.zeros((len(q), len(self.coordinates), len(wanted)))
+        bodies = [(k, self.of_bodies[i]) for k, i in enumerate(wanted) if i in self.of_bodies]
+        if len(bodies) < len(wanted):
+            column = {i: k for k, i in enumerate(wanted)}
+            written = self._whole.module("slopes").slopes(q.T, qd.T, qdd.T, u.T)
+            for (i, axis), slope in zip(self._whole.facts["slopes"], written, strict=True):
+                if i in column:
+                    found[:, axis, column[i]] = slope
+        if bodies:
+            robot = self.model.device.robot
+            assert robot is not None
+            for first in range(0, len(q), _TOGETHER):
+                part = slice(first, first + _TOGETHER)
+                forces = robot.columns(q[part], qd[part], qdd[part])
+                for k, number in bodies:
+                    link, place = divmod(number, INERTIAL)
+                    for axis, by_link in enumerate(forces):
+                        found[part, axis, k] -= by_link[link][place]
+        return found
 
     def contribution(self, q: Array, qd: Array, qdd: Array, z: Array, u: Array, p: Array) -> Array:
         """What the model's effects add to the residual of the bare device, (T, n_q).
@@ -366,85 +450,10 @@ def compile_model(model: Model) -> System:
     Raises:
         InputError: an expression of the model is wrong, or the cache cannot be used.
     """
-    return System(model, generated_code.load(model.key, lambda: _generate(model)))
 
+    def generate() -> Generation:
+        from bampipe.physics.model_code import effects_code
 
-def _generate(model: Model) -> tuple[dict[str, Any], dict[str, str]]:
-    """What the generator says of a model, and the source of its modules."""
-    from bampipe.model_functions import ROWS
-    from bampipe.physics.codegen import (
-        array_source,
-        bodies_along_motion,
-        bodies_at_state,
-        dynamics_source,
-        memory_source,
-        residual_source,
-        rows_source,
-        scalar_source,
-    )
-    from bampipe.physics.derivation import derive
-    from bampipe.physics.equations import contribution
+        return effects_code(model)
 
-    equations = derive(model)
-    bare = _derive_bare(model.device) if model.effects else equations
-    added = contribution(equations, bare)
-    channels = dict(zip(equations.inputs, equations.u, strict=True))
-    forces = [channels[name] for name in model.device.forces]
-    brakes = {channels[name] for name in model.device.brakes.values() if name in channels}
-    facts = {
-        "memory": equations.z_names,
-        "inputs": equations.inputs,
-        "noise": equations.noise,
-        "linear": equations.linear,
-        "products": equations.products,
-        "constant": equations.constant,
-        "unforced": equations.unforced,
-        "touched": [i for i, e in enumerate(added) if e != 0],
-        "moves_sensors": any(e != 0 for e in equations.offset),
-        "driven": any(e.has(*forces) for e in added)
-        and not any(e.has(*forces) for e in equations.rates),
-        "compensated": [i for i, e in enumerate(equations.compensation) if e != 0],
-        "delays": equations.delays,
-        "memory_uses": {},
-        "commands": [
-            i
-            for i, u in enumerate(equations.u)
-            if u not in forces
-            and equations.inputs[i] != "t"
-            and any(u in e.free_symbols for e in equations.rates)
-        ],
-        "braked": any(brakes & e.free_symbols for e in (*added, *equations.rates)),
-    }
-    sources = {
-        "columns": array_source(equations, added),
-        "dynamics": dynamics_source(equations),
-        "rows": rows_source(equations, ROWS),
-    }
-    for name, find_bodies, source in (
-        ("compiled", bodies_at_state, scalar_source),
-        ("residual", bodies_along_motion, residual_source),
-    ):
-        bodies = find_bodies(equations)
-        title = ""
-        if bodies.names:
-            sources[f"{name}_bodies"] = bodies.source
-            title = generated_code.module_title(f"{name}_bodies", bodies.source)
-        sources[name] = source(equations, bodies, title)
-    if equations.z:
-        sources["memory"], facts["memory_uses"] = memory_source(equations)
-    return facts, sources
-
-
-_bare: dict[str, Equations] = {}
-"""Of the device whose model was derived last: the candidates of a diagnosis share it."""
-
-
-def _derive_bare(device: Device) -> Equations:
-    """Equations of a device without effects."""
-    from bampipe.physics.derivation import derive
-
-    model = Model(device)
-    if model.key not in _bare:
-        _bare.clear()
-        _bare[model.key] = derive(model)
-    return _bare[model.key]
+    return System(model, generated_code.load(model.key, generate))

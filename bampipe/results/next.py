@@ -66,7 +66,11 @@ class Proposal(Record):
     """One trial that could be recorded."""
 
     sentence: str
-    seconds: Size
+    seconds: Size = Field(description="Of all its trials together")
+    parts: Count = Field(default=1, description="Trials in which it is recorded, each as long")
+    like: str = Field(
+        default="", description="The trial at hand that is imitated; there are no moves then"
+    )
     moves: dict[str, Move] = Field(description="By axis; the first is the one that it is about")
     pose: dict[str, float] = Field(description="Where the other axes are held, rad or m")
     brakes: Share = Field(default=0.0, description="Share of the commands of the viscous trials")
@@ -146,8 +150,5 @@ class NextResult(Result):
     why: str
     expected: str = Field(description="What it is expected to give")
     proposals: tuple[Proposal, ...] = Field(description="Best first")
-    better_at_hand: str = Field(
-        default="", description="Trial at hand the like of which says more than the first proposal"
-    )
     sensitivity: dict[str, Detectable] = Field(default={}, description="By effect of the library")
     plan: Plan | None = None

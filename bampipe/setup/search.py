@@ -45,6 +45,10 @@ EXPLAINED = 0.6
 """Error that must be left of a spoilt axis at most, as a share of the applied force."""
 JUDGED_ERROR, RANKED_ERROR = 0.1, 0.01
 """Errors below these are alike: when a mistake is named, and when mistakes are ranked."""
+SPOILS = 2.0
+"""Times its error, or `JUDGED_ERROR` where that is larger, that a correction may leave of an axis
+that was sound before. All drives of a robot taken twice help an axis whose counterbalance the
+device lacks, and take another from 8 to 34 % of its force: no mistake of set-up."""
 ALIKE = 1.5
 """Difference of scores within which two mistakes cannot be distinguished."""
 LEAST_FACTOR, LEAST_TURN, LEAST_SHIFT = 1.5, 0.25, 0.3
@@ -267,6 +271,8 @@ class CorrectionSearch:
             hinted = correction.kind == "scale" and set(correction.signals) <= set(placeholders)
             if gain < (LEAST_GAIN_PLACEHOLDER if hinted else LEAST_GAIN):
                 continue
+            if _spoils_sound_axes(before, after):
+                continue
             own = after.score(RANKED_ERROR) + correction.cost
             rivals = tuple(
                 other
@@ -318,6 +324,12 @@ def spoilt_axes(finding: Finding) -> list[int]:
     before, after = finding.before.error, finding.after.error
     fallen = [i for i in range(len(before)) if after[i] < before[i] / 1.5]
     return fallen or list(range(len(before)))
+
+
+def _spoils_sound_axes(before: Plausibility, after: Plausibility) -> bool:
+    """Whether a correction makes an axis much worse that was right without it."""
+    sound = before.error < SUSPICIOUS_ERROR
+    return bool(np.any(after.error[sound] > SPOILS * np.maximum(before.error[sound], JUDGED_ERROR)))
 
 
 def _nothing_explained(system: System) -> Plausibility:

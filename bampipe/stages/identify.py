@@ -16,7 +16,7 @@ from bampipe.data.store import write_parquet
 from bampipe.declarations.model_file import MODEL_INPUTS, load_model, read_recipe
 from bampipe.discover.start import search_start
 from bampipe.errors import InputError
-from bampipe.estimate.least_squares import fit
+from bampipe.estimate.least_squares import fit, independent_samples
 from bampipe.identification.bodies import base_estimates, make_possible, summarise_bases
 from bampipe.identification.calibration import (
     describe_calibration,
@@ -126,9 +126,11 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         raw = fit(problem, np.append(start, 0.0), block_s=config.block_s)
     except ValueError as error:
         raise InputError(
-            f"the free trials are too short to identify from ({error})", where=str(run.root)
+            f"the free trials are too short to identify from ({error})",
+            where=str(run.root),
+            remedy="record faster motion at a higher rate, or more of it",
         ) from error
-    moving = sum(int(stacked.used.sum()) for stacked in raw.stacked)
+    moving = int(independent_samples(band, raw.stacked))
     # Their scatter about the fit must be known, too, or no interval means anything.
     if moving < 2 * problem.free.size:
         raise InputError(

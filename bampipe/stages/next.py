@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
@@ -17,12 +18,12 @@ from bampipe.errors import InputError, choose_from
 from bampipe.files import digest_content, write_json
 from bampipe.identification.filter_choice import FilterChoice
 from bampipe.identification.sensor_noise import sensor_noise
-from bampipe.next_trial.choice import Tried, Worth, rank_designs
+from bampipe.next_trial.choice import Tried, Worth, find_best_of_each, rank_designs
 from bampipe.next_trial.forecast import Forecast
 from bampipe.next_trial.motion import TRAJECTORY_HZ, Rehearsal
 from bampipe.next_trial.plan import Goal, plan_trials, record_plan
 from bampipe.next_trial.precision import Precision
-from bampipe.next_trial.primitives import Envelope
+from bampipe.next_trial.primitives import Envelope, imitate_trials
 from bampipe.next_trial.questions import (
     Blindness,
     find_ambiguity,
@@ -151,14 +152,20 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     if not axes:
         raise InputError("no axis moves in the trials at hand", where=str(run.root))
 
-    def rank(worth: Worth, with_rests: bool, first: float) -> list[Tried]:
+    free = [motion for motion in fitted if not _is_braked(motion, model.device.brakes)]
+    alike = imitate_trials(free, seen, config.seconds)
+
+    def rank(worth: Worth, with_rests: bool, first: float, least: float = -np.inf) -> list[Tried]:
         def report(fraction: float, message: str) -> None:
             progress(first + 0.3 * fraction, message)
 
-        return rank_designs(rehearsal, worth, config.seconds, axes, with_rests, report)
+        return rank_designs(
+            rehearsal, worth, config.seconds, axes, with_rests, report, alike, least
+        )
 
-    tried = rank(worth, chosen != "precision", 0.2)
-    if chosen == "sensitivity" and tried[0].worth < _LITTLE:
+    hidden = chosen == "sensitivity"
+    tried = rank(worth, chosen != "precision", 0.2, _LITTLE if hidden else -np.inf)
+    if hidden and (not tried or tried[0].worth < _LITTLE):
         # Nothing that a person could do here shows more: then for the parameters.
         tried = rank(_worth("precision", "", forecast, None), False, 0.5)
     progress(0.9, "what they are expected to give")
@@ -170,18 +177,21 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         progress(0.92, "planning a set of trials")
         estimates = [found.parameters[name].estimate for name in precision.names]
         goal = _goal(config, np.array(estimates), contest is None)
-        for name, entry in proposals[0].sd.items():
-            # What the best design for all leaves too uncertain gets a design of its own.
-            if entry.after > goal.sd[precision.names.index(name)]:
-                tried += rank(_worth("precision", name, forecast, None), False, 0.92)[:1]
+        # What the best design for all leaves too uncertain gets a design of its own.
+        places = {name: k for k, name in enumerate(precision.names)}
+        poor = [name for name, sd in best.sd.items() if sd.after > goal.sd[places[name]]]
+        if poor:
+            worths = [
+                partial(precision.worth, seconds=config.seconds, parameter=name) for name in poor
+            ]
+            tried += find_best_of_each(
+                rehearsal, precision.of_motion, worths, config.seconds, axes, alike
+            )
         plan = record_plan(forecast, goal, plan_trials(forecast, tried, goal))
     unlimited = [axis for axis in system.coordinates if axis not in model.device.limits]
     lacking = _lacking(run, config.model, diagnosed)
-    better = ""
-    if chosen == "precision":
-        better = _better_at_hand(precision, fitted, parameter, config.seconds, tried[0])
     missing = diagnosed.selected if diagnosed is not None else ()
-    reasons = explain_proposal(chosen, parameter, best, table, unlimited, lacking, better, missing)
+    reasons = explain_proposal(chosen, parameter, best, table, unlimited, lacking, missing)
     result = NextResult(
         model=config.model,
         purpose=chosen,
@@ -191,7 +201,6 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         why=reasons.why,
         expected=reasons.expected,
         proposals=proposals,
-        better_at_hand=better,
         sensitivity=table,
         plan=plan,
     )
@@ -311,22 +320,8 @@ def _worth(
     )
 
 
-def _better_at_hand(
-    precision: Precision, fitted: Sequence[Motion], parameter: str, seconds: float, best: Tried
-) -> str:
-    """The trial at hand the like of which, so long, says more than a design does; "" if none.
-
-    Args:
-        precision: what is known; fitted: the trials at hand; parameter: that counts, "" for all.
-        seconds: length of a trial; best: the design.
-    """
-    values = {}
-    for motion in fitted:
-        share = seconds / float(motion.t[-1] - motion.t[0])
-        added = share * precision.of_motion(motion)
-        values[trial_of_block(motion.trial_id)] = precision.worth(added, seconds, parameter)
-    most = max(values, key=lambda name: values[name])
-    return most if values[most] > best.worth else ""
+def _is_braked(motion: Motion, brakes: Mapping[str, str]) -> bool:
+    return any(motion.channels[name].any() for name in brakes.values() if name in motion.channels)
 
 
 def _sensitivity(blindness: Blindness, best: Tried) -> dict[str, Detectable]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pydantic.dataclasses import dataclass as checked_dataclass
 
 from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
-from bampipe.data.store import ParquetAppender, read_parquet
+from bampipe.data.store import ParquetAppender
 from bampipe.declarations.model_file import IDENTIFIED_MODEL, identified, load_model, read_recipe
 from bampipe.errors import InputError
 from bampipe.identification.drift import find_drift
@@ -36,8 +36,20 @@ from bampipe.results.validate import (
     ValidateResult,
 )
 from bampipe.schema import STRICT, Count
-from bampipe.trials.folds import HELD_OUT, Folds
-from bampipe.trials.measured import MeasuredTrials, read_measured_trials, trial_of_block
+from bampipe.trials.comparison import (
+    ComparedTrial,
+    axis_errors,
+    compare_trial,
+    expected_published_ratio,
+    published_rmse,
+    rms,
+)
+from bampipe.trials.measured import (
+    MeasuredTrials,
+    folds_by_channel,
+    read_measured_trials,
+    trial_of_block,
+)
 from bampipe.trials.motion import Motion
 from bampipe.trials.noise_floor import (
     STILL_WIDTH,
@@ -45,11 +57,9 @@ from bampipe.trials.noise_floor import (
     find_noise_floor,
     floor_replays,
     parameters_to_replay,
-    replay_evidence,
 )
 from bampipe.trials.reading import held_out_trials, read_motions, require_sound_motions
-from bampipe.trials.replay import UNLIKE, StandIn
-from bampipe.trials.residuals import Evidence, ModelOnTrial, gather_evidence
+from bampipe.trials.residuals import Evidence, gather_evidence
 
 SUMMARY = "Predicted against measured torque and force, on trials that the fit has not seen"
 INPUTS = (*INGESTED, *FILTERED, *IDENTIFIED_MODEL)
@@ -65,8 +75,6 @@ which they do not describe the trials they come from, and are refused."""
 
 SILENT_PERCENT = 30.0
 """Fit of a robot's joint below which its parameters say nothing of it."""
-_EXPECTED_SEED = 3
-"""After the user's: of the replay that shows how the published parameters would look if true."""
 
 Array = NDArray[np.float64]
 
@@ -94,26 +102,6 @@ class Config:
     hold_out_by: str = ""
 
 
-@dataclass(frozen=True)
-class _Compared:
-    """One trial, low-passed and thinned; torques (K, n_q), N.m or N, forces (K, n_f), N.
-
-    ``used`` (K, n_q) is false where an axis stands still: there Coulomb friction balances
-    whatever the load is, and no model predicts it.
-    """
-
-    trial_id: str
-    t: Array
-    used: NDArray[np.bool_]
-    measured: Array
-    residual: Array
-    residual_held_out: Array
-    residual_without_friction: Array
-    force: Array
-    force_residual: Array
-    judged: bool
-
-
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
     """Compare one identified model with all free trials, and those in a viscous field."""
     model = load_model(run, config.model)
@@ -121,65 +109,29 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     p = identified(run, config.model, system)
     estimates = run.read(IdentifyResult, config.model)
     trials = read_measured_trials(run, system, timing=estimates.input_timing)
-    if config.hold_out_by and trials.blocks:
-        raise InputError(
-            "there is one trial only, so nothing to hold out by a channel",
-            where="validate.hold_out_by",
-        )
     if config.hold_out_by:
-        trials = replace(trials, folds=_folds_by_channel(run, trials, config.hold_out_by))
+        where = "validate.hold_out_by"
+        trials = replace(trials, folds=folds_by_channel(run, trials, config.hold_out_by, where))
     require_sound_motions(system, trials.motions)
     progress(0.1, "held-out fits")
     evidence = gather_evidence(system, trials.motions, trials.band, p, trials.folds)
     timing = estimates.input_timing
     # Parameters found with the inputs late are those of inputs that late, known for sure or not.
     late_s = timing.estimate - trials.late_s if timing is not None else 0.0
-    compared = [_compare(evidence, number, p, late_s) for number in range(len(trials.motions))]
+    compared = [compare_trial(evidence, k, p, late_s) for k in range(len(trials.motions))]
     expected = np.ones(len(system.coordinates))
-    if np.any(_published_rmse(compared) > REFUSAL_RATIO * evidence.held_out_rmse):
-        expected = _expected_ratio(evidence, trials, p, config.seed)
-    notes = []
-    if trials.blocks == len(compared):
-        notes.append(
-            f"One trial: it is left out in {trials.blocks} blocks with gaps between them, by"
-            " parameters fitted to the others."
-        )
-    if trials.folds.nothing_held_out:
-        notes.append("One trial, or one group: nothing is held out; the error is that of the fit.")
+    if np.any(published_rmse(compared) > REFUSAL_RATIO * evidence.held_out_rmse):
+        expected = expected_published_ratio(evidence, trials, p, config.seed)
+    notes = _what_is_held_out(trials)
     floor: NoiseFloor | None = None
     if config.noise_floor:
-        count = config.repeats or floor_replays(trials.motions)
-
-        def report(done: int) -> None:
-            progress(0.4 + 0.4 * done / count, "noise floor")
-
-        report(0)
-        try:
-            replayed = parameters_to_replay(evidence, trials.sensors, trials.kinematics, p)
-            floor = find_noise_floor(
-                evidence, replayed, trials.sensors, trials.kinematics, config.seed, count, report
-            )
-        except InputError as error:
-            notes.append(f"No noise floor: simulating the fitted model failed ({error}).")
-    recipe = read_recipe(run, config.model, model)
-    if (
-        floor is not None
-        and floor.is_exceeded(evidence.held_out_rmse)
-        and not recipe.has_drawn_axes
-    ):
-        floor, said = _with_still_replays(evidence, trials, replayed, floor, recipe, config.seed)
+        recipe = read_recipe(run, config.model, model)
+        floor, said = _noise_floor(evidence, trials, p, recipe, config, progress)
         notes += said
     free: FreeRun | None = None
-    if config.free_run and not trials.blocks:
+    if config.free_run:
         progress(0.8, "free runs")
-        unseen = [evidence.held_out_parameters(k) for k in range(len(trials.motions))]
-        free = _run_freely(run, system, trials.motions, unseen, [c.judged for c in compared])
-    elif config.free_run:
-        progress(0.8, "free runs")
-        whole = read_motions(run, system, braked=True)
-        held_out = held_out_trials(run)
-        judged = [motion.trial_id in held_out for motion in whole]
-        free = _run_freely(run, system, whole, [evidence.p] * len(whole), judged)
+        free = _run_freely(run, evidence, trials, compared)
     if system.model.device.robot is not None:
         notes += _silent_joints(system, compared, floor)
     with ParquetAppender(out / f"models/{config.model}/residuals.parquet") as file:
@@ -189,6 +141,46 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     return _result(run, system, trials, compared, expected, floor, free, notes, estimates).write(
         out
     )
+
+
+def _what_is_held_out(trials: MeasuredTrials) -> list[str]:
+    """Say where it is not one trial after another."""
+    notes = []
+    if trials.blocks == len(trials.motions):
+        notes.append(
+            f"One trial: it is left out in {trials.blocks} blocks with gaps between them, by"
+            " parameters fitted to the others."
+        )
+    if trials.folds.nothing_held_out:
+        notes.append("One trial, or one group: nothing is held out; the error is that of the fit.")
+    return notes
+
+
+def _noise_floor(
+    evidence: Evidence,
+    trials: MeasuredTrials,
+    p: Array,
+    recipe: Recipe,
+    config: Config,
+    progress: Progress,
+) -> tuple[NoiseFloor | None, list[str]]:
+    """The floor, None where the fitted model cannot be simulated, and what to say of it."""
+    count = config.repeats or floor_replays(trials.motions)
+
+    def report(done: int) -> None:
+        progress(0.4 + 0.4 * done / count, "noise floor")
+
+    report(0)
+    try:
+        replayed = parameters_to_replay(evidence, trials.sensors, trials.kinematics, p)
+        floor = find_noise_floor(
+            evidence, replayed, trials.sensors, trials.kinematics, config.seed, count, report
+        )
+    except InputError as error:
+        return None, [f"No noise floor: simulating the fitted model failed ({error})."]
+    if recipe.has_drawn_axes or not floor.is_exceeded(evidence.held_out_rmse):
+        return floor, []
+    return _with_still_replays(evidence, trials, replayed, floor, recipe, config.seed)
 
 
 def _with_still_replays(
@@ -219,27 +211,32 @@ def _with_still_replays(
 
 
 def _run_freely(
-    run: RunFolder,
-    system: System,
-    motions: Sequence[Motion],
-    parameters: Sequence[Array],
-    judged: Sequence[bool],
+    run: RunFolder, evidence: Evidence, trials: MeasuredTrials, compared: Sequence[ComparedTrial]
 ) -> FreeRun:
     """Leave the model to itself, over whole trials and over short horizons."""
+    system = evidence.system
+    if trials.blocks:  # of the only trial, which runs as a whole
+        motions: Sequence[Motion] = read_motions(run, system, braked=True)
+        held_out = held_out_trials(run)
+        judged = [motion.trial_id in held_out for motion in motions]
+        parameters = [evidence.p] * len(motions)
+    else:
+        motions, judged = trials.motions, [c.judged for c in compared]
+        parameters = [evidence.held_out_parameters(k) for k in range(len(motions))]
     drift = find_drift(system, motions, parameters, judged)
     found = free_runs(run, system, motions, parameters, judged)
     return found.model_copy(update={"drift": drift})
 
 
 def _silent_joints(
-    system: System, compared: Sequence[_Compared], floor: NoiseFloor | None
+    system: System, compared: Sequence[ComparedTrial], floor: NoiseFloor | None
 ) -> list[str]:
     """Say which joints of a robot these trials do not identify, and why as far as it shows."""
     found = []
-    for i, (axis, entry) in enumerate(_errors(system, compared).items()):
+    for i, (axis, entry) in enumerate(axis_errors(system, compared).items()):
         if entry.fit_percent is None or entry.fit_percent >= SILENT_PERCENT:
             continue
-        size = _rms([c.measured for c in compared], [c.used for c in compared])[i]
+        size = rms([c.measured for c in compared], [c.used for c in compared])[i]
         buried = floor is not None and entry.held_out_rmse < 2.0 * floor.level[i]
         why = "noise and friction bury it" if buried else "the model lacks what drives it"
         share = max(entry.fit_percent, 0.0)
@@ -248,141 +245,6 @@ def _silent_joints(
             f" these trials do not identify this joint; {why}."
         )
     return found
-
-
-def _published_rmse(compared: Sequence[_Compared]) -> Array:
-    """Error of the published parameters by axis on the trials that are judged, (n_q,)."""
-    unseen = [c for c in compared if c.judged] or compared
-    return _rms([c.residual for c in unseen], [c.used for c in unseen])
-
-
-def _expected_ratio(evidence: Evidence, trials: MeasuredTrials, p: Array, seed: int) -> Array:
-    """Return published over held-out error, at least 1, were the published parameters true, (n_q,).
-
-    A refit takes on what filtering does to a change of direction; the truth does not. How much
-    worse it therefore looks, a replay of it shows.
-    """
-    nothing = np.ones(len(evidence.system.coordinates))
-    published = StandIn(evidence.system, p, evidence.motions, trials.sensors.rate_hz)
-    try:
-        again = replay_evidence(
-            published, evidence.system, evidence.p, trials.sensors, trials.kinematics,
-            evidence.band, evidence.folds, (seed, _EXPECTED_SEED),
-        )  # fmt: skip
-    except InputError:
-        return nothing
-    if np.any(again.held_out_rmse > UNLIKE * evidence.held_out_rmse):
-        return nothing
-    replayed = [_compare(again, number, p) for number in range(len(again.motions))]
-    return np.maximum(_published_rmse(replayed) / np.maximum(again.held_out_rmse, 1e-300), 1.0)
-
-
-def _compare(evidence: Evidence, number: int, p: Array, late_s: float = 0.0) -> _Compared:
-    """Compare one trial with the model as published, held out, and without friction.
-
-    Args:
-        evidence: the model, fitted; number: of the trial; p: the published parameters.
-        late_s: published timing of the inputs, as far as it is not taken off the trials.
-    """
-    system, motion = evidence.system, evidence.motions[number]
-    timed = [motion.with_input_timing(late_s)]
-    dry = (effect for effect in system.model.effects if effect.effect.is_dry_friction)
-    strengths = {item.name for effect in dry for item in effect.parameters if item.strength}
-    frictionless = p.copy()
-    for i, item in enumerate(system.parameters):
-        if item.name in strengths or item.name.startswith(("viscous.", "coulomb.")):
-            frictionless[i] = 0.0
-    band, folds = evidence.band, evidence.folds
-    u = motion.inputs(system.inputs)
-    z = system.memory(motion.q, motion.qd, motion.qdd, u, p, motion.t)
-    applied = system.applied(motion.q, motion.qd, motion.qdd, z, u, p)
-    force = [system.inputs.index(name) for name in system.model.device.forces]
-    rows = band.thinned_rows(len(motion.t))
-    residual = band.thin(ModelOnTrial(system, p, timed).residual)
-    push = np.linalg.pinv(system.input_map(motion.q[rows], u[rows], p))
-    return _Compared(
-        trial_id=motion.trial_id,
-        t=motion.t[rows],
-        used=evidence.used[number],
-        measured=band.thin(applied),
-        residual=residual,
-        residual_held_out=evidence.held_out_residual(number),
-        residual_without_friction=band.thin(ModelOnTrial(system, frictionless, timed).residual),
-        force=band.thin_input(u[:, force]),
-        force_residual=np.einsum("tfq,tq->tf", push, residual),
-        judged=folds.judged[number] and not folds.nothing_held_out,
-    )
-
-
-def _folds_by_channel(run: RunFolder, trials: MeasuredTrials, channel: str) -> Folds:
-    """Return folds that leave out together the trials at one value of a channel.
-
-    Raises:
-        InputError: the channel is not recorded, or changes within a trial.
-    """
-    path = run.require("ingest/samples.parquet", "ingest")
-    values = []
-    for motion in trials.motions:
-        frame = read_parquet(path, trial=motion.trial_id)
-        if channel not in frame:
-            raise InputError(f"no channel {channel!r} is recorded", where="validate.hold_out_by")
-        column = frame[channel].to_numpy(dtype=float)
-        if np.ptp(column) > 1e-9 * np.abs(column).max():
-            raise InputError(
-                f"channel {channel!r} changes within trial {motion.trial_id}",
-                where="validate.hold_out_by",
-                remedy="name a channel that is constant in each trial",
-            )
-        values.append(float(column[0]))
-    numbers = [sorted(set(values)).index(value) for value in values]
-    unseen = held_out_trials(run)
-    groups = [
-        HELD_OUT if motion.trial_id in unseen else number
-        for motion, number in zip(trials.motions, numbers, strict=True)
-    ]
-    return Folds.of_groups(groups, trials.folds.fitted)
-
-
-def _rms(values: Sequence[Array], used: Sequence[NDArray[np.bool_]]) -> Array:
-    """Return the root mean square by axis of the samples that count."""
-    square = sum(np.sum(v**2 * keep, axis=0) for v, keep in zip(values, used, strict=True))
-    count = sum(keep.sum(axis=0) for keep in used)
-    return np.asarray(np.sqrt(square / np.maximum(count, 1)))
-
-
-def _percent(error: float, size: float) -> float:
-    """Relative error: norm of the residual over norm of the measured torque, per cent."""
-    return 100.0 * error / size if size > 0.0 else 100.0
-
-
-def _errors(system: System, compared: Sequence[_Compared]) -> dict[str, AxisError]:
-    """Return the errors of each axis over some trials."""
-    used = [c.used for c in compared]
-    rmse = _rms([c.residual for c in compared], used)
-    without = _rms([c.residual_without_friction for c in compared], used)
-    size = _rms([c.measured for c in compared], used)
-    unseen = [c for c in compared if c.judged] or compared
-    where = [c.used for c in unseen]
-    held_out = _rms([c.residual_held_out for c in unseen], where)
-    published = _published_rmse(compared)
-    count = np.maximum(sum(keep.sum(axis=0) for keep in where), 1)
-    mean = sum(np.sum(c.measured * c.used, axis=0) for c in unseen) / count
-    spread = _rms([c.measured - mean for c in unseen], where)
-    unseen_size = _rms([c.measured for c in unseen], where)
-    # Of an axis that nothing drives, such as a pole on a cart, no force is there to explain.
-    return {
-        axis: AxisError(
-            rmse=rmse[i],
-            rmse_without_friction=without[i],
-            held_out_rmse=held_out[i],
-            published_rmse=published[i],
-            relative_error_percent=_percent(rmse[i], size[i]),
-            held_out_relative_error_percent=_percent(held_out[i], unseen_size[i]),
-            fit_percent=100.0 * (1.0 - held_out[i] / spread[i]) if spread[i] > 0.0 else None,
-            unit=system.torque_units[i],
-        )
-        for i, axis in enumerate(system.coordinates)
-    }
 
 
 def _judged(
@@ -404,7 +266,7 @@ def _result(
     run: RunFolder,
     system: System,
     trials: MeasuredTrials,
-    compared: Sequence[_Compared],
+    compared: Sequence[ComparedTrial],
     expected: Array,
     floor: NoiseFloor | None,
     free_run: FreeRun | None,
@@ -419,7 +281,7 @@ def _result(
             floor.level[i] if floor else None,
             floor.sd[i] if floor else 0.0,
         )
-        for i, (axis, found) in enumerate(_errors(system, compared).items())
+        for i, (axis, found) in enumerate(axis_errors(system, compared).items())
     }
     forces = {}
     for column, name in enumerate(system.model.device.forces):
@@ -440,7 +302,7 @@ def _result(
         model=identified.model,
         axes=axes,
         trials={
-            c.trial_id: TrialError.model_validate(_errors(system, [c]) | {"held_out": c.judged})
+            c.trial_id: TrialError.model_validate(axis_errors(system, [c]) | {"held_out": c.judged})
             for c in compared
         },
         forces=forces,
@@ -453,13 +315,13 @@ def _result(
     )
 
 
-def _tables(system: System, compared: Sequence[_Compared]) -> Iterator[pd.DataFrame]:
+def _tables(system: System, compared: Sequence[ComparedTrial]) -> Iterator[pd.DataFrame]:
     """Yield residuals.parquet by trial: predictions by parameters that have not seen it."""
     for name, parts in groupby(compared, key=lambda c: trial_of_block(c.trial_id)):
         yield pd.concat([_table(system, name, c) for c in parts], ignore_index=True)
 
 
-def _table(system: System, trial_id: str, c: _Compared) -> pd.DataFrame:
+def _table(system: System, trial_id: str, c: ComparedTrial) -> pd.DataFrame:
     columns: dict[str, object] = {"trial_id": trial_id, "t": c.t, "held_out": c.judged}
     for i, axis in enumerate(system.coordinates):
         measured = c.measured[:, i]

@@ -129,6 +129,7 @@ def follow_motion(system: System, p: Array, motion: Motion, rate_hz: float) -> C
             force=[at[f] for f in forces],
             rate=[at.get(derivative(f, 1), -1) for f in forces],
             curvature=[at.get(derivative(f, 2), -1) for f in forces],
+            smooth=system.forced,
         )  # fmt: skip
     except Runaway:
         if not held:

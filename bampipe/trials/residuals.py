@@ -7,7 +7,7 @@ goes through one low-pass before anything is fitted, and is thinned to what that
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -57,23 +57,31 @@ def problem_of(
         timing: whether that time is estimated; else it stays as given.
     """
     n = len(system.parameters)
-    shaping = [i for i, linear in enumerate((*system.linear, False)) if not linear]
-    remembered: dict[tuple[int, bytes], Array] = {}
+    # Of differences by many parameters few change the internal states or the bodies' forces.
+    states = _Remembered([i for i, linear in enumerate((*system.linear, False)) if not linear])
+    bodies = _Remembered(range(n + 1) if system.moves_sensors else sorted(system.of_bodies))
+
+    def inputs_at(motion: Motion, p: Array) -> Array:
+        u = motion.inputs(system.inputs)
+        return u if p[n] == 0.0 else u - p[n] * motion.input_rates(system.inputs)
 
     def residual(trial: int, p: Array) -> Array:
         motion = motions[trial]
-        u = motion.inputs(system.inputs)
-        if p[n] != 0.0:
-            u = u - p[n] * motion.input_rates(system.inputs)
-        # Internal states do not change with what the residual is linear in: of differences by
-        # many parameters, those of the last point serve most.
-        key = trial, p[shaping].tobytes()
-        found, z = residual_and_memory(system, motion, u, p[:n], remembered.get(key))
-        if key not in remembered:
-            if any(other != trial for other, _ in remembered) or len(remembered) > 1:
-                remembered.clear()
-            remembered[key] = z
-        return found
+        u, at = inputs_at(motion, p), (motion.q, motion.qd, motion.qdd)
+        true = system.true_motion(*at, u, p[:n])
+        z = states.find(trial, p, lambda: system.memory(*at, u, p[:n], motion.t))
+        forces = bodies.find(trial, p, lambda: system.body_forces(*true, p[:n]))
+        return system.residual(*true, z, u, p[:n], forces)
+
+    def slopes(trial: int, p: Array, wanted: Sequence[int]) -> tuple[list[int], Array]:
+        numbers = [free[k] for k in wanted]
+        given = [k for k, i in enumerate(numbers) if i in system.lasting]
+        motion = motions[trial]
+        if not given:
+            return given, np.empty((len(motion.q), len(system.coordinates), 0))
+        u = inputs_at(motion, p)
+        true = system.true_motion(motion.q, motion.qd, motion.qdd, u, p[:n])
+        return given, system.slopes([numbers[k] for k in given], *true, u)
 
     parameters = system.parameters
     free = [i for i, item in enumerate(parameters) if not item.fixed and item.name not in held]
@@ -114,7 +122,29 @@ def problem_of(
         ),
         precision=np.array(precision),
         known=np.array(known),
+        slopes=slopes,
     )
+
+
+class _Remembered:
+    """The last values of a function of a trial and of some parameters.
+
+    Attributes:
+        uses: numbers of those parameters.
+    """
+
+    def __init__(self, uses: Iterable[int]) -> None:
+        self.uses = list(uses)
+        self._known: dict[tuple[int, bytes], Array] = {}
+
+    def find(self, trial: int, p: Array, compute: Callable[[], Array]) -> Array:
+        """The value for parameters ``p``, (n_p,), computed where it is not known."""
+        key = trial, p[self.uses].tobytes()
+        if key not in self._known:
+            if any(other != trial for other, _ in self._known) or len(self._known) > 1:
+                self._known.clear()
+            self._known[key] = compute()
+        return self._known[key]
 
 
 def standstill_of(motion: Motion, system: System, rate_hz: float) -> NDArray[np.bool_]:
@@ -132,17 +162,11 @@ def standstill_of(motion: Motion, system: System, rate_hz: float) -> NDArray[np.
     return still if motion.rest is None else still | motion.rest
 
 
-def residual_and_memory(
-    system: System, motion: Motion, u: Array, p: Array, z: Array | None = None
-) -> tuple[Array, Array]:
-    """Residual (T, n_q) of a trial under inputs ``u`` (T, n_u), unfiltered, and states (T, n_z).
-
-    The states are ``z`` where that is given.
-    """
-    if z is None:
-        z = system.memory(motion.q, motion.qd, motion.qdd, u, p, motion.t)
-    true = system.true_motion(motion.q, motion.qd, motion.qdd, u, p)
-    return system.residual(*true, z, u, p), z
+def residual_and_memory(system: System, motion: Motion, u: Array, p: Array) -> tuple[Array, Array]:
+    """Residual (T, n_q) of a trial under inputs ``u`` (T, n_u), unfiltered, and states (T, n_z)."""
+    at = motion.q, motion.qd, motion.qdd
+    z = system.memory(*at, u, p, motion.t)
+    return system.residual(*system.true_motion(*at, u, p), z, u, p), z
 
 
 def applied_rms(

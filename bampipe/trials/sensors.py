@@ -30,12 +30,6 @@ measured arm 0.98 or more is left, of a command by gains on counts and their dif
 where the log keeps every second to tenth sample of the controller, 0.5 to 0.76."""
 DISAGREEMENT = 2.0
 """Factor between stated and measured noise beyond which a warning is given."""
-_COUNTS_SPAN = 16.0
-"""Counts that a converter's readings span at least: fewer tell nothing from a reading in tens."""
-_MIDDLES = (2.0**9, 2.0**11, 2.0**13, 2.0**15)
-"""Counts at which converters of 10 to 16 bits stand where a bipolar sensor carries nothing."""
-_NEAR_MIDDLE = 0.05
-"""Share of that by which an unloaded sensor is off it, as offsets and preload go."""
 
 
 @dataclass(frozen=True)
@@ -190,22 +184,6 @@ def _typical_noise(records: Sequence[RecordNoise], stated: float | None) -> floa
 def _lower_quartile(values: Sequence[float]) -> float | None:
     finite = [value for value in values if np.isfinite(value)]
     return float(np.quantile(finite, 0.25)) if finite else None
-
-
-def looks_like_counts(readings: Array) -> bool:
-    """Whether readings of a force (T,) are rather counts of a converter than in their unit.
-
-    Whole numbers, none negative, that stay farther from zero than they span or about the middle of
-    a converter's range: a force that a machine is moved by comes near zero, and is no whole number.
-    """
-    known = readings[np.isfinite(readings)]
-    if not known.size or np.mean(np.abs(known - np.rint(known)) < 1e-6) < 0.95:
-        return False
-    low, middle, high = float(known.min()), float(np.median(known)), float(known.max())
-    if low < 0.0 or high - low < _COUNTS_SPAN:
-        return False
-    about = any(abs(middle / m - 1.0) < _NEAR_MIDDLE and high < 2.0 * m for m in _MIDDLES)
-    return about or middle > high - low
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from independent.person import follow
+from independent.person import follow, free_motion
 from independent.sensors import (
     GOOD,
     Conditions,
@@ -75,9 +75,10 @@ def record(
     trials = []
     for number, task in enumerate([*(None,) * (4 if c.trials is None else c.trials), *c.tasks]):
         rng = np.random.default_rng([seed, 1 + number])
-        if task is None:
-            goal, rate = draw_moves(rng, steps, 0.12, 0.3 * c.pace, 0.1)
-        else:
+        length, kind, reach, pace = free_motion(task, number, steps, STEP, c.pace)
+        if kind is not None:
+            goal, rate = draw_moves(rng, length, 0.12 * reach, 0.3 * pace * reach, 0.1)
+        elif task is not None:
             goal, rate = (column[:, 0] for column in follow(rng, task, ("carriage",), STEP))
         kicks = rng.choice([-60.0, 0.0, 0.0, 60.0], len(goal) // 1500 + 1)
         kick = np.repeat(kicks, 1500)[: len(goal)]

@@ -16,7 +16,7 @@ from numba import njit
 from scipy.signal import butter, lfilter, sosfiltfilt
 
 from independent.friction import MEMORY, blank_laws, push_along, remember, resist, set_law
-from independent.person import follow
+from independent.person import follow, free_motion
 from independent.sensors import (
     GOOD,
     Conditions,
@@ -487,9 +487,11 @@ def record(
     kinds = [(kind == 1, None) for kind in (0, 1) for _ in range(usual[kind])]
     for number, (braked, task) in enumerate([*kinds, *((t.brakes > 0.0, t) for t in c.tasks)]):
         rng = np.random.default_rng([seed, 1 + number])
-        if task is None:
-            wanted, rate = _draw_wanted(rng, steps, 0.6 if braked else 1.0, c.pace)
-        else:
+        length, kind, reach, pace = free_motion(task, number, steps, STEP, c.pace)
+        if kind is not None:
+            share = 0.6 if braked else 1.0
+            wanted, rate = _draw_wanted(rng, length, share * reach, pace)
+        elif task is not None:
             wanted, rate = follow(rng, task, AXES, STEP)
         machine = specimen.machine
         machine["hand_frequency"], machine["hand_lag"] = rng.uniform(8.0, 11.0), 0.012

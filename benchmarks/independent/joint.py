@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from independent.person import follow
+from independent.person import follow, free_motion
 from independent.sensors import (
     GOOD,
     Conditions,
@@ -126,12 +126,13 @@ def record(
     trials = []
     for number, task in enumerate([*(None,) * (5 if c.trials is None else c.trials), *c.tasks]):
         rng = np.random.default_rng([seed, 1 + number])
-        if task is not None:
+        length, kind, reach, pace = free_motion(task, number, steps, STEP, c.pace)
+        if kind is None and task is not None:
             goal, rate = (column[:, 0] for column in follow(rng, task, ("joint",), STEP))
-        elif number % 2:
-            goal, rate = draw_moves(rng, steps, 1.2, 1.8 * c.pace, 0.15)
+        elif (kind or 0) % 2:
+            goal, rate = draw_moves(rng, length, 1.2 * reach, 1.8 * pace * reach, 0.15)
         else:
-            goal, rate = draw_waves(rng, steps, 1.2, 0.8 * c.pace)
+            goal, rate = draw_waves(rng, length, 1.2 * reach, 0.8 * pace)
         at = sample_steps(rng, len(goal), 1.0 / (rate_hz * STEP), c, jitter=0.08)
         # The stamps have whole milliseconds and are true to that.
         at = np.unique(np.rint(at / 10).astype(np.int64) * 10)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ class Task:
         brakes: share of the field of the viscous trials that the brakes render.
         reach: share of the range that is covered; haste: factor on the speeds: one for somebody
             who follows well.
+        like: number of the free trial that is imitated, and not ``moves`` made.
     """
 
     moves: Mapping[str, Mapping[str, float]]
@@ -31,14 +32,53 @@ class Task:
     brakes: float = 0.0
     reach: float = 1.0
     haste: float = 1.0
+    like: int | None = None
 
     @classmethod
-    def read(cls, path: Path, **sloppiness: float) -> Task:
-        """The first proposal of ``next.json``, followed with ``reach`` and ``haste``."""
+    def read(cls, path: Path, **sloppiness: float) -> tuple[Task, ...]:
+        """The trials of the first proposal of ``next.json``, followed with ``reach`` and ``haste``.
+
+        The trial that is imitated is called t01, t02, or with more behind that.
+        """
         first = json.loads(path.read_text(encoding="utf-8"))["proposals"][0]
-        return cls(
-            first["moves"], first["pose"], first["seconds"], first.get("brakes", 0.0), **sloppiness
+        parts, example = first.get("parts", 1), first.get("like", "")
+        one = cls(
+            first["moves"],
+            first["pose"],
+            first["seconds"] / parts,
+            first.get("brakes", 0.0),
+            like=int(example[1:3]) - 1 if example else None,
+            **sloppiness,
         )
+        return (one,) * parts
+
+    def of_trials(self, free: int, tasks: Sequence[Task]) -> Task:
+        """The same where the trial that is imitated may be one of ``tasks``, after ``free`` others.
+
+        Args:
+            free: number of the free trials before the tasks; tasks: of the session.
+        """
+        if self.like is None or self.like < free:
+            return self
+        whole = tasks[self.like - free]
+        return replace(whole, seconds=self.seconds, reach=self.reach, haste=self.haste)
+
+
+def free_motion(
+    task: Task | None, number: int, steps: int, step: float, pace: float
+) -> tuple[int, int | None, float, float]:
+    """Of a free trial, or one that imitates it: steps, the trial's number, reach and pace.
+
+    The number is None of a trial that makes moves. Half the range at twice the speed is four times
+    the pace.
+
+    Args:
+        task: None for a free trial; number: of the trial; steps: of a free one.
+        step: of the integration, s; pace: of free motion.
+    """
+    if task is None:
+        return steps, number, 1.0, pace
+    return round(task.seconds / step), task.like, task.reach, pace * task.haste / task.reach
 
 
 def follow(

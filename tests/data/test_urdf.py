@@ -238,7 +238,7 @@ def test_motors_by_current_have_torque_constants(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("motors", "what"),
+    ("tables", "what"),
     [
         ("[robot.motors.one]\nturns = { wrist = 1.0 }\n", "there is no joint 'wrist'"),
         ("[robot.motors.one]\nturns = {}\n", "at least 1"),
@@ -253,12 +253,13 @@ def test_motors_by_current_have_torque_constants(tmp_path: Path) -> None:
             "torque_constant = 1.0\ntorque_constant_sd = 0.2\n",
             "every torque constant is estimated, which leaves the scale of all masses open",
         ),
+        ("[robot.payload]\ncenter = [0.0, 0.0, 0.1]\n", "'mass' is missing"),
     ],
 )
-def test_wrong_motors_are_refused(motors: str, what: str, tmp_path: Path) -> None:
+def test_wrong_motors_and_payloads_are_refused(tables: str, what: str, tmp_path: Path) -> None:
     write(tmp_path, *ARM)
     path = tmp_path / "device.toml"
-    path.write_text(f'name = "arm"\n[robot]\nurdf = "arm.urdf"\n{motors}')
+    path.write_text(f'name = "arm"\n[robot]\nurdf = "arm.urdf"\n{tables}')
     with pytest.raises(InputError, match=what):
         device_from(read_device_file(path), str(path))
 

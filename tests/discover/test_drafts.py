@@ -143,7 +143,7 @@ def _hold_columns_against_effect(recipe, evidence, screen, form):
         name: np.array([_between(low, high) * (2.0 if name == "longer" else 1.0)])
         for name, (low, high, _) in form.limits().items()
     }
-    columns = screen.columns(form, searched)[:, :, 0]
+    columns = screen.signals.columns(form, searched)[:, :, 0]
     names = [p.name.rpartition(".")[2] for p in item.parameters]
     for strength, column in zip(form.shape.strengths, columns, strict=True):
         p = np.concatenate([evidence.p, [q.prior for q in item.parameters]])
@@ -187,12 +187,14 @@ def test_a_form_that_cancels_the_drive_gains_nothing(clean, damper):
                 item = candidates_of(wider, (form.canonical,))[0]
                 p = [values.get(q.name.rpartition(".")[2], q.prior) for q in item.parameters]
                 exact = Scorer(evidence)._sensitivity(item, np.array(p))[0]
-                assert screen._slope(form, values) == pytest.approx(exact, rel=0.05, abs=0.05)
+                assert screen.signals.drive_slope(form, values) == pytest.approx(
+                    exact, rel=0.05, abs=0.05
+                )
             if form.shape.name == "rise":
-                assert screen._slope(form, values) < -1.0
+                assert screen.signals.drive_slope(form, values) < -1.0
     for name in ("parabola_by_position", "slope_by_position"):
         form = next(f for f in screen.forms() if f.name.endswith(name))
-        assert screen._slope(form, dict.fromkeys(form.shape.strengths, 1.0)) == 0.0
+        assert screen.signals.drive_slope(form, dict.fromkeys(form.shape.strengths, 1.0)) == 0.0
 
 
 def test_hysteresis_of_a_force_sensor_is_found(tmp_path):

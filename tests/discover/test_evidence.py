@@ -2,12 +2,16 @@
 
 import numpy as np
 import pytest
+from physics.small_arm import ARM
 from scipy.signal import butter, sosfiltfilt
 from sessions import BAND, RATE, TRUTH, bam, folds, made
 
 from bampipe.discover.chance import system_of
 from bampipe.estimate.least_squares import stacked_residual
 from bampipe.estimate.low_pass import Band
+from bampipe.physics import Model, compile_model
+from bampipe.physics.device import LAST_ORDER, derivative
+from bampipe.physics.registry import device_from
 from bampipe.trials.motion import Motion
 from bampipe.trials.residuals import gather_evidence, problem_of
 
@@ -115,3 +119,28 @@ def test_standstill_is_left_out_and_quick_reversals_stay():
     assert used[:, 0].all() and used[:, 2].all()
     assert not used[(rows > 3.1) & (rows < 3.9), 1].any()
     assert used[rows < 2.7, 1].all()
+
+
+def test_forces_of_bodies_follow_a_motion_that_the_timing_of_inputs_moves():
+    """Wound up by its drive, a joint is elsewhere when its torque is read at another time."""
+    system = compile_model(Model(device_from(ARM), ("transmission_compliance:two",)))
+    rng, count = np.random.default_rng(2), 400
+    t = np.arange(count) / RATE
+    q, qd, qdd = 0.3 * rng.normal(size=(3, count, 3))
+    channels = {name: rng.normal(size=count) for name in channels_of(system)}
+    motions = [Motion("t", t, q, qd, qdd, np.full_like(q, 1e-4), channels)]
+    p = np.append(system.prior, 0.0)
+    p[system.index("transmission_compliance.two.compliance")] = 0.01
+    late = np.append(p[:-1], 0.3 / RATE)
+
+    moved = problem_of(system, motions, Band(RATE, (8.0,) * 3), timing=True)
+    moved.residual(0, p)
+    afresh = problem_of(system, motions, Band(RATE, (8.0,) * 3), timing=True)
+    np.testing.assert_array_equal(moved.residual(0, late), afresh.residual(0, late))
+    assert np.abs(moved.residual(0, late) - moved.residual(0, p)).max() > 1e-3
+
+
+def channels_of(system):
+    """Names of its forces and all their time derivatives."""
+    forces = system.model.device.forces
+    return [derivative(name, k) for name in forces for k in range(LAST_ORDER + 1)]

@@ -40,7 +40,7 @@ def arm(tmp_path_factory):
 )
 def test_a_bred_expression_and_its_form_have_the_same_value(arm, text):
     _, screen, _ = arm
-    device = screen.evidence.system.model.device
+    device = screen.signals.device
     names = ("position", "extension velocity", "direction")
     known = [q for q in symbolic.coordinates(device, 0) if q.words in names]
     x = np.random.default_rng(1).uniform(-1.0, 1.0, (50, 3))
@@ -69,8 +69,8 @@ def test_what_two_axes_shape_is_found_by_symbolic_regression_alone(arm, monkeypa
     recipe, clean, screen = arm
     monkeypatch.setattr(symbolic, "_ROUNDS", 2)
     best = symbolic.search(screen)[0]
-    left = np.sum(screen.left**2) / np.sum(clean.left**2)
-    possible = 0.5 * screen.independent * np.log(left)
+    left = np.sum(screen.fit.left**2) / np.sum(clean.fit.left**2)
+    possible = 0.5 * screen.fit.independent * np.log(left)
     assert best.gain > 0.95 * possible
     assert screen.search()[0].gain < 0.3 * possible
     declaration = best.form.declaration("a test")
@@ -80,5 +80,7 @@ def test_what_two_axes_shape_is_found_by_symbolic_regression_alone(arm, monkeypa
     assert best.form.canonical in tried
     assert faults == []
     monkeypatch.setattr(symbolic, "_ROUNDS", 1)
-    x = np.column_stack([screen.thinned("position"), screen.thinned("extension position")])
+    x = np.column_stack(
+        [screen.signals.thinned("position"), screen.signals.thinned("extension position")]
+    )
     assert symbolic._bred(screen, x) == symbolic._bred(screen, x)

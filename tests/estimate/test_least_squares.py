@@ -117,6 +117,33 @@ def test_intervals_cover_coloured_noise() -> None:
     assert 0.8 <= np.mean(inside) <= 1.0
 
 
+def test_intervals_of_fewer_blocks_than_parameters_hold() -> None:
+    """Five trials of a second: their blocks cannot show the scatter of three parameters."""
+    rng = np.random.default_rng(1)
+    count = int(1.2 * RATE)
+    whole = problem(5)
+
+    def short(trial: int, p: np.ndarray) -> np.ndarray:
+        return whole.residual(trial, p)[500 : 500 + count]
+
+    still = [np.zeros((count, 1), dtype=bool)] * 5
+    clean = fit(problem(5, residual=short, standstill=still), TRUTH).p
+    off = []
+    for _ in range(60):
+        noise = [rng.standard_normal(count) for _ in range(5)]
+        found = fit(problem(5, residual=_with(short, noise), standstill=still), TRUTH)
+        off.append(np.abs(found.p - clean) / np.sqrt(np.diag(found.covariance)))
+    assert 0.92 <= np.mean(np.array(off) < 1.96) <= 0.99
+    assert np.max(off) < 4.0
+
+
+def test_trials_that_stand_still_are_refused() -> None:
+    inner = problem(1)
+    still = problem(1, standstill=[np.ones((len(inner.residual(0, TRUTH)), 1), dtype=bool)])
+    with pytest.raises(ValueError, match="clear of standstill"):
+        fit(still, TRUTH)
+
+
 def _with(
     residual: Callable[[int, np.ndarray], np.ndarray], noise: list[np.ndarray]
 ) -> Callable[[int, np.ndarray], np.ndarray]:

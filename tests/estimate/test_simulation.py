@@ -40,6 +40,22 @@ def test_held_and_linear_inputs_differ_by_half_a_sample():
     assert linear - held == pytest.approx(0.5 * 0.002 * 2.0, rel=1e-9)
 
 
+def test_a_smooth_force_keeps_its_strength_between_coarse_samples():
+    frequency, force, mass = 2 * np.pi * 10.0, 5.0, 2.0
+    t = 0.01 * np.arange(301)
+    u = np.zeros((len(t), 3))
+    u[:, 0] = force * np.cos(frequency * t)
+    speed = force / mass / frequency * np.sin(frequency * t)
+    p = np.array([mass, 0.0, 0.0])
+
+    def moved(**options):
+        x = simulate(slider, np.zeros(2), u, p, 0.01, width=WIDTH, n_noise=1, **options)
+        return speed @ x[:, 1] / (speed @ speed)
+
+    assert moved() == pytest.approx(np.sinc(0.1) ** 2, abs=1e-3)
+    assert moved(smooth=[0]) == pytest.approx(1.0, abs=1e-3)
+
+
 def test_coulomb_friction_stops_and_holds():
     p = [3.5, 0.0, 3.5]
     u = np.zeros((2001, 3))

@@ -9,15 +9,23 @@ import numpy as np
 import pytest
 
 from bampipe.estimate.low_pass import Band
-from bampipe.next_trial.choice import Tried, rank_designs
+from bampipe.next_trial.choice import find_best_of_each, rank_designs
 from bampipe.next_trial.discrimination import Contest, Rival, Sums
-from bampipe.next_trial.motion import Rehearsal, follow_roughly, stroke_path
+from bampipe.next_trial.motion import (
+    HASTY,
+    Rehearsal,
+    _solve,
+    example_path,
+    follow_roughly,
+    stroke_path,
+)
 from bampipe.next_trial.precision import Precision
 from bampipe.next_trial.primitives import (
     Envelope,
     Primitive,
     Stroke,
     find_beyond,
+    imitate_trials,
     list_primitives,
     vary_surroundings,
 )
@@ -26,7 +34,6 @@ from bampipe.next_trial.words import describe
 from bampipe.physics import Model, compile_model, registry
 from bampipe.results.forecast import compare_forecast, read_forecasts
 from bampipe.results.next import ExpectedConfusion, ExpectedSd, NextResult, Proposal
-from bampipe.stages.next import _better_at_hand
 from bampipe.trials.motion import Motion
 
 SEEN = Envelope(
@@ -112,6 +119,118 @@ def test_going_beyond_what_has_been_seen_has_to_pay(pays, first_is_beyond):
     # Who does not want to go there finds another one.
     assert not all(are_beyond)
     assert next(one.worth for one in tried if any(find_beyond(one.design, seen))) == pays
+
+
+def made_rehearsal(seen: Envelope) -> SimpleNamespace:
+    return SimpleNamespace(
+        seen=seen,
+        sensors=SimpleNamespace(rate_hz=10.0),
+        system=SimpleNamespace(parameters=("mass",)),
+        record=lambda design, version: (design, version),
+    )
+
+
+def test_what_is_worth_little_to_somebody_hasty_does_not_win():
+    def worth(recorded: tuple[Primitive, int]) -> float:
+        design, version = recorded
+        wide = design.strokes[design_axis(design)].high > 0.6
+        exact = 1.0 + 0.01 * design.seconds
+        return (3.0 * exact if version != HASTY else 0.0) if wide else exact
+
+    tried = rank_designs(made_rehearsal(SEEN), worth, 20.0, [0], with_rests=False)
+    assert tried[0].design.strokes[design_axis(tried[0].design)].high <= 0.6
+    assert tried[0].worth == pytest.approx(1.2)
+
+
+def design_axis(design: Primitive) -> int:
+    return next(iter(design.strokes))
+
+
+def test_designs_of_which_none_is_worth_enough_are_not_followed():
+    ranked = rank_designs(
+        made_rehearsal(SEEN), lambda _: 0.04, 20.0, [0], with_rests=False, least=0.05
+    )
+    assert ranked == []
+    # With the brakes on it may be.
+    ranked = rank_designs(
+        made_rehearsal(SEEN), lambda one: one[0].field, 20.0, [0], with_rests=False, least=0.05
+    )
+    assert ranked[0].design.field == 1.0
+
+
+def test_each_parameter_gets_the_design_that_is_best_for_it():
+    recorded = []
+
+    def inform(one: tuple[Primitive, int]) -> np.ndarray:
+        recorded.append(one)
+        return np.array([[float(one[0].strokes[0].fast)], [-float(one[0].strokes[0].fast)]])
+
+    fast, slow = find_best_of_each(
+        made_rehearsal(SEEN), inform, [lambda v: v[0, 0], lambda v: v[1, 0]], 20.0, [0]
+    )
+    assert fast.design.strokes[0].fast == pytest.approx(0.6 * SEEN.speed[0])
+    assert slow.design.strokes[0].fast < 0.1 * SEEN.speed[0]
+    designs = list_primitives(SEEN, 20.0, [0], with_rests=False)
+    assert len(recorded) == len(designs) + 20  # two of each are followed by five people
+
+
+def test_what_leaves_what_has_been_seen_is_recorded_in_two_trials():
+    seen = TIMID.within(LIMITS, np.full(3, 20.0))
+    beyond = [design for design in every_design(seen) if any(find_beyond(design, seen))]
+    assert {design.parts for design in beyond} == {2}
+    for design in list_primitives(seen, 20.0, [0], with_rests=False):
+        stroke = design.strokes[design_axis(design)]
+        # Each of them has room for three strokes.
+        longest = 1.875 * (stroke.high - stroke.low) / np.sqrt(stroke.slow * stroke.fast)
+        assert design.parts == 1 or 3.0 * longest < 1.01 * design.part_s
+    assert ", for 20 s in 2 trials of 10 s; " in describe(beyond[0], seen, registry.device("bam"))
+    assert all(d.parts == 1 for d in every_design(seen) if not any(find_beyond(d, seen)))
+    assert all(d.parts == 1 for d in list_primitives(seen, 6.0, [0], with_rests=False))
+
+
+def made_motion(name: str, rate: float) -> Motion:
+    t = np.arange(12000) / 1000.0
+    w = rate * np.array([1.0, 1.3, 0.0])
+    q = SEEN.usual + 0.2 * np.sin(w * t[:, None])
+    qd, qdd = 0.2 * w * np.cos(w * t[:, None]), -0.2 * w**2 * np.sin(w * t[:, None])
+    return Motion(name, t, q, qd, qdd, np.zeros_like(q), {})
+
+
+def test_a_trial_that_is_imitated_goes_on_smoothly_and_stays_where_it_was():
+    (first, second) = imitate_trials(
+        [made_motion("t02@0.0s", 1.0), made_motion("t01", 2.0)], SEEN, 30.0
+    )
+    assert [first.example.trial, second.example.trial] == ["t01", "t02"]
+    t = np.arange(30000) / 1000.0
+    q, qd, qdd = example_path(first.example, t)
+    np.testing.assert_allclose(q[2000:10000], first.example.motion.q[2000:10000], atol=1e-9)
+    np.testing.assert_allclose(np.gradient(q, t, axis=0)[1:-1], qd[1:-1], atol=2e-3)
+    np.testing.assert_allclose(np.gradient(qd, t, axis=0)[1:-1], qdd[1:-1], atol=2e-2)
+    assert np.all(np.abs(q - SEEN.usual) <= 0.2 + 1e-9)
+    hasty = follow_roughly(first, SEEN, np.random.default_rng(0), True)
+    q, qd, _ = example_path(hasty.example, t)
+    assert np.ptp(q[:, 0]) == pytest.approx(0.2, rel=0.02)
+    usual = np.abs(qd[1000:2500, 0]).max()
+    assert usual == pytest.approx(0.8, rel=0.01)
+    rehearsal = Rehearsal(SimpleNamespace(coordinates=("a",)), np.zeros(0), None, None, SEEN, 0)
+    t, q = rehearsal.trajectory(first)
+    assert np.abs(np.gradient(q, t, axis=0)[0]).max() < 0.02
+    said = describe(first, SEEN, registry.device("bam"))
+    assert said == (
+        "Move yaw and pitch as in trial t01, yaw between −11° and 11° (−0.20 to 0.20 rad) at up to"
+        " 23°/s, pitch between −9° and 14° (−0.15 to 0.25 rad) at up to 30°/s, for 30 s."
+    )
+
+
+def test_forces_make_up_for_a_residual_also_where_one_of_them_does_nothing():
+    rng = np.random.default_rng(0)
+    gains, force = rng.normal(size=(5, 3, 3)), rng.normal(size=(5, 3))
+    left = np.einsum("tqf,tf->tq", gains, force)
+    np.testing.assert_allclose(_solve(gains, left), force, rtol=1e-9)
+    gains[2, :, 1] = 0.0
+    found = _solve(gains, np.einsum("tqf,tf->tq", gains, force))
+    np.testing.assert_allclose(np.delete(found[2], 1), np.delete(force[2], 1), rtol=1e-9)
+    assert found[2, 1] == pytest.approx(0.0, abs=1e-9)
 
 
 def test_who_follows_roughly_stays_within_the_device_too():
@@ -230,10 +349,10 @@ def made_proposal(after: float, farther: tuple[str, ...] = ()) -> Proposal:
 
 
 def test_a_forecast_beyond_the_trials_at_hand_is_said_to_be_the_models():
-    said = explain_proposal("decision", "", made_proposal(0.01, ("yaw",)), {}, (), (), "").expected
+    said = explain_proposal("decision", "", made_proposal(0.01, ("yaw",)), {}, (), ()).expected
     assert said.startswith("The chance of confusing them is expected to fall from 40 % to")
     assert said.endswith("takes the model to hold beyond what the trials at hand have shown.")
-    said = explain_proposal("decision", "", made_proposal(0.01), {}, (), (), "").expected
+    said = explain_proposal("decision", "", made_proposal(0.01), {}, (), ()).expected
     assert "beyond" not in said
 
 
@@ -254,33 +373,38 @@ def test_what_a_model_lacks_is_said_to_count_as_noise():
     wide = ExpectedSd(before=0.05, after=0.005, low=0.002, high=0.01, unit="kg")
     sharp = ExpectedSd(before=0.05, after=0.005, low=0.0045, high=0.006, unit="kg")
     best = made_proposal(0.1).model_copy(update={"sd": {"mass": wide, "moment": sharp}})
-    said = explain_proposal("precision", "", best, {}, (), (), "").expected
+    said = explain_proposal("precision", "", best, {}, (), ()).expected
     assert said == (
         "Expected: `mass` ± 0.002 to 0.01 kg, now ± 0.05; `moment` ± 0.005 kg, now ± 0.05"
         " (eight cases in ten)."
     )
-    said = explain_proposal("precision", "", best, {}, (), ("yaw", "pitch"), "").expected
+    said = explain_proposal("precision", "", best, {}, (), ("yaw", "pitch")).expected
     assert "The error of yaw and pitch is above the noise floor" in said
-    # Where effects compete, no uncertainty is forecast, and nothing need be said of it.
-    said = explain_proposal("precision", "", best, {}, (), ("yaw",), "", ["lag:x"]).expected
-    assert "By the diagnosis the model lacks lag:x: add that first" in said
+    # What the diagnosis found comes before any trial; where effects compete, nothing need be said.
+    reasons = explain_proposal("precision", "", best, {}, (), ("yaw",), ["lag:x"])
+    assert reasons.why.startswith("By the diagnosis the model lacks lag:x: add that first")
+    assert reasons.expected.endswith("of a model that lacks something.")
+    assert "noise floor" not in reasons.expected
+    said = explain_proposal("decision", "", made_proposal(0.01), {}, (), ("yaw",)).expected
     assert "noise floor" not in said
-    said = explain_proposal("decision", "", made_proposal(0.01), {}, (), ("yaw",), "t03").expected
-    assert "noise floor" not in said
-    assert said.endswith(
-        "Moving freely as in trial t03 for as long would say more of the parameters: rather record"
-        " that."
-    )
+
+
+def test_it_is_said_what_a_trial_is_for_that_shows_no_effect_and_why_there_are_two():
+    entry = ExpectedSd(before=0.05, after=0.005, low=0.0045, high=0.006, unit="kg")
+    best = made_proposal(0.1).model_copy(update={"sd": {"mass": entry}})
+    reasons = explain_proposal("sensitivity", "", best, {}, (), ())
+    assert reasons.why.endswith("This one adds most to what is known of all parameters together.")
+    assert reasons.expected.startswith("Expected: `mass`")
+    why = explain_proposal("precision", "", best.model_copy(update={"parts": 2}), {}, (), ()).why
+    assert "more than one trial, because each is judged by what the others say" in why
 
 
 def test_where_nothing_decides_it_is_said_what_was_not_tried():
-    said = explain_proposal(
-        "decision", "", made_proposal(0.39), {}, ["yaw", "pitch"], (), ""
-    ).expected
+    said = explain_proposal("decision", "", made_proposal(0.39), {}, ["yaw", "pitch"], ()).expected
     assert said.endswith(
         "the device file states no [limits] of yaw and pitch, so that none was tried."
     )
-    said = explain_proposal("decision", "", made_proposal(0.39), {}, [], (), "").expected
+    said = explain_proposal("decision", "", made_proposal(0.39), {}, [], ()).expected
     assert said.endswith("39 % after this one. Another load may.")
 
 
@@ -306,19 +430,6 @@ def test_what_trials_are_worth_for_one_parameter_is_the_fall_of_its_logarithm():
     much = 3.0 * known.information
     assert known.worth(much, 20.0, "mass") == pytest.approx(np.log(2.0), rel=1e-3)
     assert known.worth(much, 20.0) == known.gain(much)
-
-
-def test_a_trial_at_hand_that_says_more_than_a_design_is_named():
-    known = made_precision(0.01, 0.01, 10_000)
-    weak, strong = (
-        SimpleNamespace(trial_id=name, t=np.array([0.0, 10.0]), size=size)
-        for name, size in (("t01", 0.1), ("t02", 1.0))
-    )
-    known = replace(known, of_motion=lambda motion: motion.size * known.information)
-    # Twice as long, it says twice as much.
-    for worth, named in ((0.5 * np.log(2.9), "t02"), (0.5 * np.log(3.1), "")):
-        best = Tried(None, worth, ())
-        assert _better_at_hand(known, [weak, strong], "", 20.0, best) == named
 
 
 def test_what_few_blocks_widen_goes_with_more_of_them():

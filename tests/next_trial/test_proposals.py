@@ -41,13 +41,13 @@ def test_the_uncertainty_forecast_is_the_one_that_comes(tmp_path):
     found, path = propose(run, purpose="coulomb.joint", seconds=12.0)
     assert found.purpose == "precision"
     forecast = found.proposals[0].sd
-    after, _ = record_run(tmp_path / "after", "joint", 922, **LONG, tasks=(Task.read(path),))
+    after, _ = record_run(tmp_path / "after", "joint", 922, **LONG, tasks=Task.read(path))
     more, _ = record_run(tmp_path / "more", "joint", 922, **LONG | {"trials": 5})
     came = after.parameters("base").sd
     for name in ("coulomb.joint", "viscous.joint", "moment", "inertia"):
         assert came[name] / 1.3 < forecast[name].after < 1.3 * came[name], name
     sloppy = Task.read(path, reach=0.5, haste=2.0)
-    rough, _ = record_run(tmp_path / "rough", "joint", 922, **LONG, tasks=(sloppy,))
+    rough, _ = record_run(tmp_path / "rough", "joint", 922, **LONG, tasks=sloppy)
     # By the filter's own uncertainty: the scatter of blocks of time is itself known to a tenth.
     gained, by_chance, roughly = (
         filter_sd_of(one, "coulomb.joint") ** -2 - filter_sd_of(run, "coulomb.joint") ** -2
@@ -70,7 +70,7 @@ def test_what_is_undecided_is_decided_after_the_proposed_trial(tmp_path):
     assert found.proposals[0].confusion[0].after < 0.25
     after, _ = record_run(
         tmp_path / "after", "joint", 905, "quadratic_drag:joint", **UNDECIDED,
-        tasks=(Task.read(path),),
+        tasks=Task.read(path),
     )  # fmt: skip
     again = diagnose(after)
     assert again["selected"] == ["quadratic_drag:joint"]
@@ -149,7 +149,7 @@ def test_a_plan_reaches_what_is_asked_in_few_trials_and_says_what_came(tmp_path)
     # The same run folder, the session with the proposed trial in it.
     independent.record(
         "joint", tmp_path / "now" / "joint", 922, {},
-        replace(SHORT["joint"], **LONG, tasks=(Task.read(path),)),
+        replace(SHORT["joint"], **LONG, tasks=Task.read(path)),
     )  # fmt: skip
     again = bampipe.run_session(
         tmp_path / "now" / "joint",

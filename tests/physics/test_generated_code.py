@@ -177,10 +177,10 @@ def test_generated_code_is_the_same_text_again(tmp_path, monkeypatch):
     texts = []
     for folder in ("a", "b"):
         monkeypatch.setenv("BAMPIPE_CACHE_DIR", str(tmp_path / folder))
-        compile_model(Model(BAM, ("presliding:pitch", "force_delay")))
+        assert compile_model(Model(BAM, ("presliding:pitch", "force_delay"))).lasting
         files = sorted((tmp_path / folder).rglob("*_*.*"))
         texts.append([(f.name, f.read_text()) for f in files])
-    assert len(texts[0]) == 7
+    assert len(texts[0]) == 9
     assert texts[0] == texts[1]
 
 
@@ -214,9 +214,9 @@ def test_a_device_may_call_its_quantities_anything(names):
 def test_generated_code_holds_no_name_from_a_file(tmp_path, monkeypatch):
     monkeypatch.setenv("BAMPIPE_CACHE_DIR", str(tmp_path))
     device = awkward(("wandering", "pushing", "heaviness"))
-    compile_model(Model(device, ("presliding:wandering", "force_drift:pushing")))
+    assert compile_model(Model(device, ("presliding:wandering", "force_drift:pushing"))).lasting
     sources = [f.read_text() for f in tmp_path.rglob("*.py")]
-    assert len(sources) == 6
+    assert len(sources) == 7
     for word in ("wandering", "pushing", "heaviness", "presliding", "deflection", "drift"):
         assert not any(word in text for text in sources)
     assert all(set(text) <= set(string.printable) for text in sources)

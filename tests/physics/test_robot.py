@@ -133,10 +133,10 @@ def test_all_models_of_a_robot_take_its_bodies_from_the_same_compiled_text() -> 
     device = random_robot(3, 5)
     first = device.coordinates[0].name
     some = [compile_model(Model(device, effects)) for effects in ((), (f"stribeck:{first}",))]
-    for kind in ("compiled_bodies", "residual_bodies"):
-        assert len({system._code.sources[kind] for system in some}) == 1
+    for kind in ("compiled_bodies", "bodies"):
+        assert len({system._whole.sources[kind] for system in some}) == 1
     for kind in ("compiled", "residual"):
-        texts = [system._code.sources[kind] for system in some]
+        texts = [system._whole.sources[kind] for system in some]
         assert len(set(texts)) == 2
         assert not any("inertia" in text or "r_9 =" in text for text in texts)
 

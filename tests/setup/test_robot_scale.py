@@ -12,6 +12,8 @@ from bampipe.data.device_file import complete_device
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import Model, System, compile_model
 from bampipe.physics.registry import device_from
+from bampipe.setup.corrections import scaled
+from bampipe.setup.plausibility import Plausibility
 from bampipe.setup.search import CorrectionSearch, Finding
 from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion
@@ -65,13 +67,19 @@ def motions(factor: float, viscous: float) -> list[Motion]:
     return found
 
 
-def find_mistakes(given: list[Motion]) -> tuple[Finding, ...]:
-    forces = tuple(f"torque_{name}" for name in JOINTS)
+FORCES = tuple(f"torque_{name}" for name in JOINTS)
+
+
+def search_in(given: list[Motion]) -> CorrectionSearch:
     units = ("rad",) * 4 + ("N.m",) * 4
     eye, none = np.eye(8), np.zeros(8)
-    signals = Signals(JOINTS, forces, (), (), units, units, eye, none, 0.0 * eye, none)
+    signals = Signals(JOINTS, FORCES, (), (), units, units, eye, none, 0.0 * eye, none)
     folds = Folds.of_trials(["t0", "t1"], [], ["t0", "t1"])
-    search = CorrectionSearch(arm(), given, Band(RATE, (10.0,) * 4), folds, signals)
+    return CorrectionSearch(arm(), given, Band(RATE, (10.0,) * 4), folds, signals)
+
+
+def find_mistakes(given: list[Motion]) -> tuple[Finding, ...]:
+    search = search_in(given)
     return search.find_mistakes(search.judge(Change.none(8)), ())
 
 
@@ -93,3 +101,15 @@ def test_torques_of_another_unit_are_named() -> None:
     (found,) = find_mistakes(motions(4.0, 2.0))
     assert found.correction.kind == "scale" and len(found.correction.signals) == 4
     assert found.correction.factor == pytest.approx(0.25)
+
+
+@pytest.mark.parametrize(("third", "named"), [(0.34, False), (0.18, True)])
+def test_what_spoils_a_joint_that_was_right_is_no_mistake(third: float, named: bool) -> None:
+    """A counterbalance that the device lacks made all drives of a measured arm look halved."""
+    search = search_in([])
+    before, after = (
+        Plausibility(np.array(error), np.ones(4), arm().prior, np.full(len(arm().prior), objection))
+        for error, objection in (((0.10, 0.55, 0.08, 0.21), 1.0), ((0.12, 0.32, third, 0.21), 0.5))
+    )
+    twice = scaled(search.signals, FORCES, 2.0, 0.0)
+    assert (search._choose(before, [(twice, after)], ()) is not None) == named

@@ -92,15 +92,15 @@ Multiplicand = Ratio | Call | Sum
 
 def search(screen: Screen) -> list[Screened]:
     """Formulas that may explain the residual of an axis, best first."""
-    device = screen.evidence.system.model.device
+    device = screen.signals.device
     known = [
         q
-        for q in coordinates(device, screen.axis)
+        for q in coordinates(device, screen.signals.axis)
         if q.quantity in _FOLLOWED and q.words in screen.spans
     ]
     x = np.column_stack([_ratios(screen, q) for q in known])
     found: dict[str, Screened] = {}
-    worth = Settings().draft_worth * screen.independent
+    worth = Settings().draft_worth * screen.fit.independent
 
     def cost(one: Screened) -> float:
         return worth * one.form.constants - one.gain
@@ -140,21 +140,21 @@ def _ratios(screen: Screen, quantity: Quantity) -> Array:
     """A quantity over its reach where the residual is, (n,), low-passed as that is."""
     span = screen.spans[quantity.words]
     middle = span.middle if quantity.quantity == _CENTRED else 0.0
-    return (screen.thinned(quantity.words) - middle) / (0.5 * span.width)
+    return (screen.signals.thinned(quantity.words) - middle) / (0.5 * span.width)
 
 
 def _bred(screen: Screen, x: Array) -> list[str]:
     """Expressions of ``x`` (n, k) for what the model leaves, as text, shorter ones first."""
     breeder = importlib.import_module("pyoperon.sklearn").SymbolicRegressor
     some = slice(None, None, -(-len(x) // _MOST_SAMPLES))
-    wanted, found = -screen.left, []
+    wanted, found = -screen.fit.left, []
     for number in range(_ROUNDS):
         regressor = breeder(**_BREEDING, random_state=number + 1)
         regressor.fit(x[some], wanted[some])
         front = sorted(regressor.pareto_front_, key=lambda entry: entry["complexity"])
         found += [regressor.get_model_string(entry["tree"], _DIGITS) for entry in front]
         # What the model's own parameters took of the formula belongs to it.
-        wanted = -screen.left + screen.taken(regressor.predict(x))
+        wanted = -screen.fit.left + screen.fit.taken(regressor.predict(x))
     return found
 
 
@@ -179,8 +179,9 @@ def _form(screen: Screen, known: Sequence[Quantity], whole: Sum) -> tuple[Form, 
     writer = _Writer(used, [q.quantity for q in chosen])
     shape = writer.shape(whole)
     (first, span), *beside = ((q, screen.spans[q.words]) for q in chosen)
-    axis = screen.evidence.system.model.device.coordinates[screen.axis]
-    form = Form(axis, screen.axis, FORCE, shape, first, span, screen.times, 1.0, tuple(beside))
+    of = screen.signals
+    axis = of.device.coordinates[of.axis]
+    form = Form(axis, of.axis, FORCE, shape, first, span, of.times, 1.0, tuple(beside))
     return form, dict(zip(shape.searched, writer.numbers, strict=True))
 
 

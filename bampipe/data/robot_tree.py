@@ -1,0 +1,196 @@
+"""The links of a robot and the joints between them, as a file draws them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from bampipe.data.rigid_body import Body
+from bampipe.errors import InputError
+
+Array = NDArray[np.float64]
+
+MOVING = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
+"""Kinds of joint that a chain moves by, and what a device file calls them."""
+UPRIGHT = (0.0, 0.0, -9.81)
+"""Gravity where nothing else is said, m/s2."""
+_ROUNDING = 1e-6
+"""Share of gravity by which a component of it may be off zero."""
+
+
+@dataclass(frozen=True)
+class DriveLimits:
+    """What a file says of a joint's drive; 0 where it says nothing.
+
+    Attributes:
+        lower, upper: range, rad or m; equal where there is none.
+        effort: N.m or N; velocity: rad/s or m/s.
+        damping: N.m.s/rad or N.s/m; friction: N.m or N.
+        armature: inertia of the drive at the joint, kg.m2 or kg.
+    """
+
+    lower: float = 0.0
+    upper: float = 0.0
+    effort: float = 0.0
+    velocity: float = 0.0
+    damping: float = 0.0
+    friction: float = 0.0
+    armature: float = 0.0
+
+
+@dataclass(frozen=True)
+class TreeJoint:
+    """A joint between two links.
+
+    Attributes:
+        name: its own; kind: as of a URDF.
+        parent, child: the links.
+        turn, offset: of its frame in that of the parent, (3, 3) and (3,), m.
+        angles: of ``turn``, about the fixed axes x, y, z, rad.
+        axis: in its own frame.
+        limits: of its drive.
+    """
+
+    name: str
+    kind: str
+    parent: str
+    child: str
+    turn: Array
+    offset: Array
+    angles: tuple[float, float, float]
+    axis: list[float]
+    limits: DriveLimits
+
+
+@dataclass(frozen=True)
+class Tree:
+    """Links and the joints between them, as a file has them.
+
+    Attributes:
+        bodies: by link, in its frame.
+        joints: from a link to one behind it.
+        notes: what of the file is not heard, one sentence each.
+        gravity: in the frame of the link at the root, m/s2; None where the file says nothing.
+    """
+
+    bodies: Mapping[str, Body]
+    joints: Sequence[TreeJoint]
+    notes: tuple[str, ...] = ()
+    gravity: tuple[float, float, float] | None = None
+
+    @cached_property
+    def above(self) -> Mapping[str, TreeJoint]:
+        """By link, the joint that it hangs on."""
+        return {joint.child: joint for joint in self.joints}
+
+    def path(self, base: str, tip: str, where: str = "") -> list[TreeJoint]:
+        """Joints from base to tip.
+
+        Raises:
+            InputError: there is no such path, or one with a joint of another kind than a chain has.
+        """
+        found: list[TreeJoint] = []
+        link = tip
+        while link != base:
+            if link not in self.above:
+                raise InputError(f"link {tip!r} does not hang on {base!r}", where=where)
+            joint = self.above[link]
+            if joint.kind not in (*MOVING, "fixed"):
+                raise InputError(
+                    f"a joint of type {joint.kind!r}",
+                    where=f"{where}: joint {joint.name!r}",
+                    remedy="between base and tip joints are revolute, continuous, prismatic or"
+                    " fixed",
+                )
+            found.append(joint)
+            link = joint.parent
+        return found[::-1]
+
+
+def gravity_at(tree: Tree, base: str) -> tuple[tuple[float, float, float] | None, str]:
+    """Gravity in the frame of a link, m/s2, and a clause where joints on the way to it turn it.
+
+    The root of a URDF stands upright. None where that goes for the link as well, or where a joint
+    above it can tilt it.
+    """
+    root, way = base, list[TreeJoint]()
+    while root in tree.above:
+        way.insert(0, tree.above[root])
+        root = tree.above[root].parent
+    if not way:
+        return tree.gravity, ""
+    start = np.array(tree.gravity or UPRIGHT)
+    down, least = start, _ROUNDING * float(np.linalg.norm(start))
+    for joint in way:
+        down = joint.turn.T @ down
+        turns = joint.kind not in ("fixed", "prismatic")
+        about_it = joint.kind in MOVING and np.abs(np.cross(joint.axis, down)).max() <= least
+        if turns and not about_it:
+            return None, f"gravity taken along -z of {base}, which {joint.name} can tilt"
+    if tree.gravity is None and np.abs(down - start).max() <= least:
+        return None, ""
+    x, y, z = (float(v) for v in np.where(np.abs(down) <= least, 0.0, down))
+    said = f"gravity ({x:.4g}, {y:.4g}, {z:.4g}) m/s2 in the frame of {base}, from that of {root}"
+    return (x, y, z), said
+
+
+def hold_beside(tree: Tree, base: str, tip: str) -> Tree:
+    """The part of the tree on ``base``, fixed what does not move from there to ``tip``.
+
+    Joints come parents first.
+    """
+    moving = {joint.child for joint in tree.path(base, tip)}
+    joints: list[TreeJoint] = []
+    links = [base]
+    for link in links:
+        for joint in tree.joints:
+            if joint.parent == link:
+                kind = joint.kind if joint.child in moving else "fixed"
+                joints.append(replace(joint, kind=kind))
+                links.append(joint.child)
+    return replace(tree, bodies={link: tree.bodies[link] for link in links}, joints=joints)
+
+
+def tree_of_tables(tables: Mapping[str, Mapping[str, Any]]) -> Tree:
+    """Links and joints of the tables of ``[robot.joints]``: ``base``, and one link a joint."""
+    bodies, joints = {"base": Body()}, []
+    for name, table in tables.items():
+        link, after = f"{name}_link", table.get("after")
+        bodies[link] = Body.of_table(table)
+        roll, pitch, yaw = (float(v) for v in table.get("rotation", (0.0,) * 3))
+        joints.append(
+            TreeJoint(
+                name,
+                str(table["kind"]),
+                f"{after}_link" if after else "base",
+                link,
+                Rotation.from_euler("xyz", (roll, pitch, yaw)).as_matrix(),
+                np.array(table.get("position", (0.0,) * 3), dtype=float),
+                (roll, pitch, yaw),
+                [float(v) for v in table.get("axis", (0.0, 0.0, 1.0))],
+                DriveLimits(),
+            )
+        )
+    return Tree(bodies, joints)
+
+
+def fixed_joint(name: str, parent: str, child: str, turn: Array, offset: Array) -> TreeJoint:
+    """A joint that does not move, between two links."""
+    roll, pitch, yaw = (float(v) for v in Rotation.from_matrix(turn).as_euler("xyz"))
+    axis = [0.0, 0.0, 1.0]
+    return TreeJoint(
+        name, "fixed", parent, child, turn, offset, (roll, pitch, yaw), axis, DriveLimits()
+    )
+
+
+def identifier(name: str) -> str:
+    """The joint's name as expressions can use it."""
+    text = re.sub(r"\W", "_", name, flags=re.ASCII)
+    return text if text[:1].isalpha() else f"joint_{text}"

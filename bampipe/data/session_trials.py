@@ -1,0 +1,82 @@
+"""The trials of a session: each read from its log and cleaned, copies of one another refused."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import replace
+
+import numpy as np
+
+from bampipe.data.quality import CleaningLimits, CleanTrial, clean
+from bampipe.data.readers import read_trial
+from bampipe.data.session import SECONDS, Session, TrialEntry, inside
+from bampipe.errors import InputError
+from bampipe.files import digest_file
+
+
+def find_copies(session: Session) -> list[str]:
+    """Why each trial is refused as the same file or content as another, or ''."""
+    same: dict[str, list[int]] = defaultdict(list)
+    for number, entry in enumerate(session.trials):
+        try:
+            path = inside(session.root, entry.file, where="")
+        except InputError:
+            continue  # said when the trial's turn comes
+        if path.stat().st_size > 0:
+            same[digest_file(path)].append(number)
+    reasons = [""] * len(session.trials)
+    for alike_files in same.values():
+        numbers = [
+            n
+            for n in alike_files
+            if any(session.trials[n].overlaps(session.trials[m]) for m in alike_files if m != n)
+        ]
+        entries = [session.trials[number] for number in numbers]
+        alike = len({(entry.kind, entry.locked_axis, entry.viscous) for entry in entries}) == 1
+        for number in numbers[1:] if alike else numbers if len(numbers) > 1 else []:
+            entry = session.trials[number]
+            other = next(e for e in entries if e is not entry)
+            what = "file" if other.file == entry.file else "content"
+            reasons[number] = f"the same {what} as trial {other.trial_id}" + (
+                ": used once" if alike else f", which is declared {other.kind}"
+            )
+    return reasons
+
+
+def read_sound_trial(
+    session: Session, entry: TrialEntry, limits: CleaningLimits, largest_bytes: int
+) -> CleanTrial:
+    """One sound trial in SI units.
+
+    Args:
+        session: what its columns mean; entry: what kind of trial it is.
+        limits: what counts as sound; largest_bytes: what it may take in memory.
+
+    Raises:
+        InputError: the trial is to be set aside, with the reason.
+    """
+    path = inside(session.root, entry.file, where=entry.file)
+    clock = session.clock
+    raw = read_trial(
+        path,
+        session.columns,
+        name=entry.file,
+        largest_bytes=largest_bytes,
+        datetimes={clock.column: clock.format} if clock.datetime else {},
+        dialect=session.dialect,
+    )
+    if clock.nanoseconds:
+        columns = dict(raw.columns)
+        seconds, nanoseconds = columns[clock.column], columns.pop(clock.nanoseconds)
+        # Seconds since 1970 leave no room for nanoseconds in a double: the first goes first.
+        columns[clock.column] = seconds - np.fmin.reduce(seconds) + SECONDS["ns"] * nanoseconds
+        raw = replace(raw, columns=columns)
+    if not clock.column:
+        count = len(raw.columns[session.columns[0]])
+        note = f"no time stamps: samples counted at {session.sample_rate:g} Hz"
+        raw = replace(
+            raw,
+            columns={clock.column: np.arange(count, dtype=float), **raw.columns},
+            remarks=(*raw.remarks, note),
+        )
+    return clean(raw, session, entry, limits)

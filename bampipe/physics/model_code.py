@@ -1,0 +1,105 @@
+"""What is generated of a model: facts about its equations, and the source of its functions.
+
+In two parts, for of most candidates for an effect that a model lacks only the first is needed.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from bampipe import generated_code
+from bampipe.model_functions import ROWS
+from bampipe.physics.codegen import (
+    array_source,
+    bodies_along_motion,
+    bodies_at_state,
+    dynamics_source,
+    residual_source,
+    rows_source,
+    scalar_source,
+    slopes_source,
+)
+from bampipe.physics.derivation import derive
+from bampipe.physics.equations import Equations, contribution
+from bampipe.physics.memory_code import memory_source
+from bampipe.physics.model import Model
+
+Generation = tuple[dict[str, Any], dict[str, str]]
+"""Facts, which JSON can hold, and the source of each module by name."""
+
+
+def effects_code(model: Model) -> Generation:
+    """What the generator says of a model, and the source of what effects add to a residual."""
+    equations = _derive(model)
+    bare = _derive(Model(model.device)) if model.effects else equations
+    added = contribution(equations, bare)
+    channels = dict(zip(equations.inputs, equations.u, strict=True))
+    forces = [channels[name] for name in model.device.forces]
+    brakes = {channels[name] for name in model.device.brakes.values() if name in channels}
+    facts = {
+        "memory": equations.z_names,
+        "inputs": equations.inputs,
+        "noise": equations.noise,
+        "linear": equations.linear,
+        "products": equations.products,
+        "constant": equations.constant,
+        "unforced": equations.unforced,
+        "touched": [i for i, e in enumerate(added) if e != 0],
+        "moves_sensors": any(e != 0 for e in equations.offset),
+        "driven": any(e.has(*forces) for e in added)
+        and not any(e.has(*forces) for e in equations.rates),
+        "compensated": [i for i, e in enumerate(equations.compensation) if e != 0],
+        "delays": equations.delays,
+        "memory_uses": {},
+        "commands": [
+            i
+            for i, u in enumerate(equations.u)
+            if u not in forces
+            and equations.inputs[i] != "t"
+            and any(u in e.free_symbols for e in equations.rates)
+        ],
+        "braked": any(brakes & e.free_symbols for e in (*added, *equations.rates)),
+    }
+    sources = {"columns": array_source(equations, added)}
+    if equations.z:
+        sources["memory"], facts["memory_uses"] = memory_source(equations)
+    return facts, sources
+
+
+def whole_code(model: Model) -> Generation:
+    """Which slopes are the same everywhere, and the source of the whole mechanism's functions."""
+    equations = _derive(model)
+    slopes, places = slopes_source(equations)
+    along, here = bodies_along_motion(equations), bodies_at_state(equations)
+    facts = {
+        "slopes": places,
+        "lasting": [i for i, by_axis in enumerate(equations.lasting) if by_axis is not None],
+        "of_bodies": equations.of_bodies,
+        "bodies": len(along.names),
+    }
+    sources = {
+        "slopes": slopes,
+        "dynamics": dynamics_source(equations),
+        "rows": rows_source(equations, ROWS),
+    }
+    sources["residual"], title = residual_source(equations, along.names), ""
+    if along.names:
+        sources["bodies"], sources["compiled_bodies"] = along.source, here.source
+        title = generated_code.module_title("compiled_bodies", here.source)
+    sources["compiled"] = scalar_source(equations, here, title)
+    return facts, sources
+
+
+_derived: dict[str, Equations] = {}
+"""By `Model.key`, the last used last."""
+_MOST_DERIVED = 4
+"""The device without effects, which every candidate wants, and those at hand."""
+
+
+def _derive(model: Model) -> Equations:
+    """Equations of a model; those asked for last are kept."""
+    known = _derived.pop(model.key, None) or derive(model)
+    _derived[model.key] = known
+    if len(_derived) > _MOST_DERIVED:
+        del _derived[next(iter(_derived))]
+    return known

@@ -1,0 +1,149 @@
+"""What the samples of a session say of its channels, noted one trial at a time."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.data.quality import CleanTrial
+from bampipe.data.session import Session
+from bampipe.estimate.spectral_lines import remove_mains
+from bampipe.physics.device import Device
+from bampipe.results.ingest import MainsHum
+from bampipe.trials.sensors import ChannelNoise, RecordNoise, settle_encoder, settle_force
+
+Array = NDArray[np.float64]
+
+_COUNTS_SPAN = 16.0
+"""Counts that a converter's readings span at least: fewer tell nothing from a reading in tens."""
+_MIDDLES = (2.0**9, 2.0**11, 2.0**13, 2.0**15)
+"""Counts at which converters of 10 to 16 bits stand where a bipolar sensor carries nothing."""
+_NEAR_MIDDLE = 0.05
+"""Share of that by which an unloaded sensor is off it, as offsets and preload go."""
+
+
+class ChannelRecords:
+    """What a session's trials say of its channels: noise, mains hum, readings in counts."""
+
+    def __init__(self, session: Session, device: Device) -> None:
+        """Begin with no trial."""
+        self._session, self._device = session, device
+        self._units = _force_units(session, device)
+        self._noise: dict[str, list[RecordNoise]] = defaultdict(list)
+        self._hum: dict[str, list[dict[float, float]]] = defaultdict(list)
+        self._counts: dict[str, list[tuple[float, float] | None]] = defaultdict(list)
+
+    def note(self, trial: CleanTrial, noise: bool) -> None:
+        """Note one trial and take mains hum off its inputs; ``noise``: whether that is measured."""
+        for name, unit in self._units.items():
+            self._counts[name].append(_counts(trial.columns[name] / unit))
+        self._remove_hum(trial)
+        if noise:
+            self._measure_noise(trial)
+
+    def encoders(self) -> dict[str, ChannelNoise]:
+        """Resolution and noise of the encoders, by axis."""
+        return {
+            e.axis: settle_encoder(e.axis, e.unit, e.resolution, self._noise.get(f"q_{e.axis}", []))
+            for e in self._session.encoders
+        }
+
+    def forces(self) -> dict[str, ChannelNoise]:
+        """Noise of the force channels, by name."""
+        stated = self._session.force.noise_sd if self._session.force else None
+        return {
+            name: settle_force(name, self._device.force_unit, stated, self._noise.get(name, []))
+            for name in self._device.forces
+        }
+
+    def mains_hum(self) -> tuple[MainsHum, ...]:
+        """The hum taken off each channel, typical of the trials that had it."""
+        return tuple(
+            MainsHum(
+                channel=name,
+                unit=self._device.channels.get(name, self._device.force_unit),
+                hz=hz,
+                amplitude=float(np.median([trial[hz] for trial in trials if hz in trial])),
+                trials=sum(hz in trial for trial in trials),
+            )
+            for name, trials in sorted(self._hum.items())
+            for hz in sorted({hz for trial in trials for hz in trial})
+        )
+
+    def count_warnings(self) -> dict[str, str]:
+        """A sentence for each channel that looks like counts in most of its trials."""
+        said, force, device = {}, self._session.force, self._device
+        for name, ranges in self._counts.items():
+            found = [each for each in ranges if each is not None]
+            if 2 * len(found) <= len(ranges):
+                continue
+            low, high = min(each[0] for each in found), max(each[1] for each in found)
+            in_force = force is not None and name in force.names
+            said[name] = (
+                f"{name}: whole numbers from {low:.0f} to {high:.0f} look like counts of a"
+                f" converter, not like {device.channels.get(name, device.force_unit)}; if so, "
+                + (
+                    'give [force] unit = "V", calibration_n_per_v with the force of one count, and'
+                    " zero_v with the reading without load"
+                    if in_force
+                    else f"give scale and offset under channels.{name}"
+                )
+            )
+        return said
+
+    def _remove_hum(self, trial: CleanTrial) -> None:
+        """Take mains hum off the inputs of a trial, and note it; encoders have none."""
+        moving = [column for name, column in trial.columns.items() if name.startswith("q_")]
+        for name, values in trial.columns.items():
+            if not name.startswith(("q_", "brake_")) and np.isfinite(values).all():
+                trial.columns[name], found = remove_mains(values, trial.t, moving)
+                self._hum[name].append(found)
+
+    def _measure_noise(self, trial: CleanTrial) -> None:
+        """Note what a trial says of the noise of its encoders (``q_<axis>``) and inputs."""
+        columns = {
+            name: np.asarray(values, dtype=float)
+            for name, values in trial.columns.items()
+            if not name.startswith("brake_")
+        }
+        readings = {name: x for name, x in columns.items() if name.startswith("q_")}
+        inputs = {name: x for name, x in columns.items() if name not in readings}
+        found = {name: RecordNoise.of(x, trial.t) for name, x in readings.items()}
+        found |= RecordNoise.of_inputs(inputs, [*readings.values()], trial.t)
+        for name, one in found.items():
+            self._noise[name].append(one)
+
+
+def _force_units(session: Session, device: Device) -> dict[str, float]:
+    """One raw unit, in SI, of the forces that are logged in a unit in which none counts whole."""
+    units: dict[str, float] = {}
+    if session.force and not session.force.volts:
+        gains = np.diag(np.array(session.force.calibration))
+        units |= dict(zip(session.force.names, gains, strict=True))
+    units |= {each.name: each.scale for each in session.channels if each.offset == 0.0}
+    return {name: unit for name, unit in units.items() if name in device.forces and unit >= 1.0}
+
+
+def _counts(readings: np.ndarray) -> tuple[float, float] | None:
+    """The range of readings that look like counts of a converter; None for others."""
+    if not _look_like_counts(readings):
+        return None
+    return float(readings.min()), float(readings.max())
+
+
+def _look_like_counts(readings: Array) -> bool:
+    """Whether readings of a force (T,) are rather counts of a converter than in their unit.
+
+    Whole numbers, none negative, that stay farther from zero than they span or about the middle of
+    a converter's range: a force that a machine is moved by comes near zero, and is no whole number.
+    """
+    known = readings[np.isfinite(readings)]
+    if not known.size or np.mean(np.abs(known - np.rint(known)) < 1e-6) < 0.95:
+        return False
+    low, middle, high = float(known.min()), float(np.median(known)), float(known.max())
+    if low < 0.0 or high - low < _COUNTS_SPAN:
+        return False
+    about = any(abs(middle / m - 1.0) < _NEAR_MIDDLE and high < 2.0 * m for m in _MIDDLES)
+    return about or middle > high - low
