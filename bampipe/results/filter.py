@@ -44,6 +44,16 @@ class ForceFilter(Record):
     derivative_cutoff_hz: Positive
 
 
+class Disturbance(Record):
+    """A stretch of a trial that no estimate and no error counts: its error comes back nowhere."""
+
+    start_s: Size = Field(description="Since the start of the trial")
+    end_s: Positive
+    axis: str
+    error: Positive = Field(description="Root mean square of the bare device's residual, N.m or N")
+    rest: Size = Field(description="The same over all other times")
+
+
 class FilterResult(Result):
     """How the motion was differentiated, and how well."""
 
@@ -60,3 +70,6 @@ class FilterResult(Result):
         description="By trial: share of its grid that had no sample"
     )
     skipped: dict[str, str] = Field(description="By trial: why it could not be differentiated")
+    disturbances: dict[str, tuple[Disturbance, ...]] = Field(
+        default_factory=dict, description="By trial: stretches that are left out"
+    )

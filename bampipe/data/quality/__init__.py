@@ -34,6 +34,7 @@ from bampipe.data.quality.encoders import (
     unwrap,
 )
 from bampipe.data.quality.motion import refuse_wrong_brakes, refuse_wrong_motion
+from bampipe.data.quality.spikes import interpolate_spikes
 from bampipe.data.quality.table import CleaningLimits, CleanTrial, TrialTable
 from bampipe.data.readers import RawTrial
 from bampipe.data.session import Session, TrialEntry
@@ -67,6 +68,7 @@ def clean(raw: RawTrial, session: Session, entry: TrialEntry, limits: CleaningLi
     for channel in session.channels:
         to_signed(table, channel)
     fill_missing(table)
+    interpolate_spikes(table)
     for encoder in session.encoders:
         integrate(table, encoder)
         interpolate_jumps(table, encoder)
