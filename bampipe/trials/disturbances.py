@@ -205,8 +205,12 @@ def _cut(motions: Sequence[Motion], band: Band) -> _Blocks:
         total = int(own[-1]) + 1 if own.size else 0
         first = kept[::rows]
         trial.append(np.full(total, number))
-        starts.append(motion.t[first])
-        ends.append(motion.t[np.minimum(first + rows * band.step, len(motion.t) - 1)])
+        start = motion.t[first]
+        end = motion.t[np.minimum(first + rows * band.step, len(motion.t) - 1)]
+        if total:  # the margins of the low-pass belong to the blocks beside them
+            start[0], end[-1] = motion.t[0], motion.t[-1]
+        starts.append(start)
+        ends.append(end)
         count += total
     return _Blocks(
         np.concatenate(block), np.concatenate(trial), np.concatenate(starts), np.concatenate(ends)
@@ -236,27 +240,33 @@ def _robust_residual(stacked: Stacked, blocks: _Blocks) -> Array:
 
 
 def _candidates(mean_square: Array, blocks: _Blocks) -> list[tuple[int, int]]:
-    """First and last block of every stretch whose error (B,) stands far above the rest's."""
-    known = np.flatnonzero(np.isfinite(mean_square))
-    order = known[np.argsort(mean_square[known])]
-    below = np.cumsum(mean_square[order]) / np.arange(1, order.size + 1)
-    least = int(np.ceil((1.0 - _MOST) * order.size))
-    far = [k for k in range(max(least, 1), order.size)
-           if mean_square[order[k]] > _TIMES**2 * below[k - 1]]  # fmt: skip
-    if not far:
+    """First and last block of every stretch whose error (B,) stands far above the rest's.
+
+    The rest is what is left without such stretches and all that are larger.
+    """
+    size = np.nan_to_num(mean_square)
+    known = np.isfinite(mean_square)
+    calm = np.sort(mean_square[known])[: int(np.ceil((1.0 - _MOST) * known.sum()))]
+    if not calm.size:
         return []
-    rest = below[far[0] - 1]
-    loud = np.nan_to_num(mean_square) > _EDGE**2 * rest
-    stretches = []
-    for start in order[far[0] :]:
-        first = last = int(start)
-        while first > 0 and loud[first - 1] and blocks.trial[first - 1] == blocks.trial[start]:
-            first -= 1
-        end = loud.size - 1
-        while last < end and loud[last + 1] and blocks.trial[last + 1] == blocks.trial[start]:
-            last += 1
-        stretches.append((first, last))
-    return sorted(set(stretches))
+    loud = size > _EDGE**2 * calm.mean()
+    apart = np.flatnonzero(np.diff(blocks.trial)) + 1
+    edges = np.diff(np.concatenate([[0], loud.astype(np.int8), [0]]))
+    bounds = np.sort(
+        np.concatenate([np.flatnonzero(edges), np.repeat(apart[loud[apart - 1] & loud[apart]], 2)])
+    )
+    stretches = list(zip(bounds[::2].tolist(), bounds[1::2].tolist(), strict=True))
+    total, count, inside = size.sum(), int(known.sum()), 0
+    found = []
+    for start, end in sorted(stretches, key=lambda one: -size[one[0] : one[1]].max()):
+        total -= size[start:end].sum()
+        count -= int(known[start:end].sum())
+        inside += end - start
+        if inside > _MOST * known.sum():
+            break
+        found.append((size[start:end].max() * max(count, 1), total, (start, end - 1)))
+    far = [k for k, (peak, rest, _) in enumerate(found) if peak > _TIMES**2 * rest]
+    return sorted(stretch for _, _, stretch in found[: far[-1] + 1]) if far else []
 
 
 def _error_elsewhere(
