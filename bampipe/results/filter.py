@@ -45,13 +45,11 @@ class ForceFilter(Record):
 
 
 class Disturbance(Record):
-    """A stretch of a trial that no estimate and no error counts: its error comes back nowhere."""
+    """A stretch of a trial that no estimate and no error counts."""
 
     start_s: Size = Field(description="Since the start of the trial")
     end_s: Positive
-    axis: str
-    error: Positive = Field(description="Root mean square of the bare device's residual, N.m or N")
-    rest: Size = Field(description="The same over all other times")
+    reason: str
 
 
 class FilterResult(Result):

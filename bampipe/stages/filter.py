@@ -35,7 +35,7 @@ from bampipe.setup.inspection import inspect_setup
 from bampipe.setup.search import HIGHEST_HZ, spread
 from bampipe.trials.band import LEAST_HZ, find_band
 from bampipe.trials.cache import TrialCache
-from bampipe.trials.disturbances import describe_disturbances, find_disturbances
+from bampipe.trials.disturbances import find_disturbances
 from bampipe.trials.folds import Folds
 from bampipe.trials.kinematics import AxisFilter, Kinematics
 from bampipe.trials.motion import input_derivatives, n_samples
@@ -165,13 +165,19 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     free = set(trials.loc[trials["kind"] == MOVING[0], "trial_id"])
     held_out = held_out_trials(run)
     band = Band(rate, tuple(bands[axis].cutoff_hz for axis in system.coordinates))
-    disturbances = _disturbances(system, out, [k for k in names if k in free], held_out, band)
+    disturbances = _disturbances(
+        system, out, session, [k for k in names if k in free], held_out, band
+    )
     result = _result(config, kinematics, axes, choices, written, bands, disturbances)
     progress(0.97, "the set-up")
     setup = _inspect(system, out, session, names, free - held_out, bands, disturbances)
     setup.write(out)
     notes = [f"{name}: not used: {reason}" for name, reason in written.skipped.items()]
-    notes += describe_disturbances(disturbances, {k: axis.unit for k, axis in axes.items()})
+    notes += [
+        f"{name}: {one.start_s:.1f} to {one.end_s:.1f} s left out: {one.reason}"
+        for name, stretches in disturbances.items()
+        for one in stretches
+    ]
     return result.write(out) | {"setup": list(setup.lines), "notes": notes}
 
 
@@ -225,17 +231,31 @@ def _write_motions(
 def _disturbances(
     system: System,
     out: Path,
+    session: IngestResult,
     free: Sequence[str],
     held_out: Collection[str],
     band: Band,
 ) -> dict[str, tuple[Disturbance, ...]]:
-    """Find what disturbs the free trials."""
+    """Find where a sensor of a moving trial is dead, and what else disturbs the free ones."""
     path = out / "filter/kinematics.parquet"
+    found = {
+        name: tuple(
+            Disturbance(start_s=one.start_s, end_s=one.end_s, reason=one.sentence)
+            for one in stretches
+        )
+        for name, stretches in session.dead.items()
+    }
     motions = TrialCache(
-        lambda k: read_motion_of(path, free[k], system), len(free), n_samples, names=free
+        lambda k: read_motion_of(path, free[k], system, found.get(free[k], ())),
+        len(free),
+        n_samples,
+        names=free,
     )
     fitted = [k for k, name in enumerate(free) if name not in held_out]
-    return find_disturbances(system, motions, band, fitted)
+    for name, stretches in find_disturbances(system, motions, band, fitted).items():
+        both = (*found.get(name, ()), *stretches)
+        found[name] = tuple(sorted(both, key=lambda one: one.start_s))
+    return found
 
 
 def _inspect(

@@ -7,20 +7,22 @@ an event; left in, it moves estimates and floors, and passes for a physical effe
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter1d
 from scipy.spatial import cKDTree
 
-from bampipe.estimate.least_squares import Stacked, minimise
+from bampipe.errors import InputError
+from bampipe.estimate.least_squares import Stacked, minimise, stacked_residual
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import System
 from bampipe.results.filter import Disturbance
 from bampipe.trials.cache import TrialCache
 from bampipe.trials.motion import Motion, n_samples, trial_names, trial_sizes
-from bampipe.trials.residuals import problem_of
+from bampipe.trials.residuals import applied_rms, problem_of
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -31,17 +33,23 @@ _TIMES = 20.0
 """Error of such a stretch over that of the rest. In 490 runs of machines with and without hidden
 effects nothing that comes back and no start reached 18; a hit of 40 N for 80 ms, a force sensor
 dead for a second and one that drifts as it warms up reached 30 to 800."""
+_ALONE = 25.0
+"""The same, over the whole stretch, of a motion that does not come back: a stop that is reached
+once has 15."""
 _EDGE = 3.0
 """The same at its ends: what is left of an event there would still weigh."""
 _MOST = 0.1
 """Share of the samples beyond which the rest is no longer the rule."""
-_ORDINARY = 0.1
-"""Share of a stretch's error that the same motion may have at other times."""
-_APART_S = 1.0
-_NEIGHBOURS, _FEWEST, _RADIUS = 12, 4, 0.25
-"""Samples held against one of a stretch, and how near they are: in spreads of position and
-velocity, and at least `_APART_S` away or in another trial."""
+_ORDINARY = 0.05
+"""Share of a stretch's squared error that the same motion may have at other times."""
+_APART_S, _BEFORE_S = 1.0, 0.3
+_NEIGHBOURS, _FEWEST, _RADIUS = 12, 4, 0.35
+"""Samples held against one of a stretch, and how near they are: in spreads of all that the error
+may depend on, and at least `_APART_S` away or in another trial."""
 _SLOWLY = 50.0
+_SLOW, _FRICTION = 0.1, 2.0
+"""Below this share of its root mean square velocity an axis may turn unseen; a wrong sign of the
+velocity may be worth so many root mean squares of the applied force."""
 _ROUNDS = 8
 _SHORTEST_S = 1.0
 """Of a part between two disturbances, s, that a filter can start in."""
@@ -63,13 +71,78 @@ class _Blocks:
     ends: Array
 
     def mean_square(self, values: Array, used: Flags) -> Array:
-        """Of values (N, n_q) over the samples used, (B, n_q), NaN where there is none."""
+        """Of values (N, n_q) over the samples used, (B, n_q), NaN where most are at rest."""
         found = np.full((self.trial.size, values.shape[1]), np.nan)
+        whole = np.bincount(self.block, minlength=self.trial.size)
         for i in range(values.shape[1]):
             count = np.bincount(self.block, used[:, i], self.trial.size)
             total = np.bincount(self.block, values[:, i] ** 2 * used[:, i], self.trial.size)
-            np.divide(total, count, out=found[:, i], where=count > 0)
+            np.divide(total, count, out=found[:, i], where=2 * count > whole)
         return found
+
+
+@dataclass(frozen=True)
+class _Stretch:
+    """What one axis says of a stretch, from the words "the error" on."""
+
+    start_s: float
+    end_s: float
+    words: str
+
+
+@dataclass(frozen=True)
+class _Samples:
+    """Thinned samples of all trials, one after the other.
+
+    Attributes:
+        system: the device; blocks: of the samples.
+        t: (N,) s since the start of the trial; motion: (N, n_q, 3) position, rate, acceleration.
+        inputs: (N, k) further inputs than forces, such as a damper's current, and how far each is
+            from what it was `_BEFORE_S` before.
+        error: (N, n_q) of the device, N.m or N; excess: (N, n_q) the same, of a turn only what no
+            friction could do, for the sign of the velocity may be wrong there.
+        used: (N, n_q) which of them count.
+    """
+
+    system: System
+    blocks: _Blocks
+    t: Array
+    motion: Array
+    inputs: Array
+    error: Array
+    excess: Array
+    used: Flags
+
+    def judge(self, axis: int, first: int, last: int, calm: Flags) -> _Stretch | None:
+        """Blocks ``first`` to ``last`` as a stretch to leave out; None if its error comes back.
+
+        Args:
+            calm: (B,) blocks outside all such stretches of the axis.
+        """
+        blocks, excess = self.blocks, self.excess[:, axis]
+        start, end = float(blocks.starts[first]), float(blocks.ends[last])
+        inside = (blocks.block >= first) & (blocks.block <= last) & self.used[:, axis]
+        here = blocks.trial[blocks.block] == blocks.trial[first]
+        near = here & (self.t > start - _APART_S) & (self.t < end + _APART_S)
+        others = self.used[:, axis] & ~near
+        outside = calm[blocks.block] & self.used[:, axis]
+        if not others.any() or not outside.any():
+            return None
+        state = np.hstack([self.motion[:, axis], self.inputs])
+        again, share = _repeated_share(state, excess, inside, others)
+        if share > _ORDINARY:
+            return None
+        if not again and _rms(excess[inside]) < _ALONE * _rms(excess[outside]):
+            return None
+        size, rest = (_rms(self.error[part, axis]) for part in (inside, outside))
+        coordinate = self.system.model.device.coordinates[axis]
+        unit = "N.m" if coordinate.unit == "rad" else "N"
+        when = "the same motion included" if again else "where it moves otherwise"
+        words = (
+            f"of {coordinate.name} is {size:.3g} {unit}, {rest:.3g} {unit} at all other times,"
+            f" {when}"
+        )
+        return _Stretch(start, end, words)
 
 
 def find_disturbances(
@@ -84,50 +157,94 @@ def find_disturbances(
     Returns:
         The stretches of each trial that has some, in the order of time.
     """
+    samples = _gather(system, motions, band, fitted)
+    stretches: dict[str, list[_Stretch]] = {}
+    if samples is None:
+        return {}
+    mean_square = samples.blocks.mean_square(samples.excess, samples.used)
+    for axis in range(len(system.coordinates)):
+        candidates = _candidates(mean_square[:, axis], samples.blocks)
+        calm = np.ones(len(mean_square), dtype=bool)
+        for first, last in candidates:
+            calm[first : last + 1] = False
+        for first, last in candidates:
+            found = samples.judge(axis, first, last, calm)
+            if found is not None:
+                name = motions[int(samples.blocks.trial[first])].trial_id
+                stretches.setdefault(name, []).append(found)
+    return {name: _joined(found) for name, found in stretches.items()}
+
+
+def _gather(
+    system: System, motions: Sequence[Motion], band: Band, fitted: Sequence[int]
+) -> _Samples | None:
+    """The errors of the device on all trials; None where it cannot be fitted: others say why."""
     problem = problem_of(system, motions, band)
     try:
         found = minimise(problem, np.append(system.prior, 0.0), fitted, 12, tolerance=1e-6)
-    except ValueError:  # hardly anything moves
-        return {}
-    stacked = dict(zip(fitted, found.stacked, strict=True))
-    chosen = sorted(stacked)
-    blocks = _cut([motions[k] for k in chosen], band)
-    residual = np.concatenate([stacked[k].residual for k in chosen])
-    used = np.concatenate([stacked[k].used for k in chosen])
-    slope = np.concatenate([stacked[k].slope for k in chosen])
-    error = _robust_residual(Stacked(residual, slope, used), blocks)
-    del slope
-    at = [band.thinned_rows(len(motions[k].t)) for k in chosen]
-    q = np.concatenate([motions[k].q[rows] for k, rows in zip(chosen, at, strict=True)])
-    qd = np.concatenate([motions[k].qd[rows] for k, rows in zip(chosen, at, strict=True)])
-    t = np.concatenate([motions[k].t[rows] for k, rows in zip(chosen, at, strict=True)])
-    mean_square = blocks.mean_square(error, used)
-    stretches: dict[str, list[Disturbance]] = {}
-    for i, axis in enumerate(system.coordinates):
-        for first, last in _candidates(mean_square[:, i], blocks):
-            inside = (blocks.block >= first) & (blocks.block <= last) & used[:, i]
-            trial = blocks.trial[blocks.block]
-            here = trial == blocks.trial[first]
-            near = here & (t > blocks.starts[first] - _APART_S) & (t < blocks.ends[last] + _APART_S)
-            others = used[:, i] & ~near
-            size = float(np.sqrt(np.mean(error[inside, i] ** 2)))
-            usual = _error_elsewhere(q[:, i], qd[:, i], error[:, i], inside, others)
-            if usual is None or usual > _ORDINARY * size:
-                continue
-            rest = float(np.sqrt(np.mean(error[others, i] ** 2)))
-            stretches.setdefault(motions[chosen[blocks.trial[first]]].trial_id, []).append(
-                Disturbance(
-                    start_s=float(blocks.starts[first]),
-                    end_s=float(blocks.ends[last]),
-                    axis=axis,
-                    error=size,
-                    rest=rest,
-                )
-            )
-    return {
-        name: tuple(sorted(found, key=lambda one: (one.start_s, one.axis)))
-        for name, found in stretches.items()
-    }
+    except (ValueError, InputError):
+        return None
+    by_trial = dict(zip(fitted, found.stacked, strict=True))
+    order = range(len(motions))
+    by_trial |= {k: stacked_residual(problem, k, found.p) for k in order if k not in by_trial}
+    stacked = Stacked(
+        np.concatenate([by_trial[k].residual for k in order]),
+        np.concatenate([by_trial[k].slope for k in order]),
+        np.concatenate([by_trial[k].used for k in order]),
+    )
+    blocks = _cut(motions, band)
+    kept = [_thinned(system, motion, band) for motion in motions]
+    t, state, inputs = (np.concatenate(columns) for columns in zip(*kept, strict=True))
+    error = _robust_residual(stacked, blocks)
+    turning = np.concatenate([_turning(motion, band) for motion in motions])
+    force = applied_rms(system, motions, band, found.p[:-1], [by_trial[k].used for k in order])
+    beyond = np.sign(error) * np.maximum(np.abs(error) - _FRICTION * force, 0.0)
+    excess = np.where(turning, beyond, error)
+    return _Samples(system, blocks, t, state, inputs, error, excess, stacked.used)
+
+
+def _turning(motion: Motion, band: Band) -> Flags:
+    """Which thinned samples lie within half a period of the band of a turn or a halt, (K, n_q)."""
+    turns = np.abs(motion.qd) < _SLOW * np.sqrt(np.mean(motion.qd**2, axis=0))
+    turns[1:] |= np.signbit(motion.qd[1:]) != np.signbit(motion.qd[:-1])
+    near = np.empty_like(turns)
+    for i, cutoff in enumerate(band.cutoff_hz):
+        reach = int(np.ceil(0.5 * band.rate_hz / cutoff))
+        near[:, i] = maximum_filter1d(turns[:, i], 2 * reach + 1)
+    return np.asarray(near[band.thinned_rows(len(motion.t))])
+
+
+def _thinned(system: System, motion: Motion, band: Band) -> tuple[Array, Array, Array]:
+    """Time, motion and inputs of the samples that the residual keeps; see `_Samples`."""
+    rows = band.thinned_rows(len(motion.t))
+    forces = system.model.device.forces
+    u = motion.inputs([name for name in system.inputs if name != "t" and name not in forces])
+    before = np.maximum(rows - round(_BEFORE_S * band.rate_hz), 0)
+    state = np.stack([motion.q[rows], motion.qd[rows], motion.qdd[rows]], axis=2)
+    return motion.t[rows], state, np.hstack([u[rows], u[rows] - u[before]])
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _joined(stretches: list[_Stretch]) -> tuple[Disturbance, ...]:
+    """The stretches of one trial in the order of time, those that touch as one."""
+    groups: list[list[_Stretch]] = []
+    for one in sorted(stretches, key=lambda one: one.start_s):
+        if groups and one.start_s <= max(other.end_s for other in groups[-1]):
+            groups[-1].append(one)
+        else:
+            groups.append([one])
+    return tuple(
+        Disturbance(
+            start_s=group[0].start_s,
+            end_s=max(one.end_s for one in group),
+            reason=f"the error {'; '.join(one.words for one in group)}: a hit, a fault of a sensor"
+            " or a start",
+        )
+        for group in groups
+    )
 
 
 def disturbed_samples(t: Array, stretches: Sequence[Disturbance]) -> Flags:
@@ -136,22 +253,6 @@ def disturbed_samples(t: Array, stretches: Sequence[Disturbance]) -> Flags:
     for one in stretches:
         inside |= (t >= one.start_s) & (t <= one.end_s)
     return inside
-
-
-def describe_disturbances(
-    found: Mapping[str, Sequence[Disturbance]], units: Mapping[str, str]
-) -> list[str]:
-    """Say of each trial which stretches are left out and why; ``units`` of position by axis."""
-    lines = []
-    for name, stretches in found.items():
-        for one in stretches:
-            unit = "N.m" if units[one.axis] == "rad" else "N"
-            lines.append(
-                f"{name}: {one.start_s:.1f} to {one.end_s:.1f} s left out: the error of"
-                f" {one.axis} is {one.error:.3g} {unit} there, {one.rest:.3g} {unit} at all other"
-                " times, the same motion included: a hit, a fault of a sensor or a start"
-            )
-    return lines
 
 
 def part_trials(motions: Sequence[Motion], rate_hz: float) -> tuple[Sequence[Motion], list[int]]:
@@ -269,15 +370,14 @@ def _candidates(mean_square: Array, blocks: _Blocks) -> list[tuple[int, int]]:
     return sorted(stretch for _, _, stretch in found[: far[-1] + 1]) if far else []
 
 
-def _error_elsewhere(
-    q: Array, qd: Array, error: Array, inside: Flags, others: Flags
-) -> float | None:
-    """The error (N,) that the motion of a stretch has at other times.
+def _repeated_share(state: Array, error: Array, inside: Flags, others: Flags) -> tuple[bool, float]:
+    """Whether the motion of a stretch comes back, and the share of its squared error that does.
 
-    None where the machine does not move like that again.
+    Args:
+        state: (N, k) position, rate, and what else the error may depend on; error: (N,).
+        inside: the stretch; others: what it is held against.
     """
-    scale = np.maximum([np.std(q[others]), np.std(qd[others])], np.finfo(float).tiny)
-    places = np.column_stack([q, qd]) / scale
+    places = state / np.maximum(state[others].std(axis=0), np.finfo(float).tiny)
     # A tenth of the scale at standstill: friction changes within little, and turns meet turns.
     places[:, 1] = np.arcsinh(_SLOWLY * places[:, 1]) / np.arcsinh(_SLOWLY)
     tree = cKDTree(places[others])
@@ -285,6 +385,7 @@ def _error_elsewhere(
     found = np.isfinite(distance)
     enough = found.sum(axis=1) >= _FEWEST
     if enough.mean() < 0.5:
-        return None
+        return False, 0.0
     size = np.append(np.abs(error[others]), np.nan)[np.where(found, neighbour, -1)]
-    return float(np.sqrt(np.mean(np.nanmedian(size[enough], axis=1) ** 2)))
+    usual, here = np.nanmedian(size[enough], axis=1), np.abs(error[inside][enough])
+    return True, float(np.sum(np.minimum(usual, here) ** 2) / max(np.sum(here**2), 1e-300))

@@ -7,58 +7,65 @@ import numpy as np
 from bampipe.data.quality.channels import fill_missing
 from bampipe.data.quality.table import TrialTable, counted
 
-_FAR = 20.0
-"""A reading is wild this many times farther off than all but one in twenty are: some fifty standard
-deviations of white noise."""
-_CALM = 0.25
-"""Share of that by which its neighbours may change their pace: a hit at a stop turns them round."""
+POSITION, INPUT = (0.95, 20.0), (0.5, 40.0)
+"""A reading is wild this many times farther from its neighbours than so large a share of the
+readings is. What a position does between three samples is curvature, which has its extremes; an
+input jumps with the friction of every reversal, and its median tells its noise."""
+_CALM = 0.05
+"""Share of that by which its neighbours may change their pace: a machine at a stop turns round, and
+the kick of a controller leaves its drive unsteady."""
 _LONGEST = 2
 """Samples of one spike, the most."""
+_ROUNDING = 1e-6
+"""Share of the range below which a change is no step of the sensor."""
 
 
-def find_spikes(values: np.ndarray, step: float = 0.0) -> np.ndarray:
+def find_spikes(values: np.ndarray, rule: tuple[float, float]) -> np.ndarray:
     """Tell which readings are wild.
 
     Args:
-        values: (T,) finite readings; step: the least step of the sensor, 0 where it is unknown.
+        values: (T,) finite readings; rule: `POSITION` or `INPUT`.
 
     Returns:
         (T,) bool.
     """
     wild = np.zeros(values.size, dtype=bool)
+    if values.size < _LONGEST + 4:
+        return wild
+    share, far = rule
+    changes = np.abs(np.diff(values))
+    changes = changes[changes > _ROUNDING * np.ptp(values)]
+    step = float(changes.min()) if changes.size else 0.0
     for width in range(1, _LONGEST + 1):
-        if values.size < width + 4:
-            break
-        inner, end = slice(2, values.size - width - 1), values.size
-        # The reading before the spike, the one after it, and the pace on either side.
+        end = values.size
         before, after = values[1 : end - width - 2], values[width + 2 : end - 1]
         pace = (after - before) / (width + 1)
-        parts = np.stack(
+        off = np.stack(
             [values[2 + k : end - width - 1 + k] - before - (k + 1) * pace for k in range(width)]
         )
-        off = np.abs(parts).min(axis=0)
-        limit = _FAR * max(float(np.quantile(off, 0.95)), step)
+        least = np.abs(off).min(axis=0)
         turn = np.maximum(
             np.abs(pace - before + values[: end - width - 3]),
             np.abs(pace - values[width + 3 :] + after),
         )
-        same_side = np.abs(np.sign(parts).sum(axis=0)) == width
-        found = np.zeros(values.size, dtype=bool)
-        found[inner] = same_side & (off > limit) & (turn < _CALM * off) & (limit > 0.0)
+        limit = far * max(float(np.quantile(least, share)), 0.5 * step)
+        one_sided = np.abs(np.sign(off).sum(axis=0)) == width
+        starts = 2 + np.flatnonzero(one_sided & (least > limit) & (turn < _CALM * least))
         for k in range(width):
-            wild[k:] |= found[: end - k]
+            wild[starts + k] = True
     return wild
 
 
 def interpolate_spikes(table: TrialTable) -> None:
-    """Take wild readings of positions and forces out and interpolate them, where they are few."""
+    """Take wild readings of positions and inputs out and interpolate them, where they are few."""
     session = table.session
-    steps = {encoder.column: float(encoder.counts) for encoder in session.encoders}
-    steps |= dict.fromkeys(session.force.columns if session.force is not None else (), 0.0)
+    rules = {encoder.column: POSITION for encoder in session.encoders}
+    rules |= dict.fromkeys(session.force.columns if session.force is not None else (), INPUT)
+    rules |= {channel.column: INPUT for channel in session.channels}
     some = False
-    for column, step in steps.items():
+    for column, rule in rules.items():
         values = table.columns[column]
-        wild = find_spikes(values, step)
+        wild = find_spikes(values, rule)
         if 0 < wild.sum() <= table.limits.nan_share * len(values):
             some = True
             values[wild] = np.nan
