@@ -30,9 +30,8 @@ Flags = NDArray[np.bool_]
 BLOCK_S = 0.2
 """Length of the blocks of which the errors are compared, s."""
 _TIMES = 20.0
-"""Error of such a stretch over that of the rest. In 490 runs of machines with and without hidden
-effects nothing that comes back and no start reached 18; a hit of 40 N for 80 ms, a force sensor
-dead for a second and one that drifts as it warms up reached 30 to 800."""
+"""Error of the worst block of such a stretch over that of the rest. `benchmarks/disturbances.py` is
+the study behind it; docs/benchmarks.md has what came of it."""
 _ALONE = 25.0
 """The same, over the whole stretch, of a motion that does not come back: a stop that is reached
 once has 15."""
@@ -47,6 +46,8 @@ _NEIGHBOURS, _FEWEST, _RADIUS = 12, 4, 0.35
 """Samples held against one of a stretch, and how near they are: in spreads of all that the error
 may depend on, and at least `_APART_S` away or in another trial."""
 _SLOWLY = 50.0
+_UNKNOWN = 3
+"""Most blocks at rest that a stretch goes on through."""
 _SLOW, _FRICTION = 0.1, 2.0
 """Below this share of its root mean square velocity an axis may turn unseen; a wrong sign of the
 velocity may be worth so many root mean squares of the applied force."""
@@ -162,8 +163,9 @@ def find_disturbances(
     if samples is None:
         return {}
     mean_square = samples.blocks.mean_square(samples.excess, samples.used)
+    whole = samples.blocks.mean_square(samples.error, samples.used)
     for axis in range(len(system.coordinates)):
-        candidates = _candidates(mean_square[:, axis], samples.blocks)
+        candidates = _candidates(mean_square[:, axis], whole[:, axis], samples.blocks)
         calm = np.ones(len(mean_square), dtype=bool)
         for first, last in candidates:
             calm[first : last + 1] = False
@@ -238,8 +240,8 @@ def _joined(stretches: list[_Stretch]) -> tuple[Disturbance, ...]:
             groups.append([one])
     return tuple(
         Disturbance(
-            start_s=group[0].start_s,
-            end_s=max(one.end_s for one in group),
+            start_s=round(group[0].start_s, 3),
+            end_s=round(max(one.end_s for one in group), 3),
             reason=f"the error {'; '.join(one.words for one in group)}: a hit, a fault of a sensor"
             " or a start",
         )
@@ -340,17 +342,23 @@ def _robust_residual(stacked: Stacked, blocks: _Blocks) -> Array:
     return error
 
 
-def _candidates(mean_square: Array, blocks: _Blocks) -> list[tuple[int, int]]:
+def _candidates(mean_square: Array, whole: Array, blocks: _Blocks) -> list[tuple[int, int]]:
     """First and last block of every stretch whose error (B,) stands far above the rest's.
 
-    The rest is what is left without such stretches and all that are larger.
+    The rest is what is left without such stretches and all that are larger. A stretch goes on
+    through turns as long as the whole error, theirs included, does.
     """
     size = np.nan_to_num(mean_square)
     known = np.isfinite(mean_square)
-    calm = np.sort(mean_square[known])[: int(np.ceil((1.0 - _MOST) * known.sum()))]
-    if not calm.size:
+    if not known.any():
         return []
-    loud = size > _EDGE**2 * calm.mean()
+    loud = _loud(mean_square) | _loud(whole)
+    # Blocks that are mostly at rest are unknown: what lies beside a stretch belongs to it.
+    for _ in range(_UNKNOWN):
+        beside = np.zeros_like(loud)
+        beside[1:] |= loud[:-1] & (blocks.trial[1:] == blocks.trial[:-1])
+        beside[:-1] |= loud[1:] & (blocks.trial[1:] == blocks.trial[:-1])
+        loud |= beside & ~known
     apart = np.flatnonzero(np.diff(blocks.trial)) + 1
     edges = np.diff(np.concatenate([[0], loud.astype(np.int8), [0]]))
     bounds = np.sort(
@@ -368,6 +376,13 @@ def _candidates(mean_square: Array, blocks: _Blocks) -> list[tuple[int, int]]:
         found.append((size[start:end].max() * max(count, 1), total, (start, end - 1)))
     far = [k for k, (peak, rest, _) in enumerate(found) if peak > _TIMES**2 * rest]
     return sorted(stretch for _, _, stretch in found[: far[-1] + 1]) if far else []
+
+
+def _loud(mean_square: Array) -> Flags:
+    """Which blocks (B,) stand above the calmer ones."""
+    known = np.sort(mean_square[np.isfinite(mean_square)])
+    calm = known[: int(np.ceil((1.0 - _MOST) * known.size))].mean()
+    return np.asarray(np.nan_to_num(mean_square) > _EDGE**2 * calm)
 
 
 def _repeated_share(state: Array, error: Array, inside: Flags, others: Flags) -> tuple[bool, float]:

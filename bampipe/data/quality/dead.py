@@ -12,6 +12,8 @@ _CHANCE = 1e-9
 """Of so long a run of equal readings, from the share of equal neighbours in the rest."""
 _UNSTEADY = 0.1
 """Least share of changes that take back the one before: readings with noise, no set-points."""
+_MOST = 0.2
+"""Share of the trial beyond which such runs are steps of a command."""
 _MOVES = 0.02
 """Share of its travel in the trial that some axis covers meanwhile."""
 
@@ -47,9 +49,17 @@ def find_equal_runs(values: np.ndarray, t: np.ndarray) -> list[tuple[int, int]]:
     equal = int(np.sum((stops - starts - 1)[~long]))
     share = equal / max(equal + moved.size, 1)
     least = np.log(_CHANCE) / np.log(max(share, 1e-3)) if share < 1.0 else np.inf
-    limits = values.min(), values.max()
-    return [
+    found = [
         (int(start), int(stop))
         for start, stop in zip(starts[long], stops[long], strict=True)
-        if stop - start > least and values[start] not in limits
+        if stop - start > least and not _at_limit(values, start, stop)
     ]
+    return found if sum(stop - start for start, stop in found) < _MOST * values.size else []
+
+
+def _at_limit(values: np.ndarray, start: int, stop: int) -> bool:
+    """Whether a run is at the highest or lowest reading, which others have, too."""
+    here = values[start]
+    if here not in (values.min(), values.max()):
+        return False
+    return int(np.sum(values == here)) > stop - start
