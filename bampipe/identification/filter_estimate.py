@@ -47,6 +47,7 @@ from bampipe.physics import System
 from bampipe.progress import Progress
 from bampipe.trials.bias import UnbiasedFit
 from bampipe.trials.cache import TrialCache
+from bampipe.trials.disturbances import part_trials
 from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion, trial_names
 
@@ -100,6 +101,7 @@ def estimate_by_filter(
     Raises:
         MotionLost: the filter does not follow the motion.
     """
+    motions, of_trial = part_trials(motions, 1.0 / float(np.median(np.diff(motions[0].t))))
     stride = choose_stride(motions)
     near = squares.raw.p[: len(start)]
     trials = TrialCache(
@@ -213,7 +215,7 @@ def estimate_by_filter(
         problem=problem,
         covariance=scaled[:count, :count],
         at_bound=at_bound[:count],
-        held_out=_leave_out(p, found, model, problem, covariance, folds),
+        held_out=_leave_out(p, found, model, problem, covariance, folds, of_trial),
         doubts=_doubts(names, value[:count], at_bound[:count], scaled, squares, nis.mean),
         details=details,
         report=report,
@@ -232,11 +234,16 @@ def _leave_out(
     problem: Problem,
     covariance: Array,
     folds: Folds,
+    of_trial: Sequence[int],
 ) -> list[Array]:
-    """Return the parameters (n_p + 1,) without the trials that each is left out with."""
+    """Return the parameters (n_p + 1,) without the trials that each is left out with.
+
+    Args:
+        of_trial: numbers of the trials of `folds` that those filtered are parts of.
+    """
     if folds.nothing_held_out:
         return [p] * len(folds.groups)
-    groups = [folds.groups[place] for place in found.order]
+    groups = [folds.groups[of_trial[place]] for place in found.order]
     without = leave_out(
         found.ends, groups, model.n_states, found.search_theta, found.search_covariance
     )

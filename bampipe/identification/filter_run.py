@@ -159,7 +159,7 @@ def load_filter_trial(
     something between the two.
 
     Args:
-        run: the run folder; motion: the trial; system: the model.
+        run: the run folder; motion: the trial, or a part of it; system: the model.
         p: (n_p,) parameters near the answer, for the state at the first sample.
         noise: of the sensors; stride: the filter stores every so many samples; choice: of the
             filter.
@@ -179,6 +179,10 @@ def load_filter_trial(
     if choice.measure == "position_velocity":
         velocity = [np.interp(t, motion.t, column) for column in motion.qd.T]
         y = np.hstack([y, np.stack(velocity, axis=1)])
+    # The grid of the motion ends up to a sample before the stamps do.
+    step = float(motion.t[-1] - motion.t[0]) / (len(motion.t) - 1)
+    own = (t > motion.t[0] - 0.5 * step) & (t < motion.t[-1] + step)
+    t, u, y = t[own], u[own], y[own]
     n = len(system.coordinates)
     first = int(np.flatnonzero(np.isfinite(y).all(axis=1))[0])
     speed = np.maximum(motion.qd_sd[0], np.sqrt(np.mean(motion.qd**2, axis=0)) * 0.1)

@@ -21,9 +21,13 @@ def tabulate_nis(found: FilterRun, motions: Sequence[Motion]) -> Consistency:
     """Return the normalised innovation squared: near 1 where the noise levels are right."""
     size = found.settings.observed.size
     names = trial_names(motions)
+    of_parts: dict[str, list[Pass]] = {}
+    for place, trial in zip(found.order, found.trials, strict=True):
+        of_parts.setdefault(names[place], []).append(trial)
     by_trial = {
-        names[place]: trial.nis / size
-        for place, trial in zip(found.order, found.trials, strict=True)
+        name: float(np.average([one.nis for one in parts], weights=[p.counted for p in parts]))
+        / size
+        for name, parts in of_parts.items()
     }
     counts = [trial.counted for trial in found.trials]
     total = np.average([trial.nis for trial in found.trials], weights=counts)

@@ -31,7 +31,7 @@ _POSITION_STEP, _RATE_STEP, _PARAMETER_STEP, _TIMING_STEP = 1e-5, 1e-4, 1e-4, 1e
 
 
 def cut_segments(system: System, motion: Motion, trial: Trial, p: Array) -> list[Segment]:
-    """Cut a trial into segments; those with a missing reading are left out.
+    """Cut a trial into segments; those disturbed or with a missing reading are left out.
 
     Args:
         system: the model; motion: the filtered trial, for initial velocities; trial: its raw
@@ -46,6 +46,9 @@ def cut_segments(system: System, motion: Motion, trial: Trial, p: Array) -> list
     y, u = (np.stack([np.interp(t, trial.t, c) for c in x.T], axis=1) for x in (trial.y, trial.u))
     rate = np.gradient(u, dt, axis=0)
     width = np.array([c.sign_width for c in system.model.device.coordinates])
+    disturbed = np.zeros(t.size, dtype=bool)
+    if motion.left_out is not None:
+        disturbed = np.interp(t, motion.t, motion.left_out.any(axis=1)) > 0.0
     given = motion.inputs(system.inputs)
     memory = system.memory(motion.q, motion.qd, motion.qdd, given, p, motion.t)
     state = np.hstack([motion.qd, memory])
@@ -53,9 +56,9 @@ def cut_segments(system: System, motion: Motion, trial: Trial, p: Array) -> list
     found = []
     for first in range(0, t.size - count + 1, count):
         part = slice(first, first + count)
-        if not np.isfinite(y[part]).all():
+        if not np.isfinite(y[part]).all() or disturbed[part].any():
             continue
-        start = [np.interp(t[first] - trial.t[0], motion.t, column) for column in state.T]
+        start = [np.interp(t[first], motion.t, column) for column in state.T]
         x0 = np.concatenate([y[first, :n], start])
 
         def run(x: Array, parameters: Array, part: slice = part) -> Array:

@@ -44,6 +44,14 @@ class ForceFilter(Record):
     derivative_cutoff_hz: Positive
 
 
+class Disturbance(Record):
+    """A stretch of a trial that no estimate and no error counts."""
+
+    start_s: Size = Field(description="Since the start of the trial")
+    end_s: Positive
+    reason: str
+
+
 class FilterResult(Result):
     """How the motion was differentiated, and how well."""
 
@@ -60,3 +68,6 @@ class FilterResult(Result):
         description="By trial: share of its grid that had no sample"
     )
     skipped: dict[str, str] = Field(description="By trial: why it could not be differentiated")
+    disturbances: dict[str, tuple[Disturbance, ...]] = Field(
+        default_factory=dict, description="By trial: stretches that are left out"
+    )

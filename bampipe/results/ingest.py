@@ -84,6 +84,19 @@ class MainsHum(Record):
         )
 
 
+class DeadStretch(Record):
+    """Where a sensor reads one value while the machine moves."""
+
+    column: str
+    start_s: Size = Field(description="Since the start of the trial")
+    end_s: Positive
+
+    @property
+    def sentence(self) -> str:
+        """What is the matter with which column."""
+        return f"'{self.column}' reads one and the same value while the machine moves"
+
+
 class IngestResult(Result):
     """What the session says, in SI units."""
 
@@ -123,3 +136,6 @@ class IngestResult(Result):
     mains_hum: tuple[MainsHum, ...] = ()
     brakes: dict[str, RecordedChannel]
     channels: dict[str, RecordedChannel]
+    dead: dict[str, tuple[DeadStretch, ...]] = Field(
+        default_factory=dict, description="By trial: stretches without a sensor"
+    )

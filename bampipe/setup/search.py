@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 
 import numpy as np
@@ -298,17 +298,7 @@ def spread(count: int) -> list[int]:
 
 def _middle(motion: Motion, most: int) -> Motion:
     first = max((motion.t.size - most) // 2, 0)
-    cut = slice(first, first + most)
-    return replace(
-        motion,
-        t=motion.t[cut],
-        q=motion.q[cut],
-        qd=motion.qd[cut],
-        qdd=motion.qdd[cut],
-        qd_sd=motion.qd_sd[cut],
-        channels={name: values[cut] for name, values in motion.channels.items()},
-        _columns={},
-    )
+    return motion.rows(slice(first, first + most))
 
 
 def _scaled_by_power(signals: Signals, names: tuple[str, ...], power: float) -> Correction:

@@ -21,7 +21,13 @@ from bampipe.estimate.differentiation import Array, Flags, UniformGrid, uniform_
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import Model, System, compile_model
 from bampipe.progress import Progress
-from bampipe.results.filter import AxisDifferentiation, FilterResult, ForceFilter, ResidualBand
+from bampipe.results.filter import (
+    AxisDifferentiation,
+    Disturbance,
+    FilterResult,
+    ForceFilter,
+    ResidualBand,
+)
 from bampipe.results.ingest import EncoderChannel, IngestResult
 from bampipe.results.setup import SetupResult
 from bampipe.schema import STRICT, NotNegative
@@ -29,6 +35,7 @@ from bampipe.setup.inspection import inspect_setup
 from bampipe.setup.search import HIGHEST_HZ, spread
 from bampipe.trials.band import LEAST_HZ, find_band
 from bampipe.trials.cache import TrialCache
+from bampipe.trials.disturbances import find_disturbances
 from bampipe.trials.folds import Folds
 from bampipe.trials.kinematics import AxisFilter, Kinematics
 from bampipe.trials.motion import input_derivatives, n_samples
@@ -154,12 +161,23 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     if not config.force_cutoff_hz and widest > LEAST_HZ and needed > kinematics.input_cutoff_hz:
         kinematics = replace(kinematics, input_cutoff_hz=needed)
         written = _write_motions(path, samples, ids, kinematics, progress)
-    result = _result(config, kinematics, axes, choices, written, bands)
+    progress(0.95, "disturbances")
+    free = set(trials.loc[trials["kind"] == MOVING[0], "trial_id"])
+    held_out = held_out_trials(run)
+    band = Band(rate, tuple(bands[axis].cutoff_hz for axis in system.coordinates))
+    disturbances = _disturbances(
+        system, out, session, [k for k in names if k in free], held_out, band
+    )
+    result = _result(config, kinematics, axes, choices, written, bands, disturbances)
     progress(0.97, "the set-up")
-    free = set(trials.loc[trials["kind"] == MOVING[0], "trial_id"]) - held_out_trials(run)
-    setup = _inspect(system, out, session, names, free, bands)
+    setup = _inspect(system, out, session, names, free - held_out, bands, disturbances)
     setup.write(out)
     notes = [f"{name}: not used: {reason}" for name, reason in written.skipped.items()]
+    notes += [
+        f"{name}: {one.start_s:.1f} to {one.end_s:.1f} s left out: {one.reason}"
+        for name, stretches in disturbances.items()
+        for one in stretches
+    ]
     return result.write(out) | {"setup": list(setup.lines), "notes": notes}
 
 
@@ -210,6 +228,36 @@ def _write_motions(
     return written
 
 
+def _disturbances(
+    system: System,
+    out: Path,
+    session: IngestResult,
+    free: Sequence[str],
+    held_out: Collection[str],
+    band: Band,
+) -> dict[str, tuple[Disturbance, ...]]:
+    """Find where a sensor of a moving trial is dead, and what else disturbs the free ones."""
+    path = out / "filter/kinematics.parquet"
+    found = {
+        name: tuple(
+            Disturbance(start_s=one.start_s, end_s=one.end_s, reason=one.sentence)
+            for one in stretches
+        )
+        for name, stretches in session.dead.items()
+    }
+    motions = TrialCache(
+        lambda k: read_motion_of(path, free[k], system, found.get(free[k], ())),
+        len(free),
+        n_samples,
+        names=free,
+    )
+    fitted = [k for k, name in enumerate(free) if name not in held_out]
+    for name, stretches in find_disturbances(system, motions, band, fitted).items():
+        both = (*found.get(name, ()), *stretches)
+        found[name] = tuple(sorted(both, key=lambda one: one.start_s))
+    return found
+
+
 def _inspect(
     system: System,
     out: Path,
@@ -217,12 +265,14 @@ def _inspect(
     ids: Sequence[str],
     free: Collection[str],
     bands: Mapping[str, ResidualBand],
+    disturbances: Mapping[str, Sequence[Disturbance]],
 ) -> SetupResult:
     """Hold the set-up against some trials ``ids``, those in ``free`` fitted."""
     fitted, others = ([k for k in ids if (k in free) == side] for side in (True, False))
     chosen = [some[k] for some in (fitted, others) for k in spread(len(some))]
+    path = out / "filter/kinematics.parquet"
     motions = [
-        read_motion_of(out / "filter/kinematics.parquet", name, system, every_input=True)
+        read_motion_of(path, name, system, disturbances.get(name, ()), every_input=True)
         for name in chosen
     ]
     # What brakes do is no part of the bare device: it is judged by braked trials, not fitted.
@@ -399,6 +449,7 @@ def _result(
     choices: dict[str, _Choice],
     written: _Written,
     bands: Mapping[str, ResidualBand],
+    disturbances: dict[str, tuple[Disturbance, ...]],
 ) -> FilterResult:
     """Return what filter.json holds."""
     entries = {}
@@ -423,6 +474,7 @@ def _result(
         force=ForceFilter(derivative_cutoff_hz=kinematics.input_cutoff_hz),
         bridged_fraction=written.interpolated,
         skipped=written.skipped,
+        disturbances=disturbances,
         headline=f"{kinematics.method}, {len(written.interpolated)} trials; bandwidth {widest}; "
         f"residuals compared below {residuals}",
     )

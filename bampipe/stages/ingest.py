@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import pandas as pd
@@ -74,7 +74,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         rows = _ingest_trials(session, config, channels, samples, progress)
     trials = _trials_table(rows)
     write_parquet(out / "ingest/trials.parquet", trials)
-    description = _description(session, device, _rate(session, trials), channels)
+    description = _description(session, device, _rate(session, trials), channels, rows)
     description.write(out)
     if session.device_file is not None:
         _write_device(session.device_file, device, out / "ingest")
@@ -91,13 +91,13 @@ def _ingest_trials(
     channels: ChannelRecords,
     samples: ParquetAppender,
     progress: Progress,
-) -> list[dict[str, object]]:
+) -> list[dict[str, Any]]:
     """Write the samples of the sound trials, and return what became of each.
 
     Raises:
         InputError: none is sound.
     """
-    rows: list[dict[str, object]] = []
+    rows: list[dict[str, Any]] = []
     copies = find_copies(session)
     total, measured = len(session.trials), 0
     for number, entry in enumerate(session.trials):
@@ -136,7 +136,7 @@ def _write_device(file: Path, device: Device, out: Path) -> None:
         (out / "robot.xml").write_bytes(drawing.read_bytes())
 
 
-def _reasons(rows: list[dict[str, object]], where: str) -> list[InputError]:
+def _reasons(rows: list[dict[str, Any]], where: str) -> list[InputError]:
     """Return why trials were set aside: each kind of reason once, as of the first it holds for.
 
     Reasons that differ by numbers alone, such as rows and sizes, are of one kind.
@@ -160,7 +160,7 @@ def _append(samples: ParquetAppender, entry: TrialEntry, trial: CleanTrial) -> N
     samples.append({"trial_id": ids, "t": trial.t, **trial.columns})
 
 
-def _row(entry: TrialEntry, trial: CleanTrial | None, reason: str) -> dict[str, object]:
+def _row(entry: TrialEntry, trial: CleanTrial | None, reason: str) -> dict[str, Any]:
     status = "set_aside"
     if trial is not None:
         status = "repaired" if trial.repairs else "ok"
@@ -177,11 +177,12 @@ def _row(entry: TrialEntry, trial: CleanTrial | None, reason: str) -> dict[str, 
         "status": status,
         "reason": reason,
         "repairs": "" if trial is None else "; ".join([*trial.repairs, *trial.notes]),
+        "dead": () if trial is None else tuple(trial.dead),
     }
 
 
-def _trials_table(rows: list[dict[str, object]]) -> pd.DataFrame:
-    table = pd.DataFrame(rows)
+def _trials_table(rows: list[dict[str, Any]]) -> pd.DataFrame:
+    table = pd.DataFrame(rows).drop(columns="dead")
     text = ("trial_id", "file", "kind", "locked_axis", "status", "reason", "repairs")
     return table.astype(dict.fromkeys(text, "string"))
 
@@ -195,7 +196,11 @@ def _rate(session: Session, trials: pd.DataFrame) -> float:
 
 
 def _description(
-    session: Session, device: Device, rate: float, channels: ChannelRecords
+    session: Session,
+    device: Device,
+    rate: float,
+    channels: ChannelRecords,
+    rows: list[dict[str, Any]],
 ) -> IngestResult:
     """Return what session.json says, the sensors settled."""
     force = session.force
@@ -264,10 +269,11 @@ def _description(
             )
             for channel in session.channels
         },
+        dead={row["trial_id"]: row["dead"] for row in rows if row["dead"]},
     )
 
 
-def _summary(session: Session, rows: list[dict[str, object]]) -> dict[str, object]:
+def _summary(session: Session, rows: list[dict[str, Any]]) -> dict[str, object]:
     names = ("ok", "repaired", "set_aside")
     counts = {name: sum(row["status"] == name for row in rows) for name in names}
     parts = [f"{counts['ok']} sound"]

@@ -90,15 +90,8 @@ def cut_blocks(motion: Motion, band: Band) -> list[Motion]:
     edges = np.linspace(kept[0], kept[-1] + 1, count + 1).astype(int)
     blocks = []
     for first, end in pairwise(edges):
-        rows = slice(int(first) - margin + gap, int(end) + margin - gap)
-        blocks.append(
-            Motion(
-                f"{motion.trial_id}@{motion.t[first]:.1f}s",
-                motion.t[rows], motion.q[rows], motion.qd[rows], motion.qdd[rows],
-                motion.qd_sd[rows],
-                {name: values[rows] for name, values in motion.channels.items()},
-            )
-        )  # fmt: skip
+        part = motion.rows(slice(int(first) - margin + gap, int(end) + margin - gap))
+        blocks.append(replace(part, trial_id=f"{motion.trial_id}@{motion.t[first]:.1f}s"))
     return blocks
 
 

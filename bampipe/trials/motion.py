@@ -40,8 +40,8 @@ class Motion:
         q, qd, qdd: (T, n_q), rad or m and derivatives.
         qd_sd: standard deviation of the velocities, (T, n_q).
         channels: inputs of the device and their time derivatives by name, each (T,).
-        rest: (T, n_q) where the axes of the trial that this one replays stand still, None for a
-            measured trial.
+        left_out: (T, n_q) samples that count no more than those at rest: of a replay, what its
+            trial leaves out; of a trial, its disturbances. None where there are none.
     """
 
     trial_id: str
@@ -51,7 +51,7 @@ class Motion:
     qdd: Array
     qd_sd: Array
     channels: Mapping[str, Array]
-    rest: NDArray[np.bool_] | None = None
+    left_out: NDArray[np.bool_] | None = None
     _columns: dict[tuple[str, ...], Array] = field(default_factory=dict, repr=False, compare=False)
 
     def inputs(self, names: Sequence[str]) -> Array:
@@ -71,6 +71,20 @@ class Motion:
         none = np.zeros(self.t.size)
         rates = [self.channels.get(derivative(name, 1), none) for name in names]
         return np.column_stack(rates) if rates else np.empty((self.t.size, 0))
+
+    def rows(self, which: slice) -> Motion:
+        """Some of its samples, at the same times."""
+        return replace(
+            self,
+            t=self.t[which],
+            q=self.q[which],
+            qd=self.qd[which],
+            qdd=self.qdd[which],
+            qd_sd=self.qd_sd[which],
+            channels={name: values[which] for name, values in self.channels.items()},
+            left_out=None if self.left_out is None else self.left_out[which],
+            _columns={},
+        )
 
     def with_channels(self, changed: Mapping[str, Array]) -> Motion:
         """The same motion with some channels replaced."""

@@ -15,9 +15,10 @@ from bampipe.estimate.low_pass import Band
 from bampipe.physics import System
 from bampipe.physics.device import Device
 from bampipe.physics.soundness import require_sound
-from bampipe.results.filter import FilterResult
+from bampipe.results.filter import Disturbance, FilterResult
 from bampipe.results.ingest import IngestResult
 from bampipe.trials.cache import TrialCache
+from bampipe.trials.disturbances import disturbed_samples
 from bampipe.trials.kinematics import Kinematics
 from bampipe.trials.motion import Motion, input_derivatives, n_samples
 from bampipe.trials.sensors import Sensors
@@ -98,13 +99,24 @@ def read_motion(
         InputError: the file or a column that the model needs is missing.
     """
     path = run.require(KINEMATICS, "filter")
-    return read_motion_of(path, trial_id, system, every_input=every_input)
+    disturbances = run.read(FilterResult).disturbances.get(trial_id, ())
+    return read_motion_of(path, trial_id, system, disturbances, every_input=every_input)
 
 
 def read_motion_of(
-    path: Path, trial_id: str, system: System, *, every_input: bool = False
+    path: Path,
+    trial_id: str,
+    system: System,
+    disturbances: Sequence[Disturbance] = (),
+    *,
+    every_input: bool = False,
 ) -> Motion:
-    """Read one trial of a table of kinematics; arguments and errors as `read_motion`."""
+    """Read one trial of a table of kinematics.
+
+    Args:
+        path: the table; trial_id, system, every_input: as for `read_motion`, as are the errors.
+        disturbances: of the trial, which are left out.
+    """
     axes, device = system.coordinates, system.model.device
     stored = frozenset(column_names(path))
     brakes = {name: f"brake_{axis}" for axis, name in device.brakes.items()}
@@ -135,14 +147,19 @@ def read_motion_of(
     def stack(kind: str) -> Array:
         return np.stack([columns[name] for name in motion[kind]]).T
 
+    t = t - t[0]
+    left_out = None
+    if disturbances:
+        left_out = np.tile(disturbed_samples(t, disturbances)[:, None], (1, len(axes)))
     return Motion(
         trial_id=trial_id,
-        t=t - t[0],
+        t=t,
         q=stack("q"),
         qd=stack("qd"),
         qdd=stack("qdd"),
         qd_sd=stack("qd_sd"),
         channels=channels,
+        left_out=left_out,
     )
 
 
@@ -168,9 +185,13 @@ def read_motions(
     """
     names = free_trials(run, fitted=fitted, braked=braked)
     path = run.require(KINEMATICS, "filter")
+    disturbances = run.read(FilterResult).disturbances
 
     def fetch(number: int) -> Motion:
-        motion = read_motion_of(path, names[number], system, every_input=every_input)
+        name = names[number]
+        motion = read_motion_of(
+            path, name, system, disturbances.get(name, ()), every_input=every_input
+        )
         return motion.with_input_timing(late_s)
 
     return TrialCache(fetch, len(names), n_samples, names=names, in_all=row_count(path, names))

@@ -224,7 +224,7 @@ def replay_motion(
     recording = read_by_sensors(system, stand_in.motions[trial], *course, sensors, rng)
     wanted = system.inputs if alone else None
     motion = kinematics.observe(recording, system.model.device.forces, wanted)
-    return replace(motion, rest=stand_in.rests[trial])
+    return replace(motion, left_out=stand_in.rests[trial])
 
 
 def replay_motions(
@@ -272,8 +272,8 @@ def store_motions(motions: Iterator[Motion]) -> Sequence[Motion]:
             arrays: dict[str, Any] = {f"channel {name}": x for name, x in motion.channels.items()}
             for name in _ARRAYS:
                 arrays[name] = getattr(motion, name)
-            if motion.rest is not None:
-                arrays["rest"] = motion.rest
+            if motion.left_out is not None:
+                arrays["left_out"] = motion.left_out
             with temporary_space():
                 np.savez(folder / f"{count - 1}.npz", trial_id=motion.trial_id, **arrays)
     except BaseException:
@@ -295,8 +295,8 @@ def _stored_motion(path: Path) -> Motion:
             if name.startswith("channel ")
         }
         arrays = {name: stored[name] for name in _ARRAYS}
-        rest = stored.get("rest")
-        return Motion(trial_id=str(stored["trial_id"]), channels=channels, rest=rest, **arrays)
+        trial_id, left_out = str(stored["trial_id"]), stored.get("left_out")
+        return Motion(trial_id=trial_id, channels=channels, left_out=left_out, **arrays)
 
 
 def _reference(

@@ -150,8 +150,9 @@ class _Remembered:
 def standstill_of(motion: Motion, system: System, rate_hz: float) -> NDArray[np.bool_]:
     """Which samples stand still, (T, n_q).
 
-    A replay leaves out what the trial does as well: where the machine rests for just long enough
-    and the replay for just not, the load that friction balances would pass for an error.
+    Or are left out. A replay leaves out what the trial does as well: where the machine rests for
+    just long enough and the replay for just not, the load that friction balances would pass for an
+    error.
     """
     u = motion.inputs(system.inputs)
     brakes = [system.model.device.brakes.get(axis) for axis in system.coordinates]
@@ -159,7 +160,7 @@ def standstill_of(motion: Motion, system: System, rate_hz: float) -> NDArray[np.
         name in system.inputs and bool(u[:, system.inputs.index(name)].any()) for name in brakes
     ]
     still = find_standstill(motion.qd, motion.qd_sd, rate_hz, np.array(braked))
-    return still if motion.rest is None else still | motion.rest
+    return still if motion.left_out is None else still | motion.left_out
 
 
 def residual_and_memory(system: System, motion: Motion, u: Array, p: Array) -> tuple[Array, Array]:

@@ -8,7 +8,11 @@ import numpy as np
 import pytest
 from independent_runs import device_of, record_trials
 
-from bampipe.discover.candidates import build_candidate_model, compile_candidate
+from bampipe.discover.candidates import (
+    build_candidate_model,
+    compile_candidate,
+    list_candidates,
+)
 from bampipe.discover.chance import fit_trials, system_of
 from bampipe.discover.growth import collapses
 from bampipe.discover.polish import FittedSet
@@ -20,6 +24,16 @@ from bampipe.physics.recipe import Recipe
 
 DAMPER = registry.device("magnetic_damper")
 LAG, SATURATION = "channel_lag:current", "channel_saturation:current"
+
+
+@pytest.mark.parametrize("effect", ["gear_loss", "cable_torque"])
+def test_gears_and_cables_are_weighed_wherever_a_motor_drives(effect):
+    def weighed(device: str) -> bool:
+        names = list_candidates(registry.device(device), ())
+        return any(name.startswith(f"{effect}:") for name in names)
+
+    assert weighed("slider") and weighed("servo_pendulum")
+    assert not weighed("bam") and not weighed("magnetic_damper")
 
 
 @pytest.fixture(scope="module")

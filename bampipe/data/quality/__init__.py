@@ -26,6 +26,7 @@ from bampipe.data.quality.clock import (
     refuse_length,
     time_to_seconds,
 )
+from bampipe.data.quality.dead import note_dead_stretches
 from bampipe.data.quality.encoders import (
     check_velocity,
     integrate,
@@ -34,6 +35,7 @@ from bampipe.data.quality.encoders import (
     unwrap,
 )
 from bampipe.data.quality.motion import refuse_wrong_brakes, refuse_wrong_motion
+from bampipe.data.quality.spikes import interpolate_spikes
 from bampipe.data.quality.table import CleaningLimits, CleanTrial, TrialTable
 from bampipe.data.readers import RawTrial
 from bampipe.data.session import Session, TrialEntry
@@ -67,6 +69,7 @@ def clean(raw: RawTrial, session: Session, entry: TrialEntry, limits: CleaningLi
     for channel in session.channels:
         to_signed(table, channel)
     fill_missing(table)
+    interpolate_spikes(table)
     for encoder in session.encoders:
         integrate(table, encoder)
         interpolate_jumps(table, encoder)
@@ -79,8 +82,9 @@ def clean(raw: RawTrial, session: Session, entry: TrialEntry, limits: CleaningLi
         for column in session.force.columns:
             refuse_frozen(table, column)
             refuse_saturated(table, column)
+    note_dead_stretches(table)
     columns = to_si(table)
     refuse_wrong_motion(table, columns)
     refuse_wrong_brakes(table, columns)
     rate = float(1.0 / np.median(np.diff(table.t)))
-    return CleanTrial(table.t, columns, rate, table.repairs, table.notes)
+    return CleanTrial(table.t, columns, rate, table.repairs, table.notes, table.dead)

@@ -11,6 +11,7 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 from bampipe.data.readers import RawTrial
 from bampipe.data.session import Session, TrialEntry
 from bampipe.errors import InputError
+from bampipe.results.ingest import DeadStretch
 from bampipe.schema import STRICT, Count, NotNegative
 
 
@@ -59,6 +60,7 @@ class CleanTrial:
         sample_rate: 1 / median step, Hz.
         repairs: what was changed or left out.
         notes: what was noticed and left as it is.
+        dead: stretches over which a sensor was dead, that are left out of everything.
     """
 
     t: np.ndarray
@@ -66,6 +68,7 @@ class CleanTrial:
     sample_rate: float
     repairs: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    dead: list[DeadStretch] = field(default_factory=list)
 
 
 class TrialTable:
@@ -83,6 +86,7 @@ class TrialTable:
         self.rows = np.arange(raw.first_row, raw.first_row + length, dtype=np.int64)
         self.repairs = list(raw.notes)
         self.notes = list(raw.remarks)
+        self.dead: list[DeadStretch] = []
 
     def __len__(self) -> int:
         return len(self.rows)

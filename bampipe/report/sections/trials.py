@@ -175,6 +175,20 @@ def _filter(results: Results, filtered: FilterResult) -> list[Block]:
     if filtered.skipped:
         skipped = "; ".join(f"{name}: {reason}" for name, reason in filtered.skipped.items())
         blocks.append(Paragraph(f"Not differentiated: {skipped}."))
+    if filtered.disturbances:
+        blocks.append(
+            Table(
+                "Stretches that no estimate and no error counts",
+                ("Trial", "From (s)", "To (s)", "Why"),
+                tuple(
+                    (name, f"{one.start_s:.2f}", f"{one.end_s:.2f}", one.reason)
+                    for name, stretches in filtered.disturbances.items()
+                    for one in stretches
+                ),
+                "lrrl",
+                (0.0, 1.0, 1.0, 0.0),
+            )
+        )
     if rows:
         blocks.append(
             Table(

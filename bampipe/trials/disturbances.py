@@ -1,0 +1,406 @@
+"""Stretches of trials that no model of the machine could explain: a hit, a dead sensor, a start.
+
+Errors of a model come back wherever the machine does what they depend on. A stretch whose error is
+many times that of the rest, while the same motion leaves an ordinary error at other times, tells of
+an event; left in, it moves estimates and floors, and passes for a physical effect.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter1d
+from scipy.spatial import cKDTree
+
+from bampipe.errors import InputError
+from bampipe.estimate.least_squares import Stacked, minimise, stacked_residual
+from bampipe.estimate.low_pass import Band
+from bampipe.physics import System
+from bampipe.results.filter import Disturbance
+from bampipe.trials.cache import TrialCache
+from bampipe.trials.motion import Motion, n_samples, trial_names, trial_sizes
+from bampipe.trials.residuals import applied_rms, problem_of
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+BLOCK_S = 0.2
+"""Length of the blocks of which the errors are compared, s."""
+_TIMES = 20.0
+"""Error of the worst block of such a stretch over that of the rest. `benchmarks/disturbances.py` is
+the study behind it; docs/benchmarks.md has what came of it."""
+_ALONE = 25.0
+"""The same, over the whole stretch, of a motion that does not come back: a stop that is reached
+once has 15."""
+_EDGE = 3.0
+"""The same at its ends: what is left of an event there would still weigh."""
+_MOST = 0.1
+"""Share of the samples beyond which the rest is no longer the rule."""
+_ORDINARY = 0.05
+"""Share of a stretch's squared error that the same motion may have at other times."""
+_APART_S, _BEFORE_S = 1.0, 0.3
+_NEIGHBOURS, _FEWEST, _RADIUS = 12, 4, 0.35
+"""Samples held against one of a stretch, and how near they are: in spreads of all that the error
+may depend on, and at least `_APART_S` away or in another trial."""
+_SLOWLY = 50.0
+_UNKNOWN = 3
+"""Most blocks at rest that a stretch goes on through."""
+_SLOW, _FRICTION = 0.1, 2.0
+"""Below this share of its root mean square velocity an axis may turn unseen; a wrong sign of the
+velocity may be worth so many root mean squares of the applied force."""
+_ROUNDS = 8
+_SHORTEST_S = 1.0
+"""Of a part between two disturbances, s, that a filter can start in."""
+
+
+@dataclass(frozen=True)
+class _Blocks:
+    """Thinned samples of all trials in blocks.
+
+    Attributes:
+        block: (N,) number of the block of each sample, in the order of time within each trial.
+        trial: (B,) number of the trial of each block.
+        starts, ends: (B,) s since the start of the trial.
+    """
+
+    block: NDArray[np.int64]
+    trial: NDArray[np.int64]
+    starts: Array
+    ends: Array
+
+    def mean_square(self, values: Array, used: Flags) -> Array:
+        """Of values (N, n_q) over the samples used, (B, n_q), NaN where most are at rest."""
+        found = np.full((self.trial.size, values.shape[1]), np.nan)
+        whole = np.bincount(self.block, minlength=self.trial.size)
+        for i in range(values.shape[1]):
+            count = np.bincount(self.block, used[:, i], self.trial.size)
+            total = np.bincount(self.block, values[:, i] ** 2 * used[:, i], self.trial.size)
+            np.divide(total, count, out=found[:, i], where=2 * count > whole)
+        return found
+
+
+@dataclass(frozen=True)
+class _Stretch:
+    """What one axis says of a stretch, from the words "the error" on."""
+
+    start_s: float
+    end_s: float
+    words: str
+
+
+@dataclass(frozen=True)
+class _Samples:
+    """Thinned samples of all trials, one after the other.
+
+    Attributes:
+        system: the device; blocks: of the samples.
+        t: (N,) s since the start of the trial; motion: (N, n_q, 3) position, rate, acceleration.
+        inputs: (N, k) further inputs than forces, such as a damper's current, and how far each is
+            from what it was `_BEFORE_S` before.
+        error: (N, n_q) of the device, N.m or N; excess: (N, n_q) the same, of a turn only what no
+            friction could do, for the sign of the velocity may be wrong there.
+        used: (N, n_q) which of them count.
+    """
+
+    system: System
+    blocks: _Blocks
+    t: Array
+    motion: Array
+    inputs: Array
+    error: Array
+    excess: Array
+    used: Flags
+
+    def judge(self, axis: int, first: int, last: int, calm: Flags) -> _Stretch | None:
+        """Blocks ``first`` to ``last`` as a stretch to leave out; None if its error comes back.
+
+        Args:
+            calm: (B,) blocks outside all such stretches of the axis.
+        """
+        blocks, excess = self.blocks, self.excess[:, axis]
+        start, end = float(blocks.starts[first]), float(blocks.ends[last])
+        inside = (blocks.block >= first) & (blocks.block <= last) & self.used[:, axis]
+        here = blocks.trial[blocks.block] == blocks.trial[first]
+        near = here & (self.t > start - _APART_S) & (self.t < end + _APART_S)
+        others = self.used[:, axis] & ~near
+        outside = calm[blocks.block] & self.used[:, axis]
+        if not others.any() or not outside.any():
+            return None
+        state = np.hstack([self.motion[:, axis], self.inputs])
+        again, share = _repeated_share(state, excess, inside, others)
+        if share > _ORDINARY:
+            return None
+        if not again and _rms(excess[inside]) < _ALONE * _rms(excess[outside]):
+            return None
+        size, rest = (_rms(self.error[part, axis]) for part in (inside, outside))
+        coordinate = self.system.model.device.coordinates[axis]
+        unit = "N.m" if coordinate.unit == "rad" else "N"
+        when = "the same motion included" if again else "where it moves otherwise"
+        words = (
+            f"of {coordinate.name} is {size:.3g} {unit}, {rest:.3g} {unit} at all other times,"
+            f" {when}"
+        )
+        return _Stretch(start, end, words)
+
+
+def find_disturbances(
+    system: System, motions: Sequence[Motion], band: Band, fitted: Sequence[int]
+) -> dict[str, tuple[Disturbance, ...]]:
+    """Find stretches with an error that nothing repeats, by trial.
+
+    Args:
+        system: the bare device; motions: the free trials; band: of the residual.
+        fitted: numbers of the trials that a fit may see.
+
+    Returns:
+        The stretches of each trial that has some, in the order of time.
+    """
+    samples = _gather(system, motions, band, fitted)
+    stretches: dict[str, list[_Stretch]] = {}
+    if samples is None:
+        return {}
+    mean_square = samples.blocks.mean_square(samples.excess, samples.used)
+    whole = samples.blocks.mean_square(samples.error, samples.used)
+    for axis in range(len(system.coordinates)):
+        candidates = _candidates(mean_square[:, axis], whole[:, axis], samples.blocks)
+        calm = np.ones(len(mean_square), dtype=bool)
+        for first, last in candidates:
+            calm[first : last + 1] = False
+        for first, last in candidates:
+            found = samples.judge(axis, first, last, calm)
+            if found is not None:
+                name = motions[int(samples.blocks.trial[first])].trial_id
+                stretches.setdefault(name, []).append(found)
+    return {name: _joined(found) for name, found in stretches.items()}
+
+
+def _gather(
+    system: System, motions: Sequence[Motion], band: Band, fitted: Sequence[int]
+) -> _Samples | None:
+    """The errors of the device on all trials; None where it cannot be fitted: others say why."""
+    problem = problem_of(system, motions, band)
+    try:
+        found = minimise(problem, np.append(system.prior, 0.0), fitted, 12, tolerance=1e-6)
+    except (ValueError, InputError):
+        return None
+    by_trial = dict(zip(fitted, found.stacked, strict=True))
+    order = range(len(motions))
+    by_trial |= {k: stacked_residual(problem, k, found.p) for k in order if k not in by_trial}
+    stacked = Stacked(
+        np.concatenate([by_trial[k].residual for k in order]),
+        np.concatenate([by_trial[k].slope for k in order]),
+        np.concatenate([by_trial[k].used for k in order]),
+    )
+    blocks = _cut(motions, band)
+    kept = [_thinned(system, motion, band) for motion in motions]
+    t, state, inputs = (np.concatenate(columns) for columns in zip(*kept, strict=True))
+    error = _robust_residual(stacked, blocks)
+    turning = np.concatenate([_turning(motion, band) for motion in motions])
+    force = applied_rms(system, motions, band, found.p[:-1], [by_trial[k].used for k in order])
+    beyond = np.sign(error) * np.maximum(np.abs(error) - _FRICTION * force, 0.0)
+    excess = np.where(turning, beyond, error)
+    return _Samples(system, blocks, t, state, inputs, error, excess, stacked.used)
+
+
+def _turning(motion: Motion, band: Band) -> Flags:
+    """Which thinned samples lie within half a period of the band of a turn or a halt, (K, n_q)."""
+    turns = np.abs(motion.qd) < _SLOW * np.sqrt(np.mean(motion.qd**2, axis=0))
+    turns[1:] |= np.signbit(motion.qd[1:]) != np.signbit(motion.qd[:-1])
+    near = np.empty_like(turns)
+    for i, cutoff in enumerate(band.cutoff_hz):
+        reach = int(np.ceil(0.5 * band.rate_hz / cutoff))
+        near[:, i] = maximum_filter1d(turns[:, i], 2 * reach + 1)
+    return np.asarray(near[band.thinned_rows(len(motion.t))])
+
+
+def _thinned(system: System, motion: Motion, band: Band) -> tuple[Array, Array, Array]:
+    """Time, motion and inputs of the samples that the residual keeps; see `_Samples`."""
+    rows = band.thinned_rows(len(motion.t))
+    forces = system.model.device.forces
+    u = motion.inputs([name for name in system.inputs if name != "t" and name not in forces])
+    before = np.maximum(rows - round(_BEFORE_S * band.rate_hz), 0)
+    state = np.stack([motion.q[rows], motion.qd[rows], motion.qdd[rows]], axis=2)
+    return motion.t[rows], state, np.hstack([u[rows], u[rows] - u[before]])
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _joined(stretches: list[_Stretch]) -> tuple[Disturbance, ...]:
+    """The stretches of one trial in the order of time, those that touch as one."""
+    groups: list[list[_Stretch]] = []
+    for one in sorted(stretches, key=lambda one: one.start_s):
+        if groups and one.start_s <= max(other.end_s for other in groups[-1]):
+            groups[-1].append(one)
+        else:
+            groups.append([one])
+    return tuple(
+        Disturbance(
+            start_s=round(group[0].start_s, 3),
+            end_s=round(max(one.end_s for one in group), 3),
+            reason=f"the error {'; '.join(one.words for one in group)}: a hit, a fault of a sensor"
+            " or a start",
+        )
+        for group in groups
+    )
+
+
+def disturbed_samples(t: Array, stretches: Sequence[Disturbance]) -> Flags:
+    """Tell which samples at times (T,), s since the start of the trial, lie in a stretch, (T,)."""
+    inside = np.zeros(t.size, dtype=bool)
+    for one in stretches:
+        inside |= (t >= one.start_s) & (t <= one.end_s)
+    return inside
+
+
+def part_trials(motions: Sequence[Motion], rate_hz: float) -> tuple[Sequence[Motion], list[int]]:
+    """Part trials at their disturbances, for what follows a motion from sample to sample.
+
+    Args:
+        motions: measured trials; rate_hz: of their samples.
+
+    Returns:
+        The parts that are long enough, or the trials where nothing disturbs them, and the number
+        of the trial that each is of.
+    """
+    rows: list[slice] = []
+    of_trial: list[int] = []
+    for number, motion in enumerate(motions):
+        sound = np.ones(motion.t.size + 2, dtype=np.int8)
+        sound[[0, -1]] = 0
+        if motion.left_out is not None:
+            sound[1:-1] = ~motion.left_out.any(axis=1)
+        edges = np.flatnonzero(np.diff(sound))
+        for start, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+            if end - start >= _SHORTEST_S * rate_hz or end - start == motion.t.size:
+                rows.append(slice(start, end))
+                of_trial.append(number)
+    if len(rows) == len(motions) and all(
+        part.stop - part.start == size
+        for part, size in zip(rows, trial_sizes(motions), strict=True)
+    ):
+        return motions, of_trial
+    names = trial_names(motions)
+    return (
+        TrialCache(
+            lambda k: motions[of_trial[k]].rows(rows[k]),
+            len(rows),
+            n_samples,
+            names=[names[number] for number in of_trial],
+        ),
+        of_trial,
+    )
+
+
+def _cut(motions: Sequence[Motion], band: Band) -> _Blocks:
+    """The thinned samples of some trials in blocks of `BLOCK_S`."""
+    rows = max(1, round(BLOCK_S * band.rate_hz / band.step))
+    block, trial, starts, ends = [], [], [], []
+    count = 0
+    for number, motion in enumerate(motions):
+        kept = band.thinned_rows(len(motion.t))
+        own = np.arange(kept.size) // rows
+        block.append(count + own)
+        total = int(own[-1]) + 1 if own.size else 0
+        first = kept[::rows]
+        trial.append(np.full(total, number))
+        start = motion.t[first]
+        end = motion.t[np.minimum(first + rows * band.step, len(motion.t) - 1)]
+        if total:  # the margins of the low-pass belong to the blocks beside them
+            start[0], end[-1] = motion.t[0], motion.t[-1]
+        starts.append(start)
+        ends.append(end)
+        count += total
+    return _Blocks(
+        np.concatenate(block), np.concatenate(trial), np.concatenate(starts), np.concatenate(ends)
+    )
+
+
+def _robust_residual(stacked: Stacked, blocks: _Blocks) -> Array:
+    """The residual (N, n_q) with parameters that a few wild blocks do not move.
+
+    Blocks are weighted down as Cauchy's distribution has it, in units of the median block.
+    """
+    error = stacked.residual
+    count = stacked.slope.shape[2]
+    for _ in range(_ROUNDS):
+        mean_square = blocks.mean_square(error, stacked.used)
+        scale = np.nanmedian(mean_square, axis=0)
+        scale = np.where(np.isfinite(scale) & (scale > 0.0), scale, np.inf)
+        worst = np.nanmax(np.nan_to_num(mean_square / scale), axis=1)
+        weight = np.sqrt(1.0 / (1.0 + worst[blocks.block]))[:, None] / np.sqrt(scale)
+        slope = (stacked.slope * weight[:, :, None]).reshape(-1, count)
+        normal = slope.T @ slope
+        size = np.sqrt(np.maximum(np.diag(normal), np.finfo(float).tiny))
+        moment = slope.T @ (stacked.residual * weight).reshape(-1) / size
+        step = np.linalg.lstsq(normal / np.outer(size, size), -moment, rcond=1e-10)[0] / size
+        error = stacked.residual + stacked.slope @ step
+    return error
+
+
+def _candidates(mean_square: Array, whole: Array, blocks: _Blocks) -> list[tuple[int, int]]:
+    """First and last block of every stretch whose error (B,) stands far above the rest's.
+
+    The rest is what is left without such stretches and all that are larger. A stretch goes on
+    through turns as long as the whole error, theirs included, does.
+    """
+    size = np.nan_to_num(mean_square)
+    known = np.isfinite(mean_square)
+    if not known.any():
+        return []
+    loud = _loud(mean_square) | _loud(whole)
+    # Blocks that are mostly at rest are unknown: what lies beside a stretch belongs to it.
+    for _ in range(_UNKNOWN):
+        beside = np.zeros_like(loud)
+        beside[1:] |= loud[:-1] & (blocks.trial[1:] == blocks.trial[:-1])
+        beside[:-1] |= loud[1:] & (blocks.trial[1:] == blocks.trial[:-1])
+        loud |= beside & ~known
+    apart = np.flatnonzero(np.diff(blocks.trial)) + 1
+    edges = np.diff(np.concatenate([[0], loud.astype(np.int8), [0]]))
+    bounds = np.sort(
+        np.concatenate([np.flatnonzero(edges), np.repeat(apart[loud[apart - 1] & loud[apart]], 2)])
+    )
+    stretches = list(zip(bounds[::2].tolist(), bounds[1::2].tolist(), strict=True))
+    total, count, inside = size.sum(), int(known.sum()), 0
+    found = []
+    for start, end in sorted(stretches, key=lambda one: -size[one[0] : one[1]].max()):
+        total -= size[start:end].sum()
+        count -= int(known[start:end].sum())
+        inside += end - start
+        if inside > _MOST * known.sum():
+            break
+        found.append((size[start:end].max() * max(count, 1), total, (start, end - 1)))
+    far = [k for k, (peak, rest, _) in enumerate(found) if peak > _TIMES**2 * rest]
+    return sorted(stretch for _, _, stretch in found[: far[-1] + 1]) if far else []
+
+
+def _loud(mean_square: Array) -> Flags:
+    """Which blocks (B,) stand above the calmer ones."""
+    known = np.sort(mean_square[np.isfinite(mean_square)])
+    calm = known[: int(np.ceil((1.0 - _MOST) * known.size))].mean()
+    return np.asarray(np.nan_to_num(mean_square) > _EDGE**2 * calm)
+
+
+def _repeated_share(state: Array, error: Array, inside: Flags, others: Flags) -> tuple[bool, float]:
+    """Whether the motion of a stretch comes back, and the share of its squared error that does.
+
+    Args:
+        state: (N, k) position, rate, and what else the error may depend on; error: (N,).
+        inside: the stretch; others: what it is held against.
+    """
+    places = state / np.maximum(state[others].std(axis=0), np.finfo(float).tiny)
+    # A tenth of the scale at standstill: friction changes within little, and turns meet turns.
+    places[:, 1] = np.arcsinh(_SLOWLY * places[:, 1]) / np.arcsinh(_SLOWLY)
+    tree = cKDTree(places[others])
+    distance, neighbour = tree.query(places[inside], k=_NEIGHBOURS, distance_upper_bound=_RADIUS)
+    found = np.isfinite(distance)
+    enough = found.sum(axis=1) >= _FEWEST
+    if enough.mean() < 0.5:
+        return False, 0.0
+    size = np.append(np.abs(error[others]), np.nan)[np.where(found, neighbour, -1)]
+    usual, here = np.nanmedian(size[enough], axis=1), np.abs(error[inside][enough])
+    return True, float(np.sum(np.minimum(usual, here) ** 2) / max(np.sum(here**2), 1e-300))
