@@ -13,6 +13,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
 
 from bampipe.estimate.least_squares import (
     KnownSlopes,
@@ -123,7 +124,31 @@ def problem_of(
         precision=np.array(precision),
         known=np.array(known),
         slopes=slopes,
+        multiplied=_multiplied(system, free),
     )
+
+
+def _multiplied(system: System, free: Sequence[int]) -> NDArray[np.int64] | None:
+    """Axes whose inputs free parameters multiply, (n_free,), as torque constants of a robot do.
+
+    A motor that turns several joints is that of one of them. None where there are none.
+    """
+    if system.model.device.robot is None:
+        return None
+    q = np.zeros((1, len(system.coordinates)))
+    gains = system.input_map(q)[0]
+    found = np.full(len(free), -1, dtype=np.int64)
+    rows, columns = linear_sum_assignment(-(np.abs(gains) > 0.0).astype(float))
+    axes = dict(zip(columns.tolist(), rows.tolist(), strict=True))
+    for k, number in enumerate(free):
+        if number >= len(system.prior) or number in system.of_bodies:
+            continue
+        p = system.prior.copy()
+        p[number] = 2.0 * p[number] or 1.0
+        moved = np.flatnonzero(np.any(system.input_map(q, None, p)[0] != gains, axis=0))
+        if len(moved) == 1:
+            found[k] = axes[int(moved[0])]
+    return found if np.any(found >= 0) else None
 
 
 class _Remembered:
