@@ -223,7 +223,7 @@ def fit(
     found = minimise(problem, start, trials, most_iterations)
     return LeastSquares(
         **vars(found),
-        covariance=_covariance(problem, _as_measured(problem, found.p, found.stacked), block_s),
+        covariance=_covariance(problem, as_measured(problem, found.p, found.stacked), block_s),
         residual_sd=_scatter(found.stacked),
     )
 
@@ -307,7 +307,7 @@ class _Linearised:
         n_free = self.problem.free.size
         precision = self.problem.precision
         normal, moment = np.diag(precision), precision * (self.problem.known - self.value)
-        for s in _as_measured(self.problem, self.p, self.stacked):
+        for s in as_measured(self.problem, self.p, self.stacked):
             slope = (s.slope * weight[None, :, None]).reshape(-1, n_free)
             normal += slope.T @ slope
             moment -= slope.T @ (s.residual * weight).reshape(-1)
@@ -333,10 +333,14 @@ def _factors(problem: Problem) -> list[tuple[int, int]]:
     return [(k, int(axis)) for k, axis in enumerate(problem.multiplied) if axis >= 0]
 
 
-def _as_measured(problem: Problem, p: Array, stacked: Sequence[Stacked]) -> Sequence[Stacked]:
+def as_measured(problem: Problem, p: Array, stacked: Sequence[Stacked]) -> Sequence[Stacked]:
     """Trials with the slopes that the residual over the factors of its axes has, times these.
 
     Along a change of all parameters of an axis in proportion that is zero: nothing tells its scale.
+
+    Args:
+        problem: says which parameters are factors; p: (np,) where it is linearised.
+        stacked: the trials, linearised there.
     """
     factors = _factors(problem)
     if not factors:
