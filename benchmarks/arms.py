@@ -1,6 +1,6 @@
 """Arms of the independent simulator, taken from URDF and logs as a newcomer would take them.
 
-    python benchmarks/arms.py [--case NAME ...] [--seeds N] [--out DIR]
+    python benchmarks/arms.py [--case NAME ...] [--seeds N] [--noise SHARE] [--out DIR]
 
 Each case hides something in an arm, lets `bampipe init` propose the session, runs and diagnoses it.
 A row a case: whether every column went to its joint with its sign, what was named, the held-out
@@ -30,6 +30,7 @@ CASES: dict[str, tuple[int, str, str, dict[str, float]]] = {
     "coupled wrist": (217, "ZYYXY", "joint_states", {"friction_of_sum:forearm-wrist_pitch": 1.0}),
     "Stribeck, a slide": (218, "ZYx", "numbered", {"stribeck:shoulder": 1.0}),
     "spring, seven joints": (219, "ZYZYZYZ", "joint_states", {"return_spring:wrist_yaw": 1.0}),
+    "offset, by currents": (220, "ZYYX", "controller", {"drive_offset:forearm": 1.0}),
 }  # fmt: skip
 """By name: seed, axes of the joints, headers, what is hidden."""
 
@@ -41,7 +42,8 @@ def is_paired(folder: Path, names: list[str], turned: list[str]) -> bool:
     for number, name in enumerate(names, 1):
         for what, column in (("position", session["encoders"][name]), ("drive", drives[name])):
             said = column["column"]
-            if name not in said and f"_{number} " not in said:
+            by_number = f"_{number} " in said or said.endswith(f"_{number - 1}")
+            if name not in said and not by_number:
                 return False
             if what == "drive" and (column.get("scale", 1.0) < 0.0) != (name in turned):
                 return False
@@ -52,6 +54,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--case", action="append", choices=CASES)
     parser.add_argument("--seeds", type=int, default=1, help="of each case, counted from its own")
+    parser.add_argument(
+        "--noise", type=float, default=0.03, help="of drives, share of dry friction"
+    )
     parser.add_argument("--out", type=Path, default=Path(tempfile.mkdtemp()))
     given = parser.parse_args()
     print("| hidden | init | named | over the floor | run, s | diagnose, s |\n|-|-|-|-|-|-|")
@@ -60,7 +65,9 @@ def main() -> None:
         for seed in range(first, first + 100 * given.seeds, 100):
             folder = given.out / f"{case.replace(' ', '_').replace(',', '')}_{seed}"
             turned = ["shoulder"] if seed % 2 else []
-            arm.record_logs(folder, seed, kinds, effects, style=style, turned=turned)
+            arm.record_logs(
+                folder, seed, kinds, effects, style=style, turned=turned, noise=given.noise
+            )
             runs = ["--runs", str(given.out / "runs")]
             bampipe("init", str(folder))
             names = list(arm.NAMES[: len(kinds)])

@@ -86,6 +86,10 @@ class Problem:
         precision: (n_free,) of what is known of the parameters beforehand, one over its variance,
             zero where nothing is; known: (n_free,) that.
         slopes: those by some of the parameters, where they are known; see `Slopes`.
+        multiplied: (n_free,) axis whose measured force a parameter multiplies, as a current by a
+            torque constant, an axis for one parameter only; -1 of others, and of all by default.
+            Small, such a factor leaves a small residual and explains nothing: the likelihood is
+            that of what is measured.
     """
 
     residual: Residual
@@ -101,6 +105,7 @@ class Problem:
     precision: Array
     known: Array
     slopes: Slopes | None = None
+    multiplied: NDArray[np.int64] | None = None
 
 
 @dataclass(frozen=True)
@@ -218,7 +223,7 @@ def fit(
     found = minimise(problem, start, trials, most_iterations)
     return LeastSquares(
         **vars(found),
-        covariance=_covariance(problem, found.stacked, block_s),
+        covariance=_covariance(problem, as_measured(problem, found.p, found.stacked), block_s),
         residual_sd=_scatter(found.stacked),
     )
 
@@ -290,14 +295,19 @@ class _Linearised:
         scatter = np.log(np.maximum(_scatter(self.stacked), 1e-300))
         off = self.value - self.problem.known
         prior = 0.5 * float(self.problem.precision @ off**2)
-        return (float(np.sum(count * scatter)) + prior) / max(float(np.mean(count)), 1.0)
+        # A change of variables, from what is measured to the residual, once a sample.
+        volume = sum(
+            float(count[axis]) * np.log(max(abs(self.value[k]), 1e-300))
+            for k, axis in _factors(self.problem)
+        )
+        return (float(np.sum(count * scatter)) + prior - volume) / max(float(np.mean(count)), 1.0)
 
     def normal_equations(self) -> tuple[Array, Array]:
         weight = 1.0 / np.maximum(_scatter(self.stacked), 1e-300)
         n_free = self.problem.free.size
         precision = self.problem.precision
         normal, moment = np.diag(precision), precision * (self.problem.known - self.value)
-        for s in self.stacked:
+        for s in as_measured(self.problem, self.p, self.stacked):
             slope = (s.slope * weight[None, :, None]).reshape(-1, n_free)
             normal += slope.T @ slope
             moment -= slope.T @ (s.residual * weight).reshape(-1)
@@ -314,6 +324,35 @@ class _Linearised:
             known = KnownSlopes(slopes, self.problem.constant)
             stacked = [stacked_residual(self.problem, k, p, known) for k in self.trials]
         return replace(self, p=p, stacked=stacked)
+
+
+def _factors(problem: Problem) -> list[tuple[int, int]]:
+    """Free parameters that multiply what is measured, and the axis of each, by number."""
+    if problem.multiplied is None:
+        return []
+    return [(k, int(axis)) for k, axis in enumerate(problem.multiplied) if axis >= 0]
+
+
+def as_measured(problem: Problem, p: Array, stacked: Sequence[Stacked]) -> Sequence[Stacked]:
+    """Trials with the slopes that the residual over the factors of its axes has, times these.
+
+    Along a change of all parameters of an axis in proportion that is zero: nothing tells its scale.
+
+    Args:
+        problem: says which parameters are factors; p: (np,) where it is linearised.
+        stacked: the trials, linearised there.
+    """
+    factors = _factors(problem)
+    if not factors:
+        return stacked
+    found = []
+    for s in stacked:
+        slope = s.slope.copy()
+        for k, axis in factors:
+            value = p[problem.free[k]]
+            slope[:, axis, k] -= s.residual[:, axis] / (value if value != 0.0 else 1e-300)
+        found.append(replace(s, slope=slope))
+    return found
 
 
 def _require_finite(problem: Problem, trial: int, stacked: Stacked, p: Array) -> None:

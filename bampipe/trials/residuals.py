@@ -13,11 +13,13 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
 
 from bampipe.estimate.least_squares import (
     KnownSlopes,
     Problem,
     Stacked,
+    as_measured,
     minimise,
     stacked_residual,
 )
@@ -102,11 +104,15 @@ def problem_of(
     # Moved in time, inputs change the slopes that they are part of.
     constant = system.unforced if timing else system.constant
     same = [constant[i] and not system.moves_sensors for i in free]
+    multiplied = _multiplied(system, free)
+    if multiplied is not None:  # as measured, their slopes change with the residual
+        same = [constant and axis < 0 for constant, axis in zip(same, multiplied, strict=True)]
     if timing:
         half = 0.5 / band.rate_hz
         same = [*same, False]
         precision, known = [*precision, 0.0], [*known, 0.0]
         free, lower, upper, step = [*free, n], [*lower, -half], [*upper, half], [*step, half]
+        multiplied = None if multiplied is None else np.append(multiplied, -1)
     return Problem(
         residual=residual,
         n_trials=len(motions),
@@ -123,7 +129,31 @@ def problem_of(
         precision=np.array(precision),
         known=np.array(known),
         slopes=slopes,
+        multiplied=multiplied,
     )
+
+
+def _multiplied(system: System, free: Sequence[int]) -> NDArray[np.int64] | None:
+    """Axes whose inputs free parameters multiply, (n_free,), as torque constants of a robot do.
+
+    A motor that turns several joints is that of one of them. None where there are none.
+    """
+    if system.model.device.robot is None:
+        return None
+    q = np.zeros((1, len(system.coordinates)))
+    gains = system.input_map(q)[0]
+    found = np.full(len(free), -1, dtype=np.int64)
+    rows, columns = linear_sum_assignment(-(np.abs(gains) > 0.0).astype(float))
+    axes = dict(zip(columns.tolist(), rows.tolist(), strict=True))
+    for k, number in enumerate(free):
+        if number in system.of_bodies:
+            continue
+        p = system.prior.copy()
+        p[number] = 2.0 * p[number] or 1.0
+        moved = np.flatnonzero(np.any(system.input_map(q, None, p)[0] != gains, axis=0))
+        if len(moved) == 1:
+            found[k] = axes[int(moved[0])]
+    return found if np.any(found >= 0) else None
 
 
 class _Remembered:
@@ -241,7 +271,8 @@ class Evidence:
         band: the low-pass.
         folds: which trials were fitted, and which are left out together.
         residual: low-passed and thinned, by trial, each (K, n_q), N.m or N.
-        jacobian: derivative of ``residual`` by the free parameters, by trial, (K, n_q, n_free).
+        jacobian: derivative of ``residual`` by the free parameters, by trial, (K, n_q, n_free);
+            of what is measured where parameters multiply it, see `as_measured`.
         used: which samples count, by trial, (K, n_q), see `standstill`; the others are zero in
             ``residual`` and ``jacobian``.
         free: indices of the parameters that are estimated.
@@ -319,8 +350,9 @@ class Evidence:
             if len(others) < len(self.folds.fitted_trials):
                 here = [Stacked(self.residual[k], self.jacobian[k], self.used[k]) for k in others]
                 refit = minimise(
-                    problem, start, others, _REFITS, at_start=here, tolerance=_CONVERGED
-                )
+                    problem, start, others, _REFITS, tolerance=_CONVERGED,
+                    at_start=here if problem.multiplied is None else None,
+                )  # fmt: skip
                 steps[group] = refit.p[free] - self.p[free]
         return tuple(steps[group] for group in self.folds.groups)
 
@@ -405,6 +437,7 @@ def gather_evidence(
             stacked[trial] = stacked_residual(problem, trial, found.p, known)
     value = found.p[problem.free]
     order = range(len(motions))
+    measured = as_measured(problem, found.p, [stacked[k] for k in order])
     return Evidence(
         system,
         found.p[:-1],
@@ -413,7 +446,7 @@ def gather_evidence(
         band,
         folds,
         tuple(stacked[k].residual for k in order),
-        tuple(stacked[k].slope for k in order),
+        tuple(s.slope for s in measured),
         tuple(stacked[k].used for k in order),
         tuple(int(i) for i in problem.free),
         problem.lower - value,

@@ -77,6 +77,32 @@ def test_bounds_hold_and_are_reported() -> None:
     assert found.residual_sd[0] > free.residual_sd[0]
 
 
+@pytest.mark.parametrize("start", [0.1, 1.0, 8.0])
+def test_a_scale_that_is_free_does_not_collapse(start: float) -> None:
+    """A force read in other units: all of the equation gets small with what it is multiplied by."""
+    inner = problem()
+    rng = np.random.default_rng(4)
+    noise = [1.5 * rng.normal(size=(len(s), 1)) for s in inner.standstill]
+
+    def residual(trial: int, p: np.ndarray) -> np.ndarray:
+        required = -inner.residual(trial, p[:3]) + inner.residual(trial, np.zeros(3))
+        read = (inner.residual(trial, np.zeros(3)) + noise[trial]) / 5.0
+        return p[3] * read - required
+
+    known, precision = np.array([0.0, 0.0, 0.0, 4.0]), np.array([0.0, 0.0, 0.0, 1.0])
+    scaled = {
+        "residual": residual, "free": np.arange(4), "step": np.ones(4), "known": known,
+        "precision": precision, "lower": np.zeros(4), "upper": np.full(4, np.inf),
+        "constant": np.zeros(4, dtype=bool),
+    }  # fmt: skip
+    found = fit(problem(multiplied=np.array([-1, -1, -1, 0]), **scaled), np.append(TRUTH, start))
+    # As known beforehand, and no better: the trials say nothing of it.
+    np.testing.assert_allclose(found.p[3], 4.0, rtol=0.02)
+    np.testing.assert_allclose(found.covariance[3, 3], 1.0, rtol=0.05)
+    np.testing.assert_allclose(found.p[:3] / found.p[3], TRUTH / 5.0, rtol=0.03)
+    assert fit(problem(**scaled), np.append(TRUTH, start)).p[3] < 0.1
+
+
 def test_parameters_not_free_stay() -> None:
     held = problem(
         free=np.array([0, 1]), lower=np.zeros(2), upper=np.full(2, np.inf), step=np.ones(2)

@@ -197,6 +197,25 @@ def test_all_torque_constants_but_one_are_estimated(tmp_path: Path) -> None:
     np.testing.assert_allclose(estimated, scale[known], rtol=0.01)
 
 
+@pytest.mark.slow
+def test_the_torque_constant_of_a_last_joint_stays_where_noise_is_large(tmp_path: Path) -> None:
+    """Nothing behind that joint tells its scale but its drawing, and its model lacks an offset."""
+    truth = arm.record_logs(
+        tmp_path / "log", 71003, "ZYYX", {"drive_offset:forearm": 1.0}, style="controller",
+        trials=2, seconds=8.0, rate_hz=125.0, noise=0.2,
+    )  # fmt: skip
+    paired(tmp_path / "log")
+    bampipe.run_session(tmp_path / "log", runs=tmp_path / "runs", last="identify")
+    found = read_json(tmp_path / "runs/log/models/base/identify.json")["parameters"]
+    scale = {
+        name: found[f"torque_constant_{name}"]["estimate"] / constant
+        for name, constant in zip(arm.NAMES, truth["constants"], strict=False)
+        if name != "base_yaw"
+    }
+    assert scale["elbow"] == pytest.approx(scale["shoulder"], rel=0.02)
+    assert scale["forearm"] > 0.2
+
+
 def test_reductions_of_a_log_from_the_motors_side_follow_from_the_drawing(tmp_path: Path) -> None:
     truth = arm.record_logs(
         tmp_path / "log", 7, "ZYYX", style="motor", drawing_error=0.03, turned=["elbow"]
