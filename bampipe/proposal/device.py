@@ -21,6 +21,7 @@ from bampipe.files import read_toml
 from bampipe.physics import registry
 from bampipe.physics.device import KINDS, Device
 from bampipe.proposal.encoders import measured_position
+from bampipe.proposal.gravity import weight_of
 from bampipe.proposal.matching import Matcher
 from bampipe.proposal.notes import Notes
 from bampipe.proposal.positions import in_counts, position_in_si, scale_to, slides
@@ -218,7 +219,8 @@ def new_device(folder: Path, match: Matcher, notes: Notes) -> ChosenDevice:
     fit = _rough_fit(position, driver, role, linear, match.t)
     drive = Drive(role, driver.name if driver is not None else "", supply is not None, coil)
     width = 0.0 if in_counts(position) else _sign_width(position, match.t, linear)
-    starter = starter_device(position.name, linear, drive, fit, width)
+    weight, on_gravity = weight_of(position, fit, linear, found)
+    starter = starter_device(position.name, linear, drive, fit, weight, width)
     kind = "linear" if linear else "rotary"
     notes.check.append(
         f"{DEVICE}: one {kind} axis '{starter.axis}' driven by a {role}; put in what you know of it"
@@ -227,8 +229,8 @@ def new_device(folder: Path, match: Matcher, notes: Notes) -> ChosenDevice:
         notes.check.append(
             f"{DEVICE}: {constant} is not yours yet: all forces and inertias scale with it"
         )
-    if any(fit.gravity):
-        notes.check.append(f"{DEVICE}: gravity on '{starter.axis}', since the motion shows it")
+    if on_gravity:
+        notes.check.append(f"{DEVICE}: on '{starter.axis}', {on_gravity}")
     columns = {"supply": supply, starter.input: driver}
     return ChosenDevice(
         DEVICE,
