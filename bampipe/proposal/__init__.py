@@ -86,6 +86,7 @@ def propose(folder: Path, device: str = "") -> ProposedSession:
         chosen = _with_guessed_motors(folder, chosen, columns)
         match.joints, match.of_robot = columns.columns, several
         match.turned, match.gears = columns.turned, columns.gears
+        match.counting = columns.counting
         _check_robot(chosen, columns, notes)
     encoders, axes = encoders_table(chosen.device, match, notes)
     inputs = input_tables(chosen, axes, match, notes)

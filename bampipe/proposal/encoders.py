@@ -6,7 +6,7 @@ import numpy as np
 
 from bampipe.data import guesses
 from bampipe.data.survey import SurveyedColumn, words
-from bampipe.data.units import spelled
+from bampipe.data.units import spelled, unit
 from bampipe.physics.device import Coordinate, Device
 from bampipe.proposal.matching import Matcher
 from bampipe.proposal.notes import UNKNOWN, Notes, bare, entry, quoted
@@ -70,13 +70,34 @@ def _encoder(
     known = column.conversion
     if known is not None and known.si == axis.unit:
         said = spelled(column.unit, _POSITION_UNITS) or axis.unit
-        note = "" if column.stated else notes.guess(f"{column.name} in {column.unit}")
-        return entry(column.name, said, velocity) + note
+        counted, how = _counting(axis, said, match)
+        table = entry(column.name, said, counted + velocity)
+        if how:
+            return table + notes.guess(f"{column.name} {how}")
+        return table + ("" if column.stated else notes.guess(f"{column.name} in {column.unit}"))
     by_size = guesses.likely_unit(axis.unit, column.values)
     likely, why = (by_size, ", by its size") if by_size else (axis.unit, "")
-    return entry(column.name, likely, velocity) + notes.guess(
+    counted, how = _counting(axis, likely, match)
+    return entry(column.name, likely, counted + velocity) + notes.guess(
         f"{column.name} is the position of {axis.name}, in {likely}{why}"
+        + (f"; it {how}" if how else "")
     )
+
+
+def _counting(axis: Coordinate, said: str, match: Matcher) -> tuple[str, str]:
+    """Fields of an encoder that counts otherwise than a robot's drawing, and that in words."""
+    direction, zero = match.counting.get(axis.name, (1.0, 0.0))
+    fields, ways = "", []
+    if direction < 0.0:
+        fields = ", gear_ratio = -1.0"
+        ways.append("counts the other way than the drawing")
+    if zero:
+        known = unit(said)
+        reading = -direction * zero / (known.scale if known is not None else 1.0)
+        fields += f", zero_counts = {reading:.5g}"
+        ways.append(f"reads {reading:.4g} {said} where the drawing has 0")
+    why = ", by weight and inertia as drawn: look it up in the controller's manual"
+    return fields, " and ".join(ways) + why if ways else ""
 
 
 def _integrated(axis: Coordinate, column: SurveyedColumn, notes: Notes) -> str:

@@ -32,6 +32,7 @@ class Matcher:
         turned: inputs that are logged with the other sign.
         of_robot: whether the device is a robot of several joints.
         gears: joints whose position is that of a motor, which turns so often for one of theirs.
+        counting: of a robot's joints, direction and zero against the drawing, see `RobotColumns`.
     """
 
     found: Survey
@@ -40,6 +41,7 @@ class Matcher:
     joints: Mapping[str, SurveyedColumn] = field(default_factory=dict)
     turned: frozenset[str] = frozenset()
     gears: Mapping[str, float] = field(default_factory=dict)
+    counting: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     of_robot: bool = False
 
     def named(self, name: str, *roles: str) -> SurveyedColumn | None:

@@ -14,6 +14,7 @@ from bampipe.data.survey import Survey, SurveyedColumn
 from bampipe.physics.device import Device
 from bampipe.physics.newton_euler import Algebra, joint_forces
 from bampipe.physics.robot import Robot, gravity_vector
+from bampipe.proposal.directions import Counting, find_counting
 from bampipe.proposal.joints import Group, pair_joints
 from bampipe.proposal.notes import Notes
 from bampipe.proposal.positions import position_in_si, scale_to
@@ -71,11 +72,14 @@ class RobotColumns:
         columns: by name of joint or input.
         drives: by name of input, where drawing and log can be compared.
         gears: by joint whose position is that of a motor, its turns for one of the joint.
+        counting: by joint, its direction against the drawing, 1 or -1, and the angle that is added
+            to its reading times that, rad.
     """
 
     columns: Mapping[str, SurveyedColumn]
     drives: Mapping[str, Drive]
     gears: Mapping[str, float] = field(default_factory=dict)
+    counting: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
     def turned(self) -> frozenset[str]:
@@ -144,9 +148,36 @@ def find_robot_columns(
             judged = turned
             columns |= dict(zip(_joints(device), other[0].columns, strict=True))
             columns |= dict(zip(device.forces, other[1].columns, strict=True))
+            positions, drives = other
+    counting, judged = _counted(device, robot, positions, drives, t, judged)
     by_input = dict(zip(device.forces, judged, strict=True))
     notes.check += _sentences(device, columns, by_input)
-    return RobotColumns(columns, by_input)
+    return RobotColumns(
+        columns, by_input, counting=dict(zip(_joints(device), counting, strict=True))
+    )
+
+
+def _counted(
+    device: Device, robot: Robot, positions: Group, drives: Group, t: Array, judged: list[Drive]
+) -> tuple[list[tuple[float, float]], list[Drive]]:
+    """Direction and zero of each joint, and what they make of the drives, as `find_counting`."""
+    ratio = _turns(device, robot)
+    few, many = (
+        _motion(_positions(device, positions, t), t, rows) for rows in (_FEW_ROWS, _MOST_ROWS)
+    )
+    counting = Counting.as_drawn(len(device.coordinates))
+    if few is None or many is None or ratio is None:
+        return counting.by_joint, judged
+
+    def left(direction: Array, zero: Array) -> Array:
+        held = _hold(device, robot, few.counted(direction, zero), drives, ratio)
+        return np.array([drive.left for drive in held])
+
+    counting = find_counting([c.unit == "rad" for c in device.coordinates], left)
+    if not counting.changed:
+        return counting.by_joint, judged
+    motion = many.counted(counting.direction, counting.zero)
+    return counting.by_joint, _hold(device, robot, motion, drives, ratio)
 
 
 def _geared(
@@ -239,14 +270,21 @@ def _beyond_range(device: Device, positions: Group, of_joint: bool) -> list[str]
 
 def _judge(device: Device, robot: Robot, positions: Group, drives: Group, t: Array) -> list[Drive]:
     """How each drive goes with the drawing; none where drives are not one a joint."""
+    ratio = _turns(device, robot)
+    if ratio is None:
+        return []
+    return _judge_along(device, robot, _positions(device, positions, t), drives, ratio, t)
+
+
+def _turns(device: Device, robot: Robot) -> Array | None:
+    """Turns of each joint's motor for one of the joint (n,); None where motors turn several."""
     turned = [list(motor.turns) for motor in robot.motors.values()]
     names = _joints(device)
-    if turned and turned != [[name] for name in names]:
-        return []
-    ratio = np.array([abs(m.turns[n]) for m, n in zip(robot.motors.values(), names, strict=False)])
-    ratio = ratio if turned else np.ones(len(names))
-    q = _positions(device, positions, t)
-    return _judge_along(device, robot, q, drives, ratio, t)
+    if not turned:
+        return np.ones(len(names))
+    if turned != [[name] for name in names]:
+        return None
+    return np.array([abs(m.turns[n]) for m, n in zip(robot.motors.values(), names, strict=True)])
 
 
 def _positions(device: Device, group: Group, t: Array) -> Array:
@@ -265,13 +303,50 @@ def _judge_along(
     most_rows: int = _MOST_ROWS,
 ) -> list[Drive]:
     """How drives go with positions (T, n) of the joints; ``ratio``: turns of the motors (n,)."""
+    motion = _motion(q, t, most_rows)
+    return [] if motion is None else _hold(device, robot, motion, drives, ratio)
+
+
+@dataclass(frozen=True)
+class _Motion:
+    """Positions, velocities and accelerations of a robot's joints, each (K, n).
+
+    Attributes:
+        rows: of the log, of which they are.
+    """
+
+    position: Array
+    rate: Array
+    change: Array
+    rows: slice
+
+    def counted(self, direction: Array, zero: Array) -> _Motion:
+        """The same with joints that count the other way, or from another zero; each (n,)."""
+        parts = (direction * part for part in (self.position, self.rate, self.change))
+        position, rate, change = parts
+        return _Motion(position + zero, rate, change, self.rows)
+
+
+def _motion(q: Array, t: Array, most_rows: int) -> _Motion | None:
+    """The motion along positions (T, n); None where they are too few or incomplete."""
     step = float(np.median(np.diff(t)))
     window = max(5, 2 * round(0.5 * _SMOOTHED_S / step) + 1) if step > 0.0 else len(q)
     if not np.isfinite(q).all() or window >= len(q):
-        return []
-    smooth = [savgol_filter(q, window, 2, deriv=k, delta=step, axis=0) for k in range(3)]
+        return None
     rows = slice(None, None, max(1, len(q) // most_rows))
-    position, rate, change = (list(part[rows].T) for part in smooth)
+    position, rate, change = (
+        savgol_filter(q, window, 2, deriv=k, delta=step, axis=0)[rows] for k in range(3)
+    )
+    return _Motion(position, rate, change, rows)
+
+
+def _hold(
+    device: Device, robot: Robot, motion: _Motion, drives: Group, ratio: Array
+) -> list[Drive]:
+    """How drives go with a motion of the joints; ``ratio``: turns of the motors (n,)."""
+    position, rate, change = (
+        list(part.T) for part in (motion.position, motion.rate, motion.change)
+    )
     bodies = [list(joint.inertial) for joint in robot.joints]
     forces = joint_forces(
         Algebra.numbers(), robot.links, bodies, position, rate, change, gravity_vector(robot)
@@ -279,7 +354,7 @@ def _judge_along(
     found = []
     for k, column in enumerate(drives.columns):
         required = np.broadcast_to(forces[k], rate[k].shape) / ratio[k]
-        values = np.nan_to_num(column.values)[rows] * scale_to(device.force_unit, column)
+        values = np.nan_to_num(column.values)[motion.rows] * scale_to(device.force_unit, column)
         found.append(_compare(required, rate[k], change[k], values))
     return found
 

@@ -310,3 +310,40 @@ def test_an_mjcf_that_cannot_be_read_is_not_passed_over(
     assert "take it out of the folder" in str(caught.value)
     (tmp_path / "arm.xml").write_text("<recording><channel></recording>")
     assert propose(tmp_path)
+
+
+QUARTER = np.pi / 2.0
+
+
+@pytest.mark.parametrize(
+    ("counted", "turned"),
+    [
+        ({}, []),
+        ({"shoulder": (1.0, -QUARTER), "elbow": (1.0, QUARTER)}, []),
+        ({"elbow": (1.0, np.pi)}, ["shoulder"]),
+        ({"shoulder": (-1.0, QUARTER)}, []),
+    ],
+    ids=["as drawn", "two quarter turns", "half a turn, a drive turned", "the other way round"],
+)
+def test_joints_counted_otherwise_than_drawn(
+    tmp_path: Path, counted: dict[str, tuple[float, float]], turned: list[str]
+) -> None:
+    """Six joints; without their zeros half of the drives look turned, and none is."""
+    arm.record_logs(tmp_path / "log", 21, "ZYYXYX", style="joint_states", trials=1, turned=turned)
+    table = pd.read_csv(tmp_path / "log/log_01.csv")
+    for joint, (direction, zero) in counted.items():
+        column = f"/joint_states/{joint}/position"
+        table[column] = direction * table[column] + zero
+        table[column.replace("position", "velocity")] *= direction
+    table.to_csv(tmp_path / "log/log_01.csv", index=False)
+    _, _, proposal = paired(tmp_path / "log")
+    session = read_session(tmp_path / "log")
+    for encoder in session.encoders:
+        direction, zero = counted.get(encoder.axis, (1.0, 0.0))
+        assert encoder.gear_ratio == direction
+        off = np.remainder(encoder.zero - zero + 0.1, 2.0 * np.pi)
+        assert off < 0.2, (encoder.axis, encoder.zero)
+    drives = {c.name.partition("_")[2] for c in session.channels if c.scale < 0.0}
+    assert drives == set(turned)
+    said = [line for line in proposal.check if "by weight and inertia as drawn: look it up" in line]
+    assert len(said) == len(counted)
