@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,7 +19,7 @@ _WORDS = {
     "time": "t time timestamp stamp zeit clock seconds sec secs nanosec nsec nsecs nanoseconds"
     " millis micros milliseconds microseconds",
     "reference": "goal ref reference setpoint target desired des cmd command soll sollwert demand"
-    " wanted",
+    " wanted con ctrl",
     "brake": "brake bremse",
     "velocity": "vel velocity speed qd dq qdot omega geschwindigkeit drehzahl rpm rate",
     "force": "force f fx fy fz torque tau trq kraft moment loadcell wrench effort",
@@ -136,10 +137,35 @@ def survey(folder: Path) -> Survey:
     if not found:
         raise InputError("no log that can be read", where=str(folder), remedy=passed[0][1])
     common = Counter(tuple(sorted(columns)) for columns in found.values()).most_common(1)[0][0]
+    _refuse_parted(folder, found, common)
     files = [name for name, columns in found.items() if set(common) <= set(columns)]
     passed += [(name, "has other columns") for name in found if name not in files]
     columns, remarks = _columns(folder / files[0], files[0], found[files[0]], common)
     return Survey(tuple(files), columns, remarks, tuple(passed))
+
+
+def _refuse_parted(
+    folder: Path, found: Mapping[str, Mapping[str, str]], common: tuple[str, ...]
+) -> None:
+    """Refuse logs that have their positions in one file and what drives them in another.
+
+    Raises:
+        InputError: they are so.
+    """
+    roles = {
+        name: {_role(*column) for column in columns.items()} for name, columns in found.items()
+    }
+    first = next(name for name, columns in found.items() if set(common) <= set(columns))
+    for here, there in (({"position"}, set(DRIVERS)), (set(DRIVERS), {"position"})):
+        if here & roles[first] and not (there | {"reference"}) & roles[first]:
+            other = next((name for name, other in roles.items() if there & other), "")
+            if other:
+                raise InputError(
+                    f"positions and drives are in different files, such as {first} and {other}",
+                    where=str(folder),
+                    remedy="put the columns of one recording side by side in one file, the time"
+                    " once, and leave the parts out of this folder",
+                )
 
 
 def _columns(
@@ -206,10 +232,10 @@ def _role(name: str, stated: str) -> str:
 
 
 def _unit(name: str, stated: str, role: str) -> str:
-    """Unit by the file, or by a last word of the name such as ``_us``."""
+    """Unit by the file, or by a last word of the name such as ``_us``, before an index if any."""
     if stated:
         return stated
-    parts = re.split(r"[_\W]+", name)
+    parts = re.split(r"[_\W]+", re.sub(r"(\[\d+\]|_\d+)$", "", name))
     suffix = parts[-1] if len(parts) > 1 else ""
     matches = [u for u in _UNIT_WORDS.get(role, ()) if u.lower() == suffix.lower()]
     return matches[0] if matches else ""

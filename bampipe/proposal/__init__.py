@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bampipe.data.survey import survey
+from bampipe.data.survey import DRIVERS, survey
 from bampipe.errors import InputError
 from bampipe.files import write_text
 from bampipe.proposal.clock import clock_of
@@ -88,6 +88,11 @@ def propose(folder: Path, device: str = "") -> ProposedSession:
         match.turned, match.gears = columns.turned, columns.gears
         match.counting = columns.counting
         _check_robot(chosen, columns, notes)
+    if len(found.files) > 1 and not found.of(*DRIVERS, "reference", ""):
+        notes.check.append(
+            f"no column is a drive: if {found.files[0]} and {found.files[1]} are one recording, put"
+            " them side by side in one file, each column with a name of its own"
+        )
     encoders, axes = encoders_table(chosen.device, match, notes)
     inputs = input_tables(chosen, axes, match, notes)
     lines = [
@@ -149,7 +154,7 @@ def _check_robot(chosen: ChosenDevice, columns: RobotColumns, notes: Notes) -> N
     robot = chosen.device.robot
     assert robot is not None
     if "tip =" in chosen.text:
-        notes.check.append(f"{chosen.name}: the robot ends at {robot.tip}; joints branch behind it")
+        notes.check.append(f"{chosen.name}: the robot ends at {robot.tip}; is that its last link?")
     if not columns.drives:
         joints = ", ".join(j.name for j in robot.joints)
         notes.check.append(

@@ -22,6 +22,7 @@ from bampipe.physics import registry
 from bampipe.physics.device import KINDS, Device
 from bampipe.proposal.encoders import measured_position
 from bampipe.proposal.gravity import weight_of
+from bampipe.proposal.joints import chain_logged
 from bampipe.proposal.matching import Matcher
 from bampipe.proposal.notes import Notes
 from bampipe.proposal.positions import in_counts, position_in_si, scale_to, slides
@@ -95,7 +96,8 @@ def _starts_as_mjcf(path: Path) -> bool:
 def _robot(folder: Path, found: Survey) -> ChosenDevice | None:
     """The robot of the URDF or MJCF in the folder, its drives logged as torque or as current.
 
-    Where joints branch, as fingers do, it ends before them.
+    Where joints branch, as fingers do, it ends with the last one that has a column, else before
+    them.
 
     Raises:
         InputError: the file cannot be used, is a xacro file, or there are several.
@@ -121,9 +123,16 @@ def _robot(folder: Path, found: Survey) -> ChosenDevice | None:
     try:
         device = _complete(folder, text)
     except Branches as error:
-        if not error.stem:
-            raise
-        text += f'tip = "{error.stem}"  # guess: the joints branch behind it\n'
+        logged = chain_logged(error.chains, found)
+        if not (logged or error.stem):
+            raise InputError(
+                error.what,
+                where=error.where,
+                remedy=f'write {DEVICE} beside the logs: name = "robot", and in [robot] urdf ='
+                f' "{urdfs[0].name}" and tip = "...", the last link of the logged joints',
+            ) from error
+        why = "the last joint with a column" if logged else "the joints branch behind it"
+        text += f'tip = "{logged or error.stem}"  # guess: {why}\n'
         device = _complete(folder, text)
     chosen = ChosenDevice(DEVICE, device, text)
     by_torque = any(not c.is_constant for c in found.of("force"))

@@ -7,12 +7,14 @@ import numpy as np
 from bampipe.data import guesses
 from bampipe.data.survey import SurveyedColumn, words
 from bampipe.data.units import spelled, unit
+from bampipe.lists import join_names
 from bampipe.physics.device import Coordinate, Device
 from bampipe.proposal.matching import Matcher
 from bampipe.proposal.notes import UNKNOWN, Notes, bare, entry, quoted
 from bampipe.proposal.positions import in_counts, is_velocity
 
 _POSITION_UNITS = ("rad", "deg", "mrad", "rev", "m", "mm", "cm", "um", "in")
+_MANY = 6
 _SPEED_UNITS = ("rad/s", "deg/s", "rev/s", "rev/min", "m/s", "cm/s", "mm/s", "in/s")
 
 
@@ -46,7 +48,8 @@ def measured_position(axis: str, axes: int, match: Matcher, notes: Notes) -> Sur
     """
     column, candidates = match.position(axis, axes)
     if column is not None and candidates:
-        notes.guess(f"of {', '.join(candidates)}, {column.name} is the measured position")
+        listed = join_names(candidates, _MANY)
+        notes.guess(f"of {listed}, {column.name} is the measured position")
     return column
 
 

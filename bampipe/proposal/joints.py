@@ -67,6 +67,23 @@ def pair_joints(device: Device, found: Survey) -> Pairing:
     return Pairing(tuple(positions), tuple(drives), some)
 
 
+def chain_logged(chains: Mapping[str, Sequence[tuple[str, str]]], found: Survey) -> str:
+    """The link at which the chain ends whose joints the columns name most; "" where they name none.
+
+    Args:
+        chains: joints with the links behind them, as of `Branches`.
+        found: the log.
+    """
+    said = [_tokens(column.name) for column in found.of("position")]
+
+    def is_logged(joint: str) -> bool:
+        return any(_without(tokens, _tokens(joint)) is not None for tokens in said)
+
+    logged = [[(j, link) for j, link in chain if is_logged(j)] for chain in chains.values()]
+    longest = max(logged, key=len, default=[])
+    return longest[-1][1] if longest else ""
+
+
 def _incomplete(
     names: Sequence[str], columns: Sequence[SurveyedColumn], positions: Group
 ) -> Iterator[Mapping[str, SurveyedColumn]]:

@@ -15,6 +15,7 @@ from bampipe.proposal.positions import travelled
 _DRIVEN = 0.5
 """Share of a column that the motion must explain for it to pass as what drives it."""
 
+_NEVER_DRIVES = ("time", "velocity", "reference", "position")
 _INPUT_ROLE = {"N": "force", "N.m": "force", "A": "current", "V": "voltage", "": "voltage"}
 Match = tuple[SurveyedColumn | None, str]
 
@@ -142,8 +143,8 @@ class Matcher:
         """The column that acceleration, velocity and friction of the motion explain best."""
         share = {}
         for column in self.found.columns:
-            free = column.name not in self.used and column.role not in ("time", "velocity")
-            if not free or column.role == "reference" or column.is_constant or column is position:
+            free = column.name not in self.used and column.role not in _NEVER_DRIVES
+            if not free or column.is_constant or column is position:
                 continue
             values = np.nan_to_num(column.values)
             known = column.conversion
@@ -155,7 +156,10 @@ class Matcher:
             if bits:
                 values = np.where(values >= 2.0 ** (bits - 1), values - 2.0**bits, values)
             share[column.name] = guesses.driven(self.t, travelled(position, self.t), values).share
-        best = max(share, key=lambda name: share[name], default="")
+        # Of several joints without a drawing, a drive has the number of its position.
+        number = _numbers(position.name)
+        alike = [n for n in share if number and _numbers(n) == number and share[n] >= _DRIVEN]
+        best = max(alike or share, key=lambda name: share[name], default="")
         if not best or share[best] < _DRIVEN:
             return None
         return next(c for c in self.found.columns if c.name == best)

@@ -14,7 +14,7 @@ _TAKEN = frozenset(
         *("enc", "encoder", "pos", "position", "angle", "counts", "ticks", "displacement", "disp"),
         *("stroke", "present", "actual", "act", "measured", "meas", "current", "state", "value"),
         *("deg", "degree", "degrees", "rad", "radian", "radians", "vel", "velocity", "speed"),
-        *("header", "feedback", "percent"),
+        *("header", "feedback", "percent", "rec", "log", "data", "mot", "motor"),
     ]
 )
 _FROM_A_MOTOR = REFERENCE_WORDS | {"effort", "torque", "tau"}

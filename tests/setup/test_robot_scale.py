@@ -13,8 +13,9 @@ from bampipe.estimate.low_pass import Band
 from bampipe.physics import Model, System, compile_model
 from bampipe.physics.registry import device_from
 from bampipe.setup.corrections import scaled
+from bampipe.setup.finding import Finding
 from bampipe.setup.plausibility import Plausibility
-from bampipe.setup.search import CorrectionSearch, Finding
+from bampipe.setup.search import CorrectionSearch
 from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion
 from bampipe.trials.signals import Change, Signals

@@ -451,3 +451,64 @@ def test_a_rate_at_which_no_motion_is_logged_is_doubted(tmp_path):
         "0.1 Hz, from the time stamps; motion is not logged so: is its unit right?"
         in proposal.check
     )
+
+
+def two_joints(columns: dict[str, str]) -> dict[str, np.ndarray]:
+    """Two joints in one log; ``columns``: names by what they hold."""
+    one, two = (joint_log(seed) for seed in (1, 2))
+    samples = min(len(one["stamp"]), len(two["stamp"]))
+    held = {"time [s]": one["stamp"] - one["stamp"][0]}
+    for number, log in ((1, one), (2, two)):
+        held[f"q{number}"] = np.deg2rad(log["joint_angle"])
+        held[f"tau{number}"] = 1e-3 * PER_AMPERE * log["motor_current"]
+    return {columns.get(name, name): values[:samples] for name, values in held.items()}
+
+
+def write_table(path: Path, table: dict[str, np.ndarray]) -> None:
+    header = ",".join(table)
+    np.savetxt(path, np.column_stack(list(table.values())), "%.7g", ",", header=header, comments="")
+
+
+def test_of_two_joints_without_a_drawing_a_position_has_its_own_drive(tmp_path):
+    table = two_joints({"q1": "pos_meas1", "q2": "pos_meas2"})
+    # The drive of the other joint, and what was asked of this one, follow the motion better.
+    table["tau_con1"] = table["tau1"] - np.random.default_rng(0).normal(
+        0.0, 1e-3, len(table["tau1"])
+    )
+    table["tau1"] = table["tau1"] + np.random.default_rng(1).normal(0.0, 0.3, len(table["tau1"]))
+    table["tau2"] = table["tau_con1"]
+    write_table(tmp_path / "a.csv", table)
+    session, proposal = proposed(tmp_path)
+    assert session["encoders"]["joint"]["column"] == "pos_meas1"
+    assert session["force"]["columns"] == ["tau1"]
+    assert any("2 columns are positions: of a robot?" in line for line in proposal.check)
+
+
+def test_a_position_whose_drive_is_not_there_is_not_driven_by_another_position(tmp_path):
+    table = two_joints({"q1": "pos_deg[0]", "q2": "pos_deg[1]"})
+    write_table(tmp_path / "a.csv", {name: v for name, v in table.items() if "tau" not in name})
+    session, _ = proposed(tmp_path)
+    assert session["encoders"]["joint"] == {"column": "pos_deg[0]", "unit": "deg"}
+    assert "pos_deg[1]" not in str(session["force"])
+
+
+@pytest.mark.parametrize("alone", ["q", "tau"])
+def test_a_recording_in_parts_is_to_be_put_together(tmp_path, command: Command, alone: str):
+    table = two_joints({})
+    for what in ("q", "tau"):
+        part = {name: v for name, v in table.items() if name.startswith((what, "time"))}
+        write_table(tmp_path / f"{'a' if what == alone else 'b'}.csv", part)
+    code, _, errors = command("init", str(tmp_path))
+    assert code == 2 and errors.count("\n") == 1
+    assert "positions and drives are in different files, such as a.csv and b.csv" in errors
+    assert "side by side in one file" in errors
+
+
+def test_two_files_of_the_same_names_may_be_one_recording(tmp_path):
+    table = two_joints({})
+    for name in ("positions", "torques"):
+        write_table(tmp_path / f"{name}.csv", {"time [s]": table["time [s]"], "joint": table["q1"]})
+    _, proposal = proposed(tmp_path)
+    assert any(
+        "no column is a drive: if positions.csv and torques.csv" in x for x in proposal.check
+    )

@@ -347,3 +347,33 @@ def test_joints_counted_otherwise_than_drawn(
     assert drives == set(turned)
     said = [line for line in proposal.check if "by weight and inertia as drawn: look it up" in line]
     assert len(said) == len(counted)
+
+
+HAND = "".join(
+    f'''<link name="{side}"/><joint name="{side}_finger" type="prismatic"><parent link="lower"/>
+<child link="{side}"/><axis xyz="0 1 0"/><limit lower="0" upper="0.1" effort="1" velocity="1"/>
+</joint>'''
+    for side in ("left", "right")
+)
+
+
+def test_a_robot_of_which_the_urdf_shows_more_ends_with_the_last_joint_logged(
+    tmp_path: Path,
+) -> None:
+    """A service robot: wheels on the base, fingers behind the arm."""
+    write_log(tmp_path)
+    wheel = HAND.replace("lower", "base").replace("left", "wheel_a").replace("right", "wheel_b")
+    (tmp_path / "arm.urdf").write_text(URDF.replace("</robot>", HAND + wheel + "</robot>"))
+    with pytest.raises(InputError, match=r"write device\.toml beside the logs") as refused:
+        propose(tmp_path)  # q1 and q2 name no joint
+    assert "tip = " in str(refused.value)
+    names = {
+        f"{c}{k}": f"{j}_{c}" for k, j in ((1, "shoulder"), (2, "elbow")) for c in ("q", "tau")
+    }
+    table = pd.read_csv(tmp_path / "log.csv").rename(columns=names)
+    table.to_csv(tmp_path / "log.csv", index=False)
+    proposal = proposed(tmp_path)
+    assert 'tip = "lower"' in proposal.device
+    assert {e.axis: e.column for e in read_session(tmp_path).encoders} == {
+        "shoulder": "shoulder_q", "elbow": "elbow_q"
+    }  # fmt: skip
