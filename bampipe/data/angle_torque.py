@@ -16,7 +16,8 @@ joints without weight their friction, as roughly as it is fitted here, left 0.86
 _CHANCE, _CHANCE_OF_TWO = 1e-4, 1e-3
 """Probability below which position shows at all; and sine beside line, or line beside sine."""
 _PLAINLY = 0.9
-"""Share of what sine and cosine leave that a line must leave at most to be a spring instead."""
+"""Share of what sine and cosine leave that a line may leave at most, to be a spring beside them or
+in their place: friction that is fitted roughly leaves a little that resembles one."""
 _WINDOW = 5.0
 """Correlation is summed up to so many times what it sums up to (Sokal 1997)."""
 
@@ -65,7 +66,10 @@ def angle_torque(moving: np.ndarray, angle: np.ndarray, drive: np.ndarray) -> An
     if not shown:
         return AngleTorque("nothing", moments, beside)
     wave_adds = _chance(of_line, of_both, 7, 2) < _CHANCE_OF_TWO
-    line_adds = _chance(of_wave, of_both, 7, 1) < _CHANCE_OF_TWO
+    line_adds = (
+        of_both @ of_both < _PLAINLY * (of_wave @ of_wave)
+        and _chance(of_wave, of_both, 7, 1) < _CHANCE_OF_TWO
+    )
     reading: Reading = "either"
     if wave_adds:
         reading = "both" if line_adds else "gravity"

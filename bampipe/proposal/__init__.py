@@ -7,6 +7,7 @@ a radian, is left at a value that the session reader refuses with a line saying 
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -52,12 +53,13 @@ class ProposedSession:
     passed: list[str]
 
 
-def propose(folder: Path, device: str = "") -> ProposedSession:
+def propose(folder: Path, device: str = "", names: Sequence[str] = ()) -> ProposedSession:
     """Propose a session file for the logs in ``folder``; writes nothing.
 
     Args:
         folder: with logs, in it or in folders below.
         device: a built-in device or a device file in the folder; guessed where empty.
+        names: of the columns, where the logs are texts without a header.
 
     Raises:
         InputError: no logs, a session file is there already, or no such device.
@@ -68,7 +70,7 @@ def propose(folder: Path, device: str = "") -> ProposedSession:
             where=str(folder),
             remedy=f"it is left alone; to run it: bampipe run {folder}",
         )
-    found = survey(folder)
+    found = survey(folder, names)
     notes = Notes()
     chosen = find_device(folder, found, device)
     clock = clock_of(found, notes)
@@ -97,6 +99,7 @@ def propose(folder: Path, device: str = "") -> ProposedSession:
     inputs = input_tables(chosen, axes, match, notes)
     lines = [
         *_head(folder, chosen.name, clock.rate),
+        *_names(names),
         *clock.lines,
         *encoders,
         *inputs,
@@ -122,6 +125,11 @@ def _head(folder: Path, device: str, rate: str) -> list[str]:
         rate,
         "",
     ]
+
+
+def _names(names: Sequence[str]) -> list[str]:
+    listed = ", ".join(quoted(name) for name in names)
+    return ["[csv]", f"names = [{listed}]", ""] if names else []
 
 
 def _with_guessed_motors(folder: Path, chosen: ChosenDevice, columns: RobotColumns) -> ChosenDevice:

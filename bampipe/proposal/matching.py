@@ -15,7 +15,7 @@ from bampipe.proposal.positions import travelled
 _DRIVEN = 0.5
 """Share of a column that the motion must explain for it to pass as what drives it."""
 
-_NEVER_DRIVES = ("time", "velocity", "reference", "position")
+_NEVER_DRIVES = ("time", "velocity", "acceleration", "reference", "position")
 _INPUT_ROLE = {"N": "force", "N.m": "force", "A": "current", "V": "voltage", "": "voltage"}
 Match = tuple[SurveyedColumn | None, str]
 
@@ -156,12 +156,16 @@ class Matcher:
             if bits:
                 values = np.where(values >= 2.0 ** (bits - 1), values - 2.0**bits, values)
             share[column.name] = guesses.driven(self.t, travelled(position, self.t), values).share
-        # Of several joints without a drawing, a drive has the number of its position.
+        roles = {column.name: column.role for column in self.found.columns}
+        fitting = [name for name in share if share[name] >= _DRIVEN]
+        # A velocity of an unknown name fits itself. Of several joints without a drawing, a drive
+        # has the number of its position.
+        fitting = [name for name in fitting if roles[name] in DRIVERS] or fitting
         number = _numbers(position.name)
-        alike = [n for n in share if number and _numbers(n) == number and share[n] >= _DRIVEN]
-        best = max(alike or share, key=lambda name: share[name], default="")
-        if not best or share[best] < _DRIVEN:
+        fitting = [name for name in fitting if number and _numbers(name) == number] or fitting
+        if not fitting:
             return None
+        best = max(fitting, key=lambda name: share[name])
         return next(c for c in self.found.columns if c.name == best)
 
 

@@ -512,3 +512,66 @@ def test_two_files_of_the_same_names_may_be_one_recording(tmp_path):
     assert any(
         "no column is a drive: if positions.csv and torques.csv" in x for x in proposal.check
     )
+
+
+def labelled(names: str, **scales: float) -> dict[str, np.ndarray]:
+    """The joint's log under other names, in the order time, position, velocity, drive."""
+    log = joint_log(3)
+    values = (
+        log["stamp"] - log["stamp"][0],
+        np.deg2rad(log["joint_angle"]),
+        np.deg2rad(log["joint_velocity"]),
+        PER_AMPERE * 1e-3 * log["motor_current"],
+    )
+    factors = (scales.get(what, 1.0) for what in ("t", "q", "qd", "u"))
+    return {n: v * f for n, v, f in zip(names.split(","), values, factors, strict=True)}
+
+
+def test_units_at_the_end_of_names(tmp_path):
+    table = labelled("t_ms,pos_deg,vel_deg_s,cur_mA", t=1e3, q=57.29578, qd=57.29578, u=1e3)
+    write_table(tmp_path / "a.csv", table)
+    session, proposal = proposed(tmp_path)
+    assert session["time"] == {"column": "t_ms", "unit": "ms"}
+    velocity = {"column": "vel_deg_s", "unit": "deg/s"}
+    assert session["encoders"]["joint"] == {
+        "column": "pos_deg",
+        "unit": "deg",
+        "velocity": velocity,
+    }
+    assert session["channels"]["motor_current"] == {"column": "cur_mA", "unit": "mA"}
+    assert "driven by a current" in proposal.device
+
+
+def test_a_current_position_is_no_current_and_an_acceleration_drives_nothing(tmp_path):
+    table = labelled("t,current_position,acc_x,torque_nm")
+    table["acc_x"] = np.gradient(np.gradient(table["current_position"], table["t"]), table["t"])
+    write_table(tmp_path / "a.csv", table)
+    session, _ = proposed(tmp_path)
+    assert [e["column"] for e in session["encoders"].values()] == ["current_position"]
+    assert session["force"]["columns"] == ["torque_nm"]
+    del table["torque_nm"]
+    (tmp_path / "b").mkdir()
+    write_table(tmp_path / "b/a.csv", table)
+    session, _ = proposed(tmp_path / "b")
+    assert session["force"]["columns"] == ["?"]
+
+
+def test_a_torque_in_per_cent_asks_for_its_gain(tmp_path):
+    write_table(tmp_path / "a.csv", labelled("t,angle_deg,w,torque_percent", q=57.29578, u=20.0))
+    session, proposal = proposed(tmp_path)
+    assert session["force"]["unit"] == "V" and session["force"]["calibration_n_per_v"] == [[0.0]]
+    assert proposal.fill_in == ['calibration_n_per_v, N.m for one of "torque_percent"']
+
+
+def test_names_can_be_given_to_a_log_without_a_header(tmp_path, command: Command):
+    table = np.column_stack(list(labelled("t,q,dq,u").values()))
+    np.savetxt(tmp_path / "a.csv", table, "%.6f", ",")
+    code, _, errors = command("init", str(tmp_path))
+    assert code == 2 and "to bampipe init as --names time,position,..." in errors
+    code, _, errors = command("init", str(tmp_path), "--names", "t,q_rad,dq,current_A")
+    assert code == 0, errors
+    session = tomllib.loads((tmp_path / "session.toml").read_text())
+    assert session["csv"] == {"names": ["t", "q_rad", "dq", "current_A"]}
+    assert session["channels"]["motor_current"]["column"] == "current_A"
+    found = samples(tmp_path, tmp_path / "out", "a")
+    np.testing.assert_allclose(found["q_joint"][:100], table[:100, 1], atol=1e-6)

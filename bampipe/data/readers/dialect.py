@@ -199,7 +199,8 @@ def _header(
         raise InputError(
             "no header: the first line holds numbers",
             where=f"{name}, row {lines[0].number}",
-            remedy=f"add a line {shown}, or give names under [csv]",
+            remedy=f"add a line {shown}, or give names under [csv], to bampipe init as --names"
+            f" {shown}",
         )
     row = _names(lines[index].text, delimiter, lines[index + 1 :])
     check_columns(row, columns, f"{name}, row {lines[index].number}")
