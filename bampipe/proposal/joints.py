@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from bampipe.data.survey import Survey, SurveyedColumn
+from bampipe.data.units import unit
 from bampipe.physics.device import Device
 
 Tokens = tuple[str, ...]
@@ -168,7 +169,11 @@ def _numbered_alike(
 
 def _tokens(name: str) -> Tokens:
     """Words and numbers of a name, in lower case; a unit in brackets is left out."""
-    bare = re.sub(r"[\[(][^\])]*[A-Za-z%°][^\])]*[\])]", " ", name)
+    bare = re.sub(
+        r"[\[(]([^\])]*[A-Za-z%°][^\])]*)[\])]",
+        lambda said: " " if unit(said[1]) is not None or "°" in said[1] else f" {said[1]} ",
+        name,
+    )
     parts = re.findall(r"[A-Z]?[a-z]+|[A-Z]+|\d+", bare)
     return tuple(str(int(p)) if p.isdigit() else p.lower() for p in parts)
 

@@ -377,3 +377,39 @@ def test_a_robot_of_which_the_urdf_shows_more_ends_with_the_last_joint_logged(
     assert {e.axis: e.column for e in read_session(tmp_path).encoders} == {
         "shoulder": "shoulder_q", "elbow": "elbow_q"
     }  # fmt: skip
+
+
+def test_joint_states_in_a_bag_go_to_the_joints_that_they_name(tmp_path: Path) -> None:
+    """Joints are named in brackets there, where tables have units."""
+    pytest.importorskip("rosbags")
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    write_log(tmp_path, gains=(1.0, -1.0))
+    table = pd.read_csv(tmp_path / "log.csv")
+    (tmp_path / "log.csv").unlink()
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    kinds = ("sensor_msgs/msg/JointState", "std_msgs/msg/Header", "builtin_interfaces/msg/Time")
+    state, header, time = (store.types[kind] for kind in kinds)
+    with Writer(tmp_path / "rec", version=9, storage_plugin=StoragePlugin.MCAP) as bag:
+        topic = bag.add_connection("/joint_states", kinds[0], typestore=store)
+        for late, row in enumerate(table.itertuples()):
+            nanoseconds = round(row.time_s * 1e9)
+            stamp = time(100 + nanoseconds // 10**9, nanoseconds % 10**9)
+            pairs = ((row.q2, row.q1), (row.q2 * 0.0, row.q1 * 0.0), (row.tau2, row.tau1))
+            values = [np.array(pair) for pair in pairs]  # in the order of the alphabet
+            message = state(header(stamp, ""), ["elbow", "shoulder"], *values)
+            recorded = 100 * 10**9 + nanoseconds + (late % 7) * 10**5
+            bag.write(topic, recorded, store.serialize_cdr(message, kinds[0]))
+    proposal = proposed(tmp_path)
+    session = read_session(tmp_path)
+    assert 'column = "/joint_states:header.stamp"' in proposal.session
+    joints = ("shoulder", "elbow")
+    assert {e.axis: e.column for e in session.encoders} == {
+        name: f"/joint_states:position[{name}]" for name in joints
+    }
+    assert {c.name: c.column for c in session.channels} == {
+        f"torque_{name}": f"/joint_states:effort[{name}]" for name in joints
+    }
+    assert [c.scale for c in session.channels] == [1.0, -1.0]
+    assert proposal.fill_in == []
