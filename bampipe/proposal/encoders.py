@@ -65,9 +65,10 @@ def _encoder(
         said = spelled(column.unit, _POSITION_UNITS) or guesses.likely_unit(
             axis.unit, column.values
         )
-        gear = f", gear_ratio = {turns:.4g}"
-        return entry(column.name, said or axis.unit, gear) + notes.guess(
+        fields, how = _counting(axis, said or axis.unit, match, turns)
+        return entry(column.name, said or axis.unit, fields) + notes.guess(
             f"{column.name} is the position of the motor of {axis.name}, in {said or axis.unit}"
+            + (f"; it {how}" if how else "")
         )
     velocity = _velocity_beside(axis, alone, match, notes)
     known = column.conversion
@@ -87,16 +88,22 @@ def _encoder(
     )
 
 
-def _counting(axis: Coordinate, said: str, match: Matcher) -> tuple[str, str]:
-    """Fields of an encoder that counts otherwise than a robot's drawing, and that in words."""
+def _counting(axis: Coordinate, said: str, match: Matcher, turns: float = 1.0) -> tuple[str, str]:
+    """Fields of an encoder that counts otherwise than a robot's drawing, and that in words.
+
+    Args:
+        axis: whose encoder it is; said: its unit; match: the columns.
+        turns: of what the encoder sits on, for one of the axis.
+    """
     direction, zero = match.counting.get(axis.name, (1.0, 0.0))
     fields, ways = "", []
+    if direction * turns != 1.0:
+        fields = f", gear_ratio = {direction * turns:.4g}"
     if direction < 0.0:
-        fields = ", gear_ratio = -1.0"
         ways.append("counts the other way than the drawing")
     if zero:
         known = unit(said)
-        reading = -direction * zero / (known.scale if known is not None else 1.0)
+        reading = -direction * zero * turns / (known.scale if known is not None else 1.0)
         fields += f", zero_counts = {reading:.5g}"
         ways.append(f"reads {reading:.4g} {said} where the drawing has 0")
     why = ", by weight and inertia as drawn: look it up in the controller's manual"

@@ -413,3 +413,25 @@ def test_joint_states_in_a_bag_go_to_the_joints_that_they_name(tmp_path: Path) -
     }
     assert [c.scale for c in session.channels] == [1.0, -1.0]
     assert proposal.fill_in == []
+
+
+@pytest.mark.slow
+def test_zeros_of_a_log_from_the_motors_side(tmp_path: Path) -> None:
+    """Reductions and zeros hide each other: neither alone lets the drawing explain the drives."""
+    truth = arm.record_logs(
+        tmp_path / "log", 22, "ZYYX", style="motor", trials=1, drawing_error=0.03, turned=["elbow"]
+    )
+    counted = {"shoulder": (1.0, -QUARTER), "elbow": (-1.0, QUARTER)}
+    table = pd.read_csv(tmp_path / "log/log_01.csv")
+    for number, name in enumerate(NAMES[:4], 1):
+        direction, zero = counted.get(name, (1.0, 0.0))
+        column, turns = f"act_pos_mot_deg_{number}", truth["ratio"][number - 1]
+        table[column] = direction * table[column] + np.rad2deg(zero) * turns
+    table.to_csv(tmp_path / "log/log_01.csv", index=False)
+    paired(tmp_path / "log")
+    for encoder, turns in zip(read_session(tmp_path / "log").encoders, truth["ratio"], strict=True):
+        direction, zero = counted.get(encoder.axis, (1.0, 0.0))
+        assert encoder.gear_ratio == pytest.approx(direction * turns, rel=0.05)
+        assert encoder.zero == pytest.approx(np.rad2deg(zero) * turns, rel=0.05, abs=1e-9)
+    turned = {c.name for c in read_session(tmp_path / "log").channels if c.scale < 0.0}
+    assert turned == {"torque_elbow"}
