@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bampipe.data.angle_torque import Reading
 from bampipe.data.guesses import Driven
 from bampipe.data.survey import Survey, SurveyedColumn, words
 from bampipe.proposal.positions import in_counts
@@ -17,6 +18,11 @@ _UPRIGHT = frozenset(["yaw", "pan", "azimuth", "heading"])
 """What an axis that stands upright, and carries no weight, is called."""
 _MOST_TRAVEL = 4.0 * np.pi
 """Beyond two turns, rad, an angle is rather that of a motor before its gear."""
+_DOUBTS: dict[Reading, str] = {
+    "either": "a torque follows the angle, and over so short a travel a spring's looks alike",
+    "both": "a torque follows the angle, and neither weight nor a spring alone explains it; what is"
+    " beside it, a cable, a spring, a ripple, is for diagnose to name",
+}
 _LEAST = 1e-3
 """Of what friction gives, N.m, as the spread of a weight of which nothing shows."""
 
@@ -56,17 +62,9 @@ def weight_of(
             " does; diagnose has a name for it"
         )
     if fit.pose is not None and fit.pose.is_gravity:
-        doubt = {
-            "gravity": "",
-            "either": "over so short a travel a spring looks alike",
-            "both": "it does not explain all that follows the position: a cable, a spring or a"
-            " ripple beside it is for diagnose to name",
-            "nothing": "",
-            "spring": "",
-        }[reading]
-        size = max(map(abs, fit.pose.moments))
-        said = "gravity, since the motion shows it" + (f"; but {doubt}" if doubt else "")
-        return Weight(fit.pose.moments, size, doubt), said
+        doubt = _DOUBTS.get(reading, "")
+        said = f"gravity: {doubt}" if doubt else "gravity, since the motion shows it"
+        return Weight(fit.pose.moments, max(map(abs, fit.pose.moments)), doubt), said
     if not _may_carry(position, found):
         return None, ""
     moments = fit.pose.moments if fit.pose is not None else (0.0, 0.0)

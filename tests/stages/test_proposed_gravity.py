@@ -81,7 +81,7 @@ def test_a_drive_that_wanders_does_not_tell_weight_from_a_spring() -> None:
     ("torque", "name", "has_weight", "said"),
     [
         ("weight", "angle [rad]", True, "gravity, since the motion shows it"),
-        ("weight and cable", "angle [rad]", True, "a cable, a spring or a ripple beside it"),
+        ("weight and cable", "angle [rad]", True, "neither weight nor a spring alone explains it"),
         ("nothing", "angle [rad]", True, "assumed, as of any joint"),
         ("nothing", "yaw [rad]", False, ""),
         ("spring", "angle [rad]", False, "no gravity: a torque follows the position as that of a"),
