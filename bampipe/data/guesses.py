@@ -141,6 +141,11 @@ def signed_register(values: np.ndarray) -> int:
     return 0
 
 
+def signed(values: np.ndarray, bits: int) -> np.ndarray:
+    """What an unsigned register of so many bits stands for; the values themselves where 0."""
+    return np.where(values >= 2.0 ** (bits - 1), values - 2.0**bits, values) if bits else values
+
+
 def stretches(t: np.ndarray, q: np.ndarray) -> list[float]:
     """Where to cut one record into parts, s: at rests near even spacing; none if it is short.
 

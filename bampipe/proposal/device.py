@@ -30,6 +30,7 @@ from bampipe.proposal.starter import starter_device
 from bampipe.proposal.starter_input import Drive
 
 DEVICE = "device.toml"
+_MAY_SLIDE = " (no unit says that it slides: if it does, bampipe init FOLDER --device slider)"
 _HEAD_BYTES = 4096
 """Of a file that cannot be read whole, in which its first element is looked for."""
 
@@ -231,8 +232,10 @@ def new_device(folder: Path, match: Matcher, notes: Notes) -> ChosenDevice:
     weight, on_gravity = weight_of(position, fit, linear, found)
     starter = starter_device(position.name, linear, drive, fit, weight, width)
     kind = "linear" if linear else "rotary"
+    doubt = "" if linear or position.conversion is not None else _MAY_SLIDE
     notes.check.append(
-        f"{DEVICE}: one {kind} axis '{starter.axis}' driven by a {role}; put in what you know of it"
+        f"{DEVICE}: one {kind} axis '{starter.axis}' driven by a {role}{doubt}; put in what you know"
+        " of it"
     )
     for constant in starter.placeholders:
         notes.check.append(

@@ -157,12 +157,12 @@ def _channel(
         return table + notes.guess(f"{column.name} is {name}{why}{_unscaled(si, column, bits)}")
     likely = guesses.likely_unit(si, column.values) or si
     if name == "duty" and not column.unit:
-        most = float(np.nanmax(np.abs(column.values)))
-        if most > 100.0 and not bits:
-            table = entry(column.name, "", ", scale = 0.0")
+        most = float(np.nanmax(np.abs(guesses.signed(column.values, bits))))
+        if most > 100.0:
+            table = entry(column.name, "", f"{register}, scale = 0.0")
             return table + notes.ask(f"the scale of {name}, 1 over full duty")
         if most > _FULL_DUTY:
-            likely = "%" if most <= 100.0 else ""
+            likely = "%"
     where = f" in {likely}" if si else ""
     return entry(column.name, likely, register) + notes.guess(
         f"{column.name} is {name}{where}{why}{_unscaled(si, column, bits)}"

@@ -125,6 +125,10 @@ class Matcher:
         """
         named = [c for role in DRIVERS for c in self.found.of(role) if not c.is_constant]
         best = self.driving(position) or next(iter(named), None)
+        if best is not None and not best.unit and guesses.signed_register(best.values):
+            # What a servo calls its load is the share of the supply that its bridge is on, or a
+            # current: no force comes as a register.
+            return best, "duty" if self.supply(best) is not None else "current"
         if best is None or best.role not in DRIVERS:
             return best, "force"
         duty = best.role == "voltage" and {"pwm", "duty"} & set(words(best.name))
@@ -152,9 +156,7 @@ class Matcher:
                 continue
             if abs(float(np.corrcoef(position.values, values)[0, 1])) > 0.98:
                 continue
-            bits = guesses.signed_register(values)
-            if bits:
-                values = np.where(values >= 2.0 ** (bits - 1), values - 2.0**bits, values)
+            values = guesses.signed(values, guesses.signed_register(values))
             share[column.name] = guesses.driven(self.t, travelled(position, self.t), values).share
         roles = {column.name: column.role for column in self.found.columns}
         fitting = [name for name in share if share[name] >= _DRIVEN]

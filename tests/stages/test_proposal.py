@@ -556,6 +556,13 @@ def test_a_current_position_is_no_current_and_an_acceleration_drives_nothing(tmp
     assert session["force"]["columns"] == ["?"]
 
 
+@pytest.mark.parametrize(("name", "said"), [("q", True), ("q_rad", False)])
+def test_an_axis_of_no_unit_may_slide(tmp_path, name: str, said: bool):
+    write_table(tmp_path / "a.csv", labelled(f"t,{name},w,tau"))
+    assert any("--device slider" in line for line in propose(tmp_path).check) == said
+    assert 'device = "slider"' in propose(tmp_path, "slider").session
+
+
 def test_a_torque_in_per_cent_asks_for_its_gain(tmp_path):
     write_table(tmp_path / "a.csv", labelled("t,angle_deg,w,torque_percent", q=57.29578, u=20.0))
     session, proposal = proposed(tmp_path)
@@ -575,3 +582,22 @@ def test_names_can_be_given_to_a_log_without_a_header(tmp_path, command: Command
     assert session["channels"]["motor_current"]["column"] == "current_A"
     found = samples(tmp_path, tmp_path / "out", "a")
     np.testing.assert_allclose(found["q_joint"][:100], table[:100, 1], atol=1e-6)
+
+
+@pytest.mark.parametrize(("beside", "role"), [("input_volts", "duty"), ("", "current")])
+def test_a_load_in_a_register_is_no_force(tmp_path, beside: str, role: str):
+    table = labelled("t,position,w,load")
+    del table["w"]
+    table["load"] = np.mod(np.rint(300.0 * table["load"]), 65536.0)
+    if beside:
+        table[beside] = 5.0 + 0.01 * (np.arange(len(table["t"])) % 3)
+    write_table(tmp_path / "a.csv", table)
+    session, proposal = proposed(tmp_path)
+    assert f"driven by a {role}" in proposal.device and "force" not in session
+    (drive,) = (c for c in session["channels"].values() if c["column"] == "load")
+    assert drive["wrap_bits"] == 16 and drive["signed"]
+    if beside:
+        assert proposal.fill_in == ["the scale of duty, 1 over full duty"]
+    else:
+        said = "a signed register of 16 bits: give its scale"
+        assert any(said in line for line in proposal.check)
