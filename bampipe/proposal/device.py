@@ -234,8 +234,8 @@ def new_device(folder: Path, match: Matcher, notes: Notes) -> ChosenDevice:
     kind = "linear" if linear else "rotary"
     doubt = "" if linear or position.conversion is not None else _MAY_SLIDE
     notes.check.append(
-        f"{DEVICE}: one {kind} axis '{starter.axis}' driven by a {role}{doubt}; put in what you know"
-        " of it"
+        f"{DEVICE}: one {kind} axis '{starter.axis}' driven by a {role}{doubt}; put in what you"
+        " know of it"
     )
     for constant in starter.placeholders:
         notes.check.append(
