@@ -67,7 +67,7 @@ LAWS = {
         "numpy scipy pandas pyarrow numba",
         "errors files results physics estimate data declarations trials identification",
     ),
-    "proposal": law("numpy scipy pandas pyarrow numba", "errors files physics estimate data"),
+    "proposal": law("numpy scipy pandas pyarrow numba", "errors files lists physics estimate data"),
     "stages": law(
         "numpy scipy pandas pyarrow numba pydantic",
         "errors files schema results progress physics estimate data declarations trials "

@@ -16,6 +16,10 @@ def init(
         str,
         typer.Option(help="A built-in device, or a device file in the folder; guessed if omitted."),
     ] = "",
+    names: Annotated[
+        str,
+        typer.Option(help="Names of the columns of texts without a header, as t,q,tau_nm."),
+    ] = "",
     dry: Annotated[
         bool, typer.Option("--dry", help="Print the session file instead of writing it.")
     ] = False,
@@ -27,10 +31,12 @@ def init(
     Example: bampipe init logs/2026-10-03
 
     Example: bampipe init logs/2026-10-03 --device slider --dry
+
+    Example: bampipe init logs/2026-10-03 --names time_s,angle_deg,current_mA
     """
     from bampipe.proposal import propose, write_proposal
 
-    proposal = propose(folder, device)
+    proposal = propose(folder, device, [name for name in names.split(",") if name.strip()])
     written = [] if dry else write_proposal(folder, proposal)
     if json:
         show.as_json(

@@ -26,6 +26,8 @@ class Branches(InputError):
 
     Attributes:
         stem: last link before they do; empty where they do at the base.
+        chains: by the link that each ends at, its joints as the file names them, with the link
+            behind each.
     """
 
     def __init__(
@@ -36,9 +38,11 @@ class Branches(InputError):
         remedy: str = "",
         others: Sequence[InputError] = (),
         stem: str = "",
+        chains: Mapping[str, Sequence[tuple[str, str]]] | None = None,
     ) -> None:
         super().__init__(what, where=where, remedy=remedy, others=others)
         self.stem = stem
+        self.chains = chains or {}
 
 
 @dataclass(frozen=True)
@@ -213,11 +217,13 @@ def _only_end(tree: Tree, base: str, where: str) -> str:
         levels = zip(*(chains[link] for link in others), strict=False)
         common = [level[0] for level in takewhile(lambda level: len(set(level)) == 1, levels)]
         stem = next((j.child for j in tree.joints if common and j.name == common[-1]), "")
+        behind = {joint.name: joint.child for joint in tree.joints}
         raise Branches(
             f"the joints branch; chains end at {join_names(others, _MANY)}",
             where=where,
-            remedy='choose one: base = "..." and tip = "..." in [robot]'
+            remedy='choose one: base = "..." and tip = "..." in [robot] of a device file'
             + (f'; tip = "{stem}" ends before they branch' if stem else ""),
             stem=stem,
+            chains={end: [(name, behind[name]) for name in chains[end]] for end in others},
         )
     return longest

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import oaconvolve
 
+from bampipe.data.angle_torque import AngleTorque, angle_torque, least_squares
 from bampipe.data.session import SECONDS
 
 RATES_HZ = (4.0, 30_000.0)
@@ -79,15 +80,14 @@ class Driven:
         share: part of its variance that acceleration, velocity, its sign and position explain,
             0 to 1; a force, a current or a voltage that moves a mass with friction has much.
         inertia, viscous, coulomb: what multiplies acceleration, velocity and its sign.
-        gravity: what multiplies the sine and the cosine of the position, where these explain
-            clearly more than the position itself; zeros where they do not.
+        pose: what follows the position where that is an angle; None where it is none.
     """
 
     share: float
     inertia: float = 0.0
     viscous: float = 0.0
     coulomb: float = 0.0
-    gravity: tuple[float, float] = (0.0, 0.0)
+    pose: AngleTorque | None = None
 
 
 def driven(t: np.ndarray, q: np.ndarray, column: np.ndarray, angle: bool = False) -> Driven:
@@ -111,30 +111,21 @@ def driven(t: np.ndarray, q: np.ndarray, column: np.ndarray, angle: bool = False
     qdd = np.gradient(qd, step)
     inner = slice(2 * width, -2 * width or None)
     # Both sides alike: what one filter takes off the motion, it takes off the column too.
-    sides = [smoothed(qdd), smoothed(qd), smoothed(np.sign(qd)), smoothed(smooth), np.ones_like(q)]
-    design = np.column_stack(sides)[inner]
+    sides = [smoothed(qdd), smoothed(qd), smoothed(np.sign(qd)), np.ones_like(q)]
+    moving = np.column_stack(sides)[inner]
+    position = smoothed(smooth)[inner]
     target = smoothed(smoothed(column))[inner]
     spread = float(np.sum((target - target.mean()) ** 2)) if len(target) else 0.0
     if spread == 0.0:
         return Driven(0.0)
-    found, rest = _fit(design, target)
-    share, gravity = max(0.0, 1.0 - rest / spread), (0.0, 0.0)
-    if angle:
-        # Acceleration, velocity, its sign, sine and cosine of the angle; and without the angle.
-        swinging = np.column_stack([*sides[:3], np.sin(sides[3]), np.cos(sides[3])])[inner]
-        balanced = design[:, [0, 1, 2, 4]]
-        swinging_fit, swinging_rest = _fit(swinging, target)
+    found, rest = least_squares(np.column_stack([moving, position]), target)
+    share = max(0.0, 1.0 - float(rest @ rest) / spread)
+    pose = angle_torque(moving, position, target) if angle else None
+    if pose is not None and pose.is_gravity:
         # Friction apart, this is what a link that hangs on the axis shows most.
-        if swinging_rest < 0.8 * _fit(balanced, target)[1] and swinging_rest < 1.05 * rest:
-            found, gravity = swinging_fit, (float(swinging_fit[3]), float(swinging_fit[4]))
+        found = pose.beside
     inertia, viscous, coulomb = (float(value) for value in found[:3])
-    return Driven(share, inertia, viscous, coulomb, gravity)
-
-
-def _fit(design: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, float]:
-    """Least squares, and the sum of squares that they leave."""
-    found = np.linalg.lstsq(design, target, rcond=None)[0]
-    return found, float(np.sum((target - design @ found) ** 2))
+    return Driven(share, inertia, viscous, coulomb, pose)
 
 
 def signed_register(values: np.ndarray) -> int:
@@ -148,6 +139,11 @@ def signed_register(values: np.ndarray) -> int:
             middle = np.mean((known > 0.25 * top) & (known < 0.75 * top))
             return bits if middle < 0.01 else 0
     return 0
+
+
+def signed(values: np.ndarray, bits: int) -> np.ndarray:
+    """What an unsigned register of so many bits stands for; the values themselves where 0."""
+    return np.where(values >= 2.0 ** (bits - 1), values - 2.0**bits, values) if bits else values
 
 
 def stretches(t: np.ndarray, q: np.ndarray) -> list[float]:

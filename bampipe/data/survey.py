@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import re
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from bampipe.data.readers import EXTENSIONS, columns_of, read_trial
+from bampipe.data.readers.trial import Dialect
 from bampipe.data.units import RecordedUnit, unit
 from bampipe.errors import InputError
 
@@ -18,11 +20,12 @@ _WORDS = {
     "time": "t time timestamp stamp zeit clock seconds sec secs nanosec nsec nsecs nanoseconds"
     " millis micros milliseconds microseconds",
     "reference": "goal ref reference setpoint target desired des cmd command soll sollwert demand"
-    " wanted",
+    " wanted con ctrl",
     "brake": "brake bremse",
+    "acceleration": "acc accel acceleration qdd ddq beschleunigung",
     "velocity": "vel velocity speed qd dq qdot omega geschwindigkeit drehzahl rpm rate",
     "force": "force f fx fy fz torque tau trq kraft moment loadcell wrench effort",
-    "current": "current curr i iq amp amps ampere strom spulenstrom coil",
+    "current": "current curr cur i iq amp amps ampere strom spulenstrom coil",
     "voltage": "volt volts voltage pwm duty supply vin vbat vbus battery bus spannung",
     "position": "pos position angle theta phi psi q enc encoder disp displacement x stroke winkel"
     " weg lage hub joint deflection yaw pitch extension carriage counts",
@@ -35,6 +38,13 @@ _BY_UNIT = {
     "s": "time", "datetime": "time", "rad": "position", "m": "position", "rad/s": "velocity",
     "m/s": "velocity", "N": "force", "N.m": "force", "A": "current", "V": "voltage",
 }  # fmt: skip
+_BY_SUFFIX = {
+    "rad": "position", "deg": "position", "mm": "position", "rpm": "velocity", "Nm": "force",
+    "kN": "force", "mA": "current", "mV": "voltage",
+}  # fmt: skip
+"""By a unit at the end of a name that says nothing else."""
+_PLAIN_POSITIONS = frozenset(["pos", "position", "angle", "theta"])
+_PRESENT = frozenset(["current", "curr", "cur"])
 _UNIT_WORDS = {
     "time": ("us", "ms", "ns", "s"),
     "position": ("rad", "deg", "mm", "cm", "m"),
@@ -52,7 +62,8 @@ class SurveyedColumn:
     Attributes:
         name: as the reader calls it.
         stated: unit that the file gives, "" where it gives none.
-        role: time, position, velocity, force, current, voltage, brake, reference, or "".
+        role: time, position, velocity, acceleration, force, current, voltage, brake, reference,
+            or "".
         unit: unit by the file, else by the name, "" where neither says.
         values: (T,) of the first log.
     """
@@ -102,8 +113,12 @@ class Survey:
         return [column for column in self.columns if column.role in roles]
 
 
-def survey(folder: Path) -> Survey:
+def survey(folder: Path, names: Sequence[str] = ()) -> Survey:
     """Look through the logs in ``folder`` and the folders in it.
+
+    Args:
+        folder: of the logs.
+        names: of the columns, where they are texts without a header.
 
     Raises:
         InputError: no such folder, no log in it, too many, or none that can be read.
@@ -126,30 +141,56 @@ def survey(folder: Path) -> Survey:
     if len(paths) > MOST_FILES:
         raise InputError(f"{len(paths)} logs are more than {MOST_FILES}", where=str(folder))
     found: dict[str, dict[str, str]] = {}
+    dialect = Dialect(names=tuple(names))
     passed = []
     for path in paths:
         name = path.relative_to(folder).as_posix()
         try:
-            found[name] = columns_of(path, name=name)
+            found[name] = columns_of(path, name=name, dialect=dialect)
         except InputError as error:
             passed.append((name, str(error)))
     if not found:
         raise InputError("no log that can be read", where=str(folder), remedy=passed[0][1])
     common = Counter(tuple(sorted(columns)) for columns in found.values()).most_common(1)[0][0]
+    _refuse_parted(folder, found, common)
     files = [name for name, columns in found.items() if set(common) <= set(columns)]
     passed += [(name, "has other columns") for name in found if name not in files]
-    columns, remarks = _columns(folder / files[0], files[0], found[files[0]], common)
+    columns, remarks = _columns(folder / files[0], files[0], found[files[0]], common, dialect)
     return Survey(tuple(files), columns, remarks, tuple(passed))
 
 
+def _refuse_parted(
+    folder: Path, found: Mapping[str, Mapping[str, str]], common: tuple[str, ...]
+) -> None:
+    """Refuse logs that have their positions in one file and what drives them in another.
+
+    Raises:
+        InputError: they are so.
+    """
+    roles = {
+        name: {_role(*column) for column in columns.items()} for name, columns in found.items()
+    }
+    first = next(name for name, columns in found.items() if set(common) <= set(columns))
+    for here, there in (({"position"}, set(DRIVERS)), (set(DRIVERS), {"position"})):
+        if here & roles[first] and not (there | {"reference"}) & roles[first]:
+            other = next((name for name, other in roles.items() if there & other), "")
+            if other:
+                raise InputError(
+                    f"positions and drives are in different files, such as {first} and {other}",
+                    where=str(folder),
+                    remedy="put the columns of one recording side by side in one file, the time"
+                    " once, and leave the parts out of this folder",
+                )
+
+
 def _columns(
-    path: Path, name: str, stated: dict[str, str], common: tuple[str, ...]
+    path: Path, name: str, stated: dict[str, str], common: tuple[str, ...], dialect: Dialect
 ) -> tuple[tuple[SurveyedColumn, ...], tuple[str, ...]]:
     wanted = [column for column in stated if column in common]
     datetimes = {column: "" for column in wanted if stated[column] == "datetime"}
     # A reader of several topics takes the first column for the time.
     wanted.sort(key=lambda column: _role(column, stated[column]) != "time")
-    raw = read_trial(path, wanted, name=name, datetimes=datetimes)
+    raw = read_trial(path, wanted, name=name, datetimes=datetimes, dialect=dialect)
     found = []
     for column in wanted:
         said = raw.units.get(column, stated[column])
@@ -202,14 +243,21 @@ def _role(name: str, stated: str) -> str:
     known = unit(stated)
     if known is not None and known.si in _BY_UNIT:
         return _BY_UNIT[known.si]
-    return next((role for role, text in _WORDS.items() if said & set(text.split())), "")
+    if said & _PLAIN_POSITIONS and said & _PRESENT:
+        said -= _PRESENT  # the position that is current, and no current
+    named = next((role for role, text in _WORDS.items() if said & set(text.split())), "")
+    return named or _BY_SUFFIX.get(re.split(r"[_\W]+", name)[-1], "")
 
 
 def _unit(name: str, stated: str, role: str) -> str:
-    """Unit by the file, or by a last word of the name such as ``_us``."""
+    """Unit by the file, or by a last word of the name such as ``_us``, before an index if any."""
     if stated:
         return stated
-    parts = re.split(r"[_\W]+", name)
+    bare = re.sub(r"(\[\d+\]|_\d+)$", "", name)
+    rate = re.search(r"_(rad|deg|rev|mm|cm|m)_(per_)?s$", bare)
+    if role == "velocity" and rate is not None:
+        return f"{rate[1]}/s"
+    parts = re.split(r"[_\W]+", bare)
     suffix = parts[-1] if len(parts) > 1 else ""
     matches = [u for u in _UNIT_WORDS.get(role, ()) if u.lower() == suffix.lower()]
     return matches[0] if matches else ""

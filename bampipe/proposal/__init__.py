@@ -7,12 +7,13 @@ a radian, is left at a value that the session reader refuses with a line saying 
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from bampipe.data.survey import survey
+from bampipe.data.survey import DRIVERS, survey
 from bampipe.errors import InputError
 from bampipe.files import write_text
 from bampipe.proposal.clock import clock_of
@@ -52,12 +53,13 @@ class ProposedSession:
     passed: list[str]
 
 
-def propose(folder: Path, device: str = "") -> ProposedSession:
+def propose(folder: Path, device: str = "", names: Sequence[str] = ()) -> ProposedSession:
     """Propose a session file for the logs in ``folder``; writes nothing.
 
     Args:
         folder: with logs, in it or in folders below.
         device: a built-in device or a device file in the folder; guessed where empty.
+        names: of the columns, where the logs are texts without a header.
 
     Raises:
         InputError: no logs, a session file is there already, or no such device.
@@ -68,7 +70,7 @@ def propose(folder: Path, device: str = "") -> ProposedSession:
             where=str(folder),
             remedy=f"it is left alone; to run it: bampipe run {folder}",
         )
-    found = survey(folder)
+    found = survey(folder, names)
     notes = Notes()
     chosen = find_device(folder, found, device)
     clock = clock_of(found, notes)
@@ -86,11 +88,18 @@ def propose(folder: Path, device: str = "") -> ProposedSession:
         chosen = _with_guessed_motors(folder, chosen, columns)
         match.joints, match.of_robot = columns.columns, several
         match.turned, match.gears = columns.turned, columns.gears
+        match.counting = columns.counting
         _check_robot(chosen, columns, notes)
+    if len(found.files) > 1 and not found.of(*DRIVERS, "reference", ""):
+        notes.check.append(
+            f"no column is a drive: if {found.files[0]} and {found.files[1]} are one recording, put"
+            " them side by side in one file, each column with a name of its own"
+        )
     encoders, axes = encoders_table(chosen.device, match, notes)
     inputs = input_tables(chosen, axes, match, notes)
     lines = [
         *_head(folder, chosen.name, clock.rate),
+        *_names(names),
         *clock.lines,
         *encoders,
         *inputs,
@@ -102,7 +111,7 @@ def propose(folder: Path, device: str = "") -> ProposedSession:
         device=chosen.text,
         fill_in=notes.fill_in,
         check=notes.check,
-        passed=[f"{name}: {reason}" for name, reason in found.passed],
+        passed=[f"{name}: {reason.removeprefix(f'{name}: ')}" for name, reason in found.passed],
     )
 
 
@@ -116,6 +125,11 @@ def _head(folder: Path, device: str, rate: str) -> list[str]:
         rate,
         "",
     ]
+
+
+def _names(names: Sequence[str]) -> list[str]:
+    listed = ", ".join(quoted(name) for name in names)
+    return ["[csv]", f"names = [{listed}]", ""] if names else []
 
 
 def _with_guessed_motors(folder: Path, chosen: ChosenDevice, columns: RobotColumns) -> ChosenDevice:
@@ -148,7 +162,7 @@ def _check_robot(chosen: ChosenDevice, columns: RobotColumns, notes: Notes) -> N
     robot = chosen.device.robot
     assert robot is not None
     if "tip =" in chosen.text:
-        notes.check.append(f"{chosen.name}: the robot ends at {robot.tip}; joints branch behind it")
+        notes.check.append(f"{chosen.name}: the robot ends at {robot.tip}; is that its last link?")
     if not columns.drives:
         joints = ", ".join(j.name for j in robot.joints)
         notes.check.append(

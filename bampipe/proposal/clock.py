@@ -12,6 +12,8 @@ from bampipe.data.survey import Survey, SurveyedColumn, words
 from bampipe.data.units import spelled
 from bampipe.proposal.notes import UNKNOWN, Notes, quoted
 
+_RECORDED = ":@time"
+"""End of the name under which the reader of ROS bags has the time of recording."""
 _LIKELY_RATE_HZ = 100.0
 """Assumed for the other guesses where nothing shows the rate."""
 
@@ -40,7 +42,9 @@ def clock_of(found: Survey, notes: Notes) -> ProposedClock:
     rest = [c for c in times if _nanoseconds_on_top(c)]
     if seconds and rest:
         return _in_two_columns(seconds[-1], rest[-1], notes)
-    column = next((c for c in times if _increases(c.values)), None)
+    # When a message was recorded is the second best to when it was stamped.
+    stamped = sorted(times, key=lambda column: column.name.endswith(_RECORDED))
+    column = next((c for c in stamped if _increases(c.values)), None)
     return _counted(found, notes) if column is None else _in_one_column(column, notes)
 
 

@@ -21,6 +21,8 @@ from bampipe.files import read_toml
 from bampipe.physics import registry
 from bampipe.physics.device import KINDS, Device
 from bampipe.proposal.encoders import measured_position
+from bampipe.proposal.gravity import weight_of
+from bampipe.proposal.joints import chain_logged
 from bampipe.proposal.matching import Matcher
 from bampipe.proposal.notes import Notes
 from bampipe.proposal.positions import in_counts, position_in_si, scale_to, slides
@@ -28,6 +30,7 @@ from bampipe.proposal.starter import starter_device
 from bampipe.proposal.starter_input import Drive
 
 DEVICE = "device.toml"
+_MAY_SLIDE = " (no unit says that it slides: if it does, bampipe init FOLDER --device slider)"
 _HEAD_BYTES = 4096
 """Of a file that cannot be read whole, in which its first element is looked for."""
 
@@ -94,7 +97,8 @@ def _starts_as_mjcf(path: Path) -> bool:
 def _robot(folder: Path, found: Survey) -> ChosenDevice | None:
     """The robot of the URDF or MJCF in the folder, its drives logged as torque or as current.
 
-    Where joints branch, as fingers do, it ends before them.
+    Where joints branch, as fingers do, it ends with the last one that has a column, else before
+    them.
 
     Raises:
         InputError: the file cannot be used, is a xacro file, or there are several.
@@ -120,9 +124,16 @@ def _robot(folder: Path, found: Survey) -> ChosenDevice | None:
     try:
         device = _complete(folder, text)
     except Branches as error:
-        if not error.stem:
-            raise
-        text += f'tip = "{error.stem}"  # guess: the joints branch behind it\n'
+        logged = chain_logged(error.chains, found)
+        if not (logged or error.stem):
+            raise InputError(
+                error.what,
+                where=error.where,
+                remedy=f'write {DEVICE} beside the logs: name = "robot", and in [robot] urdf ='
+                f' "{urdfs[0].name}" and tip = "...", the last link of the logged joints',
+            ) from error
+        why = "the last joint with a column" if logged else "the joints branch behind it"
+        text += f'tip = "{logged or error.stem}"  # guess: {why}\n'
         device = _complete(folder, text)
     chosen = ChosenDevice(DEVICE, device, text)
     by_torque = any(not c.is_constant for c in found.of("force"))
@@ -218,17 +229,20 @@ def new_device(folder: Path, match: Matcher, notes: Notes) -> ChosenDevice:
     fit = _rough_fit(position, driver, role, linear, match.t)
     drive = Drive(role, driver.name if driver is not None else "", supply is not None, coil)
     width = 0.0 if in_counts(position) else _sign_width(position, match.t, linear)
-    starter = starter_device(position.name, linear, drive, fit, width)
+    weight, on_gravity = weight_of(position, fit, linear, found)
+    starter = starter_device(position.name, linear, drive, fit, weight, width)
     kind = "linear" if linear else "rotary"
+    doubt = "" if linear or position.conversion is not None else _MAY_SLIDE
     notes.check.append(
-        f"{DEVICE}: one {kind} axis '{starter.axis}' driven by a {role}; put in what you know of it"
+        f"{DEVICE}: one {kind} axis '{starter.axis}' driven by a {role}{doubt}; put in what you"
+        " know of it"
     )
     for constant in starter.placeholders:
         notes.check.append(
             f"{DEVICE}: {constant} is not yours yet: all forces and inertias scale with it"
         )
-    if any(fit.gravity):
-        notes.check.append(f"{DEVICE}: gravity on '{starter.axis}', since the motion shows it")
+    if on_gravity:
+        notes.check.append(f"{DEVICE}: on '{starter.axis}', {on_gravity}")
     columns = {"supply": supply, starter.input: driver}
     return ChosenDevice(
         DEVICE,

@@ -6,13 +6,15 @@ import numpy as np
 
 from bampipe.data import guesses
 from bampipe.data.survey import SurveyedColumn, words
-from bampipe.data.units import spelled
+from bampipe.data.units import spelled, unit
+from bampipe.lists import join_names
 from bampipe.physics.device import Coordinate, Device
 from bampipe.proposal.matching import Matcher
 from bampipe.proposal.notes import UNKNOWN, Notes, bare, entry, quoted
 from bampipe.proposal.positions import in_counts, is_velocity
 
 _POSITION_UNITS = ("rad", "deg", "mrad", "rev", "m", "mm", "cm", "um", "in")
+_MANY = 6
 _SPEED_UNITS = ("rad/s", "deg/s", "rev/s", "rev/min", "m/s", "cm/s", "mm/s", "in/s")
 
 
@@ -46,7 +48,8 @@ def measured_position(axis: str, axes: int, match: Matcher, notes: Notes) -> Sur
     """
     column, candidates = match.position(axis, axes)
     if column is not None and candidates:
-        notes.guess(f"of {', '.join(candidates)}, {column.name} is the measured position")
+        listed = join_names(candidates, _MANY)
+        notes.guess(f"of {listed}, {column.name} is the measured position")
     return column
 
 
@@ -62,21 +65,49 @@ def _encoder(
         said = spelled(column.unit, _POSITION_UNITS) or guesses.likely_unit(
             axis.unit, column.values
         )
-        gear = f", gear_ratio = {turns:.4g}"
-        return entry(column.name, said or axis.unit, gear) + notes.guess(
+        fields, how = _counting(axis, said or axis.unit, match, turns)
+        return entry(column.name, said or axis.unit, fields) + notes.guess(
             f"{column.name} is the position of the motor of {axis.name}, in {said or axis.unit}"
+            + (f"; it {how}" if how else "")
         )
     velocity = _velocity_beside(axis, alone, match, notes)
     known = column.conversion
     if known is not None and known.si == axis.unit:
         said = spelled(column.unit, _POSITION_UNITS) or axis.unit
-        note = "" if column.stated else notes.guess(f"{column.name} in {column.unit}")
-        return entry(column.name, said, velocity) + note
+        counted, how = _counting(axis, said, match)
+        table = entry(column.name, said, counted + velocity)
+        if how:
+            return table + notes.guess(f"{column.name} {how}")
+        return table + ("" if column.stated else notes.guess(f"{column.name} in {column.unit}"))
     by_size = guesses.likely_unit(axis.unit, column.values)
     likely, why = (by_size, ", by its size") if by_size else (axis.unit, "")
-    return entry(column.name, likely, velocity) + notes.guess(
+    counted, how = _counting(axis, likely, match)
+    return entry(column.name, likely, counted + velocity) + notes.guess(
         f"{column.name} is the position of {axis.name}, in {likely}{why}"
+        + (f"; it {how}" if how else "")
     )
+
+
+def _counting(axis: Coordinate, said: str, match: Matcher, turns: float = 1.0) -> tuple[str, str]:
+    """Fields of an encoder that counts otherwise than a robot's drawing, and that in words.
+
+    Args:
+        axis: whose encoder it is; said: its unit; match: the columns.
+        turns: of what the encoder sits on, for one of the axis.
+    """
+    direction, zero = match.counting.get(axis.name, (1.0, 0.0))
+    fields, ways = "", []
+    if direction * turns != 1.0:
+        fields = f", gear_ratio = {direction * turns:.4g}"
+    if direction < 0.0:
+        ways.append("counts the other way than the drawing")
+    if zero:
+        known = unit(said)
+        reading = -direction * zero * turns / (known.scale if known is not None else 1.0)
+        fields += f", zero_counts = {reading:.5g}"
+        ways.append(f"reads {reading:.4g} {said} where the drawing has 0")
+    why = ", by weight and inertia as drawn: look it up in the controller's manual"
+    return fields, " and ".join(ways) + why if ways else ""
 
 
 def _integrated(axis: Coordinate, column: SurveyedColumn, notes: Notes) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from bampipe.data import guesses
-from bampipe.data.survey import SurveyedColumn
+from bampipe.data.survey import SurveyedColumn, words
 from bampipe.data.units import spelled, unit
 from bampipe.physics.device import Device
 from bampipe.proposal.device import ChosenDevice
@@ -15,6 +15,8 @@ from bampipe.proposal.matching import Match, Matcher
 from bampipe.proposal.notes import UNKNOWN, Notes, bare, entry, quoted
 
 _FORCE_UNITS = ("N", "N.m", "mN", "kN", "mN.m", "N.cm", "N.mm", "kN.m", "kgf", "lbf", "V")
+_SHARES = frozenset(["percent", "pct", "raw", "counts", "adc", "permille"])
+_FEWEST_COUNTS = 100
 _FULL_DUTY = 1.05
 """A duty cycle as a share goes to 1, and a little over by rounding."""
 
@@ -86,8 +88,23 @@ def _force_unit(device: Device, columns: list[SurveyedColumn], why: str, notes: 
             f"zero_v = {row}" + notes.ask("zero_v, the volts without force"),
         ]
     names = ", ".join(quoted(column.name) for column in columns)
+    if any(_needs_gain(column) for column in columns):
+        row = f"[{', '.join(['0.0'] * len(columns))}]"
+        rows = f"[{', '.join([row] * len(columns))}]"
+        return [
+            'unit = "V"' + notes.guess(f"{names} is no force yet: as a voltage it gets a gain"),
+            f"calibration_n_per_v = {rows}"
+            + notes.ask(f"calibration_n_per_v, {device.force_unit} for one of {names}"),
+            f"zero_v = {row}" + notes.guess(f"{names} is 0 without force"),
+        ]
     note = notes.guess(f"{names} is a force in {device.force_unit}{why}; volts need a gain")
     return [f'unit = "{device.force_unit}"{note}']
+
+
+def _needs_gain(column: SurveyedColumn) -> bool:
+    """Whether the column of a force is a share or a count, by its name or by whole numbers."""
+    counts = column.is_integer and float(np.ptp(column.values)) > _FEWEST_COUNTS
+    return not column.unit and (counts or not _SHARES.isdisjoint(words(column.name)))
 
 
 def _brakes_table(device: Device, match: Matcher, notes: Notes) -> list[str]:
@@ -140,12 +157,12 @@ def _channel(
         return table + notes.guess(f"{column.name} is {name}{why}{_unscaled(si, column, bits)}")
     likely = guesses.likely_unit(si, column.values) or si
     if name == "duty" and not column.unit:
-        most = float(np.nanmax(np.abs(column.values)))
-        if most > 100.0 and not bits:
-            table = entry(column.name, "", ", scale = 0.0")
+        most = float(np.nanmax(np.abs(guesses.signed(column.values, bits))))
+        if most > 100.0:
+            table = entry(column.name, "", f"{register}, scale = 0.0")
             return table + notes.ask(f"the scale of {name}, 1 over full duty")
         if most > _FULL_DUTY:
-            likely = "%" if most <= 100.0 else ""
+            likely = "%"
     where = f" in {likely}" if si else ""
     return entry(column.name, likely, register) + notes.guess(
         f"{column.name} is {name}{where}{why}{_unscaled(si, column, bits)}"

@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from bampipe.data.survey import Survey, SurveyedColumn
+from bampipe.data.units import unit
 from bampipe.physics.device import Device
 
 Tokens = tuple[str, ...]
@@ -65,6 +66,23 @@ def pair_joints(device: Device, found: Survey) -> Pairing:
         most = max(incomplete, key=len, default={})
         some = {name: most[m] for name, m in zip(device.forces, motors, strict=True) if m in most}
     return Pairing(tuple(positions), tuple(drives), some)
+
+
+def chain_logged(chains: Mapping[str, Sequence[tuple[str, str]]], found: Survey) -> str:
+    """The link at which the chain ends whose joints the columns name most; "" where they name none.
+
+    Args:
+        chains: joints with the links behind them, as of `Branches`.
+        found: the log.
+    """
+    said = [_tokens(column.name) for column in found.of("position")]
+
+    def is_logged(joint: str) -> bool:
+        return any(_without(tokens, _tokens(joint)) is not None for tokens in said)
+
+    logged = [[(j, link) for j, link in chain if is_logged(j)] for chain in chains.values()]
+    longest = max(logged, key=len, default=[])
+    return longest[-1][1] if longest else ""
 
 
 def _incomplete(
@@ -151,7 +169,11 @@ def _numbered_alike(
 
 def _tokens(name: str) -> Tokens:
     """Words and numbers of a name, in lower case; a unit in brackets is left out."""
-    bare = re.sub(r"[\[(][^\])]*[A-Za-z%°][^\])]*[\])]", " ", name)
+    bare = re.sub(
+        r"[\[(]([^\])]*[A-Za-z%°][^\])]*)[\])]",
+        lambda said: " " if unit(said[1]) is not None or "°" in said[1] else f" {said[1]} ",
+        name,
+    )
     parts = re.findall(r"[A-Z]?[a-z]+|[A-Z]+|\d+", bare)
     return tuple(str(int(p)) if p.isdigit() else p.lower() for p in parts)
 

@@ -15,6 +15,7 @@ from bampipe.proposal.positions import travelled
 _DRIVEN = 0.5
 """Share of a column that the motion must explain for it to pass as what drives it."""
 
+_NEVER_DRIVES = ("time", "velocity", "acceleration", "reference", "position")
 _INPUT_ROLE = {"N": "force", "N.m": "force", "A": "current", "V": "voltage", "": "voltage"}
 Match = tuple[SurveyedColumn | None, str]
 
@@ -32,6 +33,7 @@ class Matcher:
         turned: inputs that are logged with the other sign.
         of_robot: whether the device is a robot of several joints.
         gears: joints whose position is that of a motor, which turns so often for one of theirs.
+        counting: of a robot's joints, direction and zero against the drawing, see `RobotColumns`.
     """
 
     found: Survey
@@ -40,6 +42,7 @@ class Matcher:
     joints: Mapping[str, SurveyedColumn] = field(default_factory=dict)
     turned: frozenset[str] = frozenset()
     gears: Mapping[str, float] = field(default_factory=dict)
+    counting: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     of_robot: bool = False
 
     def named(self, name: str, *roles: str) -> SurveyedColumn | None:
@@ -122,6 +125,10 @@ class Matcher:
         """
         named = [c for role in DRIVERS for c in self.found.of(role) if not c.is_constant]
         best = self.driving(position) or next(iter(named), None)
+        if best is not None and not best.unit and guesses.signed_register(best.values):
+            # What a servo calls its load is the share of the supply that its bridge is on, or a
+            # current: no force comes as a register.
+            return best, "duty" if self.supply(best) is not None else "current"
         if best is None or best.role not in DRIVERS:
             return best, "force"
         duty = best.role == "voltage" and {"pwm", "duty"} & set(words(best.name))
@@ -140,8 +147,8 @@ class Matcher:
         """The column that acceleration, velocity and friction of the motion explain best."""
         share = {}
         for column in self.found.columns:
-            free = column.name not in self.used and column.role not in ("time", "velocity")
-            if not free or column.role == "reference" or column.is_constant or column is position:
+            free = column.name not in self.used and column.role not in _NEVER_DRIVES
+            if not free or column.is_constant or column is position:
                 continue
             values = np.nan_to_num(column.values)
             known = column.conversion
@@ -149,13 +156,18 @@ class Matcher:
                 continue
             if abs(float(np.corrcoef(position.values, values)[0, 1])) > 0.98:
                 continue
-            bits = guesses.signed_register(values)
-            if bits:
-                values = np.where(values >= 2.0 ** (bits - 1), values - 2.0**bits, values)
+            values = guesses.signed(values, guesses.signed_register(values))
             share[column.name] = guesses.driven(self.t, travelled(position, self.t), values).share
-        best = max(share, key=lambda name: share[name], default="")
-        if not best or share[best] < _DRIVEN:
+        roles = {column.name: column.role for column in self.found.columns}
+        fitting = [name for name in share if share[name] >= _DRIVEN]
+        # A velocity of an unknown name fits itself. Of several joints without a drawing, a drive
+        # has the number of its position.
+        fitting = [name for name in fitting if roles[name] in DRIVERS] or fitting
+        number = _numbers(position.name)
+        fitting = [name for name in fitting if number and _numbers(name) == number] or fitting
+        if not fitting:
             return None
+        best = max(fitting, key=lambda name: share[name])
         return next(c for c in self.found.columns if c.name == best)
 
 

@@ -2,65 +2,43 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
-from scipy.signal import savgol_filter
 
 from bampipe.data.survey import Survey, SurveyedColumn
 from bampipe.physics.device import Device
-from bampipe.physics.newton_euler import Algebra, joint_forces
-from bampipe.physics.robot import Robot, gravity_vector
+from bampipe.physics.robot import Robot
+from bampipe.proposal.directions import Counting, find_counting
+from bampipe.proposal.drawing import (
+    FEW_ROWS,
+    MOST_ROWS,
+    Drive,
+    fits,
+    hold,
+    judge_along,
+    left_by,
+    mean_left,
+    motion_along,
+    positions_of,
+    range_of,
+)
+from bampipe.proposal.gears import BEYOND, Gears, find_gears
 from bampipe.proposal.joints import Group, pair_joints
 from bampipe.proposal.notes import Notes
-from bampipe.proposal.positions import position_in_si, scale_to
+from bampipe.proposal.positions import scale_to
 
 Array = NDArray[np.float64]
 
-_SMOOTHED_S = 0.1
-"""Stretch of a record over which a parabola gives velocity and acceleration."""
-_MOST_ROWS = 4000
-_SURE = 5.0
-"""Standard errors from which on the sign of a drive is known."""
 LEAST_AT_JOINT = 1.0 / 3.0
 """Share of what the drawing requires below which a torque is that of a motor."""
-_BEYOND = 1.5
-"""Times its range that a joint must travel for the position to be another's."""
 _BETTER = 0.5
 """Of what one order of the joints leaves unexplained: another one must leave less."""
-_FEW_ROWS = 1000
-_MARGINS = (1.05, 1.4, 2.0)
-"""Of its range over what a motor travels: how much of its range a joint is thought to use."""
-_DRAWN = 0.05
-"""Weight of the size of the drawn bodies beside the shape of the drives."""
-_MOST_LEFT = 0.05
-"""Of the drives' variance: what a drawing with the right reductions leaves at most."""
 _DOUBTED = 0.01
 """The same: what positions leave whose unit is guessed, before those of motors are tried."""
 _OTHER_UNITS = {"rad": ("deg", np.pi / 180.0), "m": ("mm", 1e-3)}
-
-
-@dataclass(frozen=True)
-class Drive:
-    """How the drive of a joint goes with what its motion requires by the drawing.
-
-    Attributes:
-        share: of the drive, for one of what is required; 1 where both are of the joint.
-        error: its standard error by the scatter alone; the drawing has another.
-        left: part of the drive's variance that drawing, drive's inertia and friction leave.
-    """
-
-    share: float
-    error: float
-    left: float
-
-    @property
-    def is_sure(self) -> bool:
-        """Whether the sign is known."""
-        return abs(self.share) > _SURE * self.error
 
 
 @dataclass(frozen=True)
@@ -71,11 +49,14 @@ class RobotColumns:
         columns: by name of joint or input.
         drives: by name of input, where drawing and log can be compared.
         gears: by joint whose position is that of a motor, its turns for one of the joint.
+        counting: by joint, its direction against the drawing, 1 or -1, and the angle that is added
+            to its reading times that, rad.
     """
 
     columns: Mapping[str, SurveyedColumn]
     drives: Mapping[str, Drive]
     gears: Mapping[str, float] = field(default_factory=dict)
+    counting: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
     def turned(self) -> frozenset[str]:
@@ -104,10 +85,10 @@ def find_robot_columns(
             notes.check.append(f"of several {what}, {chosen} are taken, not {listed}")
     columns: dict[str, SurveyedColumn] = {}
     if positions is not None:
-        other_unit = _in_unit_of_range(device, positions)
+        other_unit = _in_unit_ofrange_of(device, positions)
         if other_unit is not None and drives is not None:
             judged = _judge(device, robot, other_unit, drives, t)
-            positions = other_unit if judged and _left(judged) < _BETTER else positions
+            positions = other_unit if judged and mean_left(judged) < _BETTER else positions
         columns |= dict(zip(_joints(device), positions.columns, strict=True))
     if drives is not None:
         columns |= dict(zip(device.forces, drives.columns, strict=True))
@@ -116,61 +97,91 @@ def find_robot_columns(
     if positions is None or drives is None:
         return RobotColumns(columns, {})
     judged = _judge(device, robot, positions, drives, t)
-    beyond = _beyond_range(device, positions, of_joint=bool(judged) and _fits(judged))
-    guessed = positions is not pairing.positions[0] and bool(judged) and _left(judged) > _DOUBTED
-    if judged and not robot.motors and (guessed or not _fits(judged)):
+    beyond = _beyondrange_of(device, positions, of_joint=bool(judged) and fits(judged))
+    guessed = (
+        positions is not pairing.positions[0] and bool(judged) and mean_left(judged) > _DOUBTED
+    )
+    if judged and not robot.motors and (guessed or not fits(judged)):
         # Hundreds without a unit are degrees, or radians of a motor.
         geared = [
             (group, fitted)
             for group in (positions, _in_si(device, pairing.positions[0]))
-            if (fitted := _find_gears(device, robot, group, drives, t)) is not None
+            if (fitted := find_gears(device, robot, group, drives, t)) is not None
         ]
         if geared:
-            group, (ratio, by_motor) = min(geared, key=lambda item: _left(item[1][1]))
-            if not _fits(judged) or _left(by_motor) < _BETTER * _left(judged):
-                return _geared(device, columns, group, ratio, by_motor, notes)
+            group, gears = min(geared, key=lambda item: mean_left(item[1].drives))
+            if not fits(judged) or mean_left(gears.drives) < _BETTER * mean_left(judged):
+                return _geared(device, columns, group, gears, notes)
     notes.check += beyond
-    if not judged or (beyond and not _fits(judged)):
+    if not judged or (beyond and not fits(judged)):
         return RobotColumns(columns, {})
     if not (positions.named or drives.named):
         other = _in_alphabetical_order(device, positions), _in_alphabetical_order(device, drives)
         turned = _judge(device, robot, *other, t)
-        if turned and _left(turned) < _BETTER * _left(judged):
+        if turned and mean_left(turned) < _BETTER * mean_left(judged):
             notes.check.append(
                 "columns stand in the alphabetical order of the joints' names, since weight and"
-                f" inertia as drawn explain {1.0 - _left(turned):.1%} of the drives that way,"
-                f" {max(1.0 - _left(judged), 0.0):.1%} in the order of the chain"
+                f" inertia as drawn explain {1.0 - mean_left(turned):.1%} of the drives that way,"
+                f" {max(1.0 - mean_left(judged), 0.0):.1%} in the order of the chain"
             )
             judged = turned
             columns |= dict(zip(_joints(device), other[0].columns, strict=True))
             columns |= dict(zip(device.forces, other[1].columns, strict=True))
+            positions, drives = other
+    counting, judged = _counted(device, robot, positions, drives, t, judged)
     by_input = dict(zip(device.forces, judged, strict=True))
     notes.check += _sentences(device, columns, by_input)
-    return RobotColumns(columns, by_input)
+    return RobotColumns(
+        columns, by_input, counting=dict(zip(_joints(device), counting, strict=True))
+    )
+
+
+def _counted(
+    device: Device, robot: Robot, positions: Group, drives: Group, t: Array, judged: list[Drive]
+) -> tuple[list[tuple[float, float]], list[Drive]]:
+    """Direction and zero of each joint, and what they make of the drives, as `find_counting`."""
+    ratio = _turns(device, robot)
+    few, many = (
+        motion_along(positions_of(device, positions, t), t, rows) for rows in (FEW_ROWS, MOST_ROWS)
+    )
+    counting = Counting.as_drawn(len(device.coordinates))
+    if few is None or many is None or ratio is None:
+        return counting.by_joint, judged
+
+    if max(drive.left for drive in judged) < _DOUBTED:
+        return counting.by_joint, judged
+    left = left_by(device, robot, few, drives, ratio)
+    counting = find_counting([c.unit == "rad" for c in device.coordinates], left)
+    if not counting.changed:
+        return counting.by_joint, judged
+    motion = many.counted(counting.direction, counting.zero)
+    return counting.by_joint, hold(device, robot, motion, drives, ratio)
 
 
 def _geared(
     device: Device,
     columns: Mapping[str, SurveyedColumn],
     positions: Group,
-    ratio: Array,
-    judged: Sequence[Drive],
+    found: Gears,
     notes: Notes,
 ) -> RobotColumns:
     """The columns of a log on the side of the motors."""
     joints = _joints(device)
-    found = {**columns, **dict(zip(joints, positions.columns, strict=True))}
-    gears = {j: float(r) for j, r in zip(joints, ratio, strict=True) if r != 1.0}
+    paired = {**columns, **dict(zip(joints, positions.columns, strict=True))}
+    gears = {j: float(r) for j, r in zip(joints, found.ratio, strict=True) if r != 1.0}
     listed = ", ".join(f"{joint} {turns:.3g}" for joint, turns in gears.items())
     notes.check.append(
         "positions are those of motors, by weight and inertia as drawn with these turns for one of"
         f" the joint: {listed}; put in those of the gears"
     )
-    explained = max(0.0, 1.0 - _left(judged))
+    explained = max(0.0, 1.0 - mean_left(found.drives))
     notes.check.append(
         f"drawing, drives' inertia and friction explain {explained:.1%} of the drives"
     )
-    return RobotColumns(found, dict(zip(device.forces, judged, strict=True)), gears)
+    drives = dict(zip(device.forces, found.drives, strict=True))
+    return RobotColumns(
+        paired, drives, gears, dict(zip(joints, found.counting.by_joint, strict=True))
+    )
 
 
 def _in_si(device: Device, group: Group) -> Group:
@@ -190,12 +201,12 @@ def _in_alphabetical_order(device: Device, group: Group) -> Group:
     return replace(group, columns=tuple(group.columns[k] for k in order))
 
 
-def _in_unit_of_range(device: Device, group: Group) -> Group | None:
+def _in_unit_ofrange_of(device: Device, group: Group) -> Group | None:
     """The positions in degrees or millimetres where they state no unit and only these fit."""
     found = []
     for c, column in zip(device.coordinates, group.columns, strict=True):
         name, scale = _OTHER_UNITS[c.unit]
-        most = _BEYOND * _range(device, c.name)
+        most = BEYOND * range_of(device, c.name)
         span = float(np.ptp(np.nan_to_num(column.values)))
         if column.unit or span <= most or span * scale > most:
             found.append(column)
@@ -213,17 +224,12 @@ def _in_unit_of_range(device: Device, group: Group) -> Group | None:
     return replace(group, columns=tuple(found)) if changed else None
 
 
-def _range(device: Device, joint: str) -> float:
-    low, high = device.limits.get(joint, (-np.inf, np.inf))
-    return high - low
-
-
-def _beyond_range(device: Device, positions: Group, of_joint: bool) -> list[str]:
+def _beyondrange_of(device: Device, positions: Group, of_joint: bool) -> list[str]:
     found = []
     for c, column in zip(device.coordinates, positions.columns, strict=True):
         span = float(np.ptp(np.nan_to_num(column.values))) * scale_to(c.unit, column)
-        width = _range(device, c.name)
-        if span > _BEYOND * width:
+        width = range_of(device, c.name)
+        if span > BEYOND * width:
             why = "weight and inertia as drawn agree with that: is the range of the drawing right?"
             if not of_joint:
                 why = (
@@ -239,116 +245,21 @@ def _beyond_range(device: Device, positions: Group, of_joint: bool) -> list[str]
 
 def _judge(device: Device, robot: Robot, positions: Group, drives: Group, t: Array) -> list[Drive]:
     """How each drive goes with the drawing; none where drives are not one a joint."""
+    ratio = _turns(device, robot)
+    if ratio is None:
+        return []
+    return judge_along(device, robot, positions_of(device, positions, t), drives, ratio, t)
+
+
+def _turns(device: Device, robot: Robot) -> Array | None:
+    """Turns of each joint's motor for one of the joint (n,); None where motors turn several."""
     turned = [list(motor.turns) for motor in robot.motors.values()]
     names = _joints(device)
-    if turned and turned != [[name] for name in names]:
-        return []
-    ratio = np.array([abs(m.turns[n]) for m, n in zip(robot.motors.values(), names, strict=False)])
-    ratio = ratio if turned else np.ones(len(names))
-    q = _positions(device, positions, t)
-    return _judge_along(device, robot, q, drives, ratio, t)
-
-
-def _positions(device: Device, group: Group, t: Array) -> Array:
-    """Positions (T, n) in SI, wherever their encoders sit."""
-    columns = zip(device.coordinates, group.columns, strict=True)
-    return np.column_stack([position_in_si(column, t, c.unit) for c, column in columns])
-
-
-def _judge_along(
-    device: Device,
-    robot: Robot,
-    q: Array,
-    drives: Group,
-    ratio: Array,
-    t: Array,
-    most_rows: int = _MOST_ROWS,
-) -> list[Drive]:
-    """How drives go with positions (T, n) of the joints; ``ratio``: turns of the motors (n,)."""
-    step = float(np.median(np.diff(t)))
-    window = max(5, 2 * round(0.5 * _SMOOTHED_S / step) + 1) if step > 0.0 else len(q)
-    if not np.isfinite(q).all() or window >= len(q):
-        return []
-    smooth = [savgol_filter(q, window, 2, deriv=k, delta=step, axis=0) for k in range(3)]
-    rows = slice(None, None, max(1, len(q) // most_rows))
-    position, rate, change = (list(part[rows].T) for part in smooth)
-    bodies = [list(joint.inertial) for joint in robot.joints]
-    forces = joint_forces(
-        Algebra.numbers(), robot.links, bodies, position, rate, change, gravity_vector(robot)
-    )
-    found = []
-    for k, column in enumerate(drives.columns):
-        required = np.broadcast_to(forces[k], rate[k].shape) / ratio[k]
-        values = np.nan_to_num(column.values)[rows] * scale_to(device.force_unit, column)
-        found.append(_compare(required, rate[k], change[k], values))
-    return found
-
-
-def _find_gears(
-    device: Device, robot: Robot, positions: Group, drives: Group, t: Array
-) -> tuple[Array, list[Drive]] | None:
-    """Turns of each motor for one of its joint (n,), by positions on the side of the motors.
-
-    Weight goes with the sine of the joint's angle, so only the right reductions let the drawing
-    explain the drives. Returns them with what they make of the drives; None where none do well.
-    """
-    q = _positions(device, positions, t)
-    span = np.ptp(q, axis=0)
-    least = span / np.array([_range(device, c.name) for c in device.coordinates])
-    moved, at_joint = least > _BEYOND, np.ones(len(least))
-    if not moved.any() or not _judge_along(device, robot, q, drives, at_joint, t, _FEW_ROWS):
+    if not turned:
+        return np.ones(len(names))
+    if turned != [[name] for name in names]:
         return None
-    in_torque = device.force_unit == "N.m"
-
-    def ratios(x: Array) -> Array:
-        ratio = np.ones(len(least))
-        ratio[moved] = np.exp(x)
-        return ratio
-
-    def misfit(x: Array) -> Array:
-        ratio = ratios(x)
-        judged = _judge_along(device, robot, q / ratio, drives, at_joint, t, _FEW_ROWS)
-        left = np.sqrt([max(drive.left, 1e-12) for drive in judged])
-        if not in_torque:
-            return np.asarray(left)
-        # A torque of the motor is that of the joint over the reduction, as well as it is drawn.
-        size = np.array([max(abs(drive.share), 1e-9) for drive in judged])
-        return np.concatenate([left, _DRAWN * np.log(size[moved] * ratio[moved])])
-
-    found = [
-        least_squares(misfit, np.log(factor * least[moved]), diff_step=1e-3, max_nfev=40)
-        for factor in _MARGINS
-    ]
-    best = min(found, key=lambda solution: float(solution.cost))
-    ratio = ratios(best.x)
-    judged = _judge_along(device, robot, q / ratio, drives, at_joint, t)
-    # A gear that speeds up would take the joint further beyond its range than the log goes.
-    return (ratio, judged) if _fits(judged) and ratio.min() >= 1.0 else None
-
-
-def _compare(required: Array, rate: Array, change: Array, drive: Array) -> Drive:
-    """Regress a drive on what the drawing requires, its own inertia, friction and an offset."""
-    sign = np.tanh(rate / max(0.02 * float(np.abs(rate).max()), 1e-9))
-    columns = np.column_stack([required, change, rate, sign, np.ones_like(rate)])
-    size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
-    values, _, rank, _ = np.linalg.lstsq(columns / size, drive, rcond=1e-9)
-    rest = drive - columns / size @ values
-    left = float(np.var(rest) / max(np.var(drive), 1e-300))
-    if rank < columns.shape[1]:
-        return Drive(0.0, np.inf, left)
-    inverse = np.linalg.inv((columns / size).T @ (columns / size))
-    # Neighbouring samples err alike: about one in ten counts.
-    error = np.sqrt(10.0 * np.mean(rest**2) * inverse[0, 0])
-    return Drive(float(values[0] / size[0]), float(error / size[0]), left)
-
-
-def _fits(drives: Sequence[Drive]) -> bool:
-    """Whether drawing and log are of the same joints."""
-    return _left(drives) < _MOST_LEFT
-
-
-def _left(drives: Sequence[Drive]) -> float:
-    return float(np.mean([drive.left for drive in drives]))
+    return np.array([abs(m.turns[n]) for m, n in zip(robot.motors.values(), names, strict=True)])
 
 
 def _sentences(
@@ -393,6 +304,6 @@ def _sentences(
             f"signs and sizes of the drives agree with weight and inertia as drawn (1 is perfect):"
             f" {', '.join(agreed)}"
         )
-    explained = max(0.0, 1.0 - _left(list(drives.values())))
+    explained = max(0.0, 1.0 - mean_left(list(drives.values())))
     lines.append(f"drawing, drives' inertia and friction explain {explained:.1%} of the drives")
     return lines

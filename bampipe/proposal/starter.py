@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from bampipe.data.guesses import Driven
 from bampipe.data.survey import REFERENCE_WORDS, words
+from bampipe.proposal.gravity import Weight
 from bampipe.proposal.starter_input import Axis, Drive, Input, input_of
 
 _TAKEN = frozenset(
@@ -13,7 +14,7 @@ _TAKEN = frozenset(
         *("enc", "encoder", "pos", "position", "angle", "counts", "ticks", "displacement", "disp"),
         *("stroke", "present", "actual", "act", "measured", "meas", "current", "state", "value"),
         *("deg", "degree", "degrees", "rad", "radian", "radians", "vel", "velocity", "speed"),
-        *("header", "feedback", "percent"),
+        *("header", "feedback", "percent", "rec", "log", "data", "mot", "motor"),
     ]
 )
 _FROM_A_MOTOR = REFERENCE_WORDS | {"effort", "torque", "tau"}
@@ -42,7 +43,12 @@ class Starter:
 
 
 def starter_device(
-    position: str, linear: bool, drive: Drive, found: Driven, sign_width: float = 0.0
+    position: str,
+    linear: bool,
+    drive: Drive,
+    found: Driven,
+    weight: Weight | None = None,
+    sign_width: float = 0.0,
 ) -> Starter:
     """Write a device file of one axis.
 
@@ -51,6 +57,7 @@ def starter_device(
         linear: whether the axis slides rather than turns.
         drive: what drives it.
         found: sizes by a rough fit, SI, from which the priors are taken.
+        weight: gravity on the axis, None where it carries none.
         sign_width: of the sign of the velocity, rad/s or m/s; 0 for the usual one.
     """
     names = [word for word in words(position) if word not in _TAKEN and len(word) > 2]
@@ -59,7 +66,7 @@ def starter_device(
     sections = [
         _coordinate(axis, drive, sign_width),
         source.constants,
-        _energy(axis, found),
+        _energy(axis, weight),
         _torque(axis, drive.coil),
         _inputs(source, drive),
         f'[applied]\n{axis.name} = "{source.applied}"\n',
@@ -67,7 +74,7 @@ def starter_device(
         _friction(axis, found),
         _inertia(axis, drive.coil, found),
         _offset(axis, found),
-        *_moments(found),
+        *_moments(weight),
         *(_coil_parameters(axis, found) if drive.coil else []),
     ]
     text = "\n".join(section for section in sections if section)
@@ -90,10 +97,14 @@ symbol = "{axis.name[0]}"
 {width if drive.coil or sign_width else ""}"""
 
 
-def _energy(axis: Axis, found: Driven) -> str:
+def _energy(axis: Axis, weight: Weight | None) -> str:
     name = axis.name
     potential = f'"-moment*cos({name}) + moment_across*sin({name})"'
-    if not any(found.gravity):
+    if weight is not None:
+        doubt = weight.doubt or "the motion shows it"
+        without = 'of an upright axis "0", and without both tables [parameters.moment...]'
+        potential += f"  # guess: gravity; {doubt}; {without}"
+    else:
         hint = f'gravity of a link: "-moment*cos({name})", moment in N.m'
         if axis.linear:
             hint = f'gravity where the axis rises: "9.81*inertia*{name}"'
@@ -154,15 +165,15 @@ def _offset(axis: Axis, found: Driven) -> str:
     return _parameter("offset", axis.torque, values, meaning)
 
 
-def _moments(found: Driven) -> list[str]:
-    """The parameters of gravity; none where the motion shows none."""
-    if not any(found.gravity):
+def _moments(weight: Weight | None) -> list[str]:
+    """The parameters of gravity; none where there is none."""
+    if weight is None:
         return []
-    sd = f"sd = {_rounded(max(map(abs, found.gravity))):g}"
+    sd = f"sd = {_rounded(weight.sd):g}"
     meaning = "mass times gravity times distance of the centre of gravity"
     return [
         _parameter(name, "N.m", (f"prior = {_rounded(size):g}", sd), meaning)
-        for name, size in zip(("moment", "moment_across"), found.gravity, strict=True)
+        for name, size in zip(("moment", "moment_across"), weight.moments, strict=True)
     ]
 
 

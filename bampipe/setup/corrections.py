@@ -135,6 +135,14 @@ def unit_corrections(signals: Signals) -> Iterator[Correction]:
             yield scaled(signals, names, 1.0 / factor, cost)
 
 
+def quarter_turn_pairs(signals: Signals) -> Iterator[tuple[Correction, Correction]]:
+    """Two rotary axes counted from others of their main directions, as a maker's zero posture."""
+    turns = list(quarter_turns(signals))
+    for first, second in combinations(turns, 2):
+        if first.signals != second.signals:
+            yield first, second
+
+
 def quarter_turns(signals: Signals) -> Iterator[Correction]:
     """A rotary axis counted from another of its four main directions."""
     for axis, unit in zip(signals.axes, signals.units, strict=False):

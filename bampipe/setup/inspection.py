@@ -12,9 +12,10 @@ from bampipe.lists import join_names
 from bampipe.physics import System
 from bampipe.results.ingest import IngestResult
 from bampipe.results.setup import AxisSetup, PossibleMistake, SetupMistake, SetupResult
+from bampipe.setup.finding import Finding, spoilt_axes
 from bampipe.setup.placeholders import Placeholder, find_placeholders
 from bampipe.setup.plausibility import LEAST_MOVING, Plausibility
-from bampipe.setup.search import CorrectionSearch, Finding, shorten, spoilt_axes
+from bampipe.setup.search import CorrectionSearch, shorten
 from bampipe.setup.words import describe_correction, describe_evidence, describe_lack, describe_size
 from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion
@@ -124,7 +125,7 @@ def _record(
         offset=correction.offset,
         axes=tuple(system.coordinates[i] for i in axes),
         sentence=sentence,
-        evidence=describe_evidence(system, axes, found.before, found.after),
+        evidence=describe_evidence(system, axes, found.before, found.after, found.drawn),
         error_before=errors(found.before),
         error_after=errors(found.after),
         alternatives=tuple(

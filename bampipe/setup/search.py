@@ -23,6 +23,20 @@ from bampipe.setup.corrections import (
     sign_corrections,
     unit_corrections,
 )
+from bampipe.setup.drawing import DrawnSearch, is_drawn
+from bampipe.setup.finding import (
+    ALIKE,
+    JUDGED_ERROR,
+    LEAST_GAIN,
+    MOST_MISTAKES,
+    RANKED_ERROR,
+    SUSPICIOUS_ERROR,
+    Finding,
+    distinct,
+    gain_of,
+    is_explained,
+    spoils_sound_axes,
+)
 from bampipe.setup.plausibility import Plausibility, axes_without_pose, judge_setup
 from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion
@@ -30,61 +44,27 @@ from bampipe.trials.signals import Change, Signals
 
 Array = NDArray[np.float64]
 
-SUSPICIOUS_ERROR = 0.4
-"""Error, as a share of the applied force, from which other set-ups are tried. Right ones
-stand below 0.15 with any one effect hidden, a gravity compensator that lags behind at 0.36."""
 SUSPICIOUS_PRIORS = 5.0
 """Sum of objections, beyond the usual, from which other set-ups are tried: two parameters beyond
 two deviations."""
-LEAST_GAIN = 7.0
-"""Score that setting a mistake right must gain: the error of one axis falls to 42 %, say. Of sound
-sessions no other set-up gains more than 5.0, of mistaken ones the right one at least 7.9."""
 LEAST_GAIN_PLACEHOLDER = 4.0
 """The same for a scale that stands at exactly 1, as nobody has filled it in."""
-EXPLAINED = 0.6
-"""Error that must be left of a spoilt axis at most, as a share of the applied force."""
-JUDGED_ERROR, RANKED_ERROR = 0.1, 0.01
-"""Errors below these are alike: when a mistake is named, and when mistakes are ranked."""
-SPOILS = 2.0
-"""Times its error, or `JUDGED_ERROR` where that is larger, that a correction may leave of an axis
-that was sound before. All drives of a robot taken twice help an axis whose counterbalance the
-device lacks, and take another from 8 to 34 % of its force: no mistake of set-up."""
-ALIKE = 1.5
-"""Difference of scores within which two mistakes cannot be distinguished."""
 LEAST_FACTOR, LEAST_TURN, LEAST_SHIFT = 1.5, 0.25, 0.3
 """A factor, an angle (rad) and a share of an axis' travel below which what is off is no mistake of
 set-up but an effect to be diagnosed."""
-MOST_MISTAKES = 4
 MOST_AXES = 3
 """With more, only signs, the clock and units of all axes or inputs at once are tried: what may be
 exchanged, shifted or scaled grows faster than what a fit of a robot's bodies leaves time for."""
 HIGHEST_HZ = 10.0
 """Set-ups are compared below this: gross as they are, they show there, and an input that is taken
 for a position has derivatives up to no more than some 25 Hz."""
-_SAMPLES, _SCREENED_SAMPLES = 12_000, 3_000
+_SAMPLES, _SCREENED_SAMPLES, _DRAWN_SAMPLES = 12_000, 3_000, 4_000
 _SCREENING_STEPS = 3
 _SHORTLIST = 6
 _DECADES = np.arange(-10, 11) / 2.0
 _STEPS = 16
 _MOST_TRIALS = 6
 _HALVINGS = 11
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One mistake with the two set-ups it lies between.
-
-    Attributes:
-        correction: that sets it right; rivals: others that do so as well.
-        before, after: what the set-ups explain.
-        gain: of the score.
-    """
-
-    correction: Correction
-    rivals: tuple[Correction, ...]
-    before: Plausibility
-    after: Plausibility
-    gain: float
 
 
 @dataclass
@@ -159,7 +139,14 @@ class CorrectionSearch:
                 break
             found.append(step)
             change, now = step.correction.change.after(change), step.after
-        return tuple(f for f in found if now is None or self._is_explained(f, now))
+        found = [f for f in found if now is None or is_explained(f, now)]
+        if found or self.over_position is not None or not is_drawn(self.system):
+            return tuple(found)
+        short = shorten(self.motions, _DRAWN_SAMPLES)
+        search = DrawnSearch(self.system, short, self.band, self.signals)
+        against = search.find_mistakes(exchanged=self.has_few_axes)
+        self.tested += search.tested
+        return against
 
     def _lacks_pose(self, stated: Plausibility, step: Finding | None) -> bool:
         """Whether a torque over position explains as much of the stated set-up as ``step`` does.
@@ -181,10 +168,6 @@ class CorrectionSearch:
             return True
         most = LEAST_GAIN_PLACEHOLDER if placeholders else SUSPICIOUS_PRIORS
         return bool(now.objections.sum() - now.usual > most)
-
-    def _is_explained(self, finding: Finding, last: Plausibility) -> bool:
-        spoilt = spoilt_axes(finding)
-        return bool((last.error[spoilt] < EXPLAINED).all())
 
     def _best(
         self, change: Change, now: Plausibility | None, placeholders: Sequence[str]
@@ -267,11 +250,11 @@ class CorrectionSearch:
     ) -> Finding | None:
         ranked = sorted(tried, key=lambda one: one[1].score(RANKED_ERROR) + one[0].cost)
         for correction, after in ranked:
-            gain = before.score(JUDGED_ERROR) - after.score(JUDGED_ERROR) - correction.cost
+            gain = gain_of(before, after, correction.cost)
             hinted = correction.kind == "scale" and set(correction.signals) <= set(placeholders)
             if gain < (LEAST_GAIN_PLACEHOLDER if hinted else LEAST_GAIN):
                 continue
-            if _spoils_sound_axes(before, after):
+            if spoils_sound_axes(before, after):
                 continue
             own = after.score(RANKED_ERROR) + correction.cost
             rivals = tuple(
@@ -281,7 +264,7 @@ class CorrectionSearch:
                 and (other.kind, other.signals) != (correction.kind, correction.signals)
                 and found.score(RANKED_ERROR) + other.cost < own + ALIKE
             )
-            return Finding(correction, _distinct(rivals), before, after, gain)
+            return Finding(correction, distinct(rivals), before, after, gain)
         return None
 
 
@@ -309,19 +292,6 @@ def _shifted_by(signals: Signals, axis: str, offset: float) -> Correction:
     return shifted(signals, axis, offset, 3.0)
 
 
-def spoilt_axes(finding: Finding) -> list[int]:
-    """Axes whose error falls by more than a third once the mistake is set right; all, if none."""
-    before, after = finding.before.error, finding.after.error
-    fallen = [i for i in range(len(before)) if after[i] < before[i] / 1.5]
-    return fallen or list(range(len(before)))
-
-
-def _spoils_sound_axes(before: Plausibility, after: Plausibility) -> bool:
-    """Whether a correction makes an axis much worse that was right without it."""
-    sound = before.error < SUSPICIOUS_ERROR
-    return bool(np.any(after.error[sound] > SPOILS * np.maximum(before.error[sound], JUDGED_ERROR)))
-
-
 def _nothing_explained(system: System) -> Plausibility:
     n = len(system.coordinates)
     objections = np.full(len(system.parameters), 0.5)
@@ -339,11 +309,3 @@ def _is_gross(correction: Correction, motions: Sequence[Motion], signals: Signal
         return abs(correction.offset) > LEAST_TURN
     travel = max(float(np.ptp(motion.q[:, place])) for motion in motions)
     return abs(correction.offset) > LEAST_SHIFT * travel
-
-
-def _distinct(corrections: Sequence[Correction]) -> tuple[Correction, ...]:
-    """The first of each kind and signals."""
-    found: dict[tuple[str, tuple[str, ...]], Correction] = {}
-    for correction in corrections:
-        found.setdefault((correction.kind, correction.signals), correction)
-    return tuple(found.values())

@@ -23,9 +23,14 @@ def describe_correction(correction: Correction, session: IngestResult) -> str:
 
 
 def describe_evidence(
-    system: System, axes: list[int], before: Plausibility, after: Plausibility
+    system: System, axes: list[int], before: Plausibility, after: Plausibility, drawn: bool
 ) -> str:
-    """What setting it right changes: errors, and parameters that were not believable."""
+    """What setting it right changes: errors, and parameters that were not believable.
+
+    Args:
+        system: the device; axes: whose errors; before, after: what is explained.
+        drawn: whether that is with bodies as they are drawn.
+    """
     parts = [
         f"error of {system.coordinates[i]} falls from {_fall(i, before, after)}"
         for i in axes
@@ -37,7 +42,8 @@ def describe_evidence(
         for item, old, new in zip(system.parameters, before.p, after.p, strict=True)
         if abs(distance_from_prior(item, old)) > abs(distance_from_prior(item, new)) + 1.0
     ]
-    return "; ".join(parts or back[:3])
+    said = "; ".join(parts or back[:3])
+    return f"with bodies as drawn, {said}" if drawn else said
 
 
 def describe_lack(system: System, before: Plausibility, after: Plausibility) -> list[str]:

@@ -122,6 +122,13 @@ def test_fields_of_matlab_structs(tmp_path, compressed):
     np.testing.assert_array_equal(
         read_trial(tmp_path / "b.mat", ("log.axis.q",)).columns["log.axis.q"], Q
     )
+    # Gains by axis belong to no sample, and an object of MATLAB has no extents.
+    scipy.io.savemat(path, {"q": Q, "tau": F, "scale": 2.0, "gains": np.arange(6.0)})
+    body = b"\x06\0\0\0\x08\0\0\0\x11" + bytes(7) + b"\x01\0\x03\0obj\0" + bytes(8)
+    with path.open("ab") as file:
+        file.write(b"\x0e\0\0\0" + len(body).to_bytes(4, "little") + body)
+    assert list(columns_of(path)) == ["q", "tau", "scale"]
+    scipy.io.savemat(path, content, do_compression=compressed)
     sound = path.read_bytes()
     rng = np.random.default_rng(4)
     for _ in range(200):  # a damaged file is refused or read, in one line, whatever it says

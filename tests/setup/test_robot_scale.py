@@ -13,8 +13,9 @@ from bampipe.estimate.low_pass import Band
 from bampipe.physics import Model, System, compile_model
 from bampipe.physics.registry import device_from
 from bampipe.setup.corrections import scaled
+from bampipe.setup.finding import Finding
 from bampipe.setup.plausibility import Plausibility
-from bampipe.setup.search import CorrectionSearch, Finding
+from bampipe.setup.search import CorrectionSearch
 from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion
 from bampipe.trials.signals import Change, Signals
@@ -113,3 +114,46 @@ def test_what_spoils_a_joint_that_was_right_is_no_mistake(third: float, named: b
     )
     twice = scaled(search.signals, FORCES, 2.0, 0.0)
     assert (search._choose(before, [(twice, after)], ()) is not None) == named
+
+
+def turned(factor: float, zero: float, joint: int, drive: float) -> list[Motion]:
+    """Motions of which a joint, or its drive, is counted otherwise than drawn."""
+    found = []
+    for motion in motions(1.0, 2.0):
+        q, qd, qdd = motion.q.copy(), motion.qd.copy(), motion.qdd.copy()
+        q[:, joint] = factor * q[:, joint] + zero
+        qd[:, joint] *= factor
+        qdd[:, joint] *= factor
+        name = FORCES[joint]
+        channels = {**motion.channels, name: drive * motion.channels[name]}
+        found.append(replace(motion, q=q, qd=qd, qdd=qdd, channels=channels))
+    return found
+
+
+@pytest.mark.parametrize(
+    ("given", "named"),
+    [
+        (turned(1.0, 0.0, 0, 1.0), []),
+        (turned(1.0, 0.0, 1, -1.0), [("sign", ("torque_two",), 0.0)]),
+        (turned(1.0, 0.5 * np.pi, 1, 1.0), [("zero", ("two",), -0.5 * np.pi)]),
+        (turned(-1.0, 0.0, 2, 1.0), [("sign", ("three",), 0.0)]),
+    ],
+    ids=["sound", "drive reversed", "from the vertical", "encoder reversed"],
+)
+def test_what_free_bodies_take_on_is_found_with_bodies_as_drawn(
+    given: list[Motion], named: list[tuple[str, tuple[str, ...], float]]
+) -> None:
+    found = find_mistakes(given)
+    assert [(f.correction.kind, f.correction.signals, f.correction.offset) for f in found] == named
+
+
+def test_two_joints_of_a_makers_zero_posture_are_found_together() -> None:
+    """Setting one of them right alone leaves the other joints worse than before."""
+    given = []
+    for motion in motions(1.0, 2.0):
+        q = motion.q + 0.5 * np.pi * np.array([0.0, 1.0, -1.0, 0.0])
+        given.append(replace(motion, q=q))
+    found = find_mistakes(given)
+    zeros = {f.correction.signals[0]: f.correction.offset for f in found}
+    assert zeros == {"two": -0.5 * np.pi, "three": 0.5 * np.pi}
+    assert all(f.drawn and f.after.worst_error < 0.15 for f in found)

@@ -451,3 +451,153 @@ def test_a_rate_at_which_no_motion_is_logged_is_doubted(tmp_path):
         "0.1 Hz, from the time stamps; motion is not logged so: is its unit right?"
         in proposal.check
     )
+
+
+def two_joints(columns: dict[str, str]) -> dict[str, np.ndarray]:
+    """Two joints in one log; ``columns``: names by what they hold."""
+    one, two = (joint_log(seed) for seed in (1, 2))
+    samples = min(len(one["stamp"]), len(two["stamp"]))
+    held = {"time [s]": one["stamp"] - one["stamp"][0]}
+    for number, log in ((1, one), (2, two)):
+        held[f"q{number}"] = np.deg2rad(log["joint_angle"])
+        held[f"tau{number}"] = 1e-3 * PER_AMPERE * log["motor_current"]
+    return {columns.get(name, name): values[:samples] for name, values in held.items()}
+
+
+def write_table(path: Path, table: dict[str, np.ndarray]) -> None:
+    header = ",".join(table)
+    np.savetxt(path, np.column_stack(list(table.values())), "%.7g", ",", header=header, comments="")
+
+
+def test_of_two_joints_without_a_drawing_a_position_has_its_own_drive(tmp_path):
+    table = two_joints({"q1": "pos_meas1", "q2": "pos_meas2"})
+    # The drive of the other joint, and what was asked of this one, follow the motion better.
+    table["tau_con1"] = table["tau1"] - np.random.default_rng(0).normal(
+        0.0, 1e-3, len(table["tau1"])
+    )
+    table["tau1"] = table["tau1"] + np.random.default_rng(1).normal(0.0, 0.3, len(table["tau1"]))
+    table["tau2"] = table["tau_con1"]
+    write_table(tmp_path / "a.csv", table)
+    session, proposal = proposed(tmp_path)
+    assert session["encoders"]["joint"]["column"] == "pos_meas1"
+    assert session["force"]["columns"] == ["tau1"]
+    assert any("2 columns are positions: of a robot?" in line for line in proposal.check)
+
+
+def test_a_position_whose_drive_is_not_there_is_not_driven_by_another_position(tmp_path):
+    table = two_joints({"q1": "pos_deg[0]", "q2": "pos_deg[1]"})
+    write_table(tmp_path / "a.csv", {name: v for name, v in table.items() if "tau" not in name})
+    session, _ = proposed(tmp_path)
+    assert session["encoders"]["joint"] == {"column": "pos_deg[0]", "unit": "deg"}
+    assert "pos_deg[1]" not in str(session["force"])
+
+
+@pytest.mark.parametrize("alone", ["q", "tau"])
+def test_a_recording_in_parts_is_to_be_put_together(tmp_path, command: Command, alone: str):
+    table = two_joints({})
+    for what in ("q", "tau"):
+        part = {name: v for name, v in table.items() if name.startswith((what, "time"))}
+        write_table(tmp_path / f"{'a' if what == alone else 'b'}.csv", part)
+    code, _, errors = command("init", str(tmp_path))
+    assert code == 2 and errors.count("\n") == 1
+    assert "positions and drives are in different files, such as a.csv and b.csv" in errors
+    assert "side by side in one file" in errors
+
+
+def test_two_files_of_the_same_names_may_be_one_recording(tmp_path):
+    table = two_joints({})
+    for name in ("positions", "torques"):
+        write_table(tmp_path / f"{name}.csv", {"time [s]": table["time [s]"], "joint": table["q1"]})
+    _, proposal = proposed(tmp_path)
+    assert any(
+        "no column is a drive: if positions.csv and torques.csv" in x for x in proposal.check
+    )
+
+
+def labelled(names: str, **scales: float) -> dict[str, np.ndarray]:
+    """The joint's log under other names, in the order time, position, velocity, drive."""
+    log = joint_log(3)
+    values = (
+        log["stamp"] - log["stamp"][0],
+        np.deg2rad(log["joint_angle"]),
+        np.deg2rad(log["joint_velocity"]),
+        PER_AMPERE * 1e-3 * log["motor_current"],
+    )
+    factors = (scales.get(what, 1.0) for what in ("t", "q", "qd", "u"))
+    return {n: v * f for n, v, f in zip(names.split(","), values, factors, strict=True)}
+
+
+def test_units_at_the_end_of_names(tmp_path):
+    table = labelled("t_ms,pos_deg,vel_deg_s,cur_mA", t=1e3, q=57.29578, qd=57.29578, u=1e3)
+    write_table(tmp_path / "a.csv", table)
+    session, proposal = proposed(tmp_path)
+    assert session["time"] == {"column": "t_ms", "unit": "ms"}
+    velocity = {"column": "vel_deg_s", "unit": "deg/s"}
+    assert session["encoders"]["joint"] == {
+        "column": "pos_deg",
+        "unit": "deg",
+        "velocity": velocity,
+    }
+    assert session["channels"]["motor_current"] == {"column": "cur_mA", "unit": "mA"}
+    assert "driven by a current" in proposal.device
+
+
+def test_a_current_position_is_no_current_and_an_acceleration_drives_nothing(tmp_path):
+    table = labelled("t,current_position,acc_x,torque_nm")
+    table["acc_x"] = np.gradient(np.gradient(table["current_position"], table["t"]), table["t"])
+    write_table(tmp_path / "a.csv", table)
+    session, _ = proposed(tmp_path)
+    assert [e["column"] for e in session["encoders"].values()] == ["current_position"]
+    assert session["force"]["columns"] == ["torque_nm"]
+    del table["torque_nm"]
+    (tmp_path / "b").mkdir()
+    write_table(tmp_path / "b/a.csv", table)
+    session, _ = proposed(tmp_path / "b")
+    assert session["force"]["columns"] == ["?"]
+
+
+@pytest.mark.parametrize(("name", "said"), [("q", True), ("q_rad", False)])
+def test_an_axis_of_no_unit_may_slide(tmp_path, name: str, said: bool):
+    write_table(tmp_path / "a.csv", labelled(f"t,{name},w,tau"))
+    assert any("--device slider" in line for line in propose(tmp_path).check) == said
+    assert 'device = "slider"' in propose(tmp_path, "slider").session
+
+
+def test_a_torque_in_per_cent_asks_for_its_gain(tmp_path):
+    write_table(tmp_path / "a.csv", labelled("t,angle_deg,w,torque_percent", q=57.29578, u=20.0))
+    session, proposal = proposed(tmp_path)
+    assert session["force"]["unit"] == "V" and session["force"]["calibration_n_per_v"] == [[0.0]]
+    assert proposal.fill_in == ['calibration_n_per_v, N.m for one of "torque_percent"']
+
+
+def test_names_can_be_given_to_a_log_without_a_header(tmp_path, command: Command):
+    table = np.column_stack(list(labelled("t,q,dq,u").values()))
+    np.savetxt(tmp_path / "a.csv", table, "%.6f", ",")
+    code, _, errors = command("init", str(tmp_path))
+    assert code == 2 and "to bampipe init as --names time,position,..." in errors
+    code, _, errors = command("init", str(tmp_path), "--names", "t,q_rad,dq,current_A")
+    assert code == 0, errors
+    session = tomllib.loads((tmp_path / "session.toml").read_text())
+    assert session["csv"] == {"names": ["t", "q_rad", "dq", "current_A"]}
+    assert session["channels"]["motor_current"]["column"] == "current_A"
+    found = samples(tmp_path, tmp_path / "out", "a")
+    np.testing.assert_allclose(found["q_joint"][:100], table[:100, 1], atol=1e-6)
+
+
+@pytest.mark.parametrize(("beside", "role"), [("input_volts", "duty"), ("", "current")])
+def test_a_load_in_a_register_is_no_force(tmp_path, beside: str, role: str):
+    table = labelled("t,position,w,load")
+    del table["w"]
+    table["load"] = np.mod(np.rint(300.0 * table["load"]), 65536.0)
+    if beside:
+        table[beside] = 5.0 + 0.01 * (np.arange(len(table["t"])) % 3)
+    write_table(tmp_path / "a.csv", table)
+    session, proposal = proposed(tmp_path)
+    assert f"driven by a {role}" in proposal.device and "force" not in session
+    (drive,) = (c for c in session["channels"].values() if c["column"] == "load")
+    assert drive["wrap_bits"] == 16 and drive["signed"]
+    if beside:
+        assert proposal.fill_in == ["the scale of duty, 1 over full duty"]
+    else:
+        said = "a signed register of 16 bits: give its scale"
+        assert any(said in line for line in proposal.check)

@@ -329,3 +329,128 @@ def test_an_mjcf_that_cannot_be_read_is_not_passed_over(
     assert "take it out of the folder" in str(caught.value)
     (tmp_path / "arm.xml").write_text("<recording><channel></recording>")
     assert propose(tmp_path)
+
+
+QUARTER = np.pi / 2.0
+
+
+@pytest.mark.parametrize(
+    ("counted", "turned"),
+    [
+        ({}, []),
+        ({"shoulder": (1.0, -QUARTER), "elbow": (1.0, QUARTER)}, []),
+        ({"elbow": (1.0, np.pi)}, ["shoulder"]),
+        ({"shoulder": (-1.0, QUARTER)}, []),
+    ],
+    ids=["as drawn", "two quarter turns", "half a turn, a drive turned", "the other way round"],
+)
+def test_joints_counted_otherwise_than_drawn(
+    tmp_path: Path, counted: dict[str, tuple[float, float]], turned: list[str]
+) -> None:
+    """Six joints; without their zeros half of the drives look turned, and none is."""
+    arm.record_logs(tmp_path / "log", 21, "ZYYXYX", style="joint_states", trials=1, turned=turned)
+    table = pd.read_csv(tmp_path / "log/log_01.csv")
+    for joint, (direction, zero) in counted.items():
+        column = f"/joint_states/{joint}/position"
+        table[column] = direction * table[column] + zero
+        table[column.replace("position", "velocity")] *= direction
+    table.to_csv(tmp_path / "log/log_01.csv", index=False)
+    _, _, proposal = paired(tmp_path / "log")
+    session = read_session(tmp_path / "log")
+    for encoder in session.encoders:
+        direction, zero = counted.get(encoder.axis, (1.0, 0.0))
+        assert encoder.gear_ratio == direction
+        off = np.remainder(encoder.zero - zero + 0.1, 2.0 * np.pi)
+        assert off < 0.2, (encoder.axis, encoder.zero)
+    drives = {c.name.partition("_")[2] for c in session.channels if c.scale < 0.0}
+    assert drives == set(turned)
+    said = [line for line in proposal.check if "by weight and inertia as drawn: look it up" in line]
+    assert len(said) == len(counted)
+
+
+HAND = "".join(
+    f'''<link name="{side}"/><joint name="{side}_finger" type="prismatic"><parent link="lower"/>
+<child link="{side}"/><axis xyz="0 1 0"/><limit lower="0" upper="0.1" effort="1" velocity="1"/>
+</joint>'''
+    for side in ("left", "right")
+)
+
+
+def test_a_robot_of_which_the_urdf_shows_more_ends_with_the_last_joint_logged(
+    tmp_path: Path,
+) -> None:
+    """A service robot: wheels on the base, fingers behind the arm."""
+    write_log(tmp_path)
+    wheel = HAND.replace("lower", "base").replace("left", "wheel_a").replace("right", "wheel_b")
+    (tmp_path / "arm.urdf").write_text(URDF.replace("</robot>", HAND + wheel + "</robot>"))
+    with pytest.raises(InputError, match=r"write device\.toml beside the logs") as refused:
+        propose(tmp_path)  # q1 and q2 name no joint
+    assert "tip = " in str(refused.value)
+    names = {
+        f"{c}{k}": f"{j}_{c}" for k, j in ((1, "shoulder"), (2, "elbow")) for c in ("q", "tau")
+    }
+    table = pd.read_csv(tmp_path / "log.csv").rename(columns=names)
+    table.to_csv(tmp_path / "log.csv", index=False)
+    proposal = proposed(tmp_path)
+    assert 'tip = "lower"' in proposal.device
+    assert {e.axis: e.column for e in read_session(tmp_path).encoders} == {
+        "shoulder": "shoulder_q", "elbow": "elbow_q"
+    }  # fmt: skip
+
+
+def test_joint_states_in_a_bag_go_to_the_joints_that_they_name(tmp_path: Path) -> None:
+    """Joints are named in brackets there, where tables have units."""
+    pytest.importorskip("rosbags")
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    write_log(tmp_path, gains=(1.0, -1.0))
+    table = pd.read_csv(tmp_path / "log.csv")
+    (tmp_path / "log.csv").unlink()
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    kinds = ("sensor_msgs/msg/JointState", "std_msgs/msg/Header", "builtin_interfaces/msg/Time")
+    state, header, time = (store.types[kind] for kind in kinds)
+    with Writer(tmp_path / "rec", version=9, storage_plugin=StoragePlugin.MCAP) as bag:
+        topic = bag.add_connection("/joint_states", kinds[0], typestore=store)
+        for late, row in enumerate(table.itertuples()):
+            nanoseconds = round(row.time_s * 1e9)
+            stamp = time(100 + nanoseconds // 10**9, nanoseconds % 10**9)
+            pairs = ((row.q2, row.q1), (row.q2 * 0.0, row.q1 * 0.0), (row.tau2, row.tau1))
+            values = [np.array(pair) for pair in pairs]  # in the order of the alphabet
+            message = state(header(stamp, ""), ["elbow", "shoulder"], *values)
+            recorded = 100 * 10**9 + nanoseconds + (late % 7) * 10**5
+            bag.write(topic, recorded, store.serialize_cdr(message, kinds[0]))
+    proposal = proposed(tmp_path)
+    session = read_session(tmp_path)
+    assert 'column = "/joint_states:header.stamp"' in proposal.session
+    joints = ("shoulder", "elbow")
+    assert {e.axis: e.column for e in session.encoders} == {
+        name: f"/joint_states:position[{name}]" for name in joints
+    }
+    assert {c.name: c.column for c in session.channels} == {
+        f"torque_{name}": f"/joint_states:effort[{name}]" for name in joints
+    }
+    assert [c.scale for c in session.channels] == [1.0, -1.0]
+    assert proposal.fill_in == []
+
+
+@pytest.mark.slow
+def test_zeros_of_a_log_from_the_motors_side(tmp_path: Path) -> None:
+    """Reductions and zeros hide each other: neither alone lets the drawing explain the drives."""
+    truth = arm.record_logs(
+        tmp_path / "log", 22, "ZYYX", style="motor", trials=1, drawing_error=0.03, turned=["elbow"]
+    )
+    counted = {"shoulder": (1.0, -QUARTER), "elbow": (-1.0, QUARTER)}
+    table = pd.read_csv(tmp_path / "log/log_01.csv")
+    for number, name in enumerate(NAMES[:4], 1):
+        direction, zero = counted.get(name, (1.0, 0.0))
+        column, turns = f"act_pos_mot_deg_{number}", truth["ratio"][number - 1]
+        table[column] = direction * table[column] + np.rad2deg(zero) * turns
+    table.to_csv(tmp_path / "log/log_01.csv", index=False)
+    paired(tmp_path / "log")
+    for encoder, turns in zip(read_session(tmp_path / "log").encoders, truth["ratio"], strict=True):
+        direction, zero = counted.get(encoder.axis, (1.0, 0.0))
+        assert encoder.gear_ratio == pytest.approx(direction * turns, rel=0.05)
+        assert encoder.zero == pytest.approx(np.rad2deg(zero) * turns, rel=0.05, abs=1e-9)
+    turned = {c.name for c in read_session(tmp_path / "log").channels if c.scale < 0.0}
+    assert turned == {"torque_elbow"}

@@ -90,10 +90,11 @@ def read_trial(
     return trial
 
 
-def columns_of(path: Path, *, name: str = "") -> dict[str, str]:
+def columns_of(path: Path, *, name: str = "", dialect: Dialect | None = None) -> dict[str, str]:
     """Names of what one trial file holds that can be read as a column, with units it states.
 
-    The unit is "datetime" for dates and times, "" where the file does not say.
+    The unit is "datetime" for dates and times, "" where the file does not say. A ``dialect`` is
+    that of a text.
 
     Raises:
         InputError: as :func:`read_trial`.
@@ -101,6 +102,8 @@ def columns_of(path: Path, *, name: str = "") -> dict[str, str]:
     path, name = Path(path), name or str(path)
     reader = _READERS[_checked_extension(path, name)]
     with _memory_named(name):
+        if reader is text and dialect is not None:
+            return text.columns(path, name, dialect)
         columns: dict[str, str] = reader.columns(path, name)
     return columns
 

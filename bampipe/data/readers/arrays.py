@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Container
+from collections.abc import Container, Mapping
 
 import numpy as np
 
@@ -53,3 +53,20 @@ def labels(name: str, shape: tuple[int, ...]) -> list[str]:
     if len(sides) < 2:
         return [name]
     return [f"{name}[{k}]" for k in range(min(sides))] if min(sides) <= LARGEST_WIDTH else []
+
+
+def recorded(shapes: Mapping[str, tuple[int, ...]]) -> list[str]:
+    """Labels of the variables that were recorded together, and of numbers that stand alone.
+
+    Beside a log a file may keep what belongs to no sample: gains by axis, a table of settings.
+
+    Args:
+        shapes: by name of the variable.
+    """
+    by_length: dict[int, list[str]] = {}
+    for name, shape in shapes.items():
+        by_length.setdefault(max(shape, default=1), []).extend(labels(name, shape))
+    longer = [length for length in by_length if length > 1]
+    samples = max(longer, key=lambda length: (len(by_length[length]), length), default=1)
+    kept = {*by_length.get(1, ()), *by_length.get(samples, ())}
+    return [x for name, shape in shapes.items() for x in labels(name, shape) if x in kept]

@@ -199,7 +199,8 @@ def _header(
         raise InputError(
             "no header: the first line holds numbers",
             where=f"{name}, row {lines[0].number}",
-            remedy=f"add a line {shown}, or give names under [csv]",
+            remedy=f"add a line {shown}, or give names under [csv], to bampipe init as --names"
+            f" {shown}",
         )
     row = _names(lines[index].text, delimiter, lines[index + 1 :])
     check_columns(row, columns, f"{name}, row {lines[index].number}")
@@ -345,13 +346,15 @@ def _are_units(row: list[str]) -> bool:
 
 
 def _units_in(header: list[str]) -> dict[str, str]:
-    """Units in names such as ``force [N]``."""
-    found = {}
-    for name in header:
-        match = _NAME_WITH_UNIT.match(name)
-        if match and match["name"]:
-            found[name] = match["unit"]
-    return found
+    """Units in names such as ``force [N]``; a number, as in ``q[0]`` and ``q[1]``, is an index."""
+    matches = {name: match for name in header if (match := _NAME_WITH_UNIT.match(name))}
+    numbered = Counter(m["name"] for m in matches.values() if m["unit"].isdigit())
+    return {
+        name: match["unit"]
+        for name, match in matches.items()
+        if match["name"]
+        and not (match["unit"].isdigit() and (match["unit"] != "1" or numbered[match["name"]] > 1))
+    }
 
 
 def _bare(unit: str) -> str:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from bampipe.data.readers import moments
-from bampipe.data.readers.arrays import labels, pick, split_index
+from bampipe.data.readers.arrays import labels, pick, recorded, split_index
 from bampipe.data.readers.trial import RawTrial, Wanted, aligned, check_columns, check_size
 from bampipe.data.readers.unpacking import MARGIN, check_unpacked, inflated_size
 from bampipe.errors import InputError
@@ -87,14 +87,15 @@ def read(path: Path, wanted: Wanted, name: str, what: str = "dataset") -> RawTri
 
 
 def columns(path: Path, name: str) -> dict[str, str]:
-    """Names and units of the vectors of numbers in the file.
+    """Names and units of the vectors of numbers that were recorded together.
 
     Raises:
         InputError: not a sound HDF5 file.
     """
     import h5py  # heavy: only for these files
 
-    found: dict[str, str] = {}
+    shapes: dict[str, tuple[int, ...]] = {}
+    units: dict[str, str] = {}
     try:
         with h5py.File(path, "r") as file:
             for label, data in _datasets(file):
@@ -102,10 +103,11 @@ def columns(path: Path, name: str) -> dict[str, str]:
                     kind = data.dtype if field is None else data.dtype[field]
                     if kind.kind in "iufb" and data.attrs.get("MATLAB_class") != b"char":
                         column = label if field is None else f"{label}.{field}"
-                        found |= dict.fromkeys(labels(column, data.shape), _unit(data))
+                        shapes[column] = data.shape
+                        units |= dict.fromkeys(labels(column, data.shape), _unit(data))
     except FAULTS as error:
         raise InputError("not a sound HDF5 file", where=name) from error
-    return found
+    return {column: units[column] for column in recorded(shapes)}
 
 
 def _datasets(group: Any, prefix: str = "", depth: int = 0) -> Iterator[tuple[str, Any]]:

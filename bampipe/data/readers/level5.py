@@ -22,6 +22,7 @@ _NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f
 _NUMBERS |= {12: "i8", 13: "u8"}
 _STRUCT_CLASS = 2
 _NUMERIC_CLASSES = range(6, 16)
+_OPAQUE_CLASS = 17
 _COMPLEX = 0x0800
 _HEADER = 128
 _LARGEST_HEAD = 4096
@@ -176,6 +177,9 @@ class _Source:
     def matrix_head(self) -> tuple[str, tuple[int, ...], bool, int]:
         """Name and shape of the array, whether it holds real numbers, and its class."""
         _, flags = self.element(_LARGEST_HEAD)
+        if len(flags) == 8 and struct.unpack(self.order + "II", flags)[0] & 0xFF == _OPAQUE_CLASS:
+            _, name = self.element(_LARGEST_HEAD)  # an object of MATLAB, without extents
+            return name.decode("utf-8", "replace"), (), False, _OPAQUE_CLASS
         _, shape = self.element(_LARGEST_HEAD)
         _, name = self.element(_LARGEST_HEAD)
         if len(flags) != 8 or len(shape) % 4 or len(shape) < 8:

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from bampipe.data.readers import hdf5, level5
-from bampipe.data.readers.arrays import labels, pick, split_index
+from bampipe.data.readers.arrays import pick, recorded, split_index
 from bampipe.data.readers.trial import RawTrial, Wanted, aligned, check_columns, check_size
 from bampipe.errors import InputError
 
@@ -38,7 +38,7 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
 
 
 def columns(path: Path, name: str) -> dict[str, str]:
-    """Names of the variables that are vectors of numbers, or of their columns; no units.
+    """Names of the vectors of numbers that were recorded together, or of columns; no units.
 
     Raises:
         InputError: as :func:`read`.
@@ -47,7 +47,7 @@ def columns(path: Path, name: str) -> dict[str, str]:
         return hdf5.columns(path, name)
     with _faults_named(name):
         found = level5.variables(path)
-    return {label: "" for v in found if v.real for label in labels(v.name, v.shape)}
+    return dict.fromkeys(recorded({v.name: v.shape for v in found if v.real}), "")
 
 
 def _is_level_5(path: Path, name: str) -> bool:

@@ -90,15 +90,16 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
     return RawTrial(values, layout.first_line, notes, (*said, *layout.remarks), units)
 
 
-def columns(path: Path, name: str) -> dict[str, str]:
+def columns(path: Path, name: str, dialect: Dialect | None = None) -> dict[str, str]:
     """Names and units of the columns of numbers, or of moments (unit "datetime").
 
     Raises:
         InputError: as :func:`read`.
     """
-    with opened(path, Dialect(), name) as (stream, _):
+    dialect = dialect or Dialect()
+    with opened(path, dialect, name) as (stream, _):
         head = _head(stream, name)
-    layout = dialects.find_layout(head, (), Dialect(), name)
+    layout = dialects.find_layout(head, (), dialect, name)
     return {
         column: "datetime" if is_moment else layout.units.get(column, "")
         for column, is_moment in dialects.readable_columns(head, layout).items()

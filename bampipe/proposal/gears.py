@@ -1,0 +1,118 @@
+"""The reductions of a log on the side of the motors, by weight and inertia as drawn."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from bampipe.physics.device import Device
+from bampipe.physics.robot import Robot
+from bampipe.proposal.directions import Counting, find_counting
+from bampipe.proposal.drawing import (
+    FEW_ROWS,
+    MOST_ROWS,
+    Drive,
+    JointMotion,
+    fits,
+    hold,
+    left_by,
+    mean_left,
+    motion_along,
+    positions_of,
+    range_of,
+)
+from bampipe.proposal.joints import Group
+
+Array = NDArray[np.float64]
+
+BEYOND = 1.5
+"""Times its range that a joint must travel for the position to be another's."""
+_MARGINS = (1.05, 1.4, 2.0)
+"""Of its range over what a motor travels: how much of its range a joint is thought to use."""
+_DRAWN = 0.05
+"""Weight of the size of the drawn bodies beside the shape of the drives."""
+_SURE_LEFT = 0.02
+"""Of the drives' variance: what the right reductions leave at most where zeros are guessed, too."""
+_ALTERNATIONS = 2
+"""How often zeros are sought with the reductions found so far, and reductions with these zeros."""
+
+
+@dataclass(frozen=True)
+class Gears:
+    """Motors that turn joints.
+
+    Attributes:
+        ratio: turns of each motor for one of its joint, (n,).
+        counting: direction and zero of the joints.
+        drives: what they make of the drives.
+    """
+
+    ratio: Array
+    counting: Counting
+    drives: list[Drive]
+
+
+def find_gears(
+    device: Device, robot: Robot, positions: Group, drives: Group, t: Array
+) -> Gears | None:
+    """Turns of each motor for one of its joint, by positions on the side of the motors.
+
+    Weight goes with the sine of the joint's angle, so only the right reductions and zeros let the
+    drawing explain the drives. None where none do well.
+    """
+    q = positions_of(device, positions, t)
+    span = np.ptp(q, axis=0)
+    least = span / np.array([range_of(device, c.name) for c in device.coordinates])
+    moved, at_joint = least > BEYOND, np.ones(len(least))
+    few, many = (motion_along(q, t, rows) for rows in (FEW_ROWS, MOST_ROWS))
+    if not moved.any() or few is None or many is None:
+        return None
+    in_torque = device.force_unit == "N.m"
+
+    def held(motors: JointMotion, ratio: Array, counting: Counting) -> list[Drive]:
+        motion = motors.counted(counting.direction / ratio, counting.zero)
+        return hold(device, robot, motion, drives, at_joint)
+
+    def fitted(ratio: Array, counting: Counting) -> tuple[float, Array]:
+        """Cost and reductions of the fit that starts at ``ratio``."""
+
+        def misfit(x: Array) -> Array:
+            tried = at_joint.copy()
+            tried[moved] = np.exp(x)
+            judged = held(few, tried, counting)
+            left = np.sqrt([max(drive.left, 1e-12) for drive in judged])
+            if not in_torque:
+                return np.asarray(left)
+            # A torque of the motor is that of the joint over the reduction, as well as it is drawn.
+            size = np.array([max(abs(drive.share), 1e-9) for drive in judged])
+            return np.concatenate([left, _DRAWN * np.log(size[moved] * tried[moved])])
+
+        found = least_squares(misfit, np.log(ratio[moved]), diff_step=1e-3, max_nfev=40)
+        best = at_joint.copy()
+        best[moved] = np.exp(found.x)
+        return float(found.cost), best
+
+    def sound(ratio: Array, counting: Counting) -> Gears | None:
+        judged = held(many, ratio, counting)
+        # A gear that speeds up would take the joint further beyond its range than the log goes.
+        return Gears(ratio, counting, judged) if fits(judged) and ratio.min() >= 1.0 else None
+
+    starts = [np.where(moved, factor * least, 1.0) for factor in _MARGINS]
+    drawn = Counting.as_drawn(len(least))
+    ratio = min((fitted(start, drawn) for start in starts), key=lambda one: one[0])[1]
+    found = sound(ratio, drawn)
+    for start in starts if found is None else ():
+        ratio = start
+        for _ in range(_ALTERNATIONS):
+            motion = few.counted(1.0 / ratio, np.zeros(len(ratio)))
+            left = left_by(device, robot, motion, drives, at_joint)
+            counting = find_counting([c.unit == "rad" for c in device.coordinates], left)
+            ratio = fitted(ratio, counting)[1]
+            found = sound(ratio, counting)
+            # Wrong zeros with reductions to match them explain much; only the right ones all.
+            if found is not None and mean_left(found.drives) < _SURE_LEFT:
+                return found
+    return found if found is not None and not found.counting.changed else None
