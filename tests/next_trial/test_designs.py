@@ -19,7 +19,8 @@ from bampipe.next_trial.motion import (
     follow_roughly,
     stroke_path,
 )
-from bampipe.next_trial.precision import Precision
+from bampipe.next_trial.plan import TrialPlan, _sentence, _shortest
+from bampipe.next_trial.precision import Expected, Precision
 from bampipe.next_trial.primitives import (
     Envelope,
     Primitive,
@@ -414,7 +415,7 @@ def made_precision(
     information = np.diag([1.0 / formal**2, 1.0])
     return Precision(
         ("mass",), np.array([sd]), np.array([formal]), np.array([apart]), np.array([lasting]),
-        blocks, information, lambda m: m,
+        blocks, information, np.zeros(2), lambda m: m,
     )  # fmt: skip
 
 
@@ -462,6 +463,44 @@ def test_a_forecast_is_a_number_after_many_blocks_and_a_range_after_few():
         )
         assert forecast.is_sharp == is_sharp
         assert (" to " in forecast.number) != is_sharp
+
+
+def test_what_is_known_beforehand_does_not_grow_with_the_scatter_of_the_trials():
+    # Of two parameters one is known from trials that scatter ten times as much as they believe.
+    trials, weighed = np.diag([1e4, 1e-6]), np.array([0.0, 4.0])
+    information = trials + np.diag(weighed)
+    known = Precision(
+        ("coulomb", "mass"), np.array([0.1, 0.5]), 1.0 / np.sqrt(np.diag(information)),
+        np.zeros(2), np.zeros(2), 30, information, weighed, lambda m: m,
+    )  # fmt: skip
+    found = known.expect(trials, 60.0)
+    assert found.median == pytest.approx([0.1 / np.sqrt(2.0), 0.5], rel=0.05)
+    assert found.high[1] < 0.6
+
+
+def test_a_planned_trial_is_shortened_no_further_than_its_strokes_allow():
+    quick = Stroke(-0.5, 0.5, 2.0, 2.0)
+    slow = replace(quick, slow=0.5, fast=0.5)
+    one = Primitive({0: quick}, np.zeros(1), 20.0)
+    assert _shortest(one) == 5.0
+    assert _shortest(replace(one, strokes={0: slow})) == pytest.approx(3 * 1.875 / 0.5)
+    assert _shortest(replace(one, parts=2)) == 10.0
+
+
+@pytest.mark.parametrize(
+    ("is_enough", "is_full", "said"),
+    [
+        (True, False, "every uncertainty is expected to fall below what is asked."),
+        (False, True, "below what is asked; ask again once they are recorded."),
+        (False, False, "below what is asked; more trials like these add little."),
+    ],
+)
+def test_a_plan_says_whether_more_trials_would_help(is_enough, is_full, said):
+    design = Primitive({0: Stroke(-0.5, 0.5, 1.0, 1.0)}, np.zeros(1), 20.0, parts=2)
+    sd = Expected(np.ones(1), np.ones(1), np.ones(1))
+    sentence = _sentence(TrialPlan((design,), sd, {}, is_enough, is_full), 20.0, "uncertainty")
+    assert sentence.startswith("With 2 trials, 20 s in all, ")
+    assert sentence.endswith(said)
 
 
 @pytest.mark.parametrize(
