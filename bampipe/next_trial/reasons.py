@@ -31,6 +31,8 @@ def explain_proposal(
     unlimited: Sequence[str],
     lacking: Sequence[str],
     missing: Sequence[str] = (),
+    told: Sequence[str] = (),
+    unbraked: Sequence[str] = (),
 ) -> Reasons:
     """Say why a trial is proposed and what it is expected to give.
 
@@ -40,8 +42,12 @@ def explain_proposal(
         unlimited: axes of which the device states no range, so that nothing wider was tried.
         lacking: axes whose held-out error is above the noise floor.
         missing: effects that the diagnosis found and the model does not have.
+        told: effects that it leaves open, though trials like these tell them apart.
+        unbraked: effects of brakes that no trial at hand has on.
     """
-    why, expected = _explain(purpose, parameter, best, table, unlimited)
+    why, expected = _explain(purpose, parameter, best, table, unlimited, unbraked)
+    if best.brakes:
+        why += " Add it to session.toml as a viscous trial."
     if best.farther or best.faster:
         expected += _UNTRIED
     if best.parts > 1:
@@ -60,6 +66,12 @@ def explain_proposal(
             f" The error of {join_names(lacking, _SHOWN)} is above the noise floor: what the model"
             " lacks there counts as noise in these uncertainties."
         )
+    if told:
+        why = (
+            f"The diagnosis leaves {join_names(told)} open, and no trial decides that: were it just"
+            " one of them, these trials would tell which (chance of confusing them"
+            f" {_chance(0.0)}). More is missing than that. {why}"
+        )
     return Reasons(why, expected)
 
 
@@ -69,6 +81,7 @@ def _explain(
     best: Proposal,
     table: Mapping[str, Detectable],
     unlimited: Sequence[str],
+    unbraked: Sequence[str],
 ) -> tuple[str, str]:
     """Why, and what is expected as far as the model goes."""
     if purpose == "decision":
@@ -82,13 +95,20 @@ def _explain(
     if purpose == "sensitivity":
         shown = _detected(table)
         # Nothing tried shows more: then it is for the parameters.
-        return _unseen(table) + ("" if shown else f" This one {most}."), shown or narrowed
+        return _unseen(table, unbraked) + ("" if shown else f" This one {most}."), shown or narrowed
     return f"Of the motions tried, this one {most}.", narrowed
 
 
 def _decision(best: Proposal, unlimited: Sequence[str]) -> tuple[str, str]:
     pair = max(best.confusion, key=lambda pair: pair.weight * pair.before)
     before, after = _chance(pair.before), _chance(pair.after)
+    if pair.before < _LIMITS.confused:
+        return (
+            f"The diagnosis leaves {pair.between[0]} or {pair.between[1]} open, though these trials"
+            f" would tell them apart, were it just one of them: the chance of confusing them is"
+            f" {before}. More is missing than that.",
+            "No trial decides that.",
+        )
     expected = (
         f"The chance of confusing them is expected to fall from {before} to {after}."
         if pair.after < _LIMITS.lowered * pair.before
@@ -112,19 +132,23 @@ def _remedy(unlimited: Sequence[str]) -> str:
     )
 
 
-def _unseen(table: Mapping[str, Detectable]) -> str:
+def _unseen(table: Mapping[str, Detectable], unbraked: Sequence[str]) -> str:
     """Which effects the trials at hand would not have shown."""
-    hidden, never = _hidden(table), _never(table)
+    hidden = _hidden(table)
+    never = [name for name in _never(table) if name not in unbraked]
     if hidden:
         sizes = [_size(name, table[name]) for name in hidden]
         why = f"These trials would not have shown {join_names(sizes, _SHOWN)}."
     else:
-        every = "every other effect" if never else "every effect"
+        every = "every other effect" if never or unbraked else "every effect"
         why = f"These trials would have shown {every} of the library at its typical size."
     if never:
         one = "one effect stays" if len(never) == 1 else f"{len(never)} effects stay"
         names = join_names(never, _SHOWN)
         why += f" In trials like these {one} out of sight at any size ({names})."
+    if unbraked:
+        names = join_names(unbraked, _SHOWN)
+        why += f" What brakes do ({names}) shows in viscous trials, of which there are none."
     return why
 
 

@@ -14,7 +14,8 @@ _BY_DRIVE = "Check the way for obstacles: the model knows none."
 _BEFORE = (
     "Start the log, wait two seconds, then move.",
     "Better a little slower and a little less far than faster and farther.",
-    "Add each file to session.toml as a free trial, and run the session again.",
+    "Add each file to session.toml, as a free trial or, with brakes on, as a viscous one.",
+    "Then run the session again.",
 )
 _VERSIONS = ((1.0, 100), (0.9, 30), (0.9, 12), (0.8, 12), (0.8, 6), (0.7, 3))
 """Scale of the type, and how many parameters are listed: the first that fits on a page is printed.

@@ -78,7 +78,8 @@ class Proposal(Record):
     worth: float = Field(description="By which proposals are ranked; of nine versions in ten")
     information_gain: float = Field(description="Half the drop of the log determinant, nats")
     sd: dict[str, ExpectedSd] = Field(
-        default={}, description="By parameter; none where the model lacks something"
+        default={},
+        description="By parameter; none where the model lacks something or is not fitted to it",
     )
     confusion: tuple[ExpectedConfusion, ...] = ()
     farther: Names = Field(default=(), description="Axes moved farther than in the trials at hand")

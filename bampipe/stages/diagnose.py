@@ -268,14 +268,14 @@ def _with_suggestion(
         return result
     seen = Envelope.of_trials(trials.motions, system, p)
     rehearsal = Rehearsal(system, p, trials.sensors, trials.kinematics, seen, settings.seed)
-    fitted = [trials.motions[k] for k in trials.folds.fitted_trials]
-    at_hand = contest.sums(fitted)
+    at_hand = contest.sums(trials.weighed)
     tried = rank_designs(
         rehearsal,
         lambda motion: -contest.confusion(contest.contrasts(at_hand + contest.sums([motion]))),
         _SUGGESTED_S,
         seen.movable,
         with_rests=True,
+        with_brakes=True,
     )[0]
     now, sums = contest.contrasts(at_hand), [contest.sums([motion]) for motion in tried.usual]
     then = [contest.contrasts(at_hand + new, new) for new in sums]

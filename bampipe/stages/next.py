@@ -133,6 +133,11 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     if asked is not None and diagnosed is not None:
         values = {name: v for row in diagnosed.ranking for name, v in row.parameters.items()}
         contest = make_contest(trials, recipe, p, asked, values, floor)
+    at_hand = contest.sums(trials.weighed) if contest else None
+    told: tuple[str, ...] = ()
+    if purpose == "auto" and contest and at_hand and contest.tells_apart(at_hand):
+        told = tuple(rival.name for rival in contest.rivals if rival.name)
+        contest, at_hand = None, None
     if purpose == "decision" and contest is None:
         raise InputError(
             "the diagnosis left nothing to decide",
@@ -144,8 +149,8 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         progress(0.1, "what these trials would have shown of each effect")
         error, spread = _errors(diagnosed, evidence)
         limit = found.input_timing.limit
-        blindness = find_blindness(evidence, recipe, error, floor, spread, limit)
-    at_hand = contest.sums(fitted) if contest else None
+        weighed = trials.weighed
+        blindness = find_blindness(evidence, weighed, recipe, error, floor, spread, limit)
     forecast = Forecast(rehearsal, precision, contest, at_hand)
     worth = _worth(chosen, parameter, forecast, blindness)
     axes = seen.movable
@@ -155,12 +160,15 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     free = [motion for motion in fitted if not _is_braked(motion, model.device.brakes)]
     alike = imitate_trials(free, seen, config.seconds)
 
-    def rank(worth: Worth, with_rests: bool, first: float, least: float = -np.inf) -> list[Tried]:
+    def rank(worth: Worth, of_effects: bool, first: float, least: float = -np.inf) -> list[Tried]:
+        # No parameters are fitted to what has the brakes on, but for those of brakes.
+        with_brakes = of_effects or system.braked
+
         def report(fraction: float, message: str) -> None:
             progress(first + 0.3 * fraction, message)
 
         return rank_designs(
-            rehearsal, worth, config.seconds, axes, with_rests, report, alike, least
+            rehearsal, worth, config.seconds, axes, of_effects, with_brakes, report, alike, least
         )
 
     hidden = chosen == "sensitivity"
@@ -191,7 +199,10 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     unlimited = [axis for axis in system.coordinates if axis not in model.device.limits]
     lacking = _lacking(run, config.model, diagnosed)
     missing = diagnosed.selected if diagnosed is not None else ()
-    reasons = explain_proposal(chosen, parameter, best, table, unlimited, lacking, missing)
+    unbraked = blindness.of_brakes if blindness and not seen.field.any() else ()
+    reasons = explain_proposal(
+        chosen, parameter, best, table, unlimited, lacking, missing, told, unbraked
+    )
     result = NextResult(
         model=config.model,
         purpose=chosen,

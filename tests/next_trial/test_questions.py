@@ -7,6 +7,8 @@ from types import SimpleNamespace
 import pytest
 
 from bampipe.next_trial.questions import find_ambiguity
+from bampipe.trials.folds import Folds
+from bampipe.trials.measured import MeasuredTrials
 
 
 def made_diagnosis(
@@ -48,3 +50,9 @@ def test_who_stands_alone_leaves_nothing_to_ask():
     assert (
         find_ambiguity(made_diagnosis({"force_gain:x": 250.0}, {"force_gain:x": 1.0}, ())) is None
     )
+
+
+def test_effects_are_weighed_by_trials_with_brakes_on_too_but_by_none_held_out():
+    names = ("t01", "t02", "t03")
+    folds = Folds.of_trials(names, held_out=("t02",), fitted=("t01",))
+    assert MeasuredTrials(names, None, None, None, folds).weighed == ["t01", "t03"]
