@@ -159,17 +159,26 @@ def _size(name: str, entry: Detectable) -> str:
     return f"{name} below {entry.smallest:.2g} {entry.unit}".rstrip()
 
 
-def _detected(table: Mapping[str, Detectable]) -> str:
-    """Which of those effects the proposed trial would show; "" where it shows none."""
+def find_shown(table: Mapping[str, Detectable]) -> tuple[str, ...]:
+    """The effects, a few, that trials at hand do not show and the proposed one would."""
     hidden = _hidden(table)
     shown = [
-        f"{name} from {entry.with_proposal:.2g} {entry.unit} on".replace("  ", " ")
+        name
         for name, entry in table.items()
         if name in hidden
         and entry.with_proposal is not None
         and (entry.smallest is None or entry.with_proposal < _LIMITS.lowered * entry.smallest)
     ]
-    return f"It would show {join_names(shown[:_SHOWN])} with 90 % probability." if shown else ""
+    return tuple(shown[:_SHOWN])
+
+
+def _detected(table: Mapping[str, Detectable]) -> str:
+    """From which sizes on the proposed trial would show effects; "" where it shows none."""
+    shown = [
+        f"{name} from {table[name].with_proposal:.2g} {table[name].unit} on".replace("  ", " ")
+        for name in find_shown(table)
+    ]
+    return f"It would show {join_names(shown)} with 90 % probability." if shown else ""
 
 
 def _narrowed(parameter: str, best: Proposal) -> str:

@@ -152,4 +152,7 @@ class NextResult(Result):
     expected: str = Field(description="What it is expected to give")
     proposals: tuple[Proposal, ...] = Field(description="Best first")
     sensitivity: dict[str, Detectable] = Field(default={}, description="By effect of the library")
+    shows: Names = Field(
+        default=(), description="Effects that the first proposal is to show, and the trials not"
+    )
     plan: Plan | None = None

@@ -30,7 +30,7 @@ from bampipe.next_trial.questions import (
     find_blindness,
     make_contest,
 )
-from bampipe.next_trial.reasons import explain_proposal
+from bampipe.next_trial.reasons import explain_proposal, find_shown
 from bampipe.physics import compile_model
 from bampipe.progress import Progress
 from bampipe.results.diagnose import AxisVerdict, DiagnoseResult
@@ -213,6 +213,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         expected=reasons.expected,
         proposals=proposals,
         sensitivity=table,
+        shows=find_shown(table),
         plan=plan,
     )
     result.write(out)

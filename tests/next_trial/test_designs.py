@@ -32,7 +32,7 @@ from bampipe.next_trial.primitives import (
     list_primitives,
     vary_surroundings,
 )
-from bampipe.next_trial.reasons import explain_proposal
+from bampipe.next_trial.reasons import explain_proposal, find_shown
 from bampipe.next_trial.words import describe
 from bampipe.physics import Model, compile_model, registry
 from bampipe.results.forecast import compare_forecast, read_forecasts
@@ -590,6 +590,36 @@ def test_what_came_is_held_against_a_range(came, said):
     line = compare_forecast(proposed, identified, None)[0]
     assert line.startswith("`mass`: ± 0.002 to 0.01 kg was forecast with trial t2, ± 0.0")
     assert line.endswith(said)
+
+
+@pytest.mark.parametrize(
+    ("weighed", "selected", "said"),
+    [
+        (("t1",), ("drag:x",), "`bampipe diagnose RUN` says whether it is there."),
+        (("t1", "t2", "t3"), ("drag:x",), "it is there."),
+        (("t1", "t2", "t3"), (), "the diagnosis does not find it, so that it is hardly larger."),
+    ],
+)
+def test_what_a_trial_was_to_show_is_held_against_the_diagnosis_that_knows_it(
+    weighed, selected, said
+):
+    entry = Detectable(
+        parameter="drag.x.size", smallest=5.0, typical=1.0, unit="N", axis="x", with_proposal=0.9
+    )
+    sure = ExpectedSd(before=0.05, after=0.005, low=0.0045, high=0.006, unit="kg")
+    best = made_proposal(0.1).model_copy(update={"sd": {"mass": sure}, "confusion": ()})
+    proposed = NextResult(
+        model="base", purpose="sensitivity", trials=("t1",), sentence="Move yaw.", why="",
+        expected="", proposals=(best,), sensitivity={"drag:x": entry},
+        shows=find_shown({"drag:x": entry}),
+    )  # fmt: skip
+    identified = SimpleNamespace(
+        trials=("t1", "t2", "t3"), parameters={"mass": SimpleNamespace(sd=0.005)}
+    )
+    diagnosed = SimpleNamespace(trials=weighed, selected=selected, groups={})
+    first, second = compare_forecast(proposed, identified, diagnosed)
+    assert "was forecast with trials t2 and t3, ± 0.005 came" in first
+    assert second == f"drag:x was to show from 0.9 N on; {said}"
 
 
 def contest_of(odds: list[float], floor: float = 1.0) -> Contest:
