@@ -13,8 +13,8 @@ diagnosis is not right at once, be it undecided or mistaken, with what `bampipe 
 by itself. ``sensitivity`` hides each effect at the smallest strength that the session without it
 claims to show with 90 % probability, and counts those that a diagnosis finds. With ``--timid``, the
 motion is confined to where two effects look alike; ``--trials`` and ``--seconds`` say how much of
-it there is, ``--added`` how long the trial more is. Precision is asked of the worst-known parameter, or with
-``--of all`` of all together.
+it there is, ``--added`` how long the trial more is. Precision is asked of the worst-known
+parameter, or with ``--of all`` of all together.
 """
 
 from __future__ import annotations
