@@ -50,8 +50,13 @@ def find_ambiguity(found: DiagnoseResult) -> Ambiguity | None:
         ranked = {row.effect: row.score for row in found.ranking}
         alike = {name, *found.groups.get(name, ())}
         if len(known) > 1:
-            # Replays tell the others from it, however close their scores are.
-            scores = {o: score for o, score in scores.items() if o in known or o in alike}
+            # Replays tell the others from it, however close their scores are; but no replay is
+            # perfect, and one that scores better than what was found stays a rival.
+            scores = {
+                o: score
+                for o, score in scores.items()
+                if o in known or o in alike or score > scores[name]
+            }
         scores |= {other: ranked[other] for other in alike - {*scores} if other in ranked}
         if len(scores) < 2 or max(scores.values()) <= 0.0:
             continue

@@ -40,6 +40,14 @@ def test_what_replays_have_told_apart_is_asked_no_more():
     assert asked.odds == pytest.approx(odds)
 
 
+def test_who_scores_better_than_what_was_found_stays_a_rival_whatever_replays_say():
+    odds = {"force_gain:x": 0.67, "encoder_scale:yaw": 0.33}
+    better = SCORES | {"inertia_mismatch:yaw": 255.0}
+    asked = find_ambiguity(made_diagnosis(better, odds, ("encoder_scale:yaw",)))
+    assert asked is not None
+    assert set(asked.odds) == set(SCORES)
+
+
 def test_where_replays_tell_all_apart_those_that_come_close_stay_rivals():
     asked = find_ambiguity(made_diagnosis(SCORES, {"force_gain:x": 1.0}, ()))
     assert asked is not None
