@@ -30,7 +30,7 @@ def explain_proposal(
     table: Mapping[str, Detectable],
     unlimited: Sequence[str],
     lacking: Sequence[str],
-    missing: Sequence[str] = (),
+    missing: Sequence[str] | None = (),
     told: Sequence[str] = (),
     unbraked: Sequence[str] = (),
 ) -> Reasons:
@@ -41,7 +41,7 @@ def explain_proposal(
         best: the proposal; table: by effect, from which size on trials show it.
         unlimited: axes of which the device states no range, so that nothing wider was tried.
         lacking: axes whose held-out error is above the noise floor.
-        missing: effects that the diagnosis found and the model does not have.
+        missing: effects that the diagnosis found and the model does not have; None without one.
         told: effects that it leaves open, though trials like these tell them apart.
         unbraked: effects of brakes that no trial at hand has on.
     """
@@ -62,6 +62,11 @@ def explain_proposal(
         )
         expected += " These are the uncertainties of a model that lacks something."
     elif best.sd and lacking:
+        if missing is None:
+            why = (
+                f"The error of {join_names(lacking, _SHOWN)} is above the noise floor: ask first"
+                f" what the model lacks (`bampipe diagnose`). {why}"
+            )
         expected += (
             f" The error of {join_names(lacking, _SHOWN)} is above the noise floor: what the model"
             " lacks there counts as noise in these uncertainties."

@@ -198,7 +198,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         plan = record_plan(forecast, goal, plan_trials(forecast, tried, goal))
     unlimited = [axis for axis in system.coordinates if axis not in model.device.limits]
     lacking = _lacking(run, config.model, diagnosed)
-    missing = diagnosed.selected if diagnosed is not None else ()
+    missing = diagnosed.selected if diagnosed is not None else None
     unbraked = blindness.of_brakes if blindness and not seen.field.any() else ()
     reasons = explain_proposal(
         chosen, parameter, best, table, unlimited, lacking, missing, told, unbraked

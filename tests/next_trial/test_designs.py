@@ -397,6 +397,8 @@ def test_what_a_model_lacks_is_said_to_count_as_noise():
     assert reasons.why.startswith("By the diagnosis the model lacks lag:x: add that first")
     assert reasons.expected.endswith("of a model that lacks something.")
     assert "noise floor" not in reasons.expected
+    why = explain_proposal("precision", "", best, {}, (), ("yaw",), None).why
+    assert why.startswith("The error of yaw is above the noise floor: ask first what")
     said = explain_proposal("decision", "", made_proposal(0.01), {}, (), ("yaw",)).expected
     assert "noise floor" not in said
 
