@@ -139,7 +139,8 @@ def _remedy(unlimited: Sequence[str]) -> str:
 
 def _unseen(table: Mapping[str, Detectable], unbraked: Sequence[str]) -> str:
     """Which effects the trials at hand would not have shown."""
-    hidden = _hidden(table)
+    shown = find_shown(table)
+    hidden = [*shown, *(name for name in _hidden(table) if name not in shown)]
     never = [name for name in _never(table) if name not in unbraked]
     if hidden:
         sizes = [_size(name, table[name]) for name in hidden]

@@ -31,6 +31,7 @@ from bampipe.next_trial.questions import (
     make_contest,
 )
 from bampipe.next_trial.reasons import explain_proposal, find_shown
+from bampipe.next_trial.sensitivity import HOPELESS
 from bampipe.physics import compile_model
 from bampipe.progress import Progress
 from bampipe.results.diagnose import AxisVerdict, DiagnoseResult
@@ -67,8 +68,6 @@ _WATCHED = 12
 """Hidden effects that designs are tried for."""
 _LITTLE = 0.05
 """Sum of log strengths by which a trial for hidden effects must lower what goes unnoticed."""
-_HOPELESS = 100.0
-"""Of the typical strength: beyond, one unnoticed size is like another."""
 
 
 @checked_dataclass(frozen=True, config=STRICT)
@@ -320,7 +319,7 @@ def _worth(
         return lambda motion: -forecast.confusion_with(motion)
     if blindness is not None and blindness.hidden:
         watched = blindness.narrowed(blindness.hidden[:_WATCHED])
-        now = np.minimum([v.factor for v in watched.found], _HOPELESS)
+        now = np.minimum([v.factor for v in watched.found], HOPELESS)
 
         def shown(motion: Motion) -> float:
             then = np.clip(watched.factors_with([motion]), 1.0, now)
@@ -343,11 +342,11 @@ def _sensitivity(blindness: Blindness, best: Tried) -> dict[str, Detectable]:
     return {
         found.rival.name: Detectable(
             parameter=found.parameter.name,
-            smallest=found.factor * found.typical if np.isfinite(found.factor) else None,
+            smallest=found.factor * found.typical if found.factor < HOPELESS else None,
             typical=found.typical,
             unit=found.parameter.unit,
-            axis=axes[found.axis] if np.isfinite(found.factor) else "",
-            with_proposal=factor * found.typical if np.isfinite(factor) else None,
+            axis=axes[found.axis] if found.factor < HOPELESS else "",
+            with_proposal=factor * found.typical if factor < HOPELESS else None,
         )
         for found, factor in zip(blindness.found, after, strict=True)
     }

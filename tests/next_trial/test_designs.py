@@ -43,6 +43,7 @@ from bampipe.results.next import (
     NextResult,
     Proposal,
 )
+from bampipe.stages.next import _sensitivity
 from bampipe.trials.motion import Motion
 
 SEEN = Envelope(
@@ -425,6 +426,34 @@ def test_effects_of_brakes_are_said_to_need_viscous_trials():
     braked = best.model_copy(update={"brakes": 1.0})
     why = explain_proposal("sensitivity", "", braked, table, (), ()).why
     assert why.endswith("Add it to session.toml as a viscous trial.")
+
+
+def test_what_shows_at_no_size_that_a_machine_has_is_out_of_sight():
+    def seen(factor: float) -> SimpleNamespace:
+        parameter = SimpleNamespace(name="p", unit="A")
+        rival = SimpleNamespace(name=f"effect:{factor:g}")
+        return SimpleNamespace(rival=rival, parameter=parameter, typical=2.0, factor=factor, axis=0)
+
+    blindness = SimpleNamespace(
+        found=[seen(3.0), seen(1e5)],
+        contest=SimpleNamespace(system=SimpleNamespace(coordinates=("yaw",))),
+        factors_with=lambda motions: np.array([1.0, 99.0]),
+    )
+    near, far = _sensitivity(blindness, SimpleNamespace(usual=(None,))).values()
+    assert (near.smallest, near.with_proposal, near.axis) == (6.0, 2.0, "yaw")
+    assert (far.smallest, far.with_proposal, far.axis) == (None, 198.0, "")
+
+
+def test_what_the_trial_would_show_is_named_first():
+    def entry(smallest: float, then: float) -> Detectable:
+        return Detectable(
+            parameter="p", smallest=smallest, typical=1.0, unit="N", axis="x", with_proposal=then
+        )
+
+    table = {f"far:{k}": entry(50.0 + k, 50.0 + k) for k in range(3)} | {"drag:x": entry(3.0, 1.0)}
+    reasons = explain_proposal("sensitivity", "", made_proposal(0.1), table, (), ())
+    assert reasons.why.startswith("These trials would not have shown drag:x below 3 N, far:2")
+    assert reasons.expected.startswith("It would show drag:x from 1 N on")
 
 
 def test_rivals_that_the_trials_would_tell_apart_are_left_to_no_trial():
