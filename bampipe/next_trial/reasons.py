@@ -166,16 +166,16 @@ def _size(name: str, entry: Detectable) -> str:
 
 
 def find_shown(table: Mapping[str, Detectable]) -> tuple[str, ...]:
-    """The effects, a few, that trials at hand do not show and the proposed one would."""
+    """What trials at hand do not show and the proposed one would, the smallest first."""
     hidden = _hidden(table)
-    shown = [
-        name
+    sizes = {
+        name: entry.with_proposal / entry.typical
         for name, entry in table.items()
         if name in hidden
         and entry.with_proposal is not None
         and (entry.smallest is None or entry.with_proposal < _LIMITS.lowered * entry.smallest)
-    ]
-    return tuple(shown[:_SHOWN])
+    }
+    return tuple(sorted(sizes, key=lambda name: sizes[name]))
 
 
 def _detected(table: Mapping[str, Detectable]) -> str:
@@ -184,7 +184,8 @@ def _detected(table: Mapping[str, Detectable]) -> str:
         f"{name} from {table[name].with_proposal:.2g} {table[name].unit} on".replace("  ", " ")
         for name in find_shown(table)
     ]
-    return f"It would show {join_names(shown)} with 90 % probability." if shown else ""
+    text = f"It would show {join_names(shown, _SHOWN)} with 90 % probability."
+    return text if shown else ""
 
 
 def _narrowed(parameter: str, best: Proposal) -> str:

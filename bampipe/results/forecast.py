@@ -119,15 +119,29 @@ def compare_forecast(
 
 def _shown(proposed: NextResult, diagnosed: DiagnoseResult | None) -> Iterator[str]:
     """Say of the effects that a trial was to show whether they are there."""
-    for name in proposed.shows:
-        entry = proposed.sensitivity[name]
-        text = f"{name} was to show from {entry.with_proposal:.2g} {entry.unit}".rstrip() + " on"
-        if diagnosed is None:
-            yield f"{text}; `bampipe diagnose RUN` says whether it is there."
-        elif name in diagnosed.selected:
-            yield f"{text}; it is there."
-        else:
-            yield f"{text}; the diagnosis does not find it, so that it is hardly larger."
+    if not proposed.shows:
+        return
+
+    def promised(names: Sequence[str], one: str, more: str) -> str:
+        table = proposed.sensitivity
+        sizes = [f"{n} from {table[n].with_proposal:.2g} {table[n].unit}".rstrip() for n in names]
+        end = more if len(names) > 1 else one
+        return f"it was to show {join_names(sizes, _SHOWN)} on; {end}"
+
+    if diagnosed is None:
+        ask = "`bampipe diagnose RUN` says whether"
+        yield promised(proposed.shows, f"{ask} it is there.", f"{ask} they are there.")
+        return
+    there = [name for name in proposed.shows if name in diagnosed.selected]
+    absent = [name for name in proposed.shows if name not in there]
+    if there:
+        yield promised(there, "it is there.", "they are there.")
+    if absent:
+        yield promised(
+            absent,
+            "the diagnosis does not find it, so that it is hardly larger.",
+            "the diagnosis does not find them, so that they are hardly larger.",
+        )
 
 
 def _verdict(forecast: ExpectedSd, came: float) -> str:

@@ -650,7 +650,7 @@ def test_what_a_trial_was_to_show_is_held_against_the_diagnosis_that_knows_it(
     diagnosed = SimpleNamespace(trials=weighed, selected=selected, groups={})
     first, second = compare_forecast(proposed, identified, diagnosed)
     assert "was forecast with trials t2 and t3, ± 0.005 came" in first
-    assert second == f"drag:x was to show from 0.9 N on; {said}"
+    assert second == f"it was to show drag:x from 0.9 N on; {said}"
 
 
 def contest_of(odds: list[float], floor: float = 1.0) -> Contest:
