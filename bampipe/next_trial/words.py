@@ -22,6 +22,8 @@ _AGAIN = 1.2
 """Of the length of a trial that is imitated: what lasts longer goes through it more than once."""
 _SLOW, _FAST = 0.12, 0.45
 """Of the speed that the trials show: where a motion is called slow, and where fast."""
+_LONG_S = 2.0
+"""Nobody calls a stroke fast that takes as long."""
 
 
 def describe(design: Primitive, seen: Envelope, device: Device) -> str:
@@ -131,7 +133,7 @@ def _pace(stroke: Stroke, seen: Envelope, axis: int) -> str:
     share = np.sqrt(stroke.slow * stroke.fast) / float(seen.speed[axis])
     if share < _SLOW:
         return "slowly"
-    return "fast" if share > _FAST else "at an easy pace"
+    return "fast" if share > _FAST and stroke.typical_s < _LONG_S else "at an easy pace"
 
 
 def _ends(stroke: Stroke, unit: str) -> str:

@@ -323,6 +323,13 @@ def test_a_sentence_says_where_how_fast_and_how_long():
     assert " mm" in said
 
 
+def test_no_stroke_is_called_fast_that_takes_long():
+    timid = replace(SEEN, speed=np.array([0.3, 1.6, 0.9]), usual=np.zeros(3))
+    for half, said in ((0.1, "Move yaw fast back"), (0.5, "Move yaw at an easy pace back")):
+        design = Primitive({0: Stroke(-half, half, 0.2, 0.3)}, np.zeros(3), 20.0)
+        assert describe(design, timid, registry.device("bam")).startswith(said)
+
+
 def test_a_zero_has_no_sign():
     said = describe(
         Primitive({0: Stroke(-0.002, 0.4, 0.5, 1.0)}, SEEN.usual, 20.0),
