@@ -1,12 +1,15 @@
 """What the best motion could give beside free motion of the same length, by the Cramér-Rao bound.
 
     python benchmarks/best_designs.py --machine bam --seeds 8701 8702
+    python benchmarks/best_designs.py --timid bias-gain --seeds 8701 8701
+    python benchmarks/best_designs.py --run runs/2026-10-03_s01
 
-A session of usual motion is recorded in a simulator that shares no code with bampipe, and
-identified. Printed are standard deviations by one mean trial at hand over those by designs of its
-length that are followed exactly: the designs of `bampipe next`; the same and others up to the
-highest speed and acceleration of the session over all of the range that the device states, with
-other axes elsewhere; and the best mixture of these, for each parameter alone and for all together.
+A session of usual motion, or with ``--timid`` of confined motion, is recorded in a simulator that
+shares no code with bampipe, and identified; ``--run`` takes one that has been. Printed are standard
+deviations by one mean trial at hand over those by designs of its length that are followed exactly:
+the designs of `bampipe next`; the same and others up to the highest speed and acceleration of the
+session over all of the range that the device states, with other axes elsewhere; and the best
+mixture of these, for each parameter alone and for all together.
 """
 
 from __future__ import annotations
@@ -19,7 +22,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from next_trials import USUAL, run_of
+from next_trials import TIMID, USUAL, run_of
 from numpy.typing import NDArray
 
 from bampipe.data.run_folder import RunFolder
@@ -99,7 +102,7 @@ class Session:
         return np.einsum("i,ipq->pq", shares, designs)
 
 
-def report(machine: str, seed: int, session: Session) -> None:
+def report(title: str, session: Session) -> None:
     """Print standard deviations by a mean trial at hand over those by designs."""
     seconds = float(np.mean([m.t[-1] - m.t[0] for m in session.motions]))
     free = np.mean(
@@ -128,14 +131,14 @@ def report(machine: str, seed: int, session: Session) -> None:
         other for k in dict.fromkeys(narrow.ravel()) for other in vary_surroundings(seen, every[k])
     ]
     by_all = np.concatenate([by_all, session.of_designs(varied)])
-    for title, designs in (("of next", by_own), ("any", by_all)):
+    for which, designs in (("of next", by_own), ("any", by_all)):
         single = at_hand / np.array([session.sd(one) for one in designs])
         alone = [
             at_hand[k] / session.sd(session.best_mixture(designs, k))[k]
             for k in range(len(session.names))
         ]
         together = at_hand / session.sd(session.best_mixture(designs, None))
-        print(f"{machine} {seed}, {len(designs)} designs ({title}):")
+        print(f"{title}, {len(designs)} designs ({which}):")
         for k, name in enumerate(session.names):
             print(
                 f"  {name}: best design {single[:, k].max():.2f}, best mixture {alone[k]:.2f},"
@@ -151,12 +154,22 @@ def report(machine: str, seed: int, session: Session) -> None:
 def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--machine", choices=sorted(USUAL), default="bam")
+    parser.add_argument(
+        "--timid", choices=sorted(TIMID), help="confined motion, by pair of effects"
+    )
+    parser.add_argument("--run", type=Path, help="of a session that has been identified")
     parser.add_argument("--seeds", type=int, nargs=2, default=(8701, 8701), metavar=("A", "B"))
     given = parser.parse_args()
+    if given.run:
+        report(given.run.name, Session(given.run))
+        return 0
+    machine, conditions = given.machine, USUAL[given.machine]
+    if given.timid:
+        machine, _, conditions = TIMID[given.timid]
     for seed in range(given.seeds[0], given.seeds[1] + 1):
         with tempfile.TemporaryDirectory() as name:
-            run, _ = run_of(Path(name) / "now", given.machine, seed, {}, USUAL[given.machine])
-            report(given.machine, seed, Session(run.root))
+            run, _ = run_of(Path(name) / "now", machine, seed, {}, conditions)
+            report(f"{machine} {seed}", Session(run.root))
     return 0
 
 

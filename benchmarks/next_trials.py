@@ -4,15 +4,17 @@
     python benchmarks/next_trials.py precision --timid drag-thinning --trials 4 --seconds 15
     python benchmarks/next_trials.py decision --seeds 5101 5110
     python benchmarks/next_trials.py decision --timid lag-delay --seeds 5201 5202
+    python benchmarks/next_trials.py sensitivity --machine joint --seeds 9811 9813
 
 Sessions come from simulators that share no code with bampipe. A proposal is followed there by
 somebody who follows well, and by somebody who covers half the range at twice the speed; beside it,
 one more trial of the motion at hand of the same length is recorded. ``decision`` does so wherever a
 diagnosis is not right at once, be it undecided or mistaken, with what `bampipe next` proposes then
-by itself. With ``--timid``, that motion
-is confined to where two effects look alike; ``--trials`` and ``--seconds`` say how much of it there
-is, ``--added`` how long the trial more is. Precision is asked of the worst-known parameter, or with
-``--of all`` of all together.
+by itself. ``sensitivity`` hides each effect at the smallest strength that the session without it
+claims to show with 90 % probability, and counts those that a diagnosis finds. With ``--timid``, the
+motion is confined to where two effects look alike; ``--trials`` and ``--seconds`` say how much of
+it there is, ``--added`` how long the trial more is. Precision is asked of the worst-known
+parameter, or with ``--of all`` of all together.
 """
 
 from __future__ import annotations
@@ -53,6 +55,22 @@ HIDDEN = (
     ("axis", "actuator_delay"), ("axis", "presliding:carriage"),
     ("bam", "force_bias:x"), ("bam", "return_spring:yaw"), ("bam", "base_tilt"),
 )  # fmt: skip
+
+
+BRIEF = {
+    "joint": Conditions(creep=True, trials=3, seconds=8.0),
+    "bam": Conditions(creep=True, trials=3, seconds=8.0, rate_hz=250.0),
+    "axis": Conditions(creep=True, trials=3, seconds=5.0),
+}
+SMALL = {
+    "joint": (
+        "quadratic_drag:joint", "actuator_delay", "actuator_lag:current",
+        "load_dependent_friction:joint", "asymmetric_coulomb:joint", "stribeck:joint",
+    ),
+    "bam": ("return_spring:yaw", "quadratic_drag:pitch", "stribeck:yaw"),
+    "axis": ("quadratic_drag:carriage", "actuator_delay", "stribeck:carriage"),
+}  # fmt: skip
+"""Effects by machine whose strength is one number there and here."""
 
 
 def _timid(seconds: float, coarse: float = 1.0, **moves: tuple[float, float, float]) -> Conditions:
@@ -298,9 +316,40 @@ def measure_decision(hidden: Sequence[Hidden], seeds: range, added_s: float | No
             print(f"  {kind}: {dict(count)}")
 
 
+def measure_sensitivity(machine: str, brief: Conditions, seeds: range) -> None:
+    """Print what a diagnosis says of effects as small as a session claims to show.
+
+    Args:
+        machine, brief, seeds: of the sessions.
+    """
+    told: Counter[str] = Counter()
+    by_effect: dict[str, Counter[str]] = {}
+    for seed in seeds:
+        with tempfile.TemporaryDirectory() as name:
+            root = Path(name)
+            run, _ = run_of(root / "clean", machine, seed, {}, brief)
+            print(f"{machine} {seed}: without any, {verdict(run, '')}", flush=True)
+            table = propose(run, purpose="sensitivity")[0].sensitivity
+            for k, effect in enumerate(SMALL[machine]):
+                entry = table.get(effect)
+                if entry is None or entry.smallest is None:
+                    continue
+                full = independent.record(machine, root / f"full{k}", seed, {effect: 1.0}, brief)
+                strength = entry.smallest / abs(full["parameters"][entry.parameter])
+                hidden, _ = run_of(root / f"{k}", machine, seed, {effect: strength}, brief)
+                said = verdict(hidden, effect)
+                print(f"  {effect} at {entry.smallest:.3g} {entry.unit}: {said}", flush=True)
+                kind = said.partition(" ")[0]
+                told[kind] += 1
+                by_effect.setdefault(effect, Counter())[kind] += 1
+    for effect, count in by_effect.items():
+        print(f"{effect}: {dict(count)}")
+    print(f"all: {dict(told)}")
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("what", choices=("precision", "decision"))
+    parser.add_argument("what", choices=("precision", "decision", "sensitivity"))
     parser.add_argument("--machine", choices=sorted(USUAL), default="joint")
     parser.add_argument("--seeds", type=int, nargs=2, default=(5001, 5004), metavar=("A", "B"))
     parser.add_argument(
@@ -325,6 +374,8 @@ def main() -> int:
             machine, timid = given.machine, USUAL[given.machine]
         added_s = given.added or timid.seconds
         measure_precision(machine, timid, seeds, added_s, given.of == "all")
+    elif given.what == "sensitivity":
+        measure_sensitivity(given.machine, BRIEF[given.machine], seeds)
     elif given.timid:
         hidden = [Hidden(machine, effect, timid) for effect in either]
         measure_decision(hidden, seeds, given.added)

@@ -23,8 +23,10 @@ from bampipe.errors import InputError
 from bampipe.results.compare import CompareResult
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.draft import DraftResult
+from bampipe.results.identify import IdentifyResult
 from bampipe.results.ingest import IngestResult
 from bampipe.results.next import NextResult
+from bampipe.results.validate import ValidateResult
 from bampipe.run.events import Event
 from bampipe.run.pipeline import load
 from bampipe.run.status import StepStatus
@@ -573,6 +575,21 @@ def test_what_a_diagnosis_found_comes_before_a_trial_for_the_parameters(ingested
     assert after_proposal(ingested, "base", "s01") == command.replace("RUN", "s01")
     write_result(ingested, NextResult, purpose="decision")
     assert after_proposal(ingested, "base", "s01").startswith(recorded)
+
+
+def test_a_diagnosis_is_asked_for_where_none_is_or_none_knows_the_new_trial(
+    ingested: Path,
+) -> None:
+    diagnose = "bampipe diagnose s01"
+    write_result(ingested, NextResult, purpose="precision")
+    write_result(ingested, ValidateResult, axes={"yaw": {"standing": "above_floor"}})
+    assert after_proposal(ingested, "base", "s01") == diagnose
+    axes, command = {"yaw": {"verdict": "undecided"}}, "bampipe next RUN --model base"
+    write_result(ingested, DiagnoseResult, axes=axes, trials=("t01",), next=command)
+    write_result(ingested, IdentifyResult, trials=("t01",))
+    assert after_run(ingested, "base", "s01") == command.replace("RUN", "s01")
+    write_result(ingested, IdentifyResult, trials=("t01", "t02"))
+    assert after_run(ingested, "base", "s01") == diagnose
 
 
 def test_what_has_been_drafted_is_not_asked_for_again(ingested: Path) -> None:

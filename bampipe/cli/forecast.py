@@ -8,12 +8,11 @@ from bampipe.cli import show
 from bampipe.data.run_folder import RunFolder
 
 
-def say_what_came(root: Path, model: str, is_diagnosed: bool) -> None:
+def say_what_came(root: Path, model: str) -> None:
     """Print forecasts beside what came, where trials are there that the proposals did not know.
 
     Args:
         root: the run folder; model: that counts.
-        is_diagnosed: whether its diagnosis has been made with them.
     """
     from bampipe.results.diagnose import DiagnoseResult
     from bampipe.results.forecast import compare_forecasts, read_forecasts
@@ -23,6 +22,7 @@ def say_what_came(root: Path, model: str, is_diagnosed: bool) -> None:
     forecasts = read_forecasts(root, model)
     if not forecasts or not run.exists(IdentifyResult.file(model)):
         return
+    is_diagnosed = run.exists(DiagnoseResult.file(model))
     diagnosed = run.read(DiagnoseResult, model) if is_diagnosed else None
     for line in compare_forecasts(forecasts, run.read(IdentifyResult, model), diagnosed):
         show.say(f"forecast: {line.replace('RUN', root.name)}")

@@ -49,7 +49,7 @@ def diagnose(
     chosen = models.choose_model(root, model)
     one_stage("diagnose", root, options, model=chosen)
     if not options.json:
-        say_what_came(root, chosen, is_diagnosed=True)
+        say_what_came(root, chosen)
     _advise_next(RunFolder(root).read(DiagnoseResult, chosen).next, root, options)
 
 

@@ -15,22 +15,42 @@ def after_run(root: Path, model: str, name: str) -> str:
     """
     from bampipe.results.diagnose import DiagnoseResult
     from bampipe.results.setup import SetupResult
-    from bampipe.results.validate import ValidateResult
 
     run = RunFolder(root)
     if run.exists(SetupResult.FILE) and run.read(SetupResult).mistakes:
         return "correct the session file as the first line says, and run it again"
+    if _has_new_trials(run, model):
+        return f"bampipe diagnose {name}{run.model_option(model)}"
     if run.exists(DiagnoseResult.file(model)):
         found = run.read(DiagnoseResult, model)
         if any(axis.verdict != "nothing_missing" for axis in found.axes.values()):
             return _after_diagnosis(run, model, found.next).replace("RUN", name)
-    elif run.exists(ValidateResult.file(model)):
-        errors = run.read(ValidateResult, model).axes.values()
-        if any(error.standing == "above_floor" for error in errors):
-            return f"bampipe diagnose {name}{run.model_option(model)}"
+    elif _is_above_floor(run, model):
+        return f"bampipe diagnose {name}{run.model_option(model)}"
     if run.exists("report/report.pdf"):
         return f"open {root / 'report' / 'report.pdf'}"
     return f"bampipe status {name}"
+
+
+def _has_new_trials(run: RunFolder, model: str) -> bool:
+    """Whether the last diagnosis does not know all the trials that the model is fitted to."""
+    from bampipe.results.diagnose import DiagnoseResult
+    from bampipe.results.identify import IdentifyResult
+
+    if not all(run.exists(kind.file(model)) for kind in (DiagnoseResult, IdentifyResult)):
+        return False
+    weighed = run.read(DiagnoseResult, model).trials
+    return bool(weighed) and not set(run.read(IdentifyResult, model).trials) <= set(weighed)
+
+
+def _is_above_floor(run: RunFolder, model: str) -> bool:
+    """Whether an axis is known to have an error above its noise floor."""
+    from bampipe.results.validate import ValidateResult
+
+    if not run.exists(ValidateResult.file(model)):
+        return False
+    errors = run.read(ValidateResult, model).axes.values()
+    return any(error.standing == "above_floor" for error in errors)
 
 
 def after_loop(root: Path, model: str, name: str) -> str:
@@ -62,6 +82,8 @@ def after_proposal(root: Path, model: str, name: str) -> str:
         found = run.read(DiagnoseResult, model)
         if found.selected:
             return _after_diagnosis(run, model, found.next).replace("RUN", name)
+    elif not decides and _is_above_floor(run, model):
+        return f"bampipe diagnose {name}{run.model_option(model)}"
     return "record that trial, add it to session.toml, and run the session again"
 
 

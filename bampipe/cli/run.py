@@ -143,9 +143,7 @@ def run(
     _report_runs(outcomes, several, json)
     refresh(runs, several, quiet or json)
     if not several and not json:
-        made = {step.step for step in outcomes[0].steps}
-        one = outcomes[0].model
-        say_what_came(outcomes[0].root, one, f"diagnose:{one}" in made)
+        say_what_came(outcomes[0].root, outcomes[0].model)
     if not several:
         name = places.next_to(requests[0].root, runs)
         advise(quiet, json, after_run(outcomes[0].root, outcomes[0].model, name))

@@ -154,7 +154,7 @@ def next_(
     more: dict[str, object] = {"sd": _share(sd)} if sd else {}
     if not options.list_settings and not options.json:
         # A new proposal closes those that a recorded trial has followed: say first what came.
-        say_what_came(places.find_run(run, options.runs), chosen, is_diagnosed=False)
+        say_what_came(places.find_run(run, options.runs), chosen)
     plain_stage("next", run, options, chosen, purpose=purpose, seconds=seconds, plan=plan, **more)
     if plan and not (options.json or options.quiet or options.list_settings):
         show.say(f"sheet: {places.find_run(run, options.runs)}/models/{chosen}/protocol.pdf")

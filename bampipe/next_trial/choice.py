@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -67,6 +67,7 @@ def rank_designs(
     seconds: float,
     axes: Sequence[int],
     with_rests: bool,
+    with_brakes: bool,
     progress: Callable[[float, str], None] = lambda fraction, message: None,
     others: Sequence[Primitive] = (),
     least: float = -np.inf,
@@ -76,7 +77,7 @@ def rank_designs(
     What is best when it is followed exactly may be worth little to somebody hasty, so that the
     finalists are those that are good both ways. One of them at least stays within what the trials
     at hand have shown. ``others`` are tried beside these primitives. Nothing is returned where none
-    is worth ``least`` when it is followed exactly.
+    is worth ``least`` when it is followed exactly. ``with_brakes``, they may be on.
     """
 
     def try_design(design: Primitive) -> float:
@@ -84,6 +85,10 @@ def rank_designs(
 
     def follow_hastily(value: float, design: Primitive) -> float:
         return _robust([value, worth(rehearsal.record(design, HASTY))])
+
+    def surroundings(design: Primitive) -> Iterator[Primitive]:
+        every = vary_surroundings(rehearsal.seen, design)
+        return (other for other in every if with_brakes or not other.field)
 
     designs, is_quick = _list_designs(rehearsal, seconds, axes, with_rests, others)
     finalists = _FINALISTS if is_quick else _OF_FEW
@@ -96,7 +101,7 @@ def rank_designs(
         varied = (
             try_design(other)
             for _, design in exact[: _VARIED * is_quick]
-            for other in vary_surroundings(rehearsal.seen, design)
+            for other in surroundings(design)
         )
         if all(value < least for value in varied):
             return []
@@ -109,7 +114,7 @@ def rank_designs(
     best.sort(key=lambda pair: -pair[0])
     near = next((d for _, d in best if not any(find_beyond(d, rehearsal.seen))), None)
     for _, design in best[: _VARIED * is_quick]:
-        for other in vary_surroundings(rehearsal.seen, design):
+        for other in surroundings(design):
             best.append((follow_hastily(try_design(other), other), other))
     best.sort(key=lambda pair: -pair[0])
     chosen = [design for _, design in best[:finalists]]

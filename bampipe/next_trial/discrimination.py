@@ -243,6 +243,11 @@ class Contest:
         total = sum(products) or 1.0
         return {pair: product / total for pair, product in zip(pairs, products, strict=True)}
 
+    def tells_apart(self, total: Sums) -> bool:
+        """Whether trials distinguish every pair of rivals, were one of them all that is missing."""
+        limit = Settings().confused
+        return all(found.confusion < limit for found in self.contrasts(total).values())
+
     def confusion(self, contrasts: Mapping[tuple[int, int], Contrast]) -> float:
         """Chance of confusing two rivals, over all pairs."""
         weights = self.weights()

@@ -45,12 +45,25 @@ class Forecast:
             self.contest.contrasts(self.at_hand + self.contest.sums([motion]))
         )
 
+    def added_by(self, tried: Tried) -> list[Array]:
+        """The information (m, m) that each usual version of a design adds on the parameters.
+
+        None on a model to which the trial is not fitted.
+        """
+        if self.is_fitted_to(tried.design):
+            return [self.precision.of_motion(motion) for motion in tried.usual]
+        return [np.zeros_like(self.precision.information)] * len(tried.usual)
+
+    def is_fitted_to(self, design: Primitive) -> bool:
+        """Whether the model is fitted to such a trial: with brakes on, if it has their effects."""
+        return self.rehearsal.system.braked or not design.field
+
     def proposal(self, tried: Tried) -> Proposal:
         """The record of a design that has been tried."""
         system, design = self.rehearsal.system, tried.design
         device = system.model.device
         axes = device.coordinates
-        added = [self.precision.of_motion(motion) for motion in tried.usual]
+        added = self.added_by(tried)
         held = [i for i in range(len(axes)) if i not in design.strokes and not design.example]
         farther, faster = (
             tuple(axes[i].name for i in found) for found in find_beyond(design, self.rehearsal.seen)
@@ -67,7 +80,9 @@ class Forecast:
             worth=tried.worth,
             information_gain=float(np.median([self.precision.gain(one) for one in added])),
             # Of a model that lacks something, uncertainties are not worth a forecast.
-            sd={} if self.contest else self._sd(added, design.seconds),
+            sd=self._sd(added, design.seconds)
+            if self.contest is None and self.is_fitted_to(design)
+            else {},
             confusion=self._confusion(tried.usual),
             farther=farther,
             faster=faster,

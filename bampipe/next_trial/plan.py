@@ -12,17 +12,19 @@ from bampipe.next_trial.choice import Tried
 from bampipe.next_trial.discrimination import Sums
 from bampipe.next_trial.forecast import NOTHING, Forecast, describe_moves
 from bampipe.next_trial.precision import Expected
-from bampipe.next_trial.primitives import Primitive
+from bampipe.next_trial.primitives import FEWEST_STROKES, Primitive
 from bampipe.next_trial.words import describe
 from bampipe.results.next import Plan, PlannedConfusion, PlannedSd, PlannedTrial
 
 Array = NDArray[np.float64]
 
-_MOST_TRIALS = 8
+_MOST_DESIGNS = 8
+"""In a plan: what more of them would do is better asked once these are there."""
 _WORTHWHILE = 0.01
 """Fall of the distance to the goal, in nats, below which a further trial is not worth recording."""
 _SHORTER = 0.5
 _SHORTEST_S = 5.0
+"""Of each trial; strokes also take the time of some of them."""
 
 
 @dataclass(frozen=True)
@@ -65,12 +67,14 @@ class TrialPlan:
         sd: standard deviations expected in the end.
         confusion: chance of confusing each pair of rivals in the end.
         is_enough: whether the goal is reached.
+        is_full: whether more trials would bring it nearer, and there are only too many already.
     """
 
     designs: tuple[Primitive, ...]
     sd: Expected
     confusion: dict[tuple[int, int], float]
     is_enough: bool
+    is_full: bool
 
 
 def plan_trials(forecast: Forecast, tried: Sequence[Tried], goal: Goal) -> TrialPlan:
@@ -81,64 +85,88 @@ def plan_trials(forecast: Forecast, tried: Sequence[Tried], goal: Goal) -> Trial
     """
     options = [_option(forecast, one) for one in tried]
     chosen: list[_Option] = []
-    left = _distance(forecast, chosen, goal)
-    while left > 0.0 and len(chosen) < _MOST_TRIALS:
-        distances = [_distance(forecast, [*chosen, option], goal) for option in options]
+    outcome, is_full = _at_hand(forecast), False
+    is_enough = _distance(outcome, goal) <= 0.0
+    # A published uncertainty may be small by luck: what a trial adds is held against what the
+    # trials at hand would be expected to give another time.
+    left = _distance(_outcome(forecast, chosen), goal)
+    while not (is_enough or is_full):
+        distances = [_distance(_outcome(forecast, [*chosen, one]), goal) for one in options]
         best = int(np.argmin(distances))
-        if distances[best] > left - _WORTHWHILE:
+        if 0.0 < distances[best] and distances[best] > left - _WORTHWHILE:
             break
         chosen, left = [*chosen, options[best]], distances[best]
-    if left <= 0.0:
+        is_enough = left <= 0.0
+        is_full = not is_enough and len(chosen) == _MOST_DESIGNS
+    if is_enough:
         chosen = _trimmed(forecast, chosen, goal)
-    sd, confusion = _outcome(forecast, chosen)
-    return TrialPlan(tuple(one.design for one in chosen), sd, confusion, left <= 0.0)
+    if chosen:
+        outcome = _outcome(forecast, chosen)
+    return TrialPlan(tuple(one.design for one in chosen), *outcome, is_enough, is_full)
 
 
 def _trimmed(forecast: Forecast, chosen: list[_Option], goal: Goal) -> list[_Option]:
     """The same without trials, or with shorter ones, as long as the goal stays reached."""
     for k in range(len(chosen) - 1, -1, -1):
         fewer = [*chosen[:k], *chosen[k + 1 :]]
-        if _distance(forecast, fewer, goal) <= 0.0:
+        if fewer and _distance(_outcome(forecast, fewer), goal) <= 0.0:
             chosen = fewer
             continue
-        while (seconds := _SHORTER * chosen[k].design.seconds) >= _SHORTEST_S:
+        while (seconds := _SHORTER * chosen[k].design.seconds) >= _shortest(chosen[k].design):
             shorter = [*chosen[:k], chosen[k].lasting(seconds), *chosen[k + 1 :]]
-            if _distance(forecast, shorter, goal) > 0.0:
+            if _distance(_outcome(forecast, shorter), goal) > 0.0:
                 break
             chosen = shorter
     return chosen
 
 
+def _shortest(design: Primitive) -> float:
+    """How long a design takes at least, s: what it adds is in proportion only from there on."""
+    stroke_s = max((stroke.typical_s for stroke in design.strokes.values()), default=0.0)
+    return design.parts * max(_SHORTEST_S, FEWEST_STROKES * stroke_s)
+
+
 def _option(forecast: Forecast, tried: Tried) -> _Option:
     """A design by the version whose information is the median one."""
-    added = [forecast.precision.of_motion(motion) for motion in tried.usual]
+    added = forecast.added_by(tried)
     order = np.argsort([forecast.precision.gain(one) for one in added])
     middle = int(order[(len(order) - 1) // 2])
     sums = forecast.contest.sums([tried.usual[middle]]) if forecast.contest else None
     return _Option(tried.design, added[middle], sums)
 
 
-def _outcome(
-    forecast: Forecast, chosen: Sequence[_Option]
-) -> tuple[Expected, dict[tuple[int, int], float]]:
-    """Standard deviations and chances of confusion, with ``chosen`` trials recorded."""
-    precision, contest, sums = forecast.precision, forecast.contest, forecast.at_hand
-    added = np.zeros_like(precision.information)
+_Outcome = tuple[Expected, dict[tuple[int, int], float]]
+"""Standard deviations, and the chance of confusing each pair of rivals."""
+
+
+def _at_hand(forecast: Forecast) -> _Outcome:
+    """What the trials at hand give, as published."""
+    now = forecast.precision.sd
+    return Expected(now, now, now), _confusion(forecast, ())
+
+
+def _outcome(forecast: Forecast, chosen: Sequence[_Option]) -> _Outcome:
+    """What is expected with ``chosen`` trials recorded."""
+    added = np.zeros_like(forecast.precision.information)
     for one in chosen:
         added = added + one.information
-        if sums is not None and one.sums is not None:
-            sums = sums + one.sums
     seconds = sum(one.design.seconds for one in chosen)
-    now = precision.sd
-    sd = precision.expect(added, seconds) if chosen else Expected(now, now, now)
+    return forecast.precision.expect(added, seconds), _confusion(forecast, chosen)
+
+
+def _confusion(forecast: Forecast, chosen: Sequence[_Option]) -> dict[tuple[int, int], float]:
+    contest, sums = forecast.contest, forecast.at_hand
     if contest is None or sums is None:
-        return sd, {}
-    return sd, {pair: found.confusion for pair, found in contest.contrasts(sums).items()}
+        return {}
+    for one in chosen:
+        if one.sums is not None:
+            sums = sums + one.sums
+    return {pair: found.confusion for pair, found in contest.contrasts(sums).items()}
 
 
-def _distance(forecast: Forecast, chosen: Sequence[_Option], goal: Goal) -> float:
+def _distance(outcome: _Outcome, goal: Goal) -> float:
     """How far trials are from the goal: sum of the logarithms of what is too large, nats."""
-    sd, confusion = _outcome(forecast, chosen)
+    sd, confusion = outcome
     far = float(np.sum(np.maximum(np.log(sd.median / goal.sd), 0.0)))
     return far + sum(max(float(np.log(c / goal.confusion)), 0.0) for c in confusion.values())
 
@@ -149,8 +177,9 @@ def record_plan(forecast: Forecast, goal: Goal, found: TrialPlan) -> Plan:
     units = {q.name: q.unit for q in system.parameters}
     seconds = sum(design.seconds for design in found.designs)
     confusion: tuple[PlannedConfusion, ...] = ()
-    if forecast.contest is not None and forecast.at_hand is not None:
-        now, rivals = forecast.contest.contrasts(forecast.at_hand), forecast.contest.rivals
+    contest = forecast.contest
+    if contest is not None and forecast.at_hand is not None:
+        now, rivals = contest.contrasts(forecast.at_hand), contest.rivals
         confusion = tuple(
             PlannedConfusion(
                 between=tuple(rivals[k].name or NOTHING for k in pair),
@@ -160,7 +189,7 @@ def record_plan(forecast: Forecast, goal: Goal, found: TrialPlan) -> Plan:
             for pair, after in found.confusion.items()
         )
     return Plan(
-        sentence=_sentence(sum(design.parts for design in found.designs), seconds, found.is_enough),
+        sentence=_sentence(found, seconds, "uncertainties" if contest is None else "confusion"),
         seconds=seconds,
         is_enough=found.is_enough,
         trials=tuple(
@@ -173,7 +202,7 @@ def record_plan(forecast: Forecast, goal: Goal, found: TrialPlan) -> Plan:
             for design, times in _counted(found.designs)
         ),
         sd={}
-        if forecast.contest is not None
+        if contest is not None
         else {
             name: PlannedSd(
                 before=precision.sd[k],
@@ -206,20 +235,20 @@ def _counted(designs: Sequence[Primitive]) -> list[tuple[Primitive, int]]:
     return counted
 
 
-def _sentence(count: int, seconds: float, is_enough: bool) -> str:
+def _sentence(found: TrialPlan, seconds: float, what: str) -> str:
+    count = sum(design.parts for design in found.designs)
+    asked = {
+        "uncertainties": "uncertainty is expected to fall below what is asked",
+        "confusion": "chance of confusing two effects is expected to fall below what is asked",
+    }[what]
     if not count:
-        return (
-            "The trials at hand are enough: nothing needs to be recorded."
-            if is_enough
-            else "No trial that could be recorded here brings the uncertainties nearer to what is"
-            " asked."
-        )
-    trials = "one trial" if count == 1 else f"{count} trials"
-    if is_enough:
-        return (
-            f"With {trials}, {seconds:.0f} s in all, every uncertainty is expected to be reached."
-        )
-    return (
-        f"With {trials}, {seconds:.0f} s in all, not every uncertainty is expected to be reached;"
-        " more of them bring little."
+        if found.is_enough:
+            return "The trials at hand are enough: nothing needs to be recorded."
+        return f"No trial that could be recorded here brings the {what} nearer to what is asked."
+    head = f"With {'one trial' if count == 1 else f'{count} trials'}, {seconds:.0f} s in all,"
+    if found.is_enough:
+        return f"{head} every {asked}."
+    rest = (
+        "ask again once they are recorded" if found.is_full else "more trials like these add little"
     )
+    return f"{head} not every {asked}; {rest}."

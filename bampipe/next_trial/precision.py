@@ -54,6 +54,8 @@ class Precision:
         blocks: of time in the trials at hand, of which the scatter is in ``sd``.
         information: (m, m) of the trials at hand with what was assumed beforehand; the timing of
             the inputs last where it is estimated, m is then n + 1.
+        weighed: (m,) part of its diagonal that the fit weighs as data; zero for what the trials
+            alone determine.
         of_motion: information (m, m) of a motion.
     """
 
@@ -64,6 +66,7 @@ class Precision:
     lasting: Array
     blocks: int
     information: Array
+    weighed: Array
     of_motion: Callable[[Motion], Array]
 
     @classmethod
@@ -131,6 +134,7 @@ class Precision:
             np.array(lasting),
             sum(_blocks_of(motion) for motion in motions),
             total,
+            problem.precision,
             of_motion,
         )
 
@@ -148,39 +152,59 @@ class Precision:
         Methods disagree by what each makes of noise that the motion at hand hardly exceeds: the
         estimate is a mean by information, in which a trial that does exceed it dilutes that at
         least. Mostly it goes beside such a trial, for a method that was misled is found out.
+        What was known beforehand and weighed as data does not scatter.
 
         Args:
             added: (m, m) information of the trials; seconds: of them together.
         """
-        n = len(self.names)
-        before, after = (
-            np.diag(_covariance(matrix))[:n]
-            for matrix in (self.information, self.information + added)
+        (before, by_data), (after, by_data_then) = (
+            self._variance(matrix) for matrix in (self.information, self.information + added)
         )
         share, new = after / before, max(1, int(seconds / _BLOCK_S))
         rest = self.systematic**2 + self.lasting**2
-        statistical = np.sqrt(np.maximum(self.sd**2 - rest, 1e-300))
-        scatter = np.log(statistical / self.formal_sd / self._few(self.blocks))
-        chance = 0.5 / max(self.blocks - len(self.information), 1)
-        trust = _ALIKE**2 / (_ALIKE**2 + chance)
-        scatter = scatter.mean() + trust * (scatter - scatter.mean())
+        statistical = np.maximum(self.sd**2 - rest, 1e-300) / self.formal_sd**2
+        scattered = np.maximum(statistical - (1.0 - by_data), 1e-12)
+        scatter = 0.5 * np.log(scattered / np.maximum(by_data, 1e-12))
+        scatter -= np.log(self._few(self.blocks))
+        chance = 0.5 / max(self.blocks - self._fitted, 1)
+        # Where prior knowledge is most of an uncertainty, nothing is seen of the scatter.
+        trust = by_data * _ALIKE**2 / (_ALIKE**2 + chance)
+        mean = float(np.average(scatter, weights=np.maximum(by_data, 1e-12)))
+        scatter = mean + trust * (scatter - mean)
         telling = np.maximum(share * self.blocks + (1.0 - share) * new, 1.0)
-        wide = _EIGHT_OF_TEN * np.sqrt(trust * chance + chance / n + 0.5 / telling)
         least = self.formal_sd * np.sqrt(share)
-        noise = least * np.exp(scatter) * self._few(self.blocks + new)
+        told = max(float(by_data.sum()), 1.0)
+        wide = _EIGHT_OF_TEN * np.sqrt(trust * chance + chance / told + 0.5 / telling)
+
+        def noise(widening: Array | float) -> Array:
+            data = np.exp(scatter) * self._few(self.blocks + new) * widening
+            return np.asarray(least * np.sqrt(by_data_then * data**2 + (1.0 - by_data_then)))
+
         low, median, high = (
             np.hypot(np.hypot(size, disagreement), self.lasting)
             for size, disagreement in (
-                (noise * np.exp(-wide), 0.0),
-                (np.maximum(noise, least), share**2 * self.systematic),
-                (np.maximum(noise * np.exp(wide), least), share * self.systematic),
+                (noise(np.exp(-wide)), 0.0),
+                (np.maximum(noise(1.0), least), share**2 * self.systematic),
+                (np.maximum(noise(np.exp(wide)), least), share * self.systematic),
             )
         )
         return Expected(low, median, high)
 
+    def _variance(self, information: Array) -> tuple[Array, Array]:
+        """Variances of the parameters, (n,), and the share of each that trials alone make."""
+        covariance, n = _covariance(information), len(self.names)
+        variance = np.diag(covariance)[:n]
+        weighed = np.einsum("ij,j,ij->i", covariance, self.weighed, covariance)[:n]
+        return variance, np.clip(1.0 - weighed / variance, 0.0, 1.0)
+
+    @property
+    def _fitted(self) -> int:
+        """How many numbers the trials alone determine."""
+        return int(np.count_nonzero(self.weighed == 0.0))
+
     def _few(self, blocks: int) -> float:
         """By how much few blocks widen a standard deviation."""
-        return float(np.sqrt(blocks / max(blocks - len(self.information), 1)))
+        return float(np.sqrt(blocks / max(blocks - self._fitted, 1)))
 
     def worth(self, added: Array, seconds: float, parameter: str = "") -> float:
         """What trials are worth, nats: for one parameter, or where none is named for all.

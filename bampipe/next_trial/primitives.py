@@ -18,7 +18,7 @@ PEAK = 1.875
 """Highest over mean speed of a stroke of least jerk; of the acceleration, over travel per time
 squared, see `PEAK_ACCELERATION` (Flash and Hogan 1985)."""
 PEAK_ACCELERATION = 5.77
-_FEWEST_STROKES = 3
+FEWEST_STROKES = 3
 """In a trial: a sweep too slow for so many is made shorter."""
 _PARTS = 2
 """Trials in which motion is recorded that leaves what has been seen: each trial is judged by what
@@ -194,6 +194,11 @@ class Stroke:
     fast: float
     rest_s: float = 0.0
     gentle: bool = False
+
+    @property
+    def typical_s(self) -> float:
+        """How long a stroke in the middle of its band takes, with the pause after it."""
+        return PEAK * (self.high - self.low) / float(np.sqrt(self.slow * self.fast)) + self.rest_s
 
 
 @dataclass(frozen=True)
@@ -374,7 +379,7 @@ def _strokes_of(
     travel = seen.high[axis] - seen.low[axis]
     low, high = (float(seen.low[axis] + share * travel) for share in span)
     slow, fast = (float(share * seen.speed[axis]) for share in band)
-    longest = seconds * np.sqrt(slow * fast) / (PEAK * _FEWEST_STROKES)
+    longest = seconds * np.sqrt(slow * fast) / (PEAK * FEWEST_STROKES)
     if high - low > longest:
         middle = 0.5 * (low + high)
         low, high = middle - 0.5 * float(longest), middle + 0.5 * float(longest)

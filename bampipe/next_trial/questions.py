@@ -50,8 +50,13 @@ def find_ambiguity(found: DiagnoseResult) -> Ambiguity | None:
         ranked = {row.effect: row.score for row in found.ranking}
         alike = {name, *found.groups.get(name, ())}
         if len(known) > 1:
-            # Replays tell the others from it, however close their scores are.
-            scores = {o: score for o, score in scores.items() if o in known or o in alike}
+            # Replays tell the others from it, however close their scores are; but no replay is
+            # perfect, and one that scores better than what was found stays a rival.
+            scores = {
+                o: score
+                for o, score in scores.items()
+                if o in known or o in alike or score > scores[name]
+            }
         scores |= {other: ranked[other] for other in alike - {*scores} if other in ranked}
         if len(scores) < 2 or max(scores.values()) <= 0.0:
             continue
@@ -136,6 +141,12 @@ class Blindness:
         order = sorted(range(len(self.found)), key=lambda k: -self.found[k].factor)
         return [k for k in order if self.found[k].is_hidden]
 
+    @property
+    def of_brakes(self) -> list[str]:
+        """Names of the effects that show where brakes are on."""
+        rivals = [one.rival for one in self.found]
+        return [rival.name for rival in rivals if rival.item and rival.item.system.braked]
+
     def narrowed(self, chosen: Sequence[int]) -> Blindness:
         """The same for some of the effects."""
         contest = replace(self.contest, rivals=tuple(self.found[k].rival for k in chosen))
@@ -161,12 +172,18 @@ class Blindness:
 
 
 def find_blindness(
-    evidence: Evidence, recipe: Recipe, error: Array, floor: Array, floor_sd: Array, timing_s: float
+    evidence: Evidence,
+    motions: Sequence[Motion],
+    recipe: Recipe,
+    error: Array,
+    floor: Array,
+    floor_sd: Array,
+    timing_s: float,
 ) -> Blindness:
     """What the trials would have shown of every effect of the library that the model lacks.
 
     Args:
-        evidence: the model's fit; recipe: the model.
+        evidence: the model's fit; motions: by which effects are weighed; recipe: the model.
         error: (n_q,) held-out error; floor, floor_sd: (n_q,) of its noise, N.m or N.
         timing_s: by how much the inputs may be sampled late or early; 0 where that is not fitted.
     """
@@ -177,7 +194,6 @@ def find_blindness(
     contest = Contest(
         evidence.system, evidence.p, tuple(rivals), evidence.band, error, False, timing_s
     )
-    motions = [evidence.motions[k] for k in evidence.folds.fitted_trials]
     at_hand, bar = contest.sums(motions), Bar.of_errors(error, floor, floor_sd, len(items))
     found = weigh_visibility(contest, at_hand, bar)
     refined = tuple(refine(contest, motions, one, bar) for one in found)

@@ -30,7 +30,9 @@ def explain_proposal(
     table: Mapping[str, Detectable],
     unlimited: Sequence[str],
     lacking: Sequence[str],
-    missing: Sequence[str] = (),
+    missing: Sequence[str] | None = (),
+    told: Sequence[str] = (),
+    unbraked: Sequence[str] = (),
 ) -> Reasons:
     """Say why a trial is proposed and what it is expected to give.
 
@@ -39,9 +41,13 @@ def explain_proposal(
         best: the proposal; table: by effect, from which size on trials show it.
         unlimited: axes of which the device states no range, so that nothing wider was tried.
         lacking: axes whose held-out error is above the noise floor.
-        missing: effects that the diagnosis found and the model does not have.
+        missing: effects that the diagnosis found and the model does not have; None without one.
+        told: effects that it leaves open, though trials like these tell them apart.
+        unbraked: effects of brakes that no trial at hand has on.
     """
-    why, expected = _explain(purpose, parameter, best, table, unlimited)
+    why, expected = _explain(purpose, parameter, best, table, unlimited, unbraked)
+    if best.brakes:
+        why += " Add it to session.toml as a viscous trial."
     if best.farther or best.faster:
         expected += _UNTRIED
     if best.parts > 1:
@@ -56,9 +62,20 @@ def explain_proposal(
         )
         expected += " These are the uncertainties of a model that lacks something."
     elif best.sd and lacking:
+        if missing is None:
+            why = (
+                f"The error of {join_names(lacking, _SHOWN)} is above the noise floor: ask first"
+                f" what the model lacks (`bampipe diagnose`). {why}"
+            )
         expected += (
             f" The error of {join_names(lacking, _SHOWN)} is above the noise floor: what the model"
             " lacks there counts as noise in these uncertainties."
+        )
+    if told:
+        why = (
+            f"The diagnosis leaves {join_names(told)} open, and no trial decides that: were it just"
+            " one of them, these trials would tell which (chance of confusing them"
+            f" {_chance(0.0)}). More is missing than that. {why}"
         )
     return Reasons(why, expected)
 
@@ -69,6 +86,7 @@ def _explain(
     best: Proposal,
     table: Mapping[str, Detectable],
     unlimited: Sequence[str],
+    unbraked: Sequence[str],
 ) -> tuple[str, str]:
     """Why, and what is expected as far as the model goes."""
     if purpose == "decision":
@@ -82,13 +100,20 @@ def _explain(
     if purpose == "sensitivity":
         shown = _detected(table)
         # Nothing tried shows more: then it is for the parameters.
-        return _unseen(table) + ("" if shown else f" This one {most}."), shown or narrowed
+        return _unseen(table, unbraked) + ("" if shown else f" This one {most}."), shown or narrowed
     return f"Of the motions tried, this one {most}.", narrowed
 
 
 def _decision(best: Proposal, unlimited: Sequence[str]) -> tuple[str, str]:
     pair = max(best.confusion, key=lambda pair: pair.weight * pair.before)
     before, after = _chance(pair.before), _chance(pair.after)
+    if pair.before < _LIMITS.confused:
+        return (
+            f"The diagnosis leaves {pair.between[0]} or {pair.between[1]} open, though these trials"
+            f" would tell them apart, were it just one of them: the chance of confusing them is"
+            f" {before}. More is missing than that.",
+            "No trial decides that.",
+        )
     expected = (
         f"The chance of confusing them is expected to fall from {before} to {after}."
         if pair.after < _LIMITS.lowered * pair.before
@@ -112,19 +137,24 @@ def _remedy(unlimited: Sequence[str]) -> str:
     )
 
 
-def _unseen(table: Mapping[str, Detectable]) -> str:
+def _unseen(table: Mapping[str, Detectable], unbraked: Sequence[str]) -> str:
     """Which effects the trials at hand would not have shown."""
-    hidden, never = _hidden(table), _never(table)
+    shown = find_shown(table)
+    hidden = [*shown, *(name for name in _hidden(table) if name not in shown)]
+    never = [name for name in _never(table) if name not in unbraked]
     if hidden:
         sizes = [_size(name, table[name]) for name in hidden]
         why = f"These trials would not have shown {join_names(sizes, _SHOWN)}."
     else:
-        every = "every other effect" if never else "every effect"
+        every = "every other effect" if never or unbraked else "every effect"
         why = f"These trials would have shown {every} of the library at its typical size."
     if never:
         one = "one effect stays" if len(never) == 1 else f"{len(never)} effects stay"
         names = join_names(never, _SHOWN)
         why += f" In trials like these {one} out of sight at any size ({names})."
+    if unbraked:
+        names = join_names(unbraked, _SHOWN)
+        why += f" What brakes do ({names}) shows in viscous trials, of which there are none."
     return why
 
 
@@ -135,17 +165,27 @@ def _size(name: str, entry: Detectable) -> str:
     return f"{name} below {entry.smallest:.2g} {entry.unit}".rstrip()
 
 
-def _detected(table: Mapping[str, Detectable]) -> str:
-    """Which of those effects the proposed trial would show; "" where it shows none."""
+def find_shown(table: Mapping[str, Detectable]) -> tuple[str, ...]:
+    """What trials at hand do not show and the proposed one would, the smallest first."""
     hidden = _hidden(table)
-    shown = [
-        f"{name} from {entry.with_proposal:.2g} {entry.unit} on".replace("  ", " ")
+    sizes = {
+        name: entry.with_proposal / entry.typical
         for name, entry in table.items()
         if name in hidden
         and entry.with_proposal is not None
         and (entry.smallest is None or entry.with_proposal < _LIMITS.lowered * entry.smallest)
+    }
+    return tuple(sorted(sizes, key=lambda name: sizes[name]))
+
+
+def _detected(table: Mapping[str, Detectable]) -> str:
+    """From which sizes on the proposed trial would show effects; "" where it shows none."""
+    shown = [
+        f"{name} from {table[name].with_proposal:.2g} {table[name].unit} on".replace("  ", " ")
+        for name in find_shown(table)
     ]
-    return f"It would show {join_names(shown[:_SHOWN])} with 90 % probability." if shown else ""
+    text = f"It would show {join_names(shown, _SHOWN)} with 90 % probability."
+    return text if shown else ""
 
 
 def _narrowed(parameter: str, best: Proposal) -> str:

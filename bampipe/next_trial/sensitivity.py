@@ -22,6 +22,8 @@ Array = NDArray[np.float64]
 
 PROBABILITY = 0.9
 """With which the strength would have been revealed."""
+HOPELESS = 100.0
+"""Of the typical strength: what shows from there on only shows at no size that a machine has."""
 LARGE = 1.0
 """Of the size at which an effect is clearly there: what goes unnoticed at that size is hidden."""
 

@@ -18,8 +18,12 @@ from bampipe.next_trial.primitives import (
 )
 from bampipe.physics.device import Device
 
+_AGAIN = 1.2
+"""Of the length of a trial that is imitated: what lasts longer goes through it more than once."""
 _SLOW, _FAST = 0.12, 0.45
 """Of the speed that the trials show: where a motion is called slow, and where fast."""
+_LONG_S = 2.0
+"""Nobody calls a stroke fast that takes as long."""
 
 
 def describe(design: Primitive, seen: Envelope, device: Device) -> str:
@@ -81,9 +85,11 @@ def _imitate(design: Primitive, example: Example, device: Device) -> str:
         f" at up to {_speed(speed[i], axes[i].unit)}"
         for i in moving
     )
+    length_s = float(example.motion.t[-1] - example.motion.t[0])
+    again = " over and over" if design.seconds > _AGAIN * length_s else ""
     return (
-        f"Move {join_names(axes[i].name for i in moving)} as in trial {example.trial}, {each}, for"
-        f" {design.seconds:.3g} s"
+        f"Move {join_names(axes[i].name for i in moving)} as in trial {example.trial}, {each},"
+        f"{again} for {design.seconds:.3g} s"
     )
 
 
@@ -109,12 +115,13 @@ def _beyond(farther: Sequence[str], faster: Sequence[str]) -> str:
 
 
 def _about(stroke: Stroke, unit: str) -> str:
-    """Around where an axis is moved, and how far."""
+    """Around where an axis is moved gently, how far, and about how long each way takes."""
     middle, half = 0.5 * (stroke.low + stroke.high), 0.5 * (stroke.high - stroke.low)
     if unit == "rad":
         text = f"{_rounded(math.degrees(middle), 0)}° ± {_rounded(math.degrees(half), 0)}°"
-        return text.replace("-", "−")
-    return f"{_rounded(1e3 * middle, 0)} ± {_rounded(1e3 * half, 0)} mm".replace("-", "−")
+    else:
+        text = f"{_rounded(1e3 * middle, 0)} ± {_rounded(1e3 * half, 0)} mm"
+    return f"{text} in {_two_figures(stroke.typical_s)} s each way".replace("-", "−")
 
 
 def _rounded(value: float, digits: int) -> str:
@@ -126,7 +133,7 @@ def _pace(stroke: Stroke, seen: Envelope, axis: int) -> str:
     share = np.sqrt(stroke.slow * stroke.fast) / float(seen.speed[axis])
     if share < _SLOW:
         return "slowly"
-    return "fast" if share > _FAST else "at an easy pace"
+    return "fast" if share > _FAST and stroke.typical_s < _LONG_S else "at an easy pace"
 
 
 def _ends(stroke: Stroke, unit: str) -> str:

@@ -160,8 +160,10 @@ class Document:
         title: its title.
         subtitle: session, device, date of recording.
         sections: in order, the summary first.
+        scale: of its type in print.
     """
 
     title: str
     subtitle: str
     sections: tuple[Section, ...]
+    scale: float = 1.0

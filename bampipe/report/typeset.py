@@ -6,7 +6,7 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import count, pairwise
 from pathlib import Path
 from typing import Any
@@ -66,6 +66,25 @@ def pdf(document: Document, recorded: int) -> bytes:
     Raises:
         InputError: ``SOURCE_DATE_EPOCH`` is set, but not to whole seconds.
     """
+    return _print(document, recorded)[0]
+
+
+def sheet(versions: Sequence[Document], recorded: int) -> bytes:
+    """Return the first of ``versions`` that fits on one page as PDF; the last, where none does.
+
+    Args:
+        versions: of one document, the fullest first; recorded: as for `pdf`.
+    """
+    printed = b""
+    for document in versions:
+        printed, pages = _print(document, recorded)
+        if pages == 1:
+            break
+    return printed
+
+
+def _print(document: Document, recorded: int) -> tuple[bytes, int]:
+    """Return the PDF, and how many pages it has."""
     stamp = os.environ.get("SOURCE_DATE_EPOCH", str(recorded))
     if not stamp.isdecimal():
         raise InputError(
@@ -85,7 +104,7 @@ def pdf(document: Document, recorded: int) -> bytes:
         compiler = _lay_out(content(document), source)
         printed = compiler.compile(format="pdf", timestamp=int(stamp))
         assert isinstance(printed, bytes)  # a list of pages comes for other formats
-        return printed
+        return printed, max(edge["page"] for edge in _edges(compiler))
 
 
 def _lay_out(shown: dict[str, Any], source: Path) -> typst.Compiler:
@@ -97,10 +116,14 @@ def _lay_out(shown: dict[str, Any], source: Path) -> typst.Compiler:
     compiler = typst.Compiler(source, root=source.parent, ignore_system_fonts=True)
     for _ in range(_PASSES):
         (source.parent / "document.json").write_text(json.dumps(shown), encoding="utf-8")
-        edges = json.loads(compiler.query("<edge>", field="value"))
-        if not mend_first(shown["sections"], edges):
+        if not mend_first(shown["sections"], _edges(compiler)):
             break
     return compiler
+
+
+def _edges(compiler: typst.Compiler) -> list[_Edge]:
+    found: list[_Edge] = json.loads(compiler.query("<edge>", field="value"))
+    return found
 
 
 def mend_first(sections: list[_Shown], edges: list[_Edge]) -> bool:
@@ -241,6 +264,7 @@ def content(document: Document) -> dict[str, Any]:
     return {
         "title": document.title,
         "subtitle": document.subtitle,
+        "scale": document.scale,
         "sections": [
             {
                 "title": section.title,

@@ -220,6 +220,7 @@ class DiagnoseResult(Result):
     STAGE: ClassVar[str] = "diagnose"
 
     model: str
+    trials: Names = Field(default=(), description="By which effects were weighed")
     sentence: str = Field(description="The verdicts in words")
     next: str = Field(description="What to do now")
     axes: dict[str, AxisVerdict] = Field(min_length=1)

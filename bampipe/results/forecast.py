@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 
 from bampipe.errors import InputError
+from bampipe.lists import join_names
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.next import AS_FORECAST, ExpectedSd, NextResult
@@ -75,7 +76,7 @@ def compare_forecast(
 
     Args:
         proposed: made before the new trials; identified: with them.
-        diagnosed: with them; None where no diagnosis has been made since.
+        diagnosed: the last diagnosis, None without one; heard where it knows the new trials.
 
     Returns:
         Nothing where there is no new trial.
@@ -83,16 +84,18 @@ def compare_forecast(
     new = [trial for trial in identified.trials if trial not in proposed.trials]
     if not new:
         return ()
+    if diagnosed is not None and not set(new) <= set(diagnosed.trials):
+        diagnosed = None
     best, said = proposed.proposals[0], []
+    trials = f"{'trial' if len(new) == 1 else 'trials'} {join_names(new, _SHOWN)}"
     falls = sorted(best.sd, key=lambda name: best.sd[name].after / (best.sd[name].before or 1.0))
     names = [proposed.parameter] if proposed.parameter in best.sd else falls[:_SHOWN]
     for name in names:
         if name in identified.parameters:
             forecast, came = best.sd[name], identified.parameters[name].sd
             said.append(
-                f"`{name}`: ± {forecast.number} {forecast.unit} was forecast with trial"
-                f" {', '.join(new)}, ± {came:.2g} came (± {forecast.before:.2g} before)"
-                + _verdict(forecast, came)
+                f"`{name}`: ± {forecast.number} {forecast.unit} was forecast with {trials},"
+                f" ± {came:.2g} came (± {forecast.before:.2g} before)" + _verdict(forecast, came)
             )
     for pair in best.confusion[:_SHOWN]:
         first, second = pair.between
@@ -105,11 +108,40 @@ def compare_forecast(
             continue
         found = {name for name in pair.between if name in diagnosed.selected}
         alike = {other for name in found for other in diagnosed.groups.get(name, ())}
-        if len(found) == 1 and not alike & set(pair.between):
+        if not found:
+            said.append(f"{forecast_text}; neither is found.")
+        elif len(found) == 1 and not alike & set(pair.between):
             said.append(f"{forecast_text}; it is {next(iter(found))}.")
         else:
             said.append(f"{forecast_text}; the trials still do not distinguish them.")
-    return tuple(said)
+    return (*said, *_shown(proposed, diagnosed))
+
+
+def _shown(proposed: NextResult, diagnosed: DiagnoseResult | None) -> Iterator[str]:
+    """Say of the effects that a trial was to show whether they are there."""
+    if not proposed.shows:
+        return
+
+    def promised(names: Sequence[str], one: str, more: str) -> str:
+        table = proposed.sensitivity
+        sizes = [f"{n} from {table[n].with_proposal:.2g} {table[n].unit}".rstrip() for n in names]
+        end = more if len(names) > 1 else one
+        return f"it was to show {join_names(sizes, _SHOWN)} on; {end}"
+
+    if diagnosed is None:
+        ask = "`bampipe diagnose RUN` says whether"
+        yield promised(proposed.shows, f"{ask} it is there.", f"{ask} they are there.")
+        return
+    there = [name for name in proposed.shows if name in diagnosed.selected]
+    absent = [name for name in proposed.shows if name not in there]
+    if there:
+        yield promised(there, "it is there.", "they are there.")
+    if absent:
+        yield promised(
+            absent,
+            "the diagnosis does not find it, so that it is hardly larger.",
+            "the diagnosis does not find them, so that they are hardly larger.",
+        )
 
 
 def _verdict(forecast: ExpectedSd, came: float) -> str:

@@ -78,7 +78,8 @@ class Proposal(Record):
     worth: float = Field(description="By which proposals are ranked; of nine versions in ten")
     information_gain: float = Field(description="Half the drop of the log determinant, nats")
     sd: dict[str, ExpectedSd] = Field(
-        default={}, description="By parameter; none where the model lacks something"
+        default={},
+        description="By parameter; none where the model lacks something or is not fitted to it",
     )
     confusion: tuple[ExpectedConfusion, ...] = ()
     farther: Names = Field(default=(), description="Axes moved farther than in the trials at hand")
@@ -151,4 +152,7 @@ class NextResult(Result):
     expected: str = Field(description="What it is expected to give")
     proposals: tuple[Proposal, ...] = Field(description="Best first")
     sensitivity: dict[str, Detectable] = Field(default={}, description="By effect of the library")
+    shows: Names = Field(
+        default=(), description="Effects that the first proposal is to show, and the trials not"
+    )
     plan: Plan | None = None

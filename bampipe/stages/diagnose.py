@@ -133,7 +133,9 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     samples = _map_variables(found)
     write_parquet(out / f"models/{config.model}/map_variables.parquet", samples)
     progress(0.97, "a trial that would decide what these do not")
-    result = _with_suggestion(_result(found, recipe, config), found, trials, recipe, settings)
+    result = _with_suggestion(
+        _result(found, trials, recipe, config), found, trials, recipe, settings
+    )
     headline = "; ".join(f"{axis}: {words}" for axis, words in result.verdicts_in_words.items())
     return {"headline": headline, **_summary(result.write(out), result.limits)}
 
@@ -186,10 +188,13 @@ def _summary(result: dict[str, Any], limits: str) -> dict[str, object]:
     }
 
 
-def _result(found: Diagnosis, recipe: Recipe, config: Config) -> DiagnoseResult:
+def _result(
+    found: Diagnosis, trials: MeasuredTrials, recipe: Recipe, config: Config
+) -> DiagnoseResult:
     names = found.evidence.system.coordinates
     return DiagnoseResult(
         model=config.model,
+        trials=tuple(dict.fromkeys(trial_of_block(m.trial_id) for m in trials.weighed)),
         axes=dict(zip(names, found.axes, strict=True)),
         ranking=found.ranking,
         descriptions=_descriptions(found.ranking[:_DESCRIBED], recipe),
@@ -268,14 +273,14 @@ def _with_suggestion(
         return result
     seen = Envelope.of_trials(trials.motions, system, p)
     rehearsal = Rehearsal(system, p, trials.sensors, trials.kinematics, seen, settings.seed)
-    fitted = [trials.motions[k] for k in trials.folds.fitted_trials]
-    at_hand = contest.sums(fitted)
+    at_hand = contest.sums(trials.weighed)
     tried = rank_designs(
         rehearsal,
         lambda motion: -contest.confusion(contest.contrasts(at_hand + contest.sums([motion]))),
         _SUGGESTED_S,
         seen.movable,
         with_rests=True,
+        with_brakes=True,
     )[0]
     now, sums = contest.contrasts(at_hand), [contest.sums([motion]) for motion in tried.usual]
     then = [contest.contrasts(at_hand + new, new) for new in sums]

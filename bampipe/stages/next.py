@@ -30,7 +30,8 @@ from bampipe.next_trial.questions import (
     find_blindness,
     make_contest,
 )
-from bampipe.next_trial.reasons import explain_proposal
+from bampipe.next_trial.reasons import explain_proposal, find_shown
+from bampipe.next_trial.sensitivity import HOPELESS
 from bampipe.physics import compile_model
 from bampipe.progress import Progress
 from bampipe.results.diagnose import AxisVerdict, DiagnoseResult
@@ -67,8 +68,6 @@ _WATCHED = 12
 """Hidden effects that designs are tried for."""
 _LITTLE = 0.05
 """Sum of log strengths by which a trial for hidden effects must lower what goes unnoticed."""
-_HOPELESS = 100.0
-"""Of the typical strength: beyond, one unnoticed size is like another."""
 
 
 @checked_dataclass(frozen=True, config=STRICT)
@@ -133,6 +132,11 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     if asked is not None and diagnosed is not None:
         values = {name: v for row in diagnosed.ranking for name, v in row.parameters.items()}
         contest = make_contest(trials, recipe, p, asked, values, floor)
+    at_hand = contest.sums(trials.weighed) if contest else None
+    told: tuple[str, ...] = ()
+    if purpose == "auto" and contest and at_hand and contest.tells_apart(at_hand):
+        told = tuple(rival.name for rival in contest.rivals if rival.name)
+        contest, at_hand = None, None
     if purpose == "decision" and contest is None:
         raise InputError(
             "the diagnosis left nothing to decide",
@@ -144,8 +148,8 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         progress(0.1, "what these trials would have shown of each effect")
         error, spread = _errors(diagnosed, evidence)
         limit = found.input_timing.limit
-        blindness = find_blindness(evidence, recipe, error, floor, spread, limit)
-    at_hand = contest.sums(fitted) if contest else None
+        weighed = trials.weighed
+        blindness = find_blindness(evidence, weighed, recipe, error, floor, spread, limit)
     forecast = Forecast(rehearsal, precision, contest, at_hand)
     worth = _worth(chosen, parameter, forecast, blindness)
     axes = seen.movable
@@ -155,12 +159,15 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     free = [motion for motion in fitted if not _is_braked(motion, model.device.brakes)]
     alike = imitate_trials(free, seen, config.seconds)
 
-    def rank(worth: Worth, with_rests: bool, first: float, least: float = -np.inf) -> list[Tried]:
+    def rank(worth: Worth, of_effects: bool, first: float, least: float = -np.inf) -> list[Tried]:
+        # No parameters are fitted to what has the brakes on, but for those of brakes.
+        with_brakes = of_effects or system.braked
+
         def report(fraction: float, message: str) -> None:
             progress(first + 0.3 * fraction, message)
 
         return rank_designs(
-            rehearsal, worth, config.seconds, axes, with_rests, report, alike, least
+            rehearsal, worth, config.seconds, axes, of_effects, with_brakes, report, alike, least
         )
 
     hidden = chosen == "sensitivity"
@@ -190,8 +197,11 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         plan = record_plan(forecast, goal, plan_trials(forecast, tried, goal))
     unlimited = [axis for axis in system.coordinates if axis not in model.device.limits]
     lacking = _lacking(run, config.model, diagnosed)
-    missing = diagnosed.selected if diagnosed is not None else ()
-    reasons = explain_proposal(chosen, parameter, best, table, unlimited, lacking, missing)
+    missing = diagnosed.selected if diagnosed is not None else None
+    unbraked = blindness.of_brakes if blindness and not seen.field.any() else ()
+    reasons = explain_proposal(
+        chosen, parameter, best, table, unlimited, lacking, missing, told, unbraked
+    )
     result = NextResult(
         model=config.model,
         purpose=chosen,
@@ -202,6 +212,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         expected=reasons.expected,
         proposals=proposals,
         sensitivity=table,
+        shows=find_shown(table),
         plan=plan,
     )
     result.write(out)
@@ -308,7 +319,7 @@ def _worth(
         return lambda motion: -forecast.confusion_with(motion)
     if blindness is not None and blindness.hidden:
         watched = blindness.narrowed(blindness.hidden[:_WATCHED])
-        now = np.minimum([v.factor for v in watched.found], _HOPELESS)
+        now = np.minimum([v.factor for v in watched.found], HOPELESS)
 
         def shown(motion: Motion) -> float:
             then = np.clip(watched.factors_with([motion]), 1.0, now)
@@ -331,11 +342,11 @@ def _sensitivity(blindness: Blindness, best: Tried) -> dict[str, Detectable]:
     return {
         found.rival.name: Detectable(
             parameter=found.parameter.name,
-            smallest=found.factor * found.typical if np.isfinite(found.factor) else None,
+            smallest=found.factor * found.typical if found.factor < HOPELESS else None,
             typical=found.typical,
             unit=found.parameter.unit,
-            axis=axes[found.axis] if np.isfinite(found.factor) else "",
-            with_proposal=factor * found.typical if np.isfinite(factor) else None,
+            axis=axes[found.axis] if found.factor < HOPELESS else "",
+            with_proposal=factor * found.typical if factor < HOPELESS else None,
         )
         for found, factor in zip(blindness.found, after, strict=True)
     }

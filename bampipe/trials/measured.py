@@ -65,6 +65,12 @@ class MeasuredTrials:
         moved = tuple(m.with_input_timing(late_s - self.late_s) for m in self.motions)
         return replace(self, motions=moved, late_s=late_s)
 
+    @property
+    def weighed(self) -> list[Motion]:
+        """All by which effects are weighed: those with brakes on, too, but none held out."""
+        groups = self.folds.groups
+        return [m for m, group in zip(self.motions, groups, strict=True) if group != HELD_OUT]
+
 
 def trial_of_block(name: str) -> str:
     """The trial that the block called ``name`` was cut from; ``name`` itself where it is none."""

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from types import SimpleNamespace
 
+import pytest
+
+from bampipe.report import protocol
 from bampipe.report.document import Callout, Table
 from bampipe.report.protocol import protocol_sheet
 from bampipe.report.sections import diagnosis, next_trial
@@ -88,21 +92,38 @@ def test_where_one_number_cannot_be_trusted_a_range_is_shown():
     assert "eight of ten" in table.note
 
 
-def test_the_protocol_sheet_is_the_same_pdf_again():
-    plan = Plan.model_validate(
+def made_plan(trials: int = 1, sentence: str = SENTENCE, parameters: int = 1) -> Plan:
+    sd = {
+        "before": 0.01, "after": 0.004, "low": 0.0035, "high": 0.005, "asked": 0.005, "unit": "N.m"
+    }  # fmt: skip
+    trial = {"sentence": sentence, "seconds": 20.0, "times": 3, "moves": {"yaw": MOVE}}
+    return Plan.model_validate(
         {
             "sentence": "With 3 trials, 60 s in all, what is asked is expected to be reached.",
-            "seconds": 60.0,
+            "seconds": 60.0 * trials,
             "is_enough": True,
-            "trials": [{"sentence": SENTENCE, "seconds": 20.0, "times": 3, "moves": {"yaw": MOVE}}],
-            "sd": {
-                "coulomb.yaw": {
-                    "before": 0.01, "after": 0.004, "low": 0.0035, "high": 0.005, "asked": 0.005,
-                    "unit": "N.m",
-                }
-            },
+            "trials": [trial] * trials,
+            "sd": {f"coulomb.joint_{k}": {**sd, "after": 0.004 + k} for k in range(parameters)},
         }
-    )  # fmt: skip
+    )
+
+
+@pytest.mark.parametrize(("trials", "parameters"), [(0, 70), (1, 70), (8, 8), (8, 70)])
+def test_the_protocol_sheet_is_one_page(trials, parameters):
+    axes = [f"joint_{k} between −240° and 9° (−4.19 to 0.16 rad) at up to 410°/s" for k in range(7)]
+    plan = made_plan(trials, f"Move them as in t01, {', '.join(axes)}, for 20 s.", parameters)
+    sheet = protocol_sheet(plan, "s01", "base", by_hand=False)
+    assert len(re.findall(rb"/Type\s*/Page\b", sheet)) == 1
+
+
+def test_a_sheet_lists_the_parameters_that_stay_farthest_from_what_is_asked():
+    table = protocol._uncertainties(made_plan(parameters=20), "base", 3)
+    assert [row[0] for row in table.rows] == [f"`coulomb.joint_{k}`" for k in (17, 18, 19)]
+    assert "Of 20 parameters" in table.note
+
+
+def test_the_protocol_sheet_is_the_same_pdf_again():
+    plan = made_plan()
     sheet = protocol_sheet(plan, "s01", "base", by_hand=True)
     assert sheet.startswith(b"%PDF")
     assert sheet == protocol_sheet(plan, "s01", "base", by_hand=True)

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from bampipe.report import wording
 from bampipe.report.document import Block, Bullets, Callout, Paragraph, Section, Table
 from bampipe.report.results import Results
+from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.forecast import compare_forecasts, read_forecasts
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.next import (
@@ -33,7 +34,8 @@ def section(results: Results) -> Section | None:
     identified = results.read(IdentifyResult)
     came: tuple[str, ...] = ()
     if identified is not None:
-        came = compare_forecasts(read_forecasts(results.root, results.model), identified, None)
+        forecasts = read_forecasts(results.root, results.model)
+        came = compare_forecasts(forecasts, identified, results.read(DiagnoseResult))
     if came:
         blocks.append(Bullets(tuple(line.replace("RUN", results.root.name) for line in came)))
     best = found.proposals[0]
