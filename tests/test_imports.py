@@ -45,7 +45,7 @@ LAWS = {
         "numpy scipy sklearn joblib threadpoolctl numba pyoperon",
         "errors lists physics estimate results trials workers",
     ),
-    "results": law("pydantic", "errors files schema"),
+    "results": law("pydantic", "errors files lists schema"),
     "data": law("numpy scipy pandas pyarrow h5py pydantic", "errors lists schema files results"),
     "trials": law("numpy scipy pandas pyarrow numba", "errors files results physics estimate data"),
     "setup": law("numpy", "errors lists results physics estimate trials"),
