@@ -179,14 +179,14 @@ def _filter(results: Results, filtered: FilterResult) -> list[Block]:
         blocks.append(
             Table(
                 "Stretches that no estimate and no error counts",
-                ("Trial", "From (s)", "To (s)", "Why"),
+                ("Trial", "Time (s)", "Why"),
                 tuple(
-                    (name, f"{one.start_s:.2f}", f"{one.end_s:.2f}", one.reason)
+                    (name, f"{one.start_s:.1f} to {one.end_s:.1f}", one.reason)
                     for name, stretches in filtered.disturbances.items()
                     for one in stretches
                 ),
-                "lrrl",
-                (0.0, 1.0, 1.0, 0.0),
+                "lll",
+                (1.0, 1.0, 6.0),
             )
         )
     if rows:
