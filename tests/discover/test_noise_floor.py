@@ -134,7 +134,7 @@ def test_a_replay_leaves_out_the_moments_at_which_the_machine_stands_still(fitte
     rest = np.zeros(motion.q.shape, dtype=bool)
     rest[200:240] = True
     stand_in = StandIn(
-        evidence.system, evidence.p, [replace(motion, rest=rest)], trials.sensors.rate_hz
+        evidence.system, evidence.p, [replace(motion, left_out=rest)], trials.sensors.rate_hz
     )
     replayed = replay_motion(
         stand_in, 0, trials.sensors, trials.kinematics, np.random.default_rng(1)
@@ -142,7 +142,7 @@ def test_a_replay_leaves_out_the_moments_at_which_the_machine_stands_still(fitte
     still = problem_of(evidence.system, [replayed], trials.band).standstill[0]
     assert still[rest].all() and 0.0 < still.mean() < 0.5
     (stored,) = replay.store_motions(iter([replayed]))
-    np.testing.assert_array_equal(stored.rest, replayed.rest)
+    np.testing.assert_array_equal(stored.left_out, replayed.left_out)
 
 
 def test_a_machine_that_stands_still_is_held_against_replays_that_do(tmp_path: Path) -> None:
