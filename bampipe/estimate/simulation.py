@@ -1,7 +1,5 @@
 """Forward simulation of a compiled model: open loop, or held near a given motion by an arm.
 
-Axes that something stiff moves follow that motion to the letter: the force it takes is solved for.
-
 Friction changes sign over a velocity as small as 1e-3 rad/s, so an axis near standstill is stiff:
 its rate is (Coulomb + brake torque) / (inertia * width), 1e3 /s in free motion and 5e4 /s under a
 60 N.m brake. Instead of an implicit method, which would need the model's Jacobian, each sampling
@@ -61,20 +59,6 @@ class Impedance:
     bandwidth: float = 120.0
 
 
-class Holding(NamedTuple):
-    """Axes that something stiff moves, such as a robot's joints by fast position controllers.
-
-    Attributes:
-        axes: (h,) their numbers.
-        along: (h, nf) forces that are a unit of generalised force on one of them, none on others.
-        acceleration: (T, n_q) of the motion that they follow, rad/s2 or m/s2.
-    """
-
-    axes: Sequence[int]
-    along: Array
-    acceleration: Array
-
-
 class Plant(NamedTuple):
     """What kernels simulate besides the derivative.
 
@@ -109,57 +93,28 @@ class _Brakes(NamedTuple):
     time: float
 
 
-class _Solver(NamedTuple):
-    """Forces that come nearest to giving some axes the accelerations that are wanted of them.
-
-    Attributes:
-        columns: (nf,) of the inputs, with forces; along: (m, nf) the directions that they may take.
-        axes: (a,) whose acceleration counts.
-        wanted: (a,) beyond what acts already; found: (m,) force along each direction.
-        response: (a, m) acceleration by force; normal, factor: (m, m).
-    """
-
-    columns: NDArray[np.int64]
-    along: Array
-    axes: NDArray[np.int64]
-    wanted: Array
-    found: Array
-    response: Array
-    normal: Array
-    factor: Array
-
-    @classmethod
-    def of(cls, columns: Sequence[int], along: Array, axes: Sequence[int]) -> _Solver:
-        """With its memory."""
-        m, a = len(along), len(axes)
-        return cls(
-            np.array(columns, dtype=np.int64), np.array(along, dtype=np.float64, order="C"),
-            np.array(axes, dtype=np.int64), np.zeros(a), np.zeros(m),
-            np.empty((a, m)), np.empty((m, m)), np.zeros((m, m)),
-        )  # fmt: skip
-
-
 class _Workspace(NamedTuple):
-    """Memory.
+    """Memory: rows of a step's states (8, nx or nu), and what the arm's force is solved with.
 
     Attributes:
-        steps: rows of a step's states, (8, nx or nu).
-        ends: inputs at both ends of a substep, (2, nu).
-        pull, pull_rate: (nf,) force of the arm, its rate.
+        response: (n, nf) acceleration by force; normal, factor: (nf, nf).
+        pull, pull_rate, goal: (nf,) force of the arm, its rate, what it is drawn to.
         speed: (n,) as the brakes' controller sees it.
     """
 
     steps: Array
-    ends: Array
+    response: Array
+    normal: Array
+    factor: Array
     pull: Array
     pull_rate: Array
+    goal: Array
     speed: Array
 
 
 PLANT = record_type(Plant, _V, _V, _V, float64)
 _ARM = record_type(_Arm, _I, _I, _I, float64, float64, float64)
-_SOLVER = record_type(_Solver, _I, _M, _I, _V, _V, _M, _M, _M)
-_WORKSPACE = record_type(_Workspace, _M, _M, _V, _V, _V)
+_WORKSPACE = record_type(_Workspace, _M, _M, _M, _M, _V, _V, _V, _V)
 
 
 @njit(int64(DERIVATIVE, _V, _V, PLANT, float64, _M), cache=True)
@@ -202,141 +157,70 @@ def stable_steps(derivative, x, u, plant, dt, work):  # type: ignore[no-untyped-
     return min(int(np.ceil(dt * fastest)), _MOST_STEPS)
 
 
-@njit(void(DERIVATIVE, _V, _V, PLANT, _SOLVER, _WORKSPACE), cache=True)
-def _solve_force(derivative, x, u, plant, solver, work):  # type: ignore[no-untyped-def]
-    """Find the forces of a `_Solver` where ``u`` acts: ``solver.found``."""
-    p, w, out = plant.p, plant.w, solver.found
-    columns, along, axes, wanted = solver.columns, solver.along, solver.axes, solver.wanted
-    response, normal, factor = solver.response, solver.normal, solver.factor
-    nx, n, m = x.shape[0], plant.width.shape[0], along.shape[0]
+@njit(void(DERIVATIVE, _V, _V, PLANT, _ARM, _V, _V, _WORKSPACE), cache=True)
+def _solve_goal(derivative, x, u, plant, arm, q_ref, qd_ref, work):  # type: ignore[no-untyped-def]
+    """Handle force that alone would give the acceleration which the arm demands: ``work.goal``."""
+    p, w, force, out = plant.p, plant.w, arm.force, work.goal
+    response, normal, factor = work.response, work.normal, work.factor
+    frequency, damping = arm.natural_frequency, arm.damping_ratio
+    nx, n, nf = x.shape[0], plant.width.shape[0], force.shape[0]
     still = work.steps[6, :nx]
     moved = work.steps[7, :nx]
     derivative(x, u, p, w, still)
-    for j in range(m):
-        for c in range(columns.shape[0]):
-            u[columns[c]] += along[j, c]
+    for j in range(nf):
+        u[force[j]] += 1.0
         derivative(x, u, p, w, moved)
-        for c in range(columns.shape[0]):
-            u[columns[c]] -= along[j, c]
-        for i in range(axes.shape[0]):
-            response[i, j] = moved[n + axes[i]] - still[n + axes[i]]
+        u[force[j]] -= 1.0
+        for i in range(n):
+            response[i, j] = moved[n + i] - still[n + i]
     trace = 0.0
-    for j in range(m):
+    for j in range(nf):
         out[j] = 0.0
-        for k in range(m):
+        for k in range(nf):
             total = 0.0
-            for i in range(axes.shape[0]):
+            for i in range(n):
                 total += response[i, j] * response[i, k]
             normal[j, k] = total
         trace += normal[j, j]
-    for i in range(axes.shape[0]):
-        for j in range(m):
-            out[j] += response[i, j] * wanted[i]
-    for j in range(m):  # keeps the solution finite where a force moves nothing
+    for i in range(n):
+        error = frequency * frequency * (q_ref[i] - x[i])
+        error += 2.0 * damping * frequency * (qd_ref[i] - x[n + i])
+        for j in range(nf):
+            out[j] += response[i, j] * error
+    for j in range(nf):  # keeps the solution finite where a force moves nothing
         normal[j, j] += 1e-12 * trace + 1e-300
     if not (np.isfinite(trace) and cholesky(normal, factor)):
-        for j in range(m):  # the motion has run away: the caller says so
+        for j in range(nf):  # the motion has run away: the caller says so
             out[j] = np.nan
         return
-    forward_substitute(factor, m, out)
-    for j in range(m - 1, -1, -1):
-        for k in range(j + 1, m):
+    forward_substitute(factor, nf, out)
+    for j in range(nf - 1, -1, -1):
+        for k in range(j + 1, nf):
             out[j] -= factor[k, j] * out[k]
         out[j] /= factor[j, j]
 
 
-@njit(void(DERIVATIVE, _V, _V, _V, PLANT, _SOLVER, _WORKSPACE), cache=True)
-def _hold(derivative, x, u, acceleration, plant, holder, work):  # type: ignore[no-untyped-def]
-    """Solve for the force that gives held axes their ``acceleration`` (n,) where ``u`` acts."""
-    n, nx = plant.width.shape[0], x.shape[0]
-    now = work.steps[6, :nx]
-    derivative(x, u, plant.p, plant.w, now)
-    for i in range(holder.axes.shape[0]):
-        axis = holder.axes[i]
-        holder.wanted[i] = acceleration[axis] - now[n + axis]
-    _solve_force(derivative, x, u, plant, holder, work)
-
-
-@njit(
-    void(DERIVATIVE, _M, _M, _M, int64, PLANT, _SOLVER, _M, _M, _M, float64, int64, _WORKSPACE),
-    cache=True,
-)
-def _step_held(  # type: ignore[no-untyped-def]
-    derivative, x, u, held_by, k, plant, holder, q_ref, qd_ref, qdd_ref, dt, count, work
-):
-    """Take row ``k`` of ``x`` (T, nx) to the next with some axes on the motion to be followed.
-
-    The force that holds them stays as it is for one of ``count`` steps; the first one's goes into
-    row ``k`` of ``held_by`` (T, nf). Inputs run straight between samples.
-    """
-    n, here = plant.width.shape[0], x[k + 1]
-    first, last, acceleration = work.ends[0], work.ends[1], work.steps[5, :n]
-    for step in range(count):
-        before, after = step / count, (step + 1.0) / count
-        for i in range(u.shape[1]):
-            first[i] = u[k, i] + before * (u[k + 1, i] - u[k, i])
-            last[i] = u[k, i] + after * (u[k + 1, i] - u[k, i])
-        for i in range(n):
-            acceleration[i] = qdd_ref[k, i] + before * (qdd_ref[k + 1, i] - qdd_ref[k, i])
-        _hold(derivative, here, first, acceleration, plant, holder, work)
-        for c in range(holder.columns.shape[0]):
-            force = 0.0
-            for j in range(holder.along.shape[0]):
-                force += holder.along[j, c] * holder.found[j]
-            first[holder.columns[c]] += force
-            last[holder.columns[c]] += force
-            if step == 0:
-                held_by[k, c] = force
-        runge_kutta(derivative, here, first, last, plant.p, plant.w, dt / count, 1, work.steps)
-        for i in range(holder.axes.shape[0]):
-            axis = holder.axes[i]
-            here[axis] = q_ref[k, axis] + after * (q_ref[k + 1, axis] - q_ref[k, axis])
-            here[n + axis] = qd_ref[k, axis] + after * (qd_ref[k + 1, axis] - qd_ref[k, axis])
-
-
 @njit(
     void(
-        DERIVATIVE, _M, _M, PLANT, _ARM, _SOLVER, _SOLVER, record_type(_Brakes, _I, _M, float64),
-        _M, _M, _M, _M, float64, boolean, _WORKSPACE,
+        DERIVATIVE, _M, _M, PLANT, _ARM, record_type(_Brakes, _I, _M, float64), _M, _M, float64,
+        boolean, _WORKSPACE,
     ),
     cache=True,
 )  # fmt: skip
-def _run(  # type: ignore[no-untyped-def]
-    derivative,
-    x,
-    u,
-    plant,
-    arm,
-    puller,
-    holder,
-    brakes,
-    q_ref,
-    qd_ref,
-    qdd_ref,
-    held_by,
-    dt,
-    hold,
-    work,
-):
+def _run(derivative, x, u, plant, arm, brakes, q_ref, qd_ref, dt, hold, work):  # type: ignore[no-untyped-def]
     """Fill the rows of ``x`` after the first and add arm force and brake commands to ``u``.
 
-    Without columns of force there is no arm, and what is to be followed is not read; without axes
-    that are held, ``qdd_ref`` and ``held_by`` (T, nf), the force that holds them, are not.
+    Without columns of force there is no arm, and ``q_ref``, ``qd_ref`` are not read.
     """
     force, rate, curvature, bandwidth = arm.force, arm.rate, arm.curvature, arm.bandwidth
-    frequency, damping = arm.natural_frequency, arm.damping_ratio
-    pull, pull_rate, goal, speed = work.pull, work.pull_rate, puller.found, work.speed
+    pull, pull_rate, goal, speed = work.pull, work.pull_rate, work.goal, work.speed
     brake, brake_gain, steps = brakes.columns, brakes.gain, work.steps
-    n, nf, held = plant.width.shape[0], force.shape[0], holder.axes.shape[0] > 0
+    n, nf = plant.width.shape[0], force.shape[0]
     fade = np.exp(-bandwidth * dt)
     follow = 1.0 - np.exp(-dt / brakes.time)
     for k in range(x.shape[0] - 1):
         if nf > 0:
-            for i in range(n):
-                error = frequency * frequency * (q_ref[k, i] - x[k, i])
-                error += 2.0 * damping * frequency * (qd_ref[k, i] - x[k, n + i])
-                puller.wanted[i] = error
-            _solve_force(derivative, x[k], u[k], plant, puller, work)
+            _solve_goal(derivative, x[k], u[k], plant, arm, q_ref[k], qd_ref[k], work)
         for j in range(nf):  # the low-pass, exact for a goal that is constant over dt
             gap = pull[j] - goal[j]
             slope = pull_rate[j] + bandwidth * gap
@@ -354,19 +238,8 @@ def _run(  # type: ignore[no-untyped-def]
         for i in range(x.shape[1]):
             x[k + 1, i] = x[k, i]
         count = stable_steps(derivative, x[k], u[k], plant, dt, steps)
-        if held:
-            _step_held(
-                derivative, x, u, held_by, k, plant, holder, q_ref, qd_ref, qdd_ref, dt, count, work
-            )
-            continue
         end = u[k] if hold else u[k + 1]
         runge_kutta(derivative, x[k + 1], u[k], end, plant.p, plant.w, dt, count, steps)
-    if held:
-        last = x.shape[0] - 1
-        _hold(derivative, x[last], u[last], qdd_ref[last], plant, holder, work)
-        for c in range(nf):
-            for j in range(holder.along.shape[0]):
-                held_by[last, c] += holder.along[j, c] * holder.found[j]
 
 
 def simulate(
@@ -429,7 +302,6 @@ def simulate_tracking(
     brake_time: float = 0.01,
     smooth: Sequence[int] = (),
     max_step: float = 2.5e-4,
-    holding: Holding | None = None,
 ) -> tuple[Array, Array]:
     """Integrate the model under given inputs plus an arm that holds it near a given motion.
 
@@ -450,7 +322,6 @@ def simulate_tracking(
         brake: columns with the brake command of each coordinate, in their order, or none.
         brake_gain: (T, n_q) damping that the brakes render: each command is this times the
             speed, low-passed over ``brake_time`` (s) as a controller sees it. N.m.s/rad or N.s/m.
-        holding: axes that follow the motion to the letter; the arm holds the others.
 
     Returns:
         states (T, nx) and inputs (T, nu) with the total handle force and the brake commands.
@@ -462,7 +333,7 @@ def simulate_tracking(
         derivative, x0, u, p, dt, q_ref, qd_ref, width, n_noise, max_step,
         force=force, rate=rate, curvature=curvature, arm=impedance or Impedance(),
         brake=brake if brake_gain is not None else (), brake_gain=brake_gain,
-        brake_time=brake_time, smooth=smooth, holding=holding,
+        brake_time=brake_time, smooth=smooth,
     )  # fmt: skip
 
 
@@ -487,24 +358,20 @@ def _integrate(
     brake_gain: Array | None = None,
     brake_time: float = 0.01,
     smooth: Sequence[int] = (),
-    holding: Holding | None = None,
 ) -> tuple[Array, Array]:
     """Give `_run` its arrays and its memory; return states (T, nx) and inputs (T, nu)."""
-    n, nf = len(width), len(force)
-    qdd_ref = np.zeros((0, 0)) if holding is None else holding.acceleration
     finer = int(np.ceil(dt / _WIDEST_GRID_S - 1e-6)) if len(smooth) else 1
     if finer > 1:
         dt /= finer
         u = _read_between(u, finer, smooth)
         everything = range(q_ref.shape[1])
         q_ref, qd_ref = (_read_between(ref, finer, everything) for ref in (q_ref, qd_ref))
-        qdd_ref = qdd_ref if holding is None else _read_between(qdd_ref, finer, everything)
         brake_gain = None if brake_gain is None else _read_between(brake_gain, finer)
     x = np.zeros((len(u), len(x0)))
     x[0] = x0
     total = np.array(u, dtype=np.float64, order="C")
     gain = np.zeros((0, 0)) if brake_gain is None else np.ascontiguousarray(brake_gain)
-    held_by = np.zeros((0 if holding is None else len(u), nf))
+    n, nf = len(width), len(force)
     _run(
         derivative, x, total, make_plant(p, n_noise, width, max_step),
         _Arm(
@@ -512,20 +379,15 @@ def _integrate(
             np.array(curvature, dtype=np.int64),
             arm.natural_frequency, arm.damping_ratio, arm.bandwidth,
         ),
-        _Solver.of(force, np.eye(nf), range(n)),
-        _Solver.of(force, np.zeros((0, nf)), ())
-        if holding is None else _Solver.of(force, holding.along, holding.axes),
         _Brakes(np.array(brake, dtype=np.int64), gain, brake_time),
         np.array(q_ref, dtype=np.float64, order="C"),  # a copy: columns of a table are read-only
-        np.array(qd_ref, dtype=np.float64, order="C"),
-        np.array(qdd_ref, dtype=np.float64, order="C"), held_by, dt, hold,
+        np.array(qd_ref, dtype=np.float64, order="C"), dt, hold,
         _Workspace(
-            np.zeros((8, max(len(x0), total.shape[1]))), np.empty((2, total.shape[1])),
-            np.zeros(nf), np.zeros(nf), np.zeros(n),
+            np.zeros((8, max(len(x0), total.shape[1]))),
+            np.empty((n, nf)), np.empty((nf, nf)), np.zeros((nf, nf)),
+            np.zeros(nf), np.zeros(nf), np.zeros(nf), np.zeros(n),
         ),
     )  # fmt: skip
-    if holding is not None:
-        total[:, list(force)] += held_by
     require_finite(x, dt)
     return np.ascontiguousarray(x[::finer]), np.ascontiguousarray(total[::finer])
 

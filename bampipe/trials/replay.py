@@ -3,9 +3,9 @@
 Noise floors, chance levels and the bias of least squares come from here. The model is driven along
 nearly the measured motion by the measured force plus an arm. Where something stiff gives the
 motion it keeps that and takes the force it needs: on a test bench; of a robot whose position
-controllers are so fast that its drives jump where joints turn round, but for joints that stand
-still there; and of any robot that a spring which the model lacks would carry away. What it does is
-read by the same sensors and goes through the same filters.
+controllers are so fast that its drives jump where joints turn round; and of any robot that a spring
+which the model lacks would carry away. What it does is read by the same sensors and goes through
+the same filters.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.estimate.butterworth import zero_phase
-from bampipe.estimate.simulation import Holding, Runaway, simulate_tracking
+from bampipe.estimate.simulation import Runaway, simulate_tracking
 from bampipe.files import temporary_space
 from bampipe.physics import System
 from bampipe.physics.device import derivative
@@ -115,11 +115,7 @@ def follow_motion(system: System, p: Array, motion: Motion, rate_hz: float) -> C
     u = motion.inputs(system.inputs)
     fitted = ModelOnTrial(system, p, [motion])
     held = system.model.device.robot is not None and not system.undriven
-    given = np.zeros(len(system.coordinates), dtype=bool)
-    if held and np.any(jumps := _jumps(fitted, u)):
-        # Controllers of one robot are alike: joints that turn round without a rest are moved, too.
-        given = jumps | ~_rests_where_it_turns(motion, standstill_of(motion, system, rate_hz))
-    if system.model.device.prescribed or given.all():
+    if system.model.device.prescribed or (held and _jumps(fitted, u)):
         return Course(motion.q, _required_force(fitted, u))
     q, qd = _reference(system, p, motion, u, rate_hz)
     start = np.concatenate([q[0], qd[0], system.initial_memory(q[0], u[0], p)])
@@ -134,7 +130,6 @@ def follow_motion(system: System, p: Array, motion: Motion, rate_hz: float) -> C
             rate=[at.get(derivative(f, 1), -1) for f in forces],
             curvature=[at.get(derivative(f, 2), -1) for f in forces],
             smooth=system.forced,
-            holding=_hold(fitted, u, given) if given.any() else None,
         )  # fmt: skip
     except Runaway:
         if not held:
@@ -152,12 +147,12 @@ def _strays(q: Array, measured: Array) -> bool:
     return bool(np.any(farthest > _FARTHEST * np.ptp(measured, axis=0)))
 
 
-def _jumps(fitted: ModelOnTrial, u: Array) -> NDArray[np.bool_]:
-    """Whose drives of a robot jump, within a sample, as friction does where a joint turns, (n_q,).
+def _jumps(fitted: ModelOnTrial, u: Array) -> bool:
+    """Whether the drives of a robot jump, within a sample, as friction does where a joint turns.
 
     Between two samples nothing says when they do: driven by such a log, a model would stick for as
     long as that, and be rougher than the machine. Of a drive that acts late they stand earlier in
-    the log, spread over two samples. Of joints that hardly turn, the others tell.
+    the log, spread over two samples.
     """
     system, motion = fitted.system, fitted.motion
     forces = [system.inputs.index(name) for name in system.model.device.forces]
@@ -172,26 +167,7 @@ def _jumps(fitted: ModelOnTrial, u: Array) -> NDArray[np.bool_]:
     late = [first + second for first, second in pairwise(earlier[1:])]
     made = np.max([earlier[0], *late], axis=0)
     known = (turns.sum(axis=0) >= _FEW_REVERSALS) & (whole > 0.0)
-    jumps = made > _JUMPS * whole
-    return np.where(known, jumps, bool(known.any() and np.all(jumps[known])))
-
-
-def _rests_where_it_turns(motion: Motion, rest: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Which axes stand still at most of their reversals, (n_q,), from where they rest (T, n_q)."""
-    found = []
-    for v, still in zip(motion.qd.T, rest.T, strict=True):
-        moving = np.flatnonzero(~still)
-        turns = np.flatnonzero(np.diff(np.sign(v[moving])))
-        between = np.diff(moving)[turns]
-        found.append(len(turns) > 0 and np.mean(between > 1) > 0.5)
-    return np.array(found)
-
-
-def _hold(fitted: ModelOnTrial, u: Array, axes: NDArray[np.bool_]) -> Holding:
-    """Have ``axes`` (n_q,) of a robot follow the motion as measured."""
-    gains = fitted.system.input_map(fitted.motion.q[:1], u[:1], fitted.p)[0]
-    along = np.linalg.pinv(gains).T[axes]
-    return Holding(np.flatnonzero(axes).tolist(), along, fitted.motion.qdd)
+    return bool(known.any() and np.all(made[known] > _JUMPS * whole[known]))
 
 
 def _required_force(fitted: ModelOnTrial, u: Array) -> Array:

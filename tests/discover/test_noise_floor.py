@@ -183,59 +183,9 @@ def test_the_jumps_of_a_drive_that_acts_late_are_seen(late: float) -> None:
     fitted = SimpleNamespace(
         system=system, motion=motion, p=np.zeros(1), residual=(given - needed)[:, None]
     )
-    assert replay._jumps(fitted, given[:, None]).all()
+    assert replay._jumps(fitted, given[:, None])
     built_up = np.convolve(given, np.ones(10) / 10.0, mode="same")[:, None]
     slow = SimpleNamespace(
         system=system, motion=motion, p=np.zeros(1), residual=built_up - needed[:, None]
     )
-    assert not replay._jumps(slow, built_up).any()
-
-
-def test_joints_that_rest_where_they_turn_are_told_from_those_that_pass() -> None:
-    t = np.arange(0.0, 10.0, 0.005)
-    qd = np.column_stack([np.cos(3.0 * t), np.cos(3.0 * t), np.full_like(t, 0.2)])
-    rest = np.zeros(qd.shape, dtype=bool)
-    rest[:, 0] = np.abs(qd[:, 0]) < 0.05
-    rest[:100, 1] = True  # before it starts
-    motion = SimpleNamespace(qd=qd)
-    assert replay._rests_where_it_turns(motion, rest).tolist() == [True, False, False]
-
-
-@pytest.mark.parametrize("resting", [False, True])
-def test_joints_without_a_jump_are_free_only_where_they_rest(
-    resting: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Beside joints whose drives jump."""
-    held = []
-
-    def simulated(*arguments: Any, **options: Any) -> tuple[Any, Any]:
-        held.append(options["holding"])
-        return np.zeros((4, 4)), np.zeros((4, 2))
-
-    monkeypatch.setattr(replay, "simulate_tracking", simulated)
-    monkeypatch.setattr(replay, "ModelOnTrial", lambda system, p, motions: None)
-    monkeypatch.setattr(replay, "standstill_of", lambda motion, system, rate_hz: None)
-    monkeypatch.setattr(replay, "_required_force", lambda fitted, u: np.ones((4, 2)))
-    monkeypatch.setattr(replay, "_jumps", lambda fitted, u: np.array([True, False]))
-    monkeypatch.setattr(
-        replay, "_rests_where_it_turns", lambda motion, rest: np.array([True, resting])
-    )
-    monkeypatch.setattr(replay, "_hold", lambda fitted, u, axes: axes)
-    coordinates = [SimpleNamespace(sign_width=1e-3)] * 2
-    device = SimpleNamespace(
-        robot=True, prescribed=False, forces=("a", "b"), coordinates=coordinates
-    )
-    system: Any = SimpleNamespace(
-        coordinates=("one", "two"), inputs=("a", "b"), model=SimpleNamespace(device=device),
-        undriven=(), moves_sensors=False, derivative=None, noise=(), forced=(),
-        initial_memory=lambda q, u, p: np.zeros(0), encoder_readings=lambda x, u, p: x,
-    )  # fmt: skip
-    motion: Any = SimpleNamespace(
-        q=np.zeros((4, 2)), qd=np.zeros((4, 2)), inputs=lambda names: np.zeros((4, 2))
-    )
-    course = replay.follow_motion(system, np.zeros(0), motion, 100.0)
-    if resting:
-        np.testing.assert_array_equal(held, [[True, False]])
-    else:
-        assert not held
-        np.testing.assert_array_equal(course.force, 1.0)
+    assert not replay._jumps(slow, built_up)

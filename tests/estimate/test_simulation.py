@@ -7,7 +7,7 @@ import pytest
 from numba import njit, types
 
 from bampipe.errors import InputError
-from bampipe.estimate.simulation import Holding, Impedance, simulate, simulate_tracking
+from bampipe.estimate.simulation import Impedance, simulate, simulate_tracking
 
 WIDTH = np.array([2.5e-4])
 
@@ -134,38 +134,6 @@ def test_replay_with_other_friction_stays_near_the_motion():
     moving = np.abs(x[:, 1]) > 0.1
     extra = (total[:, 0] - u[:, 0])[moving] * np.sign(x[moving, 1])
     assert np.median(extra) == pytest.approx(1.0, abs=0.15)  # the arm supplies the added friction
-
-
-@njit(types.void(*[types.float64[::1]] * 5), error_model="numpy")
-def coupled(x, u, p, w, dx):
-    """Two masses that accelerate each other, on springs, with friction; u: a force on either."""
-    dx[0], dx[1] = x[2], x[3]
-    first = u[0] - 3.0 * x[2] - 2.0 * np.tanh(x[2] / 1e-3) - 5.0 * x[0]
-    second = u[1] - 1.0 * x[3] - 0.5 * np.tanh(x[3] / 1e-3) - 8.0 * x[1]
-    dx[2] = (first - 0.5 * second) / 1.75  # of the mass matrix [[2, 0.5], [0.5, 1]]
-    dx[3] = (2.0 * second - 0.5 * first) / 1.75
-
-
-@pytest.mark.parametrize("rate", [1000.0, 200.0])
-def test_an_axis_that_is_held_follows_to_the_letter_and_the_others_are_free(rate):
-    t = np.arange(round(6.0 * rate)) / rate
-    q = np.column_stack([0.3 * np.sin(2.0 * t), 0.2 * np.sin(3.0 * t + 1.0)])
-    qd = np.column_stack([0.6 * np.cos(2.0 * t), 0.6 * np.cos(3.0 * t + 1.0)])
-    qdd = np.column_stack([-1.2 * np.sin(2.0 * t), -1.8 * np.sin(3.0 * t + 1.0)])
-    friction = np.array([3.0, 1.0]) * qd + np.array([2.0, 0.5]) * np.tanh(qd / 1e-3)
-    needed = qdd @ np.array([[2.0, 0.5], [0.5, 1.0]]) + friction + np.array([5.0, 8.0]) * q
-    given = needed.copy()
-    given[:, 0] = 0.0  # what its drive logs is not needed: the motion says what it gives
-    x, total = simulate_tracking(
-        coupled, np.array([*q[0], *qd[0]]), given, np.empty(0), 1.0 / rate, q, qd,
-        width=np.array([1e-3, 1e-3]), n_noise=0, force=[0, 1], smooth=[0, 1],
-        holding=Holding([0], np.array([[1.0, 0.0]]), qdd),
-    )  # fmt: skip
-    np.testing.assert_allclose(x[:, 0], q[:, 0], rtol=0.0, atol=1e-12)
-    assert np.abs(x[:, 1] - q[:, 1]).max() < 2e-3
-    # Away from reversals of the other axis, whose drive's log runs straight through its jumps.
-    steady = (np.abs(qd[:, 1]) > 0.2) & (np.abs(qd[:, 0]) > 0.01)
-    assert np.std((total - needed)[steady, 0]) < 0.02 * np.std(needed[:, 0])
 
 
 def test_without_natural_frequency_the_arm_is_absent():
