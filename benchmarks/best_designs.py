@@ -130,7 +130,8 @@ def report(title: str, session: Session) -> None:
     varied = [
         other for k in dict.fromkeys(narrow.ravel()) for other in vary_surroundings(seen, every[k])
     ]
-    by_all = np.concatenate([by_all, session.of_designs(varied)])
+    if varied:  # one axis alone has no surroundings
+        by_all = np.concatenate([by_all, session.of_designs(varied)])
     for which, designs in (("of next", by_own), ("any", by_all)):
         single = at_hand / np.array([session.sd(one) for one in designs])
         alone = [

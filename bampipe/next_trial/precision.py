@@ -203,8 +203,9 @@ class Precision:
         return int(np.count_nonzero(self.weighed == 0.0))
 
     def _few(self, blocks: int) -> float:
-        """By how much few blocks widen a standard deviation."""
-        return float(np.sqrt(blocks / max(blocks - self._fitted, 1)))
+        """By how much few blocks widen a standard deviation; for very few, shorter ones count."""
+        taken = max(blocks, 2 * self._fitted)
+        return float(np.sqrt(taken / (taken - self._fitted)))
 
     def worth(self, added: Array, seconds: float, parameter: str = "") -> float:
         """What trials are worth, nats: for one parameter, or where none is named for all.

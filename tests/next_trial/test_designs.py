@@ -516,6 +516,12 @@ def test_what_few_blocks_widen_goes_with_more_of_them():
     assert few.sd_with(nothing, 1000.0)[0] == pytest.approx(0.01, rel=0.02)
 
 
+def test_more_blocks_never_widen_an_uncertainty():
+    factors = [made_precision(0.01, 0.01, 1)._few(blocks) for blocks in range(1, 40)]
+    assert factors == sorted(factors, reverse=True)
+    assert factors[0] == pytest.approx(np.sqrt(2.0))
+
+
 def test_what_methods_disagree_by_is_diluted_and_what_a_calibration_leaves_open_stays():
     known = made_precision(np.sqrt(0.01**2 + 0.04**2 + 0.02**2), 0.01, 10_000, 0.04, 0.02)
     nothing, much = np.zeros((2, 2)), 1e6 * known.information
