@@ -47,7 +47,7 @@ def find_standstill(
     still = np.zeros(qd.shape, dtype=bool)
     longest = int(REST_S * rate_hz)
     for column, v, limit, loose in zip(still.T, qd.T, slow.T, ringing.T, strict=True):
-        for start, end in [*_runs(np.abs(v) < limit), *_ringing(v, loose)]:
+        for start, end in [*find_runs(np.abs(v) < limit), *_ringing(v, loose)]:
             if end - start - _turning(v, limit, start, end) > longest:
                 column[start:end] = True
     if braked is not None:
@@ -55,7 +55,7 @@ def find_standstill(
     return still
 
 
-def _runs(chosen: NDArray[np.bool_]) -> list[tuple[int, int]]:
+def find_runs(chosen: NDArray[np.bool_]) -> list[tuple[int, int]]:
     """First sample and the one after the last of every run of chosen samples."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], chosen.astype(int), [0]])))
     return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
@@ -67,7 +67,7 @@ def _ringing(v: Array, limit: Array) -> list[tuple[int, int]]:
     From the sample before the first change of sign to the one after the last.
     """
     found = []
-    for start, end in _runs(np.abs(v) < limit):
+    for start, end in find_runs(np.abs(v) < limit):
         turns = start + np.flatnonzero(np.diff(np.sign(v[start:end])))
         if len(turns) > 1:
             found.append((int(turns[0]), int(turns[-1]) + 2))

@@ -31,7 +31,7 @@ def explain_proposal(
     unlimited: Sequence[str],
     lacking: Sequence[str],
     missing: Sequence[str] | None = (),
-    told: Sequence[str] = (),
+    distinguishable: Sequence[str] = (),
     unbraked: Sequence[str] = (),
 ) -> Reasons:
     """Say why a trial is proposed and what it is expected to give.
@@ -42,7 +42,7 @@ def explain_proposal(
         unlimited: axes of which the device states no range, so that nothing wider was tried.
         lacking: axes whose held-out error is above the noise floor.
         missing: effects that the diagnosis found and the model does not have; None without one.
-        told: effects that it leaves open, though trials like these tell them apart.
+        distinguishable: effects that it leaves open, though trials like these tell them apart.
         unbraked: effects of brakes that no trial at hand has on.
     """
     why, expected = _explain(purpose, parameter, best, table, unlimited, unbraked)
@@ -71,10 +71,10 @@ def explain_proposal(
             f" The error of {join_names(lacking, _SHOWN)} is above the noise floor: what the model"
             " lacks there counts as noise in these uncertainties."
         )
-    if told:
+    if distinguishable:
         why = (
-            f"The diagnosis leaves {join_names(told)} open, and no trial decides that: were it just"
-            " one of them, these trials would tell which (chance of confusing them"
+            f"The diagnosis leaves {join_names(distinguishable)} open, and no trial decides that:"
+            " were it just one of them, these trials would tell which (chance of confusing them"
             f" {_chance(0.0)}). More is missing than that. {why}"
         )
     return Reasons(why, expected)

@@ -133,9 +133,9 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         values = {name: v for row in diagnosed.ranking for name, v in row.parameters.items()}
         contest = make_contest(trials, recipe, p, asked, values, floor)
     at_hand = contest.sums(trials.weighed) if contest else None
-    told: tuple[str, ...] = ()
+    distinguishable: tuple[str, ...] = ()
     if purpose == "auto" and contest and at_hand and contest.tells_apart(at_hand):
-        told = tuple(rival.name for rival in contest.rivals if rival.name)
+        distinguishable = tuple(rival.name for rival in contest.rivals if rival.name)
         contest, at_hand = None, None
     if purpose == "decision" and contest is None:
         raise InputError(
@@ -200,7 +200,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     missing = diagnosed.selected if diagnosed is not None else None
     unbraked = blindness.of_brakes if blindness and not seen.field.any() else ()
     reasons = explain_proposal(
-        chosen, parameter, best, table, unlimited, lacking, missing, told, unbraked
+        chosen, parameter, best, table, unlimited, lacking, missing, distinguishable, unbraked
     )
     result = NextResult(
         model=config.model,

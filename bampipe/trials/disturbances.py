@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 from bampipe.errors import InputError
 from bampipe.estimate.least_squares import Stacked, minimise, stacked_residual
 from bampipe.estimate.low_pass import Band
+from bampipe.estimate.standstill import find_runs
 from bampipe.physics import System
 from bampipe.results.filter import Disturbance
 from bampipe.trials.cache import TrialCache
@@ -27,7 +28,7 @@ from bampipe.trials.residuals import applied_rms, problem_of
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-BLOCK_S = 0.2
+_BLOCK_S = 0.2
 """Length of the blocks of which the errors are compared, s."""
 _TIMES = 20.0
 """Error of the worst block of such a stretch over that of the rest. `benchmarks/disturbances.py` is
@@ -46,12 +47,15 @@ _NEIGHBOURS, _FEWEST, _RADIUS = 12, 4, 0.35
 """Samples held against one of a stretch, and how near they are: in spreads of all that the error
 may depend on, and at least `_APART_S` away or in another trial."""
 _SLOWLY = 50.0
+"""How much finer velocities are told apart at standstill than as a whole: friction changes within
+little there, and turns are held against turns."""
 _UNKNOWN = 3
 """Most blocks at rest that a stretch goes on through."""
 _SLOW, _FRICTION = 0.1, 2.0
 """Below this share of its root mean square velocity an axis may turn unseen; a wrong sign of the
 velocity may be worth so many root mean squares of the applied force."""
 _ROUNDS = 8
+"""Of weighing wild blocks down, after which the weights stand."""
 _SHORTEST_S = 1.0
 """Of a part between two disturbances, s, that a filter can start in."""
 
@@ -137,7 +141,7 @@ class _Samples:
             return None
         size, rest = (_rms(self.error[part, axis]) for part in (inside, outside))
         coordinate = self.system.model.device.coordinates[axis]
-        unit = "N.m" if coordinate.unit == "rad" else "N"
+        unit = coordinate.torque_unit
         when = "the same motion included" if again else "where it moves otherwise"
         words = (
             f"of {coordinate.name} is {size:.3g} {unit}, {rest:.3g} {unit} at all other times,"
@@ -194,11 +198,13 @@ def _gather(
         np.concatenate([by_trial[k].slope for k in order]),
         np.concatenate([by_trial[k].used for k in order]),
     )
-    blocks = _cut(motions, band)
-    kept = [_thinned(system, motion, band) for motion in motions]
-    t, state, inputs = (np.concatenate(columns) for columns in zip(*kept, strict=True))
+    kept = [_thinned(system, motion, band) for motion in motions]  # one pass: of many, few are held
+    blocks = _cut([trial.t for trial in kept], [trial.end_s for trial in kept], band)
+    t, state, inputs, turning = (
+        np.concatenate([getattr(trial, name) for trial in kept])
+        for name in ("t", "motion", "inputs", "turning")
+    )
     error = _robust_residual(stacked, blocks)
-    turning = np.concatenate([_turning(motion, band) for motion in motions])
     force = applied_rms(system, motions, band, found.p[:-1], [by_trial[k].used for k in order])
     beyond = np.sign(error) * np.maximum(np.abs(error) - _FRICTION * force, 0.0)
     excess = np.where(turning, beyond, error)
@@ -206,24 +212,41 @@ def _gather(
 
 
 def _turning(motion: Motion, band: Band) -> Flags:
-    """Which thinned samples lie within half a period of the band of a turn or a halt, (K, n_q)."""
+    """Which samples lie within half a period of the band of a turn or a halt, (T, n_q)."""
     turns = np.abs(motion.qd) < _SLOW * np.sqrt(np.mean(motion.qd**2, axis=0))
     turns[1:] |= np.signbit(motion.qd[1:]) != np.signbit(motion.qd[:-1])
-    near = np.empty_like(turns)
+    near: Flags = np.empty_like(turns)
     for i, cutoff in enumerate(band.cutoff_hz):
         reach = int(np.ceil(0.5 * band.rate_hz / cutoff))
         near[:, i] = maximum_filter1d(turns[:, i], 2 * reach + 1)
-    return np.asarray(near[band.thinned_rows(len(motion.t))])
+    return near
 
 
-def _thinned(system: System, motion: Motion, band: Band) -> tuple[Array, Array, Array]:
-    """Time, motion and inputs of the samples that the residual keeps; see `_Samples`."""
+@dataclass(frozen=True)
+class _Thinned:
+    """Samples of one trial that the residual keeps, as those of all in `_Samples`.
+
+    Attributes:
+        turning: (K, n_q) near a turn or a halt; end_s: of the trial.
+    """
+
+    t: Array
+    motion: Array
+    inputs: Array
+    turning: Flags
+    end_s: float
+
+
+def _thinned(system: System, motion: Motion, band: Band) -> _Thinned:
+    """What is kept of one trial."""
     rows = band.thinned_rows(len(motion.t))
     forces = system.model.device.forces
     u = motion.inputs([name for name in system.inputs if name != "t" and name not in forces])
     before = np.maximum(rows - round(_BEFORE_S * band.rate_hz), 0)
     state = np.stack([motion.q[rows], motion.qd[rows], motion.qdd[rows]], axis=2)
-    return motion.t[rows], state, np.hstack([u[rows], u[rows] - u[before]])
+    inputs = np.hstack([u[rows], u[rows] - u[before]])
+    turning = _turning(motion, band)[rows]
+    return _Thinned(motion.t[rows], state, inputs, turning, float(motion.t[-1]))
 
 
 def _rms(values: Array) -> float:
@@ -270,12 +293,10 @@ def part_trials(motions: Sequence[Motion], rate_hz: float) -> tuple[Sequence[Mot
     rows: list[slice] = []
     of_trial: list[int] = []
     for number, motion in enumerate(motions):
-        sound = np.ones(motion.t.size + 2, dtype=np.int8)
-        sound[[0, -1]] = 0
+        sound = np.ones(motion.t.size, dtype=bool)
         if motion.left_out is not None:
-            sound[1:-1] = ~motion.left_out.any(axis=1)
-        edges = np.flatnonzero(np.diff(sound))
-        for start, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+            sound = np.logical_not(motion.left_out.any(axis=1))
+        for start, end in find_runs(sound):
             if end - start >= _SHORTEST_S * rate_hz or end - start == motion.t.size:
                 rows.append(slice(start, end))
                 of_trial.append(number)
@@ -296,28 +317,27 @@ def part_trials(motions: Sequence[Motion], rate_hz: float) -> tuple[Sequence[Mot
     )
 
 
-def _cut(motions: Sequence[Motion], band: Band) -> _Blocks:
-    """The thinned samples of some trials in blocks of `BLOCK_S`."""
-    rows = max(1, round(BLOCK_S * band.rate_hz / band.step))
+def _cut(times: Sequence[Array], ends_s: Sequence[float], band: Band) -> _Blocks:
+    """Thinned samples in blocks of `_BLOCK_S`.
+
+    The margins of the low-pass belong to the blocks beside them.
+
+    Args:
+        times: of the samples, by trial, each (K,), s; ends_s: of the trials.
+    """
+    rows = max(1, round(_BLOCK_S * band.rate_hz / band.step))
     block, trial, starts, ends = [], [], [], []
     count = 0
-    for number, motion in enumerate(motions):
-        kept = band.thinned_rows(len(motion.t))
-        own = np.arange(kept.size) // rows
-        block.append(count + own)
-        total = int(own[-1]) + 1 if own.size else 0
-        first = kept[::rows]
-        trial.append(np.full(total, number))
-        start = motion.t[first]
-        end = motion.t[np.minimum(first + rows * band.step, len(motion.t) - 1)]
-        if total:  # the margins of the low-pass belong to the blocks beside them
-            start[0], end[-1] = motion.t[0], motion.t[-1]
+    for number, (t, end_s) in enumerate(zip(times, ends_s, strict=True)):
+        start = t[::rows].copy()
+        block.append(count + np.arange(t.size) // rows)
+        trial.append(np.full(start.size, number))
+        if start.size:
+            ends.append(np.append(start[1:], end_s))
+            start[0] = 0.0
         starts.append(start)
-        ends.append(end)
-        count += total
-    return _Blocks(
-        np.concatenate(block), np.concatenate(trial), np.concatenate(starts), np.concatenate(ends)
-    )
+        count += start.size
+    return _Blocks(*(np.concatenate(parts) for parts in (block, trial, starts, ends)))
 
 
 def _robust_residual(stacked: Stacked, blocks: _Blocks) -> Array:
@@ -360,11 +380,11 @@ def _candidates(mean_square: Array, whole: Array, blocks: _Blocks) -> list[tuple
         beside[:-1] |= loud[1:] & (blocks.trial[1:] == blocks.trial[:-1])
         loud |= beside & ~known
     apart = np.flatnonzero(np.diff(blocks.trial)) + 1
-    edges = np.diff(np.concatenate([[0], loud.astype(np.int8), [0]]))
-    bounds = np.sort(
-        np.concatenate([np.flatnonzero(edges), np.repeat(apart[loud[apart - 1] & loud[apart]], 2)])
-    )
-    stretches = list(zip(bounds[::2].tolist(), bounds[1::2].tolist(), strict=True))
+    stretches = [
+        (offset + start, offset + end)
+        for offset, part in zip([0, *apart.tolist()], np.split(loud, apart), strict=True)
+        for start, end in find_runs(part)
+    ]
     total, count, inside = size.sum(), int(known.sum()), 0
     found = []
     for start, end in sorted(stretches, key=lambda one: -size[one[0] : one[1]].max()):
@@ -393,7 +413,6 @@ def _repeated_share(state: Array, error: Array, inside: Flags, others: Flags) ->
         inside: the stretch; others: what it is held against.
     """
     places = state / np.maximum(state[others].std(axis=0), np.finfo(float).tiny)
-    # A tenth of the scale at standstill: friction changes within little, and turns meet turns.
     places[:, 1] = np.arcsinh(_SLOWLY * places[:, 1]) / np.arcsinh(_SLOWLY)
     tree = cKDTree(places[others])
     distance, neighbour = tree.query(places[inside], k=_NEIGHBOURS, distance_upper_bound=_RADIUS)

@@ -464,9 +464,9 @@ def test_what_the_trial_would_show_is_named_first():
 
 
 def test_rivals_that_the_trials_would_tell_apart_are_left_to_no_trial():
-    told = ["drag:joint", "sag:joint"]
+    distinguishable = ["drag:joint", "sag:joint"]
     best = made_proposal(0.1).model_copy(update={"confusion": ()})
-    why = explain_proposal("precision", "", best, {}, (), (), told=told).why
+    why = explain_proposal("precision", "", best, {}, (), (), distinguishable=distinguishable).why
     assert why.startswith("The diagnosis leaves drag:joint and sag:joint open, and no trial")
     assert "below 1 %" in why
     pair = made_proposal(0.0).confusion[0].model_copy(update={"before": 0.001})

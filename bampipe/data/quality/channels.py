@@ -63,6 +63,13 @@ def fill_missing(table: TrialTable) -> None:
             )
 
 
+def take_out(table: TrialTable, column: str, wild: np.ndarray) -> None:
+    """Mark wild readings (T,) of a column as missing, and say so; `fill_missing` fills them."""
+    table.columns[column][wild] = np.nan
+    words = counted(int(wild.sum()), "wild reading")
+    table.repairs.append(f"column '{column}': {words} taken out")
+
+
 def _refuse_missing(table: TrialTable, name: str, missing: np.ndarray) -> None:
     count = int(missing.sum())
     if count == 0:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bampipe.data.quality.table import TrialTable
+from bampipe.data.quality.table import TrialTable, find_runs
 from bampipe.results.ingest import DeadStretch
 
 _SHORTEST_S = 0.1
@@ -43,8 +43,8 @@ def find_equal_runs(values: np.ndarray, t: np.ndarray) -> list[tuple[int, int]]:
     # A set-point goes on the way it went, and an input at its limit stays there.
     if moved.size < 2 or np.mean(moved[1:] * moved[:-1] < 0.0) < _UNSTEADY:
         return []
-    edges = np.diff(np.concatenate([[0], (changes == 0.0).astype(np.int8), [0]]))
-    starts, stops = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) + 1
+    starts, stops = find_runs(changes == 0.0)
+    stops = stops + 1
     long = t[stops - 1] - t[starts] >= _SHORTEST_S
     equal = int(np.sum((stops - starts - 1)[~long]))
     share = equal / max(equal + moved.size, 1)

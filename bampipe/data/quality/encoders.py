@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from bampipe.data import velocity
-from bampipe.data.quality.channels import fill_missing
-from bampipe.data.quality.table import TrialTable, counted, in_times
+from bampipe.data.quality.channels import fill_missing, take_out
+from bampipe.data.quality.table import TrialTable, in_times
 from bampipe.data.session import Encoder
 
 FASTEST = {"rad": 20.0, "m": 4.0}
@@ -119,10 +119,7 @@ def interpolate_jumps(table: TrialTable, encoder: Encoder) -> None:
             at=at + 1,
             remedy="counts lost, or the counter was reset",
         )
-    values[wild] = np.nan
-    table.repairs.append(
-        f"column '{encoder.column}': {counted(int(wild.sum()), 'wild reading')} taken out"
-    )
+    take_out(table, encoder.column, wild)
     fill_missing(table)
 
 

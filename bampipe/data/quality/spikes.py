@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from bampipe.data.quality.channels import fill_missing
-from bampipe.data.quality.table import TrialTable, counted
+from bampipe.data.quality.channels import fill_missing, take_out
+from bampipe.data.quality.table import TrialTable
 
 POSITION, INPUT = (0.95, 20.0), (0.5, 40.0)
 """A reading is wild this many times farther from its neighbours than so large a share of the
@@ -68,8 +68,6 @@ def interpolate_spikes(table: TrialTable) -> None:
         wild = find_spikes(values, rule)
         if 0 < wild.sum() <= table.limits.nan_share * len(values):
             some = True
-            values[wild] = np.nan
-            words = counted(int(wild.sum()), "wild reading")
-            table.repairs.append(f"column '{column}': {words} taken out")
+            take_out(table, column, wild)
     if some:
         fill_missing(table)

@@ -123,10 +123,15 @@ class TrialTable:
             raise self.fault(words(at), column=column, at=at, remedy=remedy)
 
 
+def find_runs(which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """First of every run of True in a (T,) mask, and the one after its last."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], which, [False]]).astype(np.int8)))
+    return edges[0::2], edges[1::2]
+
+
 def longest_run(which: np.ndarray) -> tuple[int, int]:
     """Start and length of the longest run of True in a (T,) mask, (0, 0) where there is none."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], which, [False]]).astype(np.int8)))
-    starts, stops = edges[0::2], edges[1::2]
+    starts, stops = find_runs(which)
     if len(starts) == 0:
         return 0, 0
     longest = int(np.argmax(stops - starts))
