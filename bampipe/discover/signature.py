@@ -89,8 +89,7 @@ def _compute_signature(
     u = _inputs(bare, channels, t)
     needed = bare.required(q, qd, qdd, bare.memory(q, qd, qdd, u, p, t), u, p)
     applied = bare.applied(q, qd, qdd, bare.memory(q, qd, qdd, u, p, t), u, p)
-    map_ = bare.input_map(q, u, p)
-    force = _smooth(np.einsum("tij,tj->ti", np.linalg.pinv(map_), needed - applied))
+    force = _smooth(bare.least_force(q, needed - applied, u, p))
     for number, label in enumerate(device.forces):
         channels[label] = force[:, number]
         rate = force[:, number]

@@ -6,7 +6,6 @@ own, and goes through the sensors and filters of the session.
 
 from __future__ import annotations
 
-from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -114,8 +113,7 @@ class Rehearsal:
         for _ in range(_STEPS):
             u = motion.inputs(system.inputs)
             left, _ = residual_and_memory(system, motion, u, self.p)
-            gains = system.input_map(motion.q, u, self.p)
-            excess = _solve(gains, left)
+            excess = system.least_force(motion.q, left, u, self.p)
             changed = {name: motion.channels[name] - excess[:, k] for k, name in enumerate(forces)}
             if not system.driven and not system.memory_names:
                 # Nothing else depends on the force: its rates are not needed.
@@ -125,15 +123,6 @@ class Rehearsal:
                 changed |= {derivative(name, o + 1): rate for o, rate in enumerate(rates)}
             motion = motion.with_channels(changed)
         return motion
-
-
-def _solve(gains: Array, left: Array) -> Array:
-    """The least forces (T, n_f) that make up for ``left`` (T, n_q) through ``gains``."""
-    if gains.shape[1] == gains.shape[2]:
-        # Some ten times as fast; a pose in which a force does nothing has no solution.
-        with suppress(np.linalg.LinAlgError):
-            return np.asarray(np.linalg.solve(gains, left[..., None])[..., 0])
-    return np.asarray(np.einsum("tfq,tq->tf", np.linalg.pinv(gains), left))
 
 
 def follow_roughly(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import cached_property
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
@@ -349,6 +350,21 @@ class System:
         u = np.zeros((len(q), len(self.inputs))) if u is None else u
         columns = self._arrays.input_map(q.T, u.T, self.prior if p is None else p)
         return _stack(columns, len(q)).reshape(len(q), n, -1)
+
+    def least_force(
+        self, q: Array, load: Array, u: Array | None = None, p: Array | None = None
+    ) -> Array:
+        """The forces of least norm that give generalised forces ``load`` (T, n_q), (T, n_force).
+
+        Args:
+            q, u, p: as for `input_map`.
+        """
+        map_ = self.input_map(q, u, p)
+        if map_.shape[1] == map_.shape[2]:
+            # Some ten times as fast; a pose in which a force does nothing has no solution.
+            with suppress(np.linalg.LinAlgError):
+                return np.asarray(np.linalg.solve(map_, load[..., None])[..., 0])
+        return np.asarray(np.einsum("tfq,tq->tf", np.linalg.pinv(map_), load))
 
     def mass_matrix(self, q: Array, p: Array) -> Array:
         """Mass matrix (eq 13), (T, n_q, n_q), kg m2, kg m, kg."""

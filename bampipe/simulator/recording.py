@@ -96,11 +96,10 @@ def _sensed_force(specimen: Specimen, true: TrueTrial) -> Array:
         raise InputError("an input effect with internal states cannot be simulated")
     p, no_states = specimen.p(system), np.zeros((len(late), 0))
     still, names = np.zeros_like(true.q), specimen.device.forces
-    inverse = np.linalg.pinv(system.input_map(true.q))
 
     def corrected(u: Array) -> Array:
         applied = system.applied(true.q, true.qd, still, no_states, u, p)
-        return np.asarray(np.einsum("tfq,tq->tf", inverse, applied), dtype=np.float64)
+        return system.least_force(true.q, applied)
 
     zero = _sensor_inputs(system, true, np.zeros_like(late))
     constant = corrected(zero)

@@ -125,19 +125,13 @@ def simulate_locked_trial(
     q[:, i] += deflection
     load = np.zeros((len(t), len(names)))
     load[:, i] = stiffness * deflection + friction * share
-    force = _handle_forces(specimen.motion.input_map(q), load)
+    force = specimen.motion.least_force(q, load)
     wander = rng.uniform(0.0, 2 * np.pi, size=force.shape[1])
     others = np.abs(force).max(axis=0) < 0.05 * np.abs(force).max()
     force += np.where(others, 1.2 * np.sin(2 * np.pi * 0.17 * t[:, None] + wander), 0.0)
     brake = np.zeros((len(t), len(device.brakes)))
     brake[:, list(device.brakes).index(axis)] = LOCKED_BRAKE
     return TrueTrial(t, q, np.zeros_like(q), force, brake)
-
-
-def _handle_forces(input_map: Array, load: Array) -> Array:
-    """Handle forces (T, n_f) that give the generalised forces ``load`` (T, n_q)."""
-    inverse = np.linalg.pinv(input_map)
-    return np.asarray(np.einsum("tfq,tq->tf", inverse, load), dtype=np.float64)
 
 
 def _middle_and_half_range(device: Device, c: Coordinate) -> tuple[float, float]:

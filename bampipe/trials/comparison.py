@@ -64,7 +64,6 @@ def compare_trial(evidence: Evidence, number: int, p: Array, late_s: float = 0.0
     force = [system.inputs.index(name) for name in system.model.device.forces]
     rows = band.thinned_rows(len(motion.t))
     residual = band.thin(ModelOnTrial(system, p, timed).residual)
-    push = np.linalg.pinv(system.input_map(motion.q[rows], u[rows], p))
     return ComparedTrial(
         trial_id=motion.trial_id,
         t=motion.t[rows],
@@ -74,7 +73,7 @@ def compare_trial(evidence: Evidence, number: int, p: Array, late_s: float = 0.0
         residual_held_out=evidence.held_out_residual(number),
         residual_without_friction=band.thin(ModelOnTrial(system, frictionless, timed).residual),
         force=band.thin_input(u[:, force]),
-        force_residual=np.einsum("tfq,tq->tf", push, residual),
+        force_residual=system.least_force(motion.q[rows], residual, u[rows], p),
         judged=folds.judged[number] and not folds.nothing_held_out,
     )
 

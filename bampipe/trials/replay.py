@@ -173,9 +173,8 @@ def _jumps(fitted: ModelOnTrial, u: Array) -> bool:
 def _required_force(fitted: ModelOnTrial, u: Array) -> Array:
     """The force that the model needs for the motion as measured, (T, n_f): none is left over."""
     system = fitted.system
-    gains = system.input_map(fitted.motion.q, u, fitted.p)
     forces = [system.inputs.index(name) for name in system.model.device.forces]
-    excess = np.einsum("tfq,tq->tf", np.linalg.pinv(gains), fitted.residual)
+    excess = system.least_force(fitted.motion.q, fitted.residual, u, fitted.p)
     return np.asarray(u[:, forces] - excess)
 
 

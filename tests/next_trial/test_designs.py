@@ -16,7 +16,6 @@ from bampipe.next_trial.forecast import Forecast
 from bampipe.next_trial.motion import (
     HASTY,
     Rehearsal,
-    _solve,
     example_path,
     follow_roughly,
     stroke_path,
@@ -233,17 +232,6 @@ def test_a_trial_that_is_imitated_goes_on_smoothly_and_stays_where_it_was():
         " 23°/s, pitch between −9° and 14° (−0.15 to 0.25 rad) at up to 30°/s, over and over for"
         " 30 s."
     )
-
-
-def test_forces_make_up_for_a_residual_also_where_one_of_them_does_nothing():
-    rng = np.random.default_rng(0)
-    gains, force = rng.normal(size=(5, 3, 3)), rng.normal(size=(5, 3))
-    left = np.einsum("tqf,tf->tq", gains, force)
-    np.testing.assert_allclose(_solve(gains, left), force, rtol=1e-9)
-    gains[2, :, 1] = 0.0
-    found = _solve(gains, np.einsum("tqf,tf->tq", gains, force))
-    np.testing.assert_allclose(np.delete(found[2], 1), np.delete(force[2], 1), rtol=1e-9)
-    assert found[2, 1] == pytest.approx(0.0, abs=1e-9)
 
 
 def test_who_follows_roughly_stays_within_the_device_too():

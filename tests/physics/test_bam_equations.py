@@ -1,12 +1,14 @@
 """The derived BAM against the equations worked out by hand (sections II-B to II-D)."""
 
+from types import SimpleNamespace
+
 import bam_oracle as oracle
 import numpy as np
 import pytest
 from motions import random_motion
 from scipy.linalg import expm
 
-from bampipe.physics import Model, compile_model, registry
+from bampipe.physics import Model, System, compile_model, registry
 
 BAM = registry.device("bam")
 
@@ -232,3 +234,17 @@ def test_singular_mass_matrix_gives_a_value_that_is_not_finite_instead_of_a_wron
     assert not np.isfinite(rate).all()
     system.derivative(np.array([0.0, 0.5, 0.0, 0.0]), np.ones(1), system.prior, np.zeros(1), rate)
     np.testing.assert_allclose(rate, [0.0, 0.0, 2.0, 0.0])
+
+
+def test_least_force_gives_a_load_also_where_one_force_does_nothing():
+    rng = np.random.default_rng(0)
+    gains, force = rng.normal(size=(5, 3, 3)), rng.normal(size=(5, 3))
+
+    def least_force():
+        load = np.einsum("tqf,tf->tq", gains, force)
+        return System.least_force(SimpleNamespace(input_map=lambda *_: gains), np.zeros(5), load)
+
+    np.testing.assert_allclose(least_force(), force, rtol=1e-9)
+    gains[2, :, 1] = 0.0
+    np.testing.assert_allclose(np.delete(least_force()[2], 1), np.delete(force[2], 1), rtol=1e-9)
+    assert least_force()[2, 1] == pytest.approx(0.0, abs=1e-9)
