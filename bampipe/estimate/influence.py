@@ -48,7 +48,7 @@ def find_worst_stretch(
     samples = max(1, round(length_s * band.rate_hz / band.step))
     weight = 1.0 / np.maximum(found.residual_sd, 1e-150)
     information = np.diag(problem.precision)
-    for stacked in found.stacked:
+    for stacked in found.measured:
         slope = stacked.slope * weight[None, :, None]
         information += np.einsum("tqi,tqj->ij", slope, slope)
     inverse = np.linalg.pinv(information, hermitian=True)
@@ -56,7 +56,7 @@ def find_worst_stretch(
     parts: list[Array] = []
     shares: list[Array] = []
     places: list[tuple[int, int]] = []
-    for trial, stacked in enumerate(found.stacked):
+    for trial, stacked in enumerate(found.measured):
         slope = stacked.slope * weight[None, :, None] @ inverse
         starts = np.arange(0, len(slope), samples)
         part = np.einsum("tqi,tq->ti", slope, stacked.residual * weight)

@@ -132,11 +132,13 @@ class LeastSquares(Minimum):
     """Fitted parameters and what they rest on.
 
     Attributes:
+        measured: ``stacked`` with the slopes that the fit went by, see `as_measured`.
         covariance: (n_free, n_free) sandwich estimate: blocks of time are independent, samples
             within one are not; no less than what independent samples would have.
         residual_sd: (n_q,) root mean square of the low-passed residual.
     """
 
+    measured: tuple[Stacked, ...]
     covariance: Array
     residual_sd: Array
 
@@ -221,9 +223,11 @@ def fit(
         ValueError, InputError: as `minimise`.
     """
     found = minimise(problem, start, trials, most_iterations)
+    measured = as_measured(problem, found.p, found.stacked)
     return LeastSquares(
         **vars(found),
-        covariance=_covariance(problem, as_measured(problem, found.p, found.stacked), block_s),
+        measured=tuple(measured),
+        covariance=_covariance(problem, measured, block_s),
         residual_sd=_scatter(found.stacked),
     )
 

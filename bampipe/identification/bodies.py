@@ -75,7 +75,7 @@ def _weight(
     problem, raw = squares.problem, squares.raw
     scale = 1.0 / np.maximum(raw.residual_sd, 1e-300)
     normal = np.diag(problem.precision)
-    for s in raw.stacked:
+    for s in raw.measured:
         slope = (s.slope * scale[None, :, None]).reshape(-1, problem.free.size)
         normal += slope.T @ slope
     column = {int(place): k for k, place in enumerate(problem.free)}

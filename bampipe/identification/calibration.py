@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from bampipe.estimate.least_squares import stacked_residual
+from bampipe.estimate.least_squares import as_measured, stacked_residual
 from bampipe.identification.estimates import Estimate
 from bampipe.physics import System, compile_model
 from bampipe.physics.recipe import Recipe
@@ -57,7 +57,8 @@ def propagate_calibration(
     normal, square, used = np.zeros((n_q, count, count)), np.zeros(n_q), np.zeros(n_q)
     moments = {source.name: np.zeros((n_q, count)) for source in sources}
     for trial, motion in enumerate(motions):
-        stacked = stacked_residual(problem, trial, estimate.p)
+        here = [stacked_residual(problem, trial, estimate.p)]
+        (stacked,) = as_measured(problem, estimate.p, here)
         slope = stacked.slope[:, :, :count]
         normal += np.einsum("kqi,kqj->qij", slope, slope)
         square += np.sum(stacked.residual**2, axis=0)

@@ -59,7 +59,7 @@ def _leave_out(squares: UnbiasedFit, folds: Folds) -> list[Array]:
     if not problem.linear:
         sd = np.sqrt(np.diag(raw.covariance))
         lower, upper = np.maximum(lower, -_FARTHEST * sd), np.minimum(upper, _FARTHEST * sd)
-    stacked = raw.stacked
+    stacked = raw.measured
     sums = NormalEquations.from_samples(
         [s.slope for s in stacked], [s.residual for s in stacked], [s.used for s in stacked],
         problem.precision, problem.known - raw.p[free],

@@ -116,7 +116,7 @@ def remove_bias(
         again = fit(problem_of(system, replays, problem.band, timing=timing), raw.p)
         if np.any(again.residual_sd > UNLIKE * raw.residual_sd):
             raise InputError("the replay of the model does not resemble the machine")
-        return replace(again, stacked=())
+        return replace(again, stacked=(), measured=())
 
     def moved(bias: Array) -> Array:
         p = raw.p.copy()

@@ -16,7 +16,7 @@ from scipy.ndimage import maximum_filter1d
 from scipy.spatial import cKDTree
 
 from bampipe.errors import InputError
-from bampipe.estimate.least_squares import Stacked, minimise, stacked_residual
+from bampipe.estimate.least_squares import Stacked, as_measured, minimise, stacked_residual
 from bampipe.estimate.low_pass import Band
 from bampipe.estimate.standstill import find_runs
 from bampipe.physics import System
@@ -193,10 +193,11 @@ def _gather(
     by_trial = dict(zip(fitted, found.stacked, strict=True))
     order = range(len(motions))
     by_trial |= {k: stacked_residual(problem, k, found.p) for k in order if k not in by_trial}
+    measured = as_measured(problem, found.p, [by_trial[k] for k in order])
     stacked = Stacked(
-        np.concatenate([by_trial[k].residual for k in order]),
-        np.concatenate([by_trial[k].slope for k in order]),
-        np.concatenate([by_trial[k].used for k in order]),
+        np.concatenate([trial.residual for trial in measured]),
+        np.concatenate([trial.slope for trial in measured]),
+        np.concatenate([trial.used for trial in measured]),
     )
     kept = [_thinned(system, motion, band) for motion in motions]  # one pass: of many, few are held
     blocks = _cut([trial.t for trial in kept], [trial.end_s for trial in kept], band)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
@@ -11,7 +11,13 @@ from slider import RATE, TRUTH, record
 from bampipe.errors import InputError
 from bampipe.estimate.butterworth import zero_phase
 from bampipe.estimate.influence import find_worst_stretch
-from bampipe.estimate.least_squares import Problem, fit, stacked_residual
+from bampipe.estimate.least_squares import (
+    LeastSquares,
+    Problem,
+    Stacked,
+    fit,
+    stacked_residual,
+)
 from bampipe.estimate.low_pass import Band
 from bampipe.estimate.standstill import find_moving_samples, find_standstill
 
@@ -101,6 +107,20 @@ def test_a_scale_that_is_free_does_not_collapse(start: float) -> None:
     np.testing.assert_allclose(found.covariance[3, 3], 1.0, rtol=0.05)
     np.testing.assert_allclose(found.p[:3] / found.p[3], TRUTH / 5.0, rtol=0.03)
     assert fit(problem(**scaled), np.append(TRUTH, start)).p[3] < 0.1
+    # What is made of the fit afterwards sees a minimum there, and no way down to no scale at all.
+    assert largest_step(found, found.measured, known, precision) < 1e-3
+    assert largest_step(found, found.stacked, known, precision) > 1.0
+
+
+def largest_step(
+    found: LeastSquares, stacked: Sequence[Stacked], known: np.ndarray, precision: np.ndarray
+) -> float:
+    """Of Gauss and Newton from a fit of one axis, in its standard deviations."""
+    slope = np.concatenate([s.slope[:, 0] for s in stacked]) / found.residual_sd
+    residual = np.concatenate([s.residual[:, 0] for s in stacked]) / found.residual_sd
+    score = precision * (known - found.p) - slope.T @ residual
+    step = np.linalg.solve(slope.T @ slope + np.diag(precision), score)
+    return float(np.abs(step / np.sqrt(np.diag(found.covariance))).max())
 
 
 def test_parameters_not_free_stay() -> None:

@@ -206,7 +206,8 @@ def test_the_torque_constant_of_a_last_joint_stays_where_noise_is_large(tmp_path
     )  # fmt: skip
     paired(tmp_path / "log")
     bampipe.run_session(tmp_path / "log", runs=tmp_path / "runs", last="identify")
-    found = read_json(tmp_path / "runs/log/models/base/identify.json")["parameters"]
+    identified = read_json(tmp_path / "runs/log/models/base/identify.json")
+    found = identified["parameters"]
     scale = {
         name: found[f"torque_constant_{name}"]["estimate"] / constant
         for name, constant in zip(arm.NAMES, truth["constants"], strict=False)
@@ -214,6 +215,9 @@ def test_the_torque_constant_of_a_last_joint_stays_where_noise_is_large(tmp_path
     }
     assert scale["elbow"] == pytest.approx(scale["shoulder"], rel=0.02)
     assert scale["forearm"] > 0.2
+    # Nor does it go to zero where a trial is left out.
+    for moves in identified["influence"]["trials"].values():
+        assert all(abs(moves[f"torque_constant_{name}"]) < 1.0 for name in scale)
 
 
 def test_reductions_of_a_log_from_the_motors_side_follow_from_the_drawing(tmp_path: Path) -> None:
