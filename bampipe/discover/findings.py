@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from bampipe.results.diagnose import (
     AxisVerdict,
@@ -32,6 +32,8 @@ class Diagnosis:
         evidence: of the model with all selected effects.
         initial: of the model as given.
         refused: candidates that beat chance and were added, but not kept.
+        wider: for each selected effect, those that it is a part of and whose other parts add
+            nothing.
     """
 
     axes: tuple[AxisVerdict, ...]
@@ -45,3 +47,4 @@ class Diagnosis:
     evidence: Evidence
     initial: Evidence
     refused: tuple[RefusedEffect, ...] = ()
+    wider: Mapping[str, frozenset[str]] = field(default_factory=dict)

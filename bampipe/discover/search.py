@@ -22,6 +22,7 @@ from bampipe.discover.growth import (
 from bampipe.discover.influence import SampleRange
 from bampipe.discover.insufficient import insufficient_rivals
 from bampipe.discover.level import Level
+from bampipe.discover.nested import idle_extensions
 from bampipe.discover.polish import FittedSet, contest_of, polish
 from bampipe.discover.rivals import Choice, choose
 from bampipe.discover.scorer import Score, Scorer
@@ -52,6 +53,7 @@ class Search:
         first: scores against it.
         found: the model with every effect found, fitted.
         groups: for each effect found, in order, the others that these trials cannot tell from it.
+        wider: for each, those that it is a part of and whose other parts add nothing.
         unlike: where one effect is found and no replay looks like the measurement, neither its own
             nor those of its rivals: these rivals, but for those that leave an axis above the floor
             where the effect found does not.
@@ -79,6 +81,7 @@ class Search:
     first: Mapping[str, Score]
     found: FittedSet
     groups: Mapping[str, tuple[str, ...]]
+    wider: Mapping[str, frozenset[str]]
     unlike: tuple[str, ...]
     misfit: float
     contests: Mapping[str, tuple[Contender, ...]]
@@ -219,9 +222,10 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
         behind = insufficient_rivals(bench, found, name, main[name], unsettled, floor)
         alike[name] = tuple(n for n in alike[name] if n not in behind)
         unlike = tuple(n for n in unlike if n not in behind)
+    wider = {n: idle_extensions(bench, found, n, main[n], {*alike[n], *unlike}) for n in main}
     return Search(
         bench.trials, base, initial, level, first, found,
-        alike, unlike, misfit, contests, main, additions, likely, transient,
+        alike, wider, unlike, misfit, contests, main, additions, likely, transient,
         tuple(r for name, r in refused.items() if name not in found.added), tuple(steps), cut_short,
         tuple(final), tuple(still), floor, explainable,
         bench.shares(found.recipe, found.evidence.p) if found.added else explainable,

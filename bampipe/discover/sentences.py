@@ -133,7 +133,13 @@ def _rivals(axis: str, a: AxisVerdict, found: Diagnosis, unit: str, s: Settings)
     said = []
     for name in a.effects:
         mine, *others = found.contests.get(name, ()) or (None,)
-        rivals = [c for c in others if c.effect not in a.likely]
+        wider = found.wider.get(name, frozenset())
+        said += [
+            f"{c.effect} is {name} and a part more, for which nothing speaks."
+            for c in others
+            if c.effect in wider
+        ]
+        rivals = [c for c in others if c.effect not in {*a.likely, *wider}]
         if mine is None or not rivals:
             continue
         doubted = [c for c in (mine, *rivals) if c.odds >= s.least_odds]

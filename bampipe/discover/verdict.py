@@ -108,6 +108,7 @@ def conclude(search: Search, s: Settings) -> Diagnosis:
     return Diagnosis(
         tuple(findings), tuple(ranking), tuple(kept), groups, contests, search.steps,
         search.cut_short, _transients(search), evidence, search.initial, search.refused,
+        search.wider,
     )  # fmt: skip
 
 
@@ -126,10 +127,11 @@ def _transients(search: Search) -> tuple[TransientCandidate, ...]:
 def _odds_of_group(search: Search, name: str, s: Settings) -> dict[str, float]:
     """Odds of an effect found and of those that replays cannot tell from it.
 
+    None of those that hold it and something more which adds nothing.
     Where no replay looks like the measurement, scores err by as much as that: their scale grows by
     the Birge ratio (Birge 1932, Physical Review 40, 207).
     """
-    among = {name, *search.groups[name], *search.unlike}
+    among = {name, *search.groups[name], *search.unlike} - search.wider.get(name, frozenset())
     scores = {c.effect: c.score for c in search.contests.get(name, ()) if c.effect in among}
     return odds_by_score(scores or {name: 0.0}, s, float(np.sqrt(search.misfit)))
 

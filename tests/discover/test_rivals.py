@@ -9,6 +9,7 @@ from sessions import bam, made
 from bampipe.discover.bench import Bench
 from bampipe.discover.chance import candidates_of, fit_trials, system_of, workers
 from bampipe.discover.insufficient import insufficient_rivals
+from bampipe.discover.nested import idle_extensions
 from bampipe.discover.polish import FittedSet, comes_close
 from bampipe.discover.rivals import _misfit, plausible, without_mere_offsets
 from bampipe.discover.scorer import Scorer
@@ -120,3 +121,22 @@ def test_a_rival_that_leaves_an_error_is_none_where_the_effect_found_leaves_none
         assert behind(spring, 0, stop, at_floor) == {stop}
         assert behind(bias, 2, friction, at_floor) == set()
         assert behind(spring, 0, stop, above) == set()
+
+
+@pytest.mark.parametrize("by_speed", [0.0, 6.0])
+def test_what_holds_an_effect_and_more_has_no_odds_beside_it_unless_it_fits_better(by_speed):
+    """A bias along an axis is friction that differs by direction, at all speeds alike."""
+    bias, friction, spring = (
+        "force_bias:z", "asymmetric_coulomb:extension", "return_spring:extension"
+    )  # fmt: skip
+    hidden = {
+        "asymmetric_coulomb.extension.difference": 1.0,
+        "asymmetric_coulomb.extension.viscous_difference": by_speed,
+    }
+    session, recipe = made(bam([friction]), hidden, trials=2), bam([bias])
+    with workers(session, 1) as pool:
+        bench = Bench(session, Settings(jobs=1), pool, (friction, spring))
+        evidence = bench.fit(recipe, system_of(recipe).prior)
+        found = FittedSet(recipe, (bias,), evidence, session)
+        idle = idle_extensions(bench, found, bias, 2, {friction, spring, "upper_stop:extension"})
+    assert idle == ({spring} if by_speed else {friction, spring})

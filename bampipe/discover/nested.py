@@ -1,0 +1,73 @@
+"""Rivals that are the effect found and something more, of which the trials ask for nothing.
+
+Friction that differs by direction is an offset of the drive and a part that grows with speed: it
+never fits worse than the offset. Where it fits no better either, the offset is what is missing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.discover.bench import Bench
+from bampipe.discover.candidates import Candidate
+from bampipe.discover.chance import candidates_of
+from bampipe.discover.columns import added_columns
+from bampipe.discover.polish import FittedSet, reduce_set
+from bampipe.discover.scorer import Score
+from bampipe.trials.residuals import Evidence
+
+Array = NDArray[np.float64]
+
+_ROUNDING = 1e-6
+"""Of what an effect adds, as a root mean square, that another one which contains it may miss."""
+
+
+def idle_extensions(
+    bench: Bench, found: FittedSet, name: str, axis: int, rivals: Collection[str]
+) -> frozenset[str]:
+    """Those of ``rivals`` that contain an effect and gain no more than replays are good for.
+
+    Args:
+        bench: the session.
+        found: the set with the effect, fitted; name: the effect; axis: where it helps most.
+        rivals: effects that might be there in its place.
+    """
+    if not rivals:
+        return frozenset()
+    s, fewer = bench.settings, reduce_set(found, name)
+    scores = bench.scores(fewer.recipe, fewer.evidence.p, [name, *rivals])
+    if name not in scores:
+        return frozenset()
+    items = {c.name: c for c in candidates_of(fewer.recipe, list(scores))}
+    added, _ = _parts(fewer.evidence, items[name], scores[name])
+    blur = s.replay_error * float(fewer.scorer.independent_samples[axis])
+    most = scores[name].total + max(s.score_sd, blur)
+    return frozenset(
+        rival
+        for rival, score in scores.items()
+        if rival != name
+        and score.total <= most
+        and _constants(items[rival]) > _constants(items[name])
+        and _contains(_parts(fewer.evidence, items[rival], score)[1], added)
+    )
+
+
+def _constants(item: Candidate) -> int:
+    return sum(not q.fixed for q in item.parameters)
+
+
+def _parts(evidence: Evidence, item: Candidate, score: Score) -> tuple[Array, Array]:
+    """What an effect adds to the residual, (N,), and that by each linear strength, (N, m)."""
+    columns, changes = added_columns(evidence, item, score.values[list(item.searched_indices)])
+    parts = np.concatenate(columns).reshape(-1, len(item.linear_indices))
+    strengths = score.values[list(item.linear_indices)]
+    return np.concatenate(changes).ravel() + parts @ strengths, parts
+
+
+def _contains(parts: Array, added: Array) -> bool:
+    """Whether some strengths of ``parts`` (N, m) make up ``added`` (N,)."""
+    left = added - parts @ np.linalg.lstsq(parts, added, rcond=None)[0]
+    return bool(np.linalg.norm(left) <= _ROUNDING * np.linalg.norm(added))
