@@ -26,7 +26,7 @@ def test_an_effect_that_fails_where_it_helps_most_is_missing_nowhere(monkeypatch
     search = SimpleNamespace(
         initial=evidence(1.0, 1.0), evidence=evidence(shoulder_after, 0.3), selected=("gain",),
         main={"gain": 0}, final=(replay,) * 4, level=SimpleNamespace(replicates=(replay,) * 4),
-        groups={"gain": ()}, contests={}, steps=(), cut_short=False, first={}, transient={},
+        groups={"gain": ()}, wider={}, contests={}, steps=(), cut_short=False, first={}, transient={},
         refused=(), still=(), floor=floor,
         explainable=np.full(2, 0.2), explainable_after=np.full(2, 0.2),
     )  # fmt: skip
@@ -85,7 +85,7 @@ def test_scores_decide_the_less_the_less_replays_look_like_the_measurement(misfi
     """Between 60 and 37 in log likelihood, good to a tenth."""
     contest = tuple(SimpleNamespace(effect=n, score=x) for n, x in (("lag", 60.0), ("delay", 37.0)))
     search = SimpleNamespace(
-        groups={"lag": ()}, unlike=("delay",), misfit=misfit, contests={"lag": contest}
+        groups={"lag": ()}, wider={}, unlike=("delay",), misfit=misfit, contests={"lag": contest}
     )
     odds = verdict._odds_of_group(search, "lag", Settings())
     assert least < odds["lag"] < most and sum(odds.values()) == pytest.approx(1.0)
