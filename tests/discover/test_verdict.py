@@ -26,8 +26,8 @@ def test_an_effect_that_fails_where_it_helps_most_is_missing_nowhere(monkeypatch
     search = SimpleNamespace(
         initial=evidence(1.0, 1.0), evidence=evidence(shoulder_after, 0.3), selected=("gain",),
         main={"gain": 0}, final=(replay,) * 4, level=SimpleNamespace(replicates=(replay,) * 4),
-        groups={"gain": ()}, wider={}, contests={}, steps=(), cut_short=False, first={}, transient={},
-        refused=(), still=(), floor=floor,
+        groups={"gain": ()}, wider={}, contests={}, steps=(), cut_short=False, first={},
+        transient={}, refused=(), still=(), floor=floor,
         explainable=np.full(2, 0.2), explainable_after=np.full(2, 0.2),
     )  # fmt: skip
     second = SimpleNamespace(stretch=Stretch(trial_id="t01", t_start=0.0, t_end=1.0))
