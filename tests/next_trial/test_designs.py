@@ -234,6 +234,14 @@ def test_a_trial_that_is_imitated_goes_on_smoothly_and_stays_where_it_was():
     )
 
 
+def test_of_one_axis_a_sentence_names_it_once():
+    motion = made_motion("t01", 2.0)
+    still = replace(motion, qd=motion.qd * [1.0, 0.0, 0.0])
+    (like,) = imitate_trials([still], SEEN, 12.0)
+    said = describe(like, SEEN, registry.device("bam"))
+    assert said.startswith("Move yaw as in trial t01, between −11° and 11°")
+
+
 def test_who_follows_roughly_stays_within_the_device_too():
     system = SimpleNamespace(coordinates=("a", "b", "c"))
     seen = TIMID.within(LIMITS, np.full(3, np.nan))
@@ -272,6 +280,22 @@ def test_no_axis_rests_unless_the_design_says_so():
     for design in list_primitives(SEEN, 20.0, [0, 1, 2], with_rests=False):
         assert set(design.strokes) == {0, 1, 2}
         assert all(stroke.rest_s == 0.0 for stroke in design.strokes.values())
+
+
+@pytest.mark.parametrize("axes", [[0], [0, 1, 2]])
+def test_no_design_is_tried_twice(axes):
+    for seen in (SEEN, SEEN.within(LIMITS, np.full(3, 3.0))):
+        listed = list_primitives(seen, 20.0, axes, with_rests=True)
+        said = [
+            (design.parts, [(axis, f"{stroke}") for axis, stroke in design.strokes.items()])
+            for design in listed
+        ]
+        assert all(one not in said[:k] for k, one in enumerate(said))
+    one = replace(SEEN, **{name: getattr(SEEN, name)[:1] for name in (
+        "low", "high", "usual", "speed", "acceleration", "field")})  # fmt: skip
+    slow = [d for d in list_primitives(one, 20.0, [0], True) if d.strokes[0].fast < 0.3]
+    # All of the range, its middle and a few per cent of it are the same strokes at that speed.
+    assert len({round(d.strokes[0].low + d.strokes[0].high, 6) for d in slow}) == len(slow)
 
 
 def test_a_path_has_the_velocity_and_acceleration_that_it_says():
@@ -586,6 +610,10 @@ def test_a_planned_trial_is_shortened_no_further_than_its_strokes_allow():
     assert _shortest(one) == 5.0
     assert _shortest(replace(one, strokes={0: slow})) == pytest.approx(3 * 1.875 / 0.5)
     assert _shortest(replace(one, parts=2)) == 10.0
+    # Of a trial of 12 s, what is shorter does not cover what it covers.
+    (like,) = imitate_trials([made_motion("t01", 2.0)], SEEN, 20.0)
+    assert _shortest(like) == pytest.approx(12.0, abs=0.01)
+    assert _shortest(replace(like, seconds=8.0)) == 8.0
 
 
 @pytest.mark.parametrize(
