@@ -28,9 +28,9 @@ the last two as shares of the range."""
 TRAJECTORY_HZ = 100.0
 HASTY = -1
 """Number of the version of somebody who covers half the range at twice the speed."""
-_FADE_S, _START_S = 2.0, 1.0
-"""In which the end of a trial that is imitated passes into its beginning, and in which a robot that
-imitates it gets under way."""
+_BACK_S, _RAMP_S = 1.0, 1.0
+"""Before the end of a trial that is imitated, from where on it turns back; and in which a robot
+gets under way, and comes to rest."""
 _STEPS = 4
 """Of the search for the force, where what the model requires depends on the force itself."""
 
@@ -63,12 +63,11 @@ class Rehearsal:
     def trajectory(self, design: Primitive) -> tuple[Array, Array]:
         """Times (T,), s, and positions (T, n_q) of one trial that follows a design exactly."""
         t = np.arange(int(design.part_s * TRAJECTORY_HZ)) / TRAJECTORY_HZ
-        if design.example is not None:
-            # It starts at rest, wherever the trial is cut.
-            started = np.where(t < _START_S, 0.5 * t**2 / _START_S, t - 0.5 * _START_S)
-            return t, example_path(design.example, started)[0]
+        # It starts and ends at rest, wherever a trial or a stroke is cut.
+        way = np.where(t <= 0.5 * t[-1], _get_under_way(t), t[-1] - _RAMP_S)
+        way -= np.where(t <= 0.5 * t[-1], 0.0, _get_under_way(t[-1] - t))
         rng = np.random.default_rng([self.seed, 1])
-        return t, self._path(design, t, rng, exact=True)[0]
+        return t, self._path(design, way, rng, exact=True)[0]
 
     def _path(
         self, design: Primitive, t: Array, rng: np.random.Generator, exact: bool
@@ -150,37 +149,44 @@ def follow_roughly(
     return replace(design, strokes=strokes)
 
 
-def example_path(example: Example, t: Array) -> tuple[Array, Array, Array]:
-    """Position, velocity and acceleration, each (T, n_q), of a trial again and again.
+def _get_under_way(t: Array) -> Array:
+    """How far along a path is at times ``t``, s, of what starts at rest."""
+    return np.where(t < _RAMP_S, 0.5 * t**2 / _RAMP_S, t - 0.5 * _RAMP_S)
 
-    Its end passes smoothly into its beginning.
+
+def example_path(example: Example, t: Array) -> tuple[Array, Array, Array]:
+    """Position, velocity and acceleration, each (T, n_q), of a trial forwards, backwards and so on.
+
+    It is never faster than the trial, as it would be were its end joined to its beginning.
 
     Args:
         example: the trial, and how it is followed; t: (T,) times from 0 on, s.
     """
     motion = example.motion
-    record = np.stack([motion.q, motion.qd, motion.qdd])
     clock = motion.t - motion.t[0]
-    fade = min(_FADE_S, 0.25 * float(clock[-1]))
-    period, rate = float(clock[-1]) - fade, example.haste / example.reach
-    at = (rate * t) % period
-
-    def read(times: Array) -> Array:
-        axes = range(record.shape[2])
-        rows = [[np.interp(times, clock, part[:, i]) for i in axes] for part in record]
-        return np.asarray(rows).transpose(0, 2, 1)
-
-    start, end = read(at), read(np.minimum(at + period, clock[-1]))
-    s = np.minimum(at / fade, 1.0)[:, None]
-    w = s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
-    w_t = 30.0 * s**2 * (1.0 - s) ** 2 / fade
-    w_tt = 60.0 * s * (1.0 - s) * (1.0 - 2.0 * s) / fade**2
-    q, qd, qdd = start - end
+    length, rate = float(clock[-1]), example.haste / example.reach
+    back = min(_BACK_S, 0.25 * length)
+    # Distance from the last turn or the next one; near them, smooth to the second derivative.
+    turn = np.rint(rate * t / length)
+    x = rate * t - turn * length
+    u = np.where(turn == 0.0, 1.0, np.clip(np.abs(x) / back, 0.0, 1.0))
+    distance = np.where(u < 1.0, back * (0.375 + 0.75 * u**2 - 0.125 * u**4), np.abs(x))
+    way = np.where(turn % 2.0 == 0.0, 1.0, -1.0)
+    at = np.where(way > 0.0, distance, length - distance)
+    slope, bend = (
+        (way * each)[:, None]
+        for each in (np.sign(x) * (1.5 * u - 0.5 * u**3), 1.5 * (1.0 - u**2) / back)
+    )
+    slope[turn == 0.0] = 1.0
+    q, qd, qdd = (
+        np.stack([np.interp(at, clock, column) for column in part.T], axis=1)
+        for part in (motion.q, motion.qd, motion.qdd)
+    )
     middle = np.median(motion.q, axis=0)
     return (
-        middle + example.reach * (end[0] + w * q - middle),
-        example.reach * rate * (end[1] + w * qd + w_t * q),
-        example.reach * rate**2 * (end[2] + w * qdd + 2.0 * w_t * qd + w_tt * q),
+        middle + example.reach * (q - middle),
+        example.reach * rate * slope * qd,
+        example.reach * rate**2 * (slope**2 * qdd + bend * qd),
     )
 
 

@@ -122,6 +122,9 @@ def _trimmed(forecast: Forecast, chosen: list[_Option], goal: Goal) -> list[_Opt
 
 def _shortest(design: Primitive) -> float:
     """How long a design takes at least, s: what it adds is in proportion only from there on."""
+    if design.example is not None:
+        # Part of a trial need not cover what all of it does.
+        return min(design.seconds, max(_SHORTEST_S, float(np.ptp(design.example.motion.t))))
     stroke_s = max((stroke.typical_s for stroke in design.strokes.values()), default=0.0)
     return design.parts * max(_SHORTEST_S, FEWEST_STROKES * stroke_s)
 
@@ -167,7 +170,7 @@ def _confusion(forecast: Forecast, chosen: Sequence[_Option]) -> dict[tuple[int,
 def _distance(outcome: _Outcome, goal: Goal) -> float:
     """How far trials are from the goal: sum of the logarithms of what is too large, nats."""
     sd, confusion = outcome
-    far = float(np.sum(np.maximum(np.log(sd.median / goal.sd), 0.0)))
+    far = float(np.sum(np.log(np.maximum(sd.median / goal.sd, 1.0))))
     return far + sum(max(float(np.log(c / goal.confusion)), 0.0) for c in confusion.values())
 
 

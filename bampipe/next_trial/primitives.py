@@ -271,7 +271,23 @@ def list_primitives(
             for design in others
             if any(find_beyond(design, seen, _HIGHEST))
         ]
-    return found
+    return _drop_repeated(found)
+
+
+def _drop_repeated(designs: Sequence[Primitive]) -> list[Primitive]:
+    """The designs without those that are like an earlier one.
+
+    Slow strokes of several ranges are all made as short as the time allows, about one place.
+    """
+    found: dict[tuple[object, ...], Primitive] = {}
+    for design in designs:
+        key: list[object] = [design.parts]
+        for axis, stroke in design.strokes.items():
+            travel = stroke.high - stroke.low
+            key += [axis, round(stroke.low / travel, 6), round(stroke.high / travel, 6)]
+            key += [f"{value:.6g}" for value in (stroke.slow, stroke.fast, stroke.rest_s)]
+        found.setdefault(tuple(key), design)
+    return list(found.values())
 
 
 def imitate_trials(motions: Sequence[Motion], seen: Envelope, seconds: float) -> list[Primitive]:

@@ -121,8 +121,8 @@ def _decision(best: Proposal, unlimited: Sequence[str]) -> tuple[str, str]:
         f" {_remedy(unlimited)}"
     )
     why = (
-        f"These trials do not distinguish {pair.between[0]} from {pair.between[1]}: the chance of"
-        f" confusing them is {before}."
+        f"These trials may confuse {pair.between[0]} with {pair.between[1]}: the chance of that is"
+        f" {before}."
     )
     return why, expected
 

@@ -80,10 +80,11 @@ def _imitate(design: Primitive, example: Example, device: Device) -> str:
     axes = device.coordinates
     (low, high), speed = example.ends, example.speed
     moving = [i for i in range(len(axes)) if speed[i] > 0.0 and high[i] > low[i]]
+    names = [f"{axes[i].name} " if len(moving) > 1 else "" for i in moving]
     each = ", ".join(
-        f"{axes[i].name} {_ends(Stroke(low[i], high[i], 0.0, 0.0), axes[i].unit)}"
+        f"{name}{_ends(Stroke(low[i], high[i], 0.0, 0.0), axes[i].unit)}"
         f" at up to {_speed(speed[i], axes[i].unit)}"
-        for i in moving
+        for i, name in zip(moving, names, strict=True)
     )
     length_s = float(example.motion.t[-1] - example.motion.t[0])
     again = " over and over" if design.seconds > _AGAIN * length_s else ""

@@ -14,6 +14,8 @@ _BY_DRIVE = "Check the way for obstacles: the model knows none."
 _BEFORE = (
     "Start the log, wait two seconds, then move.",
     "Better a little slower and a little less far than faster and farther.",
+)
+_AFTER = (
     "Add each file to session.toml, as a free trial or, with brakes on, as a viscous one.",
     "Then run the session again.",
 )
@@ -50,13 +52,17 @@ def _sheet(plan: Plan, session: str, model: str, by_hand: bool, listed: int) -> 
         heads = ("Effects", "now", "expected")
         blocks.append(confusion_table("Chance of confusion", heads, plan.confusion))
     before = (_BY_HAND if by_hand else _BY_DRIVE, *_BEFORE)
+    sections = [Section("The trials", tuple(blocks))]
+    if plan.trials:
+        first, last = (
+            Section(title, (Bullets(items),))
+            for title, items in (("Before each trial", before), ("After the last one", _AFTER))
+        )
+        sections = [first, *sections, last]
     return Document(
         f"Trials to record: {session}",
         f"Model {model}, {wording.plain(plan.seconds, 0)} s in all",
-        (
-            *([Section("Before each trial", (Bullets(before),))] if plan.trials else []),
-            Section("The trials", tuple(blocks)),
-        ),
+        tuple(sections),
     )
 
 

@@ -99,10 +99,8 @@ def compare_forecast(
             )
     for pair in best.confusion[:_SHOWN]:
         first, second = pair.between
-        forecast_text = (
-            f"{first} or {second}: a chance of {100.0 * pair.after:.0f} % was forecast of"
-            " confusing them"
-        )
+        chance = f"of {100.0 * pair.after:.0f} %" if pair.after >= 0.01 else "below 1 %"
+        forecast_text = f"{first} or {second}: a chance {chance} was forecast of confusing them"
         if diagnosed is None:
             said.append(f"{forecast_text}; `bampipe diagnose RUN` says what came.")
             continue

@@ -214,7 +214,9 @@ def test_a_trial_that_is_imitated_goes_on_smoothly_and_stays_where_it_was():
     assert [first.example.trial, second.example.trial] == ["t01", "t02"]
     t = np.arange(30000) / 1000.0
     q, qd, qdd = example_path(first.example, t)
-    np.testing.assert_allclose(q[2000:10000], first.example.motion.q[2000:10000], atol=1e-9)
+    np.testing.assert_allclose(q[:10000], first.example.motion.q[:10000], atol=1e-9)
+    # Its end is far from its beginning: were they joined, it would be faster than the trial.
+    assert np.all(np.abs(qd).max(axis=0) <= np.abs(first.example.motion.qd).max(axis=0) + 1e-9)
     np.testing.assert_allclose(np.gradient(q, t, axis=0)[1:-1], qd[1:-1], atol=2e-3)
     np.testing.assert_allclose(np.gradient(qd, t, axis=0)[1:-1], qdd[1:-1], atol=2e-2)
     assert np.all(np.abs(q - SEEN.usual) <= 0.2 + 1e-9)
@@ -225,13 +227,21 @@ def test_a_trial_that_is_imitated_goes_on_smoothly_and_stays_where_it_was():
     assert usual == pytest.approx(0.8, rel=0.01)
     rehearsal = Rehearsal(SimpleNamespace(coordinates=("a",)), np.zeros(0), None, None, SEEN, 0)
     t, q = rehearsal.trajectory(first)
-    assert np.abs(np.gradient(q, t, axis=0)[0]).max() < 0.02
+    assert np.abs(np.gradient(q, t, axis=0)[[0, -1]]).max() < 0.02
     said = describe(first, SEEN, registry.device("bam"))
     assert said == (
         "Move yaw and pitch as in trial t01, yaw between −11° and 11° (−0.20 to 0.20 rad) at up to"
         " 23°/s, pitch between −9° and 14° (−0.15 to 0.25 rad) at up to 30°/s, over and over for"
         " 30 s."
     )
+
+
+def test_of_one_axis_a_sentence_names_it_once():
+    motion = made_motion("t01", 2.0)
+    still = replace(motion, qd=motion.qd * [1.0, 0.0, 0.0])
+    (like,) = imitate_trials([still], SEEN, 12.0)
+    said = describe(like, SEEN, registry.device("bam"))
+    assert said.startswith("Move yaw as in trial t01, between −11° and 11°")
 
 
 def test_who_follows_roughly_stays_within_the_device_too():
@@ -274,6 +284,22 @@ def test_no_axis_rests_unless_the_design_says_so():
         assert all(stroke.rest_s == 0.0 for stroke in design.strokes.values())
 
 
+@pytest.mark.parametrize("axes", [[0], [0, 1, 2]])
+def test_no_design_is_tried_twice(axes):
+    for seen in (SEEN, SEEN.within(LIMITS, np.full(3, 3.0))):
+        listed = list_primitives(seen, 20.0, axes, with_rests=True)
+        said = [
+            (design.parts, [(axis, f"{stroke}") for axis, stroke in design.strokes.items()])
+            for design in listed
+        ]
+        assert all(one not in said[:k] for k, one in enumerate(said))
+    one = replace(SEEN, **{name: getattr(SEEN, name)[:1] for name in (
+        "low", "high", "usual", "speed", "acceleration", "field")})  # fmt: skip
+    slow = [d for d in list_primitives(one, 20.0, [0], True) if d.strokes[0].fast < 0.3]
+    # All of the range, its middle and a few per cent of it are the same strokes at that speed.
+    assert len({round(d.strokes[0].low + d.strokes[0].high, 6) for d in slow}) == len(slow)
+
+
 def test_a_path_has_the_velocity_and_acceleration_that_it_says():
     t = np.arange(20000) / 1000.0
     stroke = Stroke(-0.4, 0.3, 0.1, 0.9, rest_s=0.5)
@@ -294,7 +320,7 @@ def test_a_robot_gets_a_trajectory_within_what_has_been_seen_that_starts_at_rest
         assert np.all(q >= SEEN.low - 1e-9)
         assert np.all(q <= SEEN.high + 1e-9)
         speed = np.abs(np.gradient(q, t, axis=0))
-        assert np.all(speed[0] < 0.05 * SEEN.speed)
+        assert np.all(speed[[0, -1]] < 0.05 * SEEN.speed)
         assert np.all(speed.max(axis=0) <= SEEN.speed)
 
 
@@ -586,6 +612,10 @@ def test_a_planned_trial_is_shortened_no_further_than_its_strokes_allow():
     assert _shortest(one) == 5.0
     assert _shortest(replace(one, strokes={0: slow})) == pytest.approx(3 * 1.875 / 0.5)
     assert _shortest(replace(one, parts=2)) == 10.0
+    # Of a trial of 12 s, what is shorter does not cover what it covers.
+    (like,) = imitate_trials([made_motion("t01", 2.0)], SEEN, 20.0)
+    assert _shortest(like) == pytest.approx(12.0, abs=0.01)
+    assert _shortest(replace(like, seconds=8.0)) == 8.0
 
 
 @pytest.mark.parametrize(
