@@ -232,7 +232,7 @@ def _excused(a: AxisVerdict, unit: str) -> str:
             f"It is at the floor without {_when(a.worst_second)}, the worst second: "
             f"{three(a.rmse_without_worst_second)} {unit}."
         )
-    return "What exceeds the noise floor follows nothing that the arm does."
+    return "What exceeds the noise floor follows nothing that the machine does."
 
 
 def _when(second: Stretch) -> str:

@@ -9,6 +9,7 @@ import sympy as sp
 
 from bampipe.physics.codegen import SCALAR_HEADER, compiled_function, print_block, unpack
 from bampipe.physics.equations import Equations
+from bampipe.physics.system import STABLE, STIFF_STEPS
 
 # Positions and inputs are linear between samples, rates are not: of a motion with eight samples a
 # period a straight line takes a twentieth off the distance between them.
@@ -33,7 +34,8 @@ MEMORY_LOOP = '''
 def memory(q, qd, qdd, u, p, t, z0, steps, out):
     """RK4 along the samples of a motion; fills out (T, n_z).
 
-    Returns the largest product of a step and the rate at which a state decays in it.
+    Returns the largest product of a step and the rate at which a state decays in it; where that
+    asks for exponential steps, as soon as it does, with the rest of out as it was.
     """
     fastest = 0.0
     n = len(z0)
@@ -67,6 +69,8 @@ def memory(q, qd, qdd, u, p, t, z0, steps, out):
                 for j in range(n):
                     z[j] += h / 6.0 * (k1[j] + 2.0 * k2[j] + 2.0 * k3[j] + k4[j])
         out[i + 1] = z
+        if steps * fastest > FASTEST:
+            break
     return fastest
 '''
 
@@ -171,7 +175,9 @@ def memory_source(e: Equations) -> tuple[str, dict[str, list[int]]]:
     if coupled or any(slope.free_symbols & set(e.z) for slope in slopes):
         groups_of = {**passed, "z": states}
         rate = _memory_function("memory_rate", groups_of, {"dz": renamed(e.rates)})
-        source = SCALAR_HEADER + "import numpy as np\n" + rate + BETWEEN + MEMORY_LOOP
+        fastest = "np.inf" if coupled else repr(STIFF_STEPS * STABLE)
+        head = f"import numpy as np\nFASTEST = {fastest}\n"
+        source = SCALAR_HEADER + head + rate + BETWEEN + MEMORY_LOOP
         if not coupled:
             slope = _memory_function("memory_slope", groups_of, {"slope": renamed(slopes)})
             source += slope + STIFF_MEMORY_LOOP

@@ -23,10 +23,10 @@ if TYPE_CHECKING:  # it brings sympy, which few need
 Array = NDArray[np.float64]
 _MEMORY_STEPS = (3, 12, 48, 192)
 """Steps a sample tried in turn, until a stiff state is integrated without running away."""
-_STIFF_STEPS = 24
+STIFF_STEPS = 24
 """Exponential steps a sample, stable ones, in place of more than these, where no state depends on
 another. A hysteresis passed 600 times between two samples is 1 % off, 60 times 0.1 %."""
-_STABLE = 2.5
+STABLE = 2.5
 """Largest product of a step and the rate at which a state decays for which RK4 is stable, with a
 margin: it is up to 2.78 (Hairer and Wanner, Solving Ordinary Differential Equations II, IV.2)."""
 _RUNAWAY = 1e9
@@ -429,15 +429,15 @@ class System:
         least = 0.0
         stiff = getattr(module, "stiff_memory", None)
         for steps in _MEMORY_STEPS:
-            if stiff is not None and max(steps, least) > _STIFF_STEPS:
-                stiff(*arrays, z0, _STIFF_STEPS, out)
+            if stiff is not None and max(steps, least) > STIFF_STEPS:
+                stiff(*arrays, z0, STIFF_STEPS, out)
                 break
             if steps < least and steps < _MEMORY_STEPS[-1]:
                 continue
             fastest = module.memory(*arrays, z0, steps, out)
-            if fastest < _STABLE and np.all(np.abs(out) < _RUNAWAY):
+            if fastest < STABLE and np.all(np.abs(out) < _RUNAWAY):
                 break
-            least = steps * fastest / _STABLE
+            least = steps * fastest / STABLE
         return np.delete(out, at + np.arange(at.size), axis=0) if at.size else out
 
     def _switched(self, u: Array) -> NDArray[np.bool_]:

@@ -9,6 +9,7 @@ from small_arm import ARM
 
 from bampipe.physics import Model, compile_model, registry
 from bampipe.physics.effect import unit_of
+from bampipe.physics.system import STABLE, STIFF_STEPS
 from bampipe.physics.units import check_effect
 
 MACHINES = ("slider", "servo_pendulum", "magnetic_damper")
@@ -306,6 +307,24 @@ def test_a_hysteresis_over_next_to_nothing_stays_within_its_bounds(distance, sym
     settled = (np.abs(v[:, 0]) > 0.25) & (t > 0.1)
     tolerance = 0.06 if distance > 1e-4 else 0.01
     np.testing.assert_allclose(z[settled], np.sign(v[settled, 0]), atol=tolerance)
+
+
+def test_a_hysteresis_too_stiff_for_runge_kutta_is_given_up_early():
+    """What decides for exponential steps is known at the first sample that moves."""
+    system = compile_model(Model(registry.device("magnetic_damper"), ["hysteresis:piston"]))
+    p, names = system.prior.copy(), [item.name for item in system.parameters]
+    p[names.index("hysteresis.piston.distance")] = 1e-6
+    t = np.arange(0.0, 0.1, 1e-3)
+    q, qd = 0.3 * t[:, None], np.full((len(t), 1), 0.3)
+    u = np.zeros((len(t), len(system.inputs)))
+    uses = system._memory_uses
+    columns = [q[:, uses["q"]], qd[:, uses["qd"]], 0.0 * qd[:, uses["qd"]], u[:, uses["u"]]]
+    left = np.full((len(t), 1), np.nan)
+    arrays = [np.ascontiguousarray(x) for x in (*columns, p[uses["p"]], t, np.zeros(1))]
+    fastest = system._code.module("memory").memory(*arrays, 3, left)
+    assert 3 * fastest > STIFF_STEPS * STABLE
+    assert np.isnan(left[5:]).all()
+    np.testing.assert_allclose(system.memory(q, qd, 0.0 * qd, u, p, t)[5:], 1.0, atol=1e-6)
 
 
 def coarse_beside_fine(
