@@ -46,9 +46,9 @@ stages = ["ingest", "filter", "identify", "validate"]
 """
 DAYS = {"good": GOOD} | HARD
 RIGHT = "right"
-OTHERWISE = {"shear_thinning": "viscous"}
-"""Effects that simulators write in other mathematics, with the parameter of the same axis that
-takes part in the difference: of it, such a session has no truth."""
+OTHERWISE = {"shear_thinning": ("viscous", "coulomb")}
+"""Effects that simulators write in other mathematics, with the parameters of the same axis that
+take part in the difference: of them, such a session has no truth."""
 
 
 @dataclass(frozen=True)
@@ -272,9 +272,9 @@ def _hold_against(
     strengths = {item.name for item in loaded.parameters if item.strength}
     result = run.read(IdentifyResult, model)
     shared = {
-        f"{OTHERWISE[effect]}.{axis}"
-        for effect, axis in (full.split(":", 1) for full in result.effects if ":" in full)
-        if effect in OTHERWISE
+        f"{name}.{axis}"
+        for effect, _, axis in (full.partition(":") for full in result.effects)
+        for name in OTHERWISE.get(effect, ())
     }
     return tuple(
         Found(
