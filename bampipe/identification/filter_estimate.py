@@ -140,7 +140,7 @@ def estimate_by_filter(
         settings,
         model,
         [trials[place].first(samples) for place in places],
-        [clear(place).all(axis=1)[:samples] for place in places],
+        [np.asarray(clear(place)[:samples].all(axis=1)) for place in places],
         settled,
         known,
         noise,
