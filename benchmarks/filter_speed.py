@@ -62,9 +62,7 @@ class Problem:
 
     def first(self, samples: int) -> Problem:
         """The same with the first ``samples`` of the trial."""
-        trial = self.trial
-        part = replace(trial, t=trial.t[:samples], u=trial.u[:samples], y=trial.y[:samples])
-        return replace(self, trial=part)
+        return replace(self, trial=self.trial.first(samples))
 
 
 @dataclass(frozen=True)
@@ -157,7 +155,7 @@ def by_bampipe(problem: Problem, repeats: int) -> Measured:
 def in_python(derivative: Callable[..., None]) -> Callable[..., None]:
     """Runge-Kutta method over a plain Python derivative, vectors by numpy."""
 
-    def advance(_, x, u0, u1, p, w, dt, substeps, work):  # type: ignore[no-untyped-def]
+    def advance(_, x, u0, u1, c0, c1, p, w, dt, substeps, work):  # type: ignore[no-untyped-def]
         delta, rise = dt / substeps, u1 - u0
         parameters, noise = p.tolist(), w.tolist()
 

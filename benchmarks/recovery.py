@@ -46,6 +46,9 @@ stages = ["ingest", "filter", "identify", "validate"]
 """
 DAYS = {"good": GOOD} | HARD
 RIGHT = "right"
+OTHERWISE = {"shear_thinning": ("viscous", "coulomb")}
+"""Effects that simulators write in other mathematics, with the parameters of the same axis that
+take part in the difference: of them, such a session has no truth."""
 
 
 @dataclass(frozen=True)
@@ -268,6 +271,11 @@ def _hold_against(
     of_device = {item.name for item in loaded.device.parameters}
     strengths = {item.name for item in loaded.parameters if item.strength}
     result = run.read(IdentifyResult, model)
+    shared = {
+        f"{name}.{axis}"
+        for effect, _, axis in (full.partition(":") for full in result.effects)
+        for name in OTHERWISE.get(effect, ())
+    }
     return tuple(
         Found(
             name,
@@ -285,7 +293,7 @@ def _hold_against(
             result.method,
         )
         for name, value in truth.items()
-        if name in result.parameters
+        if name in result.parameters and name not in shared
     )
 
 

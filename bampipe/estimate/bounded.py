@@ -49,6 +49,19 @@ def scaled_eigenbasis(matrix: Array) -> tuple[Array, Array, Array, NDArray[np.bo
     return scale, values, vectors, values < _RANK_TOLERANCE * max(values[-1], 1e-300)
 
 
+def invert_scaled(matrix: Array) -> Array:
+    """Pseudo-inverse of normal equations, whatever the units of the coefficients.
+
+    Inverted as they are, a stiffness in N/m beside a position in m would pass for not determined.
+
+    Args:
+        matrix: (n, n) symmetric, not negative.
+    """
+    scale, values, vectors, null = scaled_eigenbasis(matrix)
+    kept = vectors[:, ~null] / scale[:, None]
+    return np.asarray((kept / values[~null]) @ kept.T)
+
+
 @dataclass(frozen=True)
 class BoundedSolution:
     """Solution of a bounded linear least-squares problem.

@@ -67,6 +67,7 @@ def _close(  # type: ignore[no-untyped-def]
     columns, ticks, out = controller.columns, controller.ticks, controller.out
     start, end, given = controller.start, controller.end, controller.given
     nu, nr, nf = u.shape[1], r.shape[1], columns.shape[0]
+    straight = work[8, :nu]
     tick_s = dt / ticks
     for k in range(x.shape[0]):
         if k > 0:
@@ -94,7 +95,9 @@ def _close(  # type: ignore[no-untyped-def]
                 start[columns[j]] = out[j]
                 end[columns[j]] = out[j]
             steps = stable_steps(derivative, x[k + 1], start, plant, tick_s, work)
-            runge_kutta(derivative, x[k + 1], start, end, p, w, tick_s, steps, work)
+            runge_kutta(
+                derivative, x[k + 1], start, end, straight, straight, p, w, tick_s, steps, work
+            )
 
 
 def simulate_controlled(
@@ -157,7 +160,7 @@ def simulate_controlled(
         given=np.empty(references.shape[1]),
         out=np.empty(columns.size + states.size),
     )
-    work = np.zeros((8, max(len(x0), total.shape[1])))
+    work = np.zeros((9, max(len(x0), total.shape[1])))
     _close(
         derivative, measure, command, x, total, references, readings, plant, controller, dt, work
     )

@@ -21,6 +21,9 @@ from scipy.interpolate import CubicSpline, PchipInterpolator
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
+_GAP = 2.5
+"""Factor on the usual sampling interval from which on a spline does not bridge it."""
+
 
 @dataclass(frozen=True)
 class Derivatives:
@@ -79,6 +82,23 @@ class UniformGrid:
         on_grid = np.asarray(CubicSpline(t, values)(inside), dtype=np.float64)
         on_grid[self.bridged] = monotone(inside[self.bridged])
         return on_grid
+
+
+def spline_curvature(t: Array, values: Array) -> Array:
+    """Second derivatives (N, n) of cubic splines through ``values`` (N, n) at times ``t`` (N,), s.
+
+    Between two samples a second derivative runs linearly. Where samples lie further apart than
+    most, or close together, the splines end, straight: across a gap they would overshoot, and
+    between close stamps follow noise.
+    """
+    curvature = np.zeros(values.shape)
+    step = np.diff(t)
+    usual = np.median(step)
+    ends = np.flatnonzero((step > _GAP * usual) | (step < usual / _GAP)) + 1
+    for run in np.split(np.arange(len(t)), ends):
+        if len(run) > 2:
+            curvature[run] = CubicSpline(t[run], values[run], bc_type="natural")(t[run], 2)
+    return curvature
 
 
 def _well_apart(t: Array, values: Array, closest: float) -> tuple[Array, Array]:

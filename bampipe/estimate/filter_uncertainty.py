@@ -18,6 +18,8 @@ from bampipe.estimate.unscented import Stored
 Array = NDArray[np.float64]
 
 
+_BLOCKS = 3
+"""Least blocks for each parameter: fewer hardly scatter, for their scores add up to nothing."""
 _SILENT = 1e-20
 """Share of the filter's variance below which a parameter has no score in any block."""
 
@@ -101,6 +103,17 @@ def leave_out(
         group: final + np.linalg.lstsq(information - matrix, matrix @ final - moment, rcond=None)[0]
         for group, (matrix, moment) in gained.items()
     }
+
+
+def choose_block(seconds: Sequence[float], parameters: int, longest_s: float) -> float:
+    """Return the shortest length of blocks, s, of which trials hold enough for a sandwich.
+
+    Args:
+        seconds: length of each trial, of which the last block takes what is left over.
+        parameters: number of those estimated.
+        longest_s: what is taken where the trials are long.
+    """
+    return min(longest_s, sum(seconds) / (_BLOCKS * parameters + len(seconds)))
 
 
 def at_block_ends(trial: Stored, block_s: float) -> Stored:

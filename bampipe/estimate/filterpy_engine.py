@@ -77,16 +77,18 @@ def _filter(
     p = np.array(model.parameters, dtype=float)
     t = np.asarray(trial.t, dtype=float)
     u = np.ascontiguousarray(trial.u, dtype=float)
+    curvature = trial.input_curvature
     work = np.empty((6, max(n, 2 * nx) + u.shape[1]))
     reading = np.empty(2 * nx)
 
     def move(point: Array, dt: float, k: int) -> Array:
         model.place_parameters(point[nx:n], p)
         x, w = point[:nx].copy(), point[n:].copy()
-        late = p[-1] / dt * (u[k] - u[k - 1])
+        c0, c1 = curvature[k - 1], curvature[k]
+        late = p[-1] * ((u[k] - u[k - 1]) / dt - 0.25 * p[-1] * (c0 + c1))
         start, end = u[k - 1] - late, u[k] - late
         substeps = max(1, int(np.ceil(dt / settings.longest_step - 1e-6)))
-        advance(model.derivative, x, start, end, p, w, dt, substeps, work)
+        advance(model.derivative, x, start, end, c0, c1, p, w, dt, substeps, work)
         return np.concatenate([x, point[nx:n], np.zeros(nw)])
 
     def read(point: Array, k: int) -> Array:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bampipe.estimate.bounded import invert_scaled
 from bampipe.estimate.least_squares import LeastSquares, Problem
 
 Array = NDArray[np.float64]
@@ -51,7 +52,7 @@ def find_worst_stretch(
     for stacked in found.measured:
         slope = stacked.slope * weight[None, :, None]
         information += np.einsum("tqi,tqj->ij", slope, slope)
-    inverse = np.linalg.pinv(information, hermitian=True)
+    inverse = invert_scaled(information)
     sd = np.sqrt(np.diag(found.covariance))
     parts: list[Array] = []
     shares: list[Array] = []

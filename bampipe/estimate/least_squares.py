@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.errors import InputError
-from bampipe.estimate.bounded import descend
+from bampipe.estimate.bounded import descend, invert_scaled
 from bampipe.estimate.low_pass import Band
 from bampipe.estimate.standstill import find_moving_samples
 
@@ -419,7 +419,7 @@ def _white(problem: Problem, stacked: Sequence[Stacked]) -> Array:
     held = problem.lower == problem.upper
     information[held], information[:, held] = 0.0, 0.0
     count = independent_samples(problem.band, stacked)
-    inverse = np.linalg.pinv(information, hermitian=True)
+    inverse = invert_scaled(information)
     return np.asarray(inverse * count / max(count - _fitted(problem), 1.0))
 
 
@@ -447,6 +447,6 @@ def _sandwich(problem: Problem, stacked: Sequence[Stacked], block_s: float) -> t
             blocks += 1
     held = problem.lower == problem.upper
     bread[held], bread[:, held], meat[held], meat[:, held] = 0.0, 0.0, 0.0, 0.0
-    inverse = np.linalg.pinv(bread, hermitian=True)
+    inverse = invert_scaled(bread)
     meat = meat * (blocks / max(blocks - fitted, 1)) + np.diag(problem.precision)
     return np.asarray(inverse @ meat @ inverse), blocks

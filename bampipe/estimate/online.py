@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bampipe.estimate.unscented import FilterModel, FilterSettings, lower_root, run_kernel
+from bampipe.estimate.unscented import FilterModel, FilterSettings, Trial, lower_root, run_kernel
 
 Array = NDArray[np.float64]
 
@@ -30,7 +30,8 @@ class OnlineFilter:
     """A filter of `unscented` that takes samples as they come.
 
     However they are cut into portions, the estimates are those of `filter_trials` on all of them:
-    the same compiled function carries mean and root on.
+    the same compiled function carries mean and root on. Inputs run straight between samples, for
+    how they curve takes samples to come.
 
     Attributes:
         mean: (n,) state and parameters on the scale of estimation.
@@ -81,8 +82,9 @@ class OnlineFilter:
             t = np.concatenate([[self._last[0]], t])
             u = np.vstack([self._last[1], u])
             y = np.vstack([np.full(ny, np.nan), y])
+        samples = Trial(t, u, y, np.zeros(0), np.zeros(0))
         found = run_kernel(
-            self._model, self._settings, t, u, y, self.mean, self._root, stride=t.size
+            self._model, self._settings, samples, self.mean, self._root, stride=t.size
         )
         skipped = 0 if self._last is None else 1
         self._last = (float(t[-1]), np.array(u[-1]))

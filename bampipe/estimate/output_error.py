@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.errors import InputError
-from bampipe.estimate.bounded import descend
+from bampipe.estimate.bounded import descend, invert_scaled
 
 Array = NDArray[np.float64]
 
@@ -254,7 +254,7 @@ def _of_state(linear: _Linear, move: Array) -> Array:
 
 def _sandwich(normal: Array, scores: Array) -> Array:
     """Covariance from the scatter of the scores of the segments."""
-    inverse = np.linalg.pinv(normal.sum(axis=0), hermitian=True)
+    inverse = invert_scaled(normal.sum(axis=0))
     count = len(scores)
     spread = scores.T @ scores * (count / max(count - scores.shape[1], 1))
     return np.asarray(inverse @ spread @ inverse)

@@ -44,12 +44,13 @@ ESTIMATED = record_type(
 )
 
 
-X, PROBE, TOTAL, RATE, U, START, P, W, SLOPE = range(9)
+X, PROBE, TOTAL, RATE, U, START, P, W, SLOPE, CURVE = range(10)
 """Rows of the workspace of sigma points: states, where the derivative is taken, the Runge-Kutta
 sum, the derivative; inputs, and those at the start of the interval; all parameters; process noise;
-and what the input gains over the interval, once for all points. In the others, quantity i of point
-r is at [i*ROWS + r]. One matrix, because of separate arrays the compiler cannot know how far apart
-they are, and checks it in every loop."""
+and, once for all points, what the input gains over the interval and a sixth of its second
+derivatives at both ends, those at the start first, in units of the interval. In the others,
+quantity i of point r is at [i*ROWS + r]. One matrix, because of separate arrays the compiler cannot
+know how far apart they are, and checks it in every loop."""
 
 
 def allocate_points(nx: int, nu: int, p: Array, nw: int) -> Array:
@@ -60,9 +61,9 @@ def allocate_points(nx: int, nu: int, p: Array, nw: int) -> Array:
         p: (np,) all parameters, the timing of the inputs last.
 
     Returns:
-        (9, width).
+        (10, width).
     """
-    points = np.zeros((9, ROWS * max(2 * nx, nu, len(p), nw)))
+    points = np.zeros((10, ROWS * max(2 * nx, nu, len(p), nw)))
     points[P, : ROWS * len(p)] = np.repeat(p, ROWS)
     return points
 
@@ -121,14 +122,17 @@ def _runge_kutta_rows(derivative, count, nx, nu, dt, substeps, points):  # type:
         points: the states ``x`` are advanced in place.
     """
     x, probe, total, rate = points[X], points[PROBE], points[TOTAL], points[RATE]
-    u, start, p, w, slope = points[U], points[START], points[P], points[W], points[SLOPE]
+    u, start, p, w = points[U], points[START], points[P], points[W]
+    slope, curve = points[SLOPE], points[CURVE]
     delta = dt / substeps
     for step in range(substeps):
         for stage in range(4):
             if stage == 0 or stage == 1 or stage == 3:
                 share = (step + 0.5 * ((stage + 1) // 2)) / substeps
+                rest = 1.0 - share
+                before, after = rest * (rest * rest - 1.0), share * (share * share - 1.0)
                 for i in range(nu):
-                    rise = slope[i] * share
+                    rise = slope[i] * share + curve[i] * before + curve[nu + i] * after
                     for r in range(i * ROWS, i * ROWS + count):
                         u[r] = start[r] + rise
             derivative(count, x if stage == 0 else probe, u, p, w, rate)
@@ -149,11 +153,24 @@ def _runge_kutta_rows(derivative, count, nx, nu, dt, substeps, points):  # type:
 
 
 @njit(
-    void(DERIVATIVE_ROWS, ESTIMATED, _V, _M, float64, _V, _V, _V, float64, int64, _M, _M),
+    void(DERIVATIVE_ROWS, ESTIMATED, _V, _M, float64, _V, _V, _V, _V, _V, float64, int64, _M, _M),
     cache=True,
 )
 def propagate_points(  # type: ignore[no-untyped-def]
-    derivative, estimated, mean, factor, reach, noise_sd, u0, u1, dt, substeps, images, points
+    derivative,
+    estimated,
+    mean,
+    factor,
+    reach,
+    noise_sd,
+    u0,
+    u1,
+    c0,
+    c1,
+    dt,
+    substeps,
+    images,
+    points,
 ):
     """Draw the sigma points of (state, parameters, process noise) and carry each over ``dt``.
 
@@ -164,7 +181,9 @@ def propagate_points(  # type: ignore[no-untyped-def]
         reach: distance of the points, in standard deviations.
         noise_sd: (nw,) of the process noise, independent of the state: its root is diagonal,
             which is why the (n + nw) root never needs to be formed.
-        u0, u1: (nu,) input at both ends; dt: s; substeps: of the Runge-Kutta method.
+        u0, u1: (nu,) input at both ends; c0, c1: (nu,) its second time derivative there, between
+            which that runs linearly, so that the input is cubic, or straight where both are zero.
+        dt: s; substeps: of the Runge-Kutta method.
         images: (nx, 1 + 2 (n + nw)) result, states only, for parameters stay: the points ahead
             of the mean along each column of the joint root, those behind it, the centre.
         points: from `allocate_points`, which has put the other parameters in position.
@@ -173,10 +192,13 @@ def propagate_points(  # type: ignore[no-untyped-def]
     nw, nu = noise_sd.shape[0], u0.shape[0]
     pairs = n + nw
     rows = 1 + 2 * pairs
-    x, start, p, w, slope = points[X], points[START], points[P], points[W], points[SLOPE]
+    x, start, p, w = points[X], points[START], points[P], points[W]
+    slope, curve = points[SLOPE], points[CURVE]
     timing = estimated.timing * ROWS
+    sixth = dt * dt / 6.0
     for i in range(nu):
         slope[i] = u1[i] - u0[i]
+        curve[i], curve[nu + i] = sixth * c0[i], sixth * c1[i]
     for first in range(0, rows, ROWS):
         count = min(ROWS, rows - first)
         padded = (count + 3) // 4 * 4
@@ -191,8 +213,11 @@ def propagate_points(  # type: ignore[no-untyped-def]
                     distance = reach if row < pairs else -reach
                     w[i * ROWS + row - first] = distance * noise_sd[i]
         for i in range(nu):
+            # The input some time ago, to second order, on average over the interval.
+            gain = 0.25 * (c0[i] + c1[i])
             for r in range(padded):
-                start[i * ROWS + r] = u0[i] - p[timing + r] * (slope[i] / dt)
+                late = p[timing + r]
+                start[i * ROWS + r] = u0[i] - late * (slope[i] / dt - late * gain)
         _runge_kutta_rows(derivative, padded, nx, nu, dt, substeps, points)
         for i in range(nx):
             for r in range(count):

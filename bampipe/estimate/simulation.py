@@ -94,7 +94,7 @@ class _Brakes(NamedTuple):
 
 
 class _Workspace(NamedTuple):
-    """Memory: rows of a step's states (8, nx or nu), and what the arm's force is solved with.
+    """Memory: rows of a step (9, nx or nu), the last of zeros, and what solves for the arm's force.
 
     Attributes:
         response: (n, nf) acceleration by force; normal, factor: (nf, nf).
@@ -239,7 +239,10 @@ def _run(derivative, x, u, plant, arm, brakes, q_ref, qd_ref, dt, hold, work):  
             x[k + 1, i] = x[k, i]
         count = stable_steps(derivative, x[k], u[k], plant, dt, steps)
         end = u[k] if hold else u[k + 1]
-        runge_kutta(derivative, x[k + 1], u[k], end, plant.p, plant.w, dt, count, steps)
+        straight = steps[8, : u.shape[1]]
+        runge_kutta(
+            derivative, x[k + 1], u[k], end, straight, straight, plant.p, plant.w, dt, count, steps
+        )
 
 
 def simulate(
@@ -383,7 +386,7 @@ def _integrate(
         np.array(q_ref, dtype=np.float64, order="C"),  # a copy: columns of a table are read-only
         np.array(qd_ref, dtype=np.float64, order="C"), dt, hold,
         _Workspace(
-            np.zeros((8, max(len(x0), total.shape[1]))),
+            np.zeros((9, max(len(x0), total.shape[1]))),
             np.empty((n, nf)), np.empty((nf, nf)), np.zeros((nf, nf)),
             np.zeros(nf), np.zeros(nf), np.zeros(nf), np.zeros(n),
         ),

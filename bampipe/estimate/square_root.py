@@ -42,13 +42,16 @@ _M = float64[:, ::1]
 
 
 class Samples(NamedTuple):
-    """Samples that follow each other: ``t`` (T,) s, inputs ``u`` (T, nu), readings ``y`` (T, ny).
+    """Samples that follow each other.
 
-    A reading of NaN is missing.
+    Attributes:
+        t: (T,) s; u: (T, nu) inputs; curvature: (T, nu) their second time derivatives.
+        y: (T, ny) readings, NaN where one is missing.
     """
 
     t: Array
     u: Array
+    curvature: Array
     y: Array
 
 
@@ -151,7 +154,7 @@ def allocate(n: int, nx: int, nu: int, ny: int, nw: int, p: Array) -> Workspace:
         MEASURE_ROWS,
         ESTIMATED,
         record_type(Levels, _V, _V, _V, float64, float64, float64, float64, int64),
-        record_type(Samples, _V, _M, _M),
+        record_type(Samples, _V, _M, _M, _M),
         _V,
         _M,
         record_type(Output, _M, float64[:, :, ::1], _M, _M, _V, _V),
@@ -181,7 +184,7 @@ def filter_square_root(  # type: ignore[no-untyped-def]
     Returns:
         Why it stopped, `DONE` or another, and the sample where it did.
     """
-    t, u, y = samples
+    t, u, curvature, y = samples
     nx, observed = estimated.n_states, estimated.observed
     lower, upper = estimated.lower, estimated.upper
     process_sd, walk_sd, reading_sd = levels.process_sd, levels.walk_sd, levels.reading_sd
@@ -210,8 +213,8 @@ def filter_square_root(  # type: ignore[no-untyped-def]
         dt = t[k] - t[k - 1]
         substeps = max(1, int(np.ceil(dt / levels.longest_step - 1e-6)))
         propagate_points(
-            derivative, estimated, mean, factor, reach, process_sd, u[k - 1], u[k], dt, substeps,
-            images, points,
+            derivative, estimated, mean, factor, reach, process_sd, u[k - 1], u[k],
+            curvature[k - 1], curvature[k], dt, substeps, images, points,
         )  # fmt: skip
         for i in range(nx):
             middle = images[i, 2 * pairs]

@@ -17,7 +17,7 @@ bounds are kept all along, by clamping sigma points and mean.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -173,6 +173,8 @@ class Trial:
         u: (T, nu) inputs of the model.
         y: (T, ny) readings, NaN where one is missing.
         x: (nx,) state at the first sample; x_sd: (nx,) its standard deviation.
+        curvature: (T, nu) second time derivatives of the inputs, between which these run linearly
+            from sample to sample, so that the inputs are cubic; None where they run straight.
     """
 
     t: Array
@@ -180,6 +182,22 @@ class Trial:
     y: Array
     x: Array
     x_sd: Array
+    curvature: Array | None = None
+
+    @property
+    def input_curvature(self) -> Array:
+        """(T, nu) second time derivatives of the inputs, zero where they run straight."""
+        return np.zeros(self.u.shape) if self.curvature is None else self.curvature
+
+    def first(self, samples: int) -> Trial:
+        """The same with no more than so many samples."""
+        return replace(
+            self,
+            t=self.t[:samples],
+            u=self.u[:samples],
+            y=self.y[:samples],
+            curvature=None if self.curvature is None else self.curvature[:samples],
+        )
 
 
 @dataclass(frozen=True)
@@ -259,9 +277,7 @@ def filter_trials(
         joint[nx:, nx:] = covariance
         try:
             root = lower_root(joint)
-            filtered = run_kernel(
-                model, settings, trial.t, trial.u, trial.y, mean, root, settings.stride
-            )
+            filtered = run_kernel(model, settings, trial, mean, root, settings.stride)
         except FilterFailure as failure:
             raise FilterFailure(index, failure.sample, failure.reason) from None
         except ValueError as error:
@@ -295,9 +311,7 @@ def in_sequence(
 def run_kernel(
     model: FilterModel,
     settings: FilterSettings,
-    t: Array,
-    u: Array,
-    y: Array,
+    trial: Trial,
     mean: Array,
     root: Array,
     stride: int,
@@ -306,7 +320,7 @@ def run_kernel(
 
     Args:
         model, settings: as in `filter_trials`.
-        t, u, y: (T,), (T, nu), (T, ny) samples.
+        trial: the samples; its state is not read.
         mean: (n,) state and parameters at the first sample, overwritten with those at the last.
         root: (n, n) lower root of their covariance, likewise.
         stride: store the distribution of every so many samples.
@@ -315,7 +329,7 @@ def run_kernel(
         FilterFailure: of trial 0: the covariance lost positive definiteness or a number is not
             finite.
     """
-    n, size, ny, nw = mean.size, t.size, settings.observed.size, settings.noise_sd.size
+    n, size, ny, nw = mean.size, trial.t.size, settings.observed.size, settings.noise_sd.size
     rows, p = -(-size // stride), _array(model.parameters)
     out = Output(
         means=np.empty((rows, n)),
@@ -339,10 +353,10 @@ def run_kernel(
         _array(settings.noise_sd), _array(settings.walk_sd), _array(settings.reading_sd),
         spread, centre, other, float(settings.longest_step), int(stride),
     )  # fmt: skip
-    samples = Samples(_array(t), _array(u), _array(y))
+    samples = Samples(*map(_array, (trial.t, trial.u, trial.input_curvature, trial.y)))
     ended, sample = filter_square_root(
         model.derivative_rows, model.measure_rows, estimated, levels, samples, mean, root, out,
-        allocate(n, model.n_states, u.shape[1], ny, nw, p),
+        allocate(n, model.n_states, trial.u.shape[1], ny, nw, p),
     )  # fmt: skip
     if ended != DONE:
         raise FilterFailure(0, sample, _REASONS[ended])

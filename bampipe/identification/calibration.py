@@ -10,6 +10,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from bampipe.estimate.bounded import invert_scaled
 from bampipe.estimate.least_squares import as_measured, stacked_residual
 from bampipe.identification.estimates import Estimate
 from bampipe.physics import System, compile_model
@@ -71,7 +72,7 @@ def propagate_calibration(
     inside = np.flatnonzero(~estimate.at_bound)
     inverse = np.zeros((count, count))
     part = np.ix_(inside, inside)
-    inverse[part] = np.linalg.pinv(np.einsum("q,qij->ij", weight, normal)[part], hermitian=True)
+    inverse[part] = invert_scaled(np.einsum("q,qij->ij", weight, normal)[part])
     return {name: np.asarray(inverse @ (weight @ moment)) for name, moment in moments.items()}
 
 

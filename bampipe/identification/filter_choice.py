@@ -25,7 +25,8 @@ class FilterChoice:
         force_noise: of a force sample, N, model error included; 0 takes it from the data, or
             from the identification where the model has been identified.
         longest_step_s: longest Runge-Kutta step, s.
-        block_s: length of the blocks that are taken as independent of each other, s.
+        block_s: length of the blocks that are taken as independent of each other, s; shorter
+            in short sessions, for three a parameter at least.
         trace_rows: most rows a trial in tables of states and of parameters along the data.
     """
 

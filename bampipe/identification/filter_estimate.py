@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.data.run_folder import RunFolder
-from bampipe.estimate.filter_uncertainty import leave_out, sandwich_covariance
+from bampipe.estimate.filter_uncertainty import choose_block, leave_out, sandwich_covariance
 from bampipe.estimate.least_squares import Problem
 from bampipe.estimate.unscented import (
     FilterFailure,
@@ -42,14 +42,20 @@ from bampipe.identification.filter_tables import (
 )
 from bampipe.identification.innovations import innovation_tests
 from bampipe.identification.least_squares_estimate import bias_details
-from bampipe.identification.sensor_noise import Noise, noise_levels, tune_noise, untuned_settings
+from bampipe.identification.sensor_noise import (
+    Noise,
+    choose_tuning_trials,
+    noise_levels,
+    tune_noise,
+    untuned_settings,
+)
 from bampipe.physics import System
 from bampipe.progress import Progress
 from bampipe.trials.bias import UnbiasedFit
 from bampipe.trials.cache import TrialCache
 from bampipe.trials.disturbances import part_trials
 from bampipe.trials.folds import Folds
-from bampipe.trials.motion import Motion, trial_names
+from bampipe.trials.motion import Motion, trial_names, trial_sizes
 
 Array = NDArray[np.float64]
 
@@ -101,7 +107,9 @@ def estimate_by_filter(
     Raises:
         MotionLost: the filter does not follow the motion.
     """
-    motions, of_trial = part_trials(motions, 1.0 / float(np.median(np.diff(motions[0].t))))
+    interval = float(np.median(np.diff(motions[0].t)))
+    motions, of_trial = part_trials(motions, 1.0 / interval)
+    sizes = trial_sizes(motions)
     stride = choose_stride(motions)
     near = squares.raw.p[: len(start)]
     trials = TrialCache(
@@ -127,18 +135,20 @@ def estimate_by_filter(
     def clear(place: int) -> NDArray[np.bool_]:
         return clear_of_reversal_mask(motions[place], system, trials[place].t)
 
-    longest = max(range(len(trials)), key=trials.size)
+    places, samples = choose_tuning_trials(sizes)
     settings = tune_noise(
         settings,
         model,
-        trials[longest],
-        np.asarray(clear(longest).all(axis=1)),
+        [trials[place].first(samples) for place in places],
+        [np.asarray(clear(place)[:samples].all(axis=1)) for place in places],
         settled,
         known,
         noise,
         choice,
     )
     settings = replace(settings, stride=stride)
+    block_s = choose_block([size * interval for size in sizes], model.free.size, choice.block_s)
+    choice = replace(choice, block_s=block_s)
     prior_sd = np.append([item.sd for item in free], late_sd)
     first = np.append(start[problem.free[:count]], late)
     spread = np.hypot(prior_sd, first - np.append(system.prior[problem.free[:count]], late))
@@ -267,8 +277,7 @@ def _moved_by(
     most = min(size, (_MOVED_SAMPLES - 1) // stride * stride + 1)
     count = min(len(trials), max(1, _MOVED_SAMPLES // size))
     places = np.linspace(0, len(trials) - 1, count).round().astype(int)
-    part = [trials[place] for place in places]
-    part = [replace(one, t=one.t[:most], u=one.u[:most], y=one.y[:most]) for one in part]
+    part = [trials[place].first(most) for place in places]
     spread = _AROUND**2 * len(trials) / count * np.diag(np.diag(found.covariance))
     finer = replace(found.settings, longest_step=0.5 * found.settings.longest_step)
 

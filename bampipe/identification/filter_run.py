@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError
+from bampipe.estimate.differentiation import spline_curvature
 from bampipe.estimate.filter_uncertainty import at_block_ends
 from bampipe.estimate.innovations import average_stretches
 from bampipe.estimate.unscented import (
@@ -190,7 +191,11 @@ def load_filter_trial(
     x, x_sd = infer_initial_state(system, p, read, u[first], noise.reading_sd[:n], speed)
     # The last stored distribution must be that of the last sample.
     last = first + (t.size - 1 - first) // stride * stride + 1
-    return Trial(t[first:last], u[first:last], y[first:last], x, x_sd)
+    t, u, y = t[first:last], u[first:last], y[first:last]
+    curvature = np.zeros(u.shape)
+    forced = list(system.forced)
+    curvature[:, forced] = spline_curvature(t, u[:, forced])
+    return Trial(t, u, y, x, x_sd, curvature)
 
 
 def infer_initial_state(

@@ -24,8 +24,10 @@ from bampipe.trials.sensors import Sensors
 
 Array = NDArray[np.float64]
 
-_TUNING_SAMPLES = 3000
-"""Samples of one trial on which the noise levels are tuned."""
+TUNING_SAMPLES = 3000
+"""Samples on which the noise levels are tuned."""
+_TUNING_TRIALS = 6
+"""Trials that they are taken from: what a model lacks may be small in one alone."""
 _TUNING_STEP_S = 2e-3
 """Longest Runge-Kutta step while tuning, s: noise levels need no more."""
 
@@ -112,17 +114,35 @@ def untuned_settings(system: System, noise: Noise, choice: FilterChoice) -> Filt
     )
 
 
+def choose_tuning_trials(sizes: Sequence[int]) -> tuple[list[int], int]:
+    """Choose trials on whose beginnings the noise levels are tuned, `TUNING_SAMPLES` together.
+
+    A filter can start where a trial does, at rest and cold; in the middle of one, nobody knows the
+    internal states of friction.
+
+    Args:
+        sizes: number of samples of each trial.
+
+    Returns:
+        Numbers of the trials, spread over all, and how many samples of each.
+    """
+    usual = int(np.median(sizes))
+    count = min(len(sizes), max(_TUNING_TRIALS, -(-TUNING_SAMPLES // usual)))
+    places = np.linspace(0, len(sizes) - 1, count).round().astype(int)
+    return places.tolist(), -(-TUNING_SAMPLES // count)
+
+
 def tune_noise(
     settings: FilterSettings,
     model: FilterModel,
-    record: Trial,
-    clear: NDArray[np.bool_],
+    records: Sequence[Trial],
+    clear: Sequence[NDArray[np.bool_]],
     value: Array,
     sd: Array,
     noise: Noise,
     choice: FilterChoice,
 ) -> FilterSettings:
-    """Set the noise levels at the maximum of the filter's likelihood on part of a trial.
+    """Set the noise levels at the maximum of the filter's likelihood on parts of trials.
 
     The noise of a measured force is at least that of its sensor: what is more is model error.
     Reversals are left out: there the filter's Gaussian fits whatever the noise, and noise of
@@ -130,21 +150,15 @@ def tune_noise(
 
     Args:
         settings: with the levels to start from.
-        model: the filter's; record: the trial, the longest one.
-        clear: (T,) its samples at which no axis reverses; all count where none is clear.
+        model: the filter's; records: the beginnings of trials.
+        clear: (T,) of each, its samples at which no axis reverses; all count where none is clear.
         value: (nt,) parameters near the answer, physical; sd: (nt,) how well they are known.
         noise: of the sensors.
         choice: fixes levels that are not to be found.
     """
     quick = replace(settings, longest_step=max(settings.longest_step, _TUNING_STEP_S))
-    part = replace(
-        record,
-        t=record.t[:_TUNING_SAMPLES],
-        u=record.u[:_TUNING_SAMPLES],
-        y=record.y[:_TUNING_SAMPLES],
-    )
-    counts = clear[:_TUNING_SAMPLES]
-    counts = counts if counts.any() else np.ones(part.t.size, dtype=bool)
+    counts = np.concatenate(clear)
+    counts = counts if counts.any() else np.ones(counts.size, dtype=bool)
     spread = np.maximum(sd, 1e-6 * np.abs(value))
     mean, sd = model.to_estimated(value, np.maximum(spread, np.finfo(float).tiny))
 
@@ -158,10 +172,11 @@ def tune_noise(
 
     def log_likelihood(levels: Array) -> float:
         try:
-            found = filter_trials(model, [part], mean, np.diag(sd**2), with_levels(levels))
+            found = filter_trials(model, records, mean, np.diag(sd**2), with_levels(levels))
         except FilterFailure:
             return -np.inf
-        return float(np.nansum(found.trials[0].log_likelihood[counts]))
+        likely = np.concatenate([one.log_likelihood for one in found.trials])
+        return float(np.nansum(likely[counts]))
 
     count = noise.process_sd.size
     step = np.log(np.array([2.0**0.125, *np.full(count, 2.0)]))

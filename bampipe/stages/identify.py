@@ -119,10 +119,10 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     timing = config.input_timing and free.isdisjoint(system.delays)
     problem = problem_of(system, motions, band, timing=timing)
     progress(0.1, "least squares")
-    start = _start(run, system, config)
-    model_parameters = problem.free[problem.free < len(start)]
-    start[model_parameters] *= config.start_factor
+    model_parameters = problem.free[problem.free < len(system.parameters)]
     try:
+        start = _start(run, system, config)
+        start[model_parameters] *= config.start_factor
         raw = fit(problem, np.append(start, 0.0), block_s=config.block_s)
     except ValueError as error:
         raise InputError(

@@ -19,7 +19,6 @@ from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
 from bampipe.data.store import read_parquet, write_parquet
 from bampipe.declarations.model_file import IDENTIFIED_MODEL, load_model
 from bampipe.estimate.filter_uncertainty import sandwich_covariance
-from bampipe.estimate.unscented import Trial
 from bampipe.identification.filter_choice import FilterChoice
 from bampipe.identification.filter_run import (
     Attempt,
@@ -149,7 +148,7 @@ def _estimated(
         trial = load_filter_trial(run, motion, system, start, noise, stride, config)
         u = trial.u.copy()
         u[:, _brakes(system)] = 0.0
-        readings.append(Trial(trial.t, u, trial.y, trial.x, trial.x_sd))
+        readings.append(replace(trial, u=u))
     free = [item for item in system.parameters if not item.fixed]
     timing = identified.input_timing.estimate
     model = build_filter_model(system, readings, start, timing=False)

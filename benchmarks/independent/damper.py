@@ -45,13 +45,19 @@ UNKNOWN = ("soft_oil:piston", "dead_travel:piston")
 
 
 @njit(cache=True)
+def _turning(symmetry, moved, z):
+    """Growth of the hysteresis ``z`` per travel in the direction of ``moved``."""
+    return 1.0 - symmetry * np.sign(moved) * z - (1.0 - symmetry) * abs(z)
+
+
+@njit(cache=True)
 def _press(m, x, v, a, current, log_at):
     """Force on the damper along a prescribed stroke, at the samples."""
     out = np.zeros(len(log_at))
     z, coil, oil, free, k_log = 0.0, current[0], 0.0, 0.0, 0
     for k in range(len(x)):
-        if m.coil_lag > 0.0:
-            coil = current[k] + (coil - current[k]) * np.exp(-STEP / m.coil_lag)
+        if m.coil_lag > 0.0 and k > 0:
+            coil = current[k - 1] + (coil - current[k - 1]) * np.exp(-STEP / m.coil_lag)
         else:
             coil = current[k]
         i = coil / (1.0 + (m.bend * coil) ** m.sharpness) ** (1.0 / m.sharpness)
@@ -63,8 +69,11 @@ def _press(m, x, v, a, current, log_at):
             speed = rate * oil
         sign = np.tanh(speed / YIELD_SPEED)
         if m.share > 0.0:
-            grow = speed - m.symmetry * abs(speed) * z - (1.0 - m.symmetry) * speed * abs(z)
-            z += STEP * grow / m.distance
+            if k > 0:
+                moved = 0.5 * STEP * (v[k - 1] + v[k]) / m.distance
+                z += moved * _turning(
+                    m.symmetry, moved, z + 0.5 * moved * _turning(m.symmetry, moved, z)
+                )
             sign += m.share * (z - sign)
         dry = m.coulomb + m.coulomb_gain * abs(i)
         force = (m.viscous + m.viscous_gain * abs(i)) * speed + dry * sign

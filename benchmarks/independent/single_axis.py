@@ -129,7 +129,10 @@ class Specimen:
             elif name in motor:
                 field, theirs = MOTOR[name]
                 self.machine[field] = size * motor[name]
-                self.truth[f"{full.replace(':', '.')}.{theirs}"] = float(self.machine[field])
+                found = float(self.machine[field])
+                if field == "delay":  # in whole steps, over each of which a command is held
+                    found = (round(found / STEP) + 0.5) * STEP
+                self.truth[f"{full.replace(':', '.')}.{theirs}"] = found
             elif name == "flexible_load":
                 # Part of the inertia that the device states hangs behind the coupling.
                 self.machine["load_inertia"] = min(0.25 * size, 0.6) * self.machine["inertia"]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares, lsq_linear
 
-from bampipe.estimate.bounded import descend, solve_bounded
+from bampipe.estimate.bounded import descend, invert_scaled, solve_bounded
 
 
 def problem(seed: int, rows: int = 60, n: int = 7) -> tuple[np.ndarray, np.ndarray]:
@@ -129,3 +129,16 @@ def test_a_descent_ends_where_scipy_s_does(highest: float) -> None:
 def test_a_descent_that_ran_out_of_steps_has_not_converged() -> None:
     found = descend(Decay(np.array([0.2, 0.1])), np.zeros(2), np.full(2, 9.0), 1)
     assert found.iterations == 1 and not found.converged
+
+
+def test_the_inverse_of_normal_equations_does_not_depend_on_units() -> None:
+    """A stiffness of 6e4 N/m beside its position in m: eigenvalues sixteen decades apart."""
+    rng = np.random.default_rng(5)
+    slope = rng.normal(size=(200, 3)) * np.array([1e-5, 6e4, 1.0])
+    slope = np.column_stack([slope, np.zeros(200)])
+    found = invert_scaled(slope.T @ slope)
+    unit = slope[:, :3] / np.array([1e-5, 6e4, 1.0])
+    expected = np.linalg.inv(unit.T @ unit) / np.outer(*2 * [np.array([1e-5, 6e4, 1.0])])
+    np.testing.assert_allclose(found[:3, :3], expected, rtol=1e-9)
+    assert not found[3].any()
+    assert not found[:, 3].any()

@@ -7,7 +7,12 @@ import pytest
 from numpy.typing import NDArray
 
 from bampipe.estimate import butterworth, kalman_smoother, savitzky_golay
-from bampipe.estimate.differentiation import Derivatives, extend, uniform_grid
+from bampipe.estimate.differentiation import (
+    Derivatives,
+    extend,
+    spline_curvature,
+    uniform_grid,
+)
 
 Array = NDArray[np.float64]
 RATE = 500.0
@@ -222,3 +227,15 @@ def test_cut_off_out_of_range(cutoff: float) -> None:
 def test_window_that_does_not_fit() -> None:
     with pytest.raises(ValueError, match="window"):
         savitzky_golay.polynomial(np.zeros(10), RATE, 11)
+
+
+def test_curvature_of_inputs_is_that_of_splines_which_end_at_gaps() -> None:
+    rng = np.random.default_rng(3)
+    t = np.delete(np.arange(400) * 0.01, slice(200, 230)) + rng.uniform(-1e-3, 1e-3, 370)
+    values = np.column_stack([np.sin(9.0 * t), np.cos(5.0 * t)])
+    found = spline_curvature(t, values)
+    inside = np.r_[8:192, 208:362]  # the ends of a natural spline are straight
+    np.testing.assert_allclose(found[inside, 0], -81.0 * values[inside, 0], atol=0.5)
+    np.testing.assert_allclose(found[inside, 1], -25.0 * values[inside, 1], atol=0.1)
+    np.testing.assert_allclose(found[[0, 199, 200, -1]], 0.0, atol=1e-9)
+    assert not spline_curvature(t[:2], values[:2]).any()

@@ -59,6 +59,7 @@ class _Points:
         self.nx, self.nw = model.n_states, settings.noise_sd.size
         self.n = self.nx + model.free.size
         self.t, self.u = trial.t, np.array(trial.u, dtype=float, order="C")
+        self.curvature = trial.input_curvature
         self.p = np.array(model.parameters, dtype=float)
 
     def draw(
@@ -98,9 +99,12 @@ class _Points:
         work = np.empty((6, max(2 * self.nx, self.u.shape[1])))
         for point in points:
             x, w = self.place(point), point[self.n : self.n + self.nw].copy()
-            late = self.p[-1] / dt * (self.u[k] - self.u[k - 1])
-            start, end = self.u[k - 1] - late, self.u[k] - late
-            runge_kutta(self.model.derivative, x, start, end, self.p, w, dt, substeps, work)
+            late, c0, c1 = self.p[-1], *self.curvature[k - 1 : k + 1]
+            shift = 0.25 * late**2 * (c0 + c1) - late * (self.u[k] - self.u[k - 1]) / dt
+            runge_kutta(
+                self.model.derivative, x, self.u[k - 1] + shift, self.u[k] + shift, c0, c1,
+                self.p, w, dt, substeps, work,
+            )  # fmt: skip
             point[: self.nx] = x
 
     def read(self, points: np.ndarray, k: int) -> np.ndarray:
