@@ -109,7 +109,9 @@ def fit_trials(
     What a model ``like`` it has in common with it, fitted to the same, is not computed again.
     """
     system = system_of(recipe)
-    return gather_evidence(system, trials.motions, trials.band, start, trials.folds, like=like)
+    return gather_evidence(
+        system, trials.motions, trials.band, start, trials.folds, like=like, timing=trials.timing
+    )
 
 
 _linearised: dict[tuple[str, bytes, float | None], Evidence] = {}
@@ -124,8 +126,9 @@ def linearise(recipe: Recipe, p: Array, late_s: float | None) -> Evidence:
         trials = open_trials(late_s)
         _linearised.clear()
         _linearised[key] = gather_evidence(
-            system, trials.motions, trials.band, p, trials.folds, most_iterations=0
-        )
+            system, trials.motions, trials.band, p, trials.folds, most_iterations=0,
+            timing=trials.timing,
+        )  # fmt: skip
     return _linearised[key]
 
 
@@ -211,8 +214,9 @@ def run_replicate(task: ReplicateTask) -> Replicate:
     replays = replay_motions(stand_in, trials.sensors, trials.kinematics, task.seed)
     analysed = system_of(task.analysed)
     evidence = gather_evidence(
-        analysed, replays, trials.band, task.start, trials.folds, most_iterations=_STEPS_OF_A_REPLAY
-    )
+        analysed, replays, trials.band, task.start, trials.folds,
+        most_iterations=_STEPS_OF_A_REPLAY, timing=trials.timing,
+    )  # fmt: skip
     scorer = Scorer(evidence)
     found = {c.name: scorer.score(c) for c in candidates_of(task.analysed, task.names)}
     axes = range(len(system.coordinates))

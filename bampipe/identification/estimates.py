@@ -214,7 +214,7 @@ def collect_result(
     effects = {each.name: _judge_effect(each, parameters) for each in system.model.effects}
     unknown = [name for name, found in effects.items() if not found.identified]
     warning = f"not identified: {', '.join(unknown)}; " if unknown else ""
-    timing = estimate.report["input_timing"]
+    timing = estimate.report["input_timing"].model_copy(update={"of_residual": float(raw.p[-1])})
     influence = _assess_influence(names, estimate, motions, raw)
     return IdentifyResult(
         model=model,
@@ -236,7 +236,7 @@ def collect_result(
             *notes,
             *identifiability.sentences,
         ),
-        **estimate.report,
+        **{**estimate.report, "input_timing": timing},
     )
 
 

@@ -138,15 +138,11 @@ class InputTiming(Record):
     limit: Size = Field(
         default=0.0, description="Half a sample, all that it may be; 0 where it was not estimated"
     )
-
-    @property
-    def is_known(self) -> bool:
-        """Whether it is known to be below its limit, so that it can be taken off.
-
-        At the limit it stands for a delay or lag that the model lacks, and taking off a part would
-        hide what it is.
-        """
-        return abs(self.estimate) + 2.0 * self.sd < self.limit
+    of_residual: float = Field(
+        default=0.0,
+        description="The one that leaves the least residual, within the limit, what filters make of"
+        " changes of direction not taken off; s. Residuals are compared with it",
+    )
 
     @property
     def is_at_limit(self) -> bool:

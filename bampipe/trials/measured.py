@@ -58,6 +58,11 @@ class MeasuredTrials:
     late_s: float = 0.0
     limit_s: float = 0.0
 
+    @property
+    def timing(self) -> tuple[float, float]:
+        """Least and largest change of the inputs' timing from what is taken off already, s."""
+        return (-self.limit_s - self.late_s, self.limit_s - self.late_s)
+
     def with_input_timing(self, late_s: float) -> MeasuredTrials:
         """The same with ``late_s`` taken off, instead of `late_s`."""
         if late_s == self.late_s:
@@ -113,14 +118,14 @@ def read_measured_trials(
         run: the run folder; system: the model.
         every_input: as in `read_motion`.
         timing: time by which inputs were sampled after positions, as identified. It is taken off
-            where it is known (`InputTiming.is_known`).
+            as far as it leaves the least residual.
 
     Raises:
         InputError: there is no free trial, or a file or column is missing.
     """
     names = free_trials(run, braked=True)
     band = read_band(run, system)
-    late_s = timing.estimate if timing is not None and timing.is_known else 0.0
+    late_s = timing.of_residual if timing is not None else 0.0
     fitted, held_out = free_trials(run, fitted=True, braked=system.braked), held_out_trials(run)
     motions = read_motions(run, system, braked=True, every_input=every_input, late_s=late_s)
     trials = MeasuredTrials(
