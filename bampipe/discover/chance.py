@@ -80,6 +80,17 @@ def open_trials(late_s: float | None = None) -> MeasuredTrials:
     return _timed_trials
 
 
+_UNMOVED = 0.05
+"""Of half a sample: inputs that move by less stay."""
+
+
+def retimed_trials(trials: MeasuredTrials, by_s: float) -> MeasuredTrials:
+    """The trials that are open, as ``trials`` but with ``by_s`` more taken off their inputs."""
+    if abs(by_s) <= _UNMOVED * trials.limit_s:
+        return trials
+    return open_trials(trials.late_s + by_s)
+
+
 _systems: dict[str, System] = {}
 _candidates: dict[str, Candidate] = {}
 """By `Model.key`: of two devices of one name and other contents it differs."""

@@ -50,6 +50,7 @@ class Score:
             units of independent samples: positive where the effect helps. An effect that weakens
             what the force does, such as friction in proportion to it, makes both sides of the
             equation small, noise included; the slope of the residual by the force takes that off.
+        late_s: change of the inputs' timing that goes with it, s.
     """
 
     name: str
@@ -57,6 +58,7 @@ class Score:
     values: Array
     shift: Array
     gain: Array
+    late_s: float = 0.0
 
     @property
     def total(self) -> float:
@@ -102,9 +104,7 @@ class Scorer:
     def sums(self) -> NormalEquations:
         """Sums of products of the model's own columns, the timing of the inputs last."""
         e = self.evidence
-        return NormalEquations.from_samples(
-            self.jacobian, e.residual, e.used, e.precision, e.known
-        )
+        return NormalEquations.from_samples(self.jacobian, e.residual, e.used, e.precision, e.known)
 
     def _folds_for(self, item: Candidate) -> Folds:
         """What brakes do is part of the model with an effect of theirs, and fitted then."""
@@ -292,7 +292,8 @@ class Scorer:
                 if self.independent_samples @ gain < Settings().worth_searching:
                     return self._score_at_zero(item)
             gain = self.independent_samples * gain
-            return Score(item.name, error, values, solution[:start], gain)
+            shift, late_s = self._split(solution)
+            return Score(item.name, error, values, shift, gain, late_s)
         best = None
         for share in _SHARES if item.linear_indices else (1.0,):
             weaker = values.copy()
@@ -308,13 +309,18 @@ class Scorer:
                 or self.independent_samples @ gain > self.independent_samples @ best.gain
             ):
                 fitted = sums.subset(folds.fitted_trials)
-                shift = fitted.solve(weight, low, high)[:start]
-                best = Score(item.name, error, weaker, shift, gain)
+                shift, late_s = self._split(fitted.solve(weight, low, high))
+                best = Score(item.name, error, weaker, shift, gain, late_s)
         assert best is not None
         # Both sides of the equation made small explain nothing, however small the error becomes.
         if self.independent_samples @ best.gain < Settings().worth_searching:
             return self._score_at_zero(item)
         return replace(best, gain=self.independent_samples * best.gain)
+
+    def _split(self, solution: Array) -> tuple[Array, float]:
+        """Change of the model's free parameters, and of the timing of the inputs, in a joint fit."""
+        count = len(self.evidence.free)
+        return solution[:count], float(solution[count]) if self.evidence.by_timing else 0.0
 
     def _values_of(self, item: Candidate, searched: Array, solution: Array) -> Array:
         """Values of its parameters, of the searched ones and the coefficients of the joint fit."""

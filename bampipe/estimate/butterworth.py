@@ -9,7 +9,6 @@ from scipy.signal import butter, periodogram, sosfiltfilt
 
 from bampipe.estimate.differentiation import Array, Derivatives, extend, linear_noise_gains
 
-
 _REACH = 6
 """Samples on either side that a derivative of an input is made of."""
 

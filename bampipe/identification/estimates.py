@@ -214,7 +214,8 @@ def collect_result(
     effects = {each.name: _judge_effect(each, parameters) for each in system.model.effects}
     unknown = [name for name, found in effects.items() if not found.identified]
     warning = f"not identified: {', '.join(unknown)}; " if unknown else ""
-    timing = estimate.report["input_timing"].model_copy(update={"of_residual": float(raw.p[-1])})
+    timing = estimate.report["input_timing"]
+    timing = timing.model_copy(update={"of_residual": _timing_of_residual(timing, raw)})
     influence = _assess_influence(names, estimate, motions, raw)
     return IdentifyResult(
         model=model,
@@ -317,6 +318,14 @@ def _fault(name: str, entry: ParameterEstimate) -> str:
             + ", an interval larger than itself"
         )
     return ""
+
+
+def _timing_of_residual(timing: InputTiming, raw: LeastSquares) -> float:
+    """The timing that least squares find, s; 0 where that may as well be none."""
+    late_s, determined = float(raw.p[-1]), timing.limit > 0.0
+    if not determined or abs(late_s) < NORMAL_95 * float(np.sqrt(raw.covariance[-1, -1])):
+        return 0.0
+    return late_s
 
 
 def _describe_limit(timing: InputTiming) -> str:

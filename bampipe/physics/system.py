@@ -94,7 +94,7 @@ class System:
 
     @property
     def has_free_delay(self) -> bool:
-        """Whether a delay is estimated: to the data, the timing of the inputs is one and the same."""
+        """Whether a delay is estimated: to the data that is the inputs' timing."""
         return any(not p.fixed and p.name in self.delays for p in self.parameters)
 
     @cached_property

@@ -127,8 +127,8 @@ def read_motion_of(
         needed += [name for name in (*smooth, *brakes) if name not in needed]
         wanted = [*needed, *(rate for name in smooth for rate in input_derivatives(name))]
     else:
-        smooth = [name for name in needed if _is_smooth(device, name)]
-        wanted += [rate for name in smooth for rate in input_derivatives(name)[:TIMING_ORDERS]]
+        for name in [name for name in needed if _is_smooth(device, name)]:
+            wanted += input_derivatives(name)[:TIMING_ORDERS]
     column_of = {name: brakes.get(name, name) for name in dict.fromkeys(wanted)}
     motion = {key: [f"{key}_{axis}" for axis in axes] for key in ("q", "qd", "qdd", "qd_sd")}
     required = [column for columns in motion.values() for column in columns]
