@@ -90,8 +90,8 @@ class Scorer:
         self.evidence = evidence
         # The trials that a session holds out choose no model.
         self.folds = evidence.folds.among_fitted()
-        # What a small shift of the inputs explains is to the credit of no effect: the model and each
-        # candidate have the timing that suits them.
+        # What a small shift of the inputs explains is to the credit of no effect: the model and
+        # each candidate have the timing that suits them.
         timing = evidence.timing if evidence.by_timing else ()
         self.jacobian: Sequence[Array] = evidence.jacobian
         if timing:
@@ -318,7 +318,7 @@ class Scorer:
         return replace(best, gain=self.independent_samples * best.gain)
 
     def _split(self, solution: Array) -> tuple[Array, float]:
-        """Change of the model's free parameters, and of the timing of the inputs, in a joint fit."""
+        """Change of the model's free parameters, and of the inputs' timing, in a joint fit."""
         count = len(self.evidence.free)
         return solution[:count], float(solution[count]) if self.evidence.by_timing else 0.0
 
