@@ -47,6 +47,7 @@ class MeasuredTrials:
         blocks: how many of the motions are blocks of the only trial that is not held out.
         late_s: time by which inputs were sampled after positions, taken off already; limit_s: the
             most that it may be, zero where it is not estimated.
+        timed: whether the trials show such a time, so that each candidate has one of its own.
     """
 
     motions: Sequence[Motion]
@@ -57,10 +58,13 @@ class MeasuredTrials:
     blocks: int = 0
     late_s: float = 0.0
     limit_s: float = 0.0
+    timed: bool = False
 
     @property
     def timing(self) -> tuple[float, float]:
         """Least and largest change of the inputs' timing from what is taken off already, s."""
+        if not self.timed:
+            return (0.0, 0.0)
         return (-self.limit_s - self.late_s, self.limit_s - self.late_s)
 
     def with_input_timing(self, late_s: float) -> MeasuredTrials:
@@ -136,6 +140,7 @@ def read_measured_trials(
         Folds.of_trials(names, held_out, fitted),
         late_s=late_s,
         limit_s=timing.limit if timing is not None else 0.0,
+        timed=late_s != 0.0,
     )
     alone = [k for k, name in enumerate(names) if name not in held_out]
     return _with_blocks(trials, alone[0], held_out) if len(alone) == 1 else trials
