@@ -63,6 +63,35 @@ def test_following_judges_the_model_that_it_starts_from(
     assert ran[0] == ("identify", "validate", "base") and ran[-1] == ("compare", "compare", "")
 
 
+@pytest.mark.parametrize(
+    ("rival", "beside", "said"),
+    [
+        ("actuator_lag:current", "about as likely", "log at a higher rate"),
+        ("stribeck:joint", "about as likely", "`bampipe next --for decision` looks for one"),
+        ("stribeck:joint", "", ""),
+    ],
+)
+def test_an_effect_that_is_added_undecided_is_called_arbitrary(
+    rival: str, beside: str, said: str
+) -> None:
+    contest = [
+        {"effect": "actuator_delay", "odds": 0.56},
+        {"effect": rival, "odds": 0.44, "beside": beside},
+    ]
+    content = {
+        "axes": {"joint": {"verdict": "undecided"}},
+        "selected": ["actuator_delay"],
+        "contests": {"actuator_delay": contest},
+        "suggested_trial": None,
+    }
+    found = DiagnoseResult.model_validate(filled(DiagnoseResult, content))
+    lines = loop._unsettled(found)
+    assert len(lines) == bool(said)
+    if said:
+        assert f"56 % against 44 % for {rival}" in lines[0] and said in lines[0]
+        assert "which of them is added is arbitrary, it is actuator_delay" in lines[0]
+
+
 @pytest.mark.parametrize("fault", [ZeroDivisionError, KeyboardInterrupt])
 def test_a_child_that_was_never_identified_is_removed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: type[BaseException]

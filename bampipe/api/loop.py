@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError
 from bampipe.files import is_normal
+from bampipe.lists import join_names
 from bampipe.run import models, record
 from bampipe.run.events import Listener
 from bampipe.run.request import Request
@@ -21,7 +22,7 @@ from bampipe.stages import base
 
 if TYPE_CHECKING:
     from bampipe.declarations.pipeline import Pipeline
-    from bampipe.results.diagnose import DiagnoseResult
+    from bampipe.results.diagnose import Contender, DiagnoseResult
 
 MOST_ROUNDS = 4
 
@@ -262,6 +263,8 @@ def follow(
         diagnosis = _diagnosis(options.root, model)
         for axis, words in sorted(diagnosis.verdicts_in_words.items()):
             tell(f"{model}, {axis}: {words}")
+        for line in _unsettled(diagnosis):
+            tell(line)
         found = diagnosis.selected
         if draft and diagnosis.unnamed_axes:
             found = _drafted(options, model, tell) or found
@@ -279,6 +282,38 @@ def follow(
         tell(f"stopped after {MOST_ROUNDS} rounds")
     options.run("compare", "compare", "")
     return model
+
+
+def _unsettled(diagnosis: DiagnoseResult) -> list[str]:
+    """Say of each effect that is added while another one is about as likely, and what decides."""
+    said = []
+    for name in diagnosis.selected:
+        contest = diagnosis.contests.get(name, ())
+        rivals = [c for c in contest if c.beside]
+        if not rivals:
+            continue
+        odds = f"{100 * contest[0].odds:.0f} % against " + join_names(
+            f"{100 * c.odds:.0f} % for {c.effect}" for c in rivals
+        )
+        trial = diagnosis.suggested_trial
+        asked = trial is not None and name in trial.between
+        said.append(
+            f"these trials do not decide between {join_names([name, *(c.effect for c in rivals)])}"
+            f" (odds {odds}): which of them is added is arbitrary, it is {name}. "
+            + (trial.sentence if trial is not None and asked else _what_decides(name, rivals))
+        )
+    return said
+
+
+def _what_decides(name: str, rivals: Sequence[Contender]) -> str:
+    """What to record where no trial was found that would tell an effect from its rivals."""
+    kinds = {each.partition(":")[0] for each in (name, *(c.effect for c in rivals))}
+    if any("delay" in kind for kind in kinds) and any("lag" in kind for kind in kinds):
+        return (
+            "A lag weakens what changes fast, a delay does not: log at a higher rate, and record"
+            " trials in which the force changes faster."
+        )
+    return "No trial was found that would tell them; `bampipe next --for decision` looks for one."
 
 
 def _drafted(options: LoopOptions, model: str, tell: Callable[[str], None]) -> tuple[str, ...]:

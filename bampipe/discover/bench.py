@@ -78,7 +78,7 @@ class Bench:
         sample late, which a fit finds on either side of that limit.
         """
         trials, system = self.trials, evidence.system
-        if trials.limit_s == 0.0 or not set(evidence.free).isdisjoint(system.delays):
+        if trials.limit_s == 0.0 or system.has_free_delay:
             return self
         problem = problem_of(system, trials.motions, trials.band, timing=True)
         wide = replace(problem, lower=_wider(problem.lower), upper=_wider(problem.upper))

@@ -80,6 +80,17 @@ def open_trials(late_s: float | None = None) -> MeasuredTrials:
     return _timed_trials
 
 
+_UNMOVED = 0.05
+"""Of half a sample: inputs that move by less stay."""
+
+
+def retimed_trials(trials: MeasuredTrials, by_s: float) -> MeasuredTrials:
+    """The trials that are open, as ``trials`` but with ``by_s`` more taken off their inputs."""
+    if abs(by_s) <= _UNMOVED * trials.limit_s:
+        return trials
+    return open_trials(trials.late_s + by_s)
+
+
 _systems: dict[str, System] = {}
 _candidates: dict[str, Candidate] = {}
 """By `Model.key`: of two devices of one name and other contents it differs."""
@@ -109,7 +120,9 @@ def fit_trials(
     What a model ``like`` it has in common with it, fitted to the same, is not computed again.
     """
     system = system_of(recipe)
-    return gather_evidence(system, trials.motions, trials.band, start, trials.folds, like=like)
+    return gather_evidence(
+        system, trials.motions, trials.band, start, trials.folds, like=like, timing=trials.timing
+    )
 
 
 _linearised: dict[tuple[str, bytes, float | None], Evidence] = {}
@@ -124,8 +137,9 @@ def linearise(recipe: Recipe, p: Array, late_s: float | None) -> Evidence:
         trials = open_trials(late_s)
         _linearised.clear()
         _linearised[key] = gather_evidence(
-            system, trials.motions, trials.band, p, trials.folds, most_iterations=0
-        )
+            system, trials.motions, trials.band, p, trials.folds, most_iterations=0,
+            timing=trials.timing,
+        )  # fmt: skip
     return _linearised[key]
 
 
@@ -211,8 +225,9 @@ def run_replicate(task: ReplicateTask) -> Replicate:
     replays = replay_motions(stand_in, trials.sensors, trials.kinematics, task.seed)
     analysed = system_of(task.analysed)
     evidence = gather_evidence(
-        analysed, replays, trials.band, task.start, trials.folds, most_iterations=_STEPS_OF_A_REPLAY
-    )
+        analysed, replays, trials.band, task.start, trials.folds,
+        most_iterations=_STEPS_OF_A_REPLAY, timing=trials.timing,
+    )  # fmt: skip
     scorer = Scorer(evidence)
     found = {c.name: scorer.score(c) for c in candidates_of(task.analysed, task.names)}
     axes = range(len(system.coordinates))

@@ -145,6 +145,7 @@ def grow_set(
         less = reduce_set(wider, earlier)
         if is_superfluous(wider.error, less.error, s):
             wider = less
+    bench = replace(bench, trials=wider.trials)
     timed = bench.retimed(wider.evidence)
     if timed is not bench:
         fitted = timed.fit(wider.recipe, wider.evidence.p)

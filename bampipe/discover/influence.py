@@ -78,6 +78,7 @@ def leave_out(evidence: Evidence, samples: SampleRange) -> Evidence:
         residual=cleared(evidence.residual),
         jacobian=cleared(evidence.jacobian),
         used=cleared(evidence.used),
+        by_timing=cleared(evidence.by_timing) if evidence.by_timing else (),
     )
 
 

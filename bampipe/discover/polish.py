@@ -20,6 +20,7 @@ from bampipe.discover.chance import (
     fit_trials,
     linearise,
     open_trials,
+    retimed_trials,
 )
 from bampipe.discover.influence import largest_second, largest_trial, score_without
 from bampipe.discover.rivals import plausible, replay_rivals, without_mere_offsets
@@ -104,8 +105,9 @@ def extend_set(known: FittedSet, score: Score) -> FittedSet:
     """Fit the set with one effect more, from where it was scored."""
     wider = replace(known.recipe, effects=(*known.recipe.effects, score.name))
     start = with_effect(wider, known.evidence, score)
-    fitted = fit_trials(known.trials, wider, start, known.evidence)
-    return FittedSet(wider, (*known.added, score.name), fitted, known.trials)
+    trials = retimed_trials(known.trials, score.late_s)
+    fitted = fit_trials(trials, wider, start, known.evidence)
+    return FittedSet(wider, (*known.added, score.name), fitted, trials)
 
 
 def reduce_set(known: FittedSet, name: str) -> FittedSet:
@@ -264,6 +266,7 @@ def _swap_by_replay(
     if not close:
         return [], None, True
     fewer = reduce_set(found, name)
+    bench = replace(bench, trials=fewer.trials)
     scores = {n: out.scores[n] for n in (name, *close)}
     axis = fewer.evidence.system.coordinates.index(mine.axis)
     misfits = replay_rivals(bench, fewer.recipe, fewer.evidence, scores, axis, progress)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from bampipe.discover.bench import Bench
 from bampipe.discover.candidates import Candidate
-from bampipe.discover.chance import Progress, candidates_of
+from bampipe.discover.chance import Progress, candidates_of, retimed_trials
 from bampipe.discover.columns import added_columns
 from bampipe.discover.influence import SampleRange, largest_second, score_without
 from bampipe.discover.level import Level
@@ -182,9 +182,10 @@ def replay_rivals(
     for k, name in enumerate(rivals):
         progress(0.5, f"replaying {name} and what may be mistaken for it")
         wider = replace(recipe, effects=(*recipe.effects, name))
-        fitted = bench.fit(wider, with_effect(wider, evidence, scores[name]), evidence)
+        timed = replace(bench, trials=retimed_trials(bench.trials, scores[name].late_s))
+        fitted = timed.fit(wider, with_effect(wider, evidence, scores[name]), evidence)
         try:
-            replicas = bench.replicas(
+            replicas = timed.replicas(
                 wider, fitted.p, s.rival_replicates, rivals, (2, k),
                 analysed=(recipe, evidence.p),
             )  # fmt: skip

@@ -50,6 +50,7 @@ class Score:
             units of independent samples: positive where the effect helps. An effect that weakens
             what the force does, such as friction in proportion to it, makes both sides of the
             equation small, noise included; the slope of the residual by the force takes that off.
+        late_s: change of the inputs' timing that goes with it, s.
     """
 
     name: str
@@ -57,6 +58,7 @@ class Score:
     values: Array
     shift: Array
     gain: Array
+    late_s: float = 0.0
 
     @property
     def total(self) -> float:
@@ -88,6 +90,21 @@ class Scorer:
         self.evidence = evidence
         # The trials that a session holds out choose no model.
         self.folds = evidence.folds.among_fitted()
+        # What a small shift of the inputs explains is to the credit of no effect: the model and
+        # each candidate have the timing that suits them.
+        timing = evidence.timing if evidence.by_timing else ()
+        self.jacobian: Sequence[Array] = evidence.jacobian
+        if timing:
+            pairs = zip(evidence.jacobian, evidence.by_timing, strict=True)
+            self.jacobian = [np.append(x, by[:, :, None], axis=2) for x, by in pairs]
+        self.lower = np.append(evidence.lower, timing[:1])
+        self.upper = np.append(evidence.upper, timing[1:])
+
+    @cached_property
+    def sums(self) -> NormalEquations:
+        """Sums of products of the model's own columns, the timing of the inputs last."""
+        e = self.evidence
+        return NormalEquations.from_samples(self.jacobian, e.residual, e.used, e.precision, e.known)
 
     def _folds_for(self, item: Candidate) -> Folds:
         """What brakes do is part of the model with an effect of theirs, and fitted then."""
@@ -108,9 +125,10 @@ class Scorer:
     @cached_property
     def base_error(self) -> Array:
         """Error of the model as it is, as that of a `Score`, by axis, (n_q,), N.m or N."""
-        e = self.evidence
-        steps = self.folds.solve(e.sums, e.weight, e.lower, e.upper, Settings().held_out_weight)
-        return self.folds.error(e.sums, steps)
+        held_out_weight = Settings().held_out_weight
+        weight, bounds = self.evidence.weight, (self.lower, self.upper)
+        steps = self.folds.solve(self.sums, weight, *bounds, held_out_weight)
+        return self.folds.error(self.sums, steps)
 
     @cached_property
     def held_out_scale(self) -> Array:
@@ -131,9 +149,9 @@ class Scorer:
 
     def _cost_before(self, item: Candidate) -> float:
         """Cost of the model as it is, fitted to the trials that ``item`` is fitted to."""
-        e = self.evidence
-        fitted = e.sums.subset(self._folds_for(item).fitted_trials)
-        return self._cost(fitted.mean_square(fitted.solve(e.weight, e.lower, e.upper)))
+        fitted = self.sums.subset(self._folds_for(item).fitted_trials)
+        step = fitted.solve(self.evidence.weight, self.lower, self.upper)
+        return self._cost(fitted.mean_square(step))
 
     def _cost(self, left: Array) -> float:
         """Cost of a fit that leaves a mean square, (n_q,): sum over axes of n log of it."""
@@ -177,9 +195,9 @@ class Scorer:
             return [np.zeros(len(r)) for r in self.evidence.residual]
         values, left = self._fit(item, problem.sums)
         weight = _weight(left)
-        e, count = self.evidence, len(self.evidence.free)
+        count, residual = self.lower.size, self.evidence.residual
         rows = zip(
-            self.folds.judged, e.residual, e.jacobian, problem.change, problem.added, strict=True
+            self.folds.judged, residual, self.jacobian, problem.change, problem.added, strict=True
         )
         return [
             0.5
@@ -210,18 +228,22 @@ class Scorer:
             return None
         if not all((np.abs(c) < _DIVERGED).all() for c in (*columns, *change)):
             return None
-        e = self.evidence
         shape = np.concatenate(columns if item.linear_indices else change)
         flat = shape.reshape(-1, shape.shape[-1]) if item.linear_indices else shape
-        sums = e.sums.bordered(e.jacobian, columns, change, e.residual)
+        sums = self.sums.bordered(self.jacobian, columns, change, self.evidence.residual)
         return _JointProblem(sums, columns, change, flat)
 
     def _bounds(self, item: Candidate) -> tuple[Array, Array]:
         """Bounds of the changes of the base parameters and of the linear strengths."""
         strengths = [item.parameters[i] for i in item.linear_indices]
+        lower, upper = self.lower, self.upper
+        if item.system.has_free_delay:
+            # Its delay has the place of the timing, as in identification.
+            timing = np.arange(lower.size) >= len(self.evidence.free)
+            lower, upper = np.where(timing, 0.0, lower), np.where(timing, 0.0, upper)
         return (
-            np.append(self.evidence.lower, [q.lower for q in strengths]),
-            np.append(self.evidence.upper, [q.upper for q in strengths]),
+            np.append(lower, [q.lower for q in strengths]),
+            np.append(upper, [q.upper for q in strengths]),
         )
 
     def _fit_cost(self, item: Candidate, searched: Array) -> tuple[float, Array] | None:
@@ -256,7 +278,7 @@ class Scorer:
         weight = _weight(left)
         folds, (lower, upper) = self._folds_for(item), self._bounds(item)
         values = self._values_of(item, searched, solution)
-        start = len(self.evidence.free)
+        start = self.lower.size
 
         def error_within(lower: Array, upper: Array) -> Array:
             steps = folds.solve(sums, weight, lower, upper, Settings().held_out_weight)
@@ -270,7 +292,8 @@ class Scorer:
                 if self.independent_samples @ gain < Settings().worth_searching:
                     return self._score_at_zero(item)
             gain = self.independent_samples * gain
-            return Score(item.name, error, values, solution[:start], gain)
+            shift, late_s = self._split(solution)
+            return Score(item.name, error, values, shift, gain, late_s)
         best = None
         for share in _SHARES if item.linear_indices else (1.0,):
             weaker = values.copy()
@@ -286,19 +309,24 @@ class Scorer:
                 or self.independent_samples @ gain > self.independent_samples @ best.gain
             ):
                 fitted = sums.subset(folds.fitted_trials)
-                shift = fitted.solve(weight, low, high)[:start]
-                best = Score(item.name, error, weaker, shift, gain)
+                shift, late_s = self._split(fitted.solve(weight, low, high))
+                best = Score(item.name, error, weaker, shift, gain, late_s)
         assert best is not None
         # Both sides of the equation made small explain nothing, however small the error becomes.
         if self.independent_samples @ best.gain < Settings().worth_searching:
             return self._score_at_zero(item)
         return replace(best, gain=self.independent_samples * best.gain)
 
+    def _split(self, solution: Array) -> tuple[Array, float]:
+        """Change of the model's free parameters, and of the inputs' timing, in a joint fit."""
+        count = len(self.evidence.free)
+        return solution[:count], float(solution[count]) if self.evidence.by_timing else 0.0
+
     def _values_of(self, item: Candidate, searched: Array, solution: Array) -> Array:
         """Values of its parameters, of the searched ones and the coefficients of the joint fit."""
         values = np.array([p.prior for p in item.parameters])
         values[list(item.searched_indices)] = searched
-        values[list(item.linear_indices)] = solution[len(self.evidence.free) :]
+        values[list(item.linear_indices)] = solution[self.lower.size :]
         return values
 
     def _passed_noise(self, item: Candidate, values: Array) -> Array:

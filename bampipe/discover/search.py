@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -195,6 +195,7 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
     rivals = {name: _rivals(base, first, name, groups.get(name, ()), s) for name in current.added}
     polished = polish(bench, current, rivals, lambda _, what: progress(0.8, what))
     found, contests = polished.found, polished.contests
+    bench = replace(bench, trials=found.trials)
     progress(0.85, "replaying the final model for its noise floor")
     same = known.replicates if found is current else ()
     try:
@@ -203,7 +204,7 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
         if found is current:
             raise
         # A rival that scored better has no mechanism that could have it: as found, then.
-        found = current
+        found, bench = current, replace(bench, trials=current.trials)
         contests = {name: contest_of(found, name, rivals[name]) for name in found.added}
         final = bench.floor_replicas(found.recipe, found.evidence, found.replayed, known.replicates)
     if found.added != current.added:

@@ -9,6 +9,7 @@ from bampipe.discover.findings import Diagnosis
 from bampipe.discover.settings import Settings
 from bampipe.lists import join_names
 from bampipe.results.diagnose import AxisVerdict, Contender, Stretch, in_words
+from bampipe.results.identify import NEAR_LIMIT
 from bampipe.results.rounding import significant as three
 from bampipe.results.standing import FLOOR_WRONG, STANDINGS_IN_WORDS, standing
 
@@ -41,7 +42,21 @@ def _parts(axis: str, i: int, found: Diagnosis, unit: str, s: Settings) -> list[
         parts.append(f"{left}: {describe(judged, i, s)}.")
     elif a.standing == "above_floor":
         parts.append(_excused(a, unit))
-    return parts + _creeping(a, unit) + _other_band(a)
+    return parts + _timing(found) + _creeping(a, unit) + _other_band(a)
+
+
+def _timing(found: Diagnosis) -> list[str]:
+    """Where the inputs are taken to act half a sample before or after the log, that they are."""
+    earliest, latest = found.evidence.timing
+    limit_s, late_s = 0.5 * (latest - earliest), -0.5 * (latest + earliest)
+    if not 0.0 < NEAR_LIMIT * limit_s <= abs(late_s):
+        return []
+    way = "after" if late_s > 0.0 else "before"
+    return [
+        f"The inputs are taken to act {three(1e3 * abs(late_s))} ms {way} they were logged, half a"
+        " sample, as of a command that is held until the next one: a delay or a lag of no more than"
+        " that would not show as an effect."
+    ]
 
 
 def _creeping(a: AxisVerdict, unit: str) -> list[str]:

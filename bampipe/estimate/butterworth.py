@@ -9,6 +9,9 @@ from scipy.signal import butter, periodogram, sosfiltfilt
 
 from bampipe.estimate.differentiation import Array, Derivatives, extend, linear_noise_gains
 
+_REACH = 6
+"""Samples on either side that a derivative of an input is made of."""
+
 
 @lru_cache(maxsize=64)
 def _design(cutoff_hz: float, rate_hz: float, order: int) -> Array:
@@ -39,11 +42,7 @@ def zero_phase(
             amplitude through there.
         order: order of one pass.
     """
-    sections = _design(cutoff_hz, rate_hz, order)
-    reach = int(np.ceil(4.0 * rate_hz / cutoff_hz)) + 2
-    longer = extend(values, reach, max(4, int(np.ceil(1.5 * rate_hz / cutoff_hz))))
-    added = (len(longer) - len(values)) // 2
-    x = np.asarray(sosfiltfilt(sections, longer, padtype=None), dtype=np.float64)
+    x, added = _low_passed(values, rate_hz, cutoff_hz, order)
     inner = np.arange(added, added + len(values))
     ahead, behind = x[np.minimum(inner + 1, len(x) - 1)], x[np.maximum(inner - 1, 0)]
     ahead2, behind2 = x[np.minimum(inner + 2, len(x) - 1)], x[np.maximum(inner - 2, 0)]
@@ -57,13 +56,38 @@ def zero_phase(
 def rates(values: Array, rate_hz: float, cutoff_hz: float, count: int) -> list[Array]:
     """Return the first ``count`` time derivatives of ``values`` (T,), each (T,), band-limited.
 
-    Two orders come from each pass of :func:`zero_phase`, so that higher ones are smoothed more.
+    Two orders come from each pass of the filter, so that higher ones are smoothed more. The central
+    differences are of twelfth order: to 0.1 % up to a fifth of the sampling rate, where residuals
+    may end; those of :func:`zero_phase` lose 7 % there, by which a delay would look like a lag.
     """
     found: list[Array] = []
     while len(found) < count:
-        _, first, second = zero_phase(found[-1] if found else values, rate_hz, cutoff_hz)
-        found += [first, second]
+        x, added = _low_passed(found[-1] if found else values, rate_hz, cutoff_hz, 2)
+        padded = np.pad(x, _REACH, mode="edge")
+        for order, weights in enumerate(_difference_weights(), start=1):
+            difference = np.convolve(padded, weights[::-1], mode="valid") * rate_hz**order
+            found.append(difference[added : added + len(values)])
     return found[:count]
+
+
+@lru_cache(maxsize=1)
+def _difference_weights() -> tuple[Array, Array]:
+    """Weights (2 _REACH + 1,) of samples in central differences, first and second order.
+
+    Those of the polynomial through all of them (Fornberg 1988, Mathematics of Computation 51, 699).
+    """
+    at = np.arange(-_REACH, _REACH + 1)
+    inverse = np.linalg.inv(np.vander(at.astype(float), increasing=True))
+    return np.asarray(inverse[1]), np.asarray(2.0 * inverse[2])
+
+
+def _low_passed(values: Array, rate_hz: float, cutoff_hz: float, order: int) -> tuple[Array, int]:
+    """``values`` (T,), continued at both ends and low-passed both ways; samples added at each."""
+    sections = _design(cutoff_hz, rate_hz, order)
+    reach = int(np.ceil(4.0 * rate_hz / cutoff_hz)) + 2
+    longer = extend(values, reach, max(4, int(np.ceil(1.5 * rate_hz / cutoff_hz))))
+    added = (len(longer) - len(values)) // 2
+    return np.asarray(sosfiltfilt(sections, longer, padtype=None), dtype=np.float64), added
 
 
 def smooth(

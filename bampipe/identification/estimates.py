@@ -215,6 +215,7 @@ def collect_result(
     unknown = [name for name, found in effects.items() if not found.identified]
     warning = f"not identified: {', '.join(unknown)}; " if unknown else ""
     timing = estimate.report["input_timing"]
+    timing = timing.model_copy(update={"of_residual": _timing_of_residual(timing, raw)})
     influence = _assess_influence(names, estimate, motions, raw)
     return IdentifyResult(
         model=model,
@@ -236,7 +237,7 @@ def collect_result(
             *notes,
             *identifiability.sentences,
         ),
-        **estimate.report,
+        **{**estimate.report, "input_timing": timing},
     )
 
 
@@ -317,6 +318,14 @@ def _fault(name: str, entry: ParameterEstimate) -> str:
             + ", an interval larger than itself"
         )
     return ""
+
+
+def _timing_of_residual(timing: InputTiming, raw: LeastSquares) -> float:
+    """The timing that least squares find, s; 0 where that may as well be none."""
+    late_s, determined = float(raw.p[-1]), timing.limit > 0.0
+    if not determined or abs(late_s) < NORMAL_95 * float(np.sqrt(raw.covariance[-1, -1])):
+        return 0.0
+    return late_s
 
 
 def _describe_limit(timing: InputTiming) -> str:

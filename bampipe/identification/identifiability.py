@@ -169,7 +169,7 @@ def find_information(
     """
     own = p[:-1]
     n = len(system.coordinates)
-    u = motion.inputs(system.inputs) - p[-1] * motion.input_rates(system.inputs)
+    u = motion.timed_inputs(system.inputs, float(p[-1]))
     z = system.memory(motion.q, motion.qd, motion.qdd, u, own, motion.t)
     slope = residual_and_slopes(problem, trial, p)[1]
     if further is not None:

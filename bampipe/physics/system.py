@@ -92,6 +92,11 @@ class System:
         self._commands: list[int] = meta["commands"]
         self._memory_uses: dict[str, list[int]] = meta["memory_uses"]
 
+    @property
+    def has_free_delay(self) -> bool:
+        """Whether a delay is estimated: to the data that is the inputs' timing."""
+        return any(not p.fixed and p.name in self.delays for p in self.parameters)
+
     @cached_property
     def forced(self) -> tuple[int, ...]:
         """Columns of the inputs that hold a force or a time derivative of one."""

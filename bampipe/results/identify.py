@@ -129,6 +129,10 @@ class EffectEstimate(Record):
         return f"`{name}` does not count as identified: {'; '.join(self.reasons)}."
 
 
+NEAR_LIMIT = 0.95
+"""Share of the limit of a timing from which on it counts as at it."""
+
+
 class InputTiming(Record):
     """Time by which forces were sampled after positions, within half a sample."""
 
@@ -138,20 +142,17 @@ class InputTiming(Record):
     limit: Size = Field(
         default=0.0, description="Half a sample, all that it may be; 0 where it was not estimated"
     )
-
-    @property
-    def is_known(self) -> bool:
-        """Whether it is known to be below its limit, so that it can be taken off.
-
-        At the limit it stands for a delay or lag that the model lacks, and taking off a part would
-        hide what it is.
-        """
-        return abs(self.estimate) + 2.0 * self.sd < self.limit
+    of_residual: float = Field(
+        default=0.0,
+        description="The one that leaves the least residual, within the limit, what filters make of"
+        " changes of direction not taken off, s; 0 where the trials do not show any. Residuals are"
+        " compared with it",
+    )
 
     @property
     def is_at_limit(self) -> bool:
         """Whether it ends within a twentieth of its limit."""
-        return 0.0 < 0.95 * self.limit <= abs(self.estimate)
+        return 0.0 < NEAR_LIMIT * self.limit <= abs(self.estimate)
 
 
 class StateBound(Record):

@@ -50,8 +50,8 @@ _FORCE_CUTOFF_HZ = 25.0
 _CUTOFF_OVER_BAND = 4.0
 """At a quarter of their cut-off, derivatives of an input are 0.4 % too small. At two thirds, where
 a band of 17 Hz ended, they were 17 %: a delay of 2 ms came out 5 % too long, at 8.6 floors."""
-_HIGHEST_CUTOFF = 0.2
-"""Of the sampling rate."""
+_HIGHEST_CUTOFF = 0.4
+"""Of the sampling rate: twice the highest frequency of a residual, where the filter takes 0.3 %."""
 _SHORTEST = 32
 """Samples of a trial, the least that can be differentiated."""
 _TUNING_PART = 2000

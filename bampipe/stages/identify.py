@@ -114,9 +114,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     require_sound_motions(system, motions)
     sensors, kinematics = read_sensors(run, system), read_kinematics(run, system)
     band = read_band(run, system)
-    # A delay in the model and the timing of the inputs are one and the same to the data.
-    free = {item.name for item in system.parameters if not item.fixed}
-    timing = config.input_timing and free.isdisjoint(system.delays)
+    timing = config.input_timing and not system.has_free_delay
     problem = problem_of(system, motions, band, timing=timing)
     progress(0.1, "least squares")
     model_parameters = problem.free[problem.free < len(system.parameters)]

@@ -116,7 +116,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     progress(0.1, "held-out fits")
     evidence = gather_evidence(system, trials.motions, trials.band, p, trials.folds)
     timing = estimates.input_timing
-    # Parameters found with the inputs late are those of inputs that late, known for sure or not.
+    # Parameters found with the inputs late are those of inputs that late.
     late_s = timing.estimate - trials.late_s if timing is not None else 0.0
     compared = [compare_trial(evidence, k, p, late_s) for k in range(len(trials.motions))]
     expected = np.ones(len(system.coordinates))

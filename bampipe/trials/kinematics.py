@@ -16,7 +16,7 @@ from bampipe.estimate import butterworth, kalman_smoother, savitzky_golay
 from bampipe.estimate.differentiation import Derivatives, Flags
 from bampipe.physics.device import LAST_ORDER
 from bampipe.results.filter import FilterResult
-from bampipe.trials.motion import Motion, Recording, input_derivatives
+from bampipe.trials.motion import TIMING_ORDERS, Motion, Recording, input_derivatives
 
 Array = NDArray[np.float64]
 
@@ -93,7 +93,7 @@ class Kinematics:
             recording: the readings.
             smooth_inputs: the channels that have time derivatives.
             wanted: inputs of the only model that sees the motion: of the derivatives, those that it
-                takes and one more, by which they are moved in time; all by default.
+                takes and some more, by which they are moved in time; all by default.
         """
         moved = [self.differentiate(axis, recording.q[:, i]) for i, axis in enumerate(self.axes)]
         channels = dict(recording.channels)
@@ -101,7 +101,7 @@ class Kinematics:
             names = input_derivatives(name)
             if wanted is not None:
                 taken = [k for k, rate in enumerate(names, start=1) if rate in wanted]
-                names = names[: max(taken, default=0) + 1]
+                names = names[: max(taken, default=0) + TIMING_ORDERS]
             rates = self.input_rates(recording.channels[name], len(names))
             channels |= dict(zip(names, rates, strict=True))
         return Motion(

@@ -47,6 +47,7 @@ class MeasuredTrials:
         blocks: how many of the motions are blocks of the only trial that is not held out.
         late_s: time by which inputs were sampled after positions, taken off already; limit_s: the
             most that it may be, zero where it is not estimated.
+        timed: whether the trials show such a time, so that each candidate has one of its own.
     """
 
     motions: Sequence[Motion]
@@ -57,6 +58,14 @@ class MeasuredTrials:
     blocks: int = 0
     late_s: float = 0.0
     limit_s: float = 0.0
+    timed: bool = False
+
+    @property
+    def timing(self) -> tuple[float, float]:
+        """Least and largest change of the inputs' timing from what is taken off already, s."""
+        if not self.timed:
+            return (0.0, 0.0)
+        return (-self.limit_s - self.late_s, self.limit_s - self.late_s)
 
     def with_input_timing(self, late_s: float) -> MeasuredTrials:
         """The same with ``late_s`` taken off, instead of `late_s`."""
@@ -113,14 +122,14 @@ def read_measured_trials(
         run: the run folder; system: the model.
         every_input: as in `read_motion`.
         timing: time by which inputs were sampled after positions, as identified. It is taken off
-            where it is known (`InputTiming.is_known`).
+            as far as it leaves the least residual.
 
     Raises:
         InputError: there is no free trial, or a file or column is missing.
     """
     names = free_trials(run, braked=True)
     band = read_band(run, system)
-    late_s = timing.estimate if timing is not None and timing.is_known else 0.0
+    late_s = timing.of_residual if timing is not None else 0.0
     fitted, held_out = free_trials(run, fitted=True, braked=system.braked), held_out_trials(run)
     motions = read_motions(run, system, braked=True, every_input=every_input, late_s=late_s)
     trials = MeasuredTrials(
@@ -131,6 +140,7 @@ def read_measured_trials(
         Folds.of_trials(names, held_out, fitted),
         late_s=late_s,
         limit_s=timing.limit if timing is not None else 0.0,
+        timed=late_s != 0.0,
     )
     alone = [k for k, name in enumerate(names) if name not in held_out]
     return _with_blocks(trials, alone[0], held_out) if len(alone) == 1 else trials

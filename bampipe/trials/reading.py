@@ -20,7 +20,7 @@ from bampipe.results.ingest import IngestResult
 from bampipe.trials.cache import TrialCache
 from bampipe.trials.disturbances import disturbed_samples
 from bampipe.trials.kinematics import Kinematics
-from bampipe.trials.motion import Motion, input_derivatives, n_samples
+from bampipe.trials.motion import TIMING_ORDERS, Motion, input_derivatives, n_samples
 from bampipe.trials.sensors import Sensors
 
 Array = NDArray[np.float64]
@@ -127,7 +127,8 @@ def read_motion_of(
         needed += [name for name in (*smooth, *brakes) if name not in needed]
         wanted = [*needed, *(rate for name in smooth for rate in input_derivatives(name))]
     else:
-        wanted += [input_derivatives(name)[0] for name in needed if _is_smooth(device, name)]
+        for name in [name for name in needed if _is_smooth(device, name)]:
+            wanted += input_derivatives(name)[:TIMING_ORDERS]
     column_of = {name: brakes.get(name, name) for name in dict.fromkeys(wanted)}
     motion = {key: [f"{key}_{axis}" for axis in axes] for key in ("q", "qd", "qdd", "qd_sd")}
     required = [column for columns in motion.values() for column in columns]

@@ -64,8 +64,7 @@ def problem_of(
     bodies = _Remembered(range(n + 1) if system.moves_sensors else sorted(system.of_bodies))
 
     def inputs_at(motion: Motion, p: Array) -> Array:
-        u = motion.inputs(system.inputs)
-        return u if p[n] == 0.0 else u - p[n] * motion.input_rates(system.inputs)
+        return motion.timed_inputs(system.inputs, float(p[n]))
 
     def residual(trial: int, p: Array) -> Array:
         motion = motions[trial]
@@ -279,6 +278,9 @@ class Evidence:
         lower, upper: bounds of their change, (n_free,).
         precision, known: what is known of their change beforehand, (n_free,); see
             `NormalEquations`.
+        by_timing: derivative of ``residual`` by the time by which inputs were sampled after
+            positions, by trial, (K, n_q), N.m/s or N/s; nothing where that is not open.
+        timing: least and largest change of that time, s.
     """
 
     system: System
@@ -295,6 +297,8 @@ class Evidence:
     upper: Array
     precision: Array
     known: Array
+    by_timing: tuple[Array, ...] = ()
+    timing: tuple[float, float] = (0.0, 0.0)
 
     def subset(self, trials: Sequence[int]) -> Evidence:
         """The same on some trials, given by number, linearised where it is."""
@@ -306,6 +310,7 @@ class Evidence:
             residual=tuple(self.residual[k] for k in trials),
             jacobian=tuple(self.jacobian[k] for k in trials),
             used=tuple(self.used[k] for k in trials),
+            by_timing=tuple(self.by_timing[k] for k in trials if self.by_timing),
         )
 
     @property
@@ -410,6 +415,7 @@ def gather_evidence(
     *,
     most_iterations: int = 12,
     like: Evidence | None = None,
+    timing: tuple[float, float] = (0.0, 0.0),
 ) -> Evidence:
     """Fit a model to the fitted trials by least squares and linearise it there on all.
 
@@ -419,6 +425,7 @@ def gather_evidence(
         most_iterations: the most Gauss-Newton steps.
         like: a model with some more effects or some less, where that has been fitted: slopes that
             are the same for both are taken from it.
+        timing: least and largest change of the inputs' timing, s, that may be weighed beside it.
 
     Raises:
         ValueError: fewer samples than parameters.
@@ -438,22 +445,48 @@ def gather_evidence(
     value = found.p[problem.free]
     order = range(len(motions))
     measured = as_measured(problem, found.p, [stacked[k] for k in order])
+    fitted_trials = tuple(ModelOnTrial(system, found.p[:-1], motions, k) for k in order)
+    used = tuple(stacked[k].used for k in order)
     return Evidence(
         system,
         found.p[:-1],
         motions,
-        tuple(ModelOnTrial(system, found.p[:-1], motions, k) for k in range(len(motions))),
+        fitted_trials,
         band,
         folds,
         tuple(stacked[k].residual for k in order),
         tuple(s.slope for s in measured),
-        tuple(stacked[k].used for k in order),
+        used,
         tuple(int(i) for i in problem.free),
         problem.lower - value,
         problem.upper - value,
         problem.precision,
         problem.known - value,
+        _slopes_by_timing(fitted_trials, band, used, timing),
+        timing,
     )
+
+
+def _slopes_by_timing(
+    fitted: Sequence[ModelOnTrial],
+    band: Band,
+    used: Sequence[NDArray[np.bool_]],
+    timing: tuple[float, float],
+) -> tuple[Array, ...]:
+    """`Evidence.by_timing`; nothing where the timing is not open, or a delay has its place."""
+    step = 0.25 * (timing[1] - timing[0])
+    system = fitted[0].system
+    if step == 0.0 or system.has_free_delay:
+        return ()
+    rows = []
+    for base in fitted:
+        late, early = (
+            ModelOnTrial(system, base.p, [base.motion.with_input_timing(by)]).residual
+            for by in (step, -step)
+        )
+        rows.append((late - early) / (2.0 * step))
+    thin = band.thin_trials(rows, range(len(system.coordinates)))
+    return tuple(values * moves for values, moves in zip(thin, used, strict=True))
 
 
 def _common_slopes(like: Evidence, system: System, problem: Problem) -> KnownSlopes | None:

@@ -154,3 +154,27 @@ def test_a_lag_counts_for_the_signal_and_not_for_the_noise_that_it_averages_out(
     else:
         blurred = scorer.score_at(item, np.array([0.1]))
         assert blurred.total <= 0.0 and found.total == 0.0
+
+
+@pytest.mark.parametrize("late_s", [0.0, 4e-3])
+def test_what_a_small_shift_of_the_inputs_explains_is_to_the_credit_of_no_effect(tmp_path, late_s):
+    punctual, recipe, _ = record_trials(tmp_path, "joint", 5)
+    shifted = [motion.with_input_timing(-late_s) for motion in punctual.motions]
+    trials = replace(punctual, motions=tuple(shifted))
+    half = 0.5 / trials.band.rate_hz
+    assert late_s < half
+    device = recipe.model().device
+    names = ("actuator_delay", "force_delay", "actuator_lag:current", "stribeck:joint")
+    items = [compile_candidate(build_candidate_model(device, name)) for name in names]
+
+    def best(some):
+        scorer = Scorer(fit_trials(some, recipe, system_of(recipe).prior))
+        return max(s.total for s in map(scorer.score, items) if s) / scorer.independent_samples[0]
+
+    open_timing = replace(trials, limit_s=half, timed=True)
+    assert best(open_timing) < 0.03
+    if late_s:
+        assert best(trials) > 0.1
+        scorer = Scorer(fit_trials(open_timing, recipe, system_of(recipe).prior))
+        plain = Scorer(fit_trials(punctual, recipe, system_of(recipe).prior))
+        assert scorer.base_error[0] < 1.05 * plain.base_error[0]

@@ -94,7 +94,9 @@ def test_a_replay_for_one_model_has_the_same_inputs(fitted) -> None:
         for alone in (False, True)
     )  # fmt: skip
     np.testing.assert_array_equal(every.inputs(system.inputs), own.inputs(system.inputs))
-    np.testing.assert_array_equal(every.input_rates(system.inputs), own.input_rates(system.inputs))
+    np.testing.assert_array_equal(
+        every.timed_inputs(system.inputs, 1e-3), own.timed_inputs(system.inputs, 1e-3)
+    )
     assert len(own.channels) < len(every.channels)
 
 

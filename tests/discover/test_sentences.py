@@ -44,7 +44,7 @@ def say(monkeypatch, axis, contests=None, transients=(), cut_short=False, refuse
     """The sentence of one axis called joint, in N.m."""
     monkeypatch.setattr(sentences, "describe", lambda evidence, axis, s: SHAPE)
     system = SimpleNamespace(coordinates=("joint",), torque_units=("N.m",))
-    evidence = SimpleNamespace(system=system)
+    evidence = SimpleNamespace(system=system, timing=(0.0, 0.0))
     found = Diagnosis(
         (axis,),
         (),

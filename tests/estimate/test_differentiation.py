@@ -13,6 +13,7 @@ from bampipe.estimate.differentiation import (
     spline_curvature,
     uniform_grid,
 )
+from bampipe.trials.motion import TIMING_ORDERS, Motion, input_derivatives
 
 Array = NDArray[np.float64]
 RATE = 500.0
@@ -239,3 +240,22 @@ def test_curvature_of_inputs_is_that_of_splines_which_end_at_gaps() -> None:
     np.testing.assert_allclose(found[inside, 1], -25.0 * values[inside, 1], atol=0.1)
     np.testing.assert_allclose(found[[0, 199, 200, -1]], 0.0, atol=1e-9)
     assert not spline_curvature(t[:2], values[:2]).any()
+
+
+def test_inputs_move_by_half_a_sample_up_to_the_highest_frequency_of_a_residual():
+    rate, cutoff = 100.0, 40.0
+    t = np.arange(400) / rate
+    inner = slice(60, -60)
+    for frequency, error in ((5.0, 1e-3), (10.0, 2e-3), (20.0, 1.2e-2)):
+        w = 2.0 * np.pi * frequency
+        found = butterworth.rates(np.sin(w * t), rate, cutoff, 6)
+        np.testing.assert_allclose(found[0][inner], w * np.cos(w * t)[inner], atol=0.005 * w)
+        names = input_derivatives("f")[:TIMING_ORDERS]
+        channels = {"f": np.sin(w * t), **dict(zip(names, found, strict=False))}
+        motion = Motion("t", t, *[np.zeros((len(t), 1))] * 4, channels)
+        late_s = 0.5 / rate
+        moved = motion.with_input_timing(late_s)
+        true = np.sin(w * (t - late_s))
+        np.testing.assert_allclose(moved.channels["f"][inner], true[inner], atol=error)
+        timed = motion.timed_inputs(("f", "f_rate"), late_s)
+        np.testing.assert_array_equal(timed, moved.inputs(("f", "f_rate")))
