@@ -153,7 +153,12 @@ def opened(browser: Any) -> Iterator[Opened]:
     complaints: list[str] = []
     contexts = []
 
-    def open_page(path: Path, width: int = 1280, scheme: str = "light") -> Any:
+    def open_page(
+        path: Path,
+        width: int = 1280,
+        scheme: str = "light",
+        first: Callable[[Any], object] = lambda page: None,
+    ) -> Any:
         context = browser.new_context(
             viewport={"width": width, "height": 900}, color_scheme=scheme, accept_downloads=True
         )
@@ -167,6 +172,7 @@ def opened(browser: Any) -> Iterator[Opened]:
                 complaints.append(f"asked for {request.url}")
 
         page.on("request", requested)
+        first(page)
         page.goto(path.as_uri())
         page.wait_for_selector("html[data-complete]")
         return page
@@ -422,14 +428,22 @@ def test_correlations_come_with_the_variables_of_a_diagnosis(
 
 @pytest.mark.slow
 def test_eight_channels_of_a_million_samples(opened: Opened, tmp_path: Path) -> None:
-    """Everything else must wait for these: 13.4 MB, 1.5 s to ready, 82 ms a zoom."""
+    """What others must wait for: 13.4 MB, 1.5 s of the page's own work, 82 ms a zoom."""
     path = tmp_path / "large.html"
     path.write_text(explorer_page(Results(_large_session(tmp_path / "large")), ""))
     assert path.stat().st_size <= 13.4e6
-    ready, zooms = [], []
-    for _ in range(10):  # on a busy machine the quickest says what the page costs
-        page = opened(path)
-        ready.append(float(page.evaluate("document.documentElement.dataset.ready")))
+    clocks: list[Any] = []
+
+    def start_clock(page: Any) -> None:
+        """Count the time that the page has the processor: other programs take none of that."""
+        clocks.append(page.context.new_cdp_session(page))
+        clocks[-1].send("Performance.enable", {"timeDomain": "threadTicks"})
+
+    busy, zooms = [], []
+    for _ in range(5):  # on a busy machine the quickest says what the page costs
+        page = opened(path, first=start_clock)
+        counted = clocks[-1].send("Performance.getMetrics")["metrics"]
+        busy.extend(one["value"] for one in counted if one["name"] == "TaskDuration")
         assert page.locator("#plots figure").count() == 8
         page.locator(".canvas").first.focus()
         for key in "++++++----":
@@ -437,9 +451,9 @@ def test_eight_channels_of_a_million_samples(opened: Opened, tmp_path: Path) -> 
         measured = "performance.getEntriesByType('measure').map((one) => one.duration)"
         zooms.append(float(np.median(page.evaluate(measured))))
         page.context.close()
-        if min(ready) <= 1500.0 and min(zooms) <= 82.0:
+        if min(busy) <= 1.5 and min(zooms) <= 82.0:
             break
-    assert min(ready) <= 1500.0
+    assert 0.0 < min(busy) <= 1.5
     assert min(zooms) <= 82.0
 
 
