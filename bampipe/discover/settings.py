@@ -2,9 +2,9 @@
 
 Every threshold that decides a verdict, a draft or a sentence of them stands here; where an error is
 at its floor is decided in `bampipe.results.standing`. The figures they rest on are in
-docs/benchmarks.md: by how much each could move before anything comes out otherwise
-(benchmarks/margins.py), clean axes beside weak effects (benchmarks/thresholds.py), hidden effects
-(benchmarks/hidden_effects.py).
+docs/benchmarks_thresholds.md: by how much each could move before anything comes out otherwise
+(benchmarks/margins.py), clean axes beside weak effects (benchmarks/thresholds.py). Hidden effects
+(benchmarks/hidden_effects.py) are in docs/benchmarks_diagnosis.md.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Settings:
-    """How carefully to look; how far each threshold is from deciding otherwise: docs/benchmarks.md.
+    """How carefully to look; by how much each could move: docs/benchmarks_thresholds.md.
 
     Attributes:
         first_replicates: replays of the model for the chance level, enough where the best

@@ -13,7 +13,7 @@ Standing = Literal["at_floor", "above_floor", "floor_implausible", "floor_missin
 AT_FLOOR = 1.2
 """Error over floor up to which a model leaves no more than its sensors do. No replay is perfect:
 clean axes stand at up to 1.08 floors, at up to 1.16 where friction truly stops the arm; the weakest
-effects that are found start at 1.18 (benchmarks/thresholds.py, docs/benchmarks.md)."""
+effects that are found start at 1.18 (docs/benchmarks_thresholds.md)."""
 FLOOR_SDS = 3.0
 """Standard deviations of the floor over replays that are allowed for. No axis of 39 sessions stands
 otherwise with 1.9 to 3.0 (benchmarks/margins.py)."""
