@@ -82,7 +82,7 @@ LAWS = {
     ),
     "lab": law("numpy scipy", "progress errors lists files results data report run stages.base"),
     "api": law(
-        "pandas", "progress errors files results physics report run stages data declarations"
+        "pandas", "progress errors files lists results physics report run stages data declarations"
     ),
     "cli": law(
         "typer rich bampipe",

@@ -106,6 +106,14 @@ class Scorer:
         e = self.evidence
         return NormalEquations.from_samples(self.jacobian, e.residual, e.used, e.precision, e.known)
 
+    @cached_property
+    def late_s(self) -> float:
+        """Change of the inputs' timing that goes with the model as it is, s; 0 if not open."""
+        if not self.evidence.by_timing:
+            return 0.0
+        fitted = self.sums.subset(self.folds.fitted_trials)
+        return float(fitted.solve(self.evidence.weight, self.lower, self.upper)[-1])
+
     def _folds_for(self, item: Candidate) -> Folds:
         """What brakes do is part of the model with an effect of theirs, and fitted then."""
         return self.folds.with_all_fitted() if item.system.braked else self.folds

@@ -400,12 +400,11 @@ def _read_between(values: Array, finer: int, smooth: Sequence[int] = ()) -> Arra
     coarse = np.arange(len(values))
     fine = np.arange((len(values) - 1) * finer + 1) / finer
     between = np.empty((len(fine), values.shape[1]))
-    for column in range(values.shape[1]):
-        given = values[:, column]
-        if column in smooth and len(values) > 3:
-            between[:, column] = CubicSpline(coarse, given)(fine)
-        else:
-            between[:, column] = np.interp(fine, coarse, given)
+    curved = list(smooth) if len(values) > 3 else []
+    if curved:
+        between[:, curved] = CubicSpline(coarse, values[:, curved])(fine)
+    for column in sorted({*range(values.shape[1])}.difference(curved)):
+        between[:, column] = np.interp(fine, coarse, values[:, column])
     return between
 
 

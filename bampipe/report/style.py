@@ -138,6 +138,7 @@ def beside(rows: int, height: float) -> tuple[Figure, list[Axes]]:
 def svg(figure: Figure) -> str:
     """Return the figure as SVG: the same figure gives the same text."""
     _part_labels(figure)
+    figure.set_layout_engine("none")  # it is laid out, which takes half of the drawing
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
     return buffer.getvalue()

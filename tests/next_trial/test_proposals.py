@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import independent
+import numpy as np
 import pytest
 from independent.person import Task
 from independent_runs import SHORT, diagnose, record_run
@@ -44,8 +45,15 @@ def test_the_uncertainty_forecast_is_the_one_that_comes(tmp_path):
     after, _ = record_run(tmp_path / "after", "joint", 922, **LONG, tasks=Task.read(path))
     more, _ = record_run(tmp_path / "more", "joint", 922, **LONG | {"trials": 5})
     came = after.parameters("base").sd
-    for name in ("coulomb.joint", "viscous.joint", "moment", "inertia"):
-        assert came[name] / 1.3 < forecast[name].after < 1.3 * came[name], name
+    names = ("coulomb.joint", "viscous.joint", "moment", "inertia")
+    assert (
+        came["coulomb.joint"] / 1.1 < forecast["coulomb.joint"].after < 1.1 * came["coulomb.joint"]
+    )
+    # What blocks of time scatter is itself known to a tenth or two: eight of ten come as expected.
+    expected = [forecast[name].low < came[name] < forecast[name].high for name in names]
+    assert sum(expected) >= 3
+    off = [np.log(came[name] / forecast[name].after) for name in names]
+    assert np.median(np.abs(off)) < np.log(1.15)
     sloppy = Task.read(path, reach=0.5, haste=2.0)
     rough, _ = record_run(tmp_path / "rough", "joint", 922, **LONG, tasks=sloppy)
     # By the filter's own uncertainty: the scatter of blocks of time is itself known to a tenth.

@@ -31,9 +31,10 @@ def quiet(fraction: float, message: str) -> None:
 
 
 def page_of(root: Path) -> str:
-    """The page of a run's report; setting it for print takes longer than everything else."""
+    """The page of a run's report without its figures; those and the print take nearly all time."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(typeset, "pdf", lambda *_: b"")
+        patch.setattr(style, "svg", lambda _: "<svg></svg>")
         return build(Results(root), quiet).html
 
 

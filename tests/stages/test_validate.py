@@ -138,11 +138,17 @@ def test_wrong_parameters_show(simulated: RunFolder, tmp_path: Path) -> None:
 
 def test_parameters_are_judged_with_the_timing_that_they_were_found_with(tmp_path: Path) -> None:
     """Forces a sample off: the timing ends at half of that, and is part of what is published."""
-    content = validated(identified(simulated_run(tmp_path, late=1)))
+    run = identified(simulated_run(tmp_path, late=1))
+    content = validated(run)
     assert any("input timing" in check for check in content["failed_checks"])
+    path = run.path("models/base/identify.json")
+    published = read_json(path)
+    published["input_timing"]["estimate"] = 0.0
+    write_json(path, published)
+    without = validated(run)
     for axis, entry in content["axes"].items():
         assert entry["estimate"] == "accepted", (axis, entry)
-        assert entry["published_rmse"] < 0.95 * entry["held_out_rmse"], (axis, entry)
+        assert entry["published_rmse"] < 0.9 * without["axes"][axis]["published_rmse"], axis
 
 
 def test_residuals_add_up_and_repeat(simulated: RunFolder, tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ from bampipe.discover.chance import (
     Progress,
     fit_trials,
     open_trials,
+    retimed_trials,
     stand_in_for,
     system_of,
     workers,
@@ -197,18 +198,29 @@ class FitTask:
 
 @dataclass(frozen=True)
 class Fitted:
-    """Parameters of a fit, its error on held-out trials and its slope by the force, by axis."""
+    """A fit of all parameters together, to inputs in the timing that goes with the model.
+
+    Attributes:
+        p: (n_p,) parameters.
+        held_out_rmse, slope: error on held-out trials, N.m or N, and slope by the force, (n_q,).
+        late_s: time taken off the inputs, s.
+    """
 
     p: Array
     held_out_rmse: Array
     slope: Array
+    late_s: float
 
 
 def run_fit(task: FitTask) -> Fitted:
-    """Fit a model, all its parameters together."""
+    """Fit a model and the timing of its inputs, within what is open."""
     trials = open_trials()
     evidence = fit_trials(trials, task.recipe, task.start)
-    return Fitted(evidence.p, evidence.held_out_rmse, _slope(task.recipe, evidence, trials))
+    retimed = retimed_trials(trials, Scorer(evidence).late_s)
+    if retimed is not trials:
+        trials, evidence = retimed, fit_trials(retimed, task.recipe, evidence.p)
+    slope = _slope(task.recipe, evidence, trials)
+    return Fitted(evidence.p, evidence.held_out_rmse, slope, trials.late_s)
 
 
 def _slope(recipe: Recipe, evidence: Evidence, trials: MeasuredTrials) -> Array:
@@ -344,13 +356,15 @@ class AxisSearch:
         found = self._cheaper(structured, wider)
         return found if found.option is structured.option else replace(found, chances=(chance,))
 
-    def _cheaper(self, stand: _Stand, wider: Sequence[tuple[Option, Recipe, Array]]) -> _Stand:
+    def _cheaper(self, stand: _Stand, wider: Sequence[tuple[Option, Recipe, Fitted]]) -> _Stand:
         """The best of some fitted models where it costs less, and all of them as options."""
         options = (*stand.options, *(option for option, _, _ in wider))
-        option, recipe, p = min(wider, key=lambda entry: self._cost(entry[0]))
+        option, recipe, fitted = min(wider, key=lambda entry: self._cost(entry[0]))
         if self._cost(option) >= self._cost(stand.option):
             return replace(stand, options=options)
-        evidence = self._bench.fit(recipe, p)
+        trials = self._bench.trials
+        trials = retimed_trials(trials, fitted.late_s - trials.late_s)
+        evidence = replace(self._bench, trials=trials).fit(recipe, fitted.p)
         return replace(stand, recipe=recipe, evidence=evidence, option=option, options=options)
 
     def _leaves_much(self, stand: _Stand) -> bool:
@@ -413,7 +427,7 @@ class AxisSearch:
         current: Option,
         screened: Sequence[Screened],
         count: int,
-    ) -> list[tuple[Option, Recipe, Array]]:
+    ) -> list[tuple[Option, Recipe, Fitted]]:
         """The model with each of the best forms, all parameters fitted together."""
         least = self._settings.draft_rival_share * screened[0].gain
         chosen = [found for found in screened if found.gain >= least][:count]
@@ -445,7 +459,7 @@ class AxisSearch:
                     fitted.slope,
                 ),
                 task.recipe,
-                fitted.p,
+                fitted,
             )
             for term, task, fitted in zip(terms, tasks, fits, strict=True)
         ]
