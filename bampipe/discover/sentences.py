@@ -52,10 +52,11 @@ def _timing(found: Diagnosis) -> list[str]:
     if not 0.0 < NEAR_LIMIT * limit_s <= abs(late_s):
         return []
     way = "after" if late_s > 0.0 else "before"
+    also = ", or as of what is still missing" if any(a.remains for a in found.axes) else ""
     return [
         f"The inputs are taken to act {three(1e3 * abs(late_s))} ms {way} they were logged, half a"
-        " sample, as of a command that is held until the next one: a delay or a lag of no more than"
-        " that would not show as an effect."
+        f" sample, as of a command that is held until the next one{also}: a delay or a lag of no"
+        " more than that would not show as an effect."
     ]
 
 
