@@ -99,7 +99,7 @@ def test_every_effect_of_the_arm_changes_its_log(tmp_path, effect):
 
 def test_joints_of_soft_drives_stand_still_within_their_friction():
     specimen = arm.build("ZY", 8)
-    t, q, _, drive = arm.measure(specimen, np.random.default_rng(1), 2.0, 250.0, 0.0, soft_hz=4.0)
+    t, q, _, drive = arm.measure(specimen, np.random.default_rng(1), 3.0, 250.0, 0.0, soft_hz=4.0)
     still = np.zeros(q.shape, dtype=bool)
     still[2:-2] = (q[4:] == q[2:-2]) & (q[:-4] == q[2:-2])
     assert np.all(np.count_nonzero(still, axis=0) > 5)
