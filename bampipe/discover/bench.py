@@ -35,6 +35,7 @@ from bampipe.trials.bias import remove_bias
 from bampipe.trials.measured import MeasuredTrials
 from bampipe.trials.noise_floor import (
     FLOOR_SEED,
+    PROBE_WIDTH,
     STILL_WIDTH,
     NoiseFloor,
     floor_replays,
@@ -183,7 +184,7 @@ class Bench:
         Raises:
             Runaway: the simulated motion grows without bounds.
         """
-        narrow = recipe.with_sign_widths(STILL_WIDTH)
+        narrow = recipe.with_sign_widths(PROBE_WIDTH)
         return standing_still_matters(
             evidence, lambda: system_of(narrow), self.trials.sensors, self.trials.kinematics, floor
         )

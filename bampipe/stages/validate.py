@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from functools import cache
+from functools import partial
 from itertools import groupby
 from pathlib import Path
 
@@ -53,6 +53,7 @@ from bampipe.trials.measured import (
 )
 from bampipe.trials.motion import Motion
 from bampipe.trials.noise_floor import (
+    PROBE_WIDTH,
     STILL_WIDTH,
     NoiseFloor,
     find_noise_floor,
@@ -195,16 +196,16 @@ def _with_still_replays(
 ) -> tuple[NoiseFloor, list[str]]:
     """The floor of a machine that creeps or stands still where it turns round, and what to say."""
 
-    @cache
-    def narrow() -> System:
-        return compile_model(recipe.with_sign_widths(STILL_WIDTH).model())
+    def narrow(width: float) -> System:
+        return compile_model(recipe.with_sign_widths(width).model())
 
     sensors, kinematics = trials.sensors, trials.kinematics
     try:
-        if not standing_still_matters(evidence, narrow, sensors, kinematics, floor):
+        probe = partial(narrow, PROBE_WIDTH)
+        if not standing_still_matters(evidence, probe, sensors, kinematics, floor):
             return floor, []
         still = find_noise_floor(
-            evidence, p, sensors, kinematics, seed, floor.replays, replayed=narrow()
+            evidence, p, sensors, kinematics, seed, floor.replays, replayed=narrow(STILL_WIDTH)
         )
     except InputError:
         return floor, []

@@ -45,8 +45,11 @@ STILL_WIDTH = 1.0 / 32.0
 """Sign width, times the device's, of replays that stand still where the motion turns round. On an
 axis at 1 kHz whose friction stops it, they leave 0.94 of the error where an eighth of the width
 leaves 0.80 and the width itself 0.23."""
-_PROBED_S = 30.0
-"""Of motion by which it is told whether standing still matters, s: trials spread over all."""
+PROBE_WIDTH = 1.0 / 8.0
+"""The same of the motions that tell whether standing still matters: they leave four fifths of what
+the narrow ones do, in a quarter of their time."""
+_PROBED = 10_000
+"""Samples that those have in all, of trials spread over the session, one at least."""
 _SHARE = 0.15
 """Of what exceeds the floor in the mean square: what explains less of it is not named."""
 MOST_REPLAYS = 6
@@ -159,7 +162,7 @@ def standing_still_matters(
     clearly more, and not next to nothing beside what is above the floor.
 
     Args:
-        evidence: the model, fitted; still: returns the same, with narrow signs, where it is wanted.
+        evidence: the model, fitted; still: returns the same with signs of `PROBE_WIDTH`, if wanted.
         sensors, kinematics: of the session.
         floor: by replays that creep.
 
@@ -171,8 +174,8 @@ def standing_still_matters(
         return True
     if keep_motion(evidence.fitted):
         return False
-    step = max(1, round(sum(evidence.sizes) / (_PROBED_S * sensors.rate_hz)))
-    probed = list(evidence.motions[::step])
+    step = min(max(1, round(sum(evidence.sizes) / _PROBED)), len(evidence.motions))
+    probed = list(evidence.motions[step // 2 :: step])
     stands, creeps = (
         _mean_square_of_own_motion(evidence, moved, probed, sensors, kinematics)
         for moved in (still(), system)
