@@ -31,8 +31,19 @@ CASES: dict[str, tuple[int, str, str, dict[str, float]]] = {
     "Stribeck, a slide": (218, "ZYx", "numbered", {"stribeck:shoulder": 1.0}),
     "spring, seven joints": (219, "ZYZYZYZ", "joint_states", {"return_spring:wrist_yaw": 1.0}),
     "offset, by currents": (220, "ZYYX", "controller", {"drive_offset:forearm": 1.0}),
+    "sticking: nothing": (8104, "ZYX", "joint_states", {}),
+    "sticking less: nothing": (8102, "ZYY", "joint_states", {}),
+    "sticking: offset": (8108, "ZYY", "joint_states", {"drive_offset:shoulder": 1.0}),
+    "sticking more: offset": (8106, "ZYZ", "joint_states", {"drive_offset:shoulder": 1.0}),
+    "sticking, four joints: offset": (8103, "ZYYX", "joint_states", {"drive_offset:elbow": 1.0}),
+    "sticking: Stribeck": (8105, "ZYY", "joint_states", {"stribeck:shoulder": 1.0}),
+    "sticking: late drive": (8107, "ZYY", "joint_states", {"actuator_delay:elbow": 1.0}),
 }  # fmt: skip
 """By name: seed, axes of the joints, headers, what is hidden."""
+SOFT_HZ = {8102: 10.0, 8103: 5.0, 8104: 4.0, 8105: 5.0, 8106: 3.0, 8107: 8.0, 8108: 4.0}
+"""By seed: how softly drives follow their paths, where joints stick as they turn round."""
+STICKING: dict[str, float] = {"rate_hz": 250.0, "seconds": 12.0, "noise": 0.01}
+"""How those are recorded."""
 
 
 def is_paired(folder: Path, names: list[str], turned: list[str]) -> bool:
@@ -62,12 +73,14 @@ def main() -> None:
     print("| hidden | init | named | over the floor | run, s | diagnose, s |\n|-|-|-|-|-|-|")
     for case in given.case or CASES:
         first, kinds, style, effects = CASES[case]
+        how = STICKING if first in SOFT_HZ else {"noise": given.noise}
         for seed in range(first, first + 100 * given.seeds, 100):
             folder = given.out / f"{case.replace(' ', '_').replace(',', '')}_{seed}"
             turned = ["shoulder"] if seed % 2 else []
             arm.record_logs(
-                folder, seed, kinds, effects, style=style, turned=turned, noise=given.noise
-            )
+                folder, seed, kinds, effects, style=style, turned=turned,
+                soft_hz=SOFT_HZ.get(first, 0.0), **how,
+            )  # fmt: skip
             runs = ["--runs", str(given.out / "runs")]
             bampipe("init", str(folder))
             names = list(arm.NAMES[: len(kinds)])

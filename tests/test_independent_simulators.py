@@ -8,6 +8,7 @@ import pandas as pd
 import pytest
 from independent import arm
 from independent.sensors import HARD, Conditions
+from scipy.interpolate import CubicSpline
 
 from bampipe.physics import Model, registry
 
@@ -94,3 +95,19 @@ def test_every_effect_of_the_arm_changes_its_log(tmp_path, effect):
     positions = [column for column in bare if not column.startswith("tau")]
     pd.testing.assert_frame_equal(bare[positions], hidden[positions])
     assert not np.allclose(bare["tau_2 [Nm]"], hidden["tau_2 [Nm]"])
+
+
+def test_joints_of_soft_drives_stand_still_within_their_friction():
+    specimen = arm.build("ZY", 8)
+    t, q, _, drive = arm.measure(specimen, np.random.default_rng(1), 3.0, 250.0, 0.0, soft_hz=4.0)
+    still = np.zeros(q.shape, dtype=bool)
+    still[2:-2] = (q[4:] == q[2:-2]) & (q[:-4] == q[2:-2])
+    assert np.all(np.count_nonzero(still, axis=0) > 5)
+    spline = CubicSpline(t, q)
+    load, dry = specimen.carried(q, spline(t, 1), spline(t, 2))
+    rest = still.all(axis=1)
+    assert np.all(np.abs(drive - load)[rest] < 1.02 * dry[rest])
+    # Counts of the encoder make accelerations noisy: in the mean the equation holds.
+    moving = np.all(np.abs(spline(t, 1)) > 0.05, axis=1)
+    off = (drive - specimen.required(q, spline(t, 1), spline(t, 2)))[moving]
+    np.testing.assert_allclose(off.mean(axis=0), 0.0, atol=0.05 * specimen.coulomb.min())

@@ -23,6 +23,7 @@ from bampipe.discover.chance import (
     run_replicate,
     run_scores,
     run_share,
+    system_of,
 )
 from bampipe.discover.level import Level
 from bampipe.discover.scorer import Score, Scorer
@@ -32,7 +33,14 @@ from bampipe.estimate.simulation import Runaway
 from bampipe.physics.recipe import Recipe
 from bampipe.trials.bias import remove_bias
 from bampipe.trials.measured import MeasuredTrials
-from bampipe.trials.noise_floor import FLOOR_SEED, STILL_WIDTH, NoiseFloor, floor_replays
+from bampipe.trials.noise_floor import (
+    FLOOR_SEED,
+    PROBE_WIDTH,
+    STILL_WIDTH,
+    NoiseFloor,
+    floor_replays,
+    standing_still_matters,
+)
 from bampipe.trials.residuals import Evidence, problem_of
 
 Array = NDArray[np.float64]
@@ -156,18 +164,30 @@ class Bench:
     ) -> list[Replicate]:
         """Replays of a model that stands still where it turns round, as many as of one that creeps.
 
-        None where these leave as much as was measured, where no width is declared, or where the
-        narrow ones run away.
+        None where these leave as much as was measured, where standing still does not matter, or
+        where the narrow ones run away.
         """
         floor = NoiseFloor.of_errors([replay.held_out_rmse for replay in creeping])
-        if recipe.has_drawn_axes or not floor.is_exceeded(evidence.held_out_rmse):
+        if not floor.is_exceeded(evidence.held_out_rmse):
             return []
         narrow, again = recipe.with_sign_widths(STILL_WIDTH), (recipe, evidence.p)
         with suppress(Runaway):
-            return self.replicas(
-                narrow, p, len(creeping), (), (FLOOR_SEED,), share=True, analysed=again
-            )
+            if self.standing_still_matters(recipe, evidence, floor):
+                return self.replicas(
+                    narrow, p, len(creeping), (), (FLOOR_SEED,), share=True, analysed=again
+                )
         return []
+
+    def standing_still_matters(self, recipe: Recipe, evidence: Evidence, floor: NoiseFloor) -> bool:
+        """Whether replays of a fitted model that stand still would say anything new.
+
+        Raises:
+            Runaway: the simulated motion grows without bounds.
+        """
+        narrow = recipe.with_sign_widths(PROBE_WIDTH)
+        return standing_still_matters(
+            evidence, lambda: system_of(narrow), self.trials.sensors, self.trials.kinematics, floor
+        )
 
     def scores(self, recipe: Recipe, p: Array, names: Sequence[str]) -> dict[str, Score]:
         """Scores of candidates against a model on the measured trials."""

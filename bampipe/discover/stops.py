@@ -17,6 +17,7 @@ from bampipe.discover.polish import FittedSet
 from bampipe.discover.scorer import Score
 from bampipe.estimate.simulation import Runaway
 from bampipe.results.diagnose import RefusedEffect
+from bampipe.trials.noise_floor import NoiseFloor
 
 Array = NDArray[np.float64]
 
@@ -28,6 +29,15 @@ class StoppingReplays:
         """Take a session and the model of it that is searched for more."""
         self._bench, self._current = bench, current
         self._made: Level | None = None
+        self._matters: bool | None = None
+
+    def _matter(self, level: Level) -> bool:
+        """Whether they say anything new beside the ``level`` of replays that creep."""
+        if self._matters is None:
+            now = self._current
+            floor = NoiseFloor.of_errors([replay.held_out_rmse for replay in level.replicates])
+            self._matters = self._bench.standing_still_matters(now.recipe, now.evidence, floor)
+        return self._matters
 
     def _level(self, name: str) -> Level:
         """The chance level on these replays; ``name``: a candidate that is learned at once."""
@@ -53,14 +63,14 @@ class StoppingReplays:
 
         Returns:
             Those, as they came; and of the ones before, p-value and gain in log error by axis. All
-            of them where no width is declared, as of a robot's axes, or the replays run away.
+            of them where standing still does not matter, or the replays run away.
         """
         s, kept = self._bench.settings, list(significant)
         doubted: dict[str, tuple[float, Array]] = {}
-        if self._current.recipe.has_drawn_axes:
-            return kept, doubted
         # The rest are weighed against the first that passes: alone, it is a third of the work.
         try:
+            if not kept or not self._matter(level):
+                return kept, doubted
             while kept:
                 name = kept[0][1]
                 still = self._level(name)

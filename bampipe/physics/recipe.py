@@ -28,17 +28,8 @@ class Recipe:
     effects: tuple[str, ...]
     extra: tuple[Mapping[str, Any], ...]
 
-    @property
-    def has_drawn_axes(self) -> bool:
-        """Whether its axes come from a robot's drawing and no width of their sign is declared."""
-        axes = self.device.get("coordinates", {}).values()
-        return "robot" in self.device and not any("sign_width" in axis for axis in axes)
-
     def with_sign_widths(self, factor: float) -> Recipe:
-        """Return the model whose signs of velocities are smoothed over ``factor`` times the width.
-
-        Axes that a URDF gives, and no declaration, stay as they are.
-        """
+        """Return the model with signs of velocities smoothed over ``factor`` times the width."""
         declaration = deepcopy(dict(self.device))
         for coordinate in device_from(self.device).coordinates:
             declared = declaration.get("coordinates", {}).get(coordinate.name)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import groupby
 from pathlib import Path
 
@@ -52,11 +53,13 @@ from bampipe.trials.measured import (
 )
 from bampipe.trials.motion import Motion
 from bampipe.trials.noise_floor import (
+    PROBE_WIDTH,
     STILL_WIDTH,
     NoiseFloor,
     find_noise_floor,
     floor_replays,
     parameters_to_replay,
+    standing_still_matters,
 )
 from bampipe.trials.reading import held_out_trials, read_motions, require_sound_motions
 from bampipe.trials.residuals import Evidence, gather_evidence
@@ -178,7 +181,7 @@ def _noise_floor(
         )
     except InputError as error:
         return None, [f"No noise floor: simulating the fitted model failed ({error})."]
-    if recipe.has_drawn_axes or not floor.is_exceeded(evidence.held_out_rmse):
+    if not floor.is_exceeded(evidence.held_out_rmse):
         return floor, []
     return _with_still_replays(evidence, trials, replayed, floor, recipe, config.seed)
 
@@ -192,10 +195,17 @@ def _with_still_replays(
     seed: int,
 ) -> tuple[NoiseFloor, list[str]]:
     """The floor of a machine that creeps or stands still where it turns round, and what to say."""
-    narrow = compile_model(recipe.with_sign_widths(STILL_WIDTH).model())
+
+    def narrow(width: float) -> System:
+        return compile_model(recipe.with_sign_widths(width).model())
+
+    sensors, kinematics = trials.sensors, trials.kinematics
     try:
+        probe = partial(narrow, PROBE_WIDTH)
+        if not standing_still_matters(evidence, probe, sensors, kinematics, floor):
+            return floor, []
         still = find_noise_floor(
-            evidence, p, trials.sensors, trials.kinematics, seed, floor.replays, replayed=narrow
+            evidence, p, sensors, kinematics, seed, floor.replays, replayed=narrow(STILL_WIDTH)
         )
     except InputError:
         return floor, []

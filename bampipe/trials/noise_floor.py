@@ -6,22 +6,29 @@ This is the one place where a floor is found; `bampipe.results.standing` holds a
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.estimate.least_squares import fit
 from bampipe.estimate.low_pass import Band
+from bampipe.estimate.standstill import find_moving_samples
 from bampipe.physics import System
-from bampipe.results.standing import standing
+from bampipe.results.standing import AT_FLOOR, standing
 from bampipe.trials.bias import remove_bias
 from bampipe.trials.draw import ENOUGH_SAMPLES, draw_trials
 from bampipe.trials.folds import Folds
 from bampipe.trials.kinematics import Kinematics
 from bampipe.trials.motion import Motion, trial_sizes
-from bampipe.trials.replay import StandIn, replay_motions
-from bampipe.trials.residuals import Evidence, gather_evidence, problem_of
+from bampipe.trials.replay import StandIn, keep_motion, replay_motions
+from bampipe.trials.residuals import (
+    Evidence,
+    ModelOnTrial,
+    gather_evidence,
+    problem_of,
+    standstill_of,
+)
 from bampipe.trials.sensors import Sensors
 
 Array = NDArray[np.float64]
@@ -38,6 +45,13 @@ STILL_WIDTH = 1.0 / 32.0
 """Sign width, times the device's, of replays that stand still where the motion turns round. On an
 axis at 1 kHz whose friction stops it, they leave 0.94 of the error where an eighth of the width
 leaves 0.80 and the width itself 0.23."""
+PROBE_WIDTH = 1.0 / 8.0
+"""The same of the motions that tell whether standing still matters: they leave four fifths of what
+the narrow ones do, in a quarter of their time."""
+_PROBED = 10_000
+"""Samples that those have in all, of trials spread over the session, one at least."""
+_SHARE = 0.15
+"""Of what exceeds the floor in the mean square: what explains less of it is not named."""
 MOST_REPLAYS = 6
 """Replays are repeated until they hold `ENOUGH_SAMPLES`, but no oftener than this: the floor of a
 session of forty thousand samples is then known to about 1 %, and longer ones need fewer."""
@@ -131,6 +145,68 @@ def parameters_to_replay(
     free = problem.free
     inside = (problem.lower < found.p[free]) & (found.p[free] < problem.upper)
     return found.p[:-1] if inside.all() else p
+
+
+def standing_still_matters(
+    evidence: Evidence,
+    still: Callable[[], System],
+    sensors: Sensors,
+    kinematics: Kinematics,
+    floor: NoiseFloor,
+) -> bool:
+    """Whether replays that stand still where the motion turns round would say anything new.
+
+    Of a robot, whose fits are dear, that is told beforehand. Where replays keep its motion as
+    measured they would not. Else its model is moved along some of the trials, creeping and standing
+    still, without noise, and held against that motion as it is: on some axis the latter must leave
+    clearly more, and not next to nothing beside what is above the floor.
+
+    Args:
+        evidence: the model, fitted; still: returns the same with signs of `PROBE_WIDTH`, if wanted.
+        sensors, kinematics: of the session.
+        floor: by replays that creep.
+
+    Raises:
+        Runaway: the simulated motion grows without bounds.
+    """
+    system, error = evidence.system, evidence.held_out_rmse
+    if system.model.device.robot is None:
+        return True
+    if keep_motion(evidence.fitted):
+        return False
+    step = min(max(1, round(sum(evidence.sizes) / _PROBED)), len(evidence.motions))
+    probed = list(evidence.motions[step // 2 :: step])
+    stands, creeps = (
+        _mean_square_of_own_motion(evidence, moved, probed, sensors, kinematics)
+        for moved in (still(), system)
+    )
+    added, known = stands - creeps, floor.level**2
+    clear, excess = (AT_FLOOR**2 - 1.0) * known, np.maximum(error**2 - known, 0.0)
+    return bool(np.any(added > np.maximum(clear, _SHARE * excess)))
+
+
+def _mean_square_of_own_motion(
+    evidence: Evidence,
+    moved: System,
+    motions: Sequence[Motion],
+    sensors: Sensors,
+    kinematics: Kinematics,
+) -> Array:
+    """What a model leaves along a motion of itself without noise, moved as ``moved``, (n_q,)."""
+    system, band, p = evidence.system, evidence.band, evidence.p
+    none = np.zeros(len(system.coordinates))
+    exact = replace(
+        sensors, resolution=none, reading_sd=none, force_sd=np.zeros_like(sensors.force_sd)
+    )
+    stand_in = StandIn(moved, p, motions, sensors.rate_hz)
+    seen = replay_motions(stand_in, exact, kinematics, (0,), alone=True)
+    square, count = none.copy(), none.copy()
+    for trial, motion in enumerate(seen):
+        residual = band.thin(ModelOnTrial(system, p, seen, trial).residual)
+        used = find_moving_samples(standstill_of(motion, system, sensors.rate_hz), band)
+        square += np.sum(residual**2 * used, axis=0)
+        count += used.sum(axis=0)
+    return np.asarray(square / np.maximum(count, 1.0))
 
 
 def find_noise_floor(

@@ -114,8 +114,7 @@ def follow_motion(system: System, p: Array, motion: Motion, rate_hz: float) -> C
     """
     u = motion.inputs(system.inputs)
     fitted = ModelOnTrial(system, p, [motion])
-    held = system.model.device.robot is not None and not system.undriven
-    if system.model.device.prescribed or (held and _jumps(fitted, u)):
+    if _is_motion_given(fitted, u):
         return Course(motion.q, _required_force(fitted, u))
     q, qd = _reference(system, p, motion, u, rate_hz)
     start = np.concatenate([q[0], qd[0], system.initial_memory(q[0], u[0], p)])
@@ -132,13 +131,28 @@ def follow_motion(system: System, p: Array, motion: Motion, rate_hz: float) -> C
             smooth=system.forced,
         )  # fmt: skip
     except Runaway:
-        if not held:
+        if not _is_controlled(system):
             raise
         return Course(motion.q, _required_force(fitted, u))
-    if held and _strays(x[:, : q.shape[1]], q):
+    if _is_controlled(system) and _strays(x[:, : q.shape[1]], q):
         return Course(motion.q, _required_force(fitted, u))
     seen = system.encoder_readings(x, total, p)[:, : len(system.coordinates)]
     return Course(seen, total[:, [at[f] for f in forces]])
+
+
+def keep_motion(fitted: Sequence[ModelOnTrial]) -> bool:
+    """Whether replays of a model keep the motion of every trial, and its turns, as measured."""
+    return all(_is_motion_given(each, each.motion.inputs(each.system.inputs)) for each in fitted)
+
+
+def _is_motion_given(fitted: ModelOnTrial, u: Array) -> bool:
+    device = fitted.system.model.device
+    return device.prescribed or (_is_controlled(fitted.system) and _jumps(fitted, u))
+
+
+def _is_controlled(system: System) -> bool:
+    """Whether each joint of a robot has a drive, which follows the path of its controller."""
+    return system.model.device.robot is not None and not system.undriven
 
 
 def _strays(q: Array, measured: Array) -> bool:

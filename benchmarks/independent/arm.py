@@ -1,8 +1,8 @@
 """An arm of revolute and prismatic joints with geared motors, its log and its drawing (URDF).
 
-Motions are prescribed, so nothing is integrated: bodies are followed in the axes of the base, and
-a joint carries the force and moment of everything behind it. ``record_logs`` writes what a lab has,
-a folder with a URDF and CSV files, and tells the truth beside it.
+Motions are prescribed, so nothing is integrated but under soft drives: bodies are followed in the
+axes of the base, and a joint carries the force and moment of everything behind it. ``record_logs``
+writes what a lab has, a folder with a URDF and CSV files, and tells the truth beside it.
 """
 
 from __future__ import annotations
@@ -17,6 +17,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from scipy.spatial.transform import Rotation
+
+from independent.soft_drives import STEP, follow
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
 CREEP = 2e-3
@@ -112,17 +114,24 @@ class Arm:
 
     def required(self, q: Array, qd: Array, qdd: Array) -> Array:
         """What the drives must give, friction and hidden effects included, (T, n)."""
-        load = self.rigid(q, qd, qdd) + self.rotor * qdd
-        friction = self.viscous * qd + self.coulomb * np.tanh(qd / CREEP)
+        load, dry = self.carried(q, qd, qdd)
+        found = load + self.viscous * qd + dry * np.tanh(qd / CREEP)
         for full, v in self.hidden.items():
             name, _, at = full.partition(":")
             if name == "friction_of_sum":
                 a, b = (self.names.index(joint) for joint in at.split("-"))
                 rate = qd[:, a] + qd[:, b]
                 shared = v["viscous"] * rate + v["coulomb"] * np.tanh(rate / CREEP)
-                friction[:, a] += shared
-                friction[:, b] += shared
-                continue
+                found[:, a] += shared
+                found[:, b] += shared
+        return found
+
+    def carried(self, q: Array, qd: Array, qdd: Array) -> tuple[Array, Array]:
+        """What the drives must give without friction, and the level of dry friction, (T, n)."""
+        load = self.rigid(q, qd, qdd) + self.rotor * qdd
+        dry = np.tile(self.coulomb, (len(q), 1))
+        for full, v in self.hidden.items():
+            name, _, at = full.partition(":")
             k = self.names.index(at) if at in self.names else -1
             x, rate = q[:, k], qd[:, k]
             if name == "return_spring":
@@ -132,15 +141,13 @@ class Arm:
             elif name == "counterbalance":
                 load[:, k] -= v["sine"] * np.sin(x) + v["cosine"] * np.cos(x)
             elif name == "stribeck":
-                friction[:, k] += (
-                    v["force"] * np.exp(-((rate / v["speed"]) ** 2)) * np.tanh(rate / CREEP)
-                )
+                dry[:, k] += v["force"] * np.exp(-((rate / v["speed"]) ** 2))
         for full, v in self.hidden.items():
             name, _, at = full.partition(":")
             if name == "load_dependent_friction":
                 k = self.names.index(at)
-                friction[:, k] += v["coefficient"] * np.abs(load[:, k]) * np.tanh(qd[:, k] / CREEP)
-        return load + friction
+                dry[:, k] += v["coefficient"] * np.abs(load[:, k])
+        return load, dry
 
 
 EFFECTS = (
@@ -255,24 +262,46 @@ def wind(arm: Arm, motion: tuple[Array, Array, Array]) -> Array:
 
 
 def measure(
-    arm: Arm, rng: np.random.Generator, seconds: float, rate_hz: float, noise: float
+    arm: Arm,
+    rng: np.random.Generator,
+    seconds: float,
+    rate_hz: float,
+    noise: float,
+    soft_hz: float = 0.0,
 ) -> tuple[Array, Array, Array, Array]:
-    """Time (T,), positions (T, n) of joints and motors, drives (T, n): as they are logged."""
+    """Time (T,), positions (T, n) of joints and motors, drives (T, n): as they are logged.
+
+    A joint follows its path exactly, or with ``soft_hz`` as softly as that (`soft_drives`).
+
+    Raises:
+        ValueError: what is hidden cannot be had under soft drives.
+    """
+    unfit = {full.partition(":")[0] for full in arm.hidden} & {"friction_of_sum", "gear_windup"}
+    if soft_hz and unfit:
+        raise ValueError(f"not under soft drives: {', '.join(unfit)}")
     motion = draw_motion(arm, rng, seconds)
     t = np.arange(round(seconds * rate_hz)) / rate_hz
-    drive = arm.required(*motion(t))
+    late = np.zeros(len(arm.names))
     for full, v in arm.hidden.items():
         name, _, at = full.partition(":")
-        k = arm.names.index(at) if at in arm.names else -1
         if name == "actuator_delay":  # what acts late is logged early
-            drive[:, k] = arm.required(*motion(t + v["delay"]))[:, k]
+            late[arm.names.index(at)] = v["delay"]
+    if soft_hz:
+        every = round(1.0 / (rate_hz * STEP))
+        path = motion(np.arange(len(t) * every) * STEP)[:2]
+        q, drive = (x[::every] for x in follow(arm.carried, arm.viscous, path, soft_hz, late))
+        motor = q
+    else:
+        drive = arm.required(*motion(t))
+        for k in np.flatnonzero(late):
+            drive[:, k] = arm.required(*motion(t + late[k]))[:, k]
+        q = motion(t)[0]
+        motor = q + wind(arm, motion(t))
     for full, v in arm.hidden.items():
         name, _, at = full.partition(":")
         if name == "drive_offset":
             drive[:, arm.names.index(at)] += v["bias"]
     drive += noise * arm.coulomb * rng.standard_normal(drive.shape)
-    q = motion(t)[0]
-    motor = q + wind(arm, motion(t))
     return t, np.floor(q / COUNT) * COUNT, np.floor(motor / COUNT) * COUNT, drive
 
 
@@ -377,6 +406,7 @@ def record_logs(
     noise: float = 0.03,
     drawing_error: float = 0.1,
     turned: Sequence[str] = (),
+    soft_hz: float = 0.0,
 ) -> dict[str, Any]:
     """Write ``arm.urdf`` and CSV logs into ``folder``; returns the truth, written beside it.
 
@@ -387,6 +417,8 @@ def record_logs(
         noise: of the drives, share of the joint's dry friction.
         drawing_error: relative error of the drawn bodies.
         turned: joints whose drive is logged with the other sign.
+        soft_hz: how softly drives follow their path, natural frequency; 0 for exactly. Softly
+            led joints stick where they turn round.
     """
     rng = np.random.default_rng([seed, 1])
     arm = build(kinds, seed)
@@ -396,7 +428,7 @@ def record_logs(
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "arm.urdf").write_text(urdf(arm, rng, drawing_error))
     for number in range(trials):
-        t, q, motor, drive = measure(arm, rng, seconds, rate_hz, noise)
+        t, q, motor, drive = measure(arm, rng, seconds, rate_hz, noise, soft_hz)
         columns = headed(arm, style, t, q, sign * drive, constants)
         if any(full.startswith("gear_windup") for full in arm.hidden):
             columns |= {f"motor_side_{j}_rad": motor[:, k] for k, j in enumerate(arm.names)}

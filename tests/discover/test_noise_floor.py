@@ -191,3 +191,35 @@ def test_the_jumps_of_a_drive_that_acts_late_are_seen(late: float) -> None:
         system=system, motion=motion, p=np.zeros(1), residual=built_up - needed[:, None]
     )
     assert not replay._jumps(slow, built_up)
+
+
+@pytest.mark.parametrize(
+    ("robot", "kept", "stands", "error", "matters"),
+    [
+        ("arm", False, 1.5, 1.3, True),
+        ("arm", False, 1.1, 1.3, False),  # not clearly more
+        ("arm", False, 1.5, 4.0, False),  # next to nothing of what the model lacks
+        ("arm", True, 1.5, 1.3, False),
+        (None, True, 1.1, 4.0, True),  # machines of one axis are not probed
+    ],
+)
+def test_standing_still_matters_where_it_leaves_clearly_more(
+    robot, kept, stands, error, matters, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    left = {"creeps": 1.0, "stands": stands**2}
+    monkeypatch.setattr(noise_floor, "keep_motion", lambda fitted: kept)
+    monkeypatch.setattr(
+        noise_floor, "_mean_square_of_own_motion",
+        lambda evidence, moved, *_: np.array([left["creeps"], left[getattr(moved, "name", moved)]]),
+    )  # fmt: skip
+    system = SimpleNamespace(
+        name="creeps", model=SimpleNamespace(device=SimpleNamespace(robot=robot))
+    )
+    evidence = SimpleNamespace(
+        system=system, fitted=(), sizes=[100], motions=[None],
+        held_out_rmse=np.array([1.0, error]),
+    )  # fmt: skip
+    floor = noise_floor.NoiseFloor(np.ones(2), np.zeros(2), 1)
+    sensors = SimpleNamespace(rate_hz=100.0)
+    found = noise_floor.standing_still_matters(evidence, lambda: "stands", sensors, None, floor)
+    assert found is matters

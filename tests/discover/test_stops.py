@@ -21,10 +21,11 @@ def level_of(gains, p_values):
         excess=lambda name: np.array([gains[name]]),
         p_value=lambda name: p_values.get(name, 1e-6),
         ask=lambda scores, names: None,
+        replicates=[SimpleNamespace(held_out_rmse=np.ones(1))],
     )
 
 
-def replays(p_values=(), drawn=False):
+def replays(p_values=(), matter=True):
     """Replays that make a level of these p-values, and a list of the times it was made."""
     made = []
 
@@ -32,12 +33,15 @@ def replays(p_values=(), drawn=False):
         made.append(replayed)
         return level_of(STILL, dict(p_values))
 
-    recipe = SimpleNamespace(with_sign_widths=lambda factor: "narrow", has_drawn_axes=drawn)
+    recipe = SimpleNamespace(with_sign_widths=lambda factor: "narrow")
     current = SimpleNamespace(
         recipe=recipe, evidence=None, replayed=None,
         scorer=SimpleNamespace(independent_samples=np.array([1000.0])),
     )  # fmt: skip
-    return StoppingReplays(SimpleNamespace(settings=Settings(), level=level), current), made
+    bench = SimpleNamespace(
+        settings=Settings(), level=level, standing_still_matters=lambda *known: matter
+    )
+    return StoppingReplays(bench, current), made
 
 
 SIGNIFICANT = [(gain, name) for name, gain in GAINS.items()]
@@ -63,7 +67,7 @@ def test_what_such_replays_have_by_chance_is_passed_over() -> None:
     assert doubted["delay"][0] == 0.2
 
 
-def test_without_a_declared_width_nothing_is_replayed() -> None:
-    found, made = replays(drawn=True)
+def test_where_standing_still_does_not_matter_nothing_is_replayed() -> None:
+    found, made = replays(matter=False)
     assert found.first_beyond(SCORES, level_of(GAINS, {}), SIGNIFICANT) == (SIGNIFICANT, {})
     assert made == []

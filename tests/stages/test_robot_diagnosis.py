@@ -13,10 +13,12 @@ from bampipe.files import read_json
 from bampipe.proposal import propose, write_proposal
 
 
-def run_arm(root: Path, seed: int, kinds: str, effects: dict[str, float]) -> RunFolder:
+def run_arm(
+    root: Path, seed: int, kinds: str, effects: dict[str, float], **how: float
+) -> RunFolder:
     """Record an arm, let `init` propose the session, and run it up to validate."""
     folder = root / "arm"
-    arm.record_logs(folder, seed, kinds, effects, style="joint_states", seconds=8.0)
+    arm.record_logs(folder, seed, kinds, effects, style="joint_states", seconds=8.0, **how)
     proposal = propose(folder)
     assert proposal.fill_in == []
     write_proposal(folder, proposal)
@@ -43,3 +45,11 @@ def test_a_drive_that_is_late_is_named(tmp_path: Path) -> None:
     truth = read_json(tmp_path / "arm.truth.json")["effects"]["actuator_delay:shoulder"]["delay"]
     fitted = best["parameters"]["drive_delay.torque_shoulder.delay"]
     assert fitted == pytest.approx(truth, rel=0.1)
+
+
+@pytest.mark.long
+def test_joints_that_stick_are_held_against_replays_that_do(tmp_path: Path) -> None:
+    run = run_arm(tmp_path, 33, "ZY", {}, soft_hz=4.0, noise=0.01, rate_hz=250.0)
+    found = read_json(run.path("models/base/validate.json"))
+    assert {entry["standing"] for entry in found["axes"].values()} == {"at_floor"}
+    assert any("stand still where the motion turns" in note for note in found["notes"])
