@@ -49,7 +49,7 @@ def choose_sign_width(trials: MeasuredTrials, recipe: Recipe) -> SignWidth:
     Raises:
         ValueError: the trials are too short to be fitted.
     """
-    scorers = {1.0: _score(trials, recipe, 1.0), _STOPS: _score(trials, recipe, _STOPS)}
+    scorers = {1.0: score_width(trials, recipe, 1.0), _STOPS: score_width(trials, recipe, _STOPS)}
     declared = scorers[1.0].base_error
     count = scorers[1.0].independent_samples
 
@@ -61,11 +61,12 @@ def choose_sign_width(trials: MeasuredTrials, recipe: Recipe) -> SignWidth:
         return SignWidth(1.0, declared, declared)
     for factor in _NARROWER:
         if factor not in scorers:
-            scorers[factor] = _score(trials, recipe, factor)
+            scorers[factor] = score_width(trials, recipe, factor)
     best = max(_NARROWER, key=drop)
     return SignWidth(best, declared, scorers[best].base_error)
 
 
-def _score(trials: MeasuredTrials, recipe: Recipe, factor: float) -> Scorer:
+def score_width(trials: MeasuredTrials, recipe: Recipe, factor: float) -> Scorer:
+    """Fit a model with its widths times ``factor``."""
     narrowed = recipe.with_sign_widths(factor)
     return Scorer(fit_trials(trials, narrowed, search_start(trials, narrowed)))

@@ -42,7 +42,7 @@ EFFECTS = (
     "return_spring:piston", "quadratic_drag:piston", "asymmetric_coulomb:piston",
     "upper_stop:piston", "shear_thinning:piston",
 )  # fmt: skip
-BY_NAME = ("stribeck:piston", "thermal_damping:piston")
+BY_NAME = ("thermal_damping:piston", "stribeck:piston")
 """Hidden where they are asked for: what seeds draw stays what it was."""
 UNKNOWN = ("soft_oil:piston", "dead_travel:piston")
 
