@@ -66,11 +66,15 @@ class Case:
     given: tuple[str, ...]
     trials: int | None = None
     seconds: float | None = None
+    stop: bool = False
+    pace: float = 1.0
 
     @property
     def conditions(self) -> Conditions:
         """How the session is recorded."""
-        day = replace(DAYS[self.day], creep=self.creep)
+        day = replace(DAYS[self.day], creep=self.creep, stop=self.stop)
+        if self.pace != 1.0:
+            day = replace(day, pace=self.pace)
         if self.trials is not None:
             day = replace(day, trials=self.trials)
         if self.seconds is not None:
@@ -404,6 +408,8 @@ def main(arguments: Sequence[str]) -> None:
     parser.add_argument("--conditions", nargs="*", default=["good"], choices=list(DAYS))
     parser.add_argument("--strength", type=float, default=1.0)
     parser.add_argument("--creep", action="store_true", help="dry friction smoothed, as in bampipe")
+    parser.add_argument("--pace", type=float, default=1.0, help="how fast the motion is")
+    parser.add_argument("--stop", action="store_true", help="the damper's friction truly stops it")
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--first-seed", type=int, default=1)
     parser.add_argument("--trials", type=int, help="trials a session, in place of the usual")
@@ -436,7 +442,8 @@ def main(arguments: Sequence[str]) -> None:
                 ]
                 cases += [
                     Case(machine, effects, options.strength, day, options.creep, seed,
-                         options.replicates, options.auto, given, options.trials, options.seconds)
+                         options.replicates, options.auto, given, options.trials, options.seconds,
+                         options.stop, options.pace)
                     for effects in sets
                 ]  # fmt: skip
     outcomes = []

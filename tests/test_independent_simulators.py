@@ -36,7 +36,9 @@ def test_every_effect_changes_what_is_recorded(tmp_path, machine):
     for name, day in (("free", free), ("braked", braked)):
         independent.record(machine, tmp_path / name, 3, conditions=day)
         bare[name] = content(tmp_path / name)
-    for number, effect in enumerate((*known.EFFECTS, *known.UNKNOWN)):
+    for number, effect in enumerate(
+        (*known.EFFECTS, *known.UNKNOWN, *getattr(known, "BY_NAME", ()))
+    ):
         name, day = ("braked", braked) if effect.startswith("brake") else ("free", free)
         folder = tmp_path / str(number) / name
         independent.record(machine, folder, 3, {effect: 1.0}, day)

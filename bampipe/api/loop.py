@@ -235,7 +235,7 @@ def _write_child(root: Path, parent: str, named: Mapping[str, Path | None]) -> N
     effects = (*before.effects, *named)
     model = ModelFile(name=child, parent=parent, device=before.device, effects=effects)
     models.write(root, model)
-    load_model(RunFolder(root), child)
+    load_model(RunFolder(root), child, as_declared=True)
 
 
 def follow(

@@ -20,11 +20,12 @@ IDENTIFIED_MODEL = (*MODEL_INPUTS, "models/{model}/identify.json")
 """What `load_model` and `identified` read."""
 
 
-def load_model(run: RunFolder, name: str) -> Model:
+def load_model(run: RunFolder, name: str, *, as_declared: bool = False) -> Model:
     """Return the model called ``name`` as ``models/<name>/model.toml`` declares it.
 
-    Effect files in ``models/<name>/effects/`` and the device file ``ingest/device.toml`` come
-    before built-in ones.
+    Once it is identified, the sign of its velocities has the width that was chosen then, unless it
+    is asked for ``as_declared``. Effect files in ``models/<name>/effects/`` and the device file
+    ``ingest/device.toml`` come before built-in ones.
 
     Raises:
         InputError: a file is missing or wrong, or an effect or the device is not known.
@@ -35,7 +36,13 @@ def load_model(run: RunFolder, name: str) -> Model:
     own = []
     for file in run.glob(f"models/{name}/effects/*.toml"):
         own.append(registry.effect_from(read_toml(run.path(file)), str(run.path(file))))
-    return Model(load_device(run, model.device), model.effects, own)
+    declared = Model(load_device(run, model.device), model.effects, own)
+    if as_declared or not run.exists(IdentifyResult.file(name)):
+        return declared
+    factor = run.read(IdentifyResult, name).sign_width_factor
+    if factor == 1.0:
+        return declared
+    return read_recipe(run, name, declared).with_sign_widths(factor).model()
 
 
 def load_device(run: RunFolder, name: str) -> Device:

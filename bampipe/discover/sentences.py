@@ -42,7 +42,7 @@ def _parts(axis: str, i: int, found: Diagnosis, unit: str, s: Settings) -> list[
         parts.append(f"{left}: {describe(judged, i, s)}.")
     elif a.standing == "above_floor":
         parts.append(_excused(a, unit))
-    return parts + _timing(found) + _creeping(a, unit) + _other_band(a)
+    return parts + _timing(found) + _creeping(a, found, unit) + _other_band(a)
 
 
 def _timing(found: Diagnosis) -> list[str]:
@@ -60,14 +60,19 @@ def _timing(found: Diagnosis) -> list[str]:
     ]
 
 
-def _creeping(a: AxisVerdict, unit: str) -> list[str]:
+_MORE = " With a smaller sign_width more would show."
+
+
+def _creeping(a: AxisVerdict, found: Diagnosis, unit: str) -> list[str]:
     """Where the floor is that of replays that stand still, what those that creep leave."""
     if a.creeping_floor is None:
         return []
+    # On a test bench the trials have chosen the width.
+    chosen = found.evidence.system.model.device.prescribed
+    whose, more = ("model's", "") if chosen else ("device's", _MORE)
     return [
         "The floor is that of a machine that stands still where it turns round; replays that creep"
-        f" there, as the device's sign_width says, leave {three(a.creeping_floor)} {unit}. With a"
-        " smaller sign_width more would show."
+        f" there, as the {whose} sign_width says, leave {three(a.creeping_floor)} {unit}.{more}"
     ]
 
 

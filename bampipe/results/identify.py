@@ -320,6 +320,11 @@ class IdentifyResult(Result):
     base_parameters: tuple[BaseEstimate, ...] | None = Field(
         default=None, description="Of a robot, from the base to the tip"
     )
+    sign_width_factor: Annotated[float, Field(gt=0, le=1)] = Field(
+        default=1.0,
+        description="Width of the smoothed sign of the velocities over the device's `sign_width`: "
+        "less where the trials of a test bench are likelier so. What is made of the model has it",
+    )
     notes: Names = Field(default=(), description="What to know before believing a number")
     nis: Consistency | None = None
     innovations: dict[str, InnovationTests] | None = Field(default=None, description="By axis")

@@ -14,6 +14,7 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
 from bampipe.data.store import write_parquet
 from bampipe.declarations.model_file import MODEL_INPUTS, load_model, read_recipe
+from bampipe.discover.sign_width import SignWidth, choose_sign_width
 from bampipe.discover.start import search_start
 from bampipe.errors import InputError
 from bampipe.estimate.least_squares import fit, independent_samples
@@ -43,6 +44,7 @@ from bampipe.identification.sign_width import describe_smoothing, with_smoothing
 from bampipe.physics import System, compile_model
 from bampipe.progress import Progress
 from bampipe.results.ingest import IngestResult
+from bampipe.results.rounding import significant
 from bampipe.schema import STRICT, Positive
 from bampipe.trials.bias import UnbiasedFit, remove_bias
 from bampipe.trials.folds import Folds
@@ -97,6 +99,8 @@ class Config(FilterChoice):
         start_factor: multiplies every starting value: estimates must not depend on it.
         input_timing: whether the time by which inputs were sampled after positions is estimated.
         remove_bias: whether the bias that filters give least squares is measured and taken off.
+        choose_sign_width: whether, on a test bench, the trials may make the sign of the velocity
+            narrower than the device's `sign_width`.
     """
 
     model: str = "base"
@@ -104,14 +108,20 @@ class Config(FilterChoice):
     start_factor: Positive = 1.0
     input_timing: bool = True
     remove_bias: bool = True
+    choose_sign_width: bool = True
 
 
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
     """Estimate one model from the free trials; effects of brakes from braked ones too."""
-    system = compile_model(load_model(run, config.model))
+    model = load_model(run, config.model, as_declared=True)
+    system = compile_model(model)
     progress(0.0, "reading the trials")
     motions = read_motions(run, system, fitted=True, braked=system.braked)
     require_sound_motions(system, motions)
+    width = _choose_width(run, system, config)
+    if width is not None:
+        narrowed = read_recipe(run, config.model, model).with_sign_widths(width.factor)
+        system = compile_model(narrowed.model())
     sensors, kinematics = read_sensors(run, system), read_kinematics(run, system)
     band = read_band(run, system)
     timing = config.input_timing and not system.has_free_delay
@@ -227,12 +237,15 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         *describe_methods(system, methods),
         *notes,
         *describe_smoothing(system, estimate),
+        *(_describe_width(system, width) if width is not None else ()),
         *describe_calibration(estimate, moved),
         *summarise_bases(system, bases),
     ]
     result = collect_result(
         system, estimate, identifiability, motions, config.model, raw, engine, methods, notes, bases
     )
+    if width is not None:
+        result = result.model_copy(update={"sign_width_factor": width.factor})
     states, trace = estimate.tabulate()
     write_parquet(out / f"models/{config.model}/states.parquet", states)
     write_parquet(out / f"models/{config.model}/trace.parquet", trace)
@@ -248,3 +261,32 @@ def _start(run: RunFolder, system: System, config: Config) -> Array:
         count = len(system.model.device.parameters)
         start[count:] = found[count:]
     return start
+
+
+def _choose_width(run: RunFolder, system: System, config: Config) -> SignWidth | None:
+    """The width of the smoothed sign that the trials ask for; None where the declared one stays.
+
+    Where no test bench gives the motion it stays: filter and replays integrate along the sign.
+    """
+    if not (config.choose_sign_width and system.model.device.prescribed):
+        return None
+    trials = read_measured_trials(run, system, every_input=True)
+    with suppress(ValueError):  # too short: the fit itself says so
+        found = choose_sign_width(trials, read_recipe(run, config.model, system.model))
+        return found if found.factor < 1.0 else None
+    return None
+
+
+def _describe_width(system: System, width: SignWidth) -> list[str]:
+    """Say which narrower width was chosen, and why, for each axis of a narrowed model."""
+    said = []
+    for i, axis in enumerate(system.model.device.coordinates):
+        before, after = width.declared[i], width.chosen[i]
+        said.append(
+            f"{axis.name}: the sign of the velocity is smoothed over {significant(axis.sign_width)}"
+            f" {axis.unit}/s, {significant(width.factor)} of the device's `sign_width`, for with"
+            f" that the error on trials left out falls from {significant(before)} to"
+            f" {significant(after)} {system.torque_units[i]}. `sign_width = {axis.sign_width:.2g}`"
+            " in a device file says so from the start."
+        )
+    return said

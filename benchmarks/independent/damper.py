@@ -32,6 +32,7 @@ MACHINE = np.dtype(
             "share", "distance", "symmetry", "coil_lag", "bend", "sharpness", "stiffness",
             "rest", "drag", "dry_difference", "viscous_difference",
             "bumper", "bumper_at", "thinning", "thinning_speed", "oil_spring", "dead_travel",
+            "yield_speed", "seal", "seal_speed", "softening", "warming_time",
         )
     ]
 )  # fmt: skip
@@ -41,6 +42,8 @@ EFFECTS = (
     "return_spring:piston", "quadratic_drag:piston", "asymmetric_coulomb:piston",
     "upper_stop:piston", "shear_thinning:piston",
 )  # fmt: skip
+BY_NAME = ("thermal_damping:piston", "stribeck:piston")
+"""Hidden where they are asked for: what seeds draw stays what it was."""
 UNKNOWN = ("soft_oil:piston", "dead_travel:piston")
 
 
@@ -54,7 +57,7 @@ def _turning(symmetry, moved, z):
 def _press(m, x, v, a, current, log_at):
     """Force on the damper along a prescribed stroke, at the samples."""
     out = np.zeros(len(log_at))
-    z, coil, oil, free, k_log = 0.0, current[0], 0.0, 0.0, 0
+    z, coil, oil, free, heat, k_log = 0.0, current[0], 0.0, 0.0, 0.0, 0
     for k in range(len(x)):
         if m.coil_lag > 0.0 and k > 0:
             coil = current[k - 1] + (coil - current[k - 1]) * np.exp(-STEP / m.coil_lag)
@@ -67,7 +70,9 @@ def _press(m, x, v, a, current, log_at):
             rate = m.oil_spring / (m.viscous + m.viscous_gain * abs(i))
             oil = (oil + STEP * speed) / (1.0 + STEP * rate)
             speed = rate * oil
-        sign = np.tanh(speed / YIELD_SPEED)
+        sign = np.tanh(speed / m.yield_speed) if m.yield_speed > 0.0 else np.sign(speed)
+        seal = m.seal * np.exp(-((speed / m.seal_speed) ** 2)) * sign
+        moves = abs(sign)
         if m.share > 0.0:
             if k > 0:
                 moved = 0.5 * STEP * (v[k - 1] + v[k]) / m.distance
@@ -76,7 +81,10 @@ def _press(m, x, v, a, current, log_at):
                 )
             sign += m.share * (z - sign)
         dry = m.coulomb + m.coulomb_gain * abs(i)
-        force = (m.viscous + m.viscous_gain * abs(i)) * speed + dry * sign
+        force = (m.viscous + m.viscous_gain * abs(i)) * speed + dry * sign + seal
+        force -= m.softening * heat * m.viscous * speed
+        power = m.viscous * speed**2 + m.coulomb * abs(speed)
+        heat += STEP * (power - heat) / m.warming_time
         if m.dead_travel > 0.0:
             # After a reversal the oil only flows round once the piston has moved the dead travel.
             free = min(max(free + STEP * speed, -m.dead_travel), m.dead_travel)
@@ -84,7 +92,7 @@ def _press(m, x, v, a, current, log_at):
         force += m.mass * a[k] + m.preload + m.stiffness * (x[k] - m.rest)
         force += m.drag * speed * abs(speed)
         force += m.thinning * speed / (1.0 + (speed / m.thinning_speed) ** 2) ** 0.35
-        force += m.dry_difference * np.tanh(speed / YIELD_SPEED) ** 2
+        force += m.dry_difference * moves**2
         force += m.viscous_difference * abs(speed)
         if x[k] > m.bumper_at:
             force += m.bumper * (x[k] - m.bumper_at)
@@ -115,6 +123,8 @@ def _hide(
                                    "viscous_difference": 60.0 * size * sign},
             "upper_stop": {"bumper": 6e4 * size, "bumper_at": 0.004},
             "shear_thinning": {"thinning": 1500.0 * size, "thinning_speed": 0.02 * shape},
+            "stribeck": {"seal": 25.0 * size, "seal_speed": 0.012 * shape},
+            "thermal_damping": {"softening": 0.15 * size, "warming_time": 6.0 * shape},
             "soft_oil": {"oil_spring": 6e4 / size},
             "dead_travel": {"dead_travel": 0.0006 * size},
         }[name]  # fmt: skip
@@ -126,6 +136,9 @@ def _hide(
             "dry_difference": "difference",
             "bumper": "stiffness",
             "bumper_at": "position",
+            "seal": "force",
+            "seal_speed": "speed",
+            "warming_time": "time_constant",
         }
         if name in (
             "upper_stop",
@@ -133,6 +146,8 @@ def _hide(
             "channel_lag",
             "quadratic_drag",
             "channel_saturation",
+            "stribeck",
+            "thermal_damping",
         ):
             prefix = full.replace(":", ".")
             truth |= {f"{prefix}.{theirs.get(k, k)}": v for k, v in laws.items()}
@@ -184,6 +199,8 @@ def record(
     }  # fmt: skip
     machine = np.zeros(1, MACHINE)[0]
     machine["sharpness"] = machine["distance"] = machine["thinning_speed"] = 1.0
+    machine["seal_speed"] = machine["warming_time"] = 1.0
+    machine["yield_speed"] = 0.0 if c.stop else YIELD_SPEED
     machine["bumper_at"] = np.inf
     for name, value in parameters.items():
         machine[name] = value

@@ -28,6 +28,7 @@ class Conditions:
         dropped: share of the samples that are lost.
         jitter: standard deviation of the time between samples, as a share of it; stamps are true.
         creep: dry friction is the smoothed one of the device file instead of a true standstill.
+        stop: the friction of the damper, which yields over 2 mm/s, changes its sign at once.
         hold: a motor's command is held for 1 ms, so that it acts half of that late.
         viscous_trials, locked_trials: of a machine with brakes.
         tasks: free trials beside those, in which somebody follows a sentence.
@@ -43,6 +44,7 @@ class Conditions:
     dropped: float = 0.0
     jitter: float = 0.0
     creep: bool = False
+    stop: bool = False
     hold: bool = False
     viscous_trials: int = 0
     locked_trials: bool = False

@@ -40,10 +40,13 @@ def finding(verdict, before, after, floor, **more):
     )  # fmt: skip
 
 
-def say(monkeypatch, axis, contests=None, transients=(), cut_short=False, refused=()):
+def say(
+    monkeypatch, axis, contests=None, transients=(), cut_short=False, refused=(), prescribed=False
+):
     """The sentence of one axis called joint, in N.m."""
     monkeypatch.setattr(sentences, "describe", lambda evidence, axis, s: SHAPE)
-    system = SimpleNamespace(coordinates=("joint",), torque_units=("N.m",))
+    model = SimpleNamespace(device=SimpleNamespace(prescribed=prescribed))
+    system = SimpleNamespace(coordinates=("joint",), torque_units=("N.m",), model=model)
     evidence = SimpleNamespace(system=system, timing=(0.0, 0.0))
     found = Diagnosis(
         (axis,),
@@ -260,3 +263,12 @@ def test_a_floor_of_replays_that_stand_still_is_said_to_be_one(monkeypatch):
     still = axis.model_copy(update={"creeping_floor": 0.0964})
     said = say(monkeypatch, still)
     assert "replays that creep there, as the device's sign_width says, leave 0.0964 N.m." in said
+    assert "With a smaller sign_width more would show." in said
+
+
+def test_on_a_test_bench_whose_trials_chose_the_width_no_smaller_one_is_asked_for(monkeypatch):
+    axis = finding("nothing_missing", 0.42, 0.42, 0.39)
+    still = axis.model_copy(update={"creeping_floor": 0.0964})
+    said = say(monkeypatch, still, prescribed=True)
+    assert "as the model's sign_width says, leave 0.0964 N.m." in said
+    assert "smaller sign_width" not in said
