@@ -34,7 +34,7 @@ PIPELINE = """schema = "bampipe.pipeline/1"
 name = "widths"
 stages = ["ingest", "filter", "identify"]
 
-[identify]
+[settings.identify]
 method = "least-squares"
 """
 
@@ -45,13 +45,9 @@ def find_drops(machine: str, seed: int, effect: str, conditions: Conditions) -> 
         root = Path(folder)
         record(machine, root / "session", seed, {effect: 1.0} if effect else {}, conditions)
         (root / "widths.toml").write_text(PIPELINE)
-        run = RunFolder(
-            Path(
-                bampipe.run_session(
-                    root / "session", runs=root / "runs", pipeline=str(root / "widths.toml")
-                ).root
-            )
-        )
+        pipeline = str(root / "widths.toml")
+        session = bampipe.run_session(root / "session", runs=root / "runs", pipeline=pipeline)
+        run = RunFolder(Path(session.root))
         recipe = read_recipe(run, "base", load_model(run, "base", as_declared=True))
         trials = read_measured_trials(run, system_of(recipe), every_input=True)
         declared = score_width(trials, recipe, 1.0)
