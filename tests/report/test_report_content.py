@@ -453,8 +453,7 @@ def test_validated_above_the_floor_asks_for_a_diagnosis(tmp_path: Path) -> None:
     synthetic_run.write_ingest(root)
     synthetic_run.write_model(root, "base")
     synthetic_run.write_validation(root, "base")
-    report = build(Results(root), quiet)
-    words = text_of(report.html)
+    words = text_of(page_of(root))
     assert "leaves something unexplained on yaw" in words
     assert "2.76 × the noise floor" in words
     assert "bampipe diagnose s03" in words
