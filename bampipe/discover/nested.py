@@ -62,9 +62,10 @@ def _constants(item: Candidate) -> int:
 def _parts(evidence: Evidence, item: Candidate, score: Score) -> tuple[Array, Array]:
     """What an effect adds to the residual, (N,), and that by each linear strength, (N, m)."""
     columns, changes = added_columns(evidence, item, score.values[list(item.searched_indices)])
-    parts = np.concatenate(columns).reshape(-1, len(item.linear_indices))
-    strengths = score.values[list(item.linear_indices)]
-    return np.concatenate(changes).ravel() + parts @ strengths, parts
+    change = np.concatenate(changes).ravel()
+    # Without linear strengths there are no columns to count the samples by.
+    parts = np.concatenate(columns).reshape(change.size, len(item.linear_indices))
+    return change + parts @ score.values[list(item.linear_indices)], parts
 
 
 def _contains(parts: Array, added: Array) -> bool:

@@ -138,5 +138,7 @@ def test_what_holds_an_effect_and_more_has_no_odds_beside_it_unless_it_fits_bett
         bench = Bench(session, Settings(jobs=1), pool, (friction, spring))
         evidence = bench.fit(recipe, system_of(recipe).prior)
         found = FittedSet(recipe, (bias,), evidence, session)
-        idle = idle_extensions(bench, found, bias, 2, {friction, spring, "upper_stop:extension"})
+        # A delay has no strength of its own, so that there is nothing for it to contain.
+        others = {"upper_stop:extension", "force_delay"}
+        idle = idle_extensions(bench, found, bias, 2, {friction, spring, *others})
     assert idle == ({spring} if by_speed else {friction, spring})
