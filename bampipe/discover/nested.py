@@ -50,13 +50,9 @@ def idle_extensions(
         for rival, score in scores.items()
         if rival != name
         and score.total <= most
-        and _constants(items[rival]) > _constants(items[name])
+        and items[rival].n_constants > items[name].n_constants
         and _contains(_parts(fewer.evidence, items[rival], score)[1], added)
     )
-
-
-def _constants(item: Candidate) -> int:
-    return sum(not q.fixed for q in item.parameters)
 
 
 def _parts(evidence: Evidence, item: Candidate, score: Score) -> tuple[Array, Array]:

@@ -94,7 +94,7 @@ def choose(
     if not firm:
         return Choice("", (), transient)
     rivals = firm[: s.most_rivals]
-    constants = {item.name: sum(not q.fixed for q in item.parameters) for item in items}
+    constants = {item.name: item.n_constants for item in items}
 
     def simplest(names: Sequence[str]) -> str:
         """Of those that explain as much as the first, the one with the fewest constants."""

@@ -122,7 +122,7 @@ class Scorer:
     def independent_samples(self) -> Array:
         """Number of independent samples that count in the error, by axis, (n_q,)."""
         judged = [k for k, counts in enumerate(self.folds.judged) if counts]
-        count = self.evidence.sums.count[judged].sum(axis=0)
+        count = self.sums.count[judged].sum(axis=0)
         return np.asarray(count * self.evidence.band.independent_share)
 
     @cached_property
@@ -396,7 +396,7 @@ class Scorer:
             bare = np.linalg.norm(plain, axis=2)
             share = np.linalg.norm(slope, axis=2) / np.where(bare > 0.0, bare, 1.0)
             total += np.sum(np.where(bare > 0.0, np.log(np.maximum(share, 1e-3)), 0.0) * used, 0)
-        return np.asarray(total / np.maximum(self.evidence.sums.count.sum(axis=0), 1.0))
+        return np.asarray(total / np.maximum(self.sums.count.sum(axis=0), 1.0))
 
 
 def _weight(left: Array) -> Array:

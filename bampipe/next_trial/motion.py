@@ -173,7 +173,7 @@ def example_path(example: Example, t: Array) -> tuple[Array, Array, Array]:
     distance = np.where(u < 1.0, back * (0.375 + 0.75 * u**2 - 0.125 * u**4), np.abs(x))
     way = np.where(turn % 2.0 == 0.0, 1.0, -1.0)
     at = np.where(way > 0.0, distance, length - distance)
-    slope, bend = (
+    slope, curvature = (
         (way * each)[:, None]
         for each in (np.sign(x) * (1.5 * u - 0.5 * u**3), 1.5 * (1.0 - u**2) / back)
     )
@@ -186,7 +186,7 @@ def example_path(example: Example, t: Array) -> tuple[Array, Array, Array]:
     return (
         middle + example.reach * (q - middle),
         example.reach * rate * slope * qd,
-        example.reach * rate**2 * (slope**2 * qdd + bend * qd),
+        example.reach * rate**2 * (slope**2 * qdd + curvature * qd),
     )
 
 

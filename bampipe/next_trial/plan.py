@@ -87,7 +87,7 @@ def plan_trials(forecast: Forecast, tried: Sequence[Tried], goal: Goal) -> Trial
     chosen: list[_Option] = []
     outcome, is_full = _at_hand(forecast), False
     is_enough = _distance(outcome, goal) <= 0.0
-    # A published uncertainty may be small by luck: what a trial adds is held against what the
+    # A published uncertainty may be small by chance: what a trial adds is held against what the
     # trials at hand would be expected to give another time.
     left = _distance(_outcome(forecast, chosen), goal)
     while not (is_enough or is_full):

@@ -171,10 +171,10 @@ class Precision:
         trust = by_data * _ALIKE**2 / (_ALIKE**2 + chance)
         mean = float(np.average(scatter, weights=np.maximum(by_data, 1e-12)))
         scatter = mean + trust * (scatter - mean)
-        telling = np.maximum(share * self.blocks + (1.0 - share) * new, 1.0)
+        informative = np.maximum(share * self.blocks + (1.0 - share) * new, 1.0)
         least = self.formal_sd * np.sqrt(share)
-        told = max(float(by_data.sum()), 1.0)
-        wide = _EIGHT_OF_TEN * np.sqrt(trust * chance + chance / told + 0.5 / telling)
+        determined = max(float(by_data.sum()), 1.0)
+        wide = _EIGHT_OF_TEN * np.sqrt(trust * chance + chance / determined + 0.5 / informative)
 
         def noise(widening: Array | float) -> Array:
             data = np.exp(scatter) * self._few(self.blocks + new) * widening

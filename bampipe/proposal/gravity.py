@@ -47,7 +47,7 @@ def weight_of(
 ) -> tuple[Weight | None, str]:
     """Gravity for the device file of an axis, None where it has none, and a sentence on it.
 
-    A joint whose mounting nobody has told is more likely to carry weight than not, and an axis
+    A joint whose mounting is not known is more likely to carry weight than not, and an axis
     whose model lacks gravity has its weight explained by springs and unbalance.
 
     Args:
