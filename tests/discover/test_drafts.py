@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from independent_runs import diagnose, record_run, record_trials
+from independent_runs import diagnose, error_over_floor, record_run, record_trials
 
 import bampipe
 from bampipe.data.run_folder import RunFolder
@@ -36,7 +36,10 @@ FEW = Settings(draft_replicates=4, jobs=1)
 def detent(tmp_path_factory):
     """A run of a joint with a magnet in it, diagnosed as unknown, and the draft for it."""
     run, _ = record_run(tmp_path_factory.mktemp("detent"), "joint", 6, "detent:joint")
-    diagnose(run)
+    unknown = diagnose(run)["axes"]["joint"]
+    assert unknown["verdict"] == "unknown_effect"
+    assert error_over_floor(unknown) > 3.0
+    assert "position" in unknown["sentence"]
     return run, bampipe.draft(run, replicates=4, jobs=1)
 
 
