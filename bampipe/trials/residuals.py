@@ -106,11 +106,15 @@ def problem_of(
     multiplied = _multiplied(system, free)
     if multiplied is not None:  # as measured, their slopes change with the residual
         same = [constant and axis < 0 for constant, axis in zip(same, multiplied, strict=True)]
+    linear = system.is_linear_in(free)
     if timing:
         half = 0.5 / band.rate_hz
+        # The secant over all of its range serves a model that is linearised once; one that is
+        # linearised again and again needs the tangent, or its descent ends short of the minimum.
+        apart = half if linear else 0.05 * half
         same = [*same, False]
         precision, known = [*precision, 0.0], [*known, 0.0]
-        free, lower, upper, step = [*free, n], [*lower, -half], [*upper, half], [*step, half]
+        free, lower, upper, step = [*free, n], [*lower, -half], [*upper, half], [*step, apart]
         multiplied = None if multiplied is None else np.append(multiplied, -1)
     return Problem(
         residual=residual,
@@ -119,7 +123,7 @@ def problem_of(
         lower=np.array(lower),
         upper=np.array(upper),
         step=np.array(step),
-        linear=system.is_linear_in([i for i in free if i < n]),
+        linear=linear,
         constant=np.array(same),
         band=band,
         standstill=TrialCache(

@@ -7,7 +7,7 @@ from scipy.signal import butter, sosfiltfilt
 from sessions import BAND, RATE, TRUTH, bam, folds, made
 
 from bampipe.discover.chance import system_of
-from bampipe.estimate.least_squares import stacked_residual
+from bampipe.estimate.least_squares import residual_and_slopes, stacked_residual
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import Model, compile_model
 from bampipe.physics.device import LAST_ORDER, derivative
@@ -138,6 +138,29 @@ def test_forces_of_bodies_follow_a_motion_that_the_timing_of_inputs_moves():
     afresh = problem_of(system, motions, Band(RATE, (8.0,) * 3), timing=True)
     np.testing.assert_array_equal(moved.residual(0, late), afresh.residual(0, late))
     assert np.abs(moved.residual(0, late) - moved.residual(0, p)).max() > 1e-3
+
+
+def test_a_descent_with_a_timing_follows_the_tangent_to_the_minimum():
+    """A force swings at 8 Hz and acts 4 ms late: a secant over half a sample is off by over 5 %."""
+    rate = 100.0
+    band, t = Band(rate, (20.0,) * 3), np.arange(2000) / rate
+    system = system_of(bam(["stribeck:yaw"]))
+    phase = 2.0 * np.pi * 8.0 * t[:, None] + np.arange(3)
+    q, qd, qdd = 0.01 * np.sin(phase), 0.5 * np.cos(phase), -25.0 * np.sin(phase)
+    channels = {name: np.zeros(len(t)) for name in system.inputs if name != "t"}
+    for axis, name in enumerate(("force_x", "force_y")):
+        for k in range(LAST_ORDER + 1):
+            turned = np.sin(phase[:, axis] + 0.5 * np.pi * k + 1.0)
+            channels[derivative(name, k)] = 8.0 * (2.0 * np.pi * 8.0) ** k * turned
+    motion = Motion("t", t, q + np.array([0.0, 0.0, 0.7]), qd, qdd, np.full_like(q, 1e-4), channels)
+    start = np.append(system.prior, 0.004)
+    problem = problem_of(system, [motion], band, timing=True)
+    _, slopes = residual_and_slopes(problem, 0, start)
+    step = 1e-6
+    late, early = (problem.residual(0, np.append(system.prior, 0.004 + by)) for by in (step, -step))
+    tangent = (late - early) / (2.0 * step)
+    assert np.abs(tangent).max() > 10.0
+    np.testing.assert_allclose(slopes[:, :, -1], tangent, atol=0.05 * np.abs(tangent).max())
 
 
 def channels_of(system):
