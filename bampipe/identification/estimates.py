@@ -68,6 +68,7 @@ class Estimate:
         moved_by: from another system of the same parameters to how far its equations move the
             estimates, (n,), nothing where they make the readings less likely; None for a method
             that does not say.
+        width: with which the method smooths the sign of a velocity, times the model's.
     """
 
     method: Method
@@ -81,6 +82,7 @@ class Estimate:
     report: dict[str, Any]
     tabulate: Callable[[], tuple[pd.DataFrame, pd.DataFrame]]
     moved_by: Callable[[System], Array] | None = None
+    width: float = 1.0
 
     @property
     def evidence(self) -> dict[str, Any]:

@@ -71,8 +71,10 @@ _REPEATS, _AROUND = 4, 10.0
 _PARTS, _LIKELIER = (1, 2, 4), 30.0
 """By what the Runge-Kutta step is divided for it, and what that must add to the logarithm of a
 trial's likelihood: three times what it adds where friction is smooth on the scale of a step."""
-_MOVED_SAMPLES = 10_000
-"""Samples from which it is taken how far other equations move the answer."""
+_NARROWER = (0.25, 0.0625)
+"""Widths of the smoothed sign, times the device's, that are tried."""
+_MOVED_TRIALS, _MOVED_SAMPLES = 5, 10_000
+"""Trials, and samples of all, by which other equations move the answer or make it likelier."""
 _SOUND_NIS = (0.5, 2.0)
 """Mean normalised innovation squared of a filter whose noise levels fit: 0.9 to 1.3 on sound
 sessions, 0.06 to 0.2 and 2.8 to 3.7 on those whose motion it lost."""
@@ -85,6 +87,7 @@ _AGREE = 6.0
 def estimate_by_filter(
     run: RunFolder,
     system: System,
+    narrowed: Callable[[float], System],
     motions: Sequence[Motion],
     start: Array,
     squares: UnbiasedFit,
@@ -98,6 +101,7 @@ def estimate_by_filter(
 
     Args:
         run: the run folder; system: the model; motions: the trials.
+        narrowed: the model with the widths of its smoothed signs times a factor.
         start: (n_p,) starting values.
         squares: least squares, which gives the region of the answer and checks it.
         noise: of the sensors; choice: of the filter; folds: which trials are left out together.
@@ -191,7 +195,13 @@ def estimate_by_filter(
         )  # fmt: skip
 
     found = run_from(attempts, settings)
-    if nonlinear:
+    width, finer = 1.0, settings
+    if not system.model.device.prescribed:
+        width, finer = _choose_width(found, model, trials, narrowed)
+    if width < 1.0:
+        model = _with_equations(model, narrowed(width))
+        found = _repeat_until_settled(found, model, finer, run_from)
+    elif nonlinear:
         finer = _choose_longest_step(found, model, trials[0])
         found = _repeat_until_settled(found, model, finer, run_from)
     covariance, blocks = sandwich_covariance(
@@ -234,6 +244,7 @@ def estimate_by_filter(
             tabulate_trace(names, model, motions, found, choice.trace_rows),
         ),
         moved_by=lambda other: _moved_by(other, found, model, trials)[:count],
+        width=width,
     )
 
 
@@ -265,6 +276,28 @@ def _leave_out(
     return [parameters[group] for group in folds.groups]
 
 
+def _with_equations(model: FilterModel, system: System) -> FilterModel:
+    """The same model with the equations of another system of the same parameters."""
+    return replace(
+        model,
+        derivative=system.derivative,
+        measure=system.measure,
+        derivative_rows=system.derivative_rows,
+        measure_rows=system.measure_rows,
+    )
+
+
+def _some_of(trials: Sequence[Trial], found: FilterRun) -> tuple[list[Trial], Array]:
+    """Beginnings of trials, spread evenly, and a covariance to start from around the answer."""
+    stride = found.settings.stride
+    count = min(len(trials), _MOVED_TRIALS)
+    places = np.linspace(0, len(trials) - 1, count).round().astype(int)
+    most = (_MOVED_SAMPLES // count - 1) // stride * stride + 1
+    part = [trials[place].first(min(trials[place].t.size, most)) for place in places]
+    share = sum(trial.t.size for trial in part) / sum(trial.t.size for trial in trials)
+    return part, _AROUND**2 / share * np.diag(np.diag(found.covariance))
+
+
 def _moved_by(
     other: System, found: FilterRun, model: FilterModel, trials: Sequence[Trial]
 ) -> Array:
@@ -273,12 +306,7 @@ def _moved_by(
     Both are filtered around it, over some of the trials and in finer steps, for the other may be
     stiffer. Where the other makes the readings less likely, or fails, it moves nothing.
     """
-    size, stride = trials[0].t.size, found.settings.stride
-    most = min(size, (_MOVED_SAMPLES - 1) // stride * stride + 1)
-    count = min(len(trials), max(1, _MOVED_SAMPLES // size))
-    places = np.linspace(0, len(trials) - 1, count).round().astype(int)
-    part = [trials[place].first(most) for place in places]
-    spread = _AROUND**2 * len(trials) / count * np.diag(np.diag(found.covariance))
+    part, spread = _some_of(trials, found)
     finer = replace(found.settings, longest_step=0.5 * found.settings.longest_step)
 
     def answer(model: FilterModel) -> tuple[Array, float]:
@@ -286,18 +314,50 @@ def _moved_by(
         likely = sum(float(np.nansum(one.log_likelihood)) for one in filtered.trials)
         return model.to_physical(filtered.theta)[0], likely
 
-    theirs = replace(
-        model,
-        derivative=other.derivative,
-        measure=other.measure,
-        derivative_rows=other.derivative_rows,
-        measure_rows=other.measure_rows,
-    )
     with suppress(FilterFailure):
-        (value, likely), (moved, likelier) = answer(model), answer(theirs)
+        (value, likely), (moved, likelier) = answer(model), answer(_with_equations(model, other))
         if likelier > likely:
             return np.asarray(moved - value)
     return np.zeros(model.free.size)
+
+
+def _choose_width(
+    found: FilterRun,
+    model: FilterModel,
+    trials: Sequence[Trial],
+    narrowed: Callable[[float], System],
+) -> tuple[float, FilterSettings]:
+    """Return the width of the smoothed sign, times the device's, that makes readings likeliest.
+
+    Friction that stops a machine changes over less than the device says it does, and estimates err
+    in proportion to the rest. Each width has the Runge-Kutta step that suits it, with the settings
+    of which it is returned; the declared width where no narrower one is likelier.
+    """
+    part, spread = _some_of(trials, found)
+    step = found.settings.longest_step
+
+    def likelihoods(width: float, parts: Sequence[int]) -> dict[tuple[float, int], float]:
+        theirs = model if width == 1.0 else _with_equations(model, narrowed(width))
+        tried = {}
+        for by in parts:
+            settings = replace(found.settings, longest_step=step / by)
+            with suppress(FilterFailure):
+                filtered = filter_trials(theirs, part, found.theta, spread, settings)
+                tried[width, by] = sum(
+                    float(np.nansum(one.log_likelihood)) for one in filtered.trials
+                )
+        return tried
+
+    ends = (_PARTS[0], _PARTS[-1])
+    declared = likelihoods(1.0, ends)
+    narrow = likelihoods(_NARROWER[0], ends)
+    if not narrow or max(narrow.values()) < max(declared.values(), default=0.0) + _LIKELIER:
+        return 1.0, found.settings
+    for width in _NARROWER:
+        narrow |= likelihoods(width, _PARTS)
+    enough = max(narrow.values()) - _LIKELIER
+    width, by = min((key for key, likely in narrow.items() if likely > enough), key=lambda k: k[1])
+    return width, replace(found.settings, longest_step=step / by)
 
 
 def _doubts(

@@ -20,6 +20,7 @@ from bampipe.errors import InputError
 from bampipe.identification.estimates import Estimate
 from bampipe.physics import System
 from bampipe.results.identify import METHODS_IN_WORDS, Method, MethodTried, MethodValue
+from bampipe.results.intervals import NORMAL_95
 from bampipe.results.rounding import round_with_sd, significant
 from bampipe.trials.bias import UnbiasedFit
 from bampipe.trials.folds import Folds
@@ -35,6 +36,8 @@ _SCATTERED = 1.3
 """Standard deviations of the filter over those of least squares, from which on least squares are
 published. In eight of 46 identifications of a joint they were: there the filter's true errors were
 1.6 to 32 times those of least squares (docs/identification.md)."""
+_BIASED = 0.5
+"""Bias of least squares over what is left, from which on it is an extrapolation."""
 _APART = 2.0
 """Uncertainties of both from which on two methods are said to disagree."""
 _SCATTER = 3.0
@@ -137,7 +140,8 @@ def _good(system: System, judged: Sequence[Judged]) -> tuple[list[int], int]:
     good = [
         k
         for k, each in enumerate(judged)
-        if ratio[k] <= AS_GOOD or (ratio[k] <= _SOUND and not _apart(each.estimate, best).any())
+        if ratio[k] <= AS_GOOD
+        or (ratio[k] <= _SOUND and not (_apart(each.estimate, best) & ~_open(system, best)).any())
     ]
     return sorted(good, key=lambda k: bool(judged[k].estimate.doubts)), least
 
@@ -155,6 +159,31 @@ def _apart(one: Estimate, other: Estimate) -> NDArray[np.bool_]:
     return np.asarray(np.abs(one.value - other.value) > size)
 
 
+def _open(system: System, estimate: Estimate) -> NDArray[np.bool_]:
+    """Return which parameters are of an effect whose size or shape an estimate leaves open, (n,).
+
+    Strength and shape of an effect trade off: of one that is uncertain by its own size, or from
+    which least squares take off half as much as bias, neither speaks against another method's.
+    """
+    names = [system.parameters[place].name for place in estimate.free]
+    bias = [
+        entry.get("least_squares_bias", 0.0) if estimate.method == "least-squares" else 0.0
+        for entry in estimate.details
+    ]
+    unknown = {
+        name
+        for name, value, sd, off in zip(names, estimate.value, estimate.sd, bias, strict=True)
+        if max(NORMAL_95 * sd, abs(off) / _BIASED) >= abs(value)
+    }
+    found: set[str] = set()
+    for effect in system.model.effects:
+        strengths = {item.name for item in effect.parameters if item.strength}
+        shapes = {item.name for item in effect.parameters if item.shape and item.lower >= 0.0}
+        if strengths and (strengths <= unknown or shapes & unknown):
+            found |= {item.name for item in effect.parameters}
+    return np.array([name in found for name in names])
+
+
 def widen(
     system: System, judged: Sequence[Judged], published: int, squares: UnbiasedFit
 ) -> Estimate:
@@ -168,7 +197,8 @@ def widen(
     systematic = np.zeros(len(chosen.value))
     for k, other in enumerate(judged):
         if k != published and ratio[k] <= _SOUND and not other.estimate.doubts:
-            systematic = np.maximum(systematic, _disagreement(chosen, other.estimate, squares))
+            apart = _disagreement(chosen, other.estimate, squares)
+            systematic = np.maximum(systematic, np.where(_open(system, other.estimate), 0.0, apart))
     details = [
         {**fields, "systematic_sd": size}
         for fields, size in zip(chosen.details, systematic, strict=True)

@@ -10,6 +10,7 @@ from bampipe.identification.estimates import Estimate
 from bampipe.lists import join_names
 from bampipe.physics import System, compile_model
 from bampipe.physics.recipe import Recipe
+from bampipe.results.rounding import significant
 
 _NARROWER = 0.5
 _MOST, _SHOWN = 0.5, 6
@@ -22,16 +23,16 @@ def with_smoothing(estimate: Estimate, recipe: Recipe) -> Estimate:
 
     A machine with dry friction truly stands still, where the model creeps within the width of its
     smoothed sign. An estimate by the filter or by output error errs in proportion to that width:
-    it is off by twice what half the width moves it. A machine that does creep shows that by
-    readings that the narrower sign comes less close to. Least squares leaves standstill out and
-    takes the rest off as bias.
+    it is off by twice what half the width that it took moves it. A machine that does creep shows
+    that by readings that the narrower sign comes less close to. Least squares leaves standstill out
+    and takes the rest off as bias.
 
     Args:
         estimate: as published; recipe: its model as data.
     """
     if estimate.moved_by is None:
         return estimate
-    narrower = compile_model(recipe.with_sign_widths(_NARROWER).model())
+    narrower = compile_model(recipe.with_sign_widths(_NARROWER * estimate.width).model())
     off = estimate.moved_by(narrower) / (1.0 - _NARROWER)
     details = [
         {**entry, "smoothing_sd": size}
@@ -42,7 +43,7 @@ def with_smoothing(estimate: Estimate, recipe: Recipe) -> Estimate:
 
 
 def describe_smoothing(system: System, estimate: Estimate) -> tuple[str, ...]:
-    """A sentence on the parameters whose uncertainty is for the most part that of smoothing."""
+    """Sentences on a narrower sign, and on uncertainty that is for the most part of smoothing."""
     shares = [
         entry.get("smoothing_sd", 0.0) ** 2 / max(sd**2, np.finfo(float).tiny)
         for entry, sd in zip(estimate.details, estimate.sd, strict=True)
@@ -52,9 +53,15 @@ def describe_smoothing(system: System, estimate: Estimate) -> tuple[str, ...]:
         for place, share in zip(estimate.free, shares, strict=True)
         if share > _MOST
     ]
-    if not names:
-        return ()
-    return (
-        f"Most of the uncertainty of {join_names(names, _SHOWN)} is that the sign of the velocity"
-        " is smoothed over the device's `sign_width`, where a machine stands still.",
-    )
+    said = []
+    if estimate.width < 1.0:
+        said.append(
+            f"The filter smooths the sign of the velocity over {significant(estimate.width)} of the"
+            " device's `sign_width`, which makes the readings likelier."
+        )
+    if names:
+        said.append(
+            f"Most of the uncertainty of {join_names(names, _SHOWN)} is that the sign of the"
+            " velocity is smoothed, where a machine stands still."
+        )
+    return tuple(said)

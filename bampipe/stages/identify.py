@@ -120,8 +120,8 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     require_sound_motions(system, motions)
     width = _choose_width(run, system, config)
     if width is not None:
-        narrowed = read_recipe(run, config.model, model).with_sign_widths(width.factor)
-        system = compile_model(narrowed.model())
+        chosen_recipe = read_recipe(run, config.model, model).with_sign_widths(width.factor)
+        system = compile_model(chosen_recipe.model())
     sensors, kinematics = read_sensors(run, system), read_kinematics(run, system)
     band = read_band(run, system)
     timing = config.input_timing and not system.has_free_delay
@@ -147,6 +147,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
             where=str(run.root),
             remedy="record faster motion at a higher rate, or more of it",
         )
+
     squares = UnbiasedFit(raw, raw.p, None, problem)
     if config.remove_bias:
         squares = remove_bias(sensors, kinematics, system, motions, problem, raw)
@@ -169,10 +170,25 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
             system, motions, raw_trials, squares, folds, progress, most_samples
         )
 
+    recipe = read_recipe(run, config.model, system.model)
+
+    def narrowed(factor: float) -> System:
+        return compile_model(recipe.with_sign_widths(factor).model())
+
     if method in ("auto", "ukf"):
         try:
             by_filter = estimate_by_filter(
-                run, system, motions, start, squares, noise, config, folds, config.model, progress
+                run,
+                system,
+                narrowed,
+                motions,
+                start,
+                squares,
+                noise,
+                config,
+                folds,
+                config.model,
+                progress,
             )
             estimates.append(by_filter)
         except MotionLost as error:
@@ -200,7 +216,6 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
                 chosen = choose(system, judged)
     if method == "auto":
         chosen = prefer_steady(system, judged, chosen)
-    recipe = read_recipe(run, config.model, system.model)
     estimate = with_smoothing(widen(system, judged, chosen, squares), recipe)
     if estimate.method == "least-squares":
         if config.remove_bias and squares.bias is None:
