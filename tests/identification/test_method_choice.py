@@ -59,7 +59,15 @@ def test_machines_that_stand_still_are_published_right(tmp_path, machine, seed):
     assert all(a["estimate"] == "accepted" for a in result(run, "validate")["axes"].values())
 
 
-def judged(method, error, value, *doubts, sd=0.1):
+FORCE = SimpleNamespace(name="stribeck.slide.force", strength=True, shape=False, lower=0.0)
+SLIDE = SimpleNamespace(
+    coordinates=("slide",), undriven=(), parameters=(FORCE,),
+    model=SimpleNamespace(effects=(SimpleNamespace(parameters=(FORCE,)),)),
+)  # fmt: skip
+"""A model of one parameter, the strength of an effect."""
+
+
+def judged(method, error, value, *doubts, sd=0.1, bias=0.0):
     """One parameter by one method, and its held-out error."""
     one = np.ones(1)
     problem = Problem(
@@ -68,8 +76,8 @@ def judged(method, error, value, *doubts, sd=0.1):
     )  # fmt: skip
     return Judged(
         Estimate(
-            method, np.array([value, 0.0]), problem, np.array([[sd**2]]), one > 2.0, (), doubts, (),
-            {}, lambda: None,
+            method, np.array([value, 0.0]), problem, np.array([[sd**2]]), one > 2.0, (), doubts,
+            ({"least_squares_bias": bias},), {}, lambda: None,
         ),
         error * one,
     )  # fmt: skip
@@ -88,9 +96,23 @@ def judged(method, error, value, *doubts, sd=0.1):
     ],
 )
 def test_the_filter_is_published_where_it_predicts_as_well(filtered, squares, published):
-    system = SimpleNamespace(coordinates=("slide",), undriven=())
     both = [judged("ukf", *filtered), judged("least-squares", *squares)]
-    assert choose(system, both) == published
+    assert choose(SLIDE, both) == published
+
+
+@pytest.mark.parametrize(
+    ("sd", "bias", "published"),
+    [
+        (0.1, 0.3, 1),
+        (0.1, 3.0, 0),  # more than half of it is a correction
+        (4.0, 0.3, 0),  # uncertain by its own size
+    ],
+)
+def test_an_effect_that_least_squares_leave_open_does_not_speak_against_the_filter(
+    sd, bias, published
+):
+    both = [judged("ukf", 1.1, 15.0), judged("least-squares", 1.0, 5.0, sd=sd, bias=bias)]
+    assert choose(SLIDE, both) == published
 
 
 @pytest.mark.parametrize(
@@ -103,12 +125,11 @@ def test_the_filter_is_published_where_it_predicts_as_well(filtered, squares, pu
     ],
 )
 def test_a_filter_that_scatters_is_not_the_more_precise(scattered, error, doubts, published):
-    system = SimpleNamespace(coordinates=("slide",), undriven=())
     both = [
         judged("ukf", 1.0, 5.0, sd=scattered), judged("least-squares", error, 5.0, *doubts)
     ]  # fmt: skip
-    assert choose(system, both) == 0
-    assert prefer_steady(system, both, 0) == published
+    assert choose(SLIDE, both) == 0
+    assert prefer_steady(SLIDE, both, 0) == published
 
 
 def test_after_one_reversal_threw_the_filter_off_least_squares_are_published(tmp_path):

@@ -105,8 +105,10 @@ def test_what_a_trial_told_the_filter_is_taken_off_without_running_it_again(tmp_
     run = simulated_run(tmp_path / "all", trials=3, seconds=6.0)
     by_count: dict[int, Estimate] = {}
 
-    def noting(run: object, system: object, motions: Sequence[object], *rest: object) -> Estimate:
-        by_count[len(motions)] = original(run, system, motions, *rest)
+    def noting(
+        run: object, system: object, narrowed: object, motions: Sequence[object], *rest: object
+    ) -> Estimate:
+        by_count[len(motions)] = original(run, system, narrowed, motions, *rest)
         return by_count[len(motions)]
 
     original = identify.estimate_by_filter
