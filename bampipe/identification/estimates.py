@@ -69,6 +69,8 @@ class Estimate:
             estimates, (n,), nothing where they make the readings less likely; None for a method
             that does not say.
         width: with which the method smooths the sign of a velocity, times the model's.
+        spread: (n,) how far the estimates move between widths that are nearly as likely; None
+            where only one was asked.
     """
 
     method: Method
@@ -83,6 +85,7 @@ class Estimate:
     tabulate: Callable[[], tuple[pd.DataFrame, pd.DataFrame]]
     moved_by: Callable[[System], Array] | None = None
     width: float = 1.0
+    spread: Array | None = None
 
     @property
     def evidence(self) -> dict[str, Any]:

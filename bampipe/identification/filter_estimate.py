@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,7 +71,7 @@ _REPEATS, _AROUND = 4, 10.0
 _PARTS, _LIKELIER = (1, 2, 4), 30.0
 """By what the Runge-Kutta step is divided for it, and what that must add to the logarithm of a
 trial's likelihood: three times what it adds where friction is smooth on the scale of a step."""
-_NARROWER = (0.25, 0.0625)
+_NARROWER = (0.5, 0.25, 0.0625)
 """Widths of the smoothed sign, times the device's, that are tried."""
 _MOVED_TRIALS, _MOVED_SAMPLES = 5, 10_000
 """Trials, and samples of all, by which other equations move the answer or make it likelier."""
@@ -195,15 +195,21 @@ def estimate_by_filter(
         )  # fmt: skip
 
     found = run_from(attempts, settings)
-    width, finer = 1.0, settings
-    if not system.model.device.prescribed:
-        width, finer = _choose_width(found, model, trials, narrowed)
-    if width < 1.0:
-        model = _with_equations(model, narrowed(width))
-        found = _repeat_until_settled(found, model, finer, run_from)
-    elif nonlinear:
+    if nonlinear:
         finer = _choose_longest_step(found, model, trials[0])
         found = _repeat_until_settled(found, model, finer, run_from)
+    width = Width(1.0, found.settings, np.zeros(count))
+    declared = model
+    if not system.model.device.prescribed:
+        width = _choose_width(found, model, trials, narrowed, choice.longest_step_s)
+    if width.factor < 1.0:
+        model = _with_equations(declared, narrowed(width.factor))
+        narrower = _repeat_until_settled(found, model, width.settings, run_from)
+        # A narrow sign may throw the filter off at one reversal of many.
+        if likelier(found, narrower) is found:
+            width, model = Width(1.0, found.settings, np.zeros(count)), declared
+        else:
+            found = narrower
     covariance, blocks = sandwich_covariance(
         found.ends, model.n_states, found.search_theta, found.search_covariance
     )
@@ -244,7 +250,8 @@ def estimate_by_filter(
             tabulate_trace(names, model, motions, found, choice.trace_rows),
         ),
         moved_by=lambda other: _moved_by(other, found, model, trials)[:count],
-        width=width,
+        width=width.factor,
+        spread=width.spread[:count],
     )
 
 
@@ -321,43 +328,63 @@ def _moved_by(
     return np.zeros(model.free.size)
 
 
+@dataclass(frozen=True)
+class Width:
+    """Over which width the filter smooths the sign of a velocity.
+
+    Attributes:
+        factor: times the device's; settings: of the filter, with the Runge-Kutta step that suits.
+        spread: (n,) how far parameters move between the widths and steps that are nearly as likely.
+    """
+
+    factor: float
+    settings: FilterSettings
+    spread: Array
+
+
 def _choose_width(
     found: FilterRun,
     model: FilterModel,
     trials: Sequence[Trial],
     narrowed: Callable[[float], System],
-) -> tuple[float, FilterSettings]:
-    """Return the width of the smoothed sign, times the device's, that makes readings likeliest.
+    step: float,
+) -> Width:
+    """Return the width of the smoothed sign that makes readings likeliest, with its step.
 
     Friction that stops a machine changes over less than the device says it does, and estimates err
-    in proportion to the rest. Each width has the Runge-Kutta step that suits it, with the settings
-    of which it is returned; the declared width where no narrower one is likelier.
-    """
-    part, spread = _some_of(trials, found)
-    step = found.settings.longest_step
+    in proportion to the rest. The declared width stays where no narrower one is likelier.
 
-    def likelihoods(width: float, parts: Sequence[int]) -> dict[tuple[float, int], float]:
+    Args:
+        found: with the declared width; model: the model of that; trials: all of them.
+        narrowed: the system by its width, times the device's; step: the longest step, s.
+    """
+    part, around = _some_of(trials, found)
+    tried: dict[tuple[float, int], tuple[float, Array]] = {}
+
+    def best(width: float, parts: Sequence[int]) -> float:
         theirs = model if width == 1.0 else _with_equations(model, narrowed(width))
-        tried = {}
         for by in parts:
             settings = replace(found.settings, longest_step=step / by)
             with suppress(FilterFailure):
-                filtered = filter_trials(theirs, part, found.theta, spread, settings)
-                tried[width, by] = sum(
-                    float(np.nansum(one.log_likelihood)) for one in filtered.trials
-                )
-        return tried
+                filtered = filter_trials(theirs, part, found.theta, around, settings)
+                likely = sum(float(np.nansum(one.log_likelihood)) for one in filtered.trials)
+                tried[width, by] = likely, model.to_physical(filtered.theta)[0]
+        return max((one for (each, _), (one, _) in tried.items() if each == width), default=-np.inf)
 
     ends = (_PARTS[0], _PARTS[-1])
-    declared = likelihoods(1.0, ends)
-    narrow = likelihoods(_NARROWER[0], ends)
-    if not narrow or max(narrow.values()) < max(declared.values(), default=0.0) + _LIKELIER:
-        return 1.0, found.settings
-    for width in _NARROWER:
-        narrow |= likelihoods(width, _PARTS)
-    enough = max(narrow.values()) - _LIKELIER
-    width, by = min((key for key, likely in narrow.items() if likely > enough), key=lambda k: k[1])
-    return width, replace(found.settings, longest_step=step / by)
+    declared = best(1.0, ends)
+    if max(best(width, ends) for width in _NARROWER[:2]) < declared + _LIKELIER:
+        return Width(1.0, found.settings, np.zeros(model.free.size))
+    most = max(best(width, _PARTS) for width in _NARROWER)
+    chosen = min(
+        (key for key, (likely, _) in tried.items() if likely > most - _LIKELIER),
+        key=lambda key: key[1],
+    )
+    near = [
+        value for likely, value in tried.values() if likely - declared > 0.5 * (most - declared)
+    ]
+    spread = np.max(np.abs(np.array(near) - tried[chosen][1]), axis=0)
+    return Width(chosen[0], replace(found.settings, longest_step=step / chosen[1]), spread)
 
 
 def _doubts(
@@ -430,7 +457,9 @@ def _repeat_until_settled(
             again = run_from([(value, _AROUND * slope * sd, 1.0)], settings)
         except MotionLost:
             break
-        again = replace(again, restarts=found.restarts, repeats=repeats, first=found.passes)
+        again = replace(
+            again, restarts=found.restarts, repeats=repeats, first=found.first or found.passes
+        )
         if np.all(np.abs(again.theta - last.theta) < sd):
             return again
         best, last = likelier(best, again), again

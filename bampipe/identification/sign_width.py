@@ -24,8 +24,9 @@ def with_smoothing(estimate: Estimate, recipe: Recipe) -> Estimate:
     A machine with dry friction truly stands still, where the model creeps within the width of its
     smoothed sign. An estimate by the filter or by output error errs in proportion to that width:
     it is off by twice what half the width that it took moves it. A machine that does creep shows
-    that by readings that the narrower sign comes less close to. Least squares leaves standstill out
-    and takes the rest off as bias.
+    that by readings that the narrower sign comes less close to. What widths that are nearly as
+    likely disagree on is as uncertain. Least squares leaves standstill out and takes the rest off
+    as bias.
 
     Args:
         estimate: as published; recipe: its model as data.
@@ -34,11 +35,12 @@ def with_smoothing(estimate: Estimate, recipe: Recipe) -> Estimate:
         return estimate
     narrower = compile_model(recipe.with_sign_widths(_NARROWER * estimate.width).model())
     off = estimate.moved_by(narrower) / (1.0 - _NARROWER)
+    spread = np.zeros(len(off)) if estimate.spread is None else estimate.spread
     details = [
         {**entry, "smoothing_sd": size}
-        for entry, size in zip(estimate.details, np.abs(off), strict=True)
+        for entry, size in zip(estimate.details, np.hypot(off, spread), strict=True)
     ]
-    covariance = estimate.covariance + np.outer(off, off)
+    covariance = estimate.covariance + np.outer(off, off) + np.diag(spread**2)
     return replace(estimate, covariance=covariance, details=details)
 
 
