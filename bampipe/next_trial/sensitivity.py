@@ -131,10 +131,27 @@ def weigh_visibility(contest: Contest, sums: Sums, bar: Bar) -> list[Visibility]
     late = contest.timing_of(sums)
     return [
         one
-        if other.factor >= one.factor
-        else replace(other, factor=min(one.factor, max(other.factor, contest.timing_s / late_s)))
+        if other.factor >= one.factor or one.factor * late_s <= contest.timing_s
+        else replace(
+            other, factor=beyond_timing(one.factor, other.factor, contest.timing_s / late_s)
+        )
         for one, other, late_s in zip(found, sharp, np.maximum(late, 1e-300), strict=True)
     ]
+
+
+def beyond_timing(free: float, sharp: float, most: float) -> float:
+    """The factor at which an effect shows whose imitation by the timing ends at ``most``.
+
+    What shows goes with the square of the strength: of the whole effect what no timing imitates,
+    and of the strength beyond ``most`` the rest as well.
+
+    Args:
+        free, sharp: factors at which it shows with a timing without limits, and without any.
+    """
+    alone = 1.0 / free**2
+    rest = 1.0 / sharp**2 - alone
+    root = np.sqrt(alone + rest - alone * rest * most**2)
+    return float((rest * most + root) / (alone + rest))
 
 
 def _weigh(contest: Contest, sums: Sums, bar: Bar) -> list[Visibility]:

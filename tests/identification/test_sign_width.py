@@ -46,19 +46,21 @@ def identified(root, **conditions) -> tuple[IdentifyResult, dict[str, float]]:
 
 @pytest.mark.long
 def test_intervals_hold_friction_that_truly_stops_the_arm(tmp_path) -> None:
+    """At the declared width the force was 6 % off, and eight standard deviations of white noise."""
     result, truth = identified(tmp_path, creep=False)
     found = {name: result.parameters[name] for name in truth}
-    off = {name: abs(entry.estimate - truth[name]) for name, entry in found.items()}
-    without = {n: np.sqrt(e.sd**2 - e.smoothing_sd**2) for n, e in found.items()}
-    assert max(off[n] / without[n] for n in off) > 4.0, off
-    assert max(off[n] / found[n].sd for n in off) < 3.0, off
+    for name, entry in found.items():
+        assert abs(entry.estimate - truth[name]) < 3.0 * entry.sd, name
     force = found["stribeck.yaw.force"]
+    assert force.estimate == pytest.approx(truth["stribeck.yaw.force"], rel=0.02)
     assert force.smoothing_sd > 0.5 * force.sd
     at = result.covariance.names.index("stribeck.yaw.force")
     assert force.sd == np.sqrt(result.covariance.matrix[at][at])
-    assert any("`stribeck.yaw.force`" in note and "`sign_width`" in note for note in result.notes)
+    assert any(note.startswith("The filter smooths the sign") for note in result.notes)
+    assert any("`stribeck.yaw.force`" in note and "stands still" in note for note in result.notes)
 
 
 def test_an_arm_that_creeps_as_the_model_does_has_nothing_added(tmp_path) -> None:
     result, _ = identified(tmp_path, creep=True)
     assert all(entry.smoothing_sd == 0.0 for entry in result.parameters.values())
+    assert not any("smooths the sign" in note for note in result.notes)

@@ -32,6 +32,7 @@ from bampipe.next_trial.primitives import (
     vary_surroundings,
 )
 from bampipe.next_trial.reasons import explain_proposal, find_shown
+from bampipe.next_trial.sensitivity import beyond_timing
 from bampipe.next_trial.words import describe
 from bampipe.physics import Model, compile_model, registry
 from bampipe.results.forecast import compare_forecast, read_forecasts
@@ -708,3 +709,13 @@ def test_confusion_falls_with_what_the_wrong_one_leaves():
     assert chances[0] == 0.5
     assert chances == sorted(chances, reverse=True)
     assert chances[-1] < 0.01
+
+
+def test_what_the_timing_imitates_up_to_its_limit_shows_beyond_it():
+    """A pure delay shows by what is beyond the limit; one that no timing imitates, as it is."""
+    assert beyond_timing(1e9, 0.1, 2.0) == pytest.approx(2.1)
+    assert beyond_timing(3.0, 0.5, 0.0) == pytest.approx(0.5)
+    assert beyond_timing(3.0, 0.5, 3.0) == pytest.approx(3.0)
+    part = beyond_timing(3.0, 0.5, 1.0)
+    whole, rest = 1.0 / 3.0**2, 1.0 / 0.5**2 - 1.0 / 3.0**2
+    assert part**2 * whole + (part - 1.0) ** 2 * rest == pytest.approx(1.0)
