@@ -36,6 +36,8 @@ _SCATTERED = 1.3
 """Standard deviations of the filter over those of least squares, from which on least squares are
 published. In eight of 46 identifications of a joint they were: there the filter's true errors were
 1.6 to 32 times those of least squares (docs/identification.md)."""
+_UNSURE = 3.0
+"""The same with what the width of the smoothed sign leaves open."""
 _BIASED = 0.5
 """Bias of least squares over what is left, from which on it is an extrapolation."""
 _APART = 2.0
@@ -120,14 +122,17 @@ def choose(system: System, judged: Sequence[Judged]) -> int:
 def prefer_steady(system: System, judged: Sequence[Judged], chosen: int) -> int:
     """Return least squares' index where the filter was chosen and they scatter far less, else it.
 
-    A filter that a single reversal has thrown off scatters from block to block, and is not the
-    more precise.
+    A filter that a single reversal has thrown off scatters from block to block, and one whose
+    answer hangs on how friction changes its sign is unsure; neither is the more precise.
     """
     published = judged[chosen].estimate
     for k in _good(system, judged)[0]:
         other = judged[k].estimate
         rivals = (published.method, other.method) == ("ukf", "least-squares")
-        if rivals and not other.doubts and _looser(published, other) > _SCATTERED:
+        if not rivals or other.doubts:
+            continue
+        scatters = _looser(published, other, smoothing=False) > _SCATTERED
+        if scatters or _looser(published, other, smoothing=True) > _UNSURE:
             return k
     return chosen
 
@@ -146,11 +151,18 @@ def _good(system: System, judged: Sequence[Judged]) -> tuple[list[int], int]:
     return sorted(good, key=lambda k: bool(judged[k].estimate.doubts)), least
 
 
-def _looser(one: Estimate, other: Estimate) -> float:
-    """Return how many times the standard deviations of one are those of another, typically."""
+def _looser(one: Estimate, other: Estimate, smoothing: bool) -> float:
+    """Return how many times the standard deviations of one are those of another, typically.
+
+    Args:
+        smoothing: whether what the width of the smoothed sign leaves open counts as well.
+    """
     least = np.finfo(float).tiny
-    ratio = np.maximum(one.sd, least) / np.maximum(other.sd, least)
-    return float(np.exp(np.mean(np.log(ratio))))
+    known = np.zeros(len(one.sd))
+    if not smoothing and one.details:
+        known = np.array([entry.get("smoothing_sd", 0.0) for entry in one.details])
+    sd = np.sqrt(np.maximum(one.sd**2 - known**2, least))
+    return float(np.exp(np.mean(np.log(sd / np.maximum(other.sd, least)))))
 
 
 def _apart(one: Estimate, other: Estimate) -> NDArray[np.bool_]:

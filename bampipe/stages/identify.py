@@ -199,7 +199,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         progress(0.3, "output error")
         estimates.append(by_output_error(None))
     estimates.append(estimate_by_least_squares(system, motions, squares, folds))
-    judged = [judge(squares, folds, estimate) for estimate in estimates]
+    judged = [judge(squares, folds, with_smoothing(estimate, recipe)) for estimate in estimates]
     chosen = choose(system, judged) if method == "auto" else 0
     moved_by_force = not system.model.device.prescribed
     if method == "auto" and estimates[chosen].method != "ukf" and moved_by_force:
@@ -212,11 +212,12 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
             notes.append(_NOT_SIMULATED)
         else:
             with suppress(InputError):
-                judged.append(judge(squares, folds, by_output_error(_MOST_SAMPLES)))
+                third = with_smoothing(by_output_error(_MOST_SAMPLES), recipe)
+                judged.append(judge(squares, folds, third))
                 chosen = choose(system, judged)
     if method == "auto":
         chosen = prefer_steady(system, judged, chosen)
-    estimate = with_smoothing(widen(system, judged, chosen, squares), recipe)
+    estimate = widen(system, judged, chosen, squares)
     if estimate.method == "least-squares":
         if config.remove_bias and squares.bias is None:
             notes.append(

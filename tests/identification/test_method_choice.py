@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -129,6 +130,18 @@ def test_a_filter_that_scatters_is_not_the_more_precise(scattered, error, doubts
         judged("ukf", 1.0, 5.0, sd=scattered), judged("least-squares", error, 5.0, *doubts)
     ]  # fmt: skip
     assert choose(SLIDE, both) == 0
+    assert prefer_steady(SLIDE, both, 0) == published
+
+
+@pytest.mark.parametrize(("smoothing", "published"), [(0.25, 0), (0.5, 1)])
+def test_a_filter_that_hangs_on_how_friction_changes_its_sign_is_not_the_more_precise(
+    smoothing, published
+):
+    unsure = judged("ukf", 1.0, 5.0, sd=np.hypot(0.1, smoothing))
+    unsure = replace(
+        unsure, estimate=replace(unsure.estimate, details=({"smoothing_sd": smoothing},))
+    )
+    both = [unsure, judged("least-squares", 1.0, 5.0)]
     assert prefer_steady(SLIDE, both, 0) == published
 
 
