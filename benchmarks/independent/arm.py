@@ -209,7 +209,7 @@ def hide(arm: Arm, effects: Mapping[str, float], rng: np.random.Generator) -> No
         size = strength * rng.uniform(0.85, 1.15)
         dry, wet = (float(values[arm.names.index(first)]) for values in (arm.coulomb, arm.viscous))
         arm.hidden[full] = {
-            "actuator_delay": {"delay": 0.015 * size},
+            "actuator_delay": {"delay": 0.015 * size},  # below zero, it is logged late
             "drive_offset": {"bias": 1.2 * dry * size},
             "return_spring": {"stiffness": 1.5 * dry * size, "offset": 0.5 * dry * size},
             "cable": {"pull": 1.2 * dry * size, "taut_at": 0.3, "width": 0.1},
