@@ -58,3 +58,17 @@ def test_joints_that_stick_are_held_against_replays_that_do(tmp_path: Path) -> N
     found = read_json(run.path("models/base/validate.json"))
     assert {entry["standing"] for entry in found["axes"].values()} == {"at_floor"}
     assert any("stand still where the motion turns" in note for note in found["notes"])
+
+
+@pytest.mark.long
+def test_friction_that_comes_up_gradually_has_one_name_a_joint(tmp_path: Path) -> None:
+    """Without that name, each joint had two others."""
+    run = run_arm(tmp_path, 35, "ZY", {}, creep=0.05)
+    bampipe.diagnose(run.root)
+    found = read_json(run.path("models/base/diagnose.json"))
+    assert set(found["selected"]) == {
+        f"gradual_friction:{joint}" for joint in ("base_yaw", "shoulder")
+    }
+    for entry in found["ranking"][:2]:
+        (speed,) = (v for name, v in entry["parameters"].items() if name.endswith("speed"))
+        assert speed == pytest.approx(0.05, rel=0.1)
