@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 import tempfile
 import tomllib
 from pathlib import Path
@@ -75,7 +76,7 @@ def main() -> None:
         first, kinds, style, effects = CASES[case]
         how = STICKING if first in SOFT_HZ else {"noise": given.noise}
         for seed in range(first, first + 100 * given.seeds, 100):
-            folder = given.out / f"{case.replace(' ', '_').replace(',', '')}_{seed}"
+            folder = given.out / f"{re.sub(r'[:,]', '', case).replace(' ', '_')}_{seed}"
             turned = ["shoulder"] if seed % 2 else []
             arm.record_logs(
                 folder, seed, kinds, effects, style=style, turned=turned,

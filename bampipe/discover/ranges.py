@@ -35,8 +35,10 @@ _PARTS = {"travel": (0.02, 0.98), "upper half": (0.5, 0.98), "lower half": (0.02
 _RESONANCE = 3.0
 """Of the highest frequency of the band: what rings beyond leaves a tenth of its force in the band,
 which a late sample or a filter leaves as well."""
-_DELAY = 0.2
-"""In samples: both sides of the equation are filtered alike, so that less than one shows."""
+_DELAY, _DELAY_OF_ONE = 0.2, 0.5
+"""In samples: both sides of the equation are filtered alike, so that less than one shows; of one
+drive among several, friction that stops its joint looks late by less than half a sample, as the
+timing of all of them does."""
 
 
 @dataclass(frozen=True)
@@ -125,8 +127,9 @@ class MachineScale:
         """Ranges of lengths, speeds and the like at the target of an effect, by unit."""
         found = {"s": (_TIME[0] * self.interval, _TIME[1] * self.duration)}
         if parameter.strength:
-            delayed = item.effect.kind == "input"
-            found["s"] = (_DELAY * self.interval if delayed else 0.0, np.inf)
+            one = item.effect.scope == "force_component" and len(self.coordinates) > 1
+            least = _DELAY_OF_ONE if one else _DELAY
+            found["s"] = (least * self.interval if item.effect.kind == "input" else 0.0, np.inf)
         if not item.axes:
             return found
         i, (unit, force) = (

@@ -30,6 +30,7 @@ from bampipe.proposal.starter import starter_device
 from bampipe.proposal.starter_input import Drive
 
 DEVICE = "device.toml"
+_SCHEMA = "bampipe.device/1"
 _MAY_SLIDE = " (no unit says that it slides: if it does, bampipe init FOLDER --device slider)"
 _HEAD_BYTES = 4096
 """Of a file that cannot be read whole, in which its first element is looked for."""
@@ -64,7 +65,9 @@ def find_device(folder: Path, found: Survey, wanted: str) -> ChosenDevice | None
         return ChosenDevice(wanted, registry.device(wanted))
     for path in sorted(folder.glob("*.toml")):
         content = read_toml(path)
-        if content.get("schema") == "bampipe.device/1":
+        # That of a robot may be three lines without a schema.
+        schema = content.get("schema", _SCHEMA if "robot" in content else "")
+        if schema == _SCHEMA:
             device = registry.device_from(read_device_file(path), str(path))
             return ChosenDevice(path.name, device)
     return _robot(folder, found) or _built_in(found)
@@ -117,10 +120,7 @@ def _robot(folder: Path, found: Survey) -> ChosenDevice | None:
             where=str(folder),
             remedy="leave the one of the logs",
         )
-    text = (
-        f'schema = "bampipe.device/1"\nname = "{urdfs[0].stem}"\n\n'
-        f'[robot]\nurdf = "{urdfs[0].name}"\n'
-    )
+    text = f'schema = "{_SCHEMA}"\nname = "{urdfs[0].stem}"\n\n[robot]\nurdf = "{urdfs[0].name}"\n'
     try:
         device = _complete(folder, text)
     except Branches as error:
@@ -160,7 +160,7 @@ def with_motors(
     uncertainty = robot.uncertainty if robot is not None else 0.0
     text = chosen.text.partition("\n[robot.motors")[0]
     for joint, (turns, constant) in motors.items():
-        text += f"\n[robot.motors.{joint}]\nturns = {{ {joint} = {turns:.3g} }}"
+        text += f"\n[robot.motors.{joint}]\nturns = {{ {joint} = {turns:.4g} }}"
         text += "" if turns == 1.0 else "  # guess: by the drawn bodies; put in that of the gear"
         if constant is not None:
             gears = ", gears included" if turns == 1.0 else ""

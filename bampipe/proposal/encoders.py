@@ -98,7 +98,7 @@ def _counting(axis: Coordinate, said: str, match: Matcher, turns: float = 1.0) -
     direction, zero = match.counting.get(axis.name, (1.0, 0.0))
     fields, ways = "", []
     if direction * turns != 1.0:
-        fields = f", gear_ratio = {direction * turns:.4g}"
+        fields = f", gear_ratio = {direction * turns:.10g}"
     if direction < 0.0:
         ways.append("counts the other way than the drawing")
     if zero:

@@ -30,6 +30,8 @@ Array = NDArray[np.float64]
 
 BEYOND = 1.5
 """Times its range that a joint must travel for the position to be another's."""
+DOUBTED = 0.01
+"""Of the drives' variance: what other units and zeros are tried from."""
 _MARGINS = (1.05, 1.4, 2.0)
 """Of its range over what a motor travels: how much of its range a joint is thought to use."""
 _DRAWN = 0.05
@@ -53,6 +55,31 @@ class Gears:
     ratio: Array
     counting: Counting
     drives: list[Drive]
+
+
+def known_gears(
+    device: Device, robot: Robot, positions: Group, drives: Group, t: Array, turns: Array
+) -> Gears | None:
+    """Positions on the side of motors whose ``turns`` for one of the joint, (n,), are known.
+
+    None where they leave a joint beyond its range, or the log is incomplete.
+    """
+    q = positions_of(device, positions, t)
+    widths = np.array([range_of(device, c.name) for c in device.coordinates])
+    if (np.ptp(q / turns, axis=0) > BEYOND * widths).any():
+        return None
+    few, many = (motion_along(q / turns, t, rows) for rows in (FEW_ROWS, MOST_ROWS))
+    if few is None or many is None:
+        return None
+    counting = Counting.as_drawn(len(turns))
+    judged = hold(device, robot, many, drives, turns)
+    if max(drive.left for drive in judged) >= DOUBTED:
+        left = left_by(device, robot, few, drives, turns)
+        counting = find_counting([c.unit == "rad" for c in device.coordinates], left)
+        motion = many.counted(counting.direction, counting.zero)
+        judged = hold(device, robot, motion, drives, turns)
+    counting = Counting(counting.direction * np.sign(turns), counting.zero)
+    return Gears(np.abs(turns), counting, judged)
 
 
 def find_gears(

@@ -25,7 +25,7 @@ from bampipe.proposal.drawing import (
     positions_of,
     range_of,
 )
-from bampipe.proposal.gears import BEYOND, Gears, find_gears
+from bampipe.proposal.gears import BEYOND, DOUBTED, Gears, find_gears, known_gears
 from bampipe.proposal.joints import Group, pair_joints
 from bampipe.proposal.notes import Notes
 from bampipe.proposal.positions import scale_to
@@ -36,8 +36,10 @@ LEAST_AT_JOINT = 1.0 / 3.0
 """Share of what the drawing requires below which a torque is that of a motor."""
 _BETTER = 0.5
 """Of what one order of the joints leaves unexplained: another one must leave less."""
-_DOUBTED = 0.01
-"""The same: what positions leave whose unit is guessed, before those of motors are tried."""
+PUT_IN = (
+    "put those of the gears into [robot.motors] of the device file, take session.toml away, and run"
+    " `bampipe init` again, which takes them from there"
+)
 _OTHER_UNITS = {"rad": ("deg", np.pi / 180.0), "m": ("mm", 1e-3)}
 
 
@@ -97,11 +99,21 @@ def find_robot_columns(
     if positions is None or drives is None:
         return RobotColumns(columns, {})
     judged = _judge(device, robot, positions, drives, t)
-    beyond = _beyondrange_of(device, positions, of_joint=bool(judged) and fits(judged))
-    guessed = (
-        positions is not pairing.positions[0] and bool(judged) and mean_left(judged) > _DOUBTED
-    )
-    if judged and not robot.motors and (guessed or not fits(judged)):
+    sound = bool(judged) and fits(judged)
+    beyond = _beyondrange_of(device, positions, of_joint=sound)
+    guessed = positions is not pairing.positions[0] and bool(judged) and mean_left(judged) > DOUBTED
+    turns = _turns(device, robot)
+    if turns is not None and (turns != 1.0).any() and (beyond or not sound):
+        of_motors = [
+            (group, known)
+            for group in (positions, _in_si(device, pairing.positions[0]))
+            if (known := known_gears(device, robot, group, drives, t, turns)) is not None
+        ]
+        if of_motors:
+            group, gears = min(of_motors, key=lambda item: mean_left(item[1].drives))
+            if beyond or mean_left(gears.drives) < mean_left(judged):
+                return _geared(device, columns, group, gears, notes, given=True)
+    if judged and not robot.motors and (guessed or not sound):
         # Hundreds without a unit are degrees, or radians of a motor.
         geared = [
             (group, fitted)
@@ -110,10 +122,10 @@ def find_robot_columns(
         ]
         if geared:
             group, gears = min(geared, key=lambda item: mean_left(item[1].drives))
-            if not fits(judged) or mean_left(gears.drives) < _BETTER * mean_left(judged):
+            if not sound or mean_left(gears.drives) < _BETTER * mean_left(judged):
                 return _geared(device, columns, group, gears, notes)
     notes.check += beyond
-    if not judged or (beyond and not fits(judged)):
+    if not judged or (beyond and not sound):
         return RobotColumns(columns, {})
     if not (positions.named or drives.named):
         other = _in_alphabetical_order(device, positions), _in_alphabetical_order(device, drives)
@@ -148,7 +160,7 @@ def _counted(
     if few is None or many is None or ratio is None:
         return counting.by_joint, judged
 
-    if max(drive.left for drive in judged) < _DOUBTED:
+    if max(drive.left for drive in judged) < DOUBTED:
         return counting.by_joint, judged
     left = left_by(device, robot, few, drives, ratio)
     counting = find_counting([c.unit == "rad" for c in device.coordinates], left)
@@ -164,15 +176,20 @@ def _geared(
     positions: Group,
     found: Gears,
     notes: Notes,
+    given: bool = False,
 ) -> RobotColumns:
-    """The columns of a log on the side of the motors."""
+    """The columns of a log on the side of the motors, whose turns may be ``given``."""
     joints = _joints(device)
     paired = {**columns, **dict(zip(joints, positions.columns, strict=True))}
-    gears = {j: float(r) for j, r in zip(joints, found.ratio, strict=True) if r != 1.0}
-    listed = ", ".join(f"{joint} {turns:.3g}" for joint, turns in gears.items())
+    ratio = [float(r) if given else float(f"{r:.4g}") for r in found.ratio]
+    gears = {joint: r for joint, r in zip(joints, ratio, strict=True) if r != 1.0}
+    listed = ", ".join(f"{joint} {turns:g}" for joint, turns in gears.items())
     notes.check.append(
-        "positions are those of motors, by weight and inertia as drawn with these turns for one of"
-        f" the joint: {listed}; put in those of the gears"
+        "positions are those of motors, which turn for one of the joint as the device file says:"
+        f" {listed}"
+        if given
+        else "positions are those of motors, by weight and inertia as drawn with these turns for"
+        f" one of the joint: {listed}; {PUT_IN}"
     )
     explained = max(0.0, 1.0 - mean_left(found.drives))
     notes.check.append(
@@ -234,7 +251,7 @@ def _beyondrange_of(device: Device, positions: Group, of_joint: bool) -> list[st
             if not of_joint:
                 why = (
                     f"a position of the motor, which turns {span / width:.3g} times for one of the"
-                    " joint or more? give gear_ratio, and [robot.motors]"
+                    f" joint or more? {PUT_IN}"
                 )
             found.append(
                 f"{column.name} travels {span:.3g} {c.unit}, and the range of {c.name} is"
@@ -259,7 +276,7 @@ def _turns(device: Device, robot: Robot) -> Array | None:
         return np.ones(len(names))
     if turned != [[name] for name in names]:
         return None
-    return np.array([abs(m.turns[n]) for m, n in zip(robot.motors.values(), names, strict=True)])
+    return np.array([m.turns[n] for m, n in zip(robot.motors.values(), names, strict=True)])
 
 
 def _sentences(

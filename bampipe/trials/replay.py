@@ -49,7 +49,8 @@ _JUMPS = 0.8
 controllers give the motion. Simulated arms along a smooth path make 0.93 to 0.99 of it, one whose
 controller acts at 250 Hz 0.07 to 0.93, two measured arms 0.01 to 0.14."""
 _LATEST = 8
-"""Samples by which a drive may act after its log says so, and its jumps stand in the log before."""
+"""Samples by which a drive may act after its log says so, or be read after it acts: its jumps then
+stand in the log before or behind those of friction."""
 _FEW_REVERSALS = 5
 FOLLOWED_HZ = 10.0
 """Highest frequency of the motion to follow where encoder and handle move apart."""
@@ -166,7 +167,7 @@ def _jumps(fitted: ModelOnTrial, u: Array) -> bool:
 
     Between two samples nothing says when they do: driven by such a log, a model would stick for as
     long as that, and be rougher than the machine. Of a drive that acts late they stand earlier in
-    the log, spread over two samples.
+    the log, of one that is read late they stand later, spread over two samples.
     """
     system, motion = fitted.system, fitted.motion
     forces = [system.inputs.index(name) for name in system.model.device.forces]
@@ -175,11 +176,11 @@ def _jumps(fitted: ModelOnTrial, u: Array) -> bool:
     turns = np.diff(np.sign(motion.qd), axis=0) != 0.0
     wanted, count = needed * turns, len(turns)
     whole = np.sum(needed * wanted, axis=0)
-    earlier = [
-        np.sum(wanted[lag:] * logged[: count - lag], axis=0) for lag in range(min(_LATEST, count))
-    ]
-    late = [first + second for first, second in pairwise(earlier[1:])]
-    made = np.max([earlier[0], *late], axis=0)
+    lags = range(1, min(_LATEST, count))
+    earlier = [np.sum(wanted[lag:] * logged[: count - lag], axis=0) for lag in lags]
+    later = [np.sum(wanted[: count - lag] * logged[lag:], axis=0) for lag in lags]
+    late = [first + second for side in (earlier, later) for first, second in pairwise(side)]
+    made = np.max([np.sum(wanted * logged, axis=0), *late], axis=0)
     known = (turns.sum(axis=0) >= _FEW_REVERSALS) & (whole > 0.0)
     return bool(known.any() and np.all(made[known] > _JUMPS * whole[known]))
 

@@ -43,6 +43,7 @@ class Arm:
         ratio: motor turns for one of the joint; rotor: inertia at the joint, kg.m2 or kg.
         viscous, coulomb: at the joint; reach: (n, 2) range, rad or m.
         effort: largest drive, N.m or N; speed: rad/s or m/s.
+        creep: speed over which dry friction comes up where nothing sticks, rad/s or m/s.
         hidden: effects by name, with the numbers that they have.
     """
 
@@ -60,6 +61,7 @@ class Arm:
     reach: Array
     effort: Array
     speed: Array
+    creep: float = CREEP
     hidden: dict[str, dict[str, float]] = field(default_factory=dict)
 
     @property
@@ -115,13 +117,13 @@ class Arm:
     def required(self, q: Array, qd: Array, qdd: Array) -> Array:
         """What the drives must give, friction and hidden effects included, (T, n)."""
         load, dry = self.carried(q, qd, qdd)
-        found = load + self.viscous * qd + dry * np.tanh(qd / CREEP)
+        found = load + self.viscous * qd + dry * np.tanh(qd / self.creep)
         for full, v in self.hidden.items():
             name, _, at = full.partition(":")
             if name == "friction_of_sum":
                 a, b = (self.names.index(joint) for joint in at.split("-"))
                 rate = qd[:, a] + qd[:, b]
-                shared = v["viscous"] * rate + v["coulomb"] * np.tanh(rate / CREEP)
+                shared = v["viscous"] * rate + v["coulomb"] * np.tanh(rate / self.creep)
                 found[:, a] += shared
                 found[:, b] += shared
         return found
@@ -209,7 +211,7 @@ def hide(arm: Arm, effects: Mapping[str, float], rng: np.random.Generator) -> No
         size = strength * rng.uniform(0.85, 1.15)
         dry, wet = (float(values[arm.names.index(first)]) for values in (arm.coulomb, arm.viscous))
         arm.hidden[full] = {
-            "actuator_delay": {"delay": 0.015 * size},
+            "actuator_delay": {"delay": 0.015 * size},  # below zero, it is logged late
             "drive_offset": {"bias": 1.2 * dry * size},
             "return_spring": {"stiffness": 1.5 * dry * size, "offset": 0.5 * dry * size},
             "cable": {"pull": 1.2 * dry * size, "taut_at": 0.3, "width": 0.1},
@@ -407,6 +409,7 @@ def record_logs(
     drawing_error: float = 0.1,
     turned: Sequence[str] = (),
     soft_hz: float = 0.0,
+    creep: float = CREEP,
 ) -> dict[str, Any]:
     """Write ``arm.urdf`` and CSV logs into ``folder``; returns the truth, written beside it.
 
@@ -419,9 +422,11 @@ def record_logs(
         turned: joints whose drive is logged with the other sign.
         soft_hz: how softly drives follow their path, natural frequency; 0 for exactly. Softly
             led joints stick where they turn round.
+        creep: as of the arm.
     """
     rng = np.random.default_rng([seed, 1])
     arm = build(kinds, seed)
+    arm.creep = creep
     hide(arm, effects or {}, np.random.default_rng([seed, 2]))
     constants = rng.uniform(5.0, 12.0, len(kinds))
     sign = np.array([-1.0 if name in turned else 1.0 for name in arm.names])

@@ -167,9 +167,9 @@ def test_a_machine_that_stands_still_is_held_against_replays_that_do(tmp_path: P
         np.testing.assert_array_equal(creeping.raised(still, far * still.level).level, level)
 
 
-@pytest.mark.parametrize("late", [0, 1.6, 3])
-def test_the_jumps_of_a_drive_that_acts_late_are_seen(late: float) -> None:
-    """A joint that turns round under a controller that gives its motion, logged before it acts."""
+@pytest.mark.parametrize("late", [0, 1.6, 3, -1.6, -3])
+def test_the_jumps_of_a_drive_that_acts_or_is_read_late_are_seen(late: float) -> None:
+    """A joint that turns round under a controller that gives its motion, logged at another time."""
     rate = 200.0
     t = np.arange(0.0, 10.0, 1.0 / rate)
     q, qd, qdd = (np.sin(3.0 * t), 3.0 * np.cos(3.0 * t), -9.0 * np.sin(3.0 * t))

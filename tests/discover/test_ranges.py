@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from sessions import BAND, bam, made
@@ -40,6 +42,14 @@ def test_a_range_follows_travel_speed_load_and_sampling(effect, parameter, low, 
     found = range_of(effect, parameter)
     assert found.by_ratio
     assert (found.low, found.high) == pytest.approx((low, high), rel=1e-9)
+
+
+def test_one_drive_of_several_is_late_by_half_a_sample_at_least():
+    """Less than that is what friction leaves where it stops a joint, and the timing of all."""
+    lag = f"actuator_lag:{registry.device('slider').components[0]}"
+    beside = replace(AXIS, coordinates={**AXIS.coordinates, "tool": ("m", "N")})
+    assert range_of(lag, "time_constant").low == pytest.approx(2e-4)
+    assert range_of(lag, "time_constant", beside).low == pytest.approx(5e-4)
 
 
 def test_a_stop_is_looked_for_in_its_half_of_the_travel():

@@ -36,15 +36,20 @@ def test_a_spring_that_the_model_lacks_carries_no_replay_away(tmp_path: Path) ->
 
 
 @pytest.mark.long
-def test_a_drive_that_is_late_is_named(tmp_path: Path) -> None:
-    run = run_arm(tmp_path, 32, "ZY", {"actuator_delay:shoulder": 1.0})
+@pytest.mark.parametrize(
+    ("seed", "strength", "effect"), [(32, 1.0, "drive_delay"), (34, -0.5, "drive_reading_delay")]
+)
+def test_a_drive_that_is_late_or_read_late_is_named(
+    tmp_path: Path, seed: int, strength: float, effect: str
+) -> None:
+    run = run_arm(tmp_path, seed, "ZY", {"actuator_delay:shoulder": strength})
     bampipe.diagnose(run.root)
     found = read_json(run.path("models/base/diagnose.json"))
-    assert found["selected"] == ["drive_delay:torque_shoulder"]
+    assert found["selected"] == [f"{effect}:torque_shoulder"]
     best = found["ranking"][0]
     truth = read_json(tmp_path / "arm.truth.json")["effects"]["actuator_delay:shoulder"]["delay"]
-    fitted = best["parameters"]["drive_delay.torque_shoulder.delay"]
-    assert fitted == pytest.approx(truth, rel=0.1)
+    fitted = best["parameters"][f"{effect}.torque_shoulder.delay"]
+    assert fitted == pytest.approx(abs(truth), rel=0.1)
 
 
 @pytest.mark.long
@@ -53,3 +58,17 @@ def test_joints_that_stick_are_held_against_replays_that_do(tmp_path: Path) -> N
     found = read_json(run.path("models/base/validate.json"))
     assert {entry["standing"] for entry in found["axes"].values()} == {"at_floor"}
     assert any("stand still where the motion turns" in note for note in found["notes"])
+
+
+@pytest.mark.long
+def test_friction_that_comes_up_gradually_has_one_name_a_joint(tmp_path: Path) -> None:
+    """Without that name, each joint had two others."""
+    run = run_arm(tmp_path, 35, "ZY", {}, creep=0.05)
+    bampipe.diagnose(run.root)
+    found = read_json(run.path("models/base/diagnose.json"))
+    assert set(found["selected"]) == {
+        f"gradual_friction:{joint}" for joint in ("base_yaw", "shoulder")
+    }
+    for entry in found["ranking"][:2]:
+        (speed,) = (v for name, v in entry["parameters"].items() if name.endswith("speed"))
+        assert speed == pytest.approx(0.05, rel=0.1)

@@ -236,6 +236,33 @@ def test_reductions_of_a_log_from_the_motors_side_follow_from_the_drawing(tmp_pa
     assert proposal.fill_in == []
 
 
+def test_reductions_of_a_device_file_beside_the_logs_are_taken(tmp_path: Path) -> None:
+    """Also of currents, of which the drawing tells no reductions, and of a motor that is turned."""
+    folder = tmp_path / "log"
+    truth = arm.record_logs(folder, 41, "ZYYX", style="motor", trials=1, drawing_error=0.1)
+    turns = [*truth["ratio"]]
+    turns[2] *= -1.0
+    table = pd.read_csv(folder / "log_01.csv")
+    table.columns = table.columns.str.replace("_nm", "_A")
+    table["act_pos_mot_deg_2"] *= (turns[1] + 0.0625) / turns[1]
+    turns[1] += 0.0625
+    for column in ("act_pos_mot_deg_3", "act_torque_mot_A_3"):
+        table[column] *= -1.0
+    table.to_csv(folder / "log_01.csv", index=False)
+    lines = ['name = "arm"', "[robot]", 'urdf = "arm.urdf"']
+    for name, ratio in zip(NAMES[:4], turns, strict=True):
+        lines += [f"[robot.motors.{name}]", f"turns = {{ {name} = {ratio} }}"]
+        lines += ["torque_constant = 1.0"]
+    (folder / "device.toml").write_text("\n".join(lines))
+    _, _, proposal = paired(folder)
+    session = read_session(folder)
+    assert [encoder.gear_ratio for encoder in session.encoders] == turns
+    assert all(encoder.zero == 0.0 for encoder in session.encoders)
+    assert all(channel.scale == 1.0 for channel in session.channels)
+    assert any("as the device file says" in line for line in proposal.check)
+    assert proposal.device == ""
+
+
 def test_radians_of_a_motor_are_not_taken_for_degrees_of_its_joint(tmp_path: Path) -> None:
     truth = arm.record_logs(tmp_path / "log", 9, "ZYY", style="motor", drawing_error=0.03)
     for path in (tmp_path / "log").glob("*.csv"):
