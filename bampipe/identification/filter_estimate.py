@@ -198,16 +198,15 @@ def estimate_by_filter(
     if nonlinear:
         finer = _choose_longest_step(found, model, trials[0])
         found = _repeat_until_settled(found, model, finer, run_from)
-    width = Width(1.0, found.settings, np.zeros(count))
-    declared = model
+    declared, width = model, None
     if not system.model.device.prescribed:
         width = _choose_width(found, model, trials, narrowed, choice.longest_step_s)
-    if width.factor < 1.0:
+    if width is not None:
         model = _with_equations(declared, narrowed(width.factor))
         narrower = _repeat_until_settled(found, model, width.settings, run_from)
         # A narrow sign may throw the filter off at one reversal of many.
         if likelier(found, narrower) is found:
-            width, model = Width(1.0, found.settings, np.zeros(count)), declared
+            model, width = declared, None
         else:
             found = narrower
     covariance, blocks = sandwich_covariance(
@@ -250,8 +249,8 @@ def estimate_by_filter(
             tabulate_trace(names, model, motions, found, choice.trace_rows),
         ),
         moved_by=lambda other: _moved_by(other, found, model, trials)[:count],
-        width=width.factor,
-        spread=width.spread[:count],
+        width=width.factor if width is not None else 1.0,
+        spread=width.spread[:count] if width is not None else None,
     )
 
 
@@ -300,8 +299,10 @@ def _some_of(trials: Sequence[Trial], found: FilterRun) -> tuple[list[Trial], Ar
     count = min(len(trials), _MOVED_TRIALS)
     places = np.linspace(0, len(trials) - 1, count).round().astype(int)
     most = (_MOVED_SAMPLES // count - 1) // stride * stride + 1
-    part = [trials[place].first(min(trials[place].t.size, most)) for place in places]
-    share = sum(trial.t.size for trial in part) / sum(trial.t.size for trial in trials)
+    whole = [trials[place] for place in places]
+    part = [trial.first(most) for trial in whole]
+    share = sum(trial.t.size for trial in part) / sum(trial.t.size for trial in whole)
+    share *= count / len(trials)
     return part, _AROUND**2 / share * np.diag(np.diag(found.covariance))
 
 
@@ -329,8 +330,8 @@ def _moved_by(
 
 
 @dataclass(frozen=True)
-class Width:
-    """Over which width the filter smooths the sign of a velocity.
+class _Width:
+    """Over which narrower width the filter smooths the sign of a velocity.
 
     Attributes:
         factor: times the device's; settings: of the filter, with the Runge-Kutta step that suits.
@@ -348,11 +349,11 @@ def _choose_width(
     trials: Sequence[Trial],
     narrowed: Callable[[float], System],
     step: float,
-) -> Width:
-    """Return the width of the smoothed sign that makes readings likeliest, with its step.
+) -> _Width | None:
+    """Return the narrower width of the smoothed sign that makes readings likeliest, with its step.
 
     Friction that stops a machine changes over less than the device says it does, and estimates err
-    in proportion to the rest. The declared width stays where no narrower one is likelier.
+    in proportion to the rest. None where no narrower width is likelier.
 
     Args:
         found: with the declared width; model: the model of that; trials: all of them.
@@ -374,7 +375,7 @@ def _choose_width(
     ends = (_PARTS[0], _PARTS[-1])
     declared = best(1.0, ends)
     if max(best(width, ends) for width in _NARROWER[:2]) < declared + _LIKELIER:
-        return Width(1.0, found.settings, np.zeros(model.free.size))
+        return None
     most = max(best(width, _PARTS) for width in _NARROWER)
     chosen = min(
         (key for key, (likely, _) in tried.items() if likely > most - _LIKELIER),
@@ -384,7 +385,7 @@ def _choose_width(
         value for likely, value in tried.values() if likely - declared > 0.5 * (most - declared)
     ]
     spread = np.max(np.abs(np.array(near) - tried[chosen][1]), axis=0)
-    return Width(chosen[0], replace(found.settings, longest_step=step / chosen[1]), spread)
+    return _Width(chosen[0], replace(found.settings, longest_step=step / chosen[1]), spread)
 
 
 def _doubts(
