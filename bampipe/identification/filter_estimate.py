@@ -374,6 +374,8 @@ def _choose_width(
 
     ends = (_PARTS[0], _PARTS[-1])
     declared = best(1.0, ends)
+    if not np.isfinite(declared):  # nothing to hold the others against
+        return None
     if max(best(width, ends) for width in _NARROWER[:2]) < declared + _LIKELIER:
         return None
     most = max(best(width, _PARTS) for width in _NARROWER)
