@@ -81,9 +81,10 @@ def added_residual(item: Candidate, p: Array, base: ModelOnTrial, z: Array | Non
         return base.system.residual(*true, base.memory, u_base, base.p) - base.residual
     if z is None:
         z = _states(item, motion, p)
-    if item.is_joint:
+    if item.is_joint and system.moves_sensors:
         return system.applied(*at, z, u, p) - system.required(*at, z, u, p) - base.residual
-    return system.contribution(*at, z, u, p)
+    added = system.contribution(*at, z, u, p)
+    return added - base.contribution if item.is_joint else added
 
 
 def _states(item: Candidate, motion: Motion, p: Array) -> Array:

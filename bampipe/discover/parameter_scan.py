@@ -201,5 +201,8 @@ def _fall_of_cost(fall: float, samples: float) -> float:
 
 def _similarity(a: Array, b: Array) -> float:
     """Cosine between two sets of columns: one where they span the same, zero where nothing."""
+    if a.shape[1] == 1:
+        size = float(np.linalg.norm(a) * np.linalg.norm(b))
+        return abs(float(a[:, 0] @ b[:, 0])) / size if size > 0.0 else 1.0
     first, second = np.linalg.qr(a)[0], np.linalg.qr(b)[0]
     return float(np.linalg.norm(first.T @ second) / np.sqrt(a.shape[1]))

@@ -9,7 +9,10 @@ import sympy as sp
 
 from bampipe.physics.codegen import SCALAR_HEADER, compiled_function, print_block, unpack
 from bampipe.physics.equations import Equations
-from bampipe.physics.system import STABLE, STIFF_STEPS
+from bampipe.physics.system import ACCURATE, STABLE, STIFF_STEPS
+
+_FEWEST = 3
+"""Exponential steps a sample where the decay of a state follows the motion."""
 
 # Positions and inputs are linear between samples, rates are not: of a motion with eight samples a
 # period a straight line takes a twentieth off the distance between them.
@@ -35,7 +38,8 @@ def memory(q, qd, qdd, u, p, t, z0, steps, out):
     """RK4 along the samples of a motion; fills out (T, n_z).
 
     Returns the largest product of a step and the rate at which a state decays in it; where that
-    asks for exponential steps, as soon as it does, with the rest of out as it was.
+    asks for exponential steps, or for more than one, as soon as it does, with the rest of out as
+    it was.
     """
     fastest = 0.0
     n = len(z0)
@@ -59,9 +63,18 @@ def memory(q, qd, qdd, u, p, t, z0, steps, out):
                 memory_rate(a, b, c, p, at, k3)
                 moved, turned = 0.0, 0.0
                 for j in range(n):
-                    at[j] = z[j] + h * k3[j]
                     moved += abs(k2[j] - k1[j])
                     turned += abs(k3[j] - k2[j])
+                    at[j] = z[j] + 0.5 * h * k3[j]
+                if COUPLED:
+                    # Of a swing, a position turns into a rate and back: twice around tells.
+                    memory_rate(a, b, c, p, at, k4)
+                    turned = 0.0
+                    for j in range(n):
+                        turned += abs(k4[j] - k3[j])
+                    turned = sqrt(turned * moved)
+                for j in range(n):
+                    at[j] = z[j] + h * k3[j]
                 if 2.0 * turned > fastest * moved and turned > 1e-12 * moved:
                     fastest = 2.0 * turned / moved
             else:
@@ -69,7 +82,7 @@ def memory(q, qd, qdd, u, p, t, z0, steps, out):
                 for j in range(n):
                     z[j] += h / 6.0 * (k1[j] + 2.0 * k2[j] + 2.0 * k3[j] + k4[j])
         out[i + 1] = z
-        if steps * fastest > FASTEST:
+        if steps * fastest > (FASTEST if steps > 1 else ACCURATE):
             break
     return fastest
 '''
@@ -121,8 +134,7 @@ def memory(q, qd, qdd, u, p, t, z0, steps, out):
     z, x, v, w = z0.copy(), q[0].copy(), qd[0].copy(), u[0].copy()
     out[0] = z
     memory_terms(x, v, w, p, c0, b0)
-    if RAMP and len(v) == 0:
-        steps = 1
+    steps = 1 if RAMP and len(v) == 0 else max(steps, FEWEST)
     for i in range(len(t) - 1):
         h = (t[i + 1] - t[i]) / steps
         for s in range(steps):
@@ -176,7 +188,8 @@ def memory_source(e: Equations) -> tuple[str, dict[str, list[int]]]:
         groups_of = {**passed, "z": states}
         rate = _memory_function("memory_rate", groups_of, {"dz": renamed(e.rates)})
         fastest = "np.inf" if coupled else repr(STIFF_STEPS * STABLE)
-        head = f"import numpy as np\nFASTEST = {fastest}\n"
+        head = f"import numpy as np\nFASTEST = {fastest}\nACCURATE = {ACCURATE}\n"
+        head += f"COUPLED = {coupled}\n"
         source = SCALAR_HEADER + head + rate + BETWEEN + MEMORY_LOOP
         if not coupled:
             slope = _memory_function("memory_slope", groups_of, {"slope": renamed(slopes)})
@@ -185,7 +198,7 @@ def memory_source(e: Equations) -> tuple[str, dict[str, list[int]]]:
     still = [rate.subs(z, 0) for rate, z in zip(e.rates, e.z, strict=True)]
     terms = _memory_function("memory_terms", passed, {"c": renamed(still), "b": renamed(slopes)})
     steady = not any(slope.free_symbols & {*e.q, *e.qd, *e.u} for slope in slopes)
-    head = f"import numpy as np\nRAMP = {steady}\n"
+    head = f"import numpy as np\nRAMP = {steady}\nFEWEST = {_FEWEST}\n"
     return SCALAR_HEADER + head + terms + BETWEEN + LINEAR_MEMORY_LOOP, uses
 
 

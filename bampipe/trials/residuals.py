@@ -261,6 +261,13 @@ class ModelOnTrial:
         """Internal states, (T, n_z)."""
         return self._residual_and_memory[1]
 
+    @cached_property
+    def contribution(self) -> Array:
+        """What the model's effects add to the residual; see `System.contribution`, (T, n_q)."""
+        motion = self.motion
+        at = motion.q, motion.qd, motion.qdd
+        return self.system.contribution(*at, self.memory, motion.inputs(self.system.inputs), self.p)
+
 
 @dataclass(frozen=True)
 class Evidence:
