@@ -18,7 +18,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass as checked_dataclass
 
 from bampipe.data.device_file import find_robot_file
-from bampipe.data.quality import CleaningLimits, CleanTrial
+from bampipe.data.quality import CleaningLimits, CleanTrial, thin, thinning_factor
 from bampipe.data.run_folder import INGESTED, MOVING, RunFolder
 from bampipe.data.session import Session, TrialEntry, read_session
 from bampipe.data.session_trials import find_copies, read_sound_trial
@@ -29,7 +29,7 @@ from bampipe.files import digest_content, toml_text
 from bampipe.physics.device import Device
 from bampipe.progress import Progress
 from bampipe.results.ingest import EncoderChannel, ForceChannels, IngestResult, RecordedChannel
-from bampipe.schema import STRICT
+from bampipe.schema import STRICT, NotNegative
 from bampipe.trials.channel_records import ChannelRecords
 
 SUMMARY = "Read a session's raw logs, check and repair the trials, bring them to SI units"
@@ -49,10 +49,12 @@ class Config(CleaningLimits):
     Attributes:
         session: folder of the session.
         largest_trial_mb: a trial that takes more memory than this, MB, is set aside.
+        fastest_hz: logs at twice this rate or more are thinned to about it; 0 keeps every sample.
     """
 
     session: str = ""
     largest_trial_mb: Annotated[int, Field(ge=1)] = 4096
+    fastest_hz: NotNegative = 1000.0
 
 
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
@@ -74,7 +76,9 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         rows = _ingest_trials(session, config, channels, samples, progress)
     trials = _trials_table(rows)
     write_parquet(out / "ingest/trials.parquet", trials)
-    description = _description(session, device, _rate(session, trials), channels, rows)
+    every = thinning_factor(session.sample_rate, config.fastest_hz)
+    rate = _rate(session.sample_rate / every, trials)
+    description = _description(session, device, rate, channels, rows)
     description.write(out)
     if session.device_file is not None:
         _write_device(session.device_file, device, out / "ingest")
@@ -82,6 +86,11 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     if device.robot is not None:
         notes += [f"no body has what is drawn: {line}" for line in device.robot.impossible]
     notes += [f"{place}: its source still says `fill in`" for place in description.placeholders]
+    if every > 1:
+        notes.append(
+            f"logged at {session.sample_rate:g} Hz, thinned to {rate:g} Hz: inputs after a low-pass"
+            " at half of that, positions as read; ingest.fastest_hz=0 keeps every sample"
+        )
     return _summary(session, rows) | {"notes": notes}
 
 
@@ -99,6 +108,8 @@ def _ingest_trials(
     """
     rows: list[dict[str, Any]] = []
     copies = find_copies(session)
+    every = thinning_factor(session.sample_rate, config.fastest_hz)
+    encoders = {each.name for each in session.channels if each.second_encoder_of}
     total, measured = len(session.trials), 0
     for number, entry in enumerate(session.trials):
         progress(number / total, entry.trial_id)
@@ -111,7 +122,10 @@ def _ingest_trials(
             continue
         noise = entry.kind in MOVING and measured <= number * _MOST_MEASURED / total
         measured += noise
-        channels.note(trial, noise)
+        channels.note(trial)
+        trial = thin(trial, every, encoders)
+        if noise:
+            channels.measure_noise(trial)
         rows.append(_row(entry, trial, ""))
         _append(samples, entry, trial)
     if all(row["status"] == "set_aside" for row in rows):
@@ -187,12 +201,10 @@ def _trials_table(rows: list[dict[str, Any]]) -> pd.DataFrame:
     return table.astype(dict.fromkeys(text, "string"))
 
 
-def _rate(session: Session, trials: pd.DataFrame) -> float:
-    """Announced sample rate, or the median of the trials where the time stamps say otherwise."""
+def _rate(announced: float, trials: pd.DataFrame) -> float:
+    """The ``announced`` rate, or the median of the trials where the time stamps say otherwise."""
     measured = float(trials["sample_rate_hz"].median())
-    if abs(measured - session.sample_rate) <= RATE_TOLERANCE * session.sample_rate:
-        return session.sample_rate
-    return measured
+    return announced if abs(measured - announced) <= RATE_TOLERANCE * announced else measured
 
 
 def _description(

@@ -35,13 +35,25 @@ class ChannelRecords:
         self._hum: dict[str, list[dict[float, float]]] = defaultdict(list)
         self._counts: dict[str, list[tuple[float, float] | None]] = defaultdict(list)
 
-    def note(self, trial: CleanTrial, noise: bool) -> None:
-        """Note one trial and take mains hum off its inputs; ``noise``: whether that is measured."""
+    def note(self, trial: CleanTrial) -> None:
+        """Note one trial and take mains hum off its inputs."""
         for name, unit in self._units.items():
             self._counts[name].append(_counts(trial.columns[name] / unit))
         self._remove_hum(trial)
-        if noise:
-            self._measure_noise(trial)
+
+    def measure_noise(self, trial: CleanTrial) -> None:
+        """Note what a trial says of the noise of its encoders (``q_<axis>``) and inputs."""
+        columns = {
+            name: np.asarray(values, dtype=float)
+            for name, values in trial.columns.items()
+            if not name.startswith("brake_")
+        }
+        readings = {name: x for name, x in columns.items() if name.startswith("q_")}
+        inputs = {name: x for name, x in columns.items() if name not in readings}
+        found = {name: RecordNoise.of(x, trial.t) for name, x in readings.items()}
+        found |= RecordNoise.of_inputs(inputs, [*readings.values()], trial.t)
+        for name, one in found.items():
+            self._noise[name].append(one)
 
     def encoders(self) -> dict[str, ChannelNoise]:
         """Resolution and noise of the encoders, by axis."""
@@ -100,20 +112,6 @@ class ChannelRecords:
             if not name.startswith(("q_", "brake_")) and np.isfinite(values).all():
                 trial.columns[name], found = remove_mains(values, trial.t, moving)
                 self._hum[name].append(found)
-
-    def _measure_noise(self, trial: CleanTrial) -> None:
-        """Note what a trial says of the noise of its encoders (``q_<axis>``) and inputs."""
-        columns = {
-            name: np.asarray(values, dtype=float)
-            for name, values in trial.columns.items()
-            if not name.startswith("brake_")
-        }
-        readings = {name: x for name, x in columns.items() if name.startswith("q_")}
-        inputs = {name: x for name, x in columns.items() if name not in readings}
-        found = {name: RecordNoise.of(x, trial.t) for name, x in readings.items()}
-        found |= RecordNoise.of_inputs(inputs, [*readings.values()], trial.t)
-        for name, one in found.items():
-            self._noise[name].append(one)
 
 
 def _force_units(session: Session, device: Device) -> dict[str, float]:

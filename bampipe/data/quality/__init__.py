@@ -37,10 +37,11 @@ from bampipe.data.quality.encoders import (
 from bampipe.data.quality.motion import refuse_wrong_brakes, refuse_wrong_motion
 from bampipe.data.quality.spikes import interpolate_spikes
 from bampipe.data.quality.table import CleaningLimits, CleanTrial, TrialTable
+from bampipe.data.quality.thinning import thin, thinning_factor
 from bampipe.data.readers import RawTrial
 from bampipe.data.session import Session, TrialEntry
 
-__all__ = ["CleanTrial", "CleaningLimits", "clean"]
+__all__ = ["CleanTrial", "CleaningLimits", "clean", "thin", "thinning_factor"]
 
 
 def clean(raw: RawTrial, session: Session, entry: TrialEntry, limits: CleaningLimits) -> CleanTrial:
