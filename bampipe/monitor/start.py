@@ -194,7 +194,14 @@ def start_from_run(run: RunFolder, name: str, options: MonitorOptions) -> tuple[
     names = found.covariance.names
     for parameter in names:
         values[system.index(parameter)] = found.parameters[parameter].estimate
-    rate = run.read(IngestResult).sample_rate_hz
+    ingested = run.read(IngestResult)
+    if ingested.kept_every > 1:
+        raise InputError(
+            f"identified from one sample in {ingested.kept_every}, and a stream has all of them",
+            where=str(run.path(IngestResult.FILE)),
+            remedy="bampipe run SESSION --set ingest.fastest_hz=0",
+        )
+    rate = ingested.sample_rate_hz
     trials = [_trial(run, trial, system) for trial in free_trials(run, fitted=True)]
     model = build_filter_model(system, trials, values, timing=False)
     model.parameters[-1] = found.input_timing.estimate

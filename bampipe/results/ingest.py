@@ -127,6 +127,7 @@ class IngestResult(Result):
     simulated: bool = Field(default=False, description="Whether a simulator made it")
     sample_rate_hz: Positive = Field(description="Median over the trials, from their clocks")
     announced_rate_hz: Positive | None = Field(description="What session.toml says, or null")
+    kept_every: int = Field(default=1, ge=1, description="Samples of a log for one that is kept")
     axes: dict[str, EncoderChannel] = Field(min_length=1)
     force: ForceChannels
     sensor_warnings: Names = Field(

@@ -78,7 +78,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     write_parquet(out / "ingest/trials.parquet", trials)
     every = thinning_factor(session.sample_rate, config.fastest_hz)
     rate = _rate(session.sample_rate / every, trials)
-    description = _description(session, device, rate, channels, rows)
+    description = _description(session, device, rate, every, channels, rows)
     description.write(out)
     if session.device_file is not None:
         _write_device(session.device_file, device, out / "ingest")
@@ -211,6 +211,7 @@ def _description(
     session: Session,
     device: Device,
     rate: float,
+    every: int,
     channels: ChannelRecords,
     rows: list[dict[str, Any]],
 ) -> IngestResult:
@@ -234,6 +235,7 @@ def _description(
         simulated=session.simulated,
         sample_rate_hz=rate,
         announced_rate_hz=session.sample_rate,
+        kept_every=every,
         axes={
             encoder.axis: EncoderChannel(
                 unit=encoder.unit,

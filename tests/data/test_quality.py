@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bampipe.data.quality import CleaningLimits, clean
+from bampipe.data.quality import CleaningLimits, CleanTrial, clean, thin, thinning_factor
 from bampipe.data.readers import RawTrial
 from bampipe.data.session import session_from
 from bampipe.errors import InputError
@@ -227,3 +227,28 @@ def test_what_comes_through_is_sound_and_what_changed_is_said(damages, length, k
     assert np.abs(np.diff(trial.columns["q_yaw"])).max() < 0.5
     if len(trial.t) != length:
         assert trial.repairs
+
+
+def test_a_fast_log_is_thinned_without_folding_noise_into_what_is_kept():
+    rate, every = 5000.0, 5
+    t = np.arange(20_000) / rate
+    swing, whistle = np.sin(2 * np.pi * 30 * t), np.sin(2 * np.pi * 1030 * t)
+    switched = np.repeat([0.0, 1.0, 0.0, 2.0], 5000)
+    fast = CleanTrial(
+        t, {"force_x": swing + whistle, "q_yaw": whistle, "current": switched}, rate, ["as it was"]
+    )
+    slow = thin(fast, every, ())
+    assert slow.sample_rate == 1000.0 and slow.repairs == ["as it was"]
+    np.testing.assert_array_equal(slow.t, t[::every])
+    inner = slice(20, -20)  # a low-pass has no past or future at the ends
+    np.testing.assert_allclose(slow.columns["force_x"][inner], swing[::every][inner], atol=3e-3)
+    np.testing.assert_array_equal(slow.columns["q_yaw"], whistle[::every])
+    np.testing.assert_array_equal(slow.columns["current"], switched[::every])
+
+
+@pytest.mark.parametrize(
+    ("announced", "fastest", "every"),
+    [(500.0, 1000.0, 1), (1999.0, 1000.0, 1), (2000.0, 1000.0, 2), (5000.0, 0.0, 1)],
+)
+def test_only_logs_of_twice_the_rate_or_more_are_thinned(announced, fastest, every):
+    assert thinning_factor(announced, fastest) == every

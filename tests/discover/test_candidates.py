@@ -14,6 +14,7 @@ from bampipe.discover.candidates import (
     list_candidates,
 )
 from bampipe.discover.chance import fit_trials, system_of
+from bampipe.discover.columns import added_residual
 from bampipe.discover.growth import collapses
 from bampipe.discover.polish import FittedSet
 from bampipe.discover.scorer import Scorer
@@ -21,6 +22,7 @@ from bampipe.discover.settings import Settings
 from bampipe.discover.start import search_start
 from bampipe.physics import registry
 from bampipe.physics.recipe import Recipe
+from bampipe.trials.residuals import residual_and_memory
 
 DAMPER = registry.device("magnetic_damper")
 LAG, SATURATION = "channel_lag:current", "channel_saturation:current"
@@ -55,6 +57,20 @@ def test_what_acts_on_what_an_effect_leaves_is_scored_with_it(trials, first, sec
     assert joint.error[0] < 2.0 * noise
     alone = scorer.score(compile_candidate(build_candidate_model(DAMPER, second)))
     assert alone.error[0] > 1.5 * joint.error[0]
+
+
+@pytest.mark.parametrize(("first", "second"), [(LAG, SATURATION), (SATURATION, LAG)])
+def test_what_a_candidate_adds_beside_others_is_what_the_whole_residual_changes_by(
+    trials, first, second
+):
+    recipe = Recipe(DAMPER.declaration, (first,), ())
+    base = fit_trials(trials, recipe, search_start(trials, recipe)).fitted[0]
+    item = compile_candidate(build_candidate_model(DAMPER, second, (), recipe.effects))
+    p = np.concatenate([base.p, 0.3 + np.array([q.prior for q in item.parameters])])
+    whole, _ = residual_and_memory(
+        item.system, base.motion, base.motion.inputs(item.system.inputs), p
+    )
+    np.testing.assert_allclose(added_residual(item, p, base), whole - base.residual, atol=1e-9)
 
 
 def test_only_effects_that_meet_are_taken_together():
