@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -19,12 +20,14 @@ from made_results import write_result
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import read_parquet
+from bampipe.errors import InputError
 from bampipe.estimate.unscented import Trial, filter_trials
 from bampipe.files import read_json, write_text
 from bampipe.monitor.monitor import Monitor
 from bampipe.monitor.start import MonitorOptions, start_from_run
 from bampipe.physics import Model, compile_model, registry
 from bampipe.results.identify import IdentifyResult
+from bampipe.results.ingest import IngestResult
 
 
 @pytest.fixture(scope="module")
@@ -90,6 +93,16 @@ def test_same_estimates_as_the_batch_filter(run: RunFolder, begun: tuple) -> Non
     for i, state in enumerate(report["state"].values()):
         assert state["position"] == pytest.approx(mean[i], rel=1e-12, abs=1e-14)
         assert state["velocity"] == pytest.approx(mean[n + i], rel=1e-12, abs=1e-14)
+
+
+def test_a_run_of_thinned_logs_is_refused(run: RunFolder, tmp_path: Path) -> None:
+    """A stream has every sample, and a window of the model's would be another time."""
+    thinned = RunFolder(Path(shutil.copytree(run.root, tmp_path / "run")))
+    result = thinned.read(IngestResult).model_copy(update={"kept_every": 5})
+    result.write(thinned.root)
+    with pytest.raises(InputError, match="one sample in 5") as raised:
+        start_from_run(thinned, "base", MonitorOptions())
+    assert "ingest.fastest_hz=0" in raised.value.remedy
 
 
 def test_no_alarm_while_nothing_changes(run: RunFolder, begun: tuple) -> None:
