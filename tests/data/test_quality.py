@@ -246,6 +246,16 @@ def test_a_fast_log_is_thinned_without_folding_noise_into_what_is_kept():
     np.testing.assert_array_equal(slow.columns["current"], switched[::every])
 
 
+@pytest.mark.parametrize("every", [2, 5])
+def test_white_noise_is_white_after_thinning(every):
+    noise = np.random.default_rng(1).normal(size=200_000)
+    trial = CleanTrial(np.arange(noise.size) / 2e3, {"force_x": noise}, 2e3)
+    thinned = thin(trial, every, ()).columns["force_x"]
+    assert thinned.std() == pytest.approx(every**-0.5, rel=0.02)
+    for lag in (1, 2, 3):
+        assert abs(np.corrcoef(thinned[lag:], thinned[:-lag])[0, 1]) < 0.02
+
+
 @pytest.mark.parametrize(
     ("announced", "fastest", "every"),
     [(500.0, 1000.0, 1), (1999.0, 1000.0, 1), (2000.0, 1000.0, 2), (5000.0, 0.0, 1)],

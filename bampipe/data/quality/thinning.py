@@ -6,13 +6,18 @@ from collections.abc import Collection
 from dataclasses import replace
 
 import numpy as np
-from scipy.signal import resample_poly
+from scipy.signal import firwin, resample_poly
 
 from bampipe.data.quality.table import CleanTrial
 
 _HELD = 0.5
 """Share of readings that repeat the one before from which on a channel is a set-point that is held:
 a low-pass would make a ramp of its steps."""
+_HALF_LENGTH = 10
+"""Samples that are kept on either side of the low-pass."""
+_HALF_POWER, _KAISER = 1.04, 5.0
+"""Cut-off over half the new rate at which half of the power passes there, of a Kaiser window: what
+folds makes up for what is taken off, and white noise stays white, as sensors are taken to be."""
 
 
 def thinning_factor(announced_hz: float, fastest_hz: float) -> int:
@@ -36,10 +41,13 @@ def thin(trial: CleanTrial, every: int, sampled: Collection[str]) -> CleanTrial:
     """
     if every == 1:
         return trial
+    low_pass = firwin(
+        2 * _HALF_LENGTH * every + 1, min(_HALF_POWER / every, 0.99), window=("kaiser", _KAISER)
+    )
     columns = {
         name: values[::every].copy()
         if name.startswith(("q_", "brake_")) or name in sampled or _is_held(values)
-        else resample_poly(values, 1, every, padtype="edge")
+        else resample_poly(values, 1, every, window=low_pass, padtype="edge")
         for name, values in trial.columns.items()
     }
     return replace(
