@@ -64,7 +64,16 @@ class SearchRange:
         """The value of the parameter for a number between ``low`` and ``high``."""
         if self.around is None:
             return searched
-        return self.around + float(np.copysign(min(1.0 / max(abs(searched), 1e-300), self.farthest), searched))
+        distance = min(1.0 / max(abs(searched), 1e-300), self.farthest)
+        return self.around + float(np.copysign(distance, searched))
+
+    def value_like(self, value: float) -> float:
+        """``value`` where it lies in the range, else one amid it; of a position beyond, above."""
+        if self.around is not None:
+            distance = abs(value - self.around)
+            holds = 1.0 / self.high <= distance <= self.farthest
+            return value if holds else self.value_at(self.within(0.75))
+        return value if self.low <= value <= self.high else self.within(0.5)
 
     def within(self, share: float) -> float:
         """The value that lies a share of the way from the lower to the upper end."""
