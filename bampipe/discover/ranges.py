@@ -32,6 +32,9 @@ _TIME = (2.0, 3.0)
 """In samples, in trials: the time in which something settles."""
 _PARTS = {"travel": (0.02, 0.98), "upper half": (0.5, 0.98), "lower half": (0.02, 0.5)}
 """Of the travel: where a position is looked for."""
+_BEYOND = (0.52, 5.0)
+"""Of the travel, from its middle: where a position outside of it is looked for; what steepens
+towards one that lies farther is a straight line."""
 _RESONANCE = 3.0
 """Of the highest frequency of the band: what rings beyond leaves a tenth of its force in the band,
 which a late sample or a filter leaves as well."""
@@ -43,11 +46,34 @@ timing of all of them does."""
 
 @dataclass(frozen=True)
 class SearchRange:
-    """Lower and upper end, and whether to step by ratios."""
+    """Lower and upper end, and whether to step by ratios.
+
+    Attributes:
+        around: middle of the travel for a position outside of it. Then ``low`` and ``high`` are
+            reciprocals of its distance from there, through 0 from one side to the other.
+        farthest: the farthest such distance.
+    """
 
     low: float
     high: float
     by_ratio: bool
+    around: float | None = None
+    farthest: float = np.inf
+
+    def value_at(self, searched: float) -> float:
+        """The value of the parameter for a number between ``low`` and ``high``."""
+        if self.around is None:
+            return searched
+        distance = min(1.0 / max(abs(searched), 1e-300), self.farthest)
+        return self.around + float(np.copysign(distance, searched))
+
+    def value_like(self, value: float) -> float:
+        """``value`` where it lies in the range, else one amid it; of a position beyond, above."""
+        if self.around is not None:
+            distance = abs(value - self.around)
+            holds = 1.0 / self.high <= distance <= self.farthest
+            return value if holds else self.value_at(self.within(0.75))
+        return value if self.low <= value <= self.high else self.within(0.5)
 
     def within(self, share: float) -> float:
         """The value that lies a share of the way from the lower to the upper end."""
@@ -110,6 +136,10 @@ class MachineScale:
         if parameter.within and item.axes:
             i = list(self.coordinates).index(item.axes[0])
             low, high = float(self.lowest[i]), float(self.highest[i])
+            if parameter.within == "beyond":
+                nearest, farthest = (share * (high - low) for share in _BEYOND)
+                steepest, around = 1.0 / nearest, 0.5 * (low + high)
+                return SearchRange(-steepest, steepest, False, around, farthest)
             start, end = (low + share * (high - low) for share in _PARTS[parameter.within])
             return SearchRange(start, end, False)
         if parameter.shape and lower <= 0.0:

@@ -172,8 +172,13 @@ class Scorer:
             self.machine_scale.range_of(effect, item.parameters[i]) for i in item.searched_indices
         ]
         hopeless = self._cost_before(item) - Settings().worth_searching
+
+        def values_at(searched: Sequence[float] | Array) -> Array:
+            pairs = zip(ranges, searched, strict=True)
+            return np.array([interval.value_at(float(x)) for interval, x in pairs])
+
         found = scan_parameters(
-            lambda values: self._fit_cost(item, values),
+            lambda searched: self._fit_cost(item, values_at(searched)),
             ranges,
             hopeless,
             has_columns=bool(item.linear_indices),
@@ -181,10 +186,10 @@ class Scorer:
         )
         if found is None:
             return None
-        values, cost = found
+        searched, cost = found
         if ranges and cost > hopeless:
             return self._score_at_zero(item)
-        best = self._score_with(item, np.array(values))
+        best = self._score_with(item, values_at(searched))
         # An error of exactly zero, on an axis that nothing drives, is no explanation.
         return best if best is not None and np.isfinite(best.gain).all() else None
 

@@ -79,11 +79,7 @@ def typical_rival(item: Candidate, scale: MachineScale) -> Rival | None:
         if i in strengths:
             value = value or q.sd
         elif not q.fixed:
-            interval = scale.range_of(effect, q)
-            if not interval.low <= value <= interval.high:
-                positive = interval.low > 0.0
-                ends = np.array([interval.low, interval.high])
-                value = float(np.exp(np.log(ends).mean()) if positive else ends.mean())
+            value = scale.range_of(effect, q).value_like(value)
         values.append(value)
     return Rival(item, np.array(values), 0.0)
 

@@ -52,9 +52,10 @@ class Parameter(NamedDeclaration):
         default=None,
         description="Size at which the effect is clearly there; strength 1 of the simulator",
     )
-    within: Literal["travel", "upper half", "lower half"] | None = Field(
+    within: Literal["travel", "upper half", "lower half", "beyond"] | None = Field(
         default=None,
-        description="For a position on the axis: the part of the travel where the diagnosis looks",
+        description="For a position on the axis: the part of the travel where the diagnosis looks;"
+        " beyond: outside of it, on either side",
     )
     description: str = Field(default="", description="What it is, in a few words")
 

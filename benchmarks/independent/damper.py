@@ -33,6 +33,7 @@ MACHINE = np.dtype(
             "rest", "drag", "dry_difference", "viscous_difference",
             "bumper", "bumper_at", "thinning", "thinning_speed", "oil_spring", "dead_travel",
             "yield_speed", "seal", "seal_speed", "softening", "warming_time",
+            "gas", "gas_length", "polytropic",
         )
     ]
 )  # fmt: skip
@@ -42,7 +43,7 @@ EFFECTS = (
     "return_spring:piston", "quadratic_drag:piston", "asymmetric_coulomb:piston",
     "upper_stop:piston", "shear_thinning:piston",
 )  # fmt: skip
-BY_NAME = ("thermal_damping:piston", "stribeck:piston")
+BY_NAME = ("thermal_damping:piston", "stribeck:piston", "gas_spring:piston")
 """Hidden where they are asked for: what seeds draw stays what it was."""
 UNKNOWN = ("soft_oil:piston", "dead_travel:piston")
 
@@ -94,6 +95,9 @@ def _press(m, x, v, a, current, log_at):
         force += m.thinning * speed / (1.0 + (speed / m.thinning_speed) ** 2) ** 0.35
         force += m.dry_difference * moves**2
         force += m.viscous_difference * abs(speed)
+        if m.gas > 0.0:
+            # A closed volume; the piston's rod presses it together as it comes in.
+            force += m.gas * ((1.0 - x[k] / m.gas_length) ** -m.polytropic - 1.0)
         if x[k] > m.bumper_at:
             force += m.bumper * (x[k] - m.bumper_at)
         if k_log < len(log_at) and log_at[k_log] == k:
@@ -125,6 +129,7 @@ def _hide(
             "shear_thinning": {"thinning": 1500.0 * size, "thinning_speed": 0.02 * shape},
             "stribeck": {"seal": 25.0 * size, "seal_speed": 0.012 * shape},
             "thermal_damping": {"softening": 0.15 * size, "warming_time": 6.0 * shape},
+            "gas_spring": {"gas": 250.0 * size, "gas_length": 0.04 * shape, "polytropic": 1.3},
             "soft_oil": {"oil_spring": 6e4 / size},
             "dead_travel": {"dead_travel": 0.0006 * size},
         }[name]  # fmt: skip
@@ -151,6 +156,8 @@ def _hide(
         ):
             prefix = full.replace(":", ".")
             truth |= {f"{prefix}.{theirs.get(k, k)}": v for k, v in laws.items()}
+        elif name == "gas_spring":
+            truth["gas_spring.piston.end"] = laws["gas_length"]
         elif name == "return_spring":
             truth["return_spring.piston.stiffness"] = laws["stiffness"]
     return truth

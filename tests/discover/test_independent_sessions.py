@@ -140,6 +140,17 @@ def test_effects_of_other_machines_are_named(tmp_path, machine, seed, effect, ax
 
 
 @pytest.mark.long
+def test_the_gas_of_a_damper_is_no_spring_and_no_stop(tmp_path):
+    run, truth = record_run(tmp_path, "damper", 503, "gas_spring:piston")
+    found = diagnose(run)
+    assert found["selected"] == ["gas_spring:piston"]
+    assert error_over_floor(found["axes"]["piston"]) < 1.2
+    # Its exponent is another one than the effect's: the end is off by a tenth at most.
+    end = found["ranking"][0]["parameters"]["gas_spring.piston.end"]
+    assert end == pytest.approx(truth["gas_spring.piston.end"], rel=0.1)
+
+
+@pytest.mark.long
 def test_a_damper_on_a_test_bench_lacks_nothing_or_the_lag_of_its_coil(tmp_path):
     run, _ = record_run(tmp_path, "damper", 501)
     (clean,) = diagnose(run)["axes"].values()

@@ -58,6 +58,20 @@ def test_a_stop_is_looked_for_in_its_half_of_the_travel():
     assert (lower.low, lower.high) == pytest.approx((-0.045, 0.075))
 
 
+def test_the_end_of_a_gas_spring_is_looked_for_beyond_either_end_of_the_travel():
+    ends = range_of("gas_spring:carriage", "end")
+    shares = np.linspace(0.0, 1.0, 21)
+    found = np.array([ends.value_at(ends.within(share)) for share in shares])
+    above, below = found[shares > 0.5], found[shares < 0.5]
+    # The travel goes from -0.05 to 0.2 m: nearly at it, and where any gas is a straight line.
+    assert above.min() == pytest.approx(0.205)
+    assert below.max() == pytest.approx(-0.055)
+    assert above.max() == pytest.approx(0.075 + 5 * 0.25)
+    assert below.min() == pytest.approx(0.075 - 5 * 0.25)
+    assert (np.diff(above) <= 0.0).all() and (np.diff(below) <= 0.0).all()
+    assert np.isfinite(found).all()
+
+
 def test_the_scale_of_a_session_is_that_of_its_motion():
     session = made(bam(), {}, trials=2)
     system = system_of(bam())
