@@ -36,7 +36,7 @@ class Choice:
         unlike: the others that were replayed, where replays of none of them, nor of the best, look
             like the measurement: scores are all that distinguishes them.
         misfit: mean squared z of the likest of those replays.
-        log_prior: of the best and those that were replayed beside it, see `believed.log_prior`.
+        log_prior: of all that came close, see `believed.log_prior`.
     """
 
     winner: str
@@ -96,12 +96,12 @@ def choose(
     transient = {name: second for name in close if name not in firm}
     if not firm:
         return Choice("", (), transient)
-    rivals = firm[: s.most_rivals]
+    believed = {item.name: log_prior(item, scores[item.name]) for item in items}
+    rivals = believable(firm, {n: rest[n].total for n in firm}, believed, s)[: s.most_rivals]
     if len(rivals) == 1:
-        return Choice(rivals[0], (), transient)
+        return Choice(rivals[0], (), transient, log_prior=believed)
     here = [item for item in items if item.name in rivals]
     constants = {item.name: count_new_constants(evidence, item, scores[item.name]) for item in here}
-    believed = {item.name: log_prior(item, scores[item.name]) for item in here}
 
     def simplest(names: Sequence[str]) -> str:
         """Of those that explain as much as the first, the one with the fewest constants.
@@ -131,6 +131,30 @@ def choose(
         winner = plain
     alike = without_mere_offsets(recipe, evidence, scores, alike, s)
     return Choice(winner, alike[: s.most_alike], transient, log_prior=believed)
+
+
+def believable(
+    names: Sequence[str],
+    totals: Mapping[str, float],
+    log_prior: Mapping[str, float],
+    s: Settings,
+) -> list[str]:
+    """Those of ``names`` beside which none that fits about as well is far easier to believe.
+
+    Args:
+        totals, log_prior: of each, its score and what is known of it beforehand.
+        s: how near scores are, and up to which odds an effect is worth a trial.
+    """
+    worth = float(np.log(s.least_odds))
+    return [
+        name
+        for name in names
+        if not any(
+            totals[other] >= s.rival_score * totals[name]
+            and log_prior[name] < log_prior[other] + worth
+            for other in names
+        )
+    ]
 
 
 def without_mere_offsets(

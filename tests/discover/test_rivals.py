@@ -13,7 +13,7 @@ from bampipe.discover.chance import candidates_of, fit_trials, system_of, worker
 from bampipe.discover.insufficient import insufficient_rivals
 from bampipe.discover.nested import idle_extensions
 from bampipe.discover.polish import FittedSet, comes_close
-from bampipe.discover.rivals import _misfit, plausible, without_mere_offsets
+from bampipe.discover.rivals import _misfit, believable, plausible, without_mere_offsets
 from bampipe.discover.scorer import Score, Scorer
 from bampipe.discover.settings import Settings
 from bampipe.results.diagnose import Contender
@@ -168,3 +168,14 @@ def test_how_wrong_counts_are_is_known_of_every_machine_how_strong_a_spring_is_o
     strong = Score(spring.name, nothing, np.array([500.0, 20.0]), nothing, nothing)
     assert log_prior(scale, wrong) == pytest.approx(known)
     assert log_prior(spring, strong) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("scale", "kept"), [(181.0, ["spring"]), (250.0, ["encoder_scale", "spring"])]
+)
+def test_what_is_hard_to_believe_is_no_rival_of_what_fits_about_as_well(scale, kept):
+    totals, known = (
+        {"encoder_scale": scale, "spring": 170.0},
+        {"encoder_scale": -5.0, "spring": 0.0},
+    )
+    assert believable(list(totals), totals, known, S) == kept
