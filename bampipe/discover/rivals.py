@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bampipe.discover.believed import count_new_constants, log_prior
 from bampipe.discover.bench import Bench
 from bampipe.discover.candidates import Candidate
 from bampipe.discover.chance import Progress, candidates_of, retimed_trials
@@ -35,6 +36,7 @@ class Choice:
         unlike: the others that were replayed, where replays of none of them, nor of the best, look
             like the measurement: scores are all that distinguishes them.
         misfit: mean squared z of the likest of those replays.
+        log_prior: of all that came close, see `believed.log_prior`.
     """
 
     winner: str
@@ -42,6 +44,7 @@ class Choice:
     transient: Mapping[str, SampleRange]
     unlike: tuple[str, ...] = ()
     misfit: float = 1.0
+    log_prior: Mapping[str, float] = field(default_factory=dict)
 
 
 def choose(
@@ -93,24 +96,30 @@ def choose(
     transient = {name: second for name in close if name not in firm}
     if not firm:
         return Choice("", (), transient)
-    rivals = firm[: s.most_rivals]
-    constants = {item.name: item.n_constants for item in items}
+    believed = {item.name: log_prior(item, scores[item.name]) for item in items}
+    rivals = believable(firm, {n: rest[n].total for n in firm}, believed, s)[: s.most_rivals]
+    if len(rivals) == 1:
+        return Choice(rivals[0], (), transient, log_prior=believed)
+    here = [item for item in items if item.name in rivals]
+    constants = {item.name: count_new_constants(evidence, item, scores[item.name]) for item in here}
 
     def simplest(names: Sequence[str]) -> str:
-        """Of those that explain as much as the first, the one with the fewest constants."""
+        """Of those that explain as much as the first, the one with the fewest constants.
+
+        Of as many, the one whose strength is easiest to believe.
+        """
         least = rest[names[0]].total - max(s.score_sd, s.swap * abs(rest[names[0]].total))
-        return min((n for n in names if rest[n].total >= least), key=lambda n: constants[n])
+        equal = (n for n in names if rest[n].total >= least)
+        return min(equal, key=lambda n: (constants[n], -believed[n]))
 
     best = simplest(rivals)
-    if len(rivals) == 1:
-        return Choice(best, (), transient)
     replayed = {name: scores[name] for name in rivals}
     misfits = replay_rivals(bench, recipe, evidence, replayed, axis, progress)
     likely = plausible(misfits, s)
     if not likely:
         # As where more is missing than one effect: the patterns are no evidence for any of them.
         unlike = tuple(n for n in rivals if n != best)
-        return Choice(best, (), transient, unlike, min(misfits.values()))
+        return Choice(best, (), transient, unlike, min(misfits.values()), believed)
     winner, *others = likely
     alike = tuple(others)
     if best in alike:
@@ -121,7 +130,31 @@ def choose(
         alike = (winner, *[n for n in alike if n != plain])
         winner = plain
     alike = without_mere_offsets(recipe, evidence, scores, alike, s)
-    return Choice(winner, alike[: s.most_alike], transient)
+    return Choice(winner, alike[: s.most_alike], transient, log_prior=believed)
+
+
+def believable(
+    names: Sequence[str],
+    totals: Mapping[str, float],
+    log_prior: Mapping[str, float],
+    s: Settings,
+) -> list[str]:
+    """Those of ``names`` beside which none that fits about as well is far easier to believe.
+
+    Args:
+        totals, log_prior: of each, its score and what is known of it beforehand.
+        s: how near scores are, and up to which odds an effect is worth a trial.
+    """
+    worth = float(np.log(s.least_odds))
+    return [
+        name
+        for name in names
+        if not any(
+            totals[other] >= s.rival_score * totals[name]
+            and log_prior[name] < log_prior[other] + worth
+            for other in names
+        )
+    ]
 
 
 def without_mere_offsets(

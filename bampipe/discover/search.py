@@ -58,6 +58,8 @@ class Search:
             nor those of its rivals: these rivals, but for those that leave an axis above the floor
             where the effect found does not.
         misfit: mean squared z of the likest of those replays, else 1.
+        log_prior: for each, that of itself and of its rivals as it was chosen; see
+            `believed.log_prior`.
         contests: for each, those who contend for its place, itself first.
         main: for each, the axis on which it helps most.
         additions: for each, how it stood against the model that it was added to.
@@ -84,6 +86,7 @@ class Search:
     wider: Mapping[str, frozenset[str]]
     unlike: tuple[str, ...]
     misfit: float
+    log_prior: Mapping[str, Mapping[str, float]]
     contests: Mapping[str, tuple[Contender, ...]]
     main: Mapping[str, int]
     additions: Mapping[str, Addition]
@@ -217,20 +220,28 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
     alike = {n: polished.alike.get(n, groups.get(n, ())) for n in found.added}
     still = bench.still_replicas(found.recipe, found.evidence, found.replayed, final)
     floor = _floor_of(found.evidence, final, still)
+    log_prior = {name: choice.log_prior for name, choice in choices.items()}
     for name in main:
         # Where replays say nothing of which it is, what each leaves does.
         unsettled = (*unlike, *(alike[name] if name in polished.unlike else ()))
         behind = insufficient_rivals(bench, found, name, main[name], unsettled, floor)
+        behind |= _unbelieved(log_prior.get(name, {}), name, s)
         alike[name] = tuple(n for n in alike[name] if n not in behind)
         unlike = tuple(n for n in unlike if n not in behind)
     wider = {n: idle_extensions(bench, found, n, main[n], {*alike[n], *unlike}) for n in main}
     return Search(
         bench.trials, base, initial, level, first, found,
-        alike, wider, unlike, misfit, contests, main, additions, likely, transient,
+        alike, wider, unlike, misfit, log_prior, contests, main, additions, likely, transient,
         tuple(r for name, r in refused.items() if name not in found.added), tuple(steps), cut_short,
         tuple(final), tuple(still), floor, explainable,
         bench.shares(found.recipe, found.evidence.p) if found.added else explainable,
     )  # fmt: skip
+
+
+def _unbelieved(log_prior: Mapping[str, float], name: str, s: Settings) -> frozenset[str]:
+    """Rivals of ``name`` that are so much harder to believe that no trial is worth it."""
+    least = log_prior.get(name, 0.0) + np.log(s.least_odds)
+    return frozenset(n for n, known in log_prior.items() if n != name and known < least)
 
 
 def _floor_of(

@@ -133,7 +133,8 @@ def _odds_of_group(search: Search, name: str, s: Settings) -> dict[str, float]:
     """
     among = {name, *search.groups[name], *search.unlike} - search.wider.get(name, frozenset())
     scores = {c.effect: c.score for c in search.contests.get(name, ()) if c.effect in among}
-    return odds_by_score(scores or {name: 0.0}, s, float(np.sqrt(search.misfit)))
+    believed = search.log_prior.get(name, {})
+    return odds_by_score(scores or {name: 0.0}, s, float(np.sqrt(search.misfit)), believed)
 
 
 def _odds_of_likely(search: Search, axis: int, s: Settings) -> dict[str, float]:

@@ -105,7 +105,7 @@ def _derive(model: Model, named_constants: bool) -> Equations:
     for item in order_of_action(model.effects):
         if "dry" in item.effect.names:
             d.dry = _dry_friction(d, other)
-        if any(name.startswith("weight_") for name in item.effect.names):
+        if item.effect.uses_weight:
             d.weight = [sp.diff(sum(v for *_, v in energies), q) for q in d.q]
         measures = item.effect.kind == "measurement"
         symbols = d.effect_symbols(item, still if measures else delivered, side)

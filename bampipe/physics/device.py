@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, PrivateAttr
 
 from bampipe.errors import InputError, did_you_mean
+from bampipe.physics import expression
 from bampipe.physics.controller import Controller
 from bampipe.physics.expression import MAX_NUMBER, Expression, Name
 from bampipe.physics.parameter import Parameter, PhysicalNumber
@@ -364,6 +365,15 @@ class Device(Declaration):
         tree = self.torque.get(axis)
         calls = [n.func for n in ast.walk(tree) if isinstance(n, ast.Call)] if tree else []
         return any(isinstance(f, ast.Name) and f.id == "sgn" for f in calls)
+
+    def has_weight(self, axis: str) -> bool:
+        """Whether the device's potential energy depends on the position of ``axis``."""
+        known, new = set[str](), expression.names(self.potential)
+        while new:
+            known |= new
+            found = (expression.names(self.definitions[n]) for n in new & set(self.definitions))
+            new = set().union(*found) - known
+        return axis in known
 
     @property
     def components(self) -> tuple[str, ...]:

@@ -282,6 +282,11 @@ class Effect(Declaration):
         trees += [tree for state in self.states for tree in (state.rate, state.initial)]
         return set().union(*map(expression.names, trees))
 
+    @property
+    def uses_weight(self) -> bool:
+        """Whether it acts on what pulls by position: the slope of the potential energy."""
+        return any(name == "weight" or name.startswith("weight_") for name in self.names)
+
     def _lacks(self, kind: str) -> bool:
         """Whether a parameter has no entry for this kind of axis."""
         return any(getattr(entry, kind, entry) is None for entry in self.parameters.values())
@@ -423,7 +428,12 @@ def bind(effect: Effect, target: str, device: Device) -> BoundEffect:
             )
         unit = unit_of(chosen.unit, effect, target, device)
         about = chosen.description or entry.description
-        bound.append(chosen.renamed(f"{prefix}.{name}", unit=unit, description=about))
+        held = chosen.needs_weight and not any(device.has_weight(axis) for axis in axes)
+        bound.append(
+            chosen.renamed(
+                f"{prefix}.{name}", unit=unit, description=about, fixed=chosen.fixed or held
+            )
+        )
     return BoundEffect(effect, target, tuple(bound), axes)
 
 

@@ -44,6 +44,10 @@ class Parameter(NamedDeclaration):
         default=False, description="Where it is all that an effect adds, that is a mere constant"
     )
     fixed: bool = Field(default=False, description="Held at its prior, never estimated")
+    needs_weight: bool = Field(
+        default=False,
+        description="Held at its prior on an axis on which the device puts no weight",
+    )
     weighed: bool = Field(
         default=False,
         description="Whether least squares weighs the prior beside the data, as a drawing's number",

@@ -24,7 +24,7 @@ def order_of_action(effects: Iterable[BoundEffect]) -> list[BoundEffect]:
 
     def order_key(item: BoundEffect) -> tuple[int, bool, str]:
         link = item.effect.acting_link
-        last = any(name == "dry" or name.startswith("weight_") for name in item.effect.names)
+        last = "dry" in item.effect.names or item.effect.uses_weight
         return (_ORDER[link] if link else len(_ORDER), last, item.name)
 
     return sorted(effects, key=order_key)

@@ -319,7 +319,7 @@ def _effect_symbols(item: BoundEffect, device: Device, check: _Check) -> dict[st
         symbols[f"viscous_{axis}"] = torque * second / unit
         if axis == item.target and item.effect.scope == "axis":
             symbols |= {"q": unit, "qd": unit / second, "brake": torque, "side_load": None}
-            symbols |= dict.fromkeys(("applied", "load", "coulomb", "dry"), torque)
+            symbols |= dict.fromkeys(("applied", "load", "coulomb", "dry", "weight"), torque)
             symbols["viscous"] = torque * second / unit
             if axis in device.side_load:
                 side = device.side_load[axis]

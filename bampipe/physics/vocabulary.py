@@ -176,7 +176,8 @@ class Vocabulary:
         if item.effect.scope == "axis":
             i, a = self.axes.index(item.target), item.target
             symbols |= {"q": self.q[i], "qd": self.qd[i], "side_load": side[i]}
-            symbols |= {n: symbols[f"{n}_{a}"] for n in ("applied", "load", "viscous", "coulomb")}
+            own = ("applied", "load", "viscous", "coulomb", "weight")
+            symbols |= {n: symbols[f"{n}_{a}"] for n in own}
             symbols["dry"] = self.dry[i]
             symbols["brake"] = self.channel.get(device.brakes.get(a, ""), sp.S.Zero)
         elif item.effect.scope == "axis_pair":

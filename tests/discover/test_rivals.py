@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from independent_runs import record_trials
 from sessions import bam, made
 
+from bampipe.discover.believed import count_new_constants, log_prior
 from bampipe.discover.bench import Bench
 from bampipe.discover.chance import candidates_of, fit_trials, system_of, workers
 from bampipe.discover.insufficient import insufficient_rivals
 from bampipe.discover.nested import idle_extensions
 from bampipe.discover.polish import FittedSet, comes_close
-from bampipe.discover.rivals import _misfit, plausible, without_mere_offsets
-from bampipe.discover.scorer import Scorer
+from bampipe.discover.rivals import _misfit, believable, plausible, without_mere_offsets
+from bampipe.discover.scorer import Score, Scorer
 from bampipe.discover.settings import Settings
 from bampipe.results.diagnose import Contender
 from bampipe.trials.noise_floor import NoiseFloor
@@ -142,3 +144,38 @@ def test_what_holds_an_effect_and_more_has_no_odds_beside_it_unless_it_fits_bett
         others = {"upper_stop:extension", "force_delay"}
         idle = idle_extensions(bench, found, bias, 2, {friction, spring, *others})
     assert idle == ({spring} if by_speed else {friction, spring})
+
+
+def test_an_offset_that_the_model_has_is_no_further_number_of_a_spring(tmp_path):
+    """Of a joint with weight and an offset, a spring adds one number and a cable two."""
+    joint, recipe, _ = record_trials(tmp_path, "joint", 4, "return_spring:joint")
+    evidence = fit_trials(joint, recipe, system_of(recipe).prior)
+    names = ("return_spring:joint", "cable_torque:joint", "encoder_scale:joint")
+    items = candidates_of(recipe, names)
+    scores = [Scorer(evidence).score(item) for item in items]
+    new = [count_new_constants(evidence, *pair) for pair in zip(items, scores, strict=True)]
+    assert new == [1, 2, 1]
+    assert [item.n_constants for item in items] == [2, 2, 1]
+
+
+@pytest.mark.parametrize(("error", "known"), [(0.02, 0.0), (-0.12, -7.5), (0.12, -7.5)])
+def test_how_wrong_counts_are_is_known_of_every_machine_how_strong_a_spring_is_of_none(
+    error, known
+):
+    scale, spring = candidates_of(bam(), ("encoder_scale:yaw", "return_spring:yaw"))
+    nothing = np.zeros(3)
+    wrong = Score(scale.name, nothing, np.array([error]), nothing, nothing)
+    strong = Score(spring.name, nothing, np.array([500.0, 20.0]), nothing, nothing)
+    assert log_prior(scale, wrong) == pytest.approx(known)
+    assert log_prior(spring, strong) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("scale", "kept"), [(181.0, ["spring"]), (250.0, ["encoder_scale", "spring"])]
+)
+def test_what_is_hard_to_believe_is_no_rival_of_what_fits_about_as_well(scale, kept):
+    totals, known = (
+        {"encoder_scale": scale, "spring": 170.0},
+        {"encoder_scale": -5.0, "spring": 0.0},
+    )
+    assert believable(list(totals), totals, known, S) == kept

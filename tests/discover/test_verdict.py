@@ -85,7 +85,20 @@ def test_scores_decide_the_less_the_less_replays_look_like_the_measurement(misfi
     """Between 60 and 37 in log likelihood, good to a tenth."""
     contest = tuple(SimpleNamespace(effect=n, score=x) for n, x in (("lag", 60.0), ("delay", 37.0)))
     search = SimpleNamespace(
-        groups={"lag": ()}, wider={}, unlike=("delay",), misfit=misfit, contests={"lag": contest}
-    )
+        groups={"lag": ()}, wider={}, unlike=("delay",), misfit=misfit, log_prior={},
+        contests={"lag": contest},
+    )  # fmt: skip
     odds = verdict._odds_of_group(search, "lag", Settings())
     assert least < odds["lag"] < most and sum(odds.values()) == pytest.approx(1.0)
+
+
+def test_of_two_that_fit_alike_the_one_that_is_hard_to_believe_has_next_to_no_odds():
+    """An encoder whose counts are a ninth wrong, 3.8 standard deviations, and a spring."""
+    names = ("encoder_scale", "spring")
+    contest = tuple(SimpleNamespace(effect=n, score=263.0) for n in names)
+    search = SimpleNamespace(
+        groups={"spring": ("encoder_scale",)}, wider={}, unlike=(), misfit=1.0,
+        contests={"spring": contest}, log_prior={"spring": {"encoder_scale": -0.5 * (3.8**2 - 1)}},
+    )  # fmt: skip
+    odds = verdict._odds_of_group(search, "spring", Settings())
+    assert odds["encoder_scale"] == pytest.approx(0.0012, rel=0.05)

@@ -172,6 +172,58 @@ def test_motor_effects_are_offered_to_motors_only():
         assert not registry.effect(name).targets(registry.device("magnetic_damper"))
 
 
+def _geared_joint(potential: str):
+    """A joint of 2 kg.m2 whose drive gives N.m."""
+    friction = {"prior": 1.0, "sd": 1.0}
+    return registry.device_from(
+        {
+            "name": "geared_joint",
+            "coordinates": {"joint": {"kind": "rotary", "sign_width": 1e-9}},
+            "energy": {"kinetic": "inertia*ddt(joint)**2/2", "potential": potential},
+            "inputs": {"force": ["torque"], "force_unit": "N.m", "drive": True},
+            "applied": {"joint": "torque"},
+            "friction": {
+                "joint": {
+                    "viscous": {"unit": "N.m.s/rad", **friction},
+                    "coulomb": {"unit": "N.m", **friction},
+                }
+            },
+            "parameters": {"inertia": {"unit": "kg.m2", "prior": 2.0, "sd": 1.0}},
+        }
+    )
+
+
+def test_a_gear_loses_of_the_load_behind_it_without_the_rotor():
+    """Closed form: the drive gives what the motion takes, and the loss by what crosses the gear."""
+    system = compile_model(Model(_geared_joint("-9*cos(joint)"), ["gear_loss:joint"]))
+    q, qd, qdd, _, t = smooth(system)
+    behind, share, weight = 0.45, 0.12, 9.0 * np.sin(q)
+    load = weight + behind * 2.0 * qdd
+    torque = 2.0 * qdd + weight + qd + np.sign(qd) + share * np.abs(load) * np.sign(qd)
+    u = np.zeros((len(t), len(system.inputs)))
+    u[:, [system.inputs.index("torque")]] = torque
+    names = [p.name for p in system.parameters]
+    p = system.prior.copy()
+    p[names.index("gear_loss.joint.share")] = share
+    p[names.index("gear_loss.joint.behind")] = behind
+    moving = np.abs(qd[:, 0]) > 1e-6
+    left = residual(system, p, (q, qd, qdd, u, t))[moving]
+    assert np.abs(left).max() < 1e-4 * np.abs(torque).max()
+
+
+@pytest.mark.parametrize(
+    ("potential", "held"), [("-9*cos(joint)", False), ("0", True), ("9", True)]
+)
+def test_the_rotors_part_is_open_only_where_a_weight_shows_it(potential, held):
+    effect = Model(_geared_joint(potential), ["gear_loss:joint"]).effects[0]
+    assert effect.parameter("behind").fixed is held
+    assert effect.parameter("behind").prior == 1.0
+    assert not effect.parameter("share").fixed
+    # The BAM's weight is in terms of definitions.
+    assert registry.device("bam").has_weight("pitch")
+    assert not registry.device("bam").has_weight("yaw")
+
+
 def test_hysteresis_of_all_dry_friction_needs_a_device_that_adds_some():
     effect = registry.effect("hysteresis")
     assert effect.targets(registry.device("magnetic_damper")) == ("piston",)
