@@ -14,13 +14,18 @@ from bampipe.discover.settings import Settings
 
 Array = NDArray[np.float64]
 
+_HOPELESS_SD = 1.5
+"""Standard deviations above chance, by the first four replays, below which a candidate is left at
+that. Among a hundred, significance takes 4.2 with thirty replays and more with fewer; four replays
+overstate a scatter by as much three times in a hundred thousand (chi-squared)."""
+
 
 class Level:
     """Mean and scatter of candidates' scores on replays of one model, found as needed.
 
     A candidate that gains nothing on the measured trials needs no chance level; most gain nothing.
-    A few replays tell chance from what stands far above it; where the best candidates do not, more
-    are made, and more again of those whose decision is close.
+    A few replays tell chance from what stands far above it, or not above it at all; where the best
+    candidates do neither, more are made, and more again of those whose decision is close.
     """
 
     def __init__(
@@ -43,7 +48,7 @@ class Level:
             settings: how many replays, and what is significant.
         """
         self._replay, self._tests, self._settings = replay, tests, settings
-        self._before, self._independent = before, independent
+        self._before, self._independent, self._first = before, independent, first
         # No replay is perfect: its log error is off by this, as a log likelihood.
         self._error = settings.replay_error * float(independent.mean())
         self._gains: dict[str, Array] = {}
@@ -87,9 +92,9 @@ class Level:
         on both, or the second look would be another chance of a false alarm.
         """
         s = self._settings
-        self._complete(names, len(self.replicates))
+        self._complete(names, self._first)
         if not all(self._is_clear(scores[n]) for n in self._deciding(scores, names)):
-            self._complete(names, s.replicates)
+            self._complete([n for n in names if self._stands_out(scores[n])], s.replicates)
         low, high = s.significance / s.close, s.significance * s.close
         close = [
             name
@@ -113,6 +118,18 @@ class Level:
         near = self._settings.rival_share * max(clear, default=-np.inf)
         return [name for name in names if excess[name] >= near]
 
+    def _stands_out(self, score: Score) -> bool:
+        """Whether more replays could make a candidate significant, and have not been made."""
+        return not self._is_clear(score) and self._height(score) > _HOPELESS_SD
+
+    def _height(self, score: Score) -> float:
+        """How far a candidate, whose chance level is known, stands above it, in its scatter."""
+        totals = self._gains[score.name].sum(axis=1)
+        count, middle = len(totals), float(np.median(totals))
+        totals = np.maximum(totals, 2.0 * middle - totals.max())
+        spread = np.hypot(totals.std(ddof=1) * np.sqrt(1.0 + 1.0 / count), self._error)
+        return float((score.total - totals.mean()) / spread)
+
     def p_value(self, score: Score) -> float:
         """Chance that any candidate scores this high with nothing missing (Bonferroni).
 
@@ -122,12 +139,8 @@ class Level:
         """
         if score.name not in self._gains:
             return 1.0
-        totals = self._gains[score.name].sum(axis=1)
-        count, middle = len(totals), float(np.median(totals))
-        totals = np.maximum(totals, 2.0 * middle - totals.max())
-        spread = np.hypot(totals.std(ddof=1) * np.sqrt(1.0 + 1.0 / count), self._error)
-        z = (score.total - totals.mean()) / spread
-        return float(min(1.0, self._tests * student.sf(z, count - 1)))
+        count = len(self._gains[score.name])
+        return float(min(1.0, self._tests * student.sf(self._height(score), count - 1)))
 
     def excess(self, score: Score) -> Array:
         """Gain beyond chance, by axis; the gain itself where chance is not known.
