@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bampipe.data.quality import CleaningLimits, CleanTrial, clean, thin, thinning_factor
+from bampipe.data.quality.clock import rate_of
 from bampipe.data.readers import RawTrial
 from bampipe.data.session import session_from
 from bampipe.errors import InputError
@@ -133,6 +134,14 @@ def test_a_second_of_samples_is_a_second():
     assert len(cleaned(table).t) == 500
     with pytest.raises(InputError, match=r"499 samples over 0\.998 s, less than 1 s"):
         cleaned({name: values[:499] for name, values in table.items()})
+
+
+@pytest.mark.parametrize(("rate_hz", "stamp_s"), [(94.0, 1e-3), (400.0, 1e-3), (4000.0, 1e-4)])
+def test_the_rate_is_that_of_the_samples_whatever_stamps_are_rounded_to(rate_hz, stamp_s):
+    t = np.rint(np.arange(3000) / rate_hz / stamp_s) * stamp_s
+    kept = np.ones(t.size, dtype=bool)
+    kept[[700, 1500, 1501]] = False
+    assert rate_of(t[kept]) == pytest.approx(rate_hz, rel=1e-3)
 
 
 def test_a_trial_is_a_stretch_of_a_record():

@@ -8,8 +8,6 @@ noticed is a sentence in ``notes``. Nothing is altered without one.
 
 from __future__ import annotations
 
-import numpy as np
-
 from bampipe.data.quality.channels import (
     fill_missing,
     refuse_frozen,
@@ -23,6 +21,7 @@ from bampipe.data.quality.clock import (
     drop_backward_stamps,
     keep_longest_stretch,
     note_clock,
+    rate_of,
     refuse_length,
     time_to_seconds,
 )
@@ -87,5 +86,4 @@ def clean(raw: RawTrial, session: Session, entry: TrialEntry, limits: CleaningLi
     columns = to_si(table)
     refuse_wrong_motion(table, columns)
     refuse_wrong_brakes(table, columns)
-    rate = float(1.0 / np.median(np.diff(table.t)))
-    return CleanTrial(table.t, columns, rate, table.repairs, table.notes, table.dead)
+    return CleanTrial(table.t, columns, rate_of(table.t), table.repairs, table.notes, table.dead)

@@ -57,7 +57,7 @@ class CleanTrial:
     Attributes:
         t: (T,) s, strictly increasing from 0.
         columns: (T,) a column in SI units: q_<axis>, force_<component>, brake_<axis>, channels.
-        sample_rate: 1 / median step, Hz.
+        sample_rate: Hz, by its mean step.
         repairs: what was changed or left out.
         notes: what was noticed and left as it is.
         dead: stretches over which a sensor was dead, that are left out of everything.
