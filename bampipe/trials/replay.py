@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 
 from bampipe.estimate.butterworth import zero_phase
 from bampipe.estimate.simulation import Runaway, simulate_tracking
@@ -30,7 +31,7 @@ from bampipe.physics import System
 from bampipe.physics.device import derivative
 from bampipe.trials.cache import MOST_SAMPLES, TrialCache
 from bampipe.trials.kinematics import Kinematics
-from bampipe.trials.motion import Motion, Recording, n_samples, trial_sizes
+from bampipe.trials.motion import Motion, Recording, input_derivatives, n_samples, trial_sizes
 from bampipe.trials.residuals import ModelOnTrial, standstill_of
 from bampipe.trials.sensors import Sensors
 
@@ -115,18 +116,28 @@ def follow_motion(system: System, p: Array, motion: Motion, rate_hz: float) -> C
     """
     u = motion.inputs(system.inputs)
     fitted = ModelOnTrial(system, p, [motion])
+    late = _lateness(fitted, u) * rate_hz
     if _is_motion_given(fitted, u):
-        return Course(motion.q, _required_force(fitted, u))
+        return Course(motion.q, _required_force(fitted, u, late))
     q, qd = _reference(system, p, motion, u, rate_hz)
     start = np.concatenate([q[0], qd[0], system.initial_memory(q[0], u[0], p)])
     at = {name: i for i, name in enumerate(system.inputs)}
     forces = system.model.device.forces
+    columns = [at[f] for f in forces]
+    # A delay by derivatives holds within the band of a residual; a simulated machine feels what is
+    # beyond it, too, such as the jumps of a drive. So its forces are moved, and it has no delay.
+    acting, prompt = u.copy(), p.copy()
+    prompt[[system.index(name) for name in system.delays]] = 0.0
+    for force, samples in zip(forces, late, strict=True):
+        for name in (force, *input_derivatives(force)):
+            if name in at:
+                acting[:, at[name]] = _shifted(u[:, at[name]], -samples)
     widths = np.array([c.sign_width for c in system.model.device.coordinates])
     try:
         x, total = simulate_tracking(
-            system.derivative, start, u, p, 1.0 / rate_hz, q, qd,
+            system.derivative, start, acting, prompt, 1.0 / rate_hz, q, qd,
             width=widths, n_noise=len(system.noise),
-            force=[at[f] for f in forces],
+            force=columns,
             rate=[at.get(derivative(f, 1), -1) for f in forces],
             curvature=[at.get(derivative(f, 2), -1) for f in forces],
             smooth=system.forced,
@@ -134,11 +145,54 @@ def follow_motion(system: System, p: Array, motion: Motion, rate_hz: float) -> C
     except Runaway:
         if not _is_controlled(system):
             raise
-        return Course(motion.q, _required_force(fitted, u))
+        return Course(motion.q, _required_force(fitted, u, late))
     if _is_controlled(system) and _strays(x[:, : q.shape[1]], q):
-        return Course(motion.q, _required_force(fitted, u))
-    seen = system.encoder_readings(x, total, p)[:, : len(system.coordinates)]
-    return Course(seen, total[:, [at[f] for f in forces]])
+        return Course(motion.q, _required_force(fitted, u, late))
+    seen = system.encoder_readings(x, total, prompt)[:, : len(system.coordinates)]
+    arm = total[:, columns] - acting[:, columns]
+    return Course(seen, u[:, columns] + _each_shifted(arm, late))
+
+
+def _lateness(fitted: ModelOnTrial, u: Array) -> Array:
+    """Time by which each force acts after it was logged, (n_f,), s; negative if it acts before.
+
+    Args:
+        fitted: the model on a trial; u: inputs of that, (T, n_u).
+    """
+    system, p, motion = fitted.system, fitted.p, fitted.motion
+    found = np.zeros(len(system.model.device.forces))
+    if not system.delays:
+        return found
+    memory = system.initial_memory(motion.q[0], u[0], p)
+    x = np.concatenate([motion.q[0], motion.qd[0], memory])
+
+    def slope(column: int) -> Array:
+        moved, here, there = u[0].copy(), np.empty(len(x)), np.empty(len(x))
+        moved[column] += 1.0
+        for inputs, out in ((u[0], here), (moved, there)):
+            system.derivative(x, inputs, p, np.zeros(len(system.noise)), out)
+        return there - here
+
+    for k, force in enumerate(system.model.device.forces):
+        rate, direct = derivative(force, 1), slope(system.inputs.index(force))
+        if rate in system.inputs and direct.any():
+            by_rate = slope(system.inputs.index(rate))
+            found[k] = -float(direct @ by_rate) / float(direct @ direct)
+    return found
+
+
+def _each_shifted(columns: Array, samples: Array) -> Array:
+    """Columns (T, k), each some samples later, (k,); see `_shifted`."""
+    pairs = zip(columns.T, samples, strict=True)
+    return np.column_stack([_shifted(column, float(by)) for column, by in pairs])
+
+
+def _shifted(values: Array, samples: float) -> Array:
+    """What a signal (T,) is some samples later; its last value beyond its ends."""
+    if samples == 0.0 or not values.any():
+        return values
+    at = np.clip(np.arange(values.size) + samples, 0, values.size - 1)
+    return np.asarray(CubicSpline(np.arange(values.size), values)(at))
 
 
 def keep_motion(fitted: Sequence[ModelOnTrial]) -> bool:
@@ -185,12 +239,17 @@ def _jumps(fitted: ModelOnTrial, u: Array) -> bool:
     return bool(known.any() and np.all(made[known] > _JUMPS * whole[known]))
 
 
-def _required_force(fitted: ModelOnTrial, u: Array) -> Array:
-    """The force that the model needs for the motion as measured, (T, n_f): none is left over."""
+def _required_force(fitted: ModelOnTrial, u: Array, late: Array) -> Array:
+    """The force that the model needs for the motion as measured, (T, n_f): none is left over.
+
+    Args:
+        fitted: the model on a trial; u: inputs of that, (T, n_u).
+        late: samples by which each force acts after it was logged, (n_f,).
+    """
     system = fitted.system
     forces = [system.inputs.index(name) for name in system.model.device.forces]
     excess = system.least_force(fitted.motion.q, fitted.residual, u, fitted.p)
-    return np.asarray(u[:, forces] - excess)
+    return np.asarray(u[:, forces] - _each_shifted(excess, late))
 
 
 def read_by_sensors(
