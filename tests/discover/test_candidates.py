@@ -154,22 +154,27 @@ def test_the_right_effect_explains_most_and_has_the_true_size(
 @pytest.mark.parametrize("hidden", [(), ("actuator_lag:current",)])
 def test_a_lag_counts_for_the_signal_and_not_for_the_noise_that_it_averages_out(tmp_path, hidden):
     quiet, recipe, truth = record_trials(tmp_path, "joint", 4, *hidden)
-    rng, motions = np.random.default_rng(8), []
-    for motion in quiet.motions:
-        force = motion.channels["current"]
-        noise = (0.05 if hidden else 2.0) * force.std() * rng.normal(size=force.size)
-        motions.append(motion.with_channels({"current": force + noise}))
-    noisy = replace(quiet, motions=tuple(motions))
-    scorer = Scorer(fit_trials(noisy, recipe, system_of(recipe).prior))
     item = compile_candidate(build_candidate_model(recipe.model().device, "actuator_lag:current"))
-    found = scorer.score(item)
+
+    def scorer(seed: int, share: float) -> Scorer:
+        rng, motions = np.random.default_rng(seed), []
+        for motion in quiet.motions:
+            force = motion.channels["current"]
+            noise = share * force.std() * rng.normal(size=force.size)
+            motions.append(motion.with_channels({"current": force + noise}))
+        noisy = replace(quiet, motions=tuple(motions))
+        return Scorer(fit_trials(noisy, recipe, system_of(recipe).prior))
+
     if hidden:
-        time_constant = truth["actuator_lag.current.time_constant"]
+        found = scorer(8, 0.05).score(item)
         assert found.total > 100.0
+        time_constant = truth["actuator_lag.current.time_constant"]
         assert found.values[0] == pytest.approx(time_constant, rel=0.05)
-    else:
-        blurred = scorer.score_at(item, np.array([0.1]))
-        assert blurred.total <= 0.0 and found.total == 0.0
+        return
+    # By chance a lag may gain a little on one draw of the noise, but not on most of them.
+    drawn = [scorer(seed, 2.0) for seed in range(8, 13)]
+    assert np.median([s.score(item).total for s in drawn]) == 0.0
+    assert np.median([s.score_at(item, np.array([0.1])).total for s in drawn]) <= 0.0
 
 
 @pytest.mark.parametrize("late_s", [0.0, 4e-3])
