@@ -41,9 +41,8 @@ def thin(trial: CleanTrial, every: int, sampled: Collection[str]) -> CleanTrial:
     """
     if every == 1:
         return trial
-    low_pass = firwin(
-        2 * _HALF_LENGTH * every + 1, min(_HALF_POWER / every, 0.99), window=("kaiser", _KAISER)
-    )
+    length = 2 * _HALF_LENGTH * every + 1
+    low_pass = firwin(length, _HALF_POWER / every, window=("kaiser", _KAISER))
     columns = {
         name: values[::every].copy()
         if name.startswith(("q_", "brake_")) or name in sampled or _is_held(values)
