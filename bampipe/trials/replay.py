@@ -116,9 +116,8 @@ def follow_motion(system: System, p: Array, motion: Motion, rate_hz: float) -> C
     """
     u = motion.inputs(system.inputs)
     fitted = ModelOnTrial(system, p, [motion])
-    late = _lateness(fitted, u) * rate_hz
     if _is_motion_given(fitted, u):
-        return Course(motion.q, _required_force(fitted, u, late))
+        return Course(motion.q, _required_force(fitted, u))
     q, qd = _reference(system, p, motion, u, rate_hz)
     start = np.concatenate([q[0], qd[0], system.initial_memory(q[0], u[0], p)])
     at = {name: i for i, name in enumerate(system.inputs)}
@@ -126,6 +125,7 @@ def follow_motion(system: System, p: Array, motion: Motion, rate_hz: float) -> C
     columns = [at[f] for f in forces]
     # A delay by derivatives holds within the band of a residual; a simulated machine feels what is
     # beyond it, too, such as the jumps of a drive. So its forces are moved, and it has no delay.
+    late = _lateness(fitted, u) * rate_hz
     acting, prompt = u.copy(), p.copy()
     prompt[[system.index(name) for name in system.delays]] = 0.0
     for force, samples in zip(forces, late, strict=True):
@@ -145,9 +145,9 @@ def follow_motion(system: System, p: Array, motion: Motion, rate_hz: float) -> C
     except Runaway:
         if not _is_controlled(system):
             raise
-        return Course(motion.q, _required_force(fitted, u, late))
+        return Course(motion.q, _required_force(fitted, u))
     if _is_controlled(system) and _strays(x[:, : q.shape[1]], q):
-        return Course(motion.q, _required_force(fitted, u, late))
+        return Course(motion.q, _required_force(fitted, u))
     seen = system.encoder_readings(x, total, prompt)[:, : len(system.coordinates)]
     arm = total[:, columns] - acting[:, columns]
     return Course(seen, u[:, columns] + _each_shifted(arm, late))
@@ -239,17 +239,12 @@ def _jumps(fitted: ModelOnTrial, u: Array) -> bool:
     return bool(known.any() and np.all(made[known] > _JUMPS * whole[known]))
 
 
-def _required_force(fitted: ModelOnTrial, u: Array, late: Array) -> Array:
-    """The force that the model needs for the motion as measured, (T, n_f): none is left over.
-
-    Args:
-        fitted: the model on a trial; u: inputs of that, (T, n_u).
-        late: samples by which each force acts after it was logged, (n_f,).
-    """
+def _required_force(fitted: ModelOnTrial, u: Array) -> Array:
+    """The force that the model needs for the motion as measured, (T, n_f): none is left over."""
     system = fitted.system
     forces = [system.inputs.index(name) for name in system.model.device.forces]
     excess = system.least_force(fitted.motion.q, fitted.residual, u, fitted.p)
-    return np.asarray(u[:, forces] - _each_shifted(excess, late))
+    return np.asarray(u[:, forces] - excess)
 
 
 def read_by_sensors(
