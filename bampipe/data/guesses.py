@@ -9,6 +9,7 @@ import numpy as np
 from scipy.signal import oaconvolve
 
 from bampipe.data.angle_torque import AngleTorque, angle_torque, least_squares
+from bampipe.data.quality.clock import rate_of
 from bampipe.data.session import SECONDS
 
 RATES_HZ = (4.0, 30_000.0)
@@ -57,10 +58,7 @@ def interval_of(name: str, value: float) -> float:
 
 def sample_rate(t: np.ndarray) -> float:
     """Rate of time stamps ``t`` (T,), s, in Hz: a round number where one is within 1 %."""
-    steps = np.diff(t[np.isfinite(t)])
-    steps = steps[steps > 0]
-    # The mean, as stamps that jitter are rarely as often early as late; gaps left out.
-    rate = 1.0 / float(np.mean(steps[steps < 1.6 * np.median(steps)]))
+    rate = rate_of(t[np.isfinite(t)])
     decade = 10.0 ** math.floor(math.log10(rate))
     nearest = min((n * decade for n in (*_NICE, 10)), key=lambda nice: abs(nice - rate))
     return float(f"{nearest:.6g}") if abs(nearest / rate - 1) < 0.01 else float(f"{rate:.4g}")

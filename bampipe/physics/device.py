@@ -368,12 +368,7 @@ class Device(Declaration):
 
     def has_weight(self, axis: str) -> bool:
         """Whether the device's potential energy depends on the position of ``axis``."""
-        known, new = set[str](), expression.names(self.potential)
-        while new:
-            known |= new
-            found = (expression.names(self.definitions[n]) for n in new & set(self.definitions))
-            new = set().union(*found) - known
-        return axis in known
+        return axis in expression.reached_names([self.potential], self.definitions)
 
     @property
     def components(self) -> tuple[str, ...]:

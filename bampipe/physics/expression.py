@@ -10,7 +10,7 @@ import ast
 import keyword
 import math
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import cache
 from typing import Annotated, Any
 
@@ -150,6 +150,18 @@ def names(tree: ast.AST) -> set[str]:
     """Names of quantities that an expression uses (function names left out)."""
     functions = {id(n.func) for n in ast.walk(tree) if isinstance(n, ast.Call)}
     return {n.id for n in ast.walk(tree) if isinstance(n, ast.Name) and id(n) not in functions}
+
+
+def reached_names(trees: Iterable[ast.expr], definitions: Mapping[str, ast.expr]) -> set[str]:
+    """Every name that expressions use, through definitions too."""
+    found: set[str] = set()
+    waiting = {name for tree in trees for name in names(tree)}
+    while waiting:
+        name = waiting.pop()
+        found.add(name)
+        if name in definitions:
+            waiting |= names(definitions[name]) - found
+    return found
 
 
 def expanded_size(tree: ast.AST, sizes: Mapping[str, int]) -> int:

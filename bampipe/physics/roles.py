@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import ast
-from collections.abc import Iterable, Mapping
 from typing import Any
 
 import sympy as sp
@@ -27,7 +25,11 @@ def compensation(d: Vocabulary, potential: Any) -> list[Any]:
     ]
     found = [t if kept else sp.S.Zero for t, kept in zip(torque, balanced, strict=True)]
     rest = [device.kinetic, device.potential, *device.applied.values(), *device.side_load.values()]
-    own = _reached(device.torque.values(), device.definitions) - _reached(rest, device.definitions)
+    of_torque, of_rest = (
+        expression.reached_names(trees, device.definitions)
+        for trees in (device.torque.values(), rest)
+    )
+    own = of_torque - of_rest
     raw_applied, side = d.table(device.applied, "applied"), d.table(device.side_load, "side_load")
     for item in (e for e in d.model.effects if e.effect.kind == "torque"):
         for key, tree in item.effect.expressions.items():
@@ -36,18 +38,6 @@ def compensation(d: Vocabulary, potential: Any) -> list[Any]:
                 found[place] += d.rebuild_for(
                     item, tree, d.effect_symbols(item, raw_applied, side), key
                 )
-    return found
-
-
-def _reached(trees: Iterable[ast.expr], definitions: Mapping[str, ast.expr]) -> set[str]:
-    """Every name that expressions use, through definitions too."""
-    found: set[str] = set()
-    waiting = {name for tree in trees for name in expression.names(tree)}
-    while waiting:
-        name = waiting.pop()
-        found.add(name)
-        if name in definitions:
-            waiting |= expression.names(definitions[name]) - found
     return found
 
 

@@ -72,11 +72,11 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         config = replace(config, frozen_share=1.0, saturated_share=1.0)
     (out / "ingest").mkdir(parents=True, exist_ok=True)
     channels = ChannelRecords(session, device)
+    every = thinning_factor(session.sample_rate, config.fastest_hz)
     with ParquetAppender(out / "ingest/samples.parquet") as samples:
-        rows = _ingest_trials(session, config, channels, samples, progress)
+        rows = _ingest_trials(session, config, every, channels, samples, progress)
     trials = _trials_table(rows)
     write_parquet(out / "ingest/trials.parquet", trials)
-    every = thinning_factor(session.sample_rate, config.fastest_hz)
     rate = _rate(session.sample_rate / every, trials)
     description = _description(session, device, rate, every, channels, rows)
     description.write(out)
@@ -97,6 +97,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
 def _ingest_trials(
     session: Session,
     config: Config,
+    every: int,
     channels: ChannelRecords,
     samples: ParquetAppender,
     progress: Progress,
@@ -108,7 +109,6 @@ def _ingest_trials(
     """
     rows: list[dict[str, Any]] = []
     copies = find_copies(session)
-    every = thinning_factor(session.sample_rate, config.fastest_hz)
     encoders = {each.name for each in session.channels if each.second_encoder_of}
     total, measured = len(session.trials), 0
     for number, entry in enumerate(session.trials):

@@ -150,7 +150,8 @@ def follow_motion(system: System, p: Array, motion: Motion, rate_hz: float) -> C
         return Course(motion.q, _required_force(fitted, u))
     seen = system.encoder_readings(x, total, prompt)[:, : len(system.coordinates)]
     arm = total[:, columns] - acting[:, columns]
-    return Course(seen, u[:, columns] + _each_shifted(arm, late))
+    logged = [_shifted(pull, samples) for pull, samples in zip(arm.T, late, strict=True)]
+    return Course(seen, u[:, columns] + np.column_stack(logged))
 
 
 def _lateness(fitted: ModelOnTrial, u: Array) -> Array:
@@ -179,12 +180,6 @@ def _lateness(fitted: ModelOnTrial, u: Array) -> Array:
             by_rate = slope(system.inputs.index(rate))
             found[k] = -float(direct @ by_rate) / float(direct @ direct)
     return found
-
-
-def _each_shifted(columns: Array, samples: Array) -> Array:
-    """Columns (T, k), each some samples later, (k,); see `_shifted`."""
-    pairs = zip(columns.T, samples, strict=True)
-    return np.column_stack([_shifted(column, float(by)) for column, by in pairs])
 
 
 def _shifted(values: Array, samples: float) -> Array:

@@ -186,12 +186,13 @@ def refuse_length(table: TrialTable) -> None:
 
 
 def rate_of(t: np.ndarray) -> float:
-    """Samples a second by time stamps (T,), s, gaps left out.
+    """Samples a second by time stamps (T,), s; gaps and stamps that do not increase left out.
 
     By the mean step, and not the median: a clock of whole milliseconds steps by 10 and 12 ms at 94
     Hz, one of a tenth by 0.2 and 0.3 ms at 4 kHz.
     """
     steps = np.diff(t)
+    steps = steps[steps > 0]
     return 1.0 / float(np.mean(steps[steps <= _GAP * np.median(steps)]))
 
 
