@@ -41,7 +41,7 @@ CASES: dict[str, tuple[int, str, str, dict[str, float]]] = {
     "sticking: late drive": (8107, "ZYY", "joint_states", {"actuator_delay:elbow": 1.0}),
 }  # fmt: skip
 """By name: seed, axes of the joints, headers, what is hidden."""
-SOFT_HZ = {8102: 10.0, 8103: 5.0, 8104: 4.0, 8105: 5.0, 8106: 3.0, 8107: 8.0, 8108: 4.0}
+SOFT_HZ = {8102: 10.0, 8103: 5.0, 8104: 4.0, 8105: 5.0, 8106: 3.0, 8107: 3.0, 8108: 4.0}
 """By seed: how softly drives follow their paths, where joints stick as they turn round."""
 STICKING: dict[str, float] = {"rate_hz": 250.0, "seconds": 12.0, "noise": 0.01}
 """How those are recorded."""

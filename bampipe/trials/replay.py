@@ -117,7 +117,7 @@ def follow_motion(system: System, p: Array, motion: Motion, rate_hz: float) -> C
     u = motion.inputs(system.inputs)
     fitted = ModelOnTrial(system, p, [motion])
     if _is_motion_given(fitted, u):
-        return Course(motion.q, _required_force(fitted, u))
+        return Course(motion.q, _required_force(fitted, u, rate_hz))
     q, qd = _reference(system, p, motion, u, rate_hz)
     start = np.concatenate([q[0], qd[0], system.initial_memory(q[0], u[0], p)])
     at = {name: i for i, name in enumerate(system.inputs)}
@@ -126,8 +126,7 @@ def follow_motion(system: System, p: Array, motion: Motion, rate_hz: float) -> C
     # A delay by derivatives holds within the band of a residual; a simulated machine feels what is
     # beyond it, too, such as the jumps of a drive. So its forces are moved, and it has no delay.
     late = _lateness(fitted, u) * rate_hz
-    acting, prompt = u.copy(), p.copy()
-    prompt[[system.index(name) for name in system.delays]] = 0.0
+    acting, prompt = u.copy(), _without_delays(system, p)
     for force, samples in zip(forces, late, strict=True):
         for name in (force, *input_derivatives(force)):
             if name in at:
@@ -145,9 +144,9 @@ def follow_motion(system: System, p: Array, motion: Motion, rate_hz: float) -> C
     except Runaway:
         if not _is_controlled(system):
             raise
-        return Course(motion.q, _required_force(fitted, u))
+        return Course(motion.q, _required_force(fitted, u, rate_hz))
     if _is_controlled(system) and _strays(x[:, : q.shape[1]], q):
-        return Course(motion.q, _required_force(fitted, u))
+        return Course(motion.q, _required_force(fitted, u, rate_hz))
     seen = system.encoder_readings(x, total, prompt)[:, : len(system.coordinates)]
     arm = total[:, columns] - acting[:, columns]
     logged = [_shifted(pull, samples) for pull, samples in zip(arm.T, late, strict=True)]
@@ -234,12 +233,44 @@ def _jumps(fitted: ModelOnTrial, u: Array) -> bool:
     return bool(known.any() and np.all(made[known] > _JUMPS * whole[known]))
 
 
-def _required_force(fitted: ModelOnTrial, u: Array) -> Array:
-    """The force that the model needs for the motion as measured, (T, n_f): none is left over."""
-    system = fitted.system
+def _required_force(fitted: ModelOnTrial, u: Array, rate_hz: float) -> Array:
+    """The force that the model needs for the motion as measured, (T, n_f): none is left over.
+
+    What acts late is logged as much earlier, sample by sample: a jump of friction then falls
+    between other samples than those of the position, which no delay of the log as a whole gives.
+    """
+    system, motion = fitted.system, fitted.motion
     forces = [system.inputs.index(name) for name in system.model.device.forces]
-    excess = system.least_force(fitted.motion.q, fitted.residual, u, fitted.p)
-    return np.asarray(u[:, forces] - excess)
+    found, late = u[:, forces].copy(), _lateness(fitted, u) * rate_hz
+    for samples in np.unique(late):
+        at = fitted
+        if late.any():
+            moved = _moved_on(motion, system.model.device.forces, samples)
+            at = ModelOnTrial(system, _without_delays(system, fitted.p), [moved])
+        inputs = at.motion.inputs(system.inputs)
+        excess = system.least_force(at.motion.q, at.residual, inputs, at.p)
+        found[:, late == samples] -= excess[:, late == samples]
+    return found
+
+
+def _without_delays(system: System, p: Array) -> Array:
+    prompt = p.copy()
+    prompt[[system.index(name) for name in system.delays]] = 0.0
+    return prompt
+
+
+def _moved_on(motion: Motion, forces: Sequence[str], samples: float) -> Motion:
+    """A trial some samples later, beside ``forces`` as they are."""
+    stay = {name for force in forces for name in (force, *input_derivatives(force))}
+    channels = {
+        name: values if name in stay else _shifted(values, samples)
+        for name, values in motion.channels.items()
+    }
+    q, qd, qdd = (
+        np.column_stack([_shifted(column, samples) for column in values.T])
+        for values in (motion.q, motion.qd, motion.qdd)
+    )
+    return replace(motion, q=q, qd=qd, qdd=qdd, channels=channels, _columns={})
 
 
 def read_by_sensors(

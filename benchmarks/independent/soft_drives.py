@@ -33,6 +33,9 @@ def follow(
             positions, rates and accelerations (m, n).
         viscous: (n,); path: (T, n) positions and rates that the drives want.
         soft_hz: natural frequency of a joint under its drive; late_s: (n,) by which each acts late.
+
+    Raises:
+        ValueError: with this delay the drives do not hold the path.
     """
     wanted, wanted_rate = path
     count, n = wanted.shape
@@ -44,6 +47,7 @@ def follow(
     w = 2.0 * np.pi * soft_hz
     behind = np.round(late_s / h).astype(int)
     out, drives = np.empty((count, n)), np.empty((count, n))
+    farthest = np.ptp(wanted, axis=0)
     impulse = np.zeros(n)
     for k in range(count):
         drive = held + inertia * (w * w * (wanted[k] - q) + 2.0 * w * (wanted_rate[k] - v))
@@ -56,6 +60,8 @@ def follow(
         new = _rub(free, damped, h * dry[0], impulse)
         before, v = (new - v) / h, new
         q = q + h * v
+        if np.any(np.abs(q - wanted[k]) > farthest):
+            raise ValueError(f"drives of {soft_hz} Hz are unstable when they act {late_s} s late")
     return out, drives
 
 

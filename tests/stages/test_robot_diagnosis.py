@@ -50,6 +50,9 @@ def test_a_drive_that_is_late_or_read_late_is_named(
     truth = read_json(tmp_path / "arm.truth.json")["effects"]["actuator_delay:shoulder"]["delay"]
     fitted = best["parameters"][f"{effect}.torque_shoulder.delay"]
     assert fitted == pytest.approx(abs(truth), rel=0.1)
+    shoulder = found["axes"]["shoulder"]
+    # Friction jumps between other samples of the log than of the position, in replays, too.
+    assert 0.9 < shoulder["rmse_after"] / shoulder["noise_floor"] < 1.1
 
 
 @pytest.mark.long
