@@ -350,8 +350,9 @@ def _robust_residual(stacked: Stacked, blocks: _Blocks) -> Array:
     count = stacked.slope.shape[2]
     for _ in range(_ROUNDS):
         mean_square = blocks.mean_square(error, stacked.used)
-        scale = np.nanmedian(mean_square, axis=0)
-        scale = np.where(np.isfinite(scale) & (scale > 0.0), scale, np.inf)
+        unused = np.isnan(mean_square).all(axis=0)
+        scale = np.nanmedian(np.where(unused, np.inf, mean_square), axis=0)
+        scale = np.where(scale > 0.0, scale, np.inf)
         worst = np.nanmax(np.nan_to_num(mean_square / scale), axis=1)
         weight = np.sqrt(1.0 / (1.0 + worst[blocks.block]))[:, None] / np.sqrt(scale)
         slope = (stacked.slope * weight[:, :, None]).reshape(-1, count)
