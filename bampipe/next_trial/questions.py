@@ -8,18 +8,30 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bampipe.discover.candidates import list_candidates
+from bampipe.discover.candidates import Candidate, list_candidates
 from bampipe.discover.chance import candidates_of, fit_trials, system_of
 from bampipe.discover.odds import odds_by_score
 from bampipe.discover.scorer import Scorer
 from bampipe.discover.settings import Settings
+from bampipe.estimate.simulation import Runaway
 from bampipe.next_trial.discrimination import Contest, Rival, Sums
-from bampipe.next_trial.sensitivity import Bar, Visibility, refine, typical_rival, weigh_visibility
+from bampipe.next_trial.sensitivity import (
+    Bar,
+    Visibility,
+    beyond_standing_still,
+    growth_of_jump,
+    refine,
+    typical_rival,
+    weigh_visibility,
+)
 from bampipe.physics.recipe import Recipe
 from bampipe.physics.registry import effect_from
 from bampipe.results.diagnose import DiagnoseResult
+from bampipe.trials.draw import draw_trials
 from bampipe.trials.measured import MeasuredTrials
 from bampipe.trials.motion import Motion
+from bampipe.trials.noise_floor import FLOOR_SEED, replay_evidence
+from bampipe.trials.replay import StandIn, keep_motion
 from bampipe.trials.residuals import Evidence
 
 Array = NDArray[np.float64]
@@ -142,6 +154,11 @@ class Blindness:
         return [k for k in order if self.found[k].is_hidden]
 
     @property
+    def unpromised(self) -> list[str]:
+        """Names of those of which nothing is said; see `Visibility.is_promised`."""
+        return [one.rival.name for one in self.found if not one.is_promised]
+
+    @property
     def of_brakes(self) -> list[str]:
         """Names of the effects that show where brakes are on."""
         rivals = [one.rival for one in self.found]
@@ -173,28 +190,57 @@ class Blindness:
 
 def find_blindness(
     evidence: Evidence,
-    motions: Sequence[Motion],
+    trials: MeasuredTrials,
     recipe: Recipe,
     error: Array,
     floor: Array,
     floor_sd: Array,
-    timing_s: float,
 ) -> Blindness:
     """What the trials would have shown of every effect of the library that the model lacks.
 
     Args:
-        evidence: the model's fit; motions: by which effects are weighed; recipe: the model.
+        evidence: the model's fit to the trials; recipe: the model.
         error: (n_q,) held-out error; floor, floor_sd: (n_q,) of its noise, N.m or N.
-        timing_s: by how much the inputs may be sampled late or early; 0 where that is not fitted.
     """
     device, extra = recipe.model().device, [effect_from(e) for e in recipe.extra]
     scale = Scorer(evidence).machine_scale
     items = candidates_of(recipe, list_candidates(device, recipe.effects, extra))
     rivals = [rival for item in items if (rival := typical_rival(item, scale)) is not None]
+    # The trials may be late already, and an effect goes on from there.
+    timing_s = trials.limit_s + abs(trials.late_s) if trials.limit_s else 0.0
     contest = Contest(
         evidence.system, evidence.p, tuple(rivals), evidence.band, error, False, timing_s
     )
+    motions = trials.weighed
     at_hand, bar = contest.sums(motions), Bar.of_errors(error, floor, floor_sd, len(items))
-    found = weigh_visibility(contest, at_hand, bar)
-    refined = tuple(refine(contest, motions, one, bar) for one in found)
-    return Blindness(contest, at_hand, refined, bar)
+    found = [refine(contest, motions, v, bar) for v in weigh_visibility(contest, at_hand, bar)]
+    found = [replace(v, growth=growth_of_jump(contest, motions, v)) for v in found]
+    jumping = [v.rival.item for v in found if v.growth > 0.0 and v.rival.item is not None]
+    still = _gain_by_standing_still(trials, recipe, evidence, jumping)
+    found = [
+        beyond_standing_still(contest, at_hand, v, left, still.get(v.rival.name, 0.0))
+        for v, left in zip(found, contest.left_by_model(at_hand), strict=True)
+    ]
+    return Blindness(contest, at_hand, tuple(found), bar)
+
+
+def _gain_by_standing_still(
+    trials: MeasuredTrials, recipe: Recipe, evidence: Evidence, items: Sequence[Candidate]
+) -> dict[str, float]:
+    """Log likelihood that effects gain where the model stands still as its motion turns round."""
+    if not items or keep_motion(evidence.fitted):
+        return {}
+    chosen = draw_trials(evidence.sizes)
+    moved = system_of(recipe.with_sign_widths(Settings().still_width))
+    motions = [evidence.motions[k] for k in chosen]
+    stand_in = StandIn(moved, evidence.p, motions, trials.sensors.rate_hz)
+    try:
+        replayed = replay_evidence(
+            stand_in, evidence.system, evidence.p, trials.sensors, trials.kinematics, trials.band,
+            evidence.folds.subset(chosen), (FLOOR_SEED,),
+        )  # fmt: skip
+    except Runaway:
+        return {}
+    scorer, share = Scorer(replayed), sum(evidence.sizes) / sum(replayed.sizes)
+    scores = (scorer.score(item) for item in items)
+    return {score.name: share * score.total for score in scores if score is not None}

@@ -23,6 +23,41 @@ class Reasons:
     expected: str
 
 
+@dataclass(frozen=True)
+class _Unseen:
+    """Which effects the trials at hand would not have shown; see `explain_proposal`."""
+
+    table: Mapping[str, Detectable]
+    unbraked: Sequence[str]
+    unpromised: Sequence[str]
+
+    @property
+    def sentence(self) -> str:
+        table, unbraked, unpromised = self.table, self.unbraked, self.unpromised
+        shown = find_shown(table)
+        hidden = [*shown, *(name for name in _hidden(table) if name not in shown)]
+        never = [name for name in _never(table) if name not in unbraked]
+        if hidden:
+            sizes = [_size(name, table[name]) for name in hidden]
+            why = f"These trials would not have shown {join_names(sizes, _SHOWN)}."
+        else:
+            every = "every other effect" if never or unbraked or unpromised else "every effect"
+            why = f"These trials would have shown {every} of the library at its typical size."
+        if never:
+            one = "one effect stays" if len(never) == 1 else f"{len(never)} effects stay"
+            names = join_names(never, _SHOWN)
+            why += f" In trials like these {one} out of sight at any size ({names})."
+        if unbraked:
+            names = join_names(unbraked, _SHOWN)
+            why += f" What brakes do ({names}) shows in viscous trials, of which there are none."
+        if unpromised:
+            why += (
+                f" Of {join_names(unpromised, _SHOWN)} no size is promised: large enough to show,"
+                " it changes how the motion turns round."
+            )
+        return why
+
+
 def explain_proposal(
     purpose: Purpose,
     parameter: str,
@@ -33,6 +68,7 @@ def explain_proposal(
     missing: Sequence[str] | None = (),
     distinguishable: Sequence[str] = (),
     unbraked: Sequence[str] = (),
+    unpromised: Sequence[str] = (),
 ) -> Reasons:
     """Say why a trial is proposed and what it is expected to give.
 
@@ -44,8 +80,10 @@ def explain_proposal(
         missing: effects that the diagnosis found and the model does not have; None without one.
         distinguishable: effects that it leaves open, though trials like these tell them apart.
         unbraked: effects of brakes that no trial at hand has on.
+        unpromised: effects with which the machine would have moved too differently.
     """
-    why, expected = _explain(purpose, parameter, best, table, unlimited, unbraked)
+    unseen = _Unseen(table, unbraked, unpromised)
+    why, expected = _explain(purpose, parameter, best, unseen, unlimited)
     if best.brakes:
         why += " Add it to session.toml as a viscous trial."
     if best.farther or best.faster:
@@ -84,9 +122,8 @@ def _explain(
     purpose: Purpose,
     parameter: str,
     best: Proposal,
-    table: Mapping[str, Detectable],
+    unseen: _Unseen,
     unlimited: Sequence[str],
-    unbraked: Sequence[str],
 ) -> tuple[str, str]:
     """Why, and what is expected as far as the model goes."""
     if purpose == "decision":
@@ -98,9 +135,9 @@ def _explain(
     )
     narrowed = _narrowed(parameter, best)
     if purpose == "sensitivity":
-        shown = _detected(table)
+        shown = _detected(unseen.table)
         # Nothing tried shows more: then it is for the parameters.
-        return _unseen(table, unbraked) + ("" if shown else f" This one {most}."), shown or narrowed
+        return unseen.sentence + ("" if shown else f" This one {most}."), shown or narrowed
     return f"Of the motions tried, this one {most}.", narrowed
 
 
@@ -135,27 +172,6 @@ def _remedy(unlimited: Sequence[str]) -> str:
         f"Another load may, or a wider motion: the device file states no [limits] of"
         f" {join_names(unlimited, _SHOWN)}, so that none was tried."
     )
-
-
-def _unseen(table: Mapping[str, Detectable], unbraked: Sequence[str]) -> str:
-    """Which effects the trials at hand would not have shown."""
-    shown = find_shown(table)
-    hidden = [*shown, *(name for name in _hidden(table) if name not in shown)]
-    never = [name for name in _never(table) if name not in unbraked]
-    if hidden:
-        sizes = [_size(name, table[name]) for name in hidden]
-        why = f"These trials would not have shown {join_names(sizes, _SHOWN)}."
-    else:
-        every = "every other effect" if never or unbraked else "every effect"
-        why = f"These trials would have shown {every} of the library at its typical size."
-    if never:
-        one = "one effect stays" if len(never) == 1 else f"{len(never)} effects stay"
-        names = join_names(never, _SHOWN)
-        why += f" In trials like these {one} out of sight at any size ({names})."
-    if unbraked:
-        names = join_names(unbraked, _SHOWN)
-        why += f" What brakes do ({names}) shows in viscous trials, of which there are none."
-    return why
 
 
 def _size(name: str, entry: Detectable) -> str:

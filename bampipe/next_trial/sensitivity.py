@@ -11,12 +11,14 @@ from scipy.stats import norm
 from scipy.stats import t as student
 
 from bampipe.discover.candidates import Candidate
+from bampipe.discover.columns import added_residual
 from bampipe.discover.ranges import MachineScale
 from bampipe.discover.settings import Settings
 from bampipe.next_trial.discrimination import Contest, Rival, Sums
 from bampipe.physics.parameter import Parameter
 from bampipe.results.standing import AT_FLOOR
 from bampipe.trials.motion import Motion
+from bampipe.trials.residuals import ModelOnTrial
 
 Array = NDArray[np.float64]
 
@@ -24,6 +26,12 @@ PROBABILITY = 0.9
 """With which the strength would have been revealed."""
 HOPELESS = 100.0
 """Of the typical strength: what shows from there on only shows at no size that a machine has."""
+ROUGHER = 0.15
+"""Growth of the jump of friction at a reversal from which on no strength is promised. The joint of
+the independent simulator, at the strength that was: friction by load (0.07, 0.08) showed in three
+sessions of four, Stribeck friction (0.24 to 0.53) in none of four."""
+_POSES, _SLIDING = 50, 5.0
+"""At which that jump is looked at, and the speed on either side, in widths of the sign."""
 LARGE = 1.0
 """Of the size at which an effect is clearly there: what goes unnoticed at that size is hidden."""
 
@@ -37,11 +45,13 @@ class Visibility:
         factor: of the typical strength, from which on it is found; infinite where the trials do
             not excite it.
         axis: where it shows first.
+        growth: of the jump of friction as that axis turns round, at the typical strength.
     """
 
     rival: Rival
     factor: float
     axis: int
+    growth: float = 0.0
 
     @property
     def parameter(self) -> Parameter:
@@ -54,6 +64,15 @@ class Visibility:
         """Its typical size, in its unit."""
         assert self.rival.item is not None
         return float(abs(self.rival.values[_strengths(self.rival.item)[0]]))
+
+    @property
+    def is_promised(self) -> bool:
+        """Whether the machine would have moved much as it did with the effect at this strength.
+
+        When friction jumps between two samples no log says, and what that leaves grows with the
+        jump; while a joint sticks and breaks free, it is not where it was without the effect.
+        """
+        return self.factor >= HOPELESS or self.factor * self.growth <= ROUGHER
 
     @property
     def is_hidden(self) -> bool:
@@ -188,3 +207,52 @@ def refine(contest: Contest, motions: Sequence[Motion], found: Visibility, bar: 
         again = weigh_visibility(probe, probe.sums(motions), bar)[0]
         found = replace(found, factor=found.factor * again.factor, axis=again.axis)
     return found
+
+
+def growth_of_jump(contest: Contest, motions: Sequence[Motion], found: Visibility) -> float:
+    """By which share an effect of typical strength makes friction jump more where motion turns.
+
+    0 of an effect with a memory, whose force does not jump.
+
+    Args:
+        contest: of the effect; motions: the trials; found: the effect on them.
+    """
+    item, values = found.rival.item, found.rival.values
+    assert item is not None
+    if item.system.memory_names != contest.system.memory_names or item.replaces_motion:
+        return 0.0
+    axis, motion = found.axis, motions[0]
+    p = np.append(contest.p[: len(item.system.parameters) - len(values)], values)
+    motion = motion.rows(slice(None, None, max(1, len(motion.t) // _POSES)))
+    speed = _SLIDING * contest.system.model.device.coordinates[axis].sign_width
+    own = more = 0.0
+    for side in (1.0, -1.0):
+        qd = np.zeros_like(motion.qd)
+        qd[:, axis] = side * speed
+        sliding = replace(motion, qd=qd, qdd=np.zeros_like(qd), _columns={})
+        base = ModelOnTrial(contest.system, contest.p, [sliding])
+        own += side * float(base.residual[:, axis].mean())
+        more += side * float(added_residual(item, p, base)[:, axis].mean())
+    return max(more / own, 0.0) if own else 0.0
+
+
+def beyond_standing_still(
+    contest: Contest, sums: Sums, found: Visibility, left: Array, gain: float
+) -> Visibility:
+    """The same with an effect that must explain more than a machine does that stands still.
+
+    Args:
+        contest, sums: as for `weigh_visibility`; found: the effect.
+        left: (n_q,) sum of squares that the model leaves of it at its typical strength.
+        gain: log likelihood that it gains on trials of a machine without it that stands still where
+            it turns round. A diagnosis wants more than that, and half of its gain besides.
+    """
+    if gain <= 0.0 or not np.isfinite(found.factor):
+        return found
+    axis = found.axis
+    independent = float(sums.count[axis] * contest.band.independent_share[axis])
+    ratio = left[axis] / (sums.count[axis] * contest.floor[axis] ** 2)
+    own = 0.5 * independent * np.log1p(found.factor**2 * ratio)
+    asked = max(own + gain, gain / (1.0 - Settings().still_share))
+    factor = float(np.sqrt(np.expm1(2.0 * asked / independent) / ratio))
+    return replace(found, factor=max(factor, found.factor))

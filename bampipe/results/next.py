@@ -152,6 +152,9 @@ class NextResult(Result):
     expected: str = Field(description="What it is expected to give")
     proposals: tuple[Proposal, ...] = Field(description="Best first")
     sensitivity: dict[str, Detectable] = Field(default={}, description="By effect of the library")
+    unpromised: Names = Field(
+        default=(), description="Effects that would change the motion too much for such a number"
+    )
     shows: Names = Field(
         default=(), description="Effects that the first proposal is to show, and the trials not"
     )

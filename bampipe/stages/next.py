@@ -147,9 +147,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     if chosen == "sensitivity":
         progress(0.1, "what these trials would have shown of each effect")
         error, spread = _errors(diagnosed, evidence)
-        limit = found.input_timing.limit
-        weighed = trials.weighed
-        blindness = find_blindness(evidence, weighed, recipe, error, floor, spread, limit)
+        blindness = find_blindness(evidence, trials, recipe, error, floor, spread)
     forecast = Forecast(rehearsal, precision, contest, at_hand)
     worth = _worth(chosen, parameter, forecast, blindness)
     axes = seen.movable
@@ -199,9 +197,11 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     lacking = _lacking(run, config.model, diagnosed)
     missing = diagnosed.selected if diagnosed is not None else None
     unbraked = blindness.of_brakes if blindness and not seen.field.any() else ()
+    unpromised = tuple(blindness.unpromised) if blindness else ()
     reasons = explain_proposal(
-        chosen, parameter, best, table, unlimited, lacking, missing, distinguishable, unbraked
-    )
+        chosen, parameter, best, table, unlimited, lacking, missing, distinguishable, unbraked,
+        unpromised,
+    )  # fmt: skip
     result = NextResult(
         model=config.model,
         purpose=chosen,
@@ -212,6 +212,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         expected=reasons.expected,
         proposals=proposals,
         sensitivity=table,
+        unpromised=unpromised,
         shows=find_shown(table),
         plan=plan,
     )
@@ -349,6 +350,7 @@ def _sensitivity(blindness: Blindness, best: Tried) -> dict[str, Detectable]:
             with_proposal=factor * found.typical if factor < HOPELESS else None,
         )
         for found, factor in zip(blindness.found, after, strict=True)
+        if found.is_promised
     }
 
 

@@ -445,6 +445,9 @@ def test_effects_of_brakes_are_said_to_need_viscous_trials():
     assert "every other effect of the library at its typical size. What brakes do" in reasons.why
     assert "(brake_lag) shows in viscous trials, of which there are none" in reasons.why
     assert "out of sight" not in reasons.why
+    assert "promised" not in reasons.why
+    unpromised = explain_proposal("sensitivity", "", best, {}, (), (), unpromised=["stribeck:yaw"])
+    assert "every other effect of the library at its typical size. Of stri" in unpromised.why
     braked = best.model_copy(update={"brakes": 1.0})
     why = explain_proposal("sensitivity", "", braked, table, (), ()).why
     assert why.endswith("Add it to session.toml as a viscous trial.")
@@ -454,12 +457,15 @@ def test_what_shows_at_no_size_that_a_machine_has_is_out_of_sight():
     def seen(factor: float) -> SimpleNamespace:
         parameter = SimpleNamespace(name="p", unit="A")
         rival = SimpleNamespace(name=f"effect:{factor:g}")
-        return SimpleNamespace(rival=rival, parameter=parameter, typical=2.0, factor=factor, axis=0)
+        return SimpleNamespace(
+            rival=rival, parameter=parameter, typical=2.0, factor=factor, axis=0,
+            is_promised=factor != 7.0,
+        )  # fmt: skip
 
     blindness = SimpleNamespace(
-        found=[seen(3.0), seen(1e5)],
+        found=[seen(3.0), seen(7.0), seen(1e5)],
         contest=SimpleNamespace(system=SimpleNamespace(coordinates=("yaw",))),
-        factors_with=lambda motions: np.array([1.0, 99.0]),
+        factors_with=lambda motions: np.array([1.0, 1.0, 99.0]),
     )
     near, far = _sensitivity(blindness, SimpleNamespace(usual=(None,))).values()
     assert (near.smallest, near.with_proposal, near.axis) == (6.0, 2.0, "yaw")

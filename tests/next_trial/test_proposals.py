@@ -130,6 +130,9 @@ def test_effects_are_found_from_the_strength_on_that_the_trials_would_have_shown
         assert diagnose(again)["selected"] == selected, share
     # An offset of the motor is one to the data with the device's own.
     assert found.sensitivity["force_bias:current"].smallest is None
+    # At 94 Hz it shows from a size on at which the joint sticks where it did not.
+    assert found.unpromised == ("stribeck:joint",)
+    assert "stribeck:joint" not in found.sensitivity
 
 
 def record_at(folder: Path, strength: float) -> dict[str, float]:
