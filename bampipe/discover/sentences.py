@@ -215,7 +215,7 @@ def _refused(axis: str, found: Diagnosis, unit: str, remains: bool) -> list[str]
     """
     said = []
     for one in found.refused:
-        if one.axis != axis or not (remains or one.why == "stops"):
+        if one.axis != axis or not (remains or one.why in ("stops", "like_stops")):
             continue
         before, after = one.held_out_rmse_before, one.held_out_rmse_after
         rest, left = one.without_worst_second_before, one.without_worst_second_after
@@ -233,10 +233,11 @@ def _refused(axis: str, found: Diagnosis, unit: str, remains: bool) -> list[str]
             why = f"would take the held-out error from {numbers}, but replays with it give no floor"
             why += " that this could be judged by"
         elif one.why == "stops":
-            why = (
-                f"would take the held-out error from {numbers}, but replays that truly stand still"
-            )
-            why += " at reversals explain that without it"
+            why = f"would take the held-out error from {numbers}, but replays without it that truly"
+            why += " stand still at reversals give it most of that gain as well"
+        elif one.why == "like_stops":
+            why = f"would take the held-out error from {numbers}, but does little beside an effect"
+            why += " that replays which truly stand still at reversals imitate"
         elif after < before:
             why = f"beats chance by its score, but takes the held-out error only from {numbers}"
         else:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from bampipe.discover.bench import Bench
 from bampipe.discover.level import Level
-from bampipe.discover.polish import FittedSet
+from bampipe.discover.polish import FittedSet, extend_set
 from bampipe.discover.scorer import Score
 from bampipe.estimate.simulation import Runaway
 from bampipe.results.diagnose import RefusedEffect
@@ -30,6 +30,8 @@ class StoppingReplays:
         self._bench, self._current = bench, current
         self._made: Level | None = None
         self._matters: bool | None = None
+        self._imitated: dict[str, Score] = {}
+        self._beside: tuple[str, FittedSet] | None = None
 
     def _matter(self, level: Level) -> bool:
         """Whether they say anything new beside the ``level`` of replays that creep."""
@@ -49,6 +51,22 @@ class StoppingReplays:
             )
         return self._made
 
+    def _says_more(self, score: Score) -> bool:
+        """Whether a candidate keeps its gain beside the best one that these replays imitate.
+
+        Friction that stops a machine rougher than any replay leaves something for other effects of
+        a like shape.
+        """
+        if not self._imitated:
+            return True
+        best = max(self._imitated.values(), key=lambda one: one.total)
+        if self._beside is None or self._beside[0] != best.name:
+            self._beside = best.name, extend_set(self._current, best)
+        beside = self._beside[1]
+        found = self._bench.scores(beside.recipe, beside.evidence.p, [score.name])
+        least = self._bench.settings.still_share * score.total
+        return score.name in found and found[score.name].total > least
+
     def first_beyond(
         self,
         scores: Mapping[str, Score],
@@ -63,7 +81,8 @@ class StoppingReplays:
 
         Returns:
             Those, as they came; and of the ones before, p-value and gain in log error by axis. All
-            of them where standing still does not matter, or the replays run away.
+            of them where standing still does not matter, or the replays run away. One that says
+            little beside another that these replays imitate does not pass either.
         """
         s, kept = self._bench.settings, list(significant)
         doubted: dict[str, tuple[float, Array]] = {}
@@ -77,8 +96,11 @@ class StoppingReplays:
                 still.ask(scores, [name])
                 p_value, excess = still.p_value(scores[name]), still.excess(scores[name])
                 share = float(excess.sum() / level.excess(scores[name]).sum())
-                if p_value < s.significance and share > s.still_share:
+                beyond = p_value < s.significance and share > s.still_share
+                if beyond and self._says_more(scores[name]):
                     break
+                if not beyond:
+                    self._imitated[name] = scores[name]
                 gain = excess / self._current.scorer.independent_samples
                 doubted[name] = (max(p_value, s.significance), np.asarray(gain))
                 kept.pop(0)
@@ -87,12 +109,15 @@ class StoppingReplays:
         return kept, doubted
 
     def refusal(self, score: Score) -> RefusedEffect:
-        """A candidate that helps on the measured trials as it does on these replays."""
+        """A candidate that helps on the measured trials as it does on these replays.
+
+        Or that is like one which does.
+        """
         evidence, axis = self._current.evidence, int(np.argmax(score.gain))
         return RefusedEffect(
             effect=score.name,
             axis=evidence.system.coordinates[axis],
             held_out_rmse_before=evidence.held_out_rmse[axis],
             held_out_rmse_after=self._current.scorer.comparable_error(score)[axis],
-            why="stops",
+            why="stops" if score.name in self._imitated else "like_stops",
         )

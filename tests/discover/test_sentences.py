@@ -222,7 +222,10 @@ def test_what_stopping_replays_explain_is_said_where_nothing_is_missing(monkeypa
         effect="lag:x", axis="joint", held_out_rmse_before=1.0, held_out_rmse_after=0.5, why="stops"
     )
     said = say(monkeypatch, finding("nothing_missing", 1.0, 1.0, 1.0), refused=(one,))
-    assert "from 1.00 to 0.500 N.m, but replays that truly stand still at reversals" in said
+    assert "from 1.00 to 0.500 N.m, but replays without it that truly stand still at" in said
+    alike = one.model_copy(update={"why": "like_stops"})
+    said = say(monkeypatch, finding("nothing_missing", 1.0, 1.0, 1.0), refused=(alike,))
+    assert "but does little beside an effect that replays which truly stand still" in said
 
 
 def test_odds_are_given_where_no_replay_looks_like_the_measurement(monkeypatch):

@@ -25,7 +25,7 @@ def level_of(gains, p_values):
     )
 
 
-def replays(p_values=(), matter=True):
+def replays(p_values=(), matter=True, like=()):
     """Replays that make a level of these p-values, and a list of the times it was made."""
     made = []
 
@@ -41,7 +41,9 @@ def replays(p_values=(), matter=True):
     bench = SimpleNamespace(
         settings=Settings(), level=level, standing_still_matters=lambda *known: matter
     )
-    return StoppingReplays(bench, current), made
+    found = StoppingReplays(bench, current)
+    found._says_more = lambda name: name not in like
+    return found, made
 
 
 SIGNIFICANT = [(gain, name) for name, gain in GAINS.items()]
@@ -65,6 +67,13 @@ def test_what_such_replays_have_by_chance_is_passed_over() -> None:
     kept, doubted = found.first_beyond(SCORES, level_of(GAINS, {}), SIGNIFICANT)
     assert [name for _, name in kept] == ["thinning"]
     assert doubted["delay"][0] == 0.2
+
+
+def test_what_is_only_like_such_an_effect_is_passed_over() -> None:
+    found, _ = replays(like=["delay"])
+    kept, doubted = found.first_beyond(SCORES, level_of(GAINS, {}), SIGNIFICANT)
+    assert [name for _, name in kept] == ["thinning"]
+    assert list(doubted) == ["compliance", "delay"]
 
 
 def test_where_standing_still_does_not_matter_nothing_is_replayed() -> None:
