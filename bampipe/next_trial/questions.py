@@ -227,8 +227,12 @@ def find_blindness(
 def _gain_by_standing_still(
     trials: MeasuredTrials, recipe: Recipe, evidence: Evidence, items: Sequence[Candidate]
 ) -> dict[str, float]:
-    """Log likelihood that effects gain where the model stands still as its motion turns round."""
-    if not items or keep_motion(evidence.fitted):
+    """Log likelihood that effects gain where the model stands still as its motion turns round.
+
+    Nothing of a robot, whose replays with a narrow sign take minutes.
+    """
+    robot = evidence.system.model.device.robot is not None
+    if robot or not items or keep_motion(evidence.fitted):
         return {}
     chosen = draw_trials(evidence.sizes)
     moved = system_of(recipe.with_sign_widths(Settings().still_width))
