@@ -285,7 +285,7 @@ def describe_methods(system: System, methods: Mapping[Method, MethodTried]) -> l
         against = [*_worse(system, published, tried), *tried.doubts]
         if tried.disagrees:
             against.append(
-                "it puts "
+                "the latter puts "
                 + ", ".join(
                     f"`{name}` at {round_with_sd(one.estimate, one.sd)}"
                     for name in tried.disagrees
@@ -310,6 +310,6 @@ def _worse(system: System, published: MethodTried, tried: MethodTried) -> list[s
         return []
     axis = max(units, key=lambda a: tried.held_out_rmse[a] - published.held_out_rmse[a])
     return [
-        f"on trials left out it errs by {significant(tried.held_out_rmse[axis])} {units[axis]} on"
-        f" {axis} instead of {significant(published.held_out_rmse[axis])}"
+        f"on trials left out the latter errs by {significant(tried.held_out_rmse[axis])}"
+        f" {units[axis]} on {axis}, the former by {significant(published.held_out_rmse[axis])}"
     ]
