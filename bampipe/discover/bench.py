@@ -41,7 +41,7 @@ from bampipe.trials.noise_floor import (
     floor_replays,
     standing_still_matters,
 )
-from bampipe.trials.residuals import Evidence, problem_of
+from bampipe.trials.residuals import Evidence, timing_problem
 
 Array = NDArray[np.float64]
 
@@ -88,7 +88,7 @@ class Bench:
         trials, system = self.trials, evidence.system
         if trials.limit_s == 0.0 or system.has_free_delay:
             return self
-        problem = problem_of(system, trials.motions, trials.band, timing=True)
+        problem = timing_problem(system, trials.motions, trials.band)
         wide = replace(problem, lower=_wider(problem.lower), upper=_wider(problem.upper))
         found = fit(
             wide,
@@ -97,7 +97,8 @@ class Bench:
             most_iterations=_STEPS_OF_TIMING,
         )
         step, sd = float(found.p[-1]), float(np.sqrt(found.covariance[-1, -1]))
-        if abs(trials.late_s + step) > trials.limit_s:
+        beyond = abs(trials.late_s + step) > trials.limit_s
+        if beyond and system.model.device.robot is None:
             # What filters make of a change of direction looks late, too.
             straight = remove_bias(
                 trials.sensors, trials.kinematics, system, trials.motions, wide, found

@@ -57,7 +57,7 @@ from bampipe.trials.reading import (
     read_sensors,
     require_sound_motions,
 )
-from bampipe.trials.residuals import applied_rms, problem_of
+from bampipe.trials.residuals import applied_rms, problem_of, timing_problem
 
 SUMMARY = "Parameters of the model with uncertainties, from the free trials"
 INPUTS = (*INGESTED, *FILTERED, *MODEL_INPUTS)
@@ -257,9 +257,13 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         *describe_calibration(estimate, moved),
         *summarise_bases(system, bases),
     ]
+    timed = raw
+    if timing and system.model.device.robot is not None:
+        timed = fit(timing_problem(system, motions, band), raw.p, block_s=config.block_s)
     result = collect_result(
-        system, estimate, identifiability, motions, config.model, raw, engine, methods, notes, bases
-    )
+        system, estimate, identifiability, motions, config.model, raw, timed, engine, methods,
+        notes, bases,
+    )  # fmt: skip
     if width is not None:
         result = result.model_copy(update={"sign_width_factor": width.factor})
     states, trace = estimate.tabulate()
