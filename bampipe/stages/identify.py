@@ -57,7 +57,8 @@ from bampipe.trials.reading import (
     read_sensors,
     require_sound_motions,
 )
-from bampipe.trials.residuals import applied_rms, problem_of, timing_problem
+from bampipe.trials.residuals import applied_rms, problem_of
+from bampipe.trials.timing import find_robot_timing
 
 SUMMARY = "Parameters of the model with uncertainties, from the free trials"
 INPUTS = (*INGESTED, *FILTERED, *MODEL_INPUTS)
@@ -257,12 +258,12 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         *describe_calibration(estimate, moved),
         *summarise_bases(system, bases),
     ]
-    timed = raw
+    late = float(raw.p[-1]), float(np.sqrt(raw.covariance[-1, -1]))
     if timing and system.model.device.robot is not None:
-        timed = fit(timing_problem(system, motions, band), raw.p, block_s=config.block_s)
+        late = find_robot_timing(system, motions, band, near)
     result = collect_result(
-        system, estimate, identifiability, motions, config.model, raw, timed, engine, methods,
-        notes, bases,
+        system, estimate, identifiability, motions, config.model, raw, late, engine, methods, notes,
+        bases,
     )  # fmt: skip
     if width is not None:
         result = result.model_copy(update={"sign_width_factor": width.factor})

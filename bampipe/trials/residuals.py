@@ -140,17 +140,6 @@ def problem_of(
     )
 
 
-def timing_problem(system: System, motions: Sequence[Motion], band: Band) -> Problem:
-    """`problem_of` by which the timing of the inputs is judged.
-
-    Friction that truly stops an axis looks late where it turns round, by milliseconds, and would
-    outweigh what all other samples say. Of a robot, whose drives work all along its path, those
-    tell the timing; a hand's force does little else than turn the axis round.
-    """
-    turning = system.model.device.robot is None
-    return problem_of(system, motions, band, timing=True, turning=turning)
-
-
 def _multiplied(system: System, free: Sequence[int]) -> NDArray[np.int64] | None:
     """Axes whose inputs free parameters multiply, (n_free,), as torque constants of a robot do.
 
@@ -512,9 +501,6 @@ def _slopes_by_timing(
         )
         rows.append((late - early) / (2.0 * step))
     thin = band.thin_trials(rows, range(len(system.coordinates)))
-    if system.model.device.robot is not None:  # as in `timing_problem`
-        turns = (find_turns(base.motion.qd, band.rate_hz) for base in fitted)
-        used = [u & find_moving_samples(t, band) for u, t in zip(used, turns, strict=True)]
     return tuple(values * moves for values, moves in zip(thin, used, strict=True))
 
 
