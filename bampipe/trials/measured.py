@@ -47,8 +47,8 @@ class MeasuredTrials:
         blocks: how many of the motions are blocks of the only trial that is not held out.
         late_s: time by which inputs were sampled after positions, taken off already; limit_s: the
             most that it may be, zero where it is not estimated.
-        timed: whether the trials show such a time, so that each candidate has one of its own; that
-            of a robot is told by most of its drives (`find_robot_timing`), whatever one of them lacks.
+        timed: whether the trials show such a time, so that each candidate has one of its own; of a
+            robot none has: most drives tell it, whatever one of them lacks (`find_robot_timing`).
     """
 
     motions: Sequence[Motion]
