@@ -20,7 +20,7 @@ from tests.physics.small_arm import ARM
 RATE = 250.0
 HERTZ = np.array([[0.31, 0.73, 1.1], [0.37, 0.61, 1.3], [0.23, 0.83, 0.97]])
 SIZE = np.array([0.8, 0.3, 0.1])
-DRY = 0.2
+DRY = 2.0
 CLOCK_S = 1.5e-3
 
 
