@@ -42,6 +42,7 @@ from bampipe.trials.noise_floor import (
     standing_still_matters,
 )
 from bampipe.trials.residuals import Evidence, problem_of
+from bampipe.trials.timing import find_robot_timing
 
 Array = NDArray[np.float64]
 
@@ -88,6 +89,21 @@ class Bench:
         trials, system = self.trials, evidence.system
         if trials.limit_s == 0.0 or system.has_free_delay:
             return self
+        chosen = evidence.folds.fitted_trials
+        if system.model.device.robot is not None:
+            motions = [trials.motions[k] for k in chosen]
+            step, sd = find_robot_timing(system, motions, trials.band, evidence.p)
+        else:
+            step, sd = self._timing_of_fit(evidence)
+        late_s, s = trials.late_s + step, self.settings
+        if abs(step) < s.timing_sd * sd or abs(late_s) - s.limit_sd * sd > trials.limit_s:
+            return self
+        late_s = float(np.clip(late_s, -trials.limit_s, trials.limit_s))
+        return replace(self, trials=open_trials(late_s))
+
+    def _timing_of_fit(self, evidence: Evidence) -> tuple[float, float]:
+        """The change of the inputs' timing that a fit to all samples finds, and its sd, s."""
+        trials, system = self.trials, evidence.system
         problem = problem_of(system, trials.motions, trials.band, timing=True)
         wide = replace(problem, lower=_wider(problem.lower), upper=_wider(problem.upper))
         found = fit(
@@ -103,11 +119,7 @@ class Bench:
                 trials.sensors, trials.kinematics, system, trials.motions, wide, found
             )
             step = float(straight.p[-1])
-        late_s, s = trials.late_s + step, self.settings
-        if abs(step) < s.timing_sd * sd or abs(late_s) - s.limit_sd * sd > trials.limit_s:
-            return self
-        late_s = float(np.clip(late_s, -trials.limit_s, trials.limit_s))
-        return replace(self, trials=open_trials(late_s))
+        return step, sd
 
     def fit(self, recipe: Recipe, start: Array, like: Evidence | None = None) -> Evidence:
         """Least squares of a model on the measured trials; see `fit_trials`."""

@@ -55,6 +55,22 @@ def find_standstill(
     return still
 
 
+def find_turns(qd: Array, rate_hz: float) -> NDArray[np.bool_]:
+    """Tell where an axis turns round: within `REST_S` of a change of the velocity's sign.
+
+    Args:
+        qd: (T, n_q) velocity; rate_hz: of the samples.
+
+    Returns:
+        (T, n_q).
+    """
+    near, turns = round(REST_S * rate_hz), np.zeros(qd.shape, dtype=bool)
+    for column, v in zip(turns.T, qd.T, strict=True):
+        for last in np.flatnonzero(np.diff(np.sign(v))):
+            column[max(last - near, 0) : last + near + 2] = True
+    return turns
+
+
 def find_runs(chosen: NDArray[np.bool_]) -> list[tuple[int, int]]:
     """First sample and the one after the last of every run of chosen samples."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], chosen.astype(int), [0]])))

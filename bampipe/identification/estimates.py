@@ -191,6 +191,7 @@ def collect_result(
     motions: Sequence[Motion],
     model: str,
     raw: LeastSquares,
+    late: tuple[float, float],
     engine: Literal["compiled", "filterpy"],
     methods: Mapping[Method, MethodTried],
     notes: Sequence[str],
@@ -201,6 +202,7 @@ def collect_result(
     Args:
         system: the model; estimate: the published one; identifiability: of its parameters.
         motions: the trials; model: its name; raw: the least-squares fit to the same trials.
+        late: timing of the inputs that residuals go by, and its standard deviation, s.
         engine: of the filter; methods: all that were tried; notes: on how it came about.
     """
     free, sd = estimate.free, estimate.sd
@@ -220,7 +222,7 @@ def collect_result(
     unknown = [name for name, found in effects.items() if not found.identified]
     warning = f"not identified: {', '.join(unknown)}; " if unknown else ""
     timing = estimate.report["input_timing"]
-    timing = timing.model_copy(update={"of_residual": _timing_of_residual(timing, raw)})
+    timing = timing.model_copy(update={"of_residual": _timing_of_residual(timing, *late)})
     influence = _assess_influence(names, estimate, motions, raw)
     return IdentifyResult(
         model=model,
@@ -325,12 +327,11 @@ def _fault(name: str, entry: ParameterEstimate) -> str:
     return ""
 
 
-def _timing_of_residual(timing: InputTiming, raw: LeastSquares) -> float:
-    """The timing that least squares find, s; 0 where that may as well be none."""
-    late_s, determined = float(raw.p[-1]), timing.limit > 0.0
-    if not determined or abs(late_s) < NORMAL_95 * float(np.sqrt(raw.covariance[-1, -1])):
+def _timing_of_residual(timing: InputTiming, late_s: float, sd: float) -> float:
+    """The timing that is taken off the trials, s; 0 where that may as well be none."""
+    if timing.limit == 0.0 or abs(late_s) < NORMAL_95 * sd:
         return 0.0
-    return late_s
+    return float(np.clip(late_s, -timing.limit, timing.limit))
 
 
 def _describe_limit(timing: InputTiming) -> str:

@@ -58,6 +58,7 @@ from bampipe.trials.reading import (
     require_sound_motions,
 )
 from bampipe.trials.residuals import applied_rms, problem_of
+from bampipe.trials.timing import find_robot_timing
 
 SUMMARY = "Parameters of the model with uncertainties, from the free trials"
 INPUTS = (*INGESTED, *FILTERED, *MODEL_INPUTS)
@@ -257,9 +258,13 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         *describe_calibration(estimate, moved),
         *summarise_bases(system, bases),
     ]
+    late = float(raw.p[-1]), float(np.sqrt(raw.covariance[-1, -1]))
+    if timing and system.model.device.robot is not None:
+        late = find_robot_timing(system, motions, band, near)
     result = collect_result(
-        system, estimate, identifiability, motions, config.model, raw, engine, methods, notes, bases
-    )
+        system, estimate, identifiability, motions, config.model, raw, late, engine, methods, notes,
+        bases,
+    )  # fmt: skip
     if width is not None:
         result = result.model_copy(update={"sign_width_factor": width.factor})
     states, trace = estimate.tabulate()

@@ -25,7 +25,7 @@ from bampipe.estimate.least_squares import (
 )
 from bampipe.estimate.low_pass import Band
 from bampipe.estimate.normal_equations import NormalEquations
-from bampipe.estimate.standstill import find_moving_samples, find_standstill
+from bampipe.estimate.standstill import find_moving_samples, find_standstill, find_turns
 from bampipe.physics import System
 from bampipe.trials.cache import TrialCache
 from bampipe.trials.folds import Folds
@@ -47,6 +47,7 @@ def problem_of(
     *,
     held: Sequence[str] = (),
     timing: bool = False,
+    turning: bool = True,
 ) -> Problem:
     """Return the inverse dynamics of ``motions`` as a least-squares problem.
 
@@ -57,6 +58,7 @@ def problem_of(
         system: the model; motions: the trials; band: the low-pass of the residual.
         held: parameters that are not estimated, beside those that the model fixes.
         timing: whether that time is estimated; else it stays as given.
+        turning: whether samples count in which an axis turns round.
     """
     n = len(system.parameters)
     # Of differences by many parameters few change the internal states or the bodies' forces.
@@ -65,6 +67,10 @@ def problem_of(
 
     def inputs_at(motion: Motion, p: Array) -> Array:
         return motion.timed_inputs(system.inputs, float(p[n]))
+
+    def left_out(trial: int) -> NDArray[np.bool_]:
+        still = standstill_of(motions[trial], system, band.rate_hz)
+        return still if turning else still | find_turns(motions[trial].qd, band.rate_hz)
 
     def residual(trial: int, p: Array) -> Array:
         motion = motions[trial]
@@ -126,9 +132,7 @@ def problem_of(
         linear=linear,
         constant=np.array(same),
         band=band,
-        standstill=TrialCache(
-            lambda k: standstill_of(motions[k], system, band.rate_hz), len(motions), len
-        ),
+        standstill=TrialCache(left_out, len(motions), len),
         precision=np.array(precision),
         known=np.array(known),
         slopes=slopes,

@@ -1,0 +1,66 @@
+"""By how much the inputs of a robot were sampled after its positions, drive by drive."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.estimate.bounded import invert_scaled
+from bampipe.estimate.least_squares import as_measured, stacked_residual
+from bampipe.estimate.low_pass import Band
+from bampipe.estimate.normal_equations import NormalEquations
+from bampipe.physics import System
+from bampipe.trials.motion import Motion
+from bampipe.trials.residuals import problem_of
+
+Array = NDArray[np.float64]
+
+
+def find_robot_timing(
+    system: System, motions: Sequence[Motion], band: Band, p: Array
+) -> tuple[float, float]:
+    """Time by which the inputs of a robot were sampled after its positions, and its sd, s.
+
+    One clock reads all drives, so that what most of them agree on is theirs: the median over the
+    joints. One drive that acts late would move a fit to all, and every other joint with it.
+    Samples in which a joint turns round do not count: friction that truly stops it looks late
+    there, by milliseconds, and would outweigh the rest of the path.
+
+    Args:
+        system: the robot, fitted; motions: the trials; band: the low-pass of the residual.
+        p: parameters of the fit, (n_p,), at which its residual is linearised.
+
+    Returns:
+        Zero and infinity where no joint tells it.
+    """
+    problem = problem_of(system, motions, band, timing=True, turning=False)
+    at = np.append(p, 0.0)
+    stacked = [stacked_residual(problem, trial, at) for trial in range(len(motions))]
+    slopes = [each.slope for each in as_measured(problem, at, stacked)]
+    own, axes = problem.free.size - 1, range(len(system.coordinates))
+    # A column for each joint's own timing, in place of the one for all.
+    split = [
+        np.concatenate([slope[:, :, :own], slope[:, :, own:] * np.eye(len(axes))], axis=2)
+        for slope in slopes
+    ]
+    sums = NormalEquations.from_samples(
+        split, [each.residual for each in stacked], [each.used for each in stacked],
+        problem.precision[:own], problem.known[:own] - at[problem.free[:own]],
+    )  # fmt: skip
+    anywhere = np.full(len(axes), np.inf)
+    lower = np.append(problem.lower[:own] - at[problem.free[:own]], -anywhere)
+    upper = np.append(problem.upper[:own] - at[problem.free[:own]], anywhere)
+    weight = 1.0 / np.maximum(sums.mean_square(np.zeros(lower.size)), 1e-24)
+    step = sums.solve(weight, lower, upper)
+    weight = band.independent_share / np.maximum(sums.mean_square(step), 1e-24)
+    normal = np.tensordot(weight, sums.xx.sum(axis=0), 1) + np.diag(sums.precision)
+    late = sums.solve(weight, lower, upper)[own:]
+    variance = np.diag(invert_scaled(normal))[own:]
+    told = np.flatnonzero((variance > 0.0) & (variance < problem.upper[-1] ** 2))
+    if not told.size:
+        return 0.0, np.inf
+    middle = told[np.argsort(late[told])][(told.size - 1) // 2 : told.size // 2 + 1]
+    chosen = middle[np.argmin(np.abs(late[middle]))]
+    return float(late[chosen]), float(np.sqrt(variance[chosen]))
