@@ -38,10 +38,10 @@ towards one that lies farther is a straight line."""
 _RESONANCE = 3.0
 """Of the highest frequency of the band: what rings beyond leaves a tenth of its force in the band,
 which a late sample or a filter leaves as well."""
-_DELAY, _DELAY_OF_ONE = 0.2, 0.5
-"""In samples: both sides of the equation are filtered alike, so that less than one shows; of one
-drive among several, friction that stops its joint looks late by less than half a sample, as the
-timing of all of them does."""
+_DELAY, _DELAY_OF_DRIVES = 0.2, 0.5
+"""In samples: both sides of the equation are filtered alike, so that less than one shows; of drives,
+where there are several, friction that stops a joint looks late by less than half a sample, and by
+how much all of them are read late within that is told by most of them already."""
 
 
 @dataclass(frozen=True)
@@ -157,8 +157,9 @@ class MachineScale:
         """Ranges of lengths, speeds and the like at the target of an effect, by unit."""
         found = {"s": (_TIME[0] * self.interval, _TIME[1] * self.duration)}
         if parameter.strength:
-            one = item.effect.scope == "force_component" and len(self.coordinates) > 1
-            least = _DELAY_OF_ONE if one else _DELAY
+            of_drives = item.effect.scope == "force_component" or item.effect.drive
+            several = len(self.coordinates) > 1
+            least = _DELAY_OF_DRIVES if of_drives and several else _DELAY
             found["s"] = (least * self.interval if item.effect.kind == "input" else 0.0, np.inf)
         if not item.axes:
             return found
