@@ -39,9 +39,9 @@ _RESONANCE = 3.0
 """Of the highest frequency of the band: what rings beyond leaves a tenth of its force in the band,
 which a late sample or a filter leaves as well."""
 _DELAY, _DELAY_OF_DRIVES = 0.2, 0.5
-"""In samples: both sides of the equation are filtered alike, so that less than one shows; of drives,
-where there are several, friction that stops a joint looks late by less than half a sample, and by
-how much all of them are read late within that is told by most of them already."""
+"""In samples: both sides of the equation are filtered alike, so that less than one shows. Where
+there are several drives, friction that stops a joint looks late by less than half a sample, and how
+late all of them are within that is told by most of them already."""
 
 
 @dataclass(frozen=True)
