@@ -145,8 +145,8 @@ class InputTiming(Record):
     of_residual: float = Field(
         default=0.0,
         description="The one that leaves the least residual, within the limit, what filters make of"
-        " changes of direction not taken off, s; of a robot the one that most drives agree on, clear"
-        " of these; 0 where the trials do not show any. Residuals are compared with it",
+        " changes of direction not taken off, s; of a robot the one that most drives agree on,"
+        " clear of these; 0 where the trials do not show any. Residuals are compared with it",
     )
 
     @property
