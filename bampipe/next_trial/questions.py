@@ -18,7 +18,7 @@ from bampipe.next_trial.discrimination import Contest, Rival, Sums
 from bampipe.next_trial.sensitivity import (
     Bar,
     Visibility,
-    beyond_standing_still,
+    gain_at,
     growth_of_jump,
     refine,
     typical_rival,
@@ -218,7 +218,7 @@ def find_blindness(
     jumping = [v.rival.item for v in found if v.growth > 0.0 and v.rival.item is not None]
     still = _gain_by_standing_still(trials, recipe, evidence, jumping)
     found = [
-        beyond_standing_still(contest, at_hand, v, left, still.get(v.rival.name, 0.0))
+        replace(v, imitated=still.get(v.rival.name, 0.0) > gain_at(contest, at_hand, v, left))
         for v, left in zip(found, contest.left_by_model(at_hand), strict=True)
     ]
     return Blindness(contest, at_hand, tuple(found), bar)

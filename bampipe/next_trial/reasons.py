@@ -53,7 +53,7 @@ class _Unseen:
         if unpromised:
             why += (
                 f" Of {join_names(unpromised, _SHOWN)} no size is promised: large enough to show,"
-                " it changes how the motion turns round."
+                " it changes how the motion turns round, or standing still there looks like it."
             )
         return why
 
@@ -80,7 +80,7 @@ def explain_proposal(
         missing: effects that the diagnosis found and the model does not have; None without one.
         distinguishable: effects that it leaves open, though trials like these tell them apart.
         unbraked: effects of brakes that no trial at hand has on.
-        unpromised: effects with which the machine would have moved too differently.
+        unpromised: effects whose smallest strength is not known; see `Visibility.is_promised`.
     """
     unseen = _Unseen(table, unbraked, unpromised)
     why, expected = _explain(purpose, parameter, best, unseen, unlimited)

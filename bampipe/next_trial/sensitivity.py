@@ -46,12 +46,15 @@ class Visibility:
             not excite it.
         axis: where it shows first.
         growth: of the jump of friction as that axis turns round, at the typical strength.
+        imitated: whether it gains more than at ``factor`` on trials of a machine without it that
+            stands still where it turns round.
     """
 
     rival: Rival
     factor: float
     axis: int
     growth: float = 0.0
+    imitated: bool = False
 
     @property
     def parameter(self) -> Parameter:
@@ -67,12 +70,13 @@ class Visibility:
 
     @property
     def is_promised(self) -> bool:
-        """Whether the machine would have moved much as it did with the effect at this strength.
+        """Whether the machine would have moved much as it did, and not look like it without it.
 
         When friction jumps between two samples no log says, and what that leaves grows with the
         jump; while a joint sticks and breaks free, it is not where it was without the effect.
         """
-        return self.factor >= HOPELESS or self.factor * self.growth <= ROUGHER
+        known = self.factor * self.growth <= ROUGHER and not self.imitated
+        return self.factor >= HOPELESS or known
 
     @property
     def is_hidden(self) -> bool:
@@ -236,23 +240,14 @@ def growth_of_jump(contest: Contest, motions: Sequence[Motion], found: Visibilit
     return max(more / own, 0.0) if own else 0.0
 
 
-def beyond_standing_still(
-    contest: Contest, sums: Sums, found: Visibility, left: Array, gain: float
-) -> Visibility:
-    """The same with an effect that must explain more than a machine does that stands still.
+def gain_at(contest: Contest, sums: Sums, found: Visibility, left: Array) -> float:
+    """Log likelihood that an effect gains at the strength at which it is found.
 
     Args:
         contest, sums: as for `weigh_visibility`; found: the effect.
         left: (n_q,) sum of squares that the model leaves of it at its typical strength.
-        gain: log likelihood that it gains on trials of a machine without it that stands still where
-            it turns round. A diagnosis wants more than that, and half of its gain besides.
     """
-    if gain <= 0.0 or not np.isfinite(found.factor):
-        return found
     axis = found.axis
     independent = float(sums.count[axis] * contest.band.independent_share[axis])
     ratio = left[axis] / (sums.count[axis] * contest.floor[axis] ** 2)
-    own = 0.5 * independent * np.log1p(found.factor**2 * ratio)
-    asked = max(own + gain, gain / (1.0 - Settings().still_share))
-    factor = float(np.sqrt(np.expm1(2.0 * asked / independent) / ratio))
-    return replace(found, factor=max(factor, found.factor))
+    return 0.5 * independent * float(np.log1p(found.factor**2 * ratio))
