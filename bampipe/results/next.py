@@ -154,8 +154,8 @@ class NextResult(Result):
     sensitivity: dict[str, Detectable] = Field(default={}, description="By effect of the library")
     unpromised: Names = Field(
         default=(),
-        description="Effects that change the motion too much for such a number, or look like a machine"
-        " without them that stands still where it turns round",
+        description="Effects that change the motion too much for such a number, or look like a"
+        " machine without them that stands still where it turns round",
     )
     shows: Names = Field(
         default=(), description="Effects that the first proposal is to show, and the trials not"
