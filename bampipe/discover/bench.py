@@ -87,7 +87,7 @@ class Bench:
         sample late, which a fit finds on either side of that limit.
         """
         trials, system = self.trials, evidence.system
-        if trials.limit_s == 0.0 or system.has_free_delay:
+        if trials.limit_s == 0.0 or system.takes_timing:
             return self
         chosen = evidence.folds.fitted_trials
         if system.model.device.robot is not None:

@@ -250,7 +250,7 @@ class Scorer:
         """Bounds of the changes of the base parameters and of the linear strengths."""
         strengths = [item.parameters[i] for i in item.linear_indices]
         lower, upper = self.lower, self.upper
-        if item.system.has_free_delay:
+        if item.system.takes_timing:
             # Its delay has the place of the timing, as in identification.
             timing = np.arange(lower.size) >= len(self.evidence.free)
             lower, upper = np.where(timing, 0.0, lower), np.where(timing, 0.0, upper)

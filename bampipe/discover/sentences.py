@@ -8,7 +8,7 @@ from bampipe.discover.description import describe
 from bampipe.discover.findings import Diagnosis
 from bampipe.discover.settings import Settings
 from bampipe.lists import join_names
-from bampipe.results.diagnose import AxisVerdict, Contender, Stretch, in_words
+from bampipe.results.diagnose import AxisVerdict, Contender, RefusedEffect, Stretch, in_words
 from bampipe.results.identify import NEAR_LIMIT
 from bampipe.results.rounding import significant as three
 from bampipe.results.standing import FLOOR_WRONG, STANDINGS_IN_WORDS, standing
@@ -215,7 +215,7 @@ def _refused(axis: str, found: Diagnosis, unit: str, remains: bool) -> list[str]
     """
     said = []
     for one in found.refused:
-        if one.axis != axis or not (remains or one.why in ("stops", "like_stops")):
+        if one.axis != axis or not remains or one.why == "stops":
             continue
         before, after = one.held_out_rmse_before, one.held_out_rmse_after
         rest, left = one.without_worst_second_before, one.without_worst_second_after
@@ -232,18 +232,30 @@ def _refused(axis: str, found: Diagnosis, unit: str, remains: bool) -> list[str]
         elif one.why == "replays":
             why = f"would take the held-out error from {numbers}, but replays with it give no floor"
             why += " that this could be judged by"
-        elif one.why == "stops":
-            why = f"would take the held-out error from {numbers}, but replays without it that truly"
-            why += " stand still at reversals give it most of that gain as well"
-        elif one.why == "like_stops":
-            why = f"would take the held-out error from {numbers}, but does little beside an effect"
-            why += " that replays which truly stand still at reversals imitate"
         elif after < before:
             why = f"beats chance by its score, but takes the held-out error only from {numbers}"
         else:
             why = f"beats chance by its score, but does not lower the held-out error ({numbers})"
         said.append(f"{one.effect} {why}: it is not named.")
-    return said
+    return said + _imitated([r for r in found.refused if r.axis == axis and r.why == "stops"], unit)
+
+
+def _imitated(refused: Sequence[RefusedEffect], unit: str) -> list[str]:
+    """What replays imitate that stand still at reversals, in one sentence."""
+    if not refused:
+        return []
+    said = [
+        f"{one.effect} would take the held-out error from {three(one.held_out_rmse_before)} to"
+        f" {three(after)} {unit}"
+        for one in refused
+        if (after := one.held_out_rmse_after) is not None
+    ]
+    said[1:] = [each.replace(" would take the held-out error", "", 1) for each in said[1:]]
+    it, none = ("them", "none of them is") if len(said) > 1 else ("it", "it is not")
+    return [
+        f"{join_names(said)}, but replays without {it} that truly stand still at"
+        f" reversals give {it} most of that gain as well: {none} named."
+    ]
 
 
 def _excused(a: AxisVerdict, unit: str) -> str:

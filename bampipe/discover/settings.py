@@ -27,8 +27,8 @@ class Settings:
         worth_at_floor: the same on an axis whose error is already at its noise floor: no replay
             is perfect, and changes of direction blurred by sampling invite
             spurious effects, up to a tenth of the error on a linear axis.
-        still_width: sign width, times the device's, of replays that truly stand still, which an
-            effect must beat as well; still_share: least share of its gain that it must keep there.
+        still_share: least share of its gain that an effect must keep on replays that truly stand
+            still.
         unmoved: change of log error on an axis up to which an effect has left it as it was: what is
             known of candidates that act on such axes alone is not found anew.
         least_slope: least share of what the applied force does that an effect must leave of it, as
@@ -110,7 +110,6 @@ class Settings:
     significance: float = 0.01
     worth: float = 0.03
     worth_at_floor: float = 0.16
-    still_width: float = 0.125
     still_share: float = 0.5
     unmoved: float = 0.01
     least_slope: float = 0.2

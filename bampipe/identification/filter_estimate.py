@@ -125,7 +125,7 @@ def estimate_by_filter(
     free = [item for item in system.parameters if not item.fixed]
     count = len(free)
     timing = problem.free.size > count
-    model = build_filter_model(system, trials, start, timing)
+    model = build_filter_model(system, trials, start, timing, squares.p[-1])
     progress(0.15, "noise levels")
     late_sd = model.upper[count:] / np.sqrt(3.0)
     late = np.zeros(late_sd.size)
@@ -214,7 +214,7 @@ def estimate_by_filter(
     )
     value, slope = model.to_physical(constrain(model, found.theta, covariance))
     scaled = covariance * np.outer(slope, slope)
-    p = np.append(start, 0.0)
+    p = np.append(start, squares.p[-1])
     p[problem.free] = value
     tight = slope * np.sqrt(np.diag(found.covariance))
     at_bound = (value - model.lower < tight) | (model.upper - value < tight)

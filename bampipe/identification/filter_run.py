@@ -246,7 +246,7 @@ def clear_of_reversal_mask(motion: Motion, system: System, t: Array) -> NDArray[
 
 
 def build_filter_model(
-    system: System, trials: Sequence[Trial], start: Array, timing: bool
+    system: System, trials: Sequence[Trial], start: Array, timing: bool, late_s: float = 0.0
 ) -> FilterModel:
     """Return the model as the filter wants it.
 
@@ -255,6 +255,7 @@ def build_filter_model(
         start: (n_p,) values of the parameters, those that are not estimated included.
         timing: whether the timing of the inputs is estimated, as the last parameter. A model
             that has a delay of its own cannot tell the two apart.
+        late_s: the timing where it is not estimated.
     """
     places = [i for i, item in enumerate(system.parameters) if not item.fixed]
     lower = [system.parameters[i].lower for i in places]
@@ -268,7 +269,7 @@ def build_filter_model(
         derivative_rows=system.derivative_rows,
         measure_rows=system.measure_rows,
         n_states=len(system.states),
-        parameters=np.append(start, 0.0),
+        parameters=np.append(start, late_s),
         free=np.array(places, dtype=np.int64),
         lower=np.array(lower),
         upper=np.array(upper),

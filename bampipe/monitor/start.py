@@ -203,8 +203,7 @@ def start_from_run(run: RunFolder, name: str, options: MonitorOptions) -> tuple[
         )
     rate = ingested.sample_rate_hz
     trials = [_trial(run, trial, system) for trial in free_trials(run, fitted=True)]
-    model = build_filter_model(system, trials, values, timing=False)
-    model.parameters[-1] = found.input_timing.estimate
+    model = build_filter_model(system, trials, values, False, found.input_timing.estimate)
     sd = np.array([found.parameters[parameter].sd for parameter in names])
     value = values[model.free]
     theta, spread = model.to_estimated(value, np.maximum(sd, 1e-6 * np.abs(value)))

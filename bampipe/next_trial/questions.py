@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,6 +14,7 @@ from bampipe.discover.chance import candidates_of, fit_trials, system_of
 from bampipe.discover.odds import odds_by_score
 from bampipe.discover.scorer import Scorer
 from bampipe.discover.settings import Settings
+from bampipe.discover.stops import WIDTHS
 from bampipe.estimate.simulation import Runaway
 from bampipe.next_trial.discrimination import Contest, Rival, Sums
 from bampipe.next_trial.sensitivity import (
@@ -229,22 +231,23 @@ def _gain_by_standing_still(
 ) -> dict[str, float]:
     """Log likelihood that effects gain where the model stands still as its motion turns round.
 
-    Nothing of a robot, whose replays with a narrow sign take minutes.
+    The most of replays with either narrow sign. Nothing of a robot, whose replays take minutes.
     """
     robot = evidence.system.model.device.robot is not None
     if robot or not items or keep_motion(evidence.fitted):
         return {}
     chosen = draw_trials(evidence.sizes)
-    moved = system_of(recipe.with_sign_widths(Settings().still_width))
     motions = [evidence.motions[k] for k in chosen]
-    stand_in = StandIn(moved, evidence.p, motions, trials.sensors.rate_hz)
-    try:
-        replayed = replay_evidence(
-            stand_in, evidence.system, evidence.p, trials.sensors, trials.kinematics, trials.band,
-            evidence.folds.subset(chosen), (FLOOR_SEED,),
-        )  # fmt: skip
-    except Runaway:
-        return {}
-    scorer, share = Scorer(replayed), sum(evidence.sizes) / sum(replayed.sizes)
-    scores = (scorer.score(item) for item in items)
-    return {score.name: share * score.total for score in scores if score is not None}
+    gained: dict[str, float] = {}
+    for width in WIDTHS:
+        moved = system_of(recipe.with_sign_widths(width))
+        stand_in = StandIn(moved, evidence.p, motions, trials.sensors.rate_hz)
+        with suppress(Runaway):
+            replayed = replay_evidence(
+                stand_in, evidence.system, evidence.p, trials.sensors, trials.kinematics,
+                trials.band, evidence.folds.subset(chosen), (FLOOR_SEED,),
+            )  # fmt: skip
+            scorer, share = Scorer(replayed), sum(evidence.sizes) / sum(replayed.sizes)
+            for score in filter(None, map(scorer.score, items)):
+                gained[score.name] = max(gained.get(score.name, 0.0), share * score.total)
+    return gained

@@ -97,8 +97,23 @@ class System:
 
     @property
     def has_free_delay(self) -> bool:
-        """Whether a delay is estimated: to the data that is the inputs' timing."""
-        return any(not p.fixed and p.name in self.delays for p in self.parameters)
+        """Whether a delay is estimated, of one measured force or of all."""
+        return bool(self._delayed)
+
+    @property
+    def takes_timing(self) -> bool:
+        """Whether a delay of every measured force is estimated: that is the inputs' timing."""
+        return self._delayed == {*self.model.device.forces}
+
+    @cached_property
+    def _delayed(self) -> set[str]:
+        """The measured forces of which a delay is estimated."""
+        device, found = self.model.device, set[str]()
+        forces = dict(zip(device.components, device.forces, strict=True))
+        for item in self.model.effects:
+            if any(not p.fixed and p.name in self.delays for p in item.parameters):
+                found |= {forces[item.target]} if item.target in forces else {*device.forces}
+        return found
 
     @cached_property
     def forced(self) -> tuple[int, ...]:

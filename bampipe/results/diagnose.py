@@ -148,7 +148,7 @@ class TransientCandidate(Record):
     second: Stretch
 
 
-RefusalReason = Literal["held_out", "runs_away", "replays", "scale", "stops", "like_stops"]
+RefusalReason = Literal["held_out", "runs_away", "replays", "scale", "stops"]
 
 
 class RefusedEffect(Record):
@@ -170,7 +170,7 @@ class RefusedEffect(Record):
         "away there; or replays with it give no floor that "
         "an error could be judged by; or it leaves next to nothing of what the force does, so that "
         "all forces become small together; or replays that truly stand still at reversals give it "
-        "most of its gain as well; or it explains little beside an effect of which they do"
+        "most of its gain as well"
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +18,7 @@ from bampipe.declarations.model_file import MODEL_INPUTS, load_model, read_recip
 from bampipe.discover.sign_width import SignWidth, choose_sign_width
 from bampipe.discover.start import search_start
 from bampipe.errors import InputError
-from bampipe.estimate.least_squares import fit, independent_samples
+from bampipe.estimate.least_squares import LeastSquares, Problem, fit, independent_samples
 from bampipe.identification.bodies import base_estimates, make_possible, summarise_bases
 from bampipe.identification.calibration import (
     describe_calibration,
@@ -43,13 +44,15 @@ from bampipe.identification.sensor_noise import sensor_noise
 from bampipe.identification.sign_width import describe_smoothing, with_smoothing
 from bampipe.physics import System, compile_model
 from bampipe.progress import Progress
+from bampipe.results.identify import InputTiming
 from bampipe.results.ingest import IngestResult
+from bampipe.results.intervals import NORMAL_95
 from bampipe.results.rounding import significant
 from bampipe.schema import STRICT, Positive
 from bampipe.trials.bias import UnbiasedFit, remove_bias
 from bampipe.trials.folds import Folds
 from bampipe.trials.measured import read_measured_trials
-from bampipe.trials.motion import trial_names
+from bampipe.trials.motion import Motion, trial_names
 from bampipe.trials.reading import (
     read_band,
     read_kinematics,
@@ -139,6 +142,9 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
             where=str(run.root),
             remedy="record faster motion at a higher rate, or more of it",
         ) from error
+    robot, held = system.model.device.robot is not None, None
+    if config.input_timing and system.has_free_delay and robot:
+        raw, held = _hold_timing(system, motions, problem, raw, config.block_s)
     moving = int(independent_samples(band, raw.stacked))
     # Their scatter about the fit must be known, too, or no interval means anything.
     if moving < 2 * problem.free.size:
@@ -259,8 +265,11 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         *summarise_bases(system, bases),
     ]
     late = float(raw.p[-1]), float(np.sqrt(raw.covariance[-1, -1]))
-    if timing and system.model.device.robot is not None:
+    if timing and robot:
         late = find_robot_timing(system, motions, band, near)
+    if held is not None:
+        late = held.estimate, held.sd
+        estimate = replace(estimate, report={**estimate.report, "input_timing": held})
     result = collect_result(
         system, estimate, identifiability, motions, config.model, raw, late, engine, methods, notes,
         bases,
@@ -271,6 +280,23 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     write_parquet(out / f"models/{config.model}/states.parquet", states)
     write_parquet(out / f"models/{config.model}/trace.parquet", trace)
     return result.write(out)
+
+
+def _hold_timing(
+    system: System, motions: Sequence[Motion], problem: Problem, raw: LeastSquares, block_s: float
+) -> tuple[LeastSquares, InputTiming | None]:
+    """The fit to inputs moved by the timing of those drives that no delay of the model moves.
+
+    Beside a delay it cannot be estimated for all drives at once; but a log in which one drive acts
+    late and all of them hold their commands leaves the others half a sample late.
+    """
+    late_s, sd = find_robot_timing(system, motions, problem.band, raw.p[:-1])
+    if abs(late_s) < NORMAL_95 * sd:
+        return raw, None
+    half = 0.5 / problem.band.rate_hz
+    late_s = float(np.clip(late_s, -half, half))
+    moved = fit(problem, np.append(raw.p[:-1], late_s), block_s=block_s)
+    return moved, InputTiming(estimate=late_s, sd=sd, unit="s", limit=half)
 
 
 def _start(run: RunFolder, system: System, config: Config) -> Array:

@@ -150,9 +150,8 @@ def _estimated(
         u[:, _brakes(system)] = 0.0
         readings.append(replace(trial, u=u))
     free = [item for item in system.parameters if not item.fixed]
-    timing = identified.input_timing.estimate
-    model = build_filter_model(system, readings, start, timing=False)
-    model = replace(model, parameters=np.append(start, timing))
+    late_s = identified.input_timing.estimate
+    model = build_filter_model(system, readings, start, False, late_s)
     command = float(np.nanmean(commanded)) if np.isfinite(commanded).any() else None
     value = np.array(
         [known[item.name].estimate if item.name in known else (command or 0.0) for item in free]

@@ -113,7 +113,9 @@ def remove_bias(
             StandIn(system, p[:count], replayed, sensors.rate_hz), sensors, kinematics, (0, 0),
             force_noise=False, alone=True,
         )  # fmt: skip
-        again = fit(problem_of(system, replays, problem.band, timing=timing), raw.p)
+        # Of a replay no input is late, unless the timing is found anew.
+        start = raw.p if timing else np.append(raw.p[:count], 0.0)
+        again = fit(problem_of(system, replays, problem.band, timing=timing), start)
         if np.any(again.residual_sd > UNLIKE * raw.residual_sd):
             raise InputError("the replay of the model does not resemble the machine")
         return replace(again, stacked=(), measured=())

@@ -491,7 +491,7 @@ def _slopes_by_timing(
     """`Evidence.by_timing`; nothing where the timing is not open, or a delay has its place."""
     step = 0.25 * (timing[1] - timing[0])
     system = fitted[0].system
-    if step == 0.0 or system.has_free_delay:
+    if step == 0.0 or system.takes_timing:
         return ()
     rows = []
     for base in fitted:

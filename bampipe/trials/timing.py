@@ -26,7 +26,8 @@ def find_robot_timing(
     One clock reads all drives, so that what most of them agree on is theirs: the median over the
     joints. One drive that acts late would move a fit to all, and every other joint with it.
     Samples in which a joint turns round do not count: friction that truly stops it looks late
-    there, by milliseconds, and would outweigh the rest of the path.
+    there, by milliseconds, and would outweigh the rest of the path. Where the model has a delay of
+    its own for a drive, its joint tells nothing, and does not count either.
 
     Args:
         system: the robot, fitted; motions: the trials; band: the low-pass of the residual.

@@ -10,7 +10,7 @@ import pytest
 from bampipe.estimate.low_pass import Band
 from bampipe.estimate.standstill import find_turns
 from bampipe.physics import Model, System, compile_model
-from bampipe.physics.device import derivative
+from bampipe.physics.device import LAST_ORDER, derivative
 from bampipe.physics.registry import device_from
 from bampipe.trials.motion import Motion
 from bampipe.trials.residuals import ModelOnTrial
@@ -53,7 +53,7 @@ def logged(system: System, late_s: np.ndarray, stuck_s: float = 0.0) -> Motion:
     channels = {}
     for name, x in forces.items():
         channels[name] = x + 0.01 * rng.standard_normal(len(t))
-        for order in (1, 2, 3):  # as the filter finds them, without the noise
+        for order in range(1, LAST_ORDER + 1):  # as the filter finds them, without the noise
             x = np.gradient(x, t)
             channels[derivative(name, order)] = x
     return replace(moved(t), channels=channels)
@@ -70,6 +70,27 @@ def test_the_clock_is_what_most_drives_agree_on(system, late_drive, stuck_s) -> 
     found, sd = find_robot_timing(system, [motion], band, system.prior)
     assert sd < 3e-4
     assert found == pytest.approx(CLOCK_S, abs=4.0 * sd)
+
+
+def test_joints_whose_drive_has_a_delay_of_its_own_do_not_tell_the_clock() -> None:
+    named = ("drive_delay:a", "drive_delay:b")
+    system = compile_model(Model(device_from(ARM), named))
+    late = np.array([9e-3, 9e-3, CLOCK_S])
+    motion = logged(compile_model(Model(device_from(ARM), [])), late)
+    p = system.prior
+    for name in named:
+        p[system.index(f"{name.replace(':', '.')}.delay")] = late[0]
+    # Two of three are 9 ms late, of which the model says so.
+    found, sd = find_robot_timing(system, [motion], Band(RATE, (8.0, 8.0, 8.0)), p)
+    assert found == pytest.approx(CLOCK_S, abs=4.0 * sd)
+
+
+def test_where_every_drive_has_a_delay_of_its_own_nothing_tells_the_clock() -> None:
+    named = tuple(f"drive_delay:{force}" for force in "abc")
+    system = compile_model(Model(device_from(ARM), named))
+    motion = logged(compile_model(Model(device_from(ARM), [])), np.full(3, CLOCK_S))
+    found, sd = find_robot_timing(system, [motion], Band(RATE, (8.0, 8.0, 8.0)), system.prior)
+    assert (found, sd) == (0.0, np.inf)
 
 
 def test_turns_reach_30_ms_to_either_side() -> None:

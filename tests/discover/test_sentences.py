@@ -223,9 +223,10 @@ def test_what_stopping_replays_explain_is_said_where_nothing_is_missing(monkeypa
     )
     said = say(monkeypatch, finding("nothing_missing", 1.0, 1.0, 1.0), refused=(one,))
     assert "from 1.00 to 0.500 N.m, but replays without it that truly stand still at" in said
-    alike = one.model_copy(update={"why": "like_stops"})
-    said = say(monkeypatch, finding("nothing_missing", 1.0, 1.0, 1.0), refused=(alike,))
-    assert "but does little beside an effect that replays which truly stand still" in said
+    other = one.model_copy(update={"effect": "play:x", "held_out_rmse_after": 0.7})
+    said = say(monkeypatch, finding("nothing_missing", 1.0, 1.0, 1.0), refused=(one, other))
+    assert "lag:x would take the held-out error from 1.00 to 0.500 N.m and play:x from" in said
+    assert said.endswith("give them most of that gain as well: none of them is named.")
 
 
 def test_odds_are_given_where_no_replay_looks_like_the_measurement(monkeypatch):
