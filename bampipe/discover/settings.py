@@ -27,8 +27,8 @@ class Settings:
         worth_at_floor: the same on an axis whose error is already at its noise floor: no replay
             is perfect, and changes of direction blurred by sampling invite
             spurious effects, up to a tenth of the error on a linear axis.
-        still_share: least share of its gain that an effect must keep on replays that truly stand
-            still.
+        still_share: least share of the mean square that it takes off which an effect must take off
+            beyond what it does to replays that truly stand still.
         unmoved: change of log error on an axis up to which an effect has left it as it was: what is
             known of candidates that act on such axes alone is not found anew.
         least_slope: least share of what the applied force does that an effect must leave of it, as

@@ -60,14 +60,19 @@ class StoppingReplays:
         self, scores: Mapping[str, Score], level: Level, name: str
     ) -> tuple[float, Array] | None:
         """p-value and excess of a candidate on replays that imitate it; None if there are none."""
-        s, whole = self._bench.settings, level.excess(scores[name]).sum()
+        s, whole = self._bench.settings, self._removed(level.excess(scores[name]))
         for width in WIDTHS:
             still = self._level(width, name)
             still.ask(scores, [name])
             p_value, excess = still.p_value(scores[name]), still.excess(scores[name])
-            if p_value >= s.significance or excess.sum() <= s.still_share * whole:
+            if p_value >= s.significance or self._removed(excess) <= s.still_share * whole:
                 return p_value, excess
         return None
+
+    def _removed(self, excess: Array) -> float:
+        """Share of the mean square that a gain beyond chance is, by sample and axis, summed."""
+        count = self._current.scorer.independent_samples
+        return float(np.sum(count * (1.0 - np.exp(-2.0 * excess / count))))
 
     def first_beyond(
         self,
