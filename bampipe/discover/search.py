@@ -36,7 +36,7 @@ from bampipe.results.standing import AT_FLOOR
 from bampipe.trials.folds import HELD_OUT
 from bampipe.trials.measured import MeasuredTrials
 from bampipe.trials.noise_floor import NoiseFloor
-from bampipe.trials.residuals import Evidence
+from bampipe.trials.residuals import Evidence, applied_rms
 
 Array = NDArray[np.float64]
 
@@ -297,6 +297,10 @@ def _weigh(
     if HELD_OUT in evidence.folds.groups:
         above |= evidence.held_out_rmse > ceiling(np.array([r.held_out_rmse for r in replayed]))
     worth = np.where(above, s.worth, s.worth_at_floor)
+    applied = applied_rms(
+        evidence.system, evidence.motions, evidence.band, evidence.p, evidence.used
+    )
+    least = (s.least_force * applied) ** 2
     found, likely = [], {}
     for name, score in scores.items():
         excess = level.excess(score)
@@ -305,7 +309,7 @@ def _weigh(
         share = removed / np.maximum(
             error**2 - replays.mean(axis=0) ** 2, np.maximum(removed, 1e-30)
         )
-        if not np.any((gain > worth) & ((share > s.share) | ~above)):
+        if not np.any((gain > worth) & (removed > least) & ((share > s.share) | ~above)):
             continue
         p_value = level.p_value(score)
         if p_value < s.significance:

@@ -27,6 +27,8 @@ class Settings:
         worth_at_floor: the same on an axis whose error is already at its noise floor: no replay
             is perfect, and changes of direction blurred by sampling invite
             spurious effects, up to a tenth of the error on a linear axis.
+        least_force: share of the applied force, as a root mean square, that an effect must take off
+            at least: no load cell and no torque by a current is linear to less.
         still_share: least share of the mean square that it takes off which an effect must take off
             beyond what it does to replays that truly stand still.
         unmoved: change of log error on an axis up to which an effect has left it as it was: what is
@@ -110,6 +112,7 @@ class Settings:
     significance: float = 0.01
     worth: float = 0.03
     worth_at_floor: float = 0.16
+    least_force: float = 5e-4
     still_share: float = 0.5
     unmoved: float = 0.01
     least_slope: float = 0.2
