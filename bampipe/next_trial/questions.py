@@ -220,7 +220,9 @@ def find_blindness(
     jumping = [v.rival.item for v in found if v.growth > 0.0 and v.rival.item is not None]
     still = _gain_by_standing_still(trials, recipe, evidence, jumping)
     found = [
-        replace(v, imitated=still.get(v.rival.name, 0.0) > gain_at(contest, at_hand, v, left))
+        replace(v, imitated=still[v.rival.name] > gain_at(contest, at_hand, v, left))
+        if v.rival.name in still and np.isfinite(v.factor)
+        else v
         for v, left in zip(found, contest.left_by_model(at_hand), strict=True)
     ]
     return Blindness(contest, at_hand, tuple(found), bar)
