@@ -85,7 +85,9 @@ def compile_candidate(model: Model) -> Candidate:
     for i, parameter in enumerate(parameters):
         if parameter.fixed:
             continue
-        if parameter.strength and system.linear[count + i] and not system.moves_sensors:
+        # Of what a spring adds, a load that it is part of takes a tenth or so: as good as linear.
+        is_linear = system.linear[count + i] or item.effect.pulls
+        if parameter.strength and is_linear and not system.moves_sensors:
             linear.append(i)
         else:
             searched.append(i)

@@ -99,6 +99,7 @@ def _derive(model: Model, named_constants: bool) -> Equations:
     still = [prompt.put_in(e).subs(none) for e in raw_applied]
     # Up to where the logged inputs are replaced by what acts of them, all is in terms of these.
     delivered = list(raw_applied)
+    pulling = [sp.S.Zero] * n
     of_states: dict[Any, tuple[Any, Any]] = {
         z: (r, signals.initial[z]) for z, r in signals.rates.items()
     }
@@ -107,6 +108,7 @@ def _derive(model: Model, named_constants: bool) -> Equations:
             d.dry = _dry_friction(d, other)
         if item.effect.uses_weight:
             d.weight = [sp.diff(sum(v for *_, v in energies), q) for q in d.q]
+            d.pull = [w - t for w, t in zip(d.weight, pulling, strict=True)]
         measures = item.effect.kind == "measurement"
         symbols = d.effect_symbols(item, still if measures else delivered, side)
         for key, tree in item.effect.expressions.items():
@@ -126,6 +128,8 @@ def _derive(model: Model, named_constants: bool) -> Equations:
                 offset[axes.index(place)] += value.subs(behind, simultaneous=True)
             else:
                 other[axes.index(place)] += value
+                if item.effect.pulls:
+                    pulling[axes.index(place)] += value
                 if item.effect.acting_link:
                     delivered[axes.index(place)] += value
         for state in item.effect.states if item.effect.kind != "input" else ():

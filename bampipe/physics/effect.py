@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated, Any, Literal
@@ -284,8 +284,20 @@ class Effect(Declaration):
 
     @property
     def uses_weight(self) -> bool:
-        """Whether it acts on what pulls by position: the slope of the potential energy."""
-        return any(name == "weight" or name.startswith("weight_") for name in self.names)
+        """Whether it acts on the slope of the potential energy."""
+        return self.uses_pull or any(name.partition("_")[0] == "weight" for name in self.names)
+
+    @property
+    def uses_pull(self) -> bool:
+        """Whether it acts on what pulls by position, springs included."""
+        return any(name.partition("_")[0] == "pull" for name in self.names)
+
+    @property
+    def pulls(self) -> bool:
+        """Whether it is a torque by the position of its axis alone, as of a spring or a cable."""
+        if self.kind != "torque" or self.scope != "axis" or self.acting_link or self.states:
+            return False
+        return self.names - set(self.parameters) == {"q"}
 
     def _lacks(self, kind: str) -> bool:
         """Whether a parameter has no entry for this kind of axis."""
@@ -302,7 +314,7 @@ class Effect(Declaration):
         for c in device.coordinates:
             known |= {
                 f"{prefix}_{c.name}"
-                for prefix in ("qd", "applied", "viscous", "coulomb", "load", "weight")
+                for prefix in ("qd", "applied", "viscous", "coulomb", "load", "weight", "pull")
             }
         keys = {key.partition(".")[2] for key in self.expressions} - {""}
         places = {c.name for c in device.coordinates} | set(device.forces)
@@ -391,8 +403,11 @@ def effect_from(declaration: Mapping[str, Any], where: str = "effect file") -> E
     return effect
 
 
-def bind(effect: Effect, target: str, device: Device) -> BoundEffect:
+def bind(effect: Effect, target: str, device: Device, pulled: Collection[str] = ()) -> BoundEffect:
     """Place ``effect`` at ``target`` of ``device``.
+
+    Args:
+        pulled: axes on which other effects of the model pull by position.
 
     Raises:
         InputError: the target does not exist there, or a parameter lacks its entry for that kind
@@ -428,7 +443,9 @@ def bind(effect: Effect, target: str, device: Device) -> BoundEffect:
             )
         unit = unit_of(chosen.unit, effect, target, device)
         about = chosen.description or entry.description
-        held = chosen.needs_weight and not any(device.has_weight(axis) for axis in axes)
+        # What a robot's bodies pull is not among what an effect can tell apart from the rest.
+        others = pulled if device.robot is None else ()
+        held = chosen.needs_pull and not any(device.has_weight(a) or a in others for a in axes)
         bound.append(
             chosen.renamed(
                 f"{prefix}.{name}", unit=unit, description=about, fixed=chosen.fixed or held

@@ -46,7 +46,7 @@ class Model:
             InputError: an effect or target is unknown, or an effect is named twice.
         """
         own = {effect.name: effect for effect in extra_effects}
-        bound: list[BoundEffect] = []
+        wanted: list[tuple[Effect, str]] = []
         for text in effects:
             name, _, target = text.partition(":")
             if name not in own and name not in registry.effect_names():
@@ -55,7 +55,11 @@ class Model:
                     f"unknown effect {name!r}{did_you_mean(name, known)}",
                     remedy="see them all with: bampipe effects",
                 )
-            item = bind(own[name] if name in own else registry.effect(name), target, device)
+            wanted.append((own[name] if name in own else registry.effect(name), target))
+        pulled = {target for effect, target in wanted if effect.pulls}
+        bound: list[BoundEffect] = []
+        for effect, target in wanted:
+            item = bind(effect, target, device, pulled)
             if item.name in [b.name for b in bound]:
                 raise InputError(f"effect {item.name!r} is in the model already")
             bound.append(item)

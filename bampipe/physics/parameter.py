@@ -44,9 +44,9 @@ class Parameter(NamedDeclaration):
         default=False, description="Where it is all that an effect adds, that is a mere constant"
     )
     fixed: bool = Field(default=False, description="Held at its prior, never estimated")
-    needs_weight: bool = Field(
+    needs_pull: bool = Field(
         default=False,
-        description="Held at its prior on an axis on which the device puts no weight",
+        description="Held at its prior on an axis that nothing pulls by its position",
     )
     weighed: bool = Field(
         default=False,

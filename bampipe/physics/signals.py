@@ -34,12 +34,14 @@ def follows(item: BoundEffect, earlier: BoundEffect, device: Device) -> bool:
     """Whether what ``item`` does changes, beyond first order, with ``earlier`` in the model.
 
     So it is behind a lag or a saturation of an input that it uses, behind what acts on the same
-    dry friction, and for two effects of positions.
+    dry friction, behind springs where it acts on what pulls, and for two effects of positions.
     """
     if item.effect.kind == "measurement" or earlier.effect.kind == "measurement":
         return item.effect.kind == earlier.effect.kind
     if "dry" in item.effect.names:
         return earlier.effect.kind in ("torque", "input")
+    if item.effect.uses_pull and earlier.effect.pulls:
+        return item.effect.scope == "device" or item.target == earlier.target
     if earlier.effect.acting_link not in ("lag", "saturation"):
         return False
     changed = {earlier.target} & set(device.channels) or set(device.forces)

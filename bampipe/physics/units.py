@@ -314,12 +314,12 @@ def _effect_symbols(item: BoundEffect, device: Device, check: _Check) -> dict[st
     second = _UNITS["s"]
     symbols = _device_symbols(device, _Check())
     for axis, unit, torque in _axes(device):
-        names = [f"{term}_{axis}" for term in ("applied", "load", "coulomb", "weight")]
-        symbols |= dict.fromkeys(names, torque)
+        terms = ("applied", "load", "coulomb", "weight", "pull")
+        symbols |= dict.fromkeys((f"{term}_{axis}" for term in terms), torque)
         symbols[f"viscous_{axis}"] = torque * second / unit
         if axis == item.target and item.effect.scope == "axis":
             symbols |= {"q": unit, "qd": unit / second, "brake": torque, "side_load": None}
-            symbols |= dict.fromkeys(("applied", "load", "coulomb", "dry", "weight"), torque)
+            symbols |= dict.fromkeys((*terms, "dry"), torque)
             symbols["viscous"] = torque * second / unit
             if axis in device.side_load:
                 side = device.side_load[axis]

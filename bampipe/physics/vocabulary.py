@@ -35,6 +35,7 @@ class Vocabulary:
         dry: by coordinate, the dry friction that turns with the motion; filled while torques are
             put together, before the first effect that uses it.
         weight: by coordinate, slope of the potential energy; filled like `dry`.
+        pull: by coordinate, the same less the torque of springs and the like; filled like `dry`.
         base: what every expression of the device may use.
     """
 
@@ -60,6 +61,7 @@ class Vocabulary:
         self.sizes: dict[str, int] = {}
         self.dry: list[Any] = [sp.S.Zero] * len(self.axes)
         self.weight: list[Any] = [sp.S.Zero] * len(self.axes)
+        self.pull: list[Any] = [sp.S.Zero] * len(self.axes)
         self.base: Symbols = dict(zip(self.axes, self.q, strict=True))
         self.base |= {f"qd_{a}": s for a, s in zip(self.axes, self.qd, strict=True)}
         self.base |= {
@@ -170,13 +172,13 @@ class Vocabulary:
         symbols = dict(self.base)
         for i, a in enumerate(self.axes):
             symbols |= {f"applied_{a}": applied[i], f"load_{a}": sp.Abs(applied[i])}
-            symbols[f"weight_{a}"] = self.weight[i]
+            symbols |= {f"weight_{a}": self.weight[i], f"pull_{a}": self.pull[i]}
             for term in ("viscous", "coulomb"):
                 symbols[f"{term}_{a}"] = self.p.get(f"{term}.{a}", sp.S.Zero)
         if item.effect.scope == "axis":
             i, a = self.axes.index(item.target), item.target
             symbols |= {"q": self.q[i], "qd": self.qd[i], "side_load": side[i]}
-            own = ("applied", "load", "viscous", "coulomb", "weight")
+            own = ("applied", "load", "viscous", "coulomb", "weight", "pull")
             symbols |= {n: symbols[f"{n}_{a}"] for n in own}
             symbols["dry"] = self.dry[i]
             symbols["brake"] = self.channel.get(device.brakes.get(a, ""), sp.S.Zero)

@@ -226,6 +226,7 @@ def symbols_of(case):
     for c in BAM.coordinates:
         torque = dimension(c.torque_unit)
         known[f"brake_{c.name}"] = known[f"weight_{c.name}"] = torque
+        known[f"pull_{c.name}"] = torque
         for letter in "ab" if bound.effect.scope == "axis_pair" else "":
             if c.name == bound.axes["ab".index(letter)]:
                 known |= dict.fromkeys((f"q_{letter}", f"middle_{letter}"), dimension(c.unit))

@@ -193,19 +193,23 @@ def _geared_joint(potential: str):
     )
 
 
-def test_a_gear_loses_of_the_load_behind_it_without_the_rotor():
+@pytest.mark.parametrize("stiffness", [0.0, 4.0])
+def test_a_gear_loses_of_the_load_behind_it_without_the_rotor(stiffness):
     """Closed form: the drive gives what the motion takes, and the loss by what crosses the gear."""
-    system = compile_model(Model(_geared_joint("-9*cos(joint)"), ["gear_loss:joint"]))
+    names = ["gear_loss:joint", *(["return_spring:joint"] if stiffness else [])]
+    system = compile_model(Model(_geared_joint("-9*cos(joint)"), names))
     q, qd, qdd, _, t = smooth(system)
-    behind, share, weight = 0.45, 0.12, 9.0 * np.sin(q)
-    load = weight + behind * 2.0 * qdd
-    torque = 2.0 * qdd + weight + qd + np.sign(qd) + share * np.abs(load) * np.sign(qd)
+    behind, share, pull = 0.45, 0.12, 9.0 * np.sin(q) + stiffness * q
+    load = pull + behind * 2.0 * qdd
+    torque = 2.0 * qdd + pull + qd + np.sign(qd) + share * np.abs(load) * np.sign(qd)
     u = np.zeros((len(t), len(system.inputs)))
     u[:, [system.inputs.index("torque")]] = torque
     names = [p.name for p in system.parameters]
     p = system.prior.copy()
     p[names.index("gear_loss.joint.share")] = share
     p[names.index("gear_loss.joint.behind")] = behind
+    if stiffness:
+        p[names.index("return_spring.joint.stiffness")] = stiffness
     moving = np.abs(qd[:, 0]) > 1e-6
     left = residual(system, p, (q, qd, qdd, u, t))[moving]
     assert np.abs(left).max() < 1e-4 * np.abs(torque).max()
@@ -214,9 +218,11 @@ def test_a_gear_loses_of_the_load_behind_it_without_the_rotor():
 @pytest.mark.parametrize(
     ("potential", "held"), [("-9*cos(joint)", False), ("0", True), ("9", True)]
 )
-def test_the_rotors_part_is_open_only_where_a_weight_shows_it(potential, held):
+def test_the_rotors_part_is_open_only_where_a_weight_or_a_spring_shows_it(potential, held):
     effect = Model(_geared_joint(potential), ["gear_loss:joint"]).effects[0]
     assert effect.parameter("behind").fixed is held
+    beside = Model(_geared_joint(potential), ["gear_loss:joint", "return_spring:joint"]).effects[0]
+    assert not beside.parameter("behind").fixed
     assert effect.parameter("behind").prior == 1.0
     assert not effect.parameter("share").fixed
     # The BAM's weight is in terms of definitions.
