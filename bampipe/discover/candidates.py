@@ -79,17 +79,19 @@ def build_candidate_model(
 def compile_candidate(model: Model) -> Candidate:
     """Compile the candidate that is the last effect of ``model``; see `build_candidate_model`."""
     system, item = compile_model(model), model.effects[-1]
-    count = len(system.parameters) - len(item.parameters)
-    parameters = system.parameters[count:]
+    is_joint = len(model.effects) > 1
+    judged = system
+    if is_joint and item.effect.pulls:
+        # A load that a spring is part of takes a tenth or so of what it adds: as good as linear.
+        judged = compile_model(Model(model.device, (item.name,), (item.effect,)))
+    parameters = system.parameters[len(system.parameters) - len(item.parameters) :]
+    is_linear = judged.linear[len(judged.linear) - len(parameters) :]
     linear, searched = [], []
     for i, parameter in enumerate(parameters):
         if parameter.fixed:
             continue
-        # Of what a spring adds, a load that it is part of takes a tenth or so: as good as linear.
-        is_linear = system.linear[count + i] or item.effect.pulls
-        if parameter.strength and is_linear and not system.moves_sensors:
+        if parameter.strength and is_linear[i] and not system.moves_sensors:
             linear.append(i)
         else:
             searched.append(i)
-    is_joint = len(model.effects) > 1
     return Candidate(item.name, system, is_joint, parameters, tuple(linear), tuple(searched))

@@ -38,6 +38,14 @@ def test_gears_and_cables_are_weighed_wherever_a_motor_drives(effect):
     assert not weighed("bam") and not weighed("magnetic_damper")
 
 
+def test_beside_a_gear_that_loses_of_its_load_a_spring_is_scored_as_part_of_that_load():
+    slider, gear = registry.device("slider"), "gear_loss:carriage"
+    beside = compile_candidate(build_candidate_model(slider, "return_spring:carriage", (), (gear,)))
+    alone = compile_candidate(build_candidate_model(slider, "return_spring:carriage"))
+    assert beside.is_joint and not alone.is_joint
+    assert beside.linear_indices == alone.linear_indices == (0, 1)
+
+
 @pytest.fixture(scope="module")
 def trials(tmp_path_factory):
     """A damper whose coil lags and whose field saturates with the lagged current."""

@@ -80,6 +80,7 @@ def test_joints_whose_drive_has_a_delay_of_its_own_do_not_tell_the_clock() -> No
     p = system.prior
     for name in named:
         p[system.index(f"{name.replace(':', '.')}.delay")] = late[0]
+    assert system.has_free_delay and not system.takes_timing
     # Two of three are 9 ms late, of which the model says so.
     found, sd = find_robot_timing(system, [motion], Band(RATE, (8.0, 8.0, 8.0)), p)
     assert found == pytest.approx(CLOCK_S, abs=4.0 * sd)
@@ -88,6 +89,7 @@ def test_joints_whose_drive_has_a_delay_of_its_own_do_not_tell_the_clock() -> No
 def test_where_every_drive_has_a_delay_of_its_own_nothing_tells_the_clock() -> None:
     named = tuple(f"drive_delay:{force}" for force in "abc")
     system = compile_model(Model(device_from(ARM), named))
+    assert system.takes_timing
     motion = logged(compile_model(Model(device_from(ARM), [])), np.full(3, CLOCK_S))
     found, sd = find_robot_timing(system, [motion], Band(RATE, (8.0, 8.0, 8.0)), system.prior)
     assert (found, sd) == (0.0, np.inf)

@@ -56,6 +56,22 @@ def test_a_drive_that_is_late_or_read_late_is_named(
 
 
 @pytest.mark.long
+def test_beside_the_delay_of_one_drive_the_others_keep_their_timing(tmp_path: Path) -> None:
+    late = dict.fromkeys(("actuator_delay:base_yaw", "actuator_delay:elbow"), 0.1)
+    run = run_arm(tmp_path, 36, "ZYY", {"actuator_delay:shoulder": 1.0, **late})
+    bampipe.extend(run.root, "drive_delay:torque_shoulder")
+    truth = read_json(tmp_path / "arm.truth.json")["effects"]
+    clock = truth["actuator_delay:elbow"]["delay"]
+    model = "models/base+drive_delay.torque_shoulder"
+    found = read_json(run.path(f"{model}/identify.json"))
+    assert found["input_timing"]["of_residual"] == pytest.approx(clock, rel=0.1)
+    delay = found["parameters"]["drive_delay.torque_shoulder.delay"]["estimate"]
+    assert delay == pytest.approx(truth["actuator_delay:shoulder"]["delay"] - clock, rel=0.05)
+    for entry in read_json(run.path(f"{model}/validate.json"))["axes"].values():
+        assert entry["held_out_rmse"] < 1.2 * entry["noise_floor"]
+
+
+@pytest.mark.long
 def test_joints_that_stick_are_held_against_replays_that_do(tmp_path: Path) -> None:
     run = run_arm(tmp_path, 33, "ZY", {}, soft_hz=4.0, noise=0.01, rate_hz=250.0)
     found = read_json(run.path("models/base/validate.json"))
