@@ -74,6 +74,10 @@ class Level:
                 short = [name for name in names if len(self._gains.get(name, ())) == first]
                 self._learn(short, first, count - first)
 
+    def learn(self, names: Sequence[str]) -> None:
+        """Replay for those of ``names`` whose chance level is not known, all at once."""
+        self._complete(names, self._first)
+
     def carry_over(self, known: Level, names: Sequence[str], moved: NDArray[np.bool_]) -> None:
         """Take over what another level knows of candidates.
 
@@ -92,7 +96,7 @@ class Level:
         on both, or the second look would be another chance of a false alarm.
         """
         s = self._settings
-        self._complete(names, self._first)
+        self.learn(names)
         if not all(self._is_clear(scores[n]) for n in self._deciding(scores, names)):
             self._complete([n for n in names if self._stands_out(scores[n])], s.replicates)
         low, high = s.significance / s.close, s.significance * s.close

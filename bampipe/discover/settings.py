@@ -113,7 +113,7 @@ class Settings:
     worth: float = 0.03
     worth_at_floor: float = 0.16
     least_force: float = 5e-4
-    still_share: float = 0.5
+    still_share: float = 2.0 / 3.0
     unmoved: float = 0.01
     least_slope: float = 0.2
     carried: float = 0.25

@@ -46,23 +46,31 @@ class StoppingReplays:
             self._matters = self._bench.standing_still_matters(now.recipe, now.evidence, floor)
         return self._matters
 
-    def _level(self, width: float, name: str) -> Level:
-        """The chance level on these replays; ``name``: a candidate that is learned at once."""
-        if width not in self._made:
+    def _level(self, width: float, names: Sequence[str]) -> Level:
+        """The chance level on these replays; ``names``: candidates that are learned at once."""
+        if width in self._made:
+            self._made[width].learn(names)
+        else:
             now = self._current
             narrow = now.recipe.with_sign_widths(width)
             self._made[width] = self._bench.level(
-                now.recipe, now.evidence, now.replayed, [name], replayed=narrow
+                now.recipe, now.evidence, now.replayed, names, replayed=narrow
             )
         return self._made[width]
 
     def _imitation(
-        self, scores: Mapping[str, Score], level: Level, name: str
+        self, scores: Mapping[str, Score], level: Level, names: Sequence[str]
     ) -> tuple[float, Array] | None:
-        """p-value and excess of a candidate on replays that imitate it; None if there are none."""
+        """p-value and excess of a candidate on replays that imitate it; None if there are none.
+
+        Args:
+            scores, level: as of `first_beyond`.
+            names: the candidate, and those whose turn may come.
+        """
+        name = names[0]
         s, whole = self._bench.settings, self._removed(level.excess(scores[name]))
         for width in WIDTHS:
-            still = self._level(width, name)
+            still = self._level(width, names)
             still.ask(scores, [name])
             p_value, excess = still.p_value(scores[name]), still.excess(scores[name])
             if p_value >= s.significance or self._removed(excess) <= s.still_share * whole:
@@ -92,13 +100,15 @@ class StoppingReplays:
         """
         s, kept = self._bench.settings, list(significant)
         doubted: dict[str, tuple[float, Array]] = {}
-        # The rest are weighed against the first that passes: alone, it is a third of the work.
         try:
             if not kept or not self._matter(level):
                 return kept, doubted
             while kept:
                 name = kept[0][1]
-                imitated = self._imitation(scores, level, name)
+                # Alone, the first is a third of the work, and mostly passes. Where one does not,
+                # many do not, and share their replays.
+                others = [other for _, other in kept[1:]] if doubted else []
+                imitated = self._imitation(scores, level, [name, *others])
                 if imitated is None:
                     break
                 p_value, excess = imitated

@@ -21,6 +21,7 @@ def level_of(gains, p_values):
         excess=lambda name: np.array([gains[name]]),
         p_value=lambda name: p_values.get(name, 1e-6),
         ask=lambda scores, names: None,
+        learn=lambda names: None,
         replicates=[SimpleNamespace(held_out_rmse=np.ones(1))],
     )
 
