@@ -27,6 +27,9 @@ WIDTHS = (STILL_WIDTH, PROBE_WIDTH)
 leaves what the other does: to a Stribeck friction that is not there, of a carriage at 1 kHz, an
 eighth gives twice what the measured trials do and a 32nd half of it; to such a backlash of a wrist
 in MuJoCo a 32nd gives all of it, and an eighth nothing."""
+_CLEAR = 0.95
+"""Share of what an effect takes off beyond what it takes off replays of the first width, from which
+on the second is not asked: there it took off six times as much at most."""
 
 
 class StoppingReplays:
@@ -73,8 +76,11 @@ class StoppingReplays:
             still = self._level(width, names)
             still.ask(scores, [name])
             p_value, excess = still.p_value(scores[name]), still.excess(scores[name])
-            if p_value >= s.significance or self._removed(excess) <= s.still_share * whole:
+            beyond = self._removed(excess) / whole
+            if p_value >= s.significance or beyond <= s.still_share:
                 return p_value, excess
+            if beyond > _CLEAR:
+                break
         return None
 
     def _removed(self, excess: Array) -> float:

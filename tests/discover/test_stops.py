@@ -14,6 +14,8 @@ GAINS = {"compliance": 100.0, "delay": 60.0, "thinning": 30.0}
 """Beyond chance on replays that creep."""
 STILL = {"compliance": 30.0, "delay": 55.0, "thinning": 29.0}
 """The same on replays that stand still."""
+LITTLE = {name: 0.9 * gain for name, gain in GAINS.items()}
+"""The same on such replays of another width."""
 
 
 def level_of(gains, p_values):
@@ -32,7 +34,7 @@ def replays(p_values=(), matter=True, width=WIDTHS[0]):
 
     def level(*_, replayed):
         made.append(replayed)
-        return level_of(STILL, dict(p_values)) if replayed == width else level_of(GAINS, {})
+        return level_of(STILL if replayed == width else LITTLE, dict(p_values))
 
     recipe = SimpleNamespace(with_sign_widths=lambda factor: factor)
     current = SimpleNamespace(
@@ -60,6 +62,14 @@ def test_what_keeps_less_than_half_of_its_gain_is_passed_over(width) -> None:
         assert gain == pytest.approx(0.03)
         assert doubted == {}
     assert sorted(made) == sorted(WIDTHS)
+
+
+def test_what_hardly_shows_on_replays_of_one_width_is_not_held_against_the_other() -> None:
+    found, made = replays()
+    scores, gains = {"delay": "delay"}, {"delay": 56.0}
+    kept, _ = found.first_beyond(scores, level_of(gains, {}), [(56.0, "delay")])
+    assert [name for _, name in kept] == ["delay"]
+    assert made == [WIDTHS[0]]
 
 
 def test_what_such_replays_have_by_chance_is_passed_over() -> None:
