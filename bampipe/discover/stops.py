@@ -28,8 +28,8 @@ leaves what the other does: to a Stribeck friction that is not there, of a carri
 eighth gives twice what the measured trials do and a 32nd half of it; to such a backlash of a wrist
 in MuJoCo a 32nd gives all of it, and an eighth nothing."""
 _CLEAR = 0.95
-"""Share of what an effect takes off beyond what it takes off replays of the first width, from which
-on the second is not asked: there it took off six times as much at most."""
+"""Share of what an effect takes off, beyond what it takes off replays of the first width, above
+which those of the second are not made: of these it was never seen to take off seven times that."""
 
 
 class StoppingReplays:
