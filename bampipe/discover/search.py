@@ -36,7 +36,7 @@ from bampipe.results.standing import AT_FLOOR
 from bampipe.trials.folds import HELD_OUT
 from bampipe.trials.measured import MeasuredTrials
 from bampipe.trials.noise_floor import NoiseFloor
-from bampipe.trials.residuals import Evidence, applied_rms
+from bampipe.trials.residuals import Evidence
 
 Array = NDArray[np.float64]
 
@@ -297,10 +297,7 @@ def _weigh(
     if HELD_OUT in evidence.folds.groups:
         above |= evidence.held_out_rmse > ceiling(np.array([r.held_out_rmse for r in replayed]))
     worth = np.where(above, s.worth, s.worth_at_floor)
-    applied = applied_rms(
-        evidence.system, evidence.motions, evidence.band, evidence.p, evidence.used
-    )
-    least = (s.least_force * applied) ** 2
+    least = (s.least_force * evidence.applied_rms) ** 2
     found, likely = [], {}
     for name, score in scores.items():
         excess = level.excess(score)

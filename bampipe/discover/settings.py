@@ -28,7 +28,7 @@ class Settings:
             is perfect, and changes of direction blurred by sampling invite
             spurious effects, up to a tenth of the error on a linear axis.
         least_force: share of the applied force, as a root mean square, that an effect must take off
-            at least: no load cell and no torque by a current is linear to less.
+            at least: a load cell is no more linear than that, nor is a torque by a current.
         still_share: least share of the mean square that it takes off which an effect must take off
             beyond what it does to replays that truly stand still.
         unmoved: change of log error on an axis up to which an effect has left it as it was: what is

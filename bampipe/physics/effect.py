@@ -283,14 +283,19 @@ class Effect(Declaration):
         return set().union(*map(expression.names, trees))
 
     @property
+    def terms(self) -> set[str]:
+        """Those names without an axis or the like behind them: ``load`` of ``load_yaw``."""
+        return {name.partition("_")[0] for name in self.names}
+
+    @property
     def uses_weight(self) -> bool:
         """Whether it acts on the slope of the potential energy."""
-        return self.uses_pull or any(name.partition("_")[0] == "weight" for name in self.names)
+        return bool(self.terms & {"weight", "pull"})
 
     @property
     def uses_pull(self) -> bool:
         """Whether it acts on what pulls by position, springs included."""
-        return any(name.partition("_")[0] == "pull" for name in self.names)
+        return "pull" in self.terms
 
     @property
     def pulls(self) -> bool:

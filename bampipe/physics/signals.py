@@ -47,8 +47,9 @@ def follows(item: BoundEffect, earlier: BoundEffect, device: Device) -> bool:
     changed = {earlier.target} & set(device.channels) or set(device.forces)
     if item.effect.kind == "input":
         return item.target == earlier.target or not item.target
-    terms = {name.partition("_")[0] for name in item.effect.names}
-    by_load = bool(terms & {"applied", "load", "side"}) and changed <= set(device.forces)
+    by_load = bool(item.effect.terms & {"applied", "load", "side"}) and changed <= set(
+        device.forces
+    )
     return by_load or bool(item.effect.names & changed)
 
 

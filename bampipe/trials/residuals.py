@@ -347,6 +347,11 @@ class Evidence:
         mean = fitted.yy.sum(axis=0) / np.maximum(fitted.count.sum(axis=0), 1.0)
         return np.asarray(1.0 / np.maximum(mean, 1e-24))
 
+    @cached_property
+    def applied_rms(self) -> Array:
+        """Root mean square of the applied force by axis; see `applied_rms`, (n_q,), N.m or N."""
+        return applied_rms(self.system, self.motions, self.band, self.p, self.used)
+
     def rmse(self) -> Array:
         """Root mean square of the residual by axis over all trials, (n_q,), N.m or N."""
         count = np.maximum(self.sums.count.sum(axis=0), 1.0)

@@ -23,16 +23,13 @@ HIDDEN = {
 EFFECTS = ("quadratic_drag:extension", "stribeck:yaw")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("applied", "named"), [(100.0, ["weak"]), (2000.0, [])])
 def test_what_takes_off_less_than_a_sensor_is_linear_to_is_not_named(
     monkeypatch, applied, named
 ) -> None:
     """An error of 0.25 falls to 0.20, and so does by 0.15 what it takes off."""
     gain = 1000.0 * np.log(0.25 / 0.20) * np.ones(1)
-    evidence = SimpleNamespace(
-        system=None, motions=None, band=None, p=None, used=None, folds=SimpleNamespace(groups=())
-    )
+    evidence = SimpleNamespace(applied_rms=np.array([applied]), folds=SimpleNamespace(groups=()))
     scorer = SimpleNamespace(base_error=np.array([0.25]), independent_samples=np.array([1000.0]))
     level = SimpleNamespace(
         ask=lambda scores, names: None, excess=lambda score: gain, p_value=lambda score: 1e-6,
@@ -40,11 +37,11 @@ def test_what_takes_off_less_than_a_sensor_is_linear_to_is_not_named(
     )  # fmt: skip
     bench = SimpleNamespace(settings=Settings(), gaining=lambda scores, scorer: list(scores))
     monkeypatch.setattr(searching, "Scorer", lambda evidence: scorer)
-    monkeypatch.setattr(searching, "applied_rms", lambda *_: np.array([applied]))
     found, _ = searching._weigh(bench, {"weak": None}, level, evidence)
     assert [name for _, name in found] == named
 
 
+@pytest.mark.slow
 def test_effects_on_two_axes_are_added_at_once_and_each_has_its_rung() -> None:
     session = made(bam(EFFECTS), HIDDEN, trials=3)
     recipe = bam()

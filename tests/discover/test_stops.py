@@ -52,7 +52,7 @@ SCORES = {name: name for name in GAINS}
 
 
 @pytest.mark.parametrize("width", WIDTHS)
-def test_what_keeps_less_than_half_of_its_gain_is_passed_over(width) -> None:
+def test_what_mostly_shows_on_such_replays_too_is_passed_over(width) -> None:
     found, made = replays(width=width)
     for _ in range(2):  # the model is the same: its replays are made once
         kept, doubted = found.first_beyond(SCORES, level_of(GAINS, {}), SIGNIFICANT)
