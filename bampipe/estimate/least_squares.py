@@ -158,10 +158,13 @@ def residual_and_slopes(
     """
     base = problem.residual(trial, p)
     chosen = range(problem.free.size) if columns is None else columns
-    slopes = np.empty((*base.shape, len(chosen)))
     given: Sequence[int] = ()
     if problem.slopes is not None:
         given, known = problem.slopes(trial, p, chosen)
+        if list(given) == list(range(len(chosen))):
+            return base, known
+    slopes = np.empty((*base.shape, len(chosen)))
+    if given:
         slopes[:, :, given] = known
     for column in sorted(set(range(len(chosen))) - set(given)):
         k = chosen[column]
@@ -189,21 +192,19 @@ def stacked_residual(
     fresh = np.arange(problem.free.size) if known is None else np.flatnonzero(~known.holds)
     base, slopes = residual_and_slopes(problem, trial, p, [int(k) for k in fresh])
     count, n_q, n_free = slopes.shape
-    columns = np.concatenate([base[:, :, None], slopes], axis=2).reshape(count, -1)
-    axes = np.repeat(np.arange(n_q, dtype=np.int64), 1 + n_free)
     # No body of a robot acts on a joint behind it: half of its columns are empty.
-    some = np.flatnonzero(columns.any(axis=0))
-    flat = np.zeros((len(problem.band.thinned_rows(count)), columns.shape[1]))
-    flat[:, some] = problem.band.thin(columns[:, some], axes[some])
-    thin = flat.reshape(-1, n_q, 1 + n_free)
+    axes, numbers = np.nonzero(slopes.any(axis=0))
+    columns = np.empty((count, n_q + axes.size))
+    columns[:, :n_q], columns[:, n_q:] = base, slopes[:, axes, numbers]
+    thin = problem.band.thin(columns, np.concatenate([np.arange(n_q), axes]))
     used = find_moving_samples(problem.standstill[trial], problem.band)
-    thin *= used[:, :, None]
-    slope = np.ascontiguousarray(thin[:, :, 1:])
-    if known is not None:
-        whole = known.by_trial[trial].copy()
-        whole[:, :, fresh] = slope
-        slope = whole
-    return Stacked(np.ascontiguousarray(thin[:, :, 0]), slope, used)
+    if known is None:
+        slope = np.zeros((len(thin), n_q, n_free))
+    else:
+        slope = known.by_trial[trial].copy()
+        slope[:, :, fresh] = 0.0
+    slope[:, axes, fresh[numbers]] = thin[:, n_q:] * used[:, axes]
+    return Stacked(thin[:, :n_q] * used, slope, used)
 
 
 def fit(

@@ -128,7 +128,8 @@ class Contest:
             thin = self.band.thin(np.concatenate(rows, axis=1)).reshape(-1, len(rows), n)
             columns.append(thin.transpose(0, 2, 1) * stacked.used[:, :, None])
         joined = np.concatenate(columns, axis=2)
-        squares = np.einsum("tap,taq->apq", joined, joined)
+        by_axis = np.ascontiguousarray(joined.transpose(1, 2, 0))
+        squares = by_axis @ by_axis.transpose(0, 2, 1)
         return Sums(squares, stacked.used.sum(axis=0).astype(float))
 
     def _added_by(self, rival: Rival, base: ModelOnTrial) -> list[Array]:
@@ -190,14 +191,19 @@ class Contest:
     def left_by_model(self, total: Sums) -> list[Array]:
         """For each rival, the sum of squares that the model alone leaves of it, (n_q,)."""
         places = self._places(total.squares)
-        base = list(range(places[0][0]))
-        return [self._left(total, total, target, base) for target, _ in places]
+        base, targets = list(range(places[0][0])), [target for target, _ in places]
+        taken = self._fit(total, targets, base)
+        by_base = total.squares[:, base]
+        left = np.diagonal(total.squares, axis1=1, axis2=2)[:, targets].T.copy()
+        left -= 2.0 * np.einsum("apr,pr->ra", by_base[:, :, targets], taken)
+        left += np.einsum("apr,pr->ra", by_base[:, :, base] @ taken, taken)
+        return list(np.maximum(left, 0.0))
 
     def timing_of(self, total: Sums) -> list[float]:
         """For each rival, the timing that the model alone takes it for, s."""
         places = self._places(total.squares)
         base = list(range(places[0][0]))
-        return [abs(float(self._fit(total, target, base)[-1])) for target, _ in places]
+        return [abs(float(late)) for late in self._fit(total, [t for t, _ in places], base)[-1]]
 
     def without_timing(self, total: Sums) -> tuple[Contest, Sums]:
         """The same where no timing is fitted."""
@@ -208,17 +214,18 @@ class Contest:
     def _left(self, total: Sums, on: Sums, target: int, fitted: Sequence[int]) -> Array:
         """Sum of squares of column ``target`` that ``fitted`` ones leave on some trials, (n_q,)."""
         vector = np.zeros(total.squares.shape[1])
-        vector[target], vector[list(fitted)] = 1.0, -self._fit(total, target, fitted)
+        vector[target], vector[list(fitted)] = 1.0, -self._fit(total, [target], fitted)[:, 0]
         return np.asarray(np.maximum(np.einsum("p,apq,q->a", vector, on.squares, vector), 0.0))
 
-    def _fit(self, total: Sums, target: int, fitted: Sequence[int]) -> Array:
-        """Coefficients with which ``fitted`` columns come closest to column ``target``."""
+    def _fit(self, total: Sums, targets: Sequence[int], fitted: Sequence[int]) -> Array:
+        """Coefficients with which ``fitted`` columns come closest to each target, (m, targets)."""
         columns = list(fitted)
-        joint = np.einsum("apq,a->pq", total.squares, 1.0 / self.floor**2)
-        normal, moment = joint[np.ix_(columns, columns)], joint[columns, target]
-        scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
-        scaled = normal * np.outer(scale, scale)
-        return np.asarray(scale * np.linalg.lstsq(scaled, scale * moment, rcond=1e-9)[0])
+        weight, by_fitted = 1.0 / self.floor**2, total.squares[:, columns]
+        normal = np.einsum("apq,a->pq", by_fitted[:, :, columns], weight)
+        moments = np.einsum("apq,a->pq", by_fitted[:, :, list(targets)], weight)
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-300))[:, None]
+        solved = np.linalg.lstsq(normal * scale * scale.T, scale * moments, rcond=1e-9)[0]
+        return np.asarray(scale * solved)
 
     def _compare(self, total: Sums, nothing: Array, left: Array) -> tuple[float, float]:
         """Distance in log likelihood, and the chance that noise and imperfect models hide it.

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -177,17 +178,20 @@ class Blindness:
 
     def factors_with(self, motions: Sequence[Motion]) -> Array:
         """From which factor on each effect is found once ``motions`` have been recorded."""
-        now = np.array([one.factor for one in self.found])
-        total = self.at_hand + self.contest.sums(motions)
-        before, after = (
-            np.array([v.factor for v in weigh_visibility(self.contest, sums, self.bar)])
-            for sums in (self.at_hand, total)
-        )
+        now, before = np.array([one.factor for one in self.found]), self._factors_at_hand
+        after = self._factors(self.at_hand + self.contest.sums(motions))
         # What is not linear in its strength is taken to change alike.
         ratio = np.ones(len(now))
         known = np.isfinite(before) & np.isfinite(now)
         ratio[known] = now[known] / before[known]
         return np.asarray(after * ratio)
+
+    @cached_property
+    def _factors_at_hand(self) -> Array:
+        return self._factors(self.at_hand)
+
+    def _factors(self, sums: Sums) -> Array:
+        return np.array([v.factor for v in weigh_visibility(self.contest, sums, self.bar)])
 
 
 def find_blindness(
@@ -215,7 +219,7 @@ def find_blindness(
     )
     motions = trials.weighed
     at_hand, bar = contest.sums(motions), Bar.of_errors(error, floor, floor_sd, len(items))
-    found = [refine(contest, motions, v, bar) for v in weigh_visibility(contest, at_hand, bar)]
+    found = refine(contest, motions, weigh_visibility(contest, at_hand, bar), bar)
     found = [replace(v, growth=growth_of_jump(contest, motions, v)) for v in found]
     jumping = [v.rival.item for v in found if v.growth > 0.0 and v.rival.item is not None]
     still = _gain_by_standing_still(trials, recipe, evidence, jumping)

@@ -195,22 +195,37 @@ def _weigh(contest: Contest, sums: Sums, bar: Bar) -> list[Visibility]:
     return found
 
 
-def refine(contest: Contest, motions: Sequence[Motion], found: Visibility, bar: Bar) -> Visibility:
-    """The same with the effect at the strength found: it may not be linear in its strength."""
+def refine(
+    contest: Contest, motions: Sequence[Motion], found: Sequence[Visibility], bar: Bar
+) -> list[Visibility]:
+    """The same with each effect at the strength found: it may not be linear in its strength."""
+    refined = list(found)
+    bent = [k for k, one in enumerate(found) if _bends(one)]
+    for _ in range(3 if bent else 0):
+        probe = replace(contest, rivals=tuple(_at_strength_found(refined[k]) for k in bent))
+        again = weigh_visibility(probe, probe.sums(motions), bar)
+        for k, one in zip(bent, again, strict=True):
+            refined[k] = replace(refined[k], factor=refined[k].factor * one.factor, axis=one.axis)
+    return refined
+
+
+def _bends(found: Visibility) -> bool:
+    """Whether what an effect adds may bend between its typical strength and the one found."""
     item = found.rival.item
     assert item is not None
-    if len(item.linear_indices) == len(_strengths(item)) or not 1e-3 < found.factor < 1e3:
-        return found
-    values = found.rival.values.copy()
-    strengths = _strengths(item)
-    for _ in range(3):
-        own = [item.parameters[i] for i in strengths]
-        scaled = [found.rival.values[i] * found.factor for i in strengths]
-        values[strengths] = np.clip(scaled, [q.lower for q in own], [q.upper for q in own])
-        probe = replace(contest, rivals=(replace(found.rival, values=values),))
-        again = weigh_visibility(probe, probe.sums(motions), bar)[0]
-        found = replace(found, factor=found.factor * again.factor, axis=again.axis)
-    return found
+    is_linear = len(item.linear_indices) == len(_strengths(item))
+    return not is_linear and 1e-3 < found.factor < 1e3
+
+
+def _at_strength_found(found: Visibility) -> Rival:
+    item = found.rival.item
+    assert item is not None
+    values, strengths = found.rival.values.copy(), _strengths(item)
+    own = [item.parameters[i] for i in strengths]
+    values[strengths] = np.clip(
+        values[strengths] * found.factor, [q.lower for q in own], [q.upper for q in own]
+    )
+    return replace(found.rival, values=values)
 
 
 def growth_of_jump(contest: Contest, motions: Sequence[Motion], found: Visibility) -> float:
