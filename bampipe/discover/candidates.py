@@ -43,7 +43,7 @@ class Candidate:
     @property
     def replaces_motion(self) -> bool:
         """Whether all that it does is that the model sees another motion than was measured."""
-        return self.system.moves_sensors and not self.is_joint
+        return self.system.model.effects[-1].effect.kind == "measurement"
 
 
 def list_candidates(
