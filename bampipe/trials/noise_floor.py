@@ -48,8 +48,9 @@ leaves 0.80 and the width itself 0.23."""
 PROBE_WIDTH = 1.0 / 8.0
 """The same of the motions that tell whether standing still matters: they leave four fifths of what
 the narrow ones do, in a quarter of their time."""
-_PROBED = 10_000
-"""Samples that those have in all, of trials spread over the session, one at least."""
+_PROBED, _FEWEST_PROBED = 50_000, 3
+"""Samples that those have in all, of trials spread over the session, and how many trials at least:
+one by itself may be fast where the others are slow."""
 _SHARE = 0.15
 """Of what exceeds the floor in the mean square: what explains less of it is not named."""
 MOST_REPLAYS = 6
@@ -174,7 +175,8 @@ def standing_still_matters(
         return True
     if keep_motion(evidence.fitted):
         return False
-    step = min(max(1, round(sum(evidence.sizes) / _PROBED)), len(evidence.motions))
+    trials = len(evidence.motions)
+    step = max(1, min(round(sum(evidence.sizes) / _PROBED), trials // _FEWEST_PROBED))
     probed = list(evidence.motions[step // 2 :: step])
     stands, creeps = (
         _mean_square_of_own_motion(evidence, moved, probed, sensors, kinematics)

@@ -226,6 +226,34 @@ def test_standing_still_matters_where_it_leaves_clearly_more(
     assert found is matters
 
 
+@pytest.mark.parametrize(
+    ("sizes", "probed"),
+    [
+        ([9000, 5000, 8000], [0, 1, 2]),  # the second, alone, may not turn round slowly once
+        ([40_000] * 4, [0, 1, 2, 3]),
+        ([20_000] * 10, [1, 4, 7]),
+        ([20_000] * 12, [2, 6, 10]),
+    ],
+)
+def test_standing_still_is_probed_on_trials_spread_over_a_session(
+    sizes, probed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen = []
+    monkeypatch.setattr(noise_floor, "keep_motion", lambda fitted: False)
+    monkeypatch.setattr(
+        noise_floor, "_mean_square_of_own_motion",
+        lambda evidence, moved, motions, *_: seen.append(motions) or np.ones(1),
+    )  # fmt: skip
+    system = SimpleNamespace(model=SimpleNamespace(device=SimpleNamespace(robot="arm")))
+    evidence = SimpleNamespace(
+        system=system, fitted=(), sizes=sizes, motions=list(range(len(sizes))),
+        held_out_rmse=np.ones(1),
+    )  # fmt: skip
+    floor = noise_floor.NoiseFloor(np.ones(1), np.zeros(1), 1)
+    noise_floor.standing_still_matters(evidence, lambda: system, None, None, floor)
+    assert seen == [probed, probed]
+
+
 @pytest.mark.parametrize("machine", ["axis", "joint"])
 def test_a_replay_of_a_late_motor_leaves_what_the_measurement_leaves(machine, tmp_path) -> None:
     """By another simulator; moved by time derivatives within the band, it was up to 27 % off."""
