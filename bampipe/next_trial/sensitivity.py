@@ -200,8 +200,10 @@ def refine(
 ) -> list[Visibility]:
     """The same with each effect at the strength found: it may not be linear in its strength."""
     refined = list(found)
-    bent = [k for k, one in enumerate(found) if _bends(one)]
-    for _ in range(3 if bent else 0):
+    for _ in range(3):
+        bent = [k for k, one in enumerate(refined) if _bends(one)]
+        if not bent:
+            break
         probe = replace(contest, rivals=tuple(_at_strength_found(refined[k]) for k in bent))
         again = weigh_visibility(probe, probe.sums(motions), bar)
         for k, one in zip(bent, again, strict=True):
