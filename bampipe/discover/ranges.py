@@ -41,7 +41,7 @@ which a late sample or a filter leaves as well."""
 _DELAY, _DELAY_OF_DRIVES = 0.2, 0.5
 """In samples: both sides of the equation are filtered alike, so that less than one shows. Where
 there are several drives, friction that stops a joint looks late by less than half a sample, and how
-late all of them are within that is told by most of them already."""
+late all of them are within that, the timing that most of them share says already."""
 
 
 @dataclass(frozen=True)

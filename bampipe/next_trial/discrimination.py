@@ -176,9 +176,9 @@ class Contest:
                 if self.rivals[right].item is None:
                     continue
                 target, fitted = places[right][0], [*base, *places[wrong][1]]
-                nothing = self._left(total, total, target, base)
-                left = self._left(total, total, target, fitted)
-                shown = self._left(total, on, target, fitted)
+                nothing = self._left(total, total, [target], base)[0]
+                left = self._left(total, total, [target], fitted)[0]
+                shown = self._left(total, on, [target], fitted)[0]
                 distance, confusion = self._compare(total, nothing, left)
                 ways.append((distance, confusion, np.sqrt(shown / np.maximum(on.count, 1.0))))
             found[i, j] = Contrast(
@@ -191,13 +191,8 @@ class Contest:
     def left_by_model(self, total: Sums) -> list[Array]:
         """For each rival, the sum of squares that the model alone leaves of it, (n_q,)."""
         places = self._places(total.squares)
-        base, targets = list(range(places[0][0])), [target for target, _ in places]
-        taken = self._fit(total, targets, base)
-        by_base = total.squares[:, base]
-        left = np.diagonal(total.squares, axis1=1, axis2=2)[:, targets].T.copy()
-        left -= 2.0 * np.einsum("apr,pr->ra", by_base[:, :, targets], taken)
-        left += np.einsum("apr,pr->ra", by_base[:, :, base] @ taken, taken)
-        return list(np.maximum(left, 0.0))
+        base = list(range(places[0][0]))
+        return list(self._left(total, total, [target for target, _ in places], base))
 
     def timing_of(self, total: Sums) -> list[float]:
         """For each rival, the timing that the model alone takes it for, s."""
@@ -211,14 +206,17 @@ class Contest:
         squares = np.delete(np.delete(total.squares, last, axis=1), last, axis=2)
         return replace(self, timing_s=0.0), replace(total, squares=squares)
 
-    def _left(self, total: Sums, on: Sums, target: int, fitted: Sequence[int]) -> Array:
-        """Sum of squares of column ``target`` that ``fitted`` ones leave on some trials, (n_q,)."""
-        vector = np.zeros(total.squares.shape[1])
-        vector[target], vector[list(fitted)] = 1.0, -self._fit(total, [target], fitted)[:, 0]
-        return np.asarray(np.maximum(np.einsum("p,apq,q->a", vector, on.squares, vector), 0.0))
+    def _left(self, total: Sums, on: Sums, targets: Sequence[int], fitted: Sequence[int]) -> Array:
+        """Sum of squares of each target that ``fitted`` columns leave on some trials, (m, n_q)."""
+        taken, wanted, columns = self._fit(total, targets, fitted), list(targets), list(fitted)
+        by_fitted = on.squares[:, columns]
+        left = np.diagonal(on.squares, axis1=1, axis2=2)[:, wanted].T.copy()
+        left -= 2.0 * np.einsum("apr,pr->ra", by_fitted[:, :, wanted], taken)
+        left += np.einsum("apr,pr->ra", by_fitted[:, :, columns] @ taken, taken)
+        return np.asarray(np.maximum(left, 0.0))
 
     def _fit(self, total: Sums, targets: Sequence[int], fitted: Sequence[int]) -> Array:
-        """Coefficients with which ``fitted`` columns come closest to each target, (m, targets)."""
+        """Coefficients with which ``fitted`` columns come closest to each target, (k, m)."""
         columns = list(fitted)
         weight, by_fitted = 1.0 / self.floor**2, total.squares[:, columns]
         normal = np.einsum("apq,a->pq", by_fitted[:, :, columns], weight)

@@ -201,18 +201,18 @@ def refine(
     """The same with each effect at the strength found: it may not be linear in its strength."""
     refined = list(found)
     for _ in range(3):
-        bent = [k for k, one in enumerate(refined) if _bends(one)]
-        if not bent:
+        chosen = [k for k, one in enumerate(refined) if _is_nonlinear(one)]
+        if not chosen:
             break
-        probe = replace(contest, rivals=tuple(_at_strength_found(refined[k]) for k in bent))
+        probe = replace(contest, rivals=tuple(_at_strength_found(refined[k]) for k in chosen))
         again = weigh_visibility(probe, probe.sums(motions), bar)
-        for k, one in zip(bent, again, strict=True):
+        for k, one in zip(chosen, again, strict=True):
             refined[k] = replace(refined[k], factor=refined[k].factor * one.factor, axis=one.axis)
     return refined
 
 
-def _bends(found: Visibility) -> bool:
-    """Whether what an effect adds may bend between its typical strength and the one found."""
+def _is_nonlinear(found: Visibility) -> bool:
+    """Whether an effect is not linear in its strength, and shows at a strength at all."""
     item = found.rival.item
     assert item is not None
     is_linear = len(item.linear_indices) == len(_strengths(item))

@@ -47,8 +47,8 @@ _NEIGHBOURS, _FEWEST, _RADIUS = 12, 4, 0.35
 """Samples held against one of a stretch, and how near they are: in spreads of all that the error
 may depend on, and at least `_APART_S` away or in another trial."""
 _SLOWLY = 50.0
-"""How much finer velocities are told apart at standstill than as a whole: friction changes within
-little there, and turns are held against turns."""
+"""How much finer the resolution in velocity is near standstill than elsewhere: friction changes
+within little there, and turns are held against turns."""
 _UNKNOWN = 3
 """Most blocks at rest that a stretch goes on through."""
 _SLOW, _FRICTION = 0.1, 2.0
@@ -118,11 +118,11 @@ class _Samples:
     excess: Array
     used: Flags
 
-    def judge(self, axis: int, first: int, last: int, calm: Flags) -> _Stretch | None:
+    def judge(self, axis: int, first: int, last: int, undisturbed: Flags) -> _Stretch | None:
         """Blocks ``first`` to ``last`` as a stretch to leave out; None if its error comes back.
 
         Args:
-            calm: (B,) blocks outside all such stretches of the axis.
+            undisturbed: (B,) blocks outside all such stretches of the axis.
         """
         blocks, excess = self.blocks, self.excess[:, axis]
         start, end = float(blocks.starts[first]), float(blocks.ends[last])
@@ -130,7 +130,7 @@ class _Samples:
         here = blocks.trial[blocks.block] == blocks.trial[first]
         near = here & (self.t > start - _APART_S) & (self.t < end + _APART_S)
         others = self.used[:, axis] & ~near
-        outside = calm[blocks.block] & self.used[:, axis]
+        outside = undisturbed[blocks.block] & self.used[:, axis]
         if not others.any() or not outside.any():
             return None
         state = np.hstack([self.motion[:, axis], self.inputs])
@@ -170,11 +170,11 @@ def find_disturbances(
     whole = samples.blocks.mean_square(samples.error, samples.used)
     for axis in range(len(system.coordinates)):
         candidates = _candidates(mean_square[:, axis], whole[:, axis], samples.blocks)
-        calm = np.ones(len(mean_square), dtype=bool)
+        undisturbed = np.ones(len(mean_square), dtype=bool)
         for first, last in candidates:
-            calm[first : last + 1] = False
+            undisturbed[first : last + 1] = False
         for first, last in candidates:
-            found = samples.judge(axis, first, last, calm)
+            found = samples.judge(axis, first, last, undisturbed)
             if found is not None:
                 name = motions[int(samples.blocks.trial[first])].trial_id
                 stretches.setdefault(name, []).append(found)
@@ -401,10 +401,10 @@ def _candidates(mean_square: Array, whole: Array, blocks: _Blocks) -> list[tuple
 
 
 def _loud(mean_square: Array) -> Flags:
-    """Which blocks (B,) stand above the calmer ones."""
+    """Which blocks (B,) stand above the lowest of them."""
     known = np.sort(mean_square[np.isfinite(mean_square)])
-    calm = known[: int(np.ceil((1.0 - _MOST) * known.size))].mean()
-    return np.asarray(np.nan_to_num(mean_square) > _EDGE**2 * calm)
+    lowest = known[: int(np.ceil((1.0 - _MOST) * known.size))].mean()
+    return np.asarray(np.nan_to_num(mean_square) > _EDGE**2 * lowest)
 
 
 def _repeated_share(state: Array, error: Array, inside: Flags, others: Flags) -> tuple[bool, float]:

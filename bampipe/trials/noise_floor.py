@@ -157,10 +157,10 @@ def standing_still_matters(
 ) -> bool:
     """Whether replays that stand still where the motion turns round would say anything new.
 
-    Of a robot, whose fits are expensive, that is told beforehand. Where replays keep its motion as
-    measured they would not. Else its model is moved along some of the trials, creeping and standing
-    still, without noise, and held against that motion as it is: on some axis the latter must leave
-    clearly more, and not next to nothing beside what is above the floor.
+    For a robot, whose fits are expensive, that is probed beforehand. Where replays keep its motion
+    as measured they would not. Else its model is moved along some of the trials, creeping and
+    standing still, without noise, and held against that motion as it is: on some axis the latter
+    must leave clearly more, and not next to nothing beside what is above the floor.
 
     Args:
         evidence: the model, fitted; still: returns the same with signs of `PROBE_WIDTH`, if wanted.
