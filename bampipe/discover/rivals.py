@@ -33,8 +33,8 @@ class Choice:
         winner: the best one; "" if every one of them rests on one second.
         alike: others that these trials cannot tell from it.
         transient: candidates that only one second speaks for, and that second.
-        unlike: the others that were replayed, where replays of none of them, nor of the best, look
-            like the measurement: scores are all that distinguishes them.
+        unlike: where replays of neither the best nor any other look like the measurement, those
+            whose replays are not much farther off: scores are all that distinguishes them.
         misfit: mean squared z of the likest of those replays.
         log_prior: of all that came close, see `believed.log_prior`.
     """
@@ -117,8 +117,8 @@ def choose(
     misfits = replay_rivals(bench, recipe, evidence, replayed, axis, progress)
     likely = plausible(misfits, s)
     if not likely:
-        # As where more is missing than one effect: the patterns are no evidence for any of them.
-        unlike = tuple(n for n in rivals if n != best)
+        # As where more is missing than one effect.
+        unlike = unsettled_rivals(misfits, best, s)
         return Choice(best, (), transient, unlike, min(misfits.values()), believed)
     winner, *others = likely
     alike = tuple(others)
@@ -239,6 +239,22 @@ def plausible(misfits: Mapping[str, float], s: Settings) -> list[str]:
         return []
     limit = max(s.rival_misfit, least + s.rival_margin)
     return [n for n, misfit in misfits.items() if misfit == least or misfit < limit]
+
+
+def unsettled_rivals(misfits: Mapping[str, float], best: str, s: Settings) -> tuple[str, ...]:
+    """Rivals that replays leave open where those of none look like the measurement.
+
+    What replays lack, they lack for every rival: they err by as much as the likest of them (Birge
+    ratio), and one that is farther off than that allows is out, unless ``best`` is so itself.
+
+    Args:
+        misfits: from `replay_rivals`; best: the one with the best score.
+    """
+    limit = min(misfits.values()) * (1.0 + s.rival_margin / s.rival_misfit)
+    contradicted = misfits[best] > limit
+    return tuple(
+        n for n, misfit in misfits.items() if n != best and (contradicted or misfit <= limit)
+    )
 
 
 def _misfit(measured: Array, replayed: Array, blur: float, s: Settings) -> float:

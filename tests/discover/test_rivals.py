@@ -147,15 +147,15 @@ def test_what_holds_an_effect_and_more_has_no_odds_beside_it_unless_it_fits_bett
 
 
 def test_an_offset_that_the_model_has_is_no_further_number_of_a_spring(tmp_path):
-    """Of a joint with weight and an offset, a spring adds one number and a cable two."""
+    """Of a joint with weight and an offset, a spring adds one number and a cable three."""
     joint, recipe, _ = record_trials(tmp_path, "joint", 4, "return_spring:joint")
     evidence = fit_trials(joint, recipe, system_of(recipe).prior)
     names = ("return_spring:joint", "cable_torque:joint", "encoder_scale:joint")
     items = candidates_of(recipe, names)
     scores = [Scorer(evidence).score(item) for item in items]
     new = [count_new_constants(evidence, *pair) for pair in zip(items, scores, strict=True)]
-    assert new == [1, 2, 1]
-    assert [item.n_constants for item in items] == [2, 2, 1]
+    assert new == [1, 3, 1]
+    assert [item.n_constants for item in items] == [2, 4, 1]
 
 
 @pytest.mark.parametrize(("error", "known"), [(0.02, 0.0), (-0.12, -7.5), (0.12, -7.5)])
