@@ -51,6 +51,10 @@ OTHERWISE = {"shear_thinning": ("viscous", "coulomb")}
 """Effects that simulators write in other mathematics, with the parameters of the same axis that
 take part in the difference: of them, such a session has no truth."""
 
+SHARE_OF_COULOMB = ("presliding", "maxwell_slip", "position_dependent_friction")
+"""What takes its force from the Coulomb friction of an axis: two of them leave none, and then the
+simulator does not have what its truth says."""
+
 
 @dataclass(frozen=True)
 class Case:
@@ -326,8 +330,14 @@ def draw_effects(machine: str, count: int, outside: int, seed: int) -> tuple[str
         (MACHINES[machine].UNKNOWN, count + outside),
     ):
         for name in rng.permutation(pool):
+            kind, _, axis = name.partition(":")
             kinds = {c.partition(":")[0] for c in chosen}
-            if len(chosen) < size and name.partition(":")[0] not in kinds:
+            sharing = [k for k in SHARE_OF_COULOMB if f"{k}:{axis}" in chosen]
+            if (
+                len(chosen) < size
+                and kind not in kinds
+                and not (kind in SHARE_OF_COULOMB and sharing)
+            ):
                 chosen.append(str(name))
     return tuple(chosen)
 
