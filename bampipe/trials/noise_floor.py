@@ -15,7 +15,7 @@ from bampipe.estimate.least_squares import fit
 from bampipe.estimate.low_pass import Band
 from bampipe.estimate.standstill import find_moving_samples
 from bampipe.physics import System
-from bampipe.results.standing import AT_FLOOR, standing
+from bampipe.results.standing import standing
 from bampipe.trials.bias import remove_bias
 from bampipe.trials.draw import ENOUGH_SAMPLES, draw_trials
 from bampipe.trials.folds import Folds
@@ -51,6 +51,9 @@ the narrow ones do, in a quarter of their time."""
 _PROBED, _FEWEST_PROBED = 50_000, 3
 """Samples that those have in all, of trials spread over the session, and how many trials at least:
 one by itself may be fast where the others are slow."""
+_CLEAR = 1.1
+"""Error over floor from which on what standing still adds to a robot's matters: a joint where it
+made 1.17 of it had a compliance that replays standing still have as well."""
 _SHARE = 0.15
 """Of what exceeds the floor in the mean square: what explains less of it is not named."""
 MOST_REPLAYS = 6
@@ -183,7 +186,7 @@ def standing_still_matters(
         for moved in (still(), system)
     )
     added, known = stands - creeps, floor.level**2
-    clear, excess = (AT_FLOOR**2 - 1.0) * known, np.maximum(error**2 - known, 0.0)
+    clear, excess = (_CLEAR**2 - 1.0) * known, np.maximum(error**2 - known, 0.0)
     return bool(np.any(added > np.maximum(clear, _SHARE * excess)))
 
 
