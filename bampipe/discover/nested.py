@@ -30,6 +30,8 @@ def idle_extensions(
 ) -> frozenset[str]:
     """Those of ``rivals`` that contain an effect and gain no more than replays are good for.
 
+    Nor than their further constants would by chance.
+
     Args:
         bench: the session.
         found: the set with the effect, fitted; name: the effect; axis: where it helps most.
@@ -43,16 +45,20 @@ def idle_extensions(
         return frozenset()
     items = {c.name: c for c in candidates_of(fewer.recipe, list(scores))}
     added, _ = _parts(fewer.evidence, items[name], scores[name])
-    blur = s.replay_error * float(fewer.scorer.independent_samples[axis])
-    most = scores[name].total + max(s.score_sd, blur)
-    return frozenset(
-        rival
-        for rival, score in scores.items()
-        if rival != name
-        and score.total <= most
-        and items[rival].n_constants > items[name].n_constants
-        and _contains(_parts(fewer.evidence, items[rival], score)[1], added)
-    )
+    samples = float(fewer.scorer.independent_samples[axis])
+
+    def is_idle(rival: str) -> bool:
+        more = items[rival].n_constants - items[name].n_constants
+        gain = scores[rival].total - scores[name].total
+        # Schwarz 1978, Annals of Statistics 6: so much each further constant must gain.
+        asked = 0.5 * more * float(np.log(max(samples, 1.0)))
+        return (
+            more > 0
+            and gain <= max(s.score_sd, s.replay_error * samples, asked)
+            and _contains(_parts(fewer.evidence, items[rival], scores[rival])[1], added)
+        )
+
+    return frozenset(rival for rival in scores if rival != name and is_idle(rival))
 
 
 def _parts(evidence: Evidence, item: Candidate, score: Score) -> tuple[Array, Array]:

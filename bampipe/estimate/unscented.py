@@ -136,7 +136,9 @@ class FilterModel:
         """Return physical parameters and their slope for ``mean`` (..., nt) as estimated."""
         value, slope = np.array(mean, dtype=float), np.ones_like(mean)
         log = self.logarithmic
-        value[..., log] = np.exp(value[..., log])
+        # A filter that has lost the motion may be anywhere.
+        with np.errstate(over="ignore"):
+            value[..., log] = np.exp(value[..., log])
         slope[..., log] = value[..., log]
         return value, slope
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from independent_runs import record_trials
@@ -13,7 +15,13 @@ from bampipe.discover.chance import candidates_of, fit_trials, system_of, worker
 from bampipe.discover.insufficient import insufficient_rivals
 from bampipe.discover.nested import idle_extensions
 from bampipe.discover.polish import FittedSet, comes_close
-from bampipe.discover.rivals import _misfit, believable, plausible, without_mere_offsets
+from bampipe.discover.rivals import (
+    _misfit,
+    believable,
+    plausible,
+    unsettled_rivals,
+    without_mere_offsets,
+)
 from bampipe.discover.scorer import Score, Scorer
 from bampipe.discover.settings import Settings
 from bampipe.results.diagnose import Contender
@@ -53,6 +61,16 @@ def test_a_pattern_between_the_two_tells_neither_from_the_other():
 
 def test_where_more_is_missing_no_rival_is_plausible():
     assert plausible(misfits(0.3 * MEASURED), S) == []
+
+
+@pytest.mark.parametrize(
+    ("sag", "best", "open_"),
+    [(62.0, "load", ["gear"]), (40.0, "load", ["gear", "sag"]), (62.0, "sag", ["gear", "load"])],
+)
+def test_where_no_replay_resembles_a_rival_far_from_the_likest_is_out(sag, best, open_):
+    """But where the best by score is that far itself, nothing is settled."""
+    found = {"gear": 26.0 if sag > 50.0 else 28.0, "load": 30.0, "sag": sag}
+    assert sorted(unsettled_rivals(found, best, S)) == open_
 
 
 def contender(score, without_second, without_trial=None):
@@ -144,6 +162,17 @@ def test_what_holds_an_effect_and_more_has_no_odds_beside_it_unless_it_fits_bett
         others = {"upper_stop:extension", "force_delay"}
         idle = idle_extensions(bench, found, bias, 2, {friction, spring, *others})
     assert idle == ({spring} if by_speed else {friction, spring})
+
+
+def test_a_cable_that_curves_no_more_than_by_chance_is_its_spring(tmp_path):
+    spring, cable = "return_spring:joint", "cable_torque:joint"
+    session, recipe, _ = record_trials(tmp_path, "joint", 4, spring)
+    recipe = replace(recipe, effects=(spring,))
+    with workers(session, 1) as pool:
+        bench = Bench(session, Settings(jobs=1), pool, (cable,))
+        evidence = bench.fit(recipe, system_of(recipe).prior)
+        found = FittedSet(recipe, (spring,), evidence, session)
+        assert idle_extensions(bench, found, spring, 0, {cable}) == {cable}
 
 
 def test_an_offset_that_the_model_has_is_no_further_number_of_a_spring(tmp_path):
