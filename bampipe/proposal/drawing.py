@@ -35,16 +35,30 @@ class Drive:
         share: of the drive, for one of what is required; 1 where both are of the joint.
         error: its standard error by the scatter alone; the drawing has another.
         left: part of the drive's variance that drawing, drive's inertia and friction leave.
+        losses: mean power that friction takes from the drive, in its standard errors: negative
+            where the drive, or the joint, is logged with the other sign.
     """
 
     share: float
     error: float
     left: float
+    losses: float
 
     @property
     def is_sure(self) -> bool:
-        """Whether the sign is known."""
-        return abs(self.share) > _SURE * self.error
+        """Whether weight and inertia tell the sign: friction gives no power, whatever they say."""
+        contradicted = self.is_dissipative if self.share < 0.0 else self.losses < -_SURE
+        return abs(self.share) > _SURE * self.error and not contradicted
+
+    @property
+    def is_dissipative(self) -> bool:
+        """Whether friction surely takes power from the drive."""
+        return self.losses > _SURE
+
+    @property
+    def is_turned(self) -> bool:
+        """Whether it is surely logged with the other sign, by weight and inertia or by friction."""
+        return self.share < 0.0 if self.is_sure else self.losses < -_SURE
 
 
 def positions_of(device: Device, group: Group, t: Array) -> Array:
@@ -120,7 +134,9 @@ def hold(
     for k, column in enumerate(drives.columns):
         required = np.broadcast_to(forces[k], rate[k].shape) / ratio[k]
         values = np.nan_to_num(column.values)[motion.rows] * scale_to(device.force_unit, column)
-        found.append(_compare(required, rate[k], change[k], values))
+        # Of the drive, which a motor that turns the other way counts so.
+        way = float(np.sign(ratio[k]))
+        found.append(_compare(required, way * rate[k], way * change[k], values))
     return found
 
 
@@ -148,11 +164,17 @@ def _compare(required: Array, rate: Array, change: Array, drive: Array) -> Drive
     rest = drive - columns / size @ values
     left = float(np.var(rest) / max(np.var(drive), 1e-300))
     if rank < columns.shape[1]:
-        return Drive(0.0, np.inf, left)
-    inverse = np.linalg.inv((columns / size).T @ (columns / size))
+        return Drive(0.0, np.inf, left, 0.0)
     # Neighbouring samples err alike: about one in ten counts.
-    error = np.sqrt(10.0 * np.mean(rest**2) * inverse[0, 0])
-    return Drive(float(values[0] / size[0]), float(error / size[0]), left)
+    covariance = 10.0 * np.mean(rest**2) * np.linalg.inv((columns / size).T @ (columns / size))
+    by_friction = np.array([0.0, 0.0, np.mean(rate**2), np.mean(sign * rate), 0.0]) / size
+    power, power_sd = by_friction @ values, np.sqrt(by_friction @ covariance @ by_friction)
+    return Drive(
+        float(values[0] / size[0]),
+        float(np.sqrt(covariance[0, 0]) / size[0]),
+        left,
+        float(power / max(power_sd, 1e-300)),
+    )
 
 
 def fits(drives: Sequence[Drive]) -> bool:

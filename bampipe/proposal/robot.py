@@ -63,7 +63,7 @@ class RobotColumns:
     @property
     def turned(self) -> frozenset[str]:
         """Inputs that are surely logged with the other sign."""
-        return frozenset(n for n, drive in self.drives.items() if drive.is_sure and drive.share < 0)
+        return frozenset(name for name, drive in self.drives.items() if drive.is_turned)
 
 
 def find_robot_columns(
@@ -289,6 +289,7 @@ def _sentences(
         if not drive.is_sure:
             lines.append(
                 f"{column}: too little weight and inertia act on {c.name} to tell its sign"
+                + _by_friction(drive, c.name)
             )
             continue
         size = abs(drive.share)
@@ -324,3 +325,10 @@ def _sentences(
     explained = max(0.0, 1.0 - mean_left(list(drives.values())))
     lines.append(f"drawing, drives' inertia and friction explain {explained:.1%} of the drives")
     return lines
+
+
+def _by_friction(drive: Drive, joint: str) -> str:
+    """What friction says of a drive's sign, as the end of a sentence."""
+    if drive.is_turned:
+        return f"; by its friction it is turned, or that of {joint} is the wrong one"
+    return "; by its friction it is right" if drive.is_dissipative else ""

@@ -17,6 +17,7 @@ from bampipe.errors import InputError
 from bampipe.files import read_json
 from bampipe.physics import Model, compile_model, registry
 from bampipe.proposal import ProposedSession, propose, write_proposal
+from bampipe.proposal.drawing import Drive
 
 URDF = """<?xml version="1.0"?><robot name="arm">
 <link name="base"/>
@@ -94,6 +95,28 @@ def test_signs_and_reductions_are_tested_against_weight_and_inertia(tmp_path: Pa
     assert "its sign is turned; or that of shoulder is the wrong one" in sign
     assert "the torque of a motor with a reduction of about" in size
     assert float(size.rpartition(" ")[2]) == pytest.approx(100.0, rel=0.1)
+
+
+@pytest.mark.parametrize(("gain", "said"), [(1.0, "it is right"), (-1.0, "it is turned")])
+def test_where_next_to_nothing_hangs_on_a_joint_friction_tells_the_sign(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, gain: float, said: str
+) -> None:
+    heavy = '<mass value="2"/>\n<inertia ixx="0.01" ixy="0" ixz="0" iyy="0.05" iyz="0" izz="0.05"/>'
+    light = heavy.replace('"2"', '"0.002"').replace('"0.01"', '"5e-5"').replace('"0.05"', '"5e-5"')
+    assert heavy in URDF
+    monkeypatch.setattr("test_robot_proposal.URDF", URDF.replace(heavy, light))
+    write_log(tmp_path, gains=(1.0, gain))
+    proposal = proposed(tmp_path)
+    assert any(f"to tell its sign; by its friction {said}" in line for line in proposal.check)
+    scale = {c.name: c.scale for c in read_session(tmp_path).channels}["torque_elbow"]
+    assert scale == gain
+
+
+def test_weight_that_would_make_friction_drive_the_joint_tells_no_sign() -> None:
+    drive = Drive(share=-3.8, error=0.5, left=0.3, losses=40.0)
+    assert not drive.is_sure and not drive.is_turned
+    assert Drive(share=-0.9, error=0.1, left=0.1, losses=-40.0).is_turned
+    assert Drive(share=-0.9, error=0.1, left=0.1, losses=0.5).is_turned
 
 
 def test_a_turned_drive_on_the_side_of_the_motor_has_its_reduction_said_too(tmp_path: Path) -> None:
