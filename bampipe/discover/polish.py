@@ -270,7 +270,7 @@ def _swap_by_replay(
     scores = {n: out.scores[n] for n in (name, *close)}
     axis = fewer.evidence.system.coordinates.index(mine.axis)
     misfits = replay_rivals(bench, fewer.recipe, fewer.evidence, scores, axis, progress)
-    likely = plausible(misfits, s)
+    likely = plausible(misfits, s, max(scores, key=lambda n: scores[n].total))
     resembles = bool(likely)
     if not resembles:
         # None looks like the measurement: those that do no worse are no less likely.

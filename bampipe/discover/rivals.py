@@ -24,6 +24,10 @@ from bampipe.trials.residuals import Evidence
 
 Array = NDArray[np.float64]
 
+_CLEARLY = 2.0
+"""Times the limit of a misfit from which on replays alone decide against the best score. Two delays
+at 1.2 and 1.5 times it, where scores were right, had the name of a lag."""
+
 
 @dataclass(frozen=True)
 class Choice:
@@ -115,7 +119,7 @@ def choose(
     best = simplest(rivals)
     replayed = {name: scores[name] for name in rivals}
     misfits = replay_rivals(bench, recipe, evidence, replayed, axis, progress)
-    likely = plausible(misfits, s)
+    likely = plausible(misfits, s, best)
     if not likely:
         # As where more is missing than one effect.
         unlike = unsettled_rivals(misfits, best, s)
@@ -232,13 +236,22 @@ def replay_rivals(
     return dict(sorted(misfits.items(), key=lambda pair: pair[1]))
 
 
-def plausible(misfits: Mapping[str, float], s: Settings) -> list[str]:
-    """Rivals whose replays look like the measurement, the likest first; none if those do not."""
+def plausible(misfits: Mapping[str, float], s: Settings, best: str = "") -> list[str]:
+    """Rivals whose replays look like the measurement, the likest first; none if those do not.
+
+    Args:
+        misfits: from `replay_rivals`; best: the one with the best score, which replays that are
+            not clearly against it leave beside those that they speak for.
+    """
     least = min(misfits.values())
     if least > s.rival_misfit + s.rival_margin:
         return []
     limit = max(s.rival_misfit, least + s.rival_margin)
-    return [n for n, misfit in misfits.items() if misfit == least or misfit < limit]
+    return [
+        name
+        for name, misfit in misfits.items()
+        if misfit == least or misfit < limit * (_CLEARLY if name == best else 1.0)
+    ]
 
 
 def unsettled_rivals(misfits: Mapping[str, float], best: str, s: Settings) -> tuple[str, ...]:

@@ -59,6 +59,13 @@ def test_a_pattern_between_the_two_tells_neither_from_the_other():
     assert plausible(found, S) == ["delay", "lag"]
 
 
+@pytest.mark.parametrize(("delay", "left"), [(3.8, ["lag", "delay"]), (7.0, ["lag"])])
+def test_replays_that_are_not_clearly_against_the_best_score_leave_it_beside_theirs(delay, left):
+    found = {"lag": 2.1, "delay": delay}
+    assert plausible(found, S) == ["lag"]
+    assert plausible(found, S, "delay") == left
+
+
 def test_where_more_is_missing_no_rival_is_plausible():
     assert plausible(misfits(0.3 * MEASURED), S) == []
 
