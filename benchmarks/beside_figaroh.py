@@ -5,10 +5,10 @@
 
 FOLDER is that of `robots.py`. FIGAROH builds the regressor of the URDF (bodies, viscous and Coulomb
 friction, inertia of the drives, offsets) and finds the base parameters; the wrist's coupling is put
-in by hand, as columns of friction and inertia of the motor that turns with joints 5 and 6. Torque and
-columns are low-passed at 40 Hz, and least squares weigh each joint by what it leaves. Printed: error
-of each joint in per cent of its torque, in-sample, and held out in five blocks of 0.8 s in turn.
-Needs nothing of bampipe, so that it runs in an environment of its own.
+in by hand, as columns of friction and inertia of the motor that turns with joints 5 and 6. Torque
+and columns are low-passed at 40 Hz; least squares weigh each joint by what it leaves. Printed is
+the error of each joint in per cent of its torque, in-sample, and held out in five folds of blocks
+of 0.8 s. Needs nothing of bampipe, so that it runs in an environment of its own.
 """
 
 from __future__ import annotations
