@@ -240,8 +240,9 @@ def plausible(misfits: Mapping[str, float], s: Settings, best: str = "") -> list
     """Rivals whose replays look like the measurement, the likest first; none if those do not.
 
     Args:
-        misfits: from `replay_rivals`; best: the one with the best score, which replays that are
-            not clearly against it leave beside those that they speak for.
+        misfits: from `replay_rivals`; best: the one with the best score, or the simplest of
+            several, which replays that are not clearly against it leave beside those that they
+            speak for.
     """
     least = min(misfits.values())
     if least > s.rival_misfit + s.rival_margin:
@@ -261,7 +262,7 @@ def unsettled_rivals(misfits: Mapping[str, float], best: str, s: Settings) -> tu
     ratio), and one that is farther off than that allows is out, unless ``best`` is so itself.
 
     Args:
-        misfits: from `replay_rivals`; best: the one with the best score.
+        misfits: from `replay_rivals`; best: as of `plausible`.
     """
     limit = min(misfits.values()) * (1.0 + s.rival_margin / s.rival_misfit)
     contradicted = misfits[best] > limit
