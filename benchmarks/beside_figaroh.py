@@ -17,10 +17,10 @@ import argparse
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pinocchio
-from figaroh.tools.qrdecomposition import QRDecomposer
+from figaroh.tools.qrdecomposition import build_baseRegressor, get_baseIndex
 from figaroh.tools.regressor import build_regressor_basic, eliminate_non_dynaffect
+from robots import tx40_joints
 from scipy.signal import butter, sosfiltfilt
 
 RATE, BAND, STEP = 5000.0, 40.0, 25
@@ -34,39 +34,29 @@ OPTIONS = {
 }
 
 
-def joint_side(source: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Positions (T, 6), rad, and torques (T, 6), N.m, of the joints."""
-    motor = pd.read_csv(source / "pos_read_data.csv").to_numpy()
-    drive = pd.read_csv(source / "curr_data.csv").to_numpy()
-    turns = np.diag([32.0, 32.0, 45.0, -48.0, 45.0, 32.0])
-    turns[5, 4] = 32.0
-    zero = np.array([0.0, -0.5, 0.5, 0.0, 0.0, 0.0]) * np.pi
-    return motor @ np.linalg.inv(turns).T + zero, drive @ turns
-
-
 def low_pass(x: np.ndarray, hz: float) -> np.ndarray:
     """Without delay, along the first axis."""
     return np.asarray(sosfiltfilt(butter(4, hz, fs=RATE, output="sos"), x, axis=0))
 
 
-def columns_of(q: np.ndarray, urdf: Path, coupled: bool) -> np.ndarray:
-    """Columns of the base parameters, low-passed, (K, 6, P)."""
+def regressors_of(q: np.ndarray, urdf: Path) -> dict[str, np.ndarray]:
+    """Columns of the base parameters without the coupling and with it, low-passed, (K, 6, P)."""
     robot = pinocchio.RobotWrapper(pinocchio.buildModelFromUrdf(str(urdf)))
     v = np.gradient(q, 1.0 / RATE, axis=0)
     a = np.gradient(v, 1.0 / RATE, axis=0)
     kept = slice(None, None, 5)  # 1 kHz is enough for 40 Hz
     q, v, a = q[kept], v[kept], a[kept]
-    w = build_regressor_basic(robot, q, v, a, OPTIONS | {"act_idxv": list(range(6))})
-    if coupled:
-        both = v[:, 4] + v[:, 5]
-        on_both = np.zeros((6, len(q), 3))
-        on_both[4:] = np.column_stack([both, np.sign(both), a[:, 4] + a[:, 5]])
-        w = np.hstack([w, on_both.reshape(-1, 3)])
-    w, names = eliminate_non_dynaffect(w, {f"p{k}": 0.0 for k in range(w.shape[1])})
-    chosen, _ = QRDecomposer()._identify_base_parameters(w, names)
-    by_joint = w[:, list(chosen)].reshape(6, len(q), -1).transpose(1, 0, 2)
-    sos = butter(4, BAND, fs=RATE / 5, output="sos")
-    return np.asarray(sosfiltfilt(sos, by_joint, axis=0)[:: STEP // 5])
+    alone = build_regressor_basic(robot, q, v, a, OPTIONS | {"act_idxv": list(range(6))})
+    both, on_both = v[:, 4] + v[:, 5], np.zeros((6, len(q), 3))
+    on_both[4:] = np.column_stack([both, np.sign(both), a[:, 4] + a[:, 5]])
+    coupled = np.hstack([alone, on_both.reshape(-1, 3)])
+    sos, found = butter(4, BAND, fs=RATE / 5, output="sos"), {}
+    for what, every in (("without", alone), ("with the coupling", coupled)):
+        w, names = eliminate_non_dynaffect(every, {f"p{k}": 0.0 for k in range(every.shape[1])})
+        w = build_baseRegressor(w, get_baseIndex(w, names))
+        by_joint = w.reshape(6, len(q), -1).transpose(1, 0, 2)
+        found[what] = sosfiltfilt(sos, by_joint, axis=0)[:: STEP // 5]
+    return found
 
 
 def fit(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -84,18 +74,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
     source = parser.parse_args().folder / "staubli_tx40"
-    q, torque = joint_side(source)
+    q, torque = tx40_joints(source)
     y = low_pass(torque, BAND)[::STEP]
     block = (np.arange(len(y)) * STEP / RATE // BLOCK_S).astype(int) % FOLDS
-    for coupled in (False, True):
-        x = columns_of(low_pass(q, 100.0), source / "tx40_mdh_modified.urdf", coupled)
+    regressors = regressors_of(low_pass(q, 100.0), next(source.glob("*.urdf")))
+    for what, x in regressors.items():
         inside, held = y - x @ fit(x, y), np.empty_like(y)
         for fold in range(FOLDS):
             out = block == fold
             held[out] = y[out] - x[out] @ fit(x[~out], y[~out])
         for name, left in (("in-sample", inside), ("held out", held)):
             share = 100.0 * np.sqrt(np.mean(left**2, axis=0) / np.mean(y**2, axis=0))
-            what = "with the coupling" if coupled else "without"
             print(f"{what}, {name}: " + " ".join(f"{value:.1f}" for value in share) + " %")
 
 

@@ -332,12 +332,9 @@ def draw_effects(machine: str, count: int, outside: int, seed: int) -> tuple[str
         for name in rng.permutation(pool):
             kind, _, axis = name.partition(":")
             kinds = {c.partition(":")[0] for c in chosen}
-            sharing = [k for k in SHARE_OF_COULOMB if f"{k}:{axis}" in chosen]
-            if (
-                len(chosen) < size
-                and kind not in kinds
-                and not (kind in SHARE_OF_COULOMB and sharing)
-            ):
+            rivals = SHARE_OF_COULOMB if kind in SHARE_OF_COULOMB else ()
+            beside_rival = any(f"{rival}:{axis}" in chosen for rival in rivals)
+            if len(chosen) < size and kind not in kinds and not beside_rival:
                 chosen.append(str(name))
     return tuple(chosen)
 

@@ -72,17 +72,23 @@ def write_session(
     (folder / "session.toml").write_text("\n".join(lines) + "\n")
 
 
-def staubli_tx40(source: Path, folder: Path) -> None:
-    """Six joints at 5 kHz; the wrist's kinematic coupling is taken out, its friction is not."""
+def tx40_joints(source: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Positions (T, 6), rad, and torques (T, 6), N.m, on the side of the joints."""
     motor = pd.read_csv(source / "pos_read_data.csv").to_numpy()
     drive = pd.read_csv(source / "curr_data.csv").to_numpy()
     turns = np.diag([32.0, 32.0, 45.0, -48.0, 45.0, 32.0])
     turns[5, 4] = 32.0
     q = np.linalg.solve(turns, motor.T).T + np.array([0, -0.5, 0.5, 0, 0, 0]) * np.pi
+    return q, drive @ turns
+
+
+def staubli_tx40(source: Path, folder: Path) -> None:
+    """Six joints at 5 kHz; the wrist's kinematic coupling is taken out, its friction is not."""
+    q, torque = tx40_joints(source)
     urdf = next(source.glob("*.urdf"))
     (folder / "arm.urdf").write_bytes(urdf.read_bytes())
     joints = [f"joint_{k}" for k in range(1, 7)]
-    trial = np.arange(len(q)) / 5000.0, q, drive @ turns
+    trial = np.arange(len(q)) / 5000.0, q, torque
     device = 'name = "tx40"\n[robot]\nurdf = "arm.urdf"\n'
     write_session(folder, joints, 5000.0, {"log": trial}, device)
 

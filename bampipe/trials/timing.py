@@ -59,9 +59,10 @@ def find_robot_timing(
     normal = np.tensordot(weight, sums.xx.sum(axis=0), 1) + np.diag(sums.precision)
     late = sums.solve(weight, lower, upper)[own:]
     variance = np.diag(invert_scaled(normal))[own:]
-    told = np.flatnonzero((variance > 0.0) & (variance < problem.upper[-1] ** 2))
-    if not told.size:
+    determined = np.flatnonzero((variance > 0.0) & (variance < problem.upper[-1] ** 2))
+    if not determined.size:
         return 0.0, np.inf
-    middle = told[np.argsort(late[told])][(told.size - 1) // 2 : told.size // 2 + 1]
+    count = determined.size
+    middle = determined[np.argsort(late[determined])][(count - 1) // 2 : count // 2 + 1]
     chosen = middle[np.argmin(np.abs(late[middle]))]
     return float(late[chosen]), float(np.sqrt(variance[chosen]))
