@@ -6,7 +6,7 @@ Colours are those of Okabe and Ito (2008). Lines that matter also differ in dash
 from __future__ import annotations
 
 import io
-import textwrap
+import re
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from itertools import pairwise
@@ -46,6 +46,8 @@ COLOURS = {
 
 _LABEL = 30
 """Letters in a line of an axis label: more is clipped where panels stand in threes."""
+_HEADING = 70
+"""Letters of a heading across the whole width."""
 _LETTER, _HANDLE = 0.058, 0.42
 """Widths in a legend, inches: of a letter on average, and of what stands before the words."""
 _MOST_LEGEND_COLUMNS = 4
@@ -55,6 +57,8 @@ _FEWER_TICKS = (6, 5, 4, 3, 2)
 
 WIDTH = 6.69
 """Width of the text in print, inches: figures are drawn at the size at which they are printed."""
+TALLEST = 9.1
+"""Height of a figure, inches, that leaves room for a caption on its page."""
 
 _SETTINGS: dict[str, Any] = {
     "font.family": "DejaVu Sans",
@@ -115,14 +119,14 @@ def panels(
     Args:
         rows: number of rows.
         columns: number of columns.
-        height: of the whole figure, inches.
+        height: of the whole figure, inches; at most `TALLEST`.
         width: of the whole figure, inches.
         sharex: one horizontal range for all panels, labelled on the last row.
 
     Returns:
         The figure and its axes, (rows, columns).
     """
-    figure = Figure(figsize=(width, height), layout="constrained")
+    figure = Figure(figsize=(width, min(height, TALLEST)), layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False, sharex=sharex)
     return figure, axes
 
@@ -167,9 +171,24 @@ def _touch(axes: Axes) -> bool:
     return any(b.x0 - a.x1 < between for a, b in pairwise(boxes))
 
 
-def label(quantity: str, unit: str) -> str:
+def label(quantity: str, unit: str, most: int = _LABEL) -> str:
     """Return the label of an axis: quantity and unit, the latter as printed; long ones in lines."""
-    return textwrap.fill(f"{quantity} ({unit})" if unit else quantity, _LABEL)
+    return lines(f"{quantity} ({unit})" if unit else quantity, most)
+
+
+def lines(text: str, most: int) -> str:
+    """Return ``text`` in lines of ``most`` letters, broken at spaces and behind underscores."""
+    found = [""]
+    for part in re.findall(r"[^ _]*[ _]|[^ _]+", text):
+        if found[-1] and len((found[-1] + part).rstrip()) > most:
+            found.append("")
+        found[-1] += part
+    return "\n".join(line.rstrip() for line in found)
+
+
+def heading(name: str, columns: int) -> str:
+    """Return the name above a panel, one of ``columns`` beside each other, in lines that fit."""
+    return lines(name, round(_HEADING / columns))
 
 
 def pick(length: int, most: int) -> slice:

@@ -581,3 +581,15 @@ def test_a_model_that_is_not_there_changes_nothing_in_the_run(
     code, _, err = command("report", root, "--model", "bse")
     assert code == 2 and "no results for model 'bse'" in err and "base" in err
     assert (root / "run.json").read_bytes() == before and not (root / "report").exists()
+
+
+def test_long_names_break_behind_underscores_so_that_neighbours_do_not_touch():
+    assert style.heading("shoulder_pan_joint", 6) == "shoulder_\npan_joint"
+    assert style.heading("shoulder_pan_joint", 3) == "shoulder_pan_joint"
+    assert style.lines("two words, joint_1", 9) == "two\nwords,\njoint_1"
+    assert style.label("wrist_1_joint, torque", "N·m", 20) == "wrist_1_joint,\ntorque (N·m)"
+
+
+def test_no_figure_is_taller_than_a_page_leaves_beside_its_caption():
+    figure, _ = style.panels(10, 2, 14.0)
+    assert figure.get_figheight() == style.TALLEST

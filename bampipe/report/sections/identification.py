@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import textwrap
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -28,7 +27,7 @@ from bampipe.results.validate import ValidateResult
 TITLE = "Identification"
 _WORTH_A_COLUMN = 0.1
 """Share of an SD from which on a table gives the part that calibration has in it."""
-_COLUMNS = (2, 3, 4)
+_COLUMNS, _MOST_ROWS = (2, 3, 4), 7
 """Of panels: those that leave the fewest places empty, and of these the least."""
 _DASHES = ("-", (0, (5, 1.5)), (0, (1.5, 1.2)), (0, (5, 1.5, 1, 1.5)))
 
@@ -260,7 +259,8 @@ def _groups(
 
 def _convergence(results: Results, identified: IdentifyResult, trace: pd.DataFrame) -> Figure:
     groups = _groups(results, _without_inertial(identified), trace)
-    columns = min(_COLUMNS, key=lambda columns: (-len(groups) % columns, columns))
+    few = [n for n in _COLUMNS if len(groups) <= n * _MOST_ROWS] or _COLUMNS[-1:]
+    columns = min(few, key=lambda columns: (-len(groups) % columns, columns))
     rows = math.ceil(len(groups) / columns)
     figure, panels = style.panels(rows, columns, 0.35 + 1.35 * rows, sharex=True)
     time_column = "t_total" if "t_total" in trace else "t"
@@ -278,7 +278,7 @@ def _convergence(results: Results, identified: IdentifyResult, trace: pd.DataFra
         if again.size:
             panel.axvline(again[0], color=style.INK, lw=0.6, zorder=0)
         _settled(panel, trace, names)
-        panel.set_title(textwrap.fill(kind, 22))
+        panel.set_title(style.heading(kind, columns + 1))
         panel.set_ylabel(wording.unit(unit) or "1")
         if len(panel.get_legend_handles_labels()[1]) > 1:
             panel.legend(loc="best", ncols=2 if columns == 2 else 1)

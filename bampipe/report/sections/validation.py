@@ -212,7 +212,7 @@ def _forces(results: Results, frame: pd.DataFrame) -> Figure:
                 style.series(panel, t, part[column].to_numpy(), colour, title, **look)
         unit = "N" if at_handle else wording.unit(results.force_unit(name))
         what = f"force {name}" if at_handle else f"{name}, {_noun(results, name)}"
-        panel.set_ylabel(style.label(what, unit))
+        panel.set_ylabel(style.label(what, unit, 20))
     panels[-1, 0].set_xlabel("time (s)")
     style.legend_below(figure, panels[0, 0])
     trial = str(frame["trial_id"].iloc[0])
@@ -281,7 +281,7 @@ def _friction(results: Results, frame: pd.DataFrame, velocity: dict[str, np.ndar
         top.plot(speed[one], error[one], color=style.VERMILLION, lw=1.2, label="one movement")
         _arrow(top, speed[one], error[one])
         force = wording.unit(results.force_unit(axis))
-        top.set_title(axis)
+        top.set_title(style.heading(axis, len(axes)))
         top.set_xlabel(style.label("velocity", unit))
         quantity = style.label(f"{_noun(results, axis)} error", force)
         new = column == 0 or quantity != panels[0, 0].get_ylabel()
