@@ -172,7 +172,7 @@ def prepare(task: PrepareTask) -> int:
         if system.memory_names:
             few = slice(0, 2)
             u = motion.inputs(system.inputs)[few]
-            q, qd, qdd = motion.q[few], motion.qd[few], motion.qdd[few]
+            q, qd, qdd = (values[few] for values in motion.kinematics)
             system.memory(q, qd, qdd, u, system.prior, motion.t[few])
     return len(task.names)
 

@@ -49,10 +49,12 @@ def added_columns(
 
 def _added_rows(item: Candidate, p: Array, count: int, base: ModelOnTrial) -> list[Array]:
     """`added_residual` on one trial, for each of `_probes`."""
-    z = None if item.replaces_motion else _states(item, base.motion, p)
-    return [
-        added_residual(item, probe, base, z) for probe in _probes(p, count, item.linear_indices)
-    ]
+    probes = _probes(p, count, item.linear_indices)
+    if _moves(item):
+        return [added_residual(item, probe, base) for probe in probes]
+    motion = base.mechanism
+    z = _states(item, motion, p)
+    return [_added_along(item, probe, base, motion, z) for probe in probes]
 
 
 def _probes(p: Array, count: int, linear: Sequence[int]) -> list[Array]:
@@ -63,31 +65,44 @@ def _probes(p: Array, count: int, linear: Sequence[int]) -> list[Array]:
     return probes
 
 
-def added_residual(item: Candidate, p: Array, base: ModelOnTrial, z: Array | None = None) -> Array:
+def added_residual(item: Candidate, p: Array, base: ModelOnTrial) -> Array:
     """What a candidate adds to the residual of a model along a motion, (T, n_q), N.m or N.
 
     Args:
         item: the candidate.
         p: parameters of its system, its own last.
         base: the model without it on a trial.
-        z: internal states (T, n_z) of the candidate's system, where they are known already.
     """
+    if not _moves(item):
+        motion = base.mechanism
+        return _added_along(item, p, base, motion, _states(item, motion, p))
     system, motion = item.system, base.motion
-    at = motion.q, motion.qd, motion.qdd
     u = motion.inputs(system.inputs)
+    moved = motion.of_mechanism(system, u, p)
     if item.replaces_motion:
-        true = system.true_motion(*at, u, p)
-        u_base = motion.inputs(base.system.inputs)
-        return base.system.residual(*true, base.memory, u_base, base.p) - base.residual
-    if z is None:
-        z = _states(item, motion, p)
-    if item.is_joint and system.moves_sensors:
-        return system.applied(*at, z, u, p) - system.required(*at, z, u, p) - base.residual
-    added = system.contribution(*at, z, u, p)
+        at = moved.kinematics
+        return base.system.residual(*at, base.memory, base.inputs, base.p) - base.residual
+    at, z = moved.kinematics, _states(item, moved, p)
+    return system.applied(*at, z, u, p) - system.required(*at, z, u, p) - base.residual
+
+
+def _moves(item: Candidate) -> bool:
+    """Whether the mechanism moves otherwise with a candidate: by its own offset, or by its load."""
+    count = len(item.system.parameters) - len(item.parameters)
+    return any(number >= count for number in item.system.moved_by)
+
+
+def _added_along(item: Candidate, p: Array, base: ModelOnTrial, motion: Motion, z: Array) -> Array:
+    """`added_residual` where the mechanism moves as by the model without the candidate.
+
+    Args:
+        motion: that motion; z: internal states (T, n_z) of the candidate's system.
+    """
+    system, at = item.system, motion.kinematics
+    added = system.contribution(*at, z, motion.inputs(system.inputs), p)
     return added - base.contribution if item.is_joint else added
 
 
 def _states(item: Candidate, motion: Motion, p: Array) -> Array:
     system = item.system
-    u = motion.inputs(system.inputs)
-    return system.memory(motion.q, motion.qd, motion.qdd, u, p, motion.t)
+    return system.memory(*motion.kinematics, motion.inputs(system.inputs), p, motion.t)

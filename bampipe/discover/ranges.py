@@ -114,8 +114,7 @@ class MachineScale:
         """The sizes of the trials of ``evidence``."""
         system, q, qd, load = evidence.system, [], [], []
         for trial, motion in enumerate(evidence.motions):
-            u, z = motion.inputs(system.inputs), evidence.fitted[trial].memory
-            applied = system.applied(motion.q, motion.qd, motion.qdd, z, u, evidence.p)
+            applied = evidence.fitted[trial].applied
             q += [motion.q.min(axis=0), motion.q.max(axis=0)]
             qd.append(np.abs(motion.qd).max(axis=0))
             load.append(np.abs(applied).max(axis=0))

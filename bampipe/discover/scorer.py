@@ -389,7 +389,8 @@ class Scorer:
         for motion, used in zip(e.motions, e.used, strict=True):
             kept = e.band.thinned_rows(len(motion.t))
             u = motion.inputs(system.inputs)
-            z = system.memory(motion.q, motion.qd, motion.qdd, u, p, motion.t)
+            motion = motion.of_mechanism(system, u, p)
+            z = system.memory(*motion.kinematics, u, p, motion.t)
             at = motion.q[kept], motion.qd[kept], motion.qdd[kept], z[kept]
             plain = system.input_map(at[0], u[kept], p)
             here, slope = system.contribution(*at, u[kept], p), plain.copy()

@@ -71,9 +71,8 @@ def variables(evidence: Evidence, axis: int) -> tuple[Variable, ...]:
 
     for index, motion in enumerate(evidence.motions):
         kept = band.thinned_rows(len(motion.t))
-        u = motion.inputs(system.inputs)
         memory = evidence.fitted[index].memory
-        load = system.applied(motion.q, motion.qd, motion.qdd, memory, u, evidence.p)[:, axis]
+        load = evidence.fitted[index].applied[:, axis]
         since, distance = _since_reversal(motion, axis)
         put("position", unit, motion.q[kept, axis])
         put("velocity", f"{unit}/s", motion.qd[kept, axis])

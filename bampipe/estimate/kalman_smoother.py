@@ -27,6 +27,8 @@ from bampipe.estimate.differentiation import Array, Derivatives, Flags
 
 ORDERS = (3, 4)
 _SETTLED = 1e-10
+_WIDE = 1e8
+"""Variance of a first state of which nothing is known, over what is known of it later."""
 
 _V = float64[::1]
 _M = float64[:, ::1]
@@ -348,6 +350,99 @@ def smooth(position: Array, model: MotionModel, present: Flags | None = None) ->
     scale = model.noise_sd * model.rate_hz ** np.arange(3)
     x, sd = passed.states[:, :3] * scale, np.sqrt(variances[:, :3]) * scale
     return Derivatives(x[:, 0] + position[0], x[:, 1], x[:, 2], sd[:, 0], sd[:, 1], sd[:, 2])
+
+
+@njit(
+    "Tuple((float64[:, ::1], float64[:, :, ::1], float64[::1]))"
+    "(int64, float64[:, ::1], float64[:, ::1], float64[:, ::1])",
+    cache=True,
+)
+def _settle(most: int, step: Array, noise: Array, p: Array) -> tuple[Array, Array, Array]:
+    """Gains (K, n), covariances (K, n, n) and variances (K,) until they settle, ``most`` at most.
+
+    They do not depend on the samples. ``p`` (n, n) is the covariance of the first state, and changed.
+    """
+    n = step.shape[0]
+    x, work = np.zeros(n), np.empty((n, n))
+    gains, covariances, spreads = np.empty((most, n)), np.empty((most, n, n)), np.empty(most)
+    count = 0
+    for t in range(most):
+        if t > 0:
+            _predict(x, p, step, noise, work)
+        _, spreads[t] = _update(x, p, 0.0, gains[t])
+        covariances[t] = p
+        count = t + 1
+        # They swing as they settle: one that stands still for a moment says nothing.
+        if t > 0 and np.all(np.abs(gains[t] - gains[t - 1]) < _SETTLED * gains[t]):
+            break
+    return gains[:count].copy(), covariances[:count].copy(), spreads[:count].copy()
+
+
+@njit(void(_V, _M, _M, float64[:, :, ::1], _V, _M, _V, _V), cache=True)
+def _smooth_mean(
+    y: Array,
+    step: Array,
+    gains: Array,
+    covariances: Array,
+    spreads: Array,
+    states: Array,
+    innovations: Array,
+    adjoint: Array,
+) -> None:
+    """Smoothed states (T, n) of samples that are all there; ``adjoint`` (n,) holds zeros.
+
+    The same recursions as `_filter` and `_smooth`, without what is the same for all samples.
+    """
+    count, n, last = y.shape[0], step.shape[0], spreads.shape[0] - 1
+    states[0, 0] = y[0]
+    for i in range(1, n):
+        states[0, i] = 0.0
+    for t in range(count):
+        if t > 0:
+            for i in range(n):
+                total = 0.0
+                for j in range(i, n):
+                    total += step[i, j] * states[t - 1, j]
+                states[t, i] = total
+        innovations[t] = y[t] - states[t, 0]
+        for i in range(n):
+            states[t, i] += gains[min(t, last), i] * innovations[t]
+    for t in range(count - 1, -1, -1):
+        k = min(t, last)
+        share = innovations[t] / spreads[k]
+        for i in range(n):
+            total = 0.0
+            for j in range(n):
+                total += covariances[k, i, j] * adjoint[j]
+            states[t, i] -= total
+            share += gains[k, i] * adjoint[i]
+        adjoint[0] -= share
+        for i in range(n - 1, -1, -1):
+            total = 0.0
+            for j in range(i + 1):
+                total += step[j, i] * adjoint[j]
+            adjoint[i] = total
+
+
+def smooth_mean(signal: Array, model: MotionModel) -> tuple[Array, Array, Array]:
+    """What `smooth` makes of a signal in the samples: position, rate and acceleration, each (T,).
+
+    A tenth of its time, for no variances are found.
+
+    Args:
+        signal: (T,) on the uniform grid of ``model.rate_hz``, all of it there.
+        model: motion and noise.
+    """
+    order, count = model.order, len(signal)
+    step, noise = transition(order)
+    # A state settles at about the cut-off, in rad a sample, to the power of its order.
+    wide = np.diag(_WIDE * model.ratio ** (np.arange(order) / order))
+    gains, covariances, spreads = _settle(count, step, model.ratio * noise, wide)
+    states, innovations = np.empty((count, order)), np.empty(count)
+    y = np.ascontiguousarray(signal, dtype=np.float64)
+    _smooth_mean(y, step, gains, covariances, spreads, states, innovations, np.zeros(order))
+    found = states[:, :3] * model.rate_hz ** np.arange(3)
+    return found[:, 0], found[:, 1], found[:, 2]
 
 
 @dataclass(frozen=True)

@@ -80,9 +80,9 @@ def _residual(system: System, motion: Motion, p: Array) -> Array:
     """Residual (T, n_q) of a trial, of functions that are not compiled: they serve once."""
     timed, p = motion.with_input_timing(p[-1]), p[:-1]
     u = timed.inputs(system.inputs)
-    z = system.memory(timed.q, timed.qd, timed.qdd, u, p, timed.t)
-    arguments = (timed.q, timed.qd, timed.qdd, z, u, p)
-    return system.applied(*arguments) - system.required(*arguments)
+    at = timed.of_mechanism(system, u, p).kinematics
+    z = system.memory(*at, u, p, timed.t)
+    return system.applied(*at, z, u, p) - system.required(*at, z, u, p)
 
 
 def with_calibration(estimate: Estimate, moved: Mapping[str, Array]) -> Estimate:

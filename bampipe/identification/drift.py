@@ -120,8 +120,8 @@ def _windows(
     p = np.ascontiguousarray(parameters[: len(system.parameters)])
     u = motion.inputs(system.inputs)
     dt = float(motion.t[1] - motion.t[0])
-    q, qd, _ = system.true_motion(motion.q, motion.qd, motion.qdd, u, p)
-    states = np.hstack([q, qd, system.memory(motion.q, motion.qd, motion.qdd, u, p, motion.t)])
+    true = motion.of_mechanism(system, u, p)
+    states = np.hstack([true.q, true.qd, system.memory(*true.kinematics, u, p, true.t)])
     last = len(motion.t) - 1 - round(_MARGIN_S / dt)
     count = int(length / spacing) if spacing > 0.0 else 0
     starts = (round((_MARGIN_S + (number + 0.5) * spacing) / dt) for number in range(count))

@@ -187,8 +187,10 @@ def load_filter_trial(
     n = len(system.coordinates)
     first = int(np.flatnonzero(np.isfinite(y).all(axis=1))[0])
     speed = np.maximum(motion.qd_sd[0], np.sqrt(np.mean(motion.qd**2, axis=0)) * 0.1)
-    read = (y[first, :n], motion.qd[0], motion.qdd[0])
-    x, x_sd = infer_initial_state(system, p, read, u[first], noise.reading_sd[:n], speed)
+    true = motion.of_mechanism(system, motion.inputs(system.inputs), p)
+    x, x_sd = infer_initial_state(
+        system, p, y[first, :n], true.qd[0], u[first], noise.reading_sd[:n], speed
+    )
     # The last stored distribution must be that of the last sample.
     last = first + (t.size - 1 - first) // stride * stride + 1
     t, u, y = t[first:last], u[first:last], y[first:last]
@@ -201,7 +203,8 @@ def load_filter_trial(
 def infer_initial_state(
     system: System,
     p: Array,
-    read: tuple[Array, Array, Array],
+    q: Array,
+    qd: Array,
     u: Array,
     reading_sd: Array,
     speed_sd: Array,
@@ -210,16 +213,15 @@ def infer_initial_state(
 
     Args:
         system: the model; p: (n_p,) parameters.
-        read: positions, rates and accelerations that the encoders read, each (n_q,).
+        q: positions that the encoders read, (n_q,); qd: rates of the mechanism, (n_q,).
         u: (n_u,) inputs.
         reading_sd: (n_q,) of a position; speed_sd: (n_q,) of a rate.
     """
-    q, qd, qdd = read
-    there, rate, _ = system.true_motion(q[None], qd[None], qdd[None], u[None], p)
-    memory = system.initial_memory(there[0], u, p)
-    place = np.hypot(2.0 * reading_sd, _SHIFT_KNOWN * (there[0] - q))
+    offset = system.offset(q[None], u[None], p)[0]
+    memory = system.initial_memory(q + offset, u, p)
+    place = np.hypot(2.0 * reading_sd, _SHIFT_KNOWN * offset)
     return (
-        np.concatenate([there[0], rate[0], memory]),
+        np.concatenate([q + offset, qd, memory]),
         np.concatenate([place, speed_sd, np.zeros(len(memory))]),
     )
 

@@ -119,9 +119,10 @@ def with_torques(
         p: (n_p,) parameters.
     """
     u = motion.inputs(system.inputs)
-    z = system.memory(motion.q, motion.qd, motion.qdd, u, p, motion.t)
-    hand = system.applied(motion.q, motion.qd, motion.qdd, z, u, p)
-    gravity = system.compensation(motion.q, motion.qd, z, u, p)
+    true = motion.of_mechanism(system, u, p)
+    z = system.memory(*true.kinematics, u, p, true.t)
+    hand = system.applied(*true.kinematics, z, u, p)
+    gravity = system.compensation(true.q, true.qd, z, u, p)
     frame = pd.DataFrame({"trial_id": motion.trial_id, "t": t, **columns})
     for i, axis in enumerate(system.coordinates):
         frame[f"torque_user_{axis}"] = np.interp(t, motion.t, hand[:, i])

@@ -160,11 +160,9 @@ def _forgets(system: System, motion: Motion, p: Array) -> bool:
 
 def _start(system: System, motion: Motion, p: Array) -> Array:
     u = motion.inputs(system.inputs)
-    q, qd, _ = system.true_motion(
-        motion.q[:1], motion.qd[:1], motion.qdd[:1], u[:1], p[: len(system.parameters)]
-    )
-    memory = system.initial_memory(q[0], u[0], p)
-    return np.concatenate([q[0], qd[0], memory])
+    true = motion.of_mechanism(system, u, p[: len(system.parameters)])
+    memory = system.initial_memory(true.q[0], u[0], p)
+    return np.concatenate([true.q[0], true.qd[0], memory])
 
 
 def _interval(motion: Motion) -> float:

@@ -170,11 +170,11 @@ def find_information(
     own = p[:-1]
     n = len(system.coordinates)
     u = motion.timed_inputs(system.inputs, float(p[-1]))
-    z = system.memory(motion.q, motion.qd, motion.qdd, u, own, motion.t)
+    motion = motion.of_mechanism(system, u, own)
+    z = system.memory(*motion.kinematics, u, own, motion.t)
     slope = residual_and_slopes(problem, trial, p)[1]
     if further is not None:
-        moved = system.true_motion(motion.q, motion.qd, motion.qdd, u, own)
-        slope = np.concatenate([slope, further(*moved, z, u, own)], axis=2)
+        slope = np.concatenate([slope, further(*motion.kinematics, z, u, own)], axis=2)
     slope *= ~problem.standstill[trial][:, :, None]
     push = system.input_map(motion.q, u, own) * noise.process_sd[noise.is_force]
     inertia = np.diagonal(system.mass_matrix(motion.q, own), axis1=1, axis2=2).mean(axis=0)

@@ -50,8 +50,9 @@ def cut_segments(system: System, motion: Motion, trial: Trial, p: Array) -> list
     if motion.left_out is not None:
         disturbed = np.interp(t, motion.t, motion.left_out.any(axis=1)) > 0.0
     given = motion.inputs(system.inputs)
-    memory = system.memory(motion.q, motion.qd, motion.qdd, given, p, motion.t)
-    state = np.hstack([motion.qd, memory])
+    true = motion.of_mechanism(system, given, p)
+    memory = system.memory(*true.kinematics, given, p, true.t)
+    state = np.hstack([true.q - motion.q, true.qd, memory])
     count = max(4 * nx, round(SEGMENT_S / dt))
     found = []
     for first in range(0, t.size - count + 1, count):
@@ -59,7 +60,8 @@ def cut_segments(system: System, motion: Motion, trial: Trial, p: Array) -> list
         if not np.isfinite(y[part]).all() or disturbed[part].any():
             continue
         start = [np.interp(t[first], motion.t, column) for column in state.T]
-        x0 = np.concatenate([y[first, :n], start])
+        start[:n] += y[first, :n]
+        x0 = np.array(start)
 
         def run(x: Array, parameters: Array, part: slice = part) -> Array:
             moved = u[part] - parameters[-1] * rate[part]

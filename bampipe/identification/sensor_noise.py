@@ -91,12 +91,11 @@ def _force_in_positions(system: System, motions: Sequence[Motion], p: Array, noi
     square, count = np.zeros(len(system.coordinates)), 0
     for motion in motions:
         given = motion.inputs(system.inputs)
-        here = system.true_motion(motion.q, motion.qd, motion.qdd, given, p)[0]
+        here = system.offset(motion.q, given, p)
         for place in np.flatnonzero(noise.is_force):
             u = given.copy()
             u[:, system.inputs.index(system.noise[place])] += noise.process_sd[place]
-            moved = system.true_motion(motion.q, motion.qd, motion.qdd, u, p)[0]
-            square += np.sum((moved - here) ** 2, axis=0)
+            square += np.sum((system.offset(motion.q, u, p) - here) ** 2, axis=0)
         count += len(motion.t)
     return np.asarray(np.sqrt(square / count))
 

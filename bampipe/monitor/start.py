@@ -108,9 +108,8 @@ class Start:
         """State (nx,) at rest where the encoders read q (n_q,) under inputs u, and its sd (nx,)."""
         p = self.model.parameters.copy()
         p[self.model.free] = self.model.to_physical(self.theta)[0]
-        none = np.zeros(q.size)
         return infer_initial_state(
-            system, p[:-1], (q, none, none), u, self.settings.reading_sd, self.speed_sd
+            system, p[:-1], q, np.zeros(q.size), u, self.settings.reading_sd, self.speed_sd
         )
 
 

@@ -246,11 +246,6 @@ def portable_expressions(
 def array_source(e: Equations, added: Sequence[Any]) -> str:
     """Source of the functions over columns; ``added`` is what the effects add to the residual."""
     motion = {"q": e.q, "qd": e.qd, "qdd": e.qdd}
-    true = [
-        *[a + b for a, b in zip(e.q, e.offset, strict=True)],
-        *[a + b for a, b in zip(e.qd, e.offset_rate, strict=True)],
-        *[a + b for a, b in zip(e.qdd, e.offset_acceleration, strict=True)],
-    ]
     parts = [
         ARRAY_HEADER,
         function_source("applied", {**motion, "z": e.z, "u": e.u, "p": e.p}, e.applied),
@@ -259,7 +254,7 @@ def array_source(e: Equations, added: Sequence[Any]) -> str:
             {**motion, "z": e.z, "u": e.u, "p": e.p},
             [expr for expr in added if expr != 0],
         ),
-        function_source("true_motion", {**motion, "u": e.u, "p": e.p}, true),
+        function_source("offset", {"q": e.q, "u": e.u, "p": e.p}, e.offset),
         function_source(
             "input_map",
             {"q": e.q, "u": e.u, "p": e.p},

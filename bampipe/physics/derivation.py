@@ -88,13 +88,11 @@ def _derive(model: Model, named_constants: bool) -> Equations:
     label = f"device {device.name!r}: energy.kinetic"
     energies = [(label, device.kinetic, kinetic, potential)] if device.energy else []
     offset = [sp.S.Zero] * n
-    # An offset is differentiated twice. It cannot follow the rates, so what a motor's back EMF
-    # takes off is left out of its load; nor states, so a lagging force counts as logged; and a
-    # delayed force is delayed to two orders less in it.
+    # An offset is differentiated. It cannot follow the rates, so what a motor's back EMF takes off
+    # is left out of its load; nor states, so a lagging force counts as logged; and a delayed force
+    # is delayed to one order less in it.
     prompt = ActingInputs(d, [e for e in model.effects if not e.effect.states], raw_applied, side)
-    lost = [
-        d.channel[derivative(f, k)] for f in device.forces for k in (LAST_ORDER - 1, LAST_ORDER)
-    ]
+    lost = [d.channel[derivative(f, LAST_ORDER)] for f in device.forces]
     none = dict.fromkeys([*d.qd, *lost], 0)
     still = [prompt.put_in(e).subs(none) for e in raw_applied]
     # Up to where the logged inputs are replaced by what acts of them, all is in terms of these.
@@ -142,7 +140,7 @@ def _derive(model: Model, named_constants: bool) -> Equations:
     rates, initial = ([of_states[z][k] for z in d.z.values()] for k in (0, 1))
     others = [d.channel[c] for c in device.channels]
     free, u = [*d.p.values(), *constants], [*d.channel.values()]
-    force0 = [d.channel[derivative(f, k)] for f in device.forces for k in range(LAST_ORDER - 1)]
+    force0 = [d.channel[derivative(f, k)] for f in device.forces for k in range(LAST_ORDER)]
     force0 += [*others, d.channel["t"]]
     motion, memory = [*d.q, *d.qd], [*d.z.values()]
     gains = [entry for row in input_map for entry in row]
@@ -190,7 +188,6 @@ def _derive(model: Model, named_constants: bool) -> Equations:
         kinetic, potential = kinetic + bodies.kinetic, potential + bodies.potential
 
     offset_rate = [d.ddt(e) for e in offset]
-    offset_acceleration = [d.ddt(e) for e in offset_rate]
     parts = [
         *applied_noise,
         *other,
@@ -198,12 +195,10 @@ def _derive(model: Model, named_constants: bool) -> Equations:
         *initial,
         *offset,
         *offset_rate,
-        *offset_acceleration,
     ]
     used = set().union(*(e.free_symbols for e in [*parts, *raw_applied]))
     inputs = [c for c in d.channels if d.channel[c] in used or c in device.forces]
     residual = [a + o - f for a, o, f in zip(applied, other, dynamics, strict=True)]
-    moved = [*offset, *offset_rate, *offset_acceleration]
     linear: list[bool] = []
     products: list[tuple[int, int]] = []
     constant: list[bool] = []
@@ -212,7 +207,7 @@ def _derive(model: Model, named_constants: bool) -> Equations:
     varying = {*d.p.values(), *d.z.values()}
     # An expression has few of a robot's hundred parameters, and sympy is slow to find a slope zero.
     present = [(i, e, e.free_symbols) for i, e in enumerate(residual)]
-    elsewhere: set[Any] = set().union(*(e.free_symbols for e in [*rates, *moved]))
+    elsewhere: set[Any] = set().union(*(e.free_symbols for e in [*rates, *offset]))
     steps = bodies.steps if bodies else []
     bodily: set[Any] = set().union(*(value.free_symbols for _, value in steps))
     of_bodies: list[int] = []
@@ -243,7 +238,7 @@ def _derive(model: Model, named_constants: bool) -> Equations:
         mass=mass, bias=bias, dynamics=dynamics, other=other,
         applied=applied, applied_noise=applied_noise,
         input_map=input_map, rates=rates, initial=initial,
-        offset=offset, offset_rate=offset_rate, offset_acceleration=offset_acceleration,
+        offset=offset, offset_rate=offset_rate,
         kinetic=kinetic, potential=potential, linear=linear, products=products, constant=constant,
         unforced=unforced, lasting=lasting, of_bodies=of_bodies,
         compensation=compensation(d, potential), delays=delays(d, applied),

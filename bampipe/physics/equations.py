@@ -26,7 +26,7 @@ class Equations:
         applied: Q_applied; applied_noise: the same with noise on the measured force.
         input_map: d applied / d force of the device itself.
         rates, initial: of the internal states.
-        offset, offset_rate, offset_acceleration: q_true - q_measured and its derivatives.
+        offset, offset_rate: q_true - q_measured and its time derivative.
         kinetic, potential: energies, as declared, definitions put in.
         linear: for each parameter, whether the residual is linear in it.
         products: pairs of parameters, by number, of which the residual has a product.
@@ -62,7 +62,6 @@ class Equations:
     initial: list[Any]
     offset: list[Any]
     offset_rate: list[Any]
-    offset_acceleration: list[Any]
     kinetic: Any
     potential: Any
     linear: list[bool]

@@ -46,6 +46,9 @@ def effects_code(model: Model) -> Generation:
         "unforced": equations.unforced,
         "touched": [i for i, e in enumerate(added) if e != 0],
         "moves_sensors": any(e != 0 for e in equations.offset),
+        "moved_by": [
+            i for i, p in enumerate(equations.p) if any(e.has(p) for e in equations.offset)
+        ],
         "driven": any(e.has(*forces) for e in added)
         and not any(e.has(*forces) for e in equations.rates),
         "compensated": [i for i, e in enumerate(equations.compensation) if e != 0],

@@ -22,7 +22,7 @@ def require_sound(
 
     Args:
         system: the model.
-        q, qd, qdd: measured motion, (T, n_q), rad or m and derivatives.
+        q, qd, qdd: motion of the mechanism, (T, n_q), rad or m and derivatives.
         u: inputs, (T, n_u); p: parameters, (n_p,); t: time, (T,), s.
         where: what to call the motion in messages.
 
@@ -30,19 +30,18 @@ def require_sound(
         InputError: the mass matrix is singular at a pose of the motion, or a force is no number
             there; says at which pose, and by which effect.
     """
-    true_q, true_qd, true_qdd = system.true_motion(q, qd, qdd, u, p)
-    mass = system.mass_matrix(true_q, p)
+    mass = system.mass_matrix(q, p)
     if np.isfinite(mass).all():
-        _require_inertia(system, true_q, mass, t, where)
+        _require_inertia(system, q, mass, t, where)
     z = system.memory(q, qd, qdd, u, p, t)
-    residual = system.residual(true_q, true_qd, true_qdd, z, u, p)
+    residual = system.residual(q, qd, qdd, z, u, p)
     lost = ~(np.isfinite(residual).all(axis=1) & np.isfinite(mass).all(axis=(1, 2)))
     if not lost.any():
         return
     row = int(np.argmax(lost))
     culprit = _culprit(system, q, qd, qdd, u, p, t)
     raise InputError(
-        f"{culprit} gives no number at {_pose(system, true_q[row])}, {t[row]:.3f} s",
+        f"{culprit} gives no number at {_pose(system, q[row])}, {t[row]:.3f} s",
         where=where,
         remedy="look for a division by zero, a root or logarithm of a negative number there",
     )
@@ -73,9 +72,8 @@ def _culprit(system: System, q: Array, qd: Array, qdd: Array, u: Array, p: Array
         values = np.array([p[system.index(item.name)] for item in alone.parameters])
         inputs = u[:, [system.inputs.index(name) for name in alone.inputs]]
         z = alone.memory(q, qd, qdd, inputs, values, t)
-        a, b, c = alone.true_motion(q, qd, qdd, inputs, values)
-        residual = alone.residual(a, b, c, z, inputs, values)
-        if not (np.isfinite(residual).all() and np.isfinite(alone.mass_matrix(a, values)).all()):
+        residual = alone.residual(q, qd, qdd, z, inputs, values)
+        if not (np.isfinite(residual).all() and np.isfinite(alone.mass_matrix(q, values)).all()):
             return f"effect {bound.name!r}"
     return f"device {model.device.name!r}"
 

@@ -72,7 +72,7 @@ class Structure:
     def slopes(self, q: Array, qd: Array, qdd: Array, z: Array, u: Array, p: Array) -> Array:
         """d residual / d number, for those in `numbers`, (T, n_q, len(numbers)).
 
-        Arguments as in `System.required`, but q, qd, qdd are what `System.true_motion` returns.
+        Arguments as in `System.required`.
         """
         out = np.empty((len(q), q.shape[1] * len(self.numbers)))
         columns = self._slopes(q.T, qd.T, qdd.T, z.T, u.T, p) if self.numbers else ()

@@ -58,6 +58,7 @@ class System:
             parameters along the mechanism's true motion; unforced: and whatever the inputs.
         touched: axes whose equation the effects change, measurement effects aside.
         moves_sensors: whether an effect of kind ``measurement`` is present.
+        moved_by: numbers of the parameters of its `offset`.
         driven: whether what the effects add to the residual depends on the measured force of
             the same moment.
         compensated: axes on which the device has something against gravity; see `compensation`.
@@ -88,6 +89,7 @@ class System:
         self._products: list[list[int]] = meta["products"]
         self.touched: tuple[int, ...] = tuple(meta["touched"])
         self.moves_sensors: bool = meta["moves_sensors"]
+        self.moved_by: tuple[int, ...] = tuple(meta["moved_by"])
         self.driven: bool = meta["driven"]
         self.compensated: tuple[int, ...] = tuple(meta["compensated"])
         self.delays: tuple[str, ...] = tuple(meta["delays"])
@@ -236,17 +238,13 @@ class System:
             found[part] = y.reshape(-1, ROWS)[:, :count].T
         return found
 
-    def true_motion(
-        self, q: Array, qd: Array, qdd: Array, u: Array, p: Array
-    ) -> tuple[Array, Array, Array]:
-        """Motion of the mechanism from what the encoders read; each (T, n_q)."""
-        if not self.moves_sensors:
-            return q, qd, qdd
-        n = len(self.coordinates)
-        columns = self._arrays.true_motion(q.T, qd.T, qdd.T, u.T, p)
-        # Three arrays, not views of one: the compiled residual takes contiguous ones.
-        a, b, c = (_stack(columns[k * n : (k + 1) * n], len(q)) for k in range(3))
-        return a, b, c
+    def offset(self, q: Array, u: Array, p: Array) -> Array:
+        """How far the mechanism is from what the encoders read, (T, n_q), rad or m.
+
+        Args:
+            q: what they read, (T, n_q); u: inputs, (T, n_u); p: parameters, (n_p,).
+        """
+        return _stack(self._arrays.offset(q.T, u.T, p), len(q))
 
     def required(self, q: Array, qd: Array, qdd: Array, z: Array, u: Array, p: Array) -> Array:
         """Generalised force that the user must supply for this motion.
@@ -255,7 +253,8 @@ class System:
         inverse dynamics of the model.
 
         Args:
-            q, qd, qdd: measured motion, (T, n_q), rad or m and derivatives.
+            q, qd, qdd: motion of the mechanism, (T, n_q), rad or m and derivatives; it is
+                `offset` from what the encoders read.
             z: internal states, (T, n_z), from `memory`.
             u: inputs, (T, n_u), columns as in `inputs`.
             p: parameters, (n_p,).
@@ -263,8 +262,7 @@ class System:
         Returns:
             (T, n_q), N.m or N.
         """
-        a, b, c = self.true_motion(q, qd, qdd, u, p)
-        return _stack(self._dynamics.required(a.T, b.T, c.T, z.T, u.T, p), len(q))
+        return _stack(self._dynamics.required(q.T, qd.T, qdd.T, z.T, u.T, p), len(q))
 
     def applied(self, q: Array, qd: Array, qdd: Array, z: Array, u: Array, p: Array) -> Array:
         """Generalised force of the measured input mapped to the joints (eq 19), (T, n_q).
@@ -272,8 +270,7 @@ class System:
         Arguments as in `required`; effects of kind ``input`` are included. The model's residual
         is ``applied - required``.
         """
-        a, b, c = self.true_motion(q, qd, qdd, u, p)
-        return _stack(self._arrays.applied(a.T, b.T, c.T, z.T, u.T, p), len(q))
+        return _stack(self._arrays.applied(q.T, qd.T, qdd.T, z.T, u.T, p), len(q))
 
     def residual(
         self,
@@ -285,10 +282,10 @@ class System:
         p: Array,
         bodies: Array | None = None,
     ) -> Array:
-        """``applied - required`` for the mechanism's true motion, compiled; (T, n_q), N.m or N.
+        """``applied - required``, compiled; (T, n_q), N.m or N.
 
-        Arguments as in `required`, but q, qd, qdd are already what `true_motion` returns;
-        ``bodies`` is what `body_forces` returns of the same, where that is known.
+        Arguments as in `required`; ``bodies`` is what `body_forces` returns of the same, where that
+        is known.
         """
         if bodies is None:
             bodies = self.body_forces(q, qd, qdd, p)
@@ -298,7 +295,7 @@ class System:
         return out
 
     def body_forces(self, q: Array, qd: Array, qdd: Array, p: Array) -> Array:
-        """What a robot's bodies require along a true motion, (T, joints); (T, 0) of other devices.
+        """What a robot's bodies require along a motion, (T, joints); (T, 0) of other devices.
 
         It changes with those of the parameters alone that are numbers of the bodies.
         """
@@ -351,8 +348,8 @@ class System:
     def contribution(self, q: Array, qd: Array, qdd: Array, z: Array, u: Array, p: Array) -> Array:
         """What the model's effects add to the residual of the bare device, (T, n_q).
 
-        Effects of kind ``measurement`` change the motion instead; see `true_motion`. Columns of
-        axes that no effect touches are zero.
+        Arguments as in `required`. Effects of kind ``measurement`` change the motion instead; see
+        `offset`. Columns of axes that no effect touches are zero.
         """
         out = np.zeros((len(q), len(self.coordinates)))
         columns = self._arrays.contribution(q.T, qd.T, qdd.T, z.T, u.T, p)
@@ -416,7 +413,7 @@ class System:
         return np.array([float(v) for v in self._arrays.initial_memory(q, u, p)])
 
     def memory(self, q: Array, qd: Array, qdd: Array, u: Array, p: Array, t: Array) -> Array:
-        """Internal states along a measured motion of one trial, (T, n_z).
+        """Internal states along the motion of one trial, (T, n_z).
 
         Integrated by RK4, or by exponential steps where its rate is linear in the state, along
         rates that are cubic between samples and inputs that are linear, in finer steps where a
@@ -429,20 +426,19 @@ class System:
         """
         if not self.memory_names:
             return np.zeros((len(q), 0))
-        a, b, c = self.true_motion(q, qd, qdd, u, p)
-        z0 = self.initial_memory(a[0], u[0], p)
+        z0 = self.initial_memory(q[0], u[0], p)
         switched = self._switched(u)
         at = np.flatnonzero(switched.any(axis=1))
         if at.size:
             # One more row at the time of the switch, with the values before it.
             held = np.where(switched[at], u[at - 1], u[at])
             u = np.insert(u, at, held, axis=0)
-            a, b, c, t = (np.insert(x, at, x[at], axis=0) for x in (a, b, c, t))
+            q, qd, qdd, t = (np.insert(x, at, x[at], axis=0) for x in (q, qd, qdd, t))
         uses = self._memory_uses
         columns = [
-            a[:, uses["q"]],
-            b[:, uses["qd"]],
-            c[:, uses["qd"]],
+            q[:, uses["q"]],
+            qd[:, uses["qd"]],
+            qdd[:, uses["qd"]],
             u[:, uses["u"]],
             p[uses["p"]],
         ]

@@ -72,7 +72,7 @@ def _sensed_position(specimen: Specimen, true: TrueTrial, force: Array) -> Array
     u, p = _sensor_inputs(system, true, force), specimen.p(system)
     q = true.q
     for _ in range(100):
-        step = true.q - system.true_motion(q, true.qd, np.zeros_like(q), u, p)[0]
+        step = true.q - q - system.offset(q, u, p)
         q = q + step
         if np.abs(step).max() < 1e-12:
             return q

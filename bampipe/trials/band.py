@@ -74,8 +74,8 @@ def _covered_hz(system: System, motion: Motion, sensors: Sensors) -> Array:
     """Frequency below which the applied force of each axis has its power, (n_q,)."""
     rate, p = sensors.rate_hz, system.prior
     u = motion.inputs(system.inputs)
-    z = system.memory(motion.q, motion.qd, motion.qdd, u, p, motion.t)
-    applied = system.applied(motion.q, motion.qd, motion.qdd, z, u, p)
+    z = system.memory(*motion.kinematics, u, p, motion.t)
+    applied = system.applied(*motion.kinematics, z, u, p)
     gain = system.input_map(motion.q, u, p)
     noise = np.sqrt(np.mean(np.square(gain) @ np.square(sensors.force_sd), axis=0))
     size = min(len(applied), max(32, int(_SEGMENT_S * rate)))

@@ -69,13 +69,28 @@ class Kinematics:
             seen: (T,) false where a reading is a guess across a gap; the Kalman smoother alone
                 leaves those out.
         """
-        chosen = self.axes[axis]
         if self.method == "kalman":
-            ratio = kalman_smoother.ratio_for(chosen.bandwidth_hz, chosen.order, self.rate_hz)
-            model = kalman_smoother.MotionModel(chosen.order, chosen.noise_sd, ratio, self.rate_hz)
-            return kalman_smoother.smooth(position, model, seen)
+            return kalman_smoother.smooth(position, self._motion_model(axis), seen)
+        chosen = self.axes[axis]
         smooth = butterworth.smooth if self.method == "butterworth" else savitzky_golay.smooth
         return smooth(position, self.rate_hz, chosen.bandwidth_hz, chosen.noise_sd)
+
+    def derivatives_of(self, axis: int, signal: Array) -> tuple[Array, Array, Array]:
+        """What `differentiate` adds for a signal (T,) that is added to the readings.
+
+        Args:
+            axis: its number; signal: known at every sample.
+        """
+        name = list(self.axes)[axis]
+        if self.method != "kalman":
+            found = self.differentiate(name, signal)
+            return found.position, found.velocity, found.acceleration
+        return kalman_smoother.smooth_mean(signal, self._motion_model(name))
+
+    def _motion_model(self, axis: str) -> kalman_smoother.MotionModel:
+        chosen = self.axes[axis]
+        ratio = kalman_smoother.ratio_for(chosen.bandwidth_hz, chosen.order, self.rate_hz)
+        return kalman_smoother.MotionModel(chosen.order, chosen.noise_sd, ratio, self.rate_hz)
 
     def input_rates(self, values: Array, count: int = LAST_ORDER) -> list[Array]:
         """Return the first ``count`` time derivatives (T,) of an input (T,), lowest order first."""
@@ -112,4 +127,5 @@ class Kinematics:
             np.column_stack([m.acceleration for m in moved]),
             np.column_stack([m.velocity_sd for m in moved]),
             channels,
+            filters=self,
         )

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bampipe.physics import System
 from bampipe.physics.device import INPUT_ORDERS, derivative
 from bampipe.trials.cache import TrialCache
 
@@ -34,6 +36,13 @@ class Recording:
     channels: Mapping[str, Array]
 
 
+class EncoderFilters(Protocol):
+    """The filters between encoders and motion."""
+
+    def derivatives_of(self, axis: int, signal: Array) -> tuple[Array, Array, Array]:
+        """Position, rate and acceleration that they make of a signal (T,) in the readings."""
+
+
 @dataclass(frozen=True)
 class Motion:
     """One trial with its derivatives, on a uniform grid; one row a sample.
@@ -46,6 +55,7 @@ class Motion:
         channels: inputs of the device and their time derivatives by name, each (T,).
         left_out: (T, n_q) samples that count no more than those at rest: of a replay, what its
             trial leaves out; of a trial, its disturbances. None where there are none.
+        filters: that q, qd and qdd went through; None where they are no readings of encoders.
     """
 
     trial_id: str
@@ -56,6 +66,7 @@ class Motion:
     qd_sd: Array
     channels: Mapping[str, Array]
     left_out: NDArray[np.bool_] | None = None
+    filters: EncoderFilters | None = None
     _columns: dict[tuple[str, ...], Array] = field(default_factory=dict, repr=False, compare=False)
 
     def inputs(self, names: Sequence[str]) -> Array:
@@ -69,6 +80,35 @@ class Motion:
             columns = [self.t if name == "t" else self.channels[name] for name in key]
             self._columns[key] = np.column_stack(columns) if key else np.empty((self.t.size, 0))
         return self._columns[key]
+
+    @property
+    def kinematics(self) -> tuple[Array, Array, Array]:
+        """Positions, rates and accelerations, each (T, n_q)."""
+        return self.q, self.qd, self.qdd
+
+    def of_mechanism(self, system: System, u: Array, p: Array) -> Motion:
+        """The motion of the mechanism, which is `System.offset` from what its encoders read.
+
+        The offset goes through the filters of the encoders. Where play is crossed it jumps as the
+        readings do, and only what was filtered alike leaves nothing of the two.
+
+        Args:
+            system: the model; u: its inputs, (T, n_u); p: its parameters, (n_p,).
+        """
+        if not system.moves_sensors:
+            return self
+        offset = system.offset(self.q, u, p)
+        moved = [values.copy() for values in self.kinematics]
+        for axis in np.flatnonzero(offset.any(axis=0)):
+            added = offset[:, axis]
+            if self.filters is None:
+                rate = np.gradient(added, self.t)
+                parts = added, rate, np.gradient(rate, self.t)
+            else:
+                parts = self.filters.derivatives_of(int(axis), added)
+            for total, part in zip(moved, parts, strict=True):
+                total[:, axis] += part
+        return replace(self, q=moved[0], qd=moved[1], qdd=moved[2])
 
     def rows(self, which: slice) -> Motion:
         """Some of its samples, at the same times."""

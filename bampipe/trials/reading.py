@@ -100,7 +100,8 @@ def read_motion(
     """
     path = run.require(KINEMATICS, "filter")
     disturbances = run.read(FilterResult).disturbances.get(trial_id, ())
-    return read_motion_of(path, trial_id, system, disturbances, every_input=every_input)
+    filters = read_kinematics(run, system)
+    return read_motion_of(path, trial_id, system, disturbances, filters, every_input=every_input)
 
 
 def read_motion_of(
@@ -108,6 +109,7 @@ def read_motion_of(
     trial_id: str,
     system: System,
     disturbances: Sequence[Disturbance] = (),
+    filters: Kinematics | None = None,
     *,
     every_input: bool = False,
 ) -> Motion:
@@ -115,7 +117,7 @@ def read_motion_of(
 
     Args:
         path: the table; trial_id, system, every_input: as for `read_motion`, as are the errors.
-        disturbances: of the trial, which are left out.
+        disturbances: of the trial, which are left out; filters: that it went through.
     """
     axes, device = system.coordinates, system.model.device
     stored = frozenset(column_names(path))
@@ -161,6 +163,7 @@ def read_motion_of(
         qd_sd=stack("qd_sd"),
         channels=channels,
         left_out=left_out,
+        filters=filters,
     )
 
 
@@ -186,12 +189,12 @@ def read_motions(
     """
     names = free_trials(run, fitted=fitted, braked=braked)
     path = run.require(KINEMATICS, "filter")
-    disturbances = run.read(FilterResult).disturbances
+    disturbances, filters = run.read(FilterResult).disturbances, read_kinematics(run, system)
 
     def fetch(number: int) -> Motion:
         name = names[number]
         motion = read_motion_of(
-            path, name, system, disturbances.get(name, ()), every_input=every_input
+            path, name, system, disturbances.get(name, ()), filters, every_input=every_input
         )
         return motion.with_input_timing(late_s)
 

@@ -31,7 +31,14 @@ from bampipe.physics import System
 from bampipe.physics.device import derivative
 from bampipe.trials.cache import MOST_SAMPLES, TrialCache
 from bampipe.trials.kinematics import Kinematics
-from bampipe.trials.motion import Motion, Recording, input_derivatives, n_samples, trial_sizes
+from bampipe.trials.motion import (
+    EncoderFilters,
+    Motion,
+    Recording,
+    input_derivatives,
+    n_samples,
+    trial_sizes,
+)
 from bampipe.trials.residuals import ModelOnTrial, standstill_of
 from bampipe.trials.sensors import Sensors
 
@@ -360,12 +367,13 @@ def store_motions(motions: Iterator[Motion]) -> Sequence[Motion]:
     """
     with temporary_space():
         folder = Path(tempfile.mkdtemp(prefix="bampipe-trials-"))
-    count = 0
+    count, filters = 0, None
     try:
         for count, motion in enumerate(motions, start=1):
             arrays: dict[str, Any] = {f"channel {name}": x for name, x in motion.channels.items()}
             for name in _ARRAYS:
                 arrays[name] = getattr(motion, name)
+            filters = motion.filters
             if motion.left_out is not None:
                 arrays["left_out"] = motion.left_out
             with temporary_space():
@@ -373,7 +381,9 @@ def store_motions(motions: Iterator[Motion]) -> Sequence[Motion]:
     except BaseException:
         shutil.rmtree(folder)
         raise
-    trials = TrialCache(lambda number: _stored_motion(folder / f"{number}.npz"), count, n_samples)
+    trials = TrialCache(
+        lambda number: _stored_motion(folder / f"{number}.npz", filters), count, n_samples
+    )
     weakref.finalize(trials, shutil.rmtree, folder)
     return trials
 
@@ -381,7 +391,7 @@ def store_motions(motions: Iterator[Motion]) -> Sequence[Motion]:
 _ARRAYS = ("t", "q", "qd", "qdd", "qd_sd")
 
 
-def _stored_motion(path: Path) -> Motion:
+def _stored_motion(path: Path, filters: EncoderFilters | None) -> Motion:
     with np.load(path) as stored:
         channels = {
             name.removeprefix("channel "): stored[name]
@@ -390,7 +400,9 @@ def _stored_motion(path: Path) -> Motion:
         }
         arrays = {name: stored[name] for name in _ARRAYS}
         trial_id, left_out = str(stored["trial_id"]), stored.get("left_out")
-        return Motion(trial_id=trial_id, channels=channels, left_out=left_out, **arrays)
+        return Motion(
+            trial_id=trial_id, channels=channels, left_out=left_out, filters=filters, **arrays
+        )
 
 
 def _reference(
@@ -404,6 +416,6 @@ def _reference(
     """
     if not system.moves_sensors:
         return motion.q, motion.qd
-    q, _, _ = system.true_motion(motion.q, motion.qd, motion.qdd, u, p)
+    q = motion.q + system.offset(motion.q, u, p)
     smooth = [zero_phase(column, rate_hz, min(FOLLOWED_HZ, 0.2 * rate_hz)) for column in q.T]
     return np.column_stack([c[0] for c in smooth]), np.column_stack([c[1] for c in smooth])

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +33,7 @@ from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion
 
 Array = NDArray[np.float64]
+Found = TypeVar("Found")
 
 _REFITS = 6
 """Most Gauss-Newton steps of a refit that starts at the fit to all trials."""
@@ -62,8 +64,14 @@ def problem_of(
     """
     n = len(system.parameters)
     # Of differences by many parameters few change the internal states or the bodies' forces.
-    states = _Remembered([i for i, linear in enumerate((*system.linear, False)) if not linear])
-    bodies = _Remembered(range(n + 1) if system.moves_sensors else sorted(system.of_bodies))
+    states = _Remembered[Array](
+        [i for i, linear in enumerate((*system.linear, False)) if not linear]
+    )
+    bodies = _Remembered[Array](range(n + 1) if system.moves_sensors else sorted(system.of_bodies))
+    moved = _Remembered[tuple[Array, Array, Array]]([*system.moved_by, n])
+
+    def mechanism(trial: int, motion: Motion, u: Array, p: Array) -> tuple[Array, Array, Array]:
+        return moved.find(trial, p, lambda: motion.of_mechanism(system, u, p[:n]).kinematics)
 
     def inputs_at(motion: Motion, p: Array) -> Array:
         return motion.timed_inputs(system.inputs, float(p[n]))
@@ -74,9 +82,9 @@ def problem_of(
 
     def residual(trial: int, p: Array) -> Array:
         motion = motions[trial]
-        u, at = inputs_at(motion, p), (motion.q, motion.qd, motion.qdd)
-        true = system.true_motion(*at, u, p[:n])
-        z = states.find(trial, p, lambda: system.memory(*at, u, p[:n], motion.t))
+        u = inputs_at(motion, p)
+        true = mechanism(trial, motion, u, p)
+        z = states.find(trial, p, lambda: system.memory(*true, u, p[:n], motion.t))
         forces = bodies.find(trial, p, lambda: system.body_forces(*true, p[:n]))
         return system.residual(*true, z, u, p[:n], forces)
 
@@ -87,7 +95,7 @@ def problem_of(
         if not given:
             return given, np.empty((len(motion.q), len(system.coordinates), 0))
         u = inputs_at(motion, p)
-        true = system.true_motion(motion.q, motion.qd, motion.qdd, u, p[:n])
+        true = mechanism(trial, motion, u, p)
         return given, system.slopes([numbers[k] for k in given], *true, u)
 
     parameters = system.parameters
@@ -163,7 +171,7 @@ def _multiplied(system: System, free: Sequence[int]) -> NDArray[np.int64] | None
     return found if np.any(found >= 0) else None
 
 
-class _Remembered:
+class _Remembered(Generic[Found]):
     """The last values of a function of a trial and of some parameters.
 
     Attributes:
@@ -172,9 +180,9 @@ class _Remembered:
 
     def __init__(self, uses: Iterable[int]) -> None:
         self.uses = list(uses)
-        self._known: dict[tuple[int, bytes], Array] = {}
+        self._known: dict[tuple[int, bytes], Found] = {}
 
-    def find(self, trial: int, p: Array, compute: Callable[[], Array]) -> Array:
+    def find(self, trial: int, p: Array, compute: Callable[[], Found]) -> Found:
         """The value for parameters ``p``, (n_p,), computed where it is not known."""
         key = trial, p[self.uses].tobytes()
         if key not in self._known:
@@ -202,9 +210,9 @@ def standstill_of(motion: Motion, system: System, rate_hz: float) -> NDArray[np.
 
 def residual_and_memory(system: System, motion: Motion, u: Array, p: Array) -> tuple[Array, Array]:
     """Residual (T, n_q) of a trial under inputs ``u`` (T, n_u), unfiltered, and states (T, n_z)."""
-    at = motion.q, motion.qd, motion.qdd
+    at = motion.of_mechanism(system, u, p).kinematics
     z = system.memory(*at, u, p, motion.t)
-    return system.residual(*system.true_motion(*at, u, p), z, u, p), z
+    return system.residual(*at, z, u, p), z
 
 
 def applied_rms(
@@ -223,8 +231,9 @@ def applied_rms(
     square, count = np.zeros(len(system.coordinates)), np.zeros(len(system.coordinates))
     for motion, moves in zip(motions, used, strict=True):
         u = motion.inputs(system.inputs)
-        z = system.memory(motion.q, motion.qd, motion.qdd, u, p, motion.t)
-        applied = band.thin(system.applied(motion.q, motion.qd, motion.qdd, z, u, p))
+        at = motion.of_mechanism(system, u, p).kinematics
+        z = system.memory(*at, u, p, motion.t)
+        applied = band.thin(system.applied(*at, z, u, p))
         square += np.sum(applied**2 * moves, axis=0)
         count += moves.sum(axis=0)
     return np.asarray(np.sqrt(square / np.maximum(count, 1)))
@@ -249,11 +258,19 @@ class ModelOnTrial:
         """The trial, fetched anew: of many, not all are in memory."""
         return self.motions[self.trial]
 
+    @property
+    def inputs(self) -> Array:
+        """The model's inputs, (T, n_u)."""
+        return self.motion.inputs(self.system.inputs)
+
+    @property
+    def mechanism(self) -> Motion:
+        """The trial as the mechanism moved, by the model."""
+        return self.motion.of_mechanism(self.system, self.inputs, self.p)
+
     @cached_property
     def _residual_and_memory(self) -> tuple[Array, Array]:
-        motion = self.motion
-        u = motion.inputs(self.system.inputs)
-        return residual_and_memory(self.system, motion, u, self.p)
+        return residual_and_memory(self.system, self.motion, self.inputs, self.p)
 
     @property
     def residual(self) -> Array:
@@ -265,12 +282,17 @@ class ModelOnTrial:
         """Internal states, (T, n_z)."""
         return self._residual_and_memory[1]
 
+    @property
+    def applied(self) -> Array:
+        """Generalised force of the measured input, before the low-pass, (T, n_q), N.m or N."""
+        at = self.mechanism.kinematics
+        return self.system.applied(*at, self.memory, self.inputs, self.p)
+
     @cached_property
     def contribution(self) -> Array:
         """What the model's effects add to the residual; see `System.contribution`, (T, n_q)."""
-        motion = self.motion
-        at = motion.q, motion.qd, motion.qdd
-        return self.system.contribution(*at, self.memory, motion.inputs(self.system.inputs), self.p)
+        at = self.mechanism.kinematics
+        return self.system.contribution(*at, self.memory, self.inputs, self.p)
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from physics.small_arm import ARM
 from scipy.signal import butter, sosfiltfilt
-from sessions import BAND, RATE, TRUTH, bam, folds, made
+from sessions import BAND, KINEMATICS, RATE, TRUTH, bam, folds, made
 
 from bampipe.discover.chance import system_of
 from bampipe.estimate.least_squares import residual_and_slopes, stacked_residual
@@ -12,7 +12,7 @@ from bampipe.estimate.low_pass import Band
 from bampipe.physics import Model, compile_model
 from bampipe.physics.device import LAST_ORDER, derivative
 from bampipe.physics.registry import device_from
-from bampipe.trials.motion import Motion
+from bampipe.trials.motion import Motion, Recording
 from bampipe.trials.residuals import gather_evidence, problem_of
 
 
@@ -167,3 +167,24 @@ def channels_of(system):
     """Names of its forces and all their time derivatives."""
     forces = system.model.device.forces
     return [derivative(name, k) for name in forces for k in range(LAST_ORDER + 1)]
+
+
+def test_the_mechanism_moves_as_if_its_encoders_had_no_play():
+    """A gap that is crossed within a sample: no filter of the readings alone follows that."""
+    system = system_of(bam(["backlash:yaw"]))
+    values = {"backlash.yaw.gap": 0.03, "backlash.yaw.closing": 0.2}
+    p = np.array([values.get(item.name, item.prior) for item in system.parameters])
+    t = np.arange(2000) / RATE
+    truth = np.column_stack([0.3 * np.sin(3.0 * t), 0.1 + 0.0 * t, 1.1 + 0.0 * t])
+    channels = {name: np.zeros(t.size) for name in system.inputs}
+    channels["force_x"] = 20.0 * np.cos(3.0 * t)
+    u = np.column_stack([channels[name] for name in system.inputs])
+    read = truth - system.offset(truth, u, p)
+
+    seen = KINEMATICS.observe(Recording("t", read, channels), ("force_x",))
+    wanted = KINEMATICS.observe(Recording("t", truth, channels), ("force_x",))
+    moved = seen.of_mechanism(system, u, p)
+
+    assert np.abs(seen.qdd - wanted.qdd)[:, 0].max() > 10.0
+    assert np.abs(moved.q - wanted.q).max() < 1e-8
+    assert np.abs(moved.qdd - wanted.qdd).max() < 1e-4

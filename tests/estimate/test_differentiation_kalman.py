@@ -124,3 +124,15 @@ def test_a_trial_at_rest() -> None:
     found = ks.smooth(np.full(500, 0.25), ks.MotionModel(4, 1e-5, 1e-4, RATE))
     np.testing.assert_allclose(found.position, 0.25, atol=1e-12)
     assert np.all(np.isfinite(found.acceleration_sd))
+
+
+@pytest.mark.parametrize("order", ks.ORDERS)
+def test_what_is_smoothed_without_variances_is_the_same(order: int) -> None:
+    """A signal that jumps, as play does, to a millionth of its spread."""
+    signal = walk(order, 4e-5, 900, 6)[:, 0]
+    signal[300:500] += np.std(signal)
+    model = ks.MotionModel(order, 1e-4, ks.ratio_for(40.0, order, RATE), RATE)
+    whole = ks.smooth(signal, model)
+    wanted = whole.position, whole.velocity, whole.acceleration
+    for found, expected in zip(ks.smooth_mean(signal, model), wanted, strict=True):
+        assert np.abs(found - expected).max() < 1e-5 * np.std(expected)

@@ -5,6 +5,13 @@ import copy
 import numpy as np
 
 from bampipe.physics import registry
+from bampipe.trials.motion import Motion
+
+
+def of_mechanism(system, q, qd, qdd, u, p, t):
+    """The motion of the mechanism where encoders without filters read this; each (T, n_q)."""
+    read = Motion("read", t, q, qd, qdd, np.zeros_like(q), {})
+    return read.of_mechanism(system, u, p).kinematics
 
 
 def random_motion(device, count, seed, speed=1.0):

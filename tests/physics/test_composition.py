@@ -60,7 +60,7 @@ def numbers(equations, model):
     states = {n: rng.uniform(0.2, 0.4) for n in sorted(equations.z_names)}
     at |= {z: states[n] for z, n in zip(equations.z, equations.z_names, strict=True)}
     groups = [equations.applied, equations.other, equations.bias, equations.offset,
-              equations.offset_acceleration]  # fmt: skip
+              equations.offset_rate]  # fmt: skip
     rates = dict(zip(equations.z_names, equations.rates, strict=True))
     expressions = [*(e for group in groups for e in group), *(rates[n] for n in sorted(rates))]
     return np.array(sp.lambdify(list(at), expressions, "numpy")(*at.values()), dtype=float)
@@ -224,7 +224,7 @@ def test_an_encoder_is_corrected_before_what_lies_behind_it():
     u = np.zeros((1, len(system.inputs)))
     u[0, system.inputs.index("force_z")] = 30.0
     q = np.array([[0.1, 0.2, 1.0]])
-    true = system.true_motion(q, 0 * q, 0 * q, u, p)[0]
+    true = q + system.offset(q, u, p)
     np.testing.assert_allclose(true[0], [0.1, 0.2, 1.05 + 2e-4 * 30.0], rtol=1e-12)
 
 

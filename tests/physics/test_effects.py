@@ -12,6 +12,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from motions import of_mechanism
 from scipy.optimize import least_squares
 
 from bampipe.errors import InputError
@@ -113,8 +114,9 @@ def smooth_motion():
 
 
 def residual_of(system, p, q, qd, qdd, u, t):
-    z = system.memory(q, qd, qdd, u, p, t)
-    return system.applied(q, qd, qdd, z, u, p) - system.required(q, qd, qdd, z, u, p)
+    at = of_mechanism(system, q, qd, qdd, u, p, t)
+    z = system.memory(*at, u, p, t)
+    return system.applied(*at, z, u, p) - system.required(*at, z, u, p)
 
 
 def contribution(case, p_of):
@@ -373,9 +375,8 @@ def recorded(system, p, braked):
     true = [x[:, :3], x[:, 3:6], qdd]
     seen = [a.copy() for a in true]
     for _ in range(30):  # what the encoders read, so that the model's correction gives the truth
-        seen = [
-            s + a - b for s, a, b in zip(seen, true, system.true_motion(*seen, u, p), strict=True)
-        ]
+        corrected = of_mechanism(system, *seen, u, p, t)
+        seen = [s + a - b for s, a, b in zip(seen, true, corrected, strict=True)]
     return *seen, u, t
 
 

@@ -31,7 +31,7 @@ def test_slopes_equal_differences(machine: Device, effects: tuple[str, ...]) -> 
     rng, n = np.random.default_rng(3), len(system.coordinates)
     q, qd, qdd = 0.5 * rng.normal(size=(3, SAMPLES, n))
     u, p = rng.normal(size=(SAMPLES, len(system.inputs))), system.prior
-    motion = system.true_motion(q, qd, qdd, u, p)
+    motion = q, qd, qdd
     z = rng.normal(size=(SAMPLES, len(system.memory_names)))
     wanted = sorted(system.lasting)
 

@@ -19,6 +19,7 @@ from bampipe.data.session import read_session
 from bampipe.errors import InputError
 from bampipe.physics import Model, compile_model, registry
 from bampipe.simulator.session import Config, simulate_session
+from bampipe.trials.motion import Motion
 
 AXES = ("yaw", "pitch", "extension")
 SAMPLES = Path(__file__).parents[2] / "sample_runs"
@@ -173,8 +174,10 @@ def fit(out, effects, start):
     def misfit(p):
         parts = []
         for q, qd, qdd, u, t in trials:
-            z = system.memory(q, qd, qdd, u, p, t)
-            r = system.applied(q, qd, qdd, z, u, p) - system.required(q, qd, qdd, z, u, p)
+            read = Motion("read", t, q, qd, qdd, np.zeros_like(q), {})
+            at = read.of_mechanism(system, u, p).kinematics
+            z = system.memory(*at, u, p, t)
+            r = system.applied(*at, z, u, p) - system.required(*at, z, u, p)
             parts.append(sosfiltfilt(sos8, r, axis=0)[100:-100:8])
         return np.concatenate(parts).ravel()
 

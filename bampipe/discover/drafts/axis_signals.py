@@ -105,7 +105,7 @@ class AxisSignals:
         system = evidence.system
         found: dict[str, list[Array]] = {}
         for k, (rows, _) in zip(self._trials, self._sampling, strict=True):
-            motion = evidence.motions[k]
+            motion = evidence.fitted[k].mechanism
             q, qd, qdd = motion.q[rows], motion.qd[rows], motion.qdd[rows]
             u = motion.inputs(system.inputs)[rows]
             z = evidence.fitted[k].memory[rows]
