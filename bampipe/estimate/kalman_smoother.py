@@ -360,7 +360,8 @@ def smooth(position: Array, model: MotionModel, present: Flags | None = None) ->
 def _settle(most: int, step: Array, noise: Array, p: Array) -> tuple[Array, Array, Array]:
     """Gains (K, n), covariances (K, n, n) and variances (K,) until they settle, ``most`` at most.
 
-    They do not depend on the samples. ``p`` (n, n) is the covariance of the first state, and changed.
+    They do not depend on the samples. ``p`` (n, n) is the covariance of the first state; it is
+    changed.
     """
     n = step.shape[0]
     x, work = np.zeros(n), np.empty((n, n))
