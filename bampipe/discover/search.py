@@ -35,7 +35,7 @@ from bampipe.results.diagnose import Contender, RefusedEffect, SearchStep
 from bampipe.results.standing import AT_FLOOR
 from bampipe.trials.folds import HELD_OUT
 from bampipe.trials.measured import MeasuredTrials
-from bampipe.trials.noise_floor import NoiseFloor
+from bampipe.trials.noise_floor import NoiseFloor, force_noise_through_offset
 from bampipe.trials.residuals import Evidence
 
 Array = NDArray[np.float64]
@@ -296,7 +296,10 @@ def _weigh(
     above = error > ceiling(replays)
     if HELD_OUT in evidence.folds.groups:
         above |= evidence.held_out_rmse > ceiling(np.array([r.held_out_rmse for r in replayed]))
-    worth = np.where(above, s.worth, s.worth_at_floor)
+    floor = np.mean(replays**2, axis=0)
+    through_play = force_noise_through_offset(evidence, bench.trials.sensors)
+    blurred = np.clip(1.0 - through_play / np.maximum(floor, 1e-30), 0.0, 1.0)
+    worth = np.where(above, s.worth, np.maximum(s.worth, s.worth_at_floor * blurred))
     least = (s.least_force * evidence.applied_rms) ** 2
     found, likely = [], {}
     for name, score in scores.items():

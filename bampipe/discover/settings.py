@@ -25,8 +25,9 @@ class Settings:
         significance: chance of a false alarm in a session that is accepted.
         worth: least drop of log error beyond chance, on one axis, that is worth an effect.
         worth_at_floor: the same on an axis whose error is already at its noise floor: no replay
-            is perfect, and changes of direction blurred by sampling invite
-            spurious effects, up to a tenth of the error on a linear axis.
+            is perfect, and changes of direction blurred by sampling invite spurious effects, up to
+            a tenth of the error on a linear axis. Of that floor, what noise of the forces makes
+            through play is no such blur, and does not count.
         least_force: share of the applied force, as a root mean square, that an effect must take off
             at least: a load cell is no more linear than that, nor is a torque by a current.
         still_share: least share of the mean square that it takes off which an effect must take off

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from math import factorial
 from typing import NamedTuple
 
@@ -35,6 +36,7 @@ _M = float64[:, ::1]
 _FLAGS = boolean[::1]
 
 
+@lru_cache
 def transition(order: int) -> tuple[Array, Array]:
     """Return transition matrix and process noise (ratio 1) of one sample, (order, order)."""
     step = np.zeros((order, order))
@@ -425,6 +427,15 @@ def _smooth_mean(
             adjoint[i] = total
 
 
+@lru_cache(maxsize=16)
+def _settled(order: int, ratio: float, most: int) -> tuple[Array, Array, Array]:
+    """`_settle` for a first state of which nothing is known."""
+    step, noise = transition(order)
+    # A state settles at about the cut-off, in rad a sample, to the power of its order.
+    wide = np.diag(_WIDE * ratio ** (np.arange(order) / order))
+    return _settle(most, step, ratio * noise, wide)
+
+
 def smooth_mean(signal: Array, model: MotionModel) -> tuple[Array, Array, Array]:
     """What `smooth` makes of a signal in the samples: position, rate and acceleration, each (T,).
 
@@ -435,15 +446,12 @@ def smooth_mean(signal: Array, model: MotionModel) -> tuple[Array, Array, Array]
         model: motion and noise.
     """
     order, count = model.order, len(signal)
-    step, noise = transition(order)
-    # A state settles at about the cut-off, in rad a sample, to the power of its order.
-    wide = np.diag(_WIDE * model.ratio ** (np.arange(order) / order))
-    gains, covariances, spreads = _settle(count, step, model.ratio * noise, wide)
+    step, _ = transition(order)
+    settled = _settled(order, model.ratio, count)
     states, innovations = np.empty((count, order)), np.empty(count)
     y = np.ascontiguousarray(signal, dtype=np.float64)
-    _smooth_mean(y, step, gains, covariances, spreads, states, innovations, np.zeros(order))
-    found = states[:, :3] * model.rate_hz ** np.arange(3)
-    return found[:, 0], found[:, 1], found[:, 2]
+    _smooth_mean(y, step, *settled, states, innovations, np.zeros(order))
+    return states[:, 0], states[:, 1] * model.rate_hz, states[:, 2] * model.rate_hz**2
 
 
 @dataclass(frozen=True)

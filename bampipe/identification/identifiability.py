@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +20,7 @@ from bampipe.estimate.least_squares import Problem, residual_and_slopes
 from bampipe.identification.sensor_noise import Noise
 from bampipe.lists import join_names
 from bampipe.physics import System
+from bampipe.physics.structure import DeterminableNumber, structure
 from bampipe.results.identify import (
     Combined,
     DeviceNumber,
@@ -30,9 +30,6 @@ from bampipe.results.identify import (
     WeakDirection,
 )
 from bampipe.trials.motion import Motion, trial_names
-
-if TYPE_CHECKING:
-    from bampipe.physics.structure import DeterminableNumber
 
 Array = NDArray[np.float64]
 
@@ -76,8 +73,6 @@ def assess_identifiability(
         The report, and the covariance (n_parameters, n_parameters) that their priors leave where
         the trials say nothing.
     """
-    from bampipe.physics.structure import structure
-
     known = structure(system)
     n_p = len(system.parameters)
     names = [system.parameters[i].name if i < n_p else TIMING for i in problem.free]

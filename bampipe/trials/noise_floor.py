@@ -214,6 +214,32 @@ def _mean_square_of_own_motion(
     return np.asarray(square / np.maximum(count, 1.0))
 
 
+def force_noise_through_offset(evidence: Evidence, sensors: Sensors) -> Array:
+    """What noise of the forces leaves of a model by moving its mechanism, mean square, (n_q,).
+
+    Where play is crossed a little force is a long way. Zero for a model without such an offset.
+
+    Args:
+        evidence: the model, fitted; sensors: of the session.
+    """
+    system, p = evidence.system, evidence.p
+    square, count = np.zeros(len(system.coordinates)), np.zeros(len(system.coordinates))
+    for trial in draw_trials(evidence.sizes) if system.moves_sensors else ():
+        fitted, rng = evidence.fitted[trial], np.random.default_rng([FLOOR_SEED, trial])
+        motion = fitted.motion
+        noisy = {
+            name: motion.channels[name] + sd * rng.normal(size=motion.t.size)
+            for name, sd in zip(system.model.device.forces, sensors.force_sd, strict=True)
+        }
+        shaken = motion.with_channels(noisy).inputs(system.inputs)
+        at = motion.of_mechanism(system, shaken, p).kinematics
+        moved = system.residual(*at, fitted.memory, fitted.inputs, p) - fitted.residual
+        used = evidence.used[trial]
+        square += np.sum((evidence.band.thin(moved) * used) ** 2, axis=0)
+        count += used.sum(axis=0)
+    return np.asarray(square / np.maximum(count, 1.0))
+
+
 def find_noise_floor(
     evidence: Evidence,
     p: Array,

@@ -266,7 +266,14 @@ class ModelOnTrial:
     @property
     def mechanism(self) -> Motion:
         """The trial as the mechanism moved, by the model."""
-        return self.motion.of_mechanism(self.system, self.inputs, self.p)
+        if not self.system.moves_sensors:
+            return self.motion
+        q, qd, qdd = self._moved
+        return replace(self.motion, q=q, qd=qd, qdd=qdd)
+
+    @cached_property
+    def _moved(self) -> tuple[Array, Array, Array]:
+        return self.motion.of_mechanism(self.system, self.inputs, self.p).kinematics
 
     @cached_property
     def _residual_and_memory(self) -> tuple[Array, Array]:

@@ -23,22 +23,46 @@ HIDDEN = {
 EFFECTS = ("quadratic_drag:extension", "stribeck:yaw")
 
 
+def weighed(monkeypatch, before, after, *, applied=100.0, floor=0.15, through_play=0.0):
+    """Names of what beats chance where an error falls from ``before`` to ``after``.
+
+    Args:
+        applied: force; floor: of the replays; through_play: how much of it play makes of noise.
+    """
+    gain = 1000.0 * np.log(before / after) * np.ones(1)
+    evidence = SimpleNamespace(applied_rms=np.array([applied]), folds=SimpleNamespace(groups=()))
+    scorer = SimpleNamespace(base_error=np.array([before]), independent_samples=np.array([1000.0]))
+    level = SimpleNamespace(
+        ask=lambda scores, names: None, excess=lambda score: gain, p_value=lambda score: 1e-6,
+        replicates=[SimpleNamespace(error=np.array([x * floor])) for x in (0.95, 1.0, 1.05)],
+    )  # fmt: skip
+    bench = SimpleNamespace(
+        settings=Settings(),
+        gaining=lambda scores, scorer: list(scores),
+        trials=SimpleNamespace(sensors=None),
+    )
+    monkeypatch.setattr(searching, "Scorer", lambda evidence: scorer)
+    monkeypatch.setattr(
+        searching, "force_noise_through_offset", lambda *_: np.array([through_play**2])
+    )
+    found, _ = searching._weigh(bench, {"weak": None}, level, evidence)
+    return [name for _, name in found]
+
+
 @pytest.mark.parametrize(("applied", "named"), [(100.0, ["weak"]), (2000.0, [])])
 def test_what_takes_off_less_than_a_sensor_is_linear_to_is_not_named(
     monkeypatch, applied, named
 ) -> None:
     """An error of 0.25 falls to 0.20, and so does by 0.15 what it takes off."""
-    gain = 1000.0 * np.log(0.25 / 0.20) * np.ones(1)
-    evidence = SimpleNamespace(applied_rms=np.array([applied]), folds=SimpleNamespace(groups=()))
-    scorer = SimpleNamespace(base_error=np.array([0.25]), independent_samples=np.array([1000.0]))
-    level = SimpleNamespace(
-        ask=lambda scores, names: None, excess=lambda score: gain, p_value=lambda score: 1e-6,
-        replicates=[SimpleNamespace(error=np.array([e])) for e in (0.14, 0.15, 0.16)],
-    )  # fmt: skip
-    bench = SimpleNamespace(settings=Settings(), gaining=lambda scores, scorer: list(scores))
-    monkeypatch.setattr(searching, "Scorer", lambda evidence: scorer)
-    found, _ = searching._weigh(bench, {"weak": None}, level, evidence)
-    assert [name for _, name in found] == named
+    assert weighed(monkeypatch, 0.25, 0.20, applied=applied) == named
+
+
+@pytest.mark.parametrize(("through_play", "named"), [(0.0, []), (0.05, []), (0.14, ["weak"])])
+def test_at_the_floor_what_play_makes_of_noise_hides_no_effect(
+    monkeypatch, through_play, named
+) -> None:
+    """An error of 1.1 floors falls by a tenth."""
+    assert weighed(monkeypatch, 0.165, 0.150, through_play=through_play) == named
 
 
 @pytest.mark.slow
