@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -11,15 +11,12 @@ from numpy.typing import NDArray
 
 from bampipe.discover.chance import (
     Pool,
-    PrepareTask,
-    Progress,
     Replicate,
     ReplicateTask,
     ScoreTask,
     ShareTask,
     fit_trials,
     open_trials,
-    prepare,
     run_replicate,
     run_scores,
     run_share,
@@ -67,17 +64,6 @@ class Bench:
     settings: Settings
     pool: Pool
     names: tuple[str, ...]
-
-    def prepare(self, recipe: Recipe, progress: Progress) -> None:
-        """Derive and compile every candidate, each in one worker only.
-
-        Args:
-            recipe: the model; progress: called with the share done and a message.
-        """
-        parts = 4 * self.settings.jobs
-        tasks = [PrepareTask(recipe, self.names[k::parts]) for k in range(parts)]
-        for done, _ in enumerate(self.pool(prepare, tasks)):
-            progress(done / parts, "preparing the candidates")
 
     def retimed(self, evidence: Evidence) -> Bench:
         """The same with inputs moved by the timing that a model with more effects gives them.
@@ -201,14 +187,28 @@ class Bench:
             evidence, lambda: system_of(narrow), self.trials.sensors, self.trials.kinematics, floor
         )
 
-    def scores(self, recipe: Recipe, p: Array, names: Sequence[str]) -> dict[str, Score]:
-        """Scores of candidates against a model on the measured trials."""
+    def scores(
+        self,
+        recipe: Recipe,
+        p: Array,
+        names: Sequence[str],
+        progress: Callable[[float], None] = lambda share: None,
+    ) -> dict[str, Score]:
+        """Scores of candidates against a model on the measured trials.
+
+        Each is derived and compiled by the worker that scores it, where it is not in the cache.
+
+        Args:
+            recipe: the model; p: its parameters as fitted, (n_p,); names: of the candidates.
+            progress: called with the share done.
+        """
         parts = min(_PARTS * self.settings.jobs, len(names))
         late_s = self.trials.late_s
         tasks = [ScoreTask(recipe, p, tuple(names[k::parts]), late_s) for k in range(parts)]
         merged: dict[str, Score] = {}
-        for found in self.pool(run_scores, tasks):
+        for done, found in enumerate(self.pool(run_scores, tasks), start=1):
             merged |= found
+            progress(done / parts)
         # In the order of the names, whatever the number of jobs: ties in the ranking keep it.
         return {name: merged[name] for name in names if name in merged}
 

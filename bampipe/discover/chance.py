@@ -157,27 +157,6 @@ def candidates_of(recipe: Recipe, names: Sequence[str]) -> list[Candidate]:
 
 
 @dataclass(frozen=True)
-class PrepareTask:
-    """Candidates to derive and compile, so that workers share this work instead of repeating it."""
-
-    recipe: Recipe
-    names: tuple[str, ...]
-
-
-def prepare(task: PrepareTask) -> int:
-    """Derive and compile candidates into the cache; returns how many."""
-    motion = open_trials().motions[0]
-    for item in candidates_of(task.recipe, task.names):
-        system = item.system
-        if system.memory_names:
-            few = slice(0, 2)
-            u = motion.inputs(system.inputs)[few]
-            q, qd, qdd = (values[few] for values in motion.kinematics)
-            system.memory(q, qd, qdd, u, system.prior, motion.t[few])
-    return len(task.names)
-
-
-@dataclass(frozen=True)
 class ReplicateTask:
     """One replay of the session.
 

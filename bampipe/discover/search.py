@@ -122,11 +122,12 @@ def search(bench: Bench, base: Recipe, start: Array, progress: Progress) -> Sear
         progress: called with a fraction and a message.
     """
     s = bench.settings
-    progress(0.0, "preparing the candidates")
-    bench.prepare(base, lambda share, what: progress(0.04 * share, what))
+    scoring = "scoring every candidate on the measured trials"
+    progress(0.0, scoring)
     initial = bench.fit(base, start)
-    progress(0.05, "scoring every candidate on the measured trials")
-    first = bench.scores(base, initial.p, bench.names)
+    first = bench.scores(
+        base, initial.p, bench.names, lambda share: progress(0.12 * share, scoring)
+    )
     explainable = bench.shares(base, initial.p)
     progress(0.15, "replaying the model for chance levels")
     current, scores = FittedSet(base, (), initial, bench.trials, start), dict(first)

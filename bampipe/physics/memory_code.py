@@ -15,10 +15,11 @@ _FEWEST = 3
 """Exponential steps a sample where the decay of a state follows the motion."""
 
 # Positions and inputs are linear between samples, rates are not: of a motion with eight samples a
-# period a straight line takes a twentieth off the distance between them.
+# period a straight line takes a twentieth off the distance between them. Without a signature it is
+# compiled where what calls it is, and not again by every process that finds that in the cache.
 BETWEEN = '''
 
-@njit(types.void(M, M, M, M, types.int64, types.float64, types.float64, V, V, V))
+@njit
 def between(q, qd, qdd, u, i, h, share, x, v, w):
     """Fills x, v, w with positions, rates and inputs between samples i and i + 1, h apart."""
     for j in range(len(x)):
