@@ -36,8 +36,8 @@ from bampipe.discover.settings import Settings
 from bampipe.physics import compile_model
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.identify import IdentifyResult
+from bampipe.trials.evidence import gather_evidence
 from bampipe.trials.measured import read_measured_trials
-from bampipe.trials.residuals import gather_evidence
 
 CASES = (
     "bam:detent:yaw", "bam:detent:extension", "bam:rough_patch:pitch", "bam:winding_cable:yaw",

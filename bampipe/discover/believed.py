@@ -7,7 +7,7 @@ import numpy as np
 from bampipe.discover.candidates import Candidate
 from bampipe.discover.columns import added_columns
 from bampipe.discover.scorer import Score
-from bampipe.trials.residuals import Evidence
+from bampipe.trials.evidence import Evidence
 
 _ROUNDING = 1e-6
 """Of what a strength adds, as a root mean square, that parameters of the model may miss of it."""

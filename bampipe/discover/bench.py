@@ -29,6 +29,7 @@ from bampipe.estimate.least_squares import fit
 from bampipe.estimate.simulation import Runaway
 from bampipe.physics.recipe import Recipe
 from bampipe.trials.bias import remove_bias
+from bampipe.trials.evidence import Evidence
 from bampipe.trials.measured import MeasuredTrials
 from bampipe.trials.noise_floor import (
     FLOOR_SEED,
@@ -38,7 +39,7 @@ from bampipe.trials.noise_floor import (
     floor_replays,
     standing_still_matters,
 )
-from bampipe.trials.residuals import Evidence, problem_of
+from bampipe.trials.residuals import problem_of
 from bampipe.trials.timing import find_robot_timing
 
 Array = NDArray[np.float64]

@@ -20,9 +20,9 @@ from bampipe.discover.shape import explainable_share
 from bampipe.physics import System, compile_model
 from bampipe.physics.recipe import Recipe
 from bampipe.physics.registry import effect_from
+from bampipe.trials.evidence import Evidence, gather_evidence
 from bampipe.trials.measured import MeasuredTrials
 from bampipe.trials.replay import StandIn, replay_motions
-from bampipe.trials.residuals import Evidence, gather_evidence
 from bampipe.workers import process_pool
 
 Array = NDArray[np.float64]

@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.discover.candidates import Candidate
+from bampipe.trials.evidence import Evidence
 from bampipe.trials.motion import Motion
-from bampipe.trials.residuals import Evidence, ModelOnTrial
+from bampipe.trials.residuals import ModelOnTrial
 
 Array = NDArray[np.float64]
 

@@ -12,7 +12,7 @@ from scipy.stats import gamma
 from bampipe.discover.settings import Settings
 from bampipe.discover.shape import BINS, Map, Variable, residual_map, variables
 from bampipe.results.rounding import significant
-from bampipe.trials.residuals import Evidence
+from bampipe.trials.evidence import Evidence
 
 Array = NDArray[np.float64]
 

@@ -13,7 +13,7 @@ from bampipe.results.diagnose import (
     SearchStep,
     TransientCandidate,
 )
-from bampipe.trials.residuals import Evidence
+from bampipe.trials.evidence import Evidence
 
 
 @dataclass(frozen=True)

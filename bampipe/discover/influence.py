@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from bampipe.discover.candidates import Candidate
 from bampipe.discover.scorer import Score, Scorer
 from bampipe.results.diagnose import Stretch
+from bampipe.trials.evidence import Evidence
 from bampipe.trials.measured import trial_of_block
-from bampipe.trials.residuals import Evidence
 
 Array = NDArray[np.float64]
 

@@ -17,7 +17,7 @@ from bampipe.discover.chance import candidates_of
 from bampipe.discover.columns import added_columns
 from bampipe.discover.polish import FittedSet, reduce_set
 from bampipe.discover.scorer import Score
-from bampipe.trials.residuals import Evidence
+from bampipe.trials.evidence import Evidence
 
 Array = NDArray[np.float64]
 

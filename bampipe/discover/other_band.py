@@ -15,10 +15,10 @@ from bampipe.estimate.simulation import Runaway
 from bampipe.results.diagnose import OtherBand
 from bampipe.results.standing import standing
 from bampipe.trials.band import LEAST_HZ
+from bampipe.trials.evidence import Evidence, gather_evidence
 from bampipe.trials.measured import MeasuredTrials
 from bampipe.trials.noise_floor import FLOOR_SEED, NoiseFloor, replay_evidence
 from bampipe.trials.replay import StandIn
-from bampipe.trials.residuals import Evidence, gather_evidence
 
 Array = NDArray[np.float64]
 

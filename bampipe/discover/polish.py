@@ -29,9 +29,10 @@ from bampipe.discover.settings import Settings
 from bampipe.discover.start import with_effect, without_effect
 from bampipe.physics.recipe import Recipe
 from bampipe.results.diagnose import Contender
+from bampipe.trials.evidence import Evidence
 from bampipe.trials.measured import MeasuredTrials
 from bampipe.trials.noise_floor import parameters_to_replay
-from bampipe.trials.residuals import Evidence, residual_and_memory
+from bampipe.trials.residuals import residual_and_memory
 
 Array = NDArray[np.float64]
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from bampipe.physics.effect import BoundEffect
 from bampipe.physics.parameter import Parameter
-from bampipe.trials.residuals import Evidence
+from bampipe.trials.evidence import Evidence
 
 Array = NDArray[np.float64]
 

@@ -20,7 +20,7 @@ from bampipe.discover.settings import Settings
 from bampipe.discover.start import with_effect
 from bampipe.estimate.simulation import Runaway
 from bampipe.physics.recipe import Recipe
-from bampipe.trials.residuals import Evidence
+from bampipe.trials.evidence import Evidence
 
 Array = NDArray[np.float64]
 

@@ -20,9 +20,10 @@ from bampipe.discover.ranges import MachineScale
 from bampipe.discover.settings import Settings
 from bampipe.estimate.normal_equations import NormalEquations
 from bampipe.trials.draw import draw_trials
+from bampipe.trials.evidence import Evidence
 from bampipe.trials.folds import Folds
 from bampipe.trials.motion import trial_sizes
-from bampipe.trials.residuals import Evidence, ModelOnTrial
+from bampipe.trials.residuals import ModelOnTrial
 
 Array = NDArray[np.float64]
 

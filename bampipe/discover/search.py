@@ -33,10 +33,10 @@ from bampipe.lists import join_names
 from bampipe.physics.recipe import Recipe
 from bampipe.results.diagnose import Contender, RefusedEffect, SearchStep
 from bampipe.results.standing import AT_FLOOR
+from bampipe.trials.evidence import Evidence
 from bampipe.trials.folds import HELD_OUT
 from bampipe.trials.measured import MeasuredTrials
 from bampipe.trials.noise_floor import NoiseFloor, force_noise_through_offset
-from bampipe.trials.residuals import Evidence
 
 Array = NDArray[np.float64]
 

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.results.diagnose import WorstWindow
+from bampipe.trials.evidence import Evidence
 from bampipe.trials.measured import trial_of_block
 from bampipe.trials.motion import Motion
-from bampipe.trials.residuals import Evidence
 
 Array = NDArray[np.float64]
 

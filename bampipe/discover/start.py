@@ -12,8 +12,8 @@ from bampipe.discover.chance import fit_trials, system_of
 from bampipe.discover.scorer import Score, Scorer
 from bampipe.physics.recipe import Recipe
 from bampipe.physics.registry import device_from, effect_from
+from bampipe.trials.evidence import Evidence
 from bampipe.trials.measured import MeasuredTrials
-from bampipe.trials.residuals import Evidence
 
 Array = NDArray[np.float64]
 

@@ -16,7 +16,7 @@ from bampipe.results.identify import Covariance
 from bampipe.results.intervals import NORMAL_95
 from bampipe.results.terms import EffectText, ModelTerm, TermCurve, TermsResult
 from bampipe.trials.draw import draw_trials
-from bampipe.trials.residuals import Evidence
+from bampipe.trials.evidence import Evidence
 
 Array = NDArray[np.float64]
 

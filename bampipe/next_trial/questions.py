@@ -31,11 +31,11 @@ from bampipe.physics.recipe import Recipe
 from bampipe.physics.registry import effect_from
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.trials.draw import draw_trials
+from bampipe.trials.evidence import Evidence
 from bampipe.trials.measured import MeasuredTrials
 from bampipe.trials.motion import Motion
 from bampipe.trials.noise_floor import FLOOR_SEED, replay_evidence
 from bampipe.trials.replay import StandIn, keep_motion
-from bampipe.trials.residuals import Evidence
 
 Array = NDArray[np.float64]
 

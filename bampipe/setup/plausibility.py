@@ -13,9 +13,10 @@ from bampipe.errors import InputError
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import System
 from bampipe.physics.parameter import Parameter
+from bampipe.trials.evidence import Evidence, gather_evidence
 from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion
-from bampipe.trials.residuals import Evidence, applied_rms, gather_evidence
+from bampipe.trials.residuals import applied_rms
 
 Array = NDArray[np.float64]
 

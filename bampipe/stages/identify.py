@@ -41,7 +41,7 @@ from bampipe.identification.method_choice import (
 )
 from bampipe.identification.output_estimate import estimate_by_output_error
 from bampipe.identification.sensor_noise import sensor_noise
-from bampipe.identification.sign_width import describe_smoothing, with_smoothing
+from bampipe.identification.smoothing import describe_smoothing, with_smoothing
 from bampipe.physics import System, compile_model
 from bampipe.progress import Progress
 from bampipe.results.identify import InputTiming

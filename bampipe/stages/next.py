@@ -41,9 +41,9 @@ from bampipe.results.ingest import IngestResult
 from bampipe.results.next import Detectable, NextResult, Plan, Purpose
 from bampipe.results.validate import JudgedError, ValidateResult
 from bampipe.schema import STRICT, Count
+from bampipe.trials.evidence import Evidence, gather_evidence
 from bampipe.trials.measured import read_measured_trials, trial_of_block
 from bampipe.trials.motion import Motion
-from bampipe.trials.residuals import Evidence, gather_evidence
 
 SUMMARY = "The trial to record next, and what it is expected to give"
 INPUTS = (

@@ -45,6 +45,7 @@ from bampipe.trials.comparison import (
     published_rmse,
     rms,
 )
+from bampipe.trials.evidence import Evidence, gather_evidence
 from bampipe.trials.measured import (
     MeasuredTrials,
     folds_by_channel,
@@ -62,7 +63,6 @@ from bampipe.trials.noise_floor import (
     standing_still_matters,
 )
 from bampipe.trials.reading import held_out_trials, read_motions, require_sound_motions
-from bampipe.trials.residuals import Evidence, gather_evidence
 
 SUMMARY = "Predicted against measured torque and force, on trials that the fit has not seen"
 INPUTS = (*INGESTED, *FILTERED, *IDENTIFIED_MODEL)

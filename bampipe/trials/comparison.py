@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from bampipe.errors import InputError
 from bampipe.physics import System
 from bampipe.results.validate import AxisError
+from bampipe.trials.evidence import Evidence
 from bampipe.trials.measured import MeasuredTrials
 from bampipe.trials.noise_floor import replay_evidence
 from bampipe.trials.replay import UNLIKE, StandIn
-from bampipe.trials.residuals import Evidence, ModelOnTrial
+from bampipe.trials.residuals import ModelOnTrial
 
 Array = NDArray[np.float64]
 

@@ -18,17 +18,12 @@ from bampipe.physics import System
 from bampipe.results.standing import standing
 from bampipe.trials.bias import remove_bias
 from bampipe.trials.draw import ENOUGH_SAMPLES, draw_trials
+from bampipe.trials.evidence import Evidence, gather_evidence
 from bampipe.trials.folds import Folds
 from bampipe.trials.kinematics import Kinematics
 from bampipe.trials.motion import Motion, trial_sizes
 from bampipe.trials.replay import StandIn, keep_motion, replay_motions
-from bampipe.trials.residuals import (
-    Evidence,
-    ModelOnTrial,
-    gather_evidence,
-    problem_of,
-    standstill_of,
-)
+from bampipe.trials.residuals import ModelOnTrial, problem_of, standstill_of
 from bampipe.trials.sensors import Sensors
 
 Array = NDArray[np.float64]

@@ -16,8 +16,8 @@ from bampipe.discover.shape import worst_windows
 from bampipe.physics import registry
 from bampipe.physics.recipe import Recipe
 from bampipe.results.standing import standing
+from bampipe.trials.evidence import gather_evidence
 from bampipe.trials.measured import MeasuredTrials
-from bampipe.trials.residuals import gather_evidence
 
 
 def bam_with_force(factor: float) -> Recipe:

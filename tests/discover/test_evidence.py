@@ -12,8 +12,9 @@ from bampipe.estimate.low_pass import Band
 from bampipe.physics import Model, compile_model
 from bampipe.physics.device import LAST_ORDER, derivative
 from bampipe.physics.registry import device_from
+from bampipe.trials.evidence import gather_evidence
 from bampipe.trials.motion import Motion, Recording
-from bampipe.trials.residuals import gather_evidence, problem_of
+from bampipe.trials.residuals import problem_of
 
 
 def test_thinning_equals_the_library_filter_away_from_the_ends():

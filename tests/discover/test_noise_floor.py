@@ -16,10 +16,11 @@ from bampipe.estimate.least_squares import fit
 from bampipe.physics import Model, compile_model
 from bampipe.trials import draw, noise_floor, replay
 from bampipe.trials.bias import remove_bias
+from bampipe.trials.evidence import Evidence, gather_evidence
 from bampipe.trials.measured import MeasuredTrials
 from bampipe.trials.noise_floor import find_noise_floor
 from bampipe.trials.replay import StandIn, replay_motion
-from bampipe.trials.residuals import Evidence, ModelOnTrial, gather_evidence, problem_of
+from bampipe.trials.residuals import ModelOnTrial, problem_of
 
 
 @pytest.fixture(scope="module")

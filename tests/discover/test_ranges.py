@@ -11,7 +11,7 @@ from sessions import BAND, bam, made
 from bampipe.discover.chance import system_of
 from bampipe.discover.ranges import MachineScale
 from bampipe.physics import Model, registry
-from bampipe.trials.residuals import gather_evidence
+from bampipe.trials.evidence import gather_evidence
 
 AXIS = MachineScale(
     np.array([-0.05]), np.array([0.2]), np.array([0.3]), np.array([100.0]),

@@ -16,8 +16,8 @@ from bampipe.discover.drafts.linear_fit import LinearFit, orthonormal
 from bampipe.discover.drafts.quantities import Span, coordinates
 from bampipe.estimate.low_pass import low_pass_at
 from bampipe.physics.device import Device
+from bampipe.trials.evidence import Evidence
 from bampipe.trials.folds import HELD_OUT
-from bampipe.trials.residuals import Evidence
 
 Array = NDArray[np.float64]
 

@@ -18,7 +18,7 @@ from bampipe.discover.drafts.axis_signals import AxisSignals
 from bampipe.discover.drafts.forms import READING, Form, forms
 from bampipe.discover.drafts.quantities import Span
 from bampipe.discover.drafts.shapes import hats
-from bampipe.trials.residuals import Evidence
+from bampipe.trials.evidence import Evidence
 
 Array = NDArray[np.float64]
 

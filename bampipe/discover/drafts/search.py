@@ -31,9 +31,10 @@ from bampipe.discover.start import with_effect
 from bampipe.estimate.least_squares import fit
 from bampipe.physics.recipe import Recipe
 from bampipe.results.draft import ChanceOfDraft, CurveBound
+from bampipe.trials.evidence import Evidence, gather_evidence
 from bampipe.trials.measured import MeasuredTrials
 from bampipe.trials.replay import replay_motions
-from bampipe.trials.residuals import Evidence, gather_evidence, problem_of
+from bampipe.trials.residuals import problem_of
 
 Array = NDArray[np.float64]
 

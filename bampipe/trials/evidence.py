@@ -1,0 +1,297 @@
+"""A model fitted to the trials of a session, its residual linearised there, and held-out errors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.estimate.least_squares import (
+    KnownSlopes,
+    Problem,
+    Stacked,
+    as_measured,
+    minimise,
+    stacked_residual,
+)
+from bampipe.estimate.low_pass import Band
+from bampipe.estimate.normal_equations import NormalEquations
+from bampipe.estimate.standstill import find_moving_samples
+from bampipe.physics import System
+from bampipe.trials.folds import Folds
+from bampipe.trials.motion import Motion
+from bampipe.trials.residuals import ModelOnTrial, applied_rms, problem_of
+
+Array = NDArray[np.float64]
+
+_REFITS = 6
+"""Most Gauss-Newton steps of a refit that starts at the fit to all trials."""
+_CONVERGED = 1e-8
+"""Change of the negative log likelihood a sample at which a fit or refit ends: a hundredth of a
+standard deviation of a parameter over ten thousand samples, and no digit of an error."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Residuals of one model on the trials of one session, linearised at its least-squares fit.
+
+    Attributes:
+        system: the model.
+        p: parameters at which it is linearised, (n_p,).
+        motions: the trials.
+        fitted: the model with these parameters on each of them.
+        band: the low-pass.
+        folds: which trials were fitted, and which are left out together.
+        residual: low-passed and thinned, by trial, each (K, n_q), N.m or N.
+        jacobian: derivative of ``residual`` by the free parameters, by trial, (K, n_q, n_free);
+            of what is measured where parameters multiply it, see `as_measured`.
+        used: which samples count, by trial, (K, n_q), see `standstill`; the others are zero in
+            ``residual`` and ``jacobian``.
+        free: indices of the parameters that are estimated.
+        lower, upper: bounds of their change, (n_free,).
+        precision, known: what is known of their change beforehand, (n_free,); see
+            `NormalEquations`.
+        by_timing: derivative of ``residual`` by the time by which inputs were sampled after
+            positions, by trial, (K, n_q), N.m/s or N/s; nothing where that is not open.
+        timing: least and largest change of that time, s.
+    """
+
+    system: System
+    p: Array
+    motions: Sequence[Motion]
+    fitted: tuple[ModelOnTrial, ...]
+    band: Band
+    folds: Folds
+    residual: tuple[Array, ...]
+    jacobian: tuple[Array, ...]
+    used: tuple[NDArray[np.bool_], ...]
+    free: tuple[int, ...]
+    lower: Array
+    upper: Array
+    precision: Array
+    known: Array
+    by_timing: tuple[Array, ...] = ()
+    timing: tuple[float, float] = (0.0, 0.0)
+
+    def subset(self, trials: Sequence[int]) -> Evidence:
+        """The same on some trials, given by number, linearised where it is."""
+        return replace(
+            self,
+            motions=[self.motions[k] for k in trials],
+            fitted=tuple(self.fitted[k] for k in trials),
+            folds=self.folds.subset(trials),
+            residual=tuple(self.residual[k] for k in trials),
+            jacobian=tuple(self.jacobian[k] for k in trials),
+            used=tuple(self.used[k] for k in trials),
+            by_timing=tuple(self.by_timing[k] for k in trials if self.by_timing),
+        )
+
+    @property
+    def sizes(self) -> list[int]:
+        """Samples of each trial that its residual stands for."""
+        return [len(residual) * self.band.step for residual in self.residual]
+
+    @cached_property
+    def sums(self) -> NormalEquations:
+        """Sums of products of the linearised residual."""
+        return NormalEquations.from_samples(
+            self.jacobian, self.residual, self.used, self.precision, self.known
+        )
+
+    @cached_property
+    def weight(self) -> Array:
+        """Weight of the squares of each axis: one over the mean square where it was fitted."""
+        fitted = self.sums.subset(self.folds.fitted_trials)
+        mean = fitted.yy.sum(axis=0) / np.maximum(fitted.count.sum(axis=0), 1.0)
+        return np.asarray(1.0 / np.maximum(mean, 1e-24))
+
+    @cached_property
+    def applied_rms(self) -> Array:
+        """Root mean square of the applied force by axis; see `applied_rms`, (n_q,), N.m or N."""
+        return applied_rms(self.system, self.motions, self.band, self.p, self.used)
+
+    def rmse(self) -> Array:
+        """Root mean square of the residual by axis over all trials, (n_q,), N.m or N."""
+        count = np.maximum(self.sums.count.sum(axis=0), 1.0)
+        return np.asarray(np.sqrt(self.sums.yy.sum(axis=0) / count))
+
+    @cached_property
+    def held_out_steps(self) -> tuple[Array, ...]:
+        """Change of the free parameters when the trials of a group are left out, by trial.
+
+        By the normal equations at the fit to all where the model is linear in its parameters; by
+        refits from there where it is not: a Gauss-Newton step alone leads shapes astray.
+        """
+        if self.is_linear or self.folds.nothing_held_out:
+            return self.folds.solve(self.sums, self.weight, self.lower, self.upper)
+        problem = problem_of(self.system, self.motions, self.band)
+        start, free = np.append(self.p, 0.0), list(self.free)
+        steps: dict[int, Array] = {}
+        for group in sorted(set(self.folds.groups)):
+            others = [k for k in self.folds.fitted_trials if self.folds.groups[k] != group]
+            steps[group] = np.zeros(len(free))
+            if len(others) < len(self.folds.fitted_trials):
+                here = [Stacked(self.residual[k], self.jacobian[k], self.used[k]) for k in others]
+                refit = minimise(
+                    problem, start, others, _REFITS, tolerance=_CONVERGED,
+                    at_start=here if problem.multiplied is None else None,
+                )  # fmt: skip
+                steps[group] = refit.p[free] - self.p[free]
+        return tuple(steps[group] for group in self.folds.groups)
+
+    @cached_property
+    def held_out_rmse(self) -> Array:
+        """Error on trials that the parameters have not seen, (n_q,), N.m or N.
+
+        See `held_out_steps` for the parameters without each group of trials.
+        """
+        if self.is_linear:
+            return self.folds.error(self.sums, self.held_out_steps)
+        judged = [k for k, counts in enumerate(self.folds.judged) if counts]
+        squares = sum(np.sum(self.held_out_residual(k) ** 2, axis=0) for k in judged)
+        count = self.sums.count[judged].sum(axis=0)
+        return np.asarray(np.sqrt(squares / np.maximum(count, 1.0)))
+
+    @property
+    def is_linear(self) -> bool:
+        """Whether the residual is linear in all free parameters together."""
+        return self.system.is_linear_in(self.free)
+
+    def held_out_residual(self, trial: int) -> Array:
+        """The residual of a trial with parameters that have not seen it, (K, n_q)."""
+        if trial not in self._held_out:
+            step = self.held_out_steps[trial]
+            if self.is_linear or not step.any():
+                found = self.residual[trial] + self.jacobian[trial] @ step
+            else:
+                unfiltered = self.unfiltered_residual(trial, self.held_out_parameters(trial))
+                found = self.band.thin(unfiltered) * self.used[trial]
+            self._held_out[trial] = found
+        return self._held_out[trial]
+
+    @cached_property
+    def _held_out(self) -> dict[int, Array]:
+        return {}
+
+    def held_out_parameters(self, trial: int) -> Array:
+        """Those parameters, (n_p,)."""
+        p = self.p.copy()
+        p[list(self.free)] += self.held_out_steps[trial]
+        return p
+
+    def unfiltered_residual(self, trial: int, p: Array) -> Array:
+        """The residual of a trial with parameters ``p``, (n_p,), before the low-pass, (T, n_q)."""
+        return ModelOnTrial(self.system, p, self.motions, trial).residual
+
+
+def gather_evidence(
+    system: System,
+    motions: Sequence[Motion],
+    band: Band,
+    start: Array,
+    folds: Folds,
+    *,
+    most_iterations: int = 12,
+    like: Evidence | None = None,
+    timing: tuple[float, float] = (0.0, 0.0),
+) -> Evidence:
+    """Fit a model to the fitted trials by least squares and linearise it there on all.
+
+    Args:
+        system: the model; motions: the trials; band: the low-pass.
+        start: parameters to start from, (n_p,); folds: which trials are fitted.
+        most_iterations: the most Gauss-Newton steps.
+        like: a model with some more effects or some less, where that has been fitted: slopes that
+            are the same for both are taken from it.
+        timing: least and largest change of the inputs' timing, s, that may be weighed beside it.
+
+    Raises:
+        ValueError: fewer samples than parameters.
+    """
+    problem = problem_of(system, motions, band)
+    fitted = folds.fitted_trials
+    known = None
+    if like is not None and like.motions is motions and like.band == band:
+        known = _common_slopes(like, system, problem)
+    found = minimise(
+        problem, np.append(start, 0.0), fitted, most_iterations, known=known, tolerance=_CONVERGED
+    )
+    stacked = dict(zip(fitted, found.stacked, strict=True))
+    for trial in range(len(motions)):
+        if trial not in stacked:
+            stacked[trial] = stacked_residual(problem, trial, found.p, known)
+    value = found.p[problem.free]
+    order = range(len(motions))
+    measured = as_measured(problem, found.p, [stacked[k] for k in order])
+    fitted_trials = tuple(ModelOnTrial(system, found.p[:-1], motions, k) for k in order)
+    used = tuple(stacked[k].used for k in order)
+    return Evidence(
+        system,
+        found.p[:-1],
+        motions,
+        fitted_trials,
+        band,
+        folds,
+        tuple(stacked[k].residual for k in order),
+        tuple(s.slope for s in measured),
+        used,
+        tuple(int(i) for i in problem.free),
+        problem.lower - value,
+        problem.upper - value,
+        problem.precision,
+        problem.known - value,
+        _slopes_by_timing(fitted_trials, band, used, timing),
+        timing,
+    )
+
+
+def _slopes_by_timing(
+    fitted: Sequence[ModelOnTrial],
+    band: Band,
+    used: Sequence[NDArray[np.bool_]],
+    timing: tuple[float, float],
+) -> tuple[Array, ...]:
+    """`Evidence.by_timing`; nothing where the timing is not open, or a delay has its place."""
+    step = 0.25 * (timing[1] - timing[0])
+    system = fitted[0].system
+    if step == 0.0 or system.takes_timing:
+        return ()
+    rows = []
+    for base in fitted:
+        late, early = (
+            ModelOnTrial(system, base.p, [base.motion.with_input_timing(by)]).residual
+            for by in (step, -step)
+        )
+        rows.append((late - early) / (2.0 * step))
+    thin = band.thin_trials(rows, range(len(system.coordinates)))
+    return tuple(values * moves for values, moves in zip(thin, used, strict=True))
+
+
+def _common_slopes(like: Evidence, system: System, problem: Problem) -> KnownSlopes | None:
+    """The slopes by parameters that two models share and that are the same for both.
+
+    A slope that no parameter changes is that of the model without any effect. None are where other
+    samples stand still for the one than for the other, as where a brake counts.
+    """
+    still = (find_moving_samples(s, problem.band) for s in problem.standstill)
+    if not all(np.array_equal(a, b) for a, b in zip(still, like.used, strict=True)):
+        return None
+    held = {like.system.parameters[i].name: k for k, i in enumerate(like.free)}
+    constant = like.system.constant
+    moved = like.system.moves_sensors
+    source = [held.get(system.parameters[i].name, -1) for i in problem.free]
+    holds = [
+        k >= 0 and not moved and constant[like.free[k]] and bool(here)
+        for k, here in zip(source, problem.constant, strict=True)
+    ]
+    places = np.flatnonzero(holds)
+    taken = [source[k] for k in places]
+    slopes = []
+    for jacobian in like.jacobian:
+        columns = np.zeros((*jacobian.shape[:2], problem.free.size))
+        columns[:, :, places] = jacobian[:, :, taken]
+        slopes.append(columns)
+    return KnownSlopes(slopes, np.array(holds))
