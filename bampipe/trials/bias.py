@@ -22,6 +22,8 @@ Array = NDArray[np.float64]
 
 _CORRECTIONS = 5
 """Most replays of a nonlinear model, until its fit is the measured one's."""
+_AVERAGED = 4
+"""Replays whose mean is the bias where noise of the forces is part of it."""
 _SAME = 1.0
 """Standard deviations within which the two fits are the same."""
 _SLOPE = (0.3, 3.0)
@@ -38,8 +40,9 @@ class UnbiasedFit:
         problem: what was fitted.
         bias_at: (n_p + 1,) parameters to their bias (n_free,), by a replay, which may raise
             :class:`InputError`; None where there is no bias.
-        drawn_covariance: (n_free, n_free) of the bias of the trials drawn for it about that of all;
-            zero where all were replayed, and None where there is no bias.
+        drawn_covariance: (n_free, n_free) of the bias of the trials drawn for it about that of all,
+            and of noise in it; zero where all were replayed without noise, and None where there is
+            no bias.
     """
 
     raw: LeastSquares
@@ -81,11 +84,12 @@ def remove_bias(
     machine is not its truth. How far off it is, is measured: the fitted model is replayed along
     the trials, read by the same encoders, sent through the same filters and fitted again
     (parametric bootstrap, Efron and Tibshirani 1993, chapter 10). The force sensor is without
-    noise there: its noise adds scatter, not bias. Where the model is nonlinear in its parameters
-    and the bias is large, it is not that at the answer: those parameters are looked for whose
-    replay is fitted as the measurement is (indirect inference, Gourieroux, Monfort and Renault
-    1993). Of a long session, trials drawn from all are replayed; how far their bias may be from
-    that of all is given as a covariance.
+    noise there: its noise adds scatter, not bias. Where it moves the mechanism, as through play, it
+    does: then several replays with that noise are averaged. Where the model is nonlinear in its
+    parameters and the bias is large, it is not that at the answer: those parameters are looked for
+    whose replay is fitted as the measurement is (indirect inference, Gourieroux, Monfort and
+    Renault 1993). Of a long session, trials drawn from all are replayed; how far their bias may be
+    from that of all, and what noise makes of a mean, is given as a covariance.
 
     Args:
         sensors: that read the trials; kinematics: the filters they went through.
@@ -98,21 +102,24 @@ def remove_bias(
     drawn = draw_trials(trial_sizes(motions))
     left_out = 1.0 - len(drawn) / len(motions)
     replayed = [motions[number] for number in drawn] if left_out else motions
-    known: dict[bytes, LeastSquares] = {}
+    noisy = system.moves_sensors
+    averaged = _AVERAGED if noisy else 1
+    known: dict[bytes, list[LeastSquares]] = {}
 
     def bias_at(p: Array) -> Array:
-        return np.asarray((refit(p).p - np.append(p[:count], 0.0))[free])
+        found = np.mean([each.p for each in refits(p)], axis=0)
+        return np.asarray((found - np.append(p[:count], 0.0))[free])
 
-    def refit(p: Array) -> LeastSquares:
+    def refits(p: Array) -> list[LeastSquares]:
         if p.tobytes() not in known:
-            known[p.tobytes()] = fit_replay(p)
+            stand_in = StandIn(system, p[:count], replayed, sensors.rate_hz)
+            known[p.tobytes()] = [fit_replay(stand_in, number) for number in range(averaged)]
         return known[p.tobytes()]
 
-    def fit_replay(p: Array) -> LeastSquares:
+    def fit_replay(stand_in: StandIn, number: int) -> LeastSquares:
         replays = replay_motions(
-            StandIn(system, p[:count], replayed, sensors.rate_hz), sensors, kinematics, (0, 0),
-            force_noise=False, alone=True,
-        )  # fmt: skip
+            stand_in, sensors, kinematics, (0, number), force_noise=noisy, alone=True
+        )
         # Of a replay no input is late, unless the timing is found anew.
         start = raw.p if timing else np.append(raw.p[:count], 0.0)
         again = fit(problem_of(system, replays, problem.band, timing=timing), start)
@@ -133,7 +140,8 @@ def remove_bias(
         return UnbiasedFit(raw, raw.p, None, problem)
     # A large bias of a nonlinear model changes on the way to the answer, by some bias^2 / p.
     sd = np.sqrt(np.diag(raw.covariance))
-    about_all = left_out * refit(raw.p).covariance
+    drawn_covariance = refits(raw.p)[0].covariance
+    about_all = (left_out + (1.0 / averaged if noisy else 0.0)) * drawn_covariance
     found = UnbiasedFit(raw, moved(bias), bias, problem, bias_at, about_all)
     if not problem.linear and np.any((bias**2 > sd * np.abs(raw.p[free]))[free < count]):
         bias = _settled(found, bias, moved)
