@@ -20,6 +20,7 @@ from bampipe.errors import InputError
 from bampipe.identification.drift import find_drift
 from bampipe.identification.free_run import free_runs
 from bampipe.identification.terms import describe_terms
+from bampipe.lists import join_names
 from bampipe.physics import System, compile_model
 from bampipe.physics.recipe import Recipe
 from bampipe.progress import Progress
@@ -59,6 +60,7 @@ from bampipe.trials.noise_floor import (
     NoiseFloor,
     find_noise_floor,
     floor_replays,
+    force_noise_through_offset,
     parameters_to_replay,
     standing_still_matters,
 )
@@ -131,6 +133,8 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         recipe = read_recipe(run, config.model, model)
         floor, said = _noise_floor(evidence, trials, p, recipe, config, progress)
         notes += said
+        if floor is not None:
+            notes += _noise_through_play(evidence, trials, floor)
     free: FreeRun | None = None
     if config.free_run:
         progress(0.8, "free runs")
@@ -184,6 +188,20 @@ def _noise_floor(
     if not floor.is_exceeded(evidence.held_out_rmse):
         return floor, []
     return _with_still_replays(evidence, trials, replayed, floor, recipe, config.seed)
+
+
+def _noise_through_play(evidence: Evidence, trials: MeasuredTrials, floor: NoiseFloor) -> list[str]:
+    """Say where most of a floor is what noise of the forces does by moving the mechanism."""
+    system = evidence.system
+    moves = (item.name for item in system.model.effects if item.effect.kind == "measurement")
+    noise = force_noise_through_offset(evidence, trials.sensors)
+    named = join_names(f"`{name}`" for name in moves)
+    return [
+        f"{system.coordinates[i]}: of the noise floor of {significant(floor.level[i])}"
+        f" {system.torque_units[i]}, {significant(np.sqrt(noise[i]))} are noise of the force, which"
+        f" moves the mechanism by {named}. A quieter force sensor lets more be seen."
+        for i in np.flatnonzero(noise > 0.5 * floor.level**2)
+    ]
 
 
 def _with_still_replays(

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from independent_runs import record_trials
+from sessions import SENSORS, bam, made
 
 from bampipe.discover.chance import fit_trials, system_of
 from bampipe.estimate.least_squares import fit
@@ -18,7 +19,7 @@ from bampipe.trials import draw, noise_floor, replay
 from bampipe.trials.bias import remove_bias
 from bampipe.trials.evidence import Evidence, gather_evidence
 from bampipe.trials.measured import MeasuredTrials
-from bampipe.trials.noise_floor import find_noise_floor
+from bampipe.trials.noise_floor import find_noise_floor, force_noise_through_offset
 from bampipe.trials.replay import StandIn, replay_motion
 from bampipe.trials.residuals import ModelOnTrial, problem_of
 
@@ -290,3 +291,18 @@ def test_how_late_a_force_acts_is_read_off_the_model(fitted, effect, late) -> No
     motion = motion.with_channels(derivatives | dict(motion.channels))
     found = replay._lateness(ModelOnTrial(system, p, [motion]), motion.inputs(system.inputs))
     np.testing.assert_allclose(found, [late], atol=1e-9)
+
+
+def test_most_of_the_floor_of_play_is_noise_of_the_force_through_it() -> None:
+    """Of the axis with play alone, and as much as it leaves: without play there is none."""
+    recipe = bam(["backlash:yaw"])
+    values = {"backlash.yaw.gap": 0.03, "backlash.yaw.closing": 1.4}
+    session = made(recipe, values, trials=3)
+    system = system_of(recipe)
+    start = np.array([values.get(item.name, item.prior) for item in system.parameters])
+    evidence = fit_trials(session, recipe, start)
+    share = force_noise_through_offset(evidence, SENSORS) / evidence.rmse() ** 2
+    assert 0.5 < share[0] < 1.1
+    assert share[1:].max() < 0.5
+    bare = fit_trials(session, bam(), system_of(bam()).prior)
+    assert not force_noise_through_offset(bare, SENSORS).any()
