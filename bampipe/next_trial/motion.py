@@ -17,7 +17,6 @@ from bampipe.physics.device import LAST_ORDER, derivative
 from bampipe.trials.kinematics import Kinematics
 from bampipe.trials.motion import Motion
 from bampipe.trials.replay import read_by_sensors
-from bampipe.trials.residuals import residual_and_memory
 from bampipe.trials.sensors import Sensors
 
 Array = NDArray[np.float64]
@@ -103,15 +102,20 @@ class Rehearsal:
         motion = Motion("design", t, q, qd, qdd, np.zeros_like(q), channels)
         motion = self._with_force(motion)
         applied = motion.inputs(device.forces)
-        recording = read_by_sensors(system, motion, motion.q, applied, self.sensors, rng)
+        # The design is what the mechanism does. An offset at the reading is that at the truth, but
+        # for its square.
+        read = q - system.offset(q, motion.inputs(system.inputs), self.p)
+        recording = read_by_sensors(system, motion, read, applied, self.sensors, rng)
         return self.kinematics.observe(recording, device.forces)
 
     def _with_force(self, motion: Motion) -> Motion:
-        """The motion with the force that leaves no residual."""
+        """The motion of the mechanism with the force that leaves no residual."""
         system, forces = self.system, self.system.model.device.forces
+        at = motion.kinematics
         for _ in range(_STEPS):
             u = motion.inputs(system.inputs)
-            left, _ = residual_and_memory(system, motion, u, self.p)
+            z = system.memory(*at, u, self.p, motion.t)
+            left = system.residual(*at, z, u, self.p)
             excess = system.least_force(motion.q, left, u, self.p)
             changed = {name: motion.channels[name] - excess[:, k] for k, name in enumerate(forces)}
             if not system.driven and not system.memory_names:
