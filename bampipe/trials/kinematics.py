@@ -82,10 +82,12 @@ class Kinematics:
             axis: its number; signal: known at every sample.
         """
         name = list(self.axes)[axis]
-        if self.method != "kalman":
-            found = self.differentiate(name, signal)
-            return found.position, found.velocity, found.acceleration
-        return kalman_smoother.smooth_mean(signal, self._motion_model(name))
+        if self.method == "kalman":
+            return kalman_smoother.smooth_mean(signal, self._motion_model(name))
+        mean = (
+            butterworth.zero_phase if self.method == "butterworth" else savitzky_golay.smooth_mean
+        )
+        return mean(signal, self.rate_hz, self.axes[name].bandwidth_hz)
 
     def _motion_model(self, axis: str) -> kalman_smoother.MotionModel:
         chosen = self.axes[axis]
