@@ -59,9 +59,8 @@ def cut_segments(system: System, motion: Motion, trial: Trial, p: Array) -> list
         part = slice(first, first + count)
         if not np.isfinite(y[part]).all() or disturbed[part].any():
             continue
-        start = [np.interp(t[first], motion.t, column) for column in state.T]
-        start[:n] += y[first, :n]
-        x0 = np.array(start)
+        x0 = np.array([np.interp(t[first], motion.t, column) for column in state.T])
+        x0[:n] += y[first, :n]
 
         def run(x: Array, parameters: Array, part: slice = part) -> Array:
             moved = u[part] - parameters[-1] * rate[part]
