@@ -54,8 +54,9 @@ def problem_of(
     states = _Remembered[Array](
         [i for i, linear in enumerate((*system.linear, False)) if not linear]
     )
-    bodies = _Remembered[Array](range(n + 1) if system.moves_sensors else sorted(system.of_bodies))
-    moved = _Remembered[tuple[Array, Array, Array]]([*system.moved_by, n])
+    by_offset = [*system.moved_by, n] if system.moves_sensors else []
+    bodies = _Remembered[Array]([*system.of_bodies, *by_offset])
+    moved = _Remembered[tuple[Array, Array, Array]](by_offset)
 
     def mechanism(trial: int, motion: Motion, u: Array, p: Array) -> tuple[Array, Array, Array]:
         return moved.find(trial, p, lambda: motion.of_mechanism(system, u, p[:n]).kinematics)
