@@ -20,7 +20,6 @@ from bampipe.errors import InputError
 from bampipe.identification.drift import find_drift
 from bampipe.identification.free_run import free_runs
 from bampipe.identification.terms import describe_terms
-from bampipe.lists import join_names
 from bampipe.physics import System, compile_model
 from bampipe.physics.recipe import Recipe
 from bampipe.progress import Progress
@@ -193,9 +192,10 @@ def _noise_floor(
 def _noise_through_play(evidence: Evidence, trials: MeasuredTrials, floor: NoiseFloor) -> list[str]:
     """Say where most of a floor is what noise of the forces does by moving the mechanism."""
     system = evidence.system
-    moves = (item.name for item in system.model.effects if item.effect.kind == "measurement")
     noise = force_noise_through_offset(evidence, trials.sensors)
-    named = join_names(f"`{name}`" for name in moves)
+    named = ", ".join(
+        f"`{item.name}`" for item in system.model.effects if item.effect.kind == "measurement"
+    )
     return [
         f"{system.coordinates[i]}: of the noise floor of {significant(floor.level[i])}"
         f" {system.torque_units[i]}, {significant(np.sqrt(noise[i]))} are noise of the force, which"
