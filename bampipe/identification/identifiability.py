@@ -195,7 +195,7 @@ def find_information(
 def _stiffness(system: System, motion: Motion, z: Array, u: Array, p: Array) -> Array:
     """Return how the force that the motion needs changes with the position, RMS, (n_q,)."""
     found = np.zeros(len(system.coordinates))
-    here = system.required(motion.q, motion.qd, motion.qdd, z, u, p)
+    here = system.required(*motion.kinematics, z, u, p)
     for i in range(len(found)):
         q = motion.q.copy()
         q[:, i] += _SHIFT

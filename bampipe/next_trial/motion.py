@@ -184,7 +184,7 @@ def example_path(example: Example, t: Array) -> tuple[Array, Array, Array]:
     slope[turn == 0.0] = 1.0
     q, qd, qdd = (
         np.stack([np.interp(at, clock, column) for column in part.T], axis=1)
-        for part in (motion.q, motion.qd, motion.qdd)
+        for part in motion.kinematics
     )
     middle = np.median(motion.q, axis=0)
     return (

@@ -196,7 +196,7 @@ def _columns(system: System, motion: Motion, band: Band) -> tuple[Array, Array, 
         if i not in known and not item.fixed:
             p[i] = 0.0
     u = motion.inputs(system.inputs)
-    at = motion.q, motion.qd, motion.qdd
+    at = motion.kinematics
     z = system.memory(*at, u, p, motion.t)
     shapes = [system.required(*at, z, u, p), *_drive(motion.qd, motion.qdd)]
     for turns in _shared_motors(system):

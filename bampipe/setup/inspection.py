@@ -148,8 +148,8 @@ def _require_scale(system: System, motions: Sequence[Motion]) -> None:
         u = motion.inputs(system.inputs)
         sizes = []
         for p in (nothing, system.prior):
-            z = system.memory(motion.q, motion.qd, motion.qdd, u, p, motion.t)
-            sizes.append(np.abs(system.residual(motion.q, motion.qd, motion.qdd, z, u, p)).max())
+            z = system.memory(*motion.kinematics, u, p, motion.t)
+            sizes.append(np.abs(system.residual(*motion.kinematics, z, u, p)).max())
         if not sizes[0] <= 1e-12 * sizes[1]:
             return
     names = join_names((system.parameters[i].name for i in free), _MANY)

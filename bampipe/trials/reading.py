@@ -209,7 +209,7 @@ def require_sound_motions(system: System, motions: Sequence[Motion]) -> None:
     """
     for motion in motions:
         require_sound(
-            system, motion.q, motion.qd, motion.qdd, motion.inputs(system.inputs), system.prior,
+            system, *motion.kinematics, motion.inputs(system.inputs), system.prior,
             motion.t, f"trial {motion.trial_id}",
         )  # fmt: skip
 

@@ -275,7 +275,7 @@ def _moved_on(motion: Motion, forces: Sequence[str], samples: float) -> Motion:
     }
     q, qd, qdd = (
         np.column_stack([_shifted(column, samples) for column in values.T])
-        for values in (motion.q, motion.qd, motion.qdd)
+        for values in motion.kinematics
     )
     return replace(motion, q=q, qd=qd, qdd=qdd, channels=channels, _columns={})
 

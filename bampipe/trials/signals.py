@@ -147,7 +147,7 @@ class Change:
         n = len(signals.axes)
         none = np.zeros_like(motion.t)
         orders = []
-        for order, positions in enumerate((motion.q, motion.qd, motion.qdd)):
+        for order, positions in enumerate(motion.kinematics):
             inputs = [motion.channels.get(derivative(name, order), none) for name in signals.inputs]
             values = np.column_stack([positions, *inputs]) @ self.gain.T
             orders.append((values + self.offset if order == 0 else values) / self.time**order)
