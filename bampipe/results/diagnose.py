@@ -2,78 +2,58 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
 from bampipe.results.record import Names, Record, Result, Share, Size
-from bampipe.results.standing import FLOOR_WRONG, Standing
+from bampipe.results.standing import Standing
 from bampipe.results.terms import EffectText
 from bampipe.schema import Count
 
-Verdict = Literal["nothing_missing", "missing", "undecided", "unknown_effect"]
+Verdict = Literal["nothing_missing", "missing", "undecided", "unknown_effect", "no_verdict"]
 UpToOne = Annotated[float, Field(le=1)]
-
-
-class Stretch(Record):
-    """A stretch of a trial, s from its beginning."""
-
-    trial_id: str
-    t_start: float
-    t_end: float
-
-
-class OtherBand(Record):
-    """How the final model stands in another band than that of the session."""
-
-    cutoff_hz: Size
-    rmse: Size = Field(description="Cross-validated, by one linear step")
-    noise_floor: Size = Field(description="The same of replays")
-    standing: Standing
 
 
 class AxisVerdict(Record):
     """What one axis lacks."""
 
     verdict: Verdict
-    effects: Names = Field(description="Found to be missing; they are what `extend` adds")
-    likely: dict[str, Share] = Field(
-        description="Where undecided: effects that may be missing, by their odds"
+    effects: Names = Field(description="Of the most probable set, on this axis; `extend` adds them")
+    probabilities: dict[str, Share] = Field(
+        description="Effects of any probable set on this axis, by their probability"
+    )
+    unknown: Share = Field(
+        description="Probability that something is missing which no effect of the library is"
     )
     rmse_before: Size = Field(description="On held-out trials")
-    rmse_after: Size = Field(description="With what was found")
-    noise_floor: Size
+    rmse_after: Size = Field(description="With the most probable set")
+    rmse_beyond_bias: Size = Field(
+        description="With it, but for the bias that filters leave where friction turns"
+    )
+    noise_floor: Size = Field(description="The error of replays of the final model")
     noise_floor_sd: Size
-    creeping_floor: Size | None = Field(
-        default=None,
-        description="Of replays that creep where the motion turns round, where that of ones that "
-        "stand still there is clearly larger, and the noise floor",
-    )
     standing: Standing = Field(description="rmse_after against noise_floor")
-    worst_second: Stretch = Field(description="Where the residual with what was found is largest")
-    rmse_without_worst_second: Size = Field(
-        description="rmse_after but for it; whether something remains is judged by this"
-    )
-    other_band: OtherBand | None = Field(
-        description="null where no other band is reasonable: below 8 Hz, or above the motion's"
-    )
     unit: str
+    force_rms: Size = Field(description="Of the applied force, root mean square")
+    explained: UpToOne = Field(
+        description="Share of the mean square of the applied force that the final model explains"
+    )
     explainable_share: UpToOne = Field(
-        description="Share of the residual that any flexible function predicts on unseen data"
+        description="Share of the residual, in the mean square, that a smooth function of position,"
+        " speed, load and time since reversal predicts on unseen trials"
     )
-    explainable_after: UpToOne
-    explainable_chance: UpToOne = Field(description="Its chance level")
-    remains: bool = Field(description="Whether something is left that the library does not explain")
+    explainable_after: UpToOne = Field(description="The same of the final model")
     explained_by_effects: UpToOne = Field(
-        description="Share of the excess mean square that what was found or is likely removes"
+        description="Share of the excess mean square that the most probable set removes"
     )
+    remains: bool = Field(description="Whether more is missing than the set explains")
     sentence: str
 
     @property
-    def by_odds(self) -> list[str]:
+    def likely(self) -> list[str]:
         """The effects that may be missing, the likeliest first."""
-        return sorted(self.likely, key=lambda name: -self.likely[name])
+        return sorted(self.probabilities, key=lambda name: -self.probabilities[name])
 
 
 class RankedEffect(Record):
@@ -81,97 +61,37 @@ class RankedEffect(Record):
 
     effect: str
     axis: str
-    held_out_rmse_before: Size = Field(
-        description="Of the model diagnosed; for an effect found, of the one it was added to"
-    )
+    held_out_rmse_before: Size = Field(description="Of the model diagnosed")
     held_out_rmse_after: Size = Field(
-        description="That, times the ratio of the cross-validated errors with and without it; "
-        "measured for an effect that was added and refused"
+        description="Of an effect of the most probable set, without and with it beside the others;"
+        " else of the model diagnosed with it alone, as if both sides of the equation kept their size"
     )
     unit: str
-    p_value: Share
-    score: float
+    probability: Share
+    p_value: Share = Field(description="Chance that replays give a gain as large to any candidate")
+    score: float = Field(description="Log evidence that it gains, nats")
     parameters: dict[str, float]
     indistinguishable_from: Names
 
 
-class Contender(Record):
-    """An effect that contends for a place in the model, all others found being in it."""
+class WeighedSet(Record):
+    """A set of effects and how probable it is."""
 
-    effect: str
-    axis: str = Field(description="Where the effect found helps most")
-    held_out_rmse: Size = Field(
-        description="There, with this effect in that place, as if it left both sides of the "
-        "equation at their size"
+    effects: Names = Field(description="Beyond those of the model diagnosed")
+    probability: Share
+    log_evidence: float = Field(description="Over that of the first set, nats")
+
+
+class NullDistribution(Record):
+    """What chance gives to candidates where nothing is missing: replays of the final model."""
+
+    replicates: Count
+    largest: tuple[float, ...] = Field(
+        description="On each replay, the largest gain of any candidate, nats"
     )
-    score: float = Field(description="Gain in log likelihood over all axes")
-    score_without_trial: float | None = Field(
-        description="Without the trial that speaks most for the effect found; null with two trials"
-    )
-    score_without_second: float = Field(
-        description="Without the second that speaks most for the effect found"
-    )
-    odds: Share = Field(
-        description="That it is this one, of those that replays do not distinguish; else 0"
-    )
-    beside: Literal["", "about as likely", "likelier by score"] = Field(
-        default="", description="Of a rival that a verdict names beside the effect found, why"
-    )
-
-
-def in_words(effect: str, contest: Sequence[Contender], mark: str = "") -> str:
-    """An effect found, with the rivals that its odds do not set it apart from.
-
-    Args:
-        effect: its name; contest: who contends for its place, itself among them.
-        mark: what a name stands between.
-    """
-    said = f"{mark}{effect}{mark}"
-    for why in ("about as likely", "likelier by score"):
-        rivals = [f"{mark}{c.effect}{mark}" for c in contest if c.beside == why]
-        said += f" or, {why}, {' or '.join(rivals)}" if rivals else ""
-    return said
-
-
-class SearchStep(Record):
-    """One step of the search over sets of effects."""
-
-    effects: Names = Field(description="In the model then, beyond those of the model diagnosed")
-    held_out_rmse: dict[str, Size] = Field(description="By axis")
-
-
-class TransientCandidate(Record):
-    """A candidate that only one second speaks for: it is not named as missing."""
-
-    effect: str
-    axis: str
-    second: Stretch
-
-
-RefusalReason = Literal["held_out", "runs_away", "replays", "scale", "stops"]
-
-
-class RefusedEffect(Record):
-    """A candidate that beats chance by its score, and is not kept."""
-
-    effect: str
-    axis: str
-    held_out_rmse_before: Size = Field(description="Of the model that it was added to")
-    held_out_rmse_after: Size | None = Field(
-        description="With it, fitted, as if it left both sides of the equation at their size; null "
-        "where it runs away"
-    )
-    without_worst_second_before: Size | None = Field(
-        default=None, description="The same but for the worst second; null where it was not fitted"
-    )
-    without_worst_second_after: Size | None = None
-    why: RefusalReason = Field(
-        description="It does too little on held-out trials; or, fitted without one of them, runs "
-        "away there; or replays with it give no floor that "
-        "an error could be judged by; or it leaves next to nothing of what the force does, so that "
-        "all forces become small together; or replays that truly stand still at reversals give it "
-        "most of its gain as well"
-    )
+    measured: float = Field(description="The same on the measured trials, beside the final model")
+    effect: str = Field(description="Of which candidate")
+    p_value: Share
 
 
 class SuggestedTrial(Record):
@@ -229,17 +149,13 @@ class DiagnoseResult(Result):
         default={}, description="By name of an effect in the ranking: what its file says"
     )
     selected: Names
-    groups: dict[str, Names] = Field(
-        description="By effect found: others that these trials cannot tell from it"
+    sets: tuple[WeighedSet, ...] = Field(description="The most probable first")
+    chance: NullDistribution | None = Field(
+        default=None, description="null where replays are not like the measurement"
     )
-    contests: dict[str, tuple[Contender, ...]] = Field(
-        description="By effect found: itself, then the rivals that come close to it"
+    cut_short: bool = Field(
+        default=False, description="Whether more effects were wanted than may be added"
     )
-    steps: tuple[SearchStep, ...] = Field(
-        description="Sets of effects that the search went through"
-    )
-    transients: tuple[TransientCandidate, ...]
-    refused: tuple[RefusedEffect, ...] = ()
     suggested_trial: SuggestedTrial | None
     not_weighed: Names = Field(default=(), description="Effects that the search was to leave out")
     maps: dict[str, dict[str, ResidualMap]] = Field(description="By axis, then variable")
@@ -257,21 +173,28 @@ class DiagnoseResult(Result):
         """By axis, in a few words, with what is missing there."""
         found = {}
         for axis, entry in self.axes.items():
-            contests = ((name, self.contests.get(name, ())) for name in entry.effects)
-            named = " and ".join(in_words(*one) for one in contests)
             words = entry.verdict.replace("_", " ")
-            found[axis] = f"{words} {named}".rstrip() if entry.verdict == "missing" else words
+            if entry.verdict == "missing":
+                words = f"missing {' and '.join(entry.effects)}"
+            elif entry.verdict == "undecided":
+                words = f"undecided: {self.alternatives_in_words(entry)}"
+            found[axis] = words
         return found
 
-    def named(self, axis: str) -> list[str]:
-        """Each effect found on an axis in words: with its rivals, and with those it is one of."""
-        entry = self.axes[axis]
-        return [
-            f"{' or '.join(entry.by_odds)} (undecided)"
-            if effect in entry.likely and len(entry.likely) > 1
-            else in_words(effect, self.contests.get(effect, ()))
-            for effect in entry.effects
-        ]
+    def alternatives_in_words(self, entry: AxisVerdict) -> str:
+        """The effects that may be missing on an axis, with their probabilities."""
+        return ", ".join(f"{n} ({100 * entry.probabilities[n]:.0f} %)" for n in entry.likely)
+
+    @property
+    def alternatives(self) -> dict[str, Names]:
+        """By effect of the most probable set, those that stand in its place in other sets."""
+        found = {}
+        for effect in self.selected:
+            rest = {*self.selected} - {effect}
+            others = [s.effects for s in self.sets[1:] if effect not in s.effects]
+            swapped = [{*o} - rest for o in others if rest <= {*o} and len({*o} - rest) == 1]
+            found[effect] = tuple(dict.fromkeys(name for one in swapped for name in one))
+        return found
 
     @property
     def unnamed_axes(self) -> Names:
@@ -279,5 +202,5 @@ class DiagnoseResult(Result):
         return tuple(
             axis
             for axis, entry in self.axes.items()
-            if entry.remains and entry.standing not in FLOOR_WRONG
+            if entry.remains and entry.verdict != "no_verdict"
         )

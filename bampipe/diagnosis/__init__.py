@@ -1,0 +1,1 @@
+"""Which effects a model lacks: one likelihood, one search over sets, one rule."""

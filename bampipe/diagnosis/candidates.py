@@ -1,0 +1,97 @@
+"""Candidate effects: which there are, and the model in which each is compiled."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from bampipe.physics import Model, System, compile_model
+from bampipe.physics.device import Device
+from bampipe.physics.effect import Effect
+from bampipe.physics.parameter import Parameter
+from bampipe.physics.registry import effect as built_in
+from bampipe.physics.registry import effect_names
+from bampipe.physics.signals import follows
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One effect at one target.
+
+    Attributes:
+        name: canonical, ``stribeck:yaw``.
+        system: the device with this effect alone; with the other effects of the model before it
+            where it acts on what they leave.
+        is_joint: whether it is with them.
+        parameters: those of the effect.
+        linear_indices: places among them of strengths in which the residual is linear.
+        searched_indices: places among them of those that are searched.
+    """
+
+    name: str
+    system: System
+    is_joint: bool
+    parameters: tuple[Parameter, ...]
+    linear_indices: tuple[int, ...]
+    searched_indices: tuple[int, ...]
+
+    @property
+    def n_constants(self) -> int:
+        """How many numbers it adds to the model."""
+        return sum(not q.fixed for q in self.parameters)
+
+    @property
+    def replaces_motion(self) -> bool:
+        """Whether all that it does is that the model sees another motion than was measured."""
+        return self.system.model.effects[-1].effect.kind == "measurement"
+
+
+def list_candidates(
+    device: Device, present: Sequence[str], extra: Sequence[Effect] = ()
+) -> tuple[str, ...]:
+    """Return the names of effects that could be added to ``device``, without those ``present``."""
+    known = {name: built_in(name) for name in effect_names()} | {e.name: e for e in extra}
+    names = [
+        f"{name}:{target}" if target else name
+        for name, effect in sorted(known.items())
+        for target in effect.targets(device)
+    ]
+    return tuple(name for name in names if name not in present)
+
+
+def build_candidate_model(
+    device: Device, name: str, extra: Sequence[Effect] = (), present: Sequence[str] = ()
+) -> Model:
+    """Return the model in which an effect is a candidate for one that has the effects ``present``.
+
+    That is ``device`` with the effect alone, last with those present where they act on each other.
+
+    Raises:
+        InputError: there is no such effect or target.
+    """
+    full = Model(device, (*present, name), extra)
+    *earlier, item = full.effects
+    if any(follows(item, one, device) or follows(one, item, device) for one in earlier):
+        return full
+    return Model(device, (name,), extra)
+
+
+def compile_candidate(model: Model) -> Candidate:
+    """Compile the candidate that is the last effect of ``model``; see `build_candidate_model`."""
+    system, item = compile_model(model), model.effects[-1]
+    is_joint = len(model.effects) > 1
+    judged = system
+    if is_joint and item.effect.pulls:
+        # A load that a spring is part of takes a tenth or so of what it adds: as good as linear.
+        judged = compile_model(Model(model.device, (item.name,), (item.effect,)))
+    parameters = system.parameters[len(system.parameters) - len(item.parameters) :]
+    is_linear = judged.linear[len(judged.linear) - len(parameters) :]
+    linear, searched = [], []
+    for i, parameter in enumerate(parameters):
+        if parameter.fixed:
+            continue
+        if parameter.strength and is_linear[i] and not system.moves_sensors:
+            linear.append(i)
+        else:
+            searched.append(i)
+    return Candidate(item.name, system, is_joint, parameters, tuple(linear), tuple(searched))

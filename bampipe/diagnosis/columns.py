@@ -1,0 +1,109 @@
+"""What a candidate adds to the residual of a fitted model: columns of a linear problem."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.diagnosis.candidates import Candidate
+from bampipe.trials.evidence import Evidence
+from bampipe.trials.motion import Motion
+from bampipe.trials.residuals import ModelOnTrial
+
+Array = NDArray[np.float64]
+
+
+def added_columns(
+    evidence: Evidence, item: Candidate, searched: Array
+) -> tuple[list[Array], list[Array]]:
+    """What a candidate adds at given values of its searched parameters, low-passed, by trial.
+
+    Returns:
+        Columns of its linear strengths, each (K, n_q, m), and where it has none of those the
+        change of the residual, each (K, n_q).
+    """
+    e, system = evidence, item.system
+    count = len(system.parameters) - len(item.parameters)
+    p = np.concatenate([e.p[:count], [q.prior for q in item.parameters]])
+    p[[count + i for i in item.searched_indices]] = searched
+    p[[count + i for i in item.linear_indices]] = 0.0
+    axes = list(range(len(system.coordinates)) if system.moves_sensors else system.touched)
+    rows = [
+        np.concatenate([r[:, axes] for r in _added_rows(item, p, count, base)], axis=1)
+        for base in e.fitted
+    ]
+    probes = max(1, len(item.linear_indices))
+    columns, changes = [], []
+    for values, used in zip(e.band.thin_trials(rows, axes * probes), e.used, strict=True):
+        thin = np.zeros((len(used), probes, used.shape[1]))
+        thin[:, :, axes] = values.reshape(len(used), probes, len(axes)) * used[:, None, axes]
+        if item.linear_indices:
+            columns.append(thin.transpose(0, 2, 1))
+            changes.append(np.zeros(used.shape))
+        else:
+            columns.append(np.zeros((*used.shape, 0)))
+            changes.append(thin[:, 0])
+    return columns, changes
+
+
+def _added_rows(item: Candidate, p: Array, count: int, base: ModelOnTrial) -> list[Array]:
+    """`added_residual` on one trial, for each of `_probes`."""
+    probes = _probes(p, count, item.linear_indices)
+    if _moves(item):
+        return [added_residual(item, probe, base) for probe in probes]
+    motion = base.mechanism
+    z = _states(item, motion, p)
+    return [_added_along(item, probe, base, motion, z) for probe in probes]
+
+
+def _probes(p: Array, count: int, linear: Sequence[int]) -> list[Array]:
+    """``p`` with each of the ``linear`` strengths, numbered from ``count``, at one; or as it is."""
+    probes = [p.copy() for _ in linear or (None,)]
+    for probe, i in zip(probes, linear, strict=False):
+        probe[count + i] = 1.0
+    return probes
+
+
+def added_residual(item: Candidate, p: Array, base: ModelOnTrial) -> Array:
+    """What a candidate adds to the residual of a model along a motion, (T, n_q), N.m or N.
+
+    Args:
+        item: the candidate.
+        p: parameters of its system, its own last.
+        base: the model without it on a trial.
+    """
+    if not _moves(item):
+        motion = base.mechanism
+        return _added_along(item, p, base, motion, _states(item, motion, p))
+    system, motion = item.system, base.motion
+    u = motion.inputs(system.inputs)
+    moved = motion.of_mechanism(system, u, p)
+    if item.replaces_motion:
+        at = moved.kinematics
+        return base.system.residual(*at, base.memory, base.inputs, base.p) - base.residual
+    at, z = moved.kinematics, _states(item, moved, p)
+    return system.applied(*at, z, u, p) - system.required(*at, z, u, p) - base.residual
+
+
+def _moves(item: Candidate) -> bool:
+    """Whether the mechanism moves otherwise with a candidate: by its own offset, or by its load."""
+    count = len(item.system.parameters) - len(item.parameters)
+    return any(number >= count for number in item.system.moved_by)
+
+
+def _added_along(item: Candidate, p: Array, base: ModelOnTrial, motion: Motion, z: Array) -> Array:
+    """`added_residual` where the mechanism moves as by the model without the candidate.
+
+    Args:
+        motion: that motion; z: internal states (T, n_z) of the candidate's system.
+    """
+    system, at = item.system, motion.kinematics
+    added = system.contribution(*at, z, motion.inputs(system.inputs), p)
+    return added - base.contribution if item.is_joint else added
+
+
+def _states(item: Candidate, motion: Motion, p: Array) -> Array:
+    system = item.system
+    return system.memory(*motion.kinematics, motion.inputs(system.inputs), p, motion.t)

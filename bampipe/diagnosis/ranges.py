@@ -1,0 +1,182 @@
+"""Where a shape or a nonlinear strength is looked for, within the bounds that its effect states.
+
+Lengths, speeds and times that matter differ by a thousand from machine to machine, so a range
+follows what the trials show: their travel, speeds, loads and sampling.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.physics.effect import BoundEffect
+from bampipe.physics.parameter import Parameter
+from bampipe.trials.evidence import Evidence
+
+Array = NDArray[np.float64]
+
+_TRAVEL = (1e-4, 0.25)
+"""Of the travel: finer lengths are crossed within a sample or two."""
+_SPEED = (1e-3, 1.0)
+"""Of the highest speed."""
+_WAVES = (2.0, 30.0)
+"""Waves on the travel."""
+_GIVE = (1e-4, 0.1)
+"""Of the travel, at the highest load: less cannot be distinguished from what happens between two
+samples where friction changes its sign."""
+_LOSS = (1e-2, 3.0)
+"""Of the load, at the highest load."""
+_TIME = (2.0, 3.0)
+"""In samples, in trials: the time in which something settles."""
+_PARTS = {"travel": (0.02, 0.98), "upper half": (0.5, 0.98), "lower half": (0.02, 0.5)}
+"""Of the travel: where a position is looked for."""
+_BEYOND = (0.52, 5.0)
+"""Of the travel, from its middle: where a position outside of it is looked for; what steepens
+towards one that lies farther is a straight line."""
+_RESONANCE = 3.0
+"""Of the highest frequency of the band: what rings beyond leaves a tenth of its force in the band,
+which a late sample or a filter leaves as well."""
+_DELAY, _DELAY_OF_DRIVES = 0.2, 0.5
+"""In samples: both sides of the equation are filtered alike, so that less than one shows. Where
+there are several drives, friction that stops a joint looks late by less than half a sample, and how
+late all of them are within that, the timing that most of them share says already."""
+
+
+@dataclass(frozen=True)
+class SearchRange:
+    """Lower and upper end, and whether to step by ratios.
+
+    Attributes:
+        around: middle of the travel for a position outside of it. Then ``low`` and ``high`` are
+            reciprocals of its distance from there, through 0 from one side to the other.
+        farthest: the farthest such distance.
+    """
+
+    low: float
+    high: float
+    by_ratio: bool
+    around: float | None = None
+    farthest: float = np.inf
+
+    def value_at(self, searched: float) -> float:
+        """The value of the parameter for a number between ``low`` and ``high``."""
+        if self.around is None:
+            return searched
+        distance = min(1.0 / max(abs(searched), 1e-300), self.farthest)
+        return self.around + float(np.copysign(distance, searched))
+
+    def value_like(self, value: float) -> float:
+        """``value`` where it lies in the range, else one amid it; of a position beyond, above."""
+        if self.around is not None:
+            distance = abs(value - self.around)
+            holds = 1.0 / self.high <= distance <= self.farthest
+            return value if holds else self.value_at(self.within(0.75))
+        return value if self.low <= value <= self.high else self.within(0.5)
+
+    def within(self, share: float) -> float:
+        """The value that lies a share of the way from the lower to the upper end."""
+        return between(self.low, self.high, share)
+
+
+def between(low: float, high: float, share: float = 0.5) -> float:
+    """The value a share of the way from ``low`` to ``high``, by ratios where both are positive."""
+    if low > 0.0 and high > 0.0:
+        return float(low ** (1.0 - share) * high**share)
+    return float(low + share * (high - low))
+
+
+@dataclass(frozen=True)
+class MachineScale:
+    """What sizes the trials of a session have.
+
+    Attributes:
+        lowest, highest: ends of the travel by coordinate, (n_q,), rad or m.
+        speed: the highest, (n_q,), rad/s or m/s.
+        load: the highest generalised force applied, (n_q,), N.m or N.
+        coordinates: names and units of these and of their forces.
+        interval, duration: time between samples, and of the longest trial, s.
+        band_hz: highest frequency of the residual, (n_q,), Hz.
+    """
+
+    lowest: Array
+    highest: Array
+    speed: Array
+    load: Array
+    coordinates: dict[str, tuple[str, str]]
+    interval: float
+    duration: float
+    band_hz: tuple[float, ...]
+
+    @classmethod
+    def of_trials(cls, evidence: Evidence) -> MachineScale:
+        """The sizes of the trials of ``evidence``."""
+        system, q, qd, load = evidence.system, [], [], []
+        for trial, motion in enumerate(evidence.motions):
+            applied = evidence.fitted[trial].applied
+            q += [motion.q.min(axis=0), motion.q.max(axis=0)]
+            qd.append(np.abs(motion.qd).max(axis=0))
+            load.append(np.abs(applied).max(axis=0))
+        times = [motion.t for motion in evidence.motions]
+        return cls(
+            np.min(q, axis=0), np.max(q, axis=0), np.max(qd, axis=0), np.max(load, axis=0),
+            {c.name: (c.unit, c.torque_unit) for c in system.model.device.coordinates},
+            float(np.median(np.diff(times[0]))), max(float(np.ptp(t)) for t in times),
+            evidence.band.cutoff_hz,
+        )  # fmt: skip
+
+    def range_of(self, item: BoundEffect, parameter: Parameter) -> SearchRange:
+        """Where to look for a parameter of an effect in which the residual is not linear."""
+        reach = 4.0 * (abs(parameter.typical) if parameter.typical else parameter.sd)
+        lower, upper = parameter.lower, parameter.upper
+        if parameter.strength and lower < 0.0:
+            return SearchRange(max(lower, -reach), min(upper, reach), False)
+        if parameter.within and item.axes:
+            i = list(self.coordinates).index(item.axes[0])
+            low, high = float(self.lowest[i]), float(self.highest[i])
+            if parameter.within == "beyond":
+                nearest, farthest = (share * (high - low) for share in _BEYOND)
+                steepest, around = 1.0 / nearest, 0.5 * (low + high)
+                return SearchRange(-steepest, steepest, False, around, farthest)
+            start, end = (low + share * (high - low) for share in _PARTS[parameter.within])
+            return SearchRange(start, end, False)
+        if parameter.shape and lower <= 0.0:
+            low = lower if np.isfinite(lower) else parameter.prior - reach
+            return SearchRange(low, upper if np.isfinite(upper) else parameter.prior + reach, False)
+        low, high = self._sizes(item, parameter).get(parameter.unit, (0.0, np.inf))
+        if parameter.strength:
+            low, high = low or 0.02 * reach, min(high, reach) if np.isinf(high) else high
+        low, high = max(low, lower), min(high, upper)
+        if not low < high:
+            low, high = lower or 0.02 * reach, min(upper, reach)
+        return SearchRange(low, high if np.isfinite(high) else parameter.prior + reach, True)
+
+    def _sizes(self, item: BoundEffect, parameter: Parameter) -> dict[str, tuple[float, float]]:
+        """Ranges of lengths, speeds and the like at the target of an effect, by unit."""
+        found = {"s": (_TIME[0] * self.interval, _TIME[1] * self.duration)}
+        if parameter.strength:
+            of_drives = item.effect.scope == "force_component" or item.effect.drive
+            several = len(self.coordinates) > 1
+            least = _DELAY_OF_DRIVES if of_drives and several else _DELAY
+            found["s"] = (least * self.interval if item.effect.kind == "input" else 0.0, np.inf)
+        if not item.axes:
+            return found
+        i, (unit, force) = (
+            list(self.coordinates).index(item.axes[0]),
+            self.coordinates[item.axes[0]],
+        )
+        travel = float(self.highest[i] - self.lowest[i])
+        speed, load = float(self.speed[i]), float(self.load[i])
+        if not travel > 0.0 or not load > 0.0:
+            return found
+        highest = 2.0 * np.pi * _RESONANCE * self.band_hz[i]
+        per_force = force.replace(".", "/")
+        return found | {
+            unit: (_TRAVEL[0] * travel, _TRAVEL[1] * travel),
+            "1/s": (0.0, highest),
+            f"{unit}/s": (_SPEED[0] * speed, _SPEED[1] * speed),
+            f"1/{unit}": (2 * np.pi * _WAVES[0] / travel, 2 * np.pi * _WAVES[1] / travel),
+            f"{unit}/{per_force}": (_GIVE[0] * travel / load, _GIVE[1] * travel / load),
+            f"1/{per_force}": (_LOSS[0] / load, _LOSS[1] / load),
+        }

@@ -1,0 +1,577 @@
+"""The search over sets of effects: each set is weighed whole, its shapes refined, its bounds held.
+
+The cost of a set is its negative log evidence: half of n log s^2 on each axis, with s^2 what the set
+leaves in units of the noise; the logarithm of what it takes off the measured quantity, so that
+nothing is explained by making both sides of the equation small; and by the priors of its parameters
+(Laplace) and of the set itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.diagnosis.criteria import Criteria
+from bampipe.diagnosis.dictionary import Atom, Dictionary, Key
+from bampipe.trials.likelihood import Problem, hold_parameters, solve_bounded, solve_scaled
+
+Array = NDArray[np.float64]
+
+_STEP = 0.02
+"""Of a shape's range: the step of its slope."""
+_FARTHEST = 0.2
+_LEAST_SLOPE = 0.2
+"""Geometric mean of what a set leaves of the slope by the force; below, the equation has no scale."""
+
+_BESIDE, _PROMISING, _SWAPPED = 24, 8, 5
+"""Candidates weighed exactly beside a set that grows, beside one that lost a member, and of those
+the ones whose shapes are refined."""
+_SWAPS, _POLISHED = 3, 4
+
+Pool = dict[tuple[str, ...], tuple[float, tuple[Key, ...]]]
+"""Sets by the names of their members, each with its cost and shapes."""
+Make = Callable[[Sequence[Key]], Iterable[tuple[Key, Atom | None]]]
+
+
+@dataclass(frozen=True)
+class Solution:
+    """A set with its best strengths.
+
+    Attributes:
+        cost: negative log evidence, nats.
+        strengths: of each effect, in the order of the set.
+        base: change of the model's own reduced parameters.
+        scale: s^2 by axis, (n_q,).
+        volume: log of what is left of the measured quantity, summed over samples, by axis.
+        penalty: what the priors take off.
+    """
+
+    cost: float
+    strengths: tuple[Array, ...] = ()
+    base: Array = field(default_factory=lambda: np.zeros(0))
+    scale: Array = field(default_factory=lambda: np.zeros(0))
+    volume: Array = field(default_factory=lambda: np.zeros(0))
+    penalty: float = 0.0
+    sizes: tuple[float, ...] = ()
+
+
+class Search:
+    """Weighs sets of candidates against one model."""
+
+    def __init__(
+        self,
+        problem: Problem,
+        dictionary: Dictionary,
+        make: Make,
+        criteria: Criteria,
+        known: Mapping[Key, Atom | None],
+    ) -> None:
+        self.p, self.dictionary, self.make, self.criteria = problem, dictionary, make, criteria
+        number = max(len(dictionary.candidates), 1)
+        self.log_prior = min(float(np.log(criteria.expected_effects / number)), 0.0)
+        p = problem
+        self.n_q = len(p.y)
+        self.bb, self.by, self.yy = p.sums()
+        self.atoms: dict[Key, Atom | None] = dict(known)
+        self._with_base: dict[Key, dict[int, tuple[Array, Array, Array]]] = {}
+        self._solved: dict[tuple[Key, ...], Solution] = {}
+        self._squares: dict[Key, dict[int, Array]] = {}
+        self.applied = [max(float(f @ f), 1e-300) for f in p.likelihood.applied]
+        self._weight = p.independent / np.maximum(self.yy, 1e-300)
+        grid = [key for name in dictionary.candidates for key in dictionary.grid(name)]
+        self.ensure(grid)
+        places = {key: atom for key in grid if (atom := self.atoms[key]) is not None}
+        self.places = list(places)
+        self._lay_out(places)
+
+    def ensure(self, keys: Iterable[Key]) -> None:
+        """Make the columns of what has none yet."""
+        missing = [key for key in dict.fromkeys(keys) if key not in self.atoms]
+        if missing:
+            self.atoms |= dict(self.make(missing))
+
+    def _lay_out(self, places: Mapping[Key, Atom]) -> None:
+        """All columns of the grid side by side, axis by axis, and their products with the base."""
+        widths = [a.width for a in places.values()]
+        self.first = np.concatenate([[0], np.cumsum(widths)])[:-1].astype(int)
+        self.widths = np.array(widths, dtype=int)
+        m = int(sum(widths))
+        p = self.p
+        self.columns, self.at = [], []
+        self.own = np.zeros(
+            (self.n_q, len(places), int(max(widths, default=1)), int(max(widths, default=1)))
+        )
+        self.xb, self.xy = [], []
+        for axis in range(self.n_q):
+            blocks, at = [], []
+            for k, atom in enumerate(places.values()):
+                if axis in atom.columns:
+                    block = atom.columns[axis] * p.likelihood.root[axis][:, None]
+                    w = block.shape[1]
+                    self.own[axis, k, :w, :w] = block.T @ block
+                    blocks.append(block)
+                    at.append(np.arange(self.first[k], self.first[k] + w))
+            x = np.concatenate(blocks, axis=1) if blocks else np.zeros((len(p.y[axis]), 0))
+            self.columns.append(x)
+            self.at.append(np.concatenate(at) if at else np.zeros(0, dtype=int))
+            self.xb.append(p.base[axis].T @ x)
+            self.xy.append(x.T @ p.y[axis])
+        self.m = m
+        bounds = [b for key in places for b in self.dictionary.bounds(key[0])]
+        self.low, self.high = np.array(bounds).reshape(-1, 2).T
+        self.spread = np.array([v for key in places for v in self.dictionary.spreads(key[0])])
+
+    # --- one set -------------------------------------------------------------------------------
+
+    def _products(self, key: Key) -> dict[int, tuple[Array, Array, Array]] | None:
+        """By axis: weighted columns of an atom, their products with the base and with y."""
+        if key not in self._with_base:
+            atom, p = self.atoms[key], self.p
+            assert atom is not None
+            found = {}
+            for axis, columns in atom.columns.items():
+                x = columns * p.likelihood.root[axis][:, None]
+                found[axis] = x, p.base[axis].T @ x, x.T @ p.y[axis]
+            self._with_base[key] = found
+        return self._with_base[key]
+
+    def solve(self, keys: Sequence[Key]) -> Solution:
+        """The best strengths of a set within their bounds, and its cost."""
+        keys = tuple(sorted(keys))
+        if keys not in self._solved:
+            self._solved[keys] = self._solve(keys)
+        return self._solved[keys]
+
+    def _solve(self, all_keys: tuple[Key, ...]) -> Solution:
+        p, nb = self.p, self.bb.shape[1]
+        absent = {
+            place: change
+            for name, _ in all_keys
+            if name[0] == "-"
+            for place, change in p.absence[name[1:]].items()
+        }
+        keys = added(all_keys)
+        if any(self.atoms.get(key) is None for key in keys):
+            return Solution(np.inf)
+        parts = [self._products(key) for key in keys]
+        widths = [self.atoms[key].width for key in keys]
+        at = np.concatenate([[nb], nb + np.cumsum(widths)]).astype(int)
+        n = int(at[-1])
+        xx, xy = np.zeros((self.n_q, n, n)), np.zeros((self.n_q, n))
+        xx[:, :nb, :nb], xy[:, :nb] = self.bb, self.by
+        for axis in range(self.n_q):
+            here = [(k, part[axis]) for k, part in enumerate(parts) if axis in part]
+            for place, (k, (x, xb, xy_)) in enumerate(here):
+                i = slice(at[k], at[k + 1])
+                xx[axis, :nb, i], xx[axis, i, :nb], xy[axis, i] = xb, xb.T, xy_
+                for j, (other, _, _) in here[: place + 1]:
+                    block = x.T @ other
+                    xx[axis, i, at[j] : at[j + 1]], xx[axis, at[j] : at[j + 1], i] = block, block.T
+        bounds = np.array([x for key in keys for x in self.dictionary.bounds(key[0])]).reshape(
+            -1, 2
+        )
+        solved = solve_bounded(p, xx, xy, self.yy, bounds[:, 0], bounds[:, 1], absent, self._weight)
+        b, weight = solved.unknowns, solved.weight
+        held = [slice(at[k] - nb, at[k + 1] - nb) for k in range(len(keys))]
+        if any(solved.held[h].all() for h in held):
+            return Solution(np.inf)
+        strengths = tuple(b[nb:][h] for h in held)
+        volume = self._volume(keys, strengths)
+        if not np.isfinite(volume).all():
+            return Solution(np.inf)
+        scale, k = solved.left / p.count, int(at[-1])
+        sizes: tuple[float, ...] = ()
+        # What an effect of the model costs is not in the cost of the model as it is.
+        gone = [name[1:] for name, _ in all_keys if name[0] == "-"]
+        penalty = self.log_prior * (len(gone) - len(keys))
+        penalty -= _STRENGTH * sum(len(p.absence[name]) for name in gone)
+        if keys:
+            normal = np.tensordot(weight, xx, 1)
+            normal[:nb, :nb] += p.precision
+            used = np.flatnonzero(~solved.held)
+            inside = _schur(normal, nb)[np.ix_(used, used)]
+            own = np.tensordot(weight, xx[:, nb:, nb:], 1)[np.ix_(used, used)]
+            place = np.repeat(np.arange(len(keys)), widths)[used]
+            sizes = self._sizes(keys, strengths, b[nb:][used], inside, own, place)
+            if min(sizes) < self.criteria.size:
+                return Solution(np.inf)
+            spread = np.array([s for key in keys for s in self.dictionary.spreads(key[0])])
+            wide = np.maximum(spread, np.abs(b[nb:]))[used]
+            penalty += 0.5 * np.linalg.slogdet(np.eye(len(used)) + inside * wide * wide[:, None])[1]
+            penalty += sum(_A_SHAPE * len(key[1]) for key in keys)
+        cost = solved.cost - float(volume.sum()) + penalty
+        return Solution(cost, strengths, b[:nb], scale, volume, penalty, sizes)
+
+    def _sizes(
+        self,
+        keys: Sequence[Key],
+        strengths: Sequence[Array],
+        b: Array,
+        inside: Array,
+        own: Array,
+        place: NDArray[np.int64],
+    ) -> tuple[float, ...]:
+        """What each effect adds as far as nothing else in the model takes its place.
+
+        As a share of the applied force of the axis where that is largest.
+        """
+        spread, sizes = np.linalg.pinv(inside, hermitian=True), []
+        for k, (key, strength) in enumerate(zip(keys, strengths, strict=True)):
+            at = np.flatnonzero(place == k)
+            here = np.ix_(at, at)
+            alone = b[at] @ np.linalg.pinv(spread[here], hermitian=True) @ b[at]
+            share = alone / max(float(b[at] @ own[here] @ b[at]), 1e-300)
+            sizes.append(self._size(key, strength) * float(np.sqrt(max(share, 0.0))))
+        return tuple(sizes)
+
+    def _size(self, key: Key, strength: Array) -> float:
+        """What an effect adds over the applied force of an axis, root mean square, the largest."""
+        if key not in self._squares:
+            self._squares[key] = {a: c.T @ c for a, c in self.atoms[key].columns.items()}
+        return max(
+            float(np.sqrt(max(strength @ square @ strength, 0.0) / self.applied[axis]))
+            for axis, square in self._squares[key].items()
+        )
+
+    def _volume(self, keys: Sequence[Key], strengths: Sequence[Array]) -> Array:
+        """By axis, the independent samples times the mean log of what is left of the force."""
+        found = np.zeros(self.n_q)
+        moved: dict[int, Array] = {}
+        for key, b in zip(keys, strengths, strict=True):
+            atom = self.atoms[key]
+            assert atom is not None
+            found += self.p.independent * atom.log_gain
+            for axis, slope in atom.slopes.items():
+                moved[axis] = moved.get(axis, 0.0) + float(b[0]) * slope
+        for axis, slope in moved.items():
+            plain = self.p.likelihood.slopes[axis]
+            bare = np.linalg.norm(plain, axis=1)
+            live = bare > 0.0
+            if live.any():
+                share = np.linalg.norm((plain + slope)[live], axis=1) / bare[live]
+                mean = float(np.log(np.maximum(share, 1e-3)).sum()) / len(bare)
+                if mean < np.log(_LEAST_SLOPE):
+                    return np.full(self.n_q, -np.inf)
+                found[axis] += self.p.independent[axis] * mean
+        return found
+
+    def cost(self, keys: Sequence[Key]) -> float:
+        """Negative log evidence of a set, nats."""
+        return self.solve(keys).cost
+
+    # --- all candidates beside a set -------------------------------------------------------------
+
+    def gains(self, keys: Sequence[Key]) -> Array:
+        """What each place of the grid would take off the cost beside a set, at its weights."""
+        known, p, nb = self.solve(keys), self.p, self.bb.shape[1]
+        pinned = [k for name, _ in keys if name[0] == "-" for k in p.absence[name[1:]]]
+        keys = added(tuple(sorted(keys)))
+        weight = p.independent / np.maximum(known.scale * p.count, 1e-300)
+        parts = [self._products(key) for key in keys]
+        widths = [self.atoms[key].width for key in keys]
+        at = np.concatenate([[nb], nb + np.cumsum(widths)]).astype(int)
+        n = int(at[-1])
+        normal = np.zeros((n, n))
+        cross, moment = np.zeros((n, self.m)), np.zeros(self.m)
+        normal[:nb, :nb] = np.tensordot(weight, self.bb, 1) + p.precision
+        for axis in range(self.n_q):
+            w, cols = weight[axis], self.at[axis]
+            cross[:nb, cols] += w * self.xb[axis]
+            moment[cols] -= w * self.xy[axis]
+            here = [(k, part[axis]) for k, part in enumerate(parts) if axis in part]
+            for place, (k, (x, xb, _)) in enumerate(here):
+                i = slice(at[k], at[k + 1])
+                normal[:nb, i] += w * xb
+                normal[i, :nb] += w * xb.T
+                cross[i, cols] += w * (x.T @ self.columns[axis])
+                for j, (other, _, _) in here[: place + 1]:
+                    block = w * (x.T @ other)
+                    normal[i, at[j] : at[j + 1]] += block
+                    if j != k:
+                        normal[at[j] : at[j + 1], i] += block.T
+        # As the set has been solved within bounds, from there.
+        b = np.concatenate([known.base, *known.strengths])
+        moment = moment - cross.T @ b
+        free = hold_parameters(p.to_parameters, dict.fromkeys(pinned, 0.0), n)[1]
+        taken = free @ solve_scaled(free.T @ normal @ free, free.T @ cross)
+        widest = self.own.shape[2]
+        place = self.first[:, None] + np.minimum(np.arange(widest), self.widths[:, None] - 1)
+        valid = np.arange(widest) < self.widths[:, None]
+        block = np.tensordot(weight, self.own, 1)
+        c, t = cross.T[place], taken.T[place]
+        block = block - c @ t.transpose(0, 2, 1)
+        mom = np.where(valid, moment[place], 0.0)
+        low, high = self.low[place], self.high[place]
+        own = np.einsum("kww->kw", np.tensordot(weight, self.own, 1))
+        active = valid & (np.einsum("kww->kw", block) > 1e-6 * own)
+        gain = np.zeros(len(self.places))
+        for _ in range(widest + 1):
+            masked = block * (active[:, :, None] & active[:, None, :])
+            diagonal = np.einsum("kww->kw", masked)
+            scale = np.where(active, 1.0 / np.sqrt(np.maximum(diagonal, 1e-300)), 0.0)
+            system = (
+                masked * scale[:, :, None] * scale[:, None, :]
+                + np.eye(widest) * np.where(active, 1e-9, 1.0)[:, :, None]
+            )
+            x = (
+                np.linalg.solve(system, (np.where(active, mom, 0.0) * scale)[:, :, None])[:, :, 0]
+                * scale
+            )
+            out = active & (
+                (x < np.minimum(low, 0.0) - 1e-12)
+                | (x > np.maximum(high, 0.0) + 1e-12)
+                | ((x < 0) & (low >= 0))
+                | ((x > 0) & (high <= 0))
+            )
+            gain = 0.5 * np.einsum("kw,kw->k", np.where(active, mom, 0.0), x)
+            if not out.any():
+                break
+            active &= ~out
+        return gain
+
+    def best_beside(
+        self, keys: Sequence[Key], most: int, shapes: int = 2
+    ) -> list[tuple[float, Key]]:
+        """Cost of a set with each candidate added, best first, of those that promise most."""
+        if not np.isfinite(self.cost(keys)):
+            return []
+        gains, have = self.gains(keys), {name.removeprefix("-") for name, _ in keys}
+        tried: dict[str, int] = {}
+        best: dict[str, tuple[float, Key]] = {}
+        for k in np.argsort(-gains):
+            key = self.places[k]
+            name = key[0]
+            if (
+                name in have
+                or tried.get(name, 0) >= shapes
+                or (name not in tried and len(tried) >= most)
+            ):
+                continue
+            tried[name] = tried.get(name, 0) + 1
+            cost = self.cost((*keys, key))
+            if np.isfinite(cost) and cost < best.get(name, (np.inf,))[0]:
+                best[name] = cost, key
+        return sorted(best.values())
+
+    # --- shapes ----------------------------------------------------------------------------------
+
+    def refine(self, sets: Sequence[tuple[Key, ...]], rounds: int) -> list[tuple[Key, ...]]:
+        """Move the shapes of sets to where their cost is least: Gauss-Newton on all at once."""
+        current = [tuple(sorted(s)) for s in sets]
+        moving = [any(shape for _, shape in s) for s in current]
+        for _ in range(rounds):
+            wanted = [k for s, m in zip(current, moving, strict=True) if m for k in added(s)]
+            self.ensure(k for key in wanted for k in _neighbours(key))
+            proposed = [self._step(s) if m else None for s, m in zip(current, moving, strict=True)]
+            trials = [
+                list(_shares(s, to)) if to is not None else []
+                for s, to in zip(current, proposed, strict=True)
+            ]
+            self.ensure(key for each in trials for one in each[:1] for key in added(one))
+            for i, each in enumerate(trials):
+                before = self.cost(current[i]) if moving[i] else 0.0
+                moved = False
+                for one in each:
+                    self.ensure(added(one))
+                    cost = self.cost(one)
+                    if cost < before - 0.02:
+                        current[i], moved = tuple(sorted(one)), True
+                        moving[i] = cost < before - 0.3
+                        break
+                moving[i] &= moved
+            if not any(moving):
+                break
+        return current
+
+    def _step(self, keys: tuple[Key, ...]) -> tuple[Key, ...] | None:
+        """Where a linear step in all shapes leads."""
+        found, all_keys = self.solve(keys), keys
+        keys = added(keys)
+        if not np.isfinite(found.cost):
+            return None
+        slopes = self.shape_slopes(keys, found.strengths)
+        if slopes is None:
+            return None
+        count = sum(len(shape) for _, shape in keys)
+        more = {a: c * self.p.likelihood.root[a][:, None] for a, c in slopes.items()}
+        solved = self._solve_with_shapes(keys, more, found)
+        if solved is None:
+            return None
+        moved, place = [], 0
+        for name, shape in keys:
+            step = np.clip(solved[place : place + len(shape)], -_FARTHEST, _FARTHEST)
+            place += len(shape)
+            moved.append(
+                (
+                    name,
+                    tuple(
+                        float(np.clip(u + d, 0.0, 1.0)) for u, d in zip(shape, step, strict=True)
+                    ),
+                )
+            )
+        assert place == count
+        return (*(key for key in all_keys if key[0][0] == "-"), *moved)
+
+    def _solve_with_shapes(
+        self, keys: tuple[Key, ...], more: Mapping[int, Array], known: Solution
+    ) -> Array | None:
+        """Steps of the shapes, (d,), strengths and the model's own parameters moving along."""
+        extra = next(iter(more.values())).shape[1]
+        p, nb = self.p, self.bb.shape[1]
+        parts = [self._products(key) for key in keys]
+        weight = p.independent / np.maximum(known.scale * p.count, 1e-300)
+        widths = [self.atoms[key].width for key in keys]
+        at = np.concatenate([[nb], nb + np.cumsum(widths)]).astype(int)
+        n = int(at[-1]) + extra
+        normal, right = np.zeros((n, n)), np.zeros(n)
+        normal[:nb, :nb] = p.precision
+        b = np.concatenate([known.base, *known.strengths])
+        right[:nb] = p.moment - p.precision @ known.base
+        normal[range(n - extra, n), range(n - extra, n)] = 1.0 / _FARTHEST**2
+        for axis in range(self.n_q):
+            x = np.concatenate(
+                [p.base[axis]]
+                + [
+                    part[axis][0] if axis in part else np.zeros((len(p.y[axis]), w))
+                    for part, w in zip(parts, widths, strict=True)
+                ]
+                + [more[axis] if axis in more else np.zeros((len(p.y[axis]), extra))],
+                axis=1,
+            )
+            left = p.y[axis] + x[:, : n - extra] @ b
+            normal += weight[axis] * (x.T @ x)
+            right -= weight[axis] * (x.T @ left)
+        return solve_scaled(normal, right)[n - extra :]
+
+    def shape_slopes(
+        self, keys: Sequence[Key], strengths: Sequence[Array]
+    ) -> dict[int, Array] | None:
+        """Slopes of what a set adds by each of its shapes, by axis, (n, d), unweighted."""
+        total = sum(len(shape) for _, shape in keys)
+        found: dict[int, Array] = {}
+        place = 0
+        for key, b in zip(keys, strengths, strict=True):
+            here = self.atoms[key]
+            for other in _neighbours(key):
+                there = self.atoms.get(other)
+                j = _which(key, other)
+                if there is None or here is None:
+                    return None
+                step = other[1][j] - key[1][j]
+                for axis in {*here.columns, *there.columns}:
+                    x = (there.columns[axis] @ b if axis in there.columns else 0.0) - (
+                        here.columns[axis] @ b if axis in here.columns else 0.0
+                    )
+                    block = found.setdefault(axis, np.zeros((len(self.p.y[axis]), total)))
+                    block[:, place + j] = x / step
+            place += len(key[1])
+        return found
+
+    def without_one(self, keys: tuple[Key, ...]) -> list[tuple[Key, ...]]:
+        """A set without each of its members, and without each effect of the model itself."""
+        less = [keys[:i] + keys[i + 1 :] for i, key in enumerate(keys) if key[0][0] != "-"]
+        gone = {name for name, _ in keys}
+        return less + [
+            tuple(sorted((*keys, (f"-{name}", ()))))
+            for name in self.p.absence
+            if f"-{name}" not in gone
+        ]
+
+    # --- sets ------------------------------------------------------------------------------------
+
+    def keep(self, pool: Pool, keys: tuple[Key, ...]) -> None:
+        """Enter a set into a pool unless the same effects are there with better shapes."""
+        cost, known = self.cost(keys), pool.get(names(keys))
+        if np.isfinite(cost) and (known is None or cost < known[0]):
+            pool[names(keys)] = cost, tuple(sorted(keys))
+
+    def swaps(self, keys: tuple[Key, ...], pool: Pool) -> list[tuple[Key, ...]]:
+        """The best sets with another effect in the place of one, that are not in ``pool`` yet."""
+        found = [
+            (cost, tuple(sorted((*rest, key))))
+            for rest in self.without_one(keys)
+            for cost, key in self.best_beside(rest, _PROMISING)[:_SWAPPED]
+        ]
+        fresh = [swap for _, swap in sorted(found) if names(swap) not in pool]
+        return fresh[: self.criteria.beam]
+
+    def beam(self, most: int) -> Iterator[list[tuple[float, tuple[Key, ...]]]]:
+        """Best sets of 1, 2, ... ``most`` effects: lists of cost and set, best first."""
+        wide, beam = self.criteria.beam, [(self.cost(()), ())]
+        for _ in range(most):
+            grown: Pool = {}
+            for _, keys in beam:
+                for _, key in self.best_beside(keys, _BESIDE):
+                    self.keep(grown, (*keys, key))
+            if not grown:
+                return
+            pool: Pool = {}
+            for keys in self.refine([keys for _, keys in sorted(grown.values())[:wide]], 2):
+                self.keep(pool, keys)
+            for _ in range(_SWAPS):
+                lead = min(pool.values())[1]
+                for rest in self.without_one(lead):
+                    self.keep(pool, rest)
+                swaps = self.swaps(lead, pool)
+                for keys in self.refine(swaps, 2):
+                    self.keep(pool, keys)
+                if min(pool.values())[1] == lead:
+                    break
+            for keys in self.refine([keys for _, keys in sorted(pool.values())[:_POLISHED]], 4):
+                self.keep(pool, keys)
+            beam = sorted(pool.values())[:wide]
+            yield beam
+
+
+_STRENGTH = 4.0
+"""The same of a strength."""
+_A_SHAPE = 2.5
+"""Half the logarithm of the information on a shape over its range, as it comes out on the whole."""
+
+
+def added(keys: Sequence[Key]) -> tuple[Key, ...]:
+    """The effects of a set that the model does not have; ``-name`` takes one of its own away."""
+    return tuple(key for key in keys if key[0][0] != "-")
+
+
+def gone(keys: Sequence[Key]) -> set[str]:
+    """The effects of the model that a set takes away."""
+    return {name[1:] for name, _ in keys if name[0] == "-"}
+
+
+def names(keys: Sequence[Key]) -> tuple[str, ...]:
+    """The effects of a set, in order."""
+    return tuple(sorted(name for name, _ in keys))
+
+
+def _neighbours(key: Key) -> list[Key]:
+    """A candidate with each of its shapes a little on, towards the middle of its range."""
+    name, shape = key
+    found = []
+    for j, u in enumerate(shape):
+        moved = u + (_STEP if u <= 0.5 else -_STEP)
+        found.append((name, (*shape[:j], moved, *shape[j + 1 :])))
+    return found
+
+
+def _which(key: Key, other: Key) -> int:
+    return next(j for j, (a, b) in enumerate(zip(key[1], other[1], strict=True)) if a != b)
+
+
+def _shares(keys: tuple[Key, ...], to: tuple[Key, ...]) -> Iterator[tuple[Key, ...]]:
+    """The whole way to a proposed set, a third, and a tenth of it."""
+    aims = dict(to)
+    for share in (1.0, 0.35, 0.1):
+        yield tuple(
+            (name, tuple(u + share * (v - u) for u, v in zip(shape, aims[name], strict=True)))
+            for name, shape in keys
+        )
+
+
+def _schur(normal: Array, nb: int) -> Array:
+    """Information on the strengths once the model's own parameters have moved along."""
+    cross = normal[:nb, nb:]
+    return np.asarray(normal[nb:, nb:] - cross.T @ solve_scaled(normal[:nb, :nb], cross))

@@ -1,0 +1,251 @@
+"""The selection of effects: search, fit what was found, and search again from there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.diagnosis.dictionary import Atom, Dictionary, Key
+from bampipe.diagnosis.ranges import MachineScale
+from bampipe.diagnosis.search import Pool, Search, added, gone, names
+from bampipe.diagnosis.session import (
+    Fit,
+    Session,
+    candidates_of,
+    shared,
+    system_of,
+    without_members,
+    workers,
+)
+from bampipe.physics.recipe import Recipe
+
+Array = NDArray[np.float64]
+Progress = Callable[[float, str], None]
+"""Called with a fraction of the work done and what is being done."""
+
+_MOST_ROUNDS = 8
+_PARTS = 8
+"""Tasks a process into which columns are divided: one candidate may take as long as ten others."""
+_MINOR = 0.05
+"""Share of the gain of a set that the next effect must bring to be added before the set is fitted:
+linearised far from the truth, a model leaves more than that."""
+_WORTH = 0.5
+"""Fall of the cost, nats, that makes another set worth fitting."""
+_DEEP = 3
+"""Effects added at once beside a set that has been fitted."""
+
+
+@dataclass(frozen=True)
+class Selection:
+    """What a search came to.
+
+    Attributes:
+        initial: the model as given, fitted; final: with the set that is most probable.
+        alternatives: sets near it with their log evidence against it, nats, itself first at 0.
+        gains: log evidence of the model as given with each single effect, nats, by effect.
+        steps: the sets that were fitted, in order.
+        cut_short: whether more effects were wanted than may be added.
+        search: over sets beside the final model.
+    """
+
+    initial: Fit
+    final: Fit
+    alternatives: tuple[Alternative, ...]
+    gains: dict[str, float]
+    steps: tuple[Fit, ...]
+    cut_short: bool
+    search: Search
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """A set of effects beside the most probable one.
+
+    Attributes:
+        effects: of the model, beyond those of the model as given.
+        log_evidence: over that of the most probable set, nats.
+        recipe, start: the model, and where its fit starts.
+    """
+
+    effects: tuple[str, ...]
+    log_evidence: float
+    recipe: Recipe
+    start: Array
+
+
+@contextmanager
+def open_search(
+    session: Session, fit: Fit, without: Collection[str] = (), known: Search | None = None
+) -> Iterator[Search]:
+    """A search over the candidates beside a fitted model, its columns made by several processes.
+
+    Args:
+        session: the trials; fit: the model; without: effects that are not weighed.
+        known: a search beside another model, of which columns that are the same are taken.
+    """
+    wanted = session.candidate_names(fit.recipe, without)
+    candidates = {c.name: c for c in candidates_of(fit.recipe, wanted)}
+    # The shapes of a candidate are shares of its range, so that this must stay.
+    scale = known.dictionary.scale if known else MachineScale.of_trials(fit.evidence)
+    dictionary = Dictionary(fit.evidence, fit.likelihood.samples, candidates, scale)
+    with workers(dictionary, session.jobs) as spread:
+
+        def make(keys: Sequence[Key]) -> Iterable[tuple[Key, Atom | None]]:
+            parts = min(len(keys), _PARTS * session.jobs)
+            if session.jobs <= 1 or parts < 2:
+                return dictionary.make_all(keys)
+            made = spread(_make_columns, [keys[k::parts] for k in range(parts)])
+            return [pair for part in made for pair in part]
+
+        yield Search(fit.problem, dictionary, make, session.criteria, _reusable(known, dictionary))
+
+
+def _make_columns(keys: Sequence[Key]) -> list[tuple[Key, Atom | None]]:
+    dictionary: Dictionary = shared()
+    return dictionary.make_all(keys)
+
+
+def _reusable(known: Search | None, dictionary: Dictionary) -> dict[Key, Atom | None]:
+    """Columns that are the same beside another model: of effects that do not act on its effects."""
+    if known is None or known.dictionary.evidence.system.moves_sensors:
+        return {}
+    if dictionary.evidence.system.moves_sensors:
+        return {}
+    same = {
+        name
+        for name, item in dictionary.candidates.items()
+        if known.dictionary.candidates.get(name) is item
+    }
+    return {key: atom for key, atom in known.atoms.items() if key[0] in same}
+
+
+def select_effects(
+    session: Session,
+    recipe: Recipe,
+    start: Array,
+    without: Collection[str] = (),
+    progress: Progress = lambda fraction, message: None,
+) -> Selection:
+    """Find the set of effects that is most probable beside a model.
+
+    Args:
+        session: the trials; recipe: the model; start: its parameters, (n_p,).
+        without: effects that are not weighed.
+        progress: called with a fraction and a message.
+
+    Raises:
+        Runaway: the model as given cannot be replayed.
+    """
+    progress(0.0, "replaying the model")
+    initial = current = session.fit(recipe, start)
+    steps, tried = [current], {frozenset(recipe.effects)}
+    gains: dict[str, float] = {}
+    known: Search | None = None
+    cut_short = False
+    for number in range(_MOST_ROUNDS):
+        progress(0.1 + 0.1 * number, "weighing sets of effects")
+        with open_search(session, current, without, known) as search:
+            known = search
+            none = search.cost(())
+            if not gains:
+                beside = search.best_beside((), len(search.dictionary.candidates))
+                gains = {key[0]: none - cost for cost, key in beside}
+            room = session.criteria.most_effects - len(current.recipe.effects) + len(recipe.effects)
+            pool = _explore(search, room, deep=room if number == 0 else min(_DEEP, room))
+            moved = None
+            for cost, keys in sorted(pool.values()):
+                wider = change_set(current.recipe, keys)
+                if cost > none - _WORTH or frozenset(wider.effects) in tried:
+                    continue
+                tried.add(frozenset(wider.effects))
+                progress(0.15 + 0.1 * number, f"fitting {', '.join(names(keys))}")
+                moved = session.try_fit(wider, start_of(search, keys, wider))
+                if moved is not None:
+                    break
+            if moved is None:
+                cut_short = room <= 0
+                return Selection(
+                    initial, current, _alternatives(search, pool, current, recipe),
+                    gains, tuple(steps), cut_short, search,
+                )  # fmt: skip
+        current = moved
+        steps.append(current)
+    raise RuntimeError("the search did not settle")
+
+
+def _explore(search: Search, room: int, deep: int) -> Pool:
+    """Sets near the fitted one: without a member, with another in its place, and with more."""
+    pool: Pool = {}
+    search.keep(pool, ())
+    lead = search.cost(())
+    for rest in search.without_one(()):
+        search.keep(pool, rest)
+    for keys in search.refine(search.swaps((), pool), 2):
+        search.keep(pool, keys)
+    for beam in search.beam(deep):
+        for _, keys in beam:
+            search.keep(pool, keys)
+        best = min(cost for cost, _ in beam)
+        gained, total = lead - best, search.cost(()) - best
+        if gained < _WORTH or gained < _MINOR * total:
+            # What is minor beside the rest is weighed once that has been fitted.
+            if gained > 0.0 and gained < total:
+                largest = max(len(keys) for _, keys in beam)
+                for name in [n for n, (_, keys) in pool.items() if len(keys) >= largest]:
+                    del pool[name]
+            break
+        lead = best
+    return pool
+
+
+def change_set(recipe: Recipe, keys: Sequence[Key]) -> Recipe:
+    """The model of ``recipe`` with the changes of a set."""
+    return without_members(recipe, gone(keys), [name for name, _ in added(keys)])
+
+
+def start_of(search: Search, keys: Sequence[Key], wider: Recipe) -> Array:
+    """Parameters of a changed model from the solution of its linear problem, (n_p,)."""
+    evidence, solution = search.dictionary.evidence, search.solve(keys)
+    known = {q.name: v for q, v in zip(evidence.system.parameters, evidence.p, strict=True)}
+    change = search.p.to_parameters @ solution.base
+    for place, number in enumerate(evidence.free):
+        known[evidence.system.parameters[number].name] += change[place]
+    for key, strength in zip(added(tuple(sorted(keys))), solution.strengths, strict=True):
+        item = search.dictionary.candidates[key[0]]
+        values = search.dictionary.values(key)
+        known |= {
+            item.parameters[i].name: v for i, v in zip(item.searched_indices, values, strict=True)
+        }
+        known |= {
+            item.parameters[i].name: v
+            for i, v in zip(item.linear_indices, strength, strict=False)
+        }
+    system = system_of(wider)
+    start = np.array([known.get(q.name, q.prior) for q in system.parameters])
+    return np.clip(
+        start, [q.lower for q in system.parameters], [q.upper for q in system.parameters]
+    )
+
+
+_NEAR = 14.0
+"""Log evidence below the best, nats, beyond which a set is no alternative: one in a million."""
+_MOST_ALTERNATIVES = 12
+
+
+def _alternatives(
+    search: Search, pool: Pool, current: Fit, given: Recipe
+) -> tuple[Alternative, ...]:
+    none, found = search.cost(()), []
+    for cost, keys in sorted(pool.values())[: 4 * _MOST_ALTERNATIVES]:
+        if cost - none > _NEAR or not keys:
+            continue
+        wider = change_set(current.recipe, keys)
+        effects = tuple(e for e in wider.effects if e not in given.effects)
+        found.append(Alternative(effects, none - cost, wider, start_of(search, keys, wider)))
+    own = tuple(e for e in current.recipe.effects if e not in given.effects)
+    first = Alternative(own, 0.0, current.recipe, current.evidence.p)
+    return (first, *found[: _MOST_ALTERNATIVES - 1])

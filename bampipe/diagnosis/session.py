@@ -1,0 +1,258 @@
+"""The trials of a session, models fitted to them under the likelihood, and replays of those."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.diagnosis.candidates import (
+    Candidate,
+    build_candidate_model,
+    compile_candidate,
+    list_candidates,
+)
+from bampipe.diagnosis.criteria import Criteria
+from bampipe.estimate.simulation import Runaway
+from bampipe.physics import System, compile_model
+from bampipe.physics.recipe import Recipe
+from bampipe.physics.registry import effect_from
+from bampipe.trials.evidence import Evidence, gather_evidence
+from bampipe.trials.folds import HELD_OUT
+from bampipe.trials.likelihood import (
+    Likelihood,
+    Noise,
+    Problem,
+    describe_noise,
+    lay_out_samples,
+)
+from bampipe.trials.measured import MeasuredTrials
+from bampipe.trials.motion import Motion
+from bampipe.trials.replay import StandIn, keep_motion, replay_motions
+from bampipe.trials.residuals import ModelOnTrial
+from bampipe.workers import process_pool
+
+Array = NDArray[np.float64]
+Task = TypeVar("Task")
+Returned = TypeVar("Returned")
+
+_STEPS = 8
+_SHARES = (1.0, 0.3, 0.1)
+_CONVERGED = 0.2
+"""Fall of the negative log likelihood, nats, below which a fit ends."""
+_STOPPING_WIDTH = 0.125
+"""Sign width, times the device's, of the replay whose friction stops it: a 32nd leaves the same."""
+_SEED = 7
+"""First number, after the user's, of the seeds of replicates."""
+
+_systems: dict[str, System] = {}
+_candidates: dict[str, Candidate] = {}
+"""By `Model.key`: compiled once a process for each content."""
+
+
+def system_of(recipe: Recipe) -> System:
+    """The compiled model of a recipe."""
+    model = recipe.model()
+    if model.key not in _systems:
+        _systems[model.key] = compile_model(model)
+    return _systems[model.key]
+
+
+def candidates_of(recipe: Recipe, names: Sequence[str]) -> list[Candidate]:
+    """Candidates by name, for a model that has the effects of ``recipe``."""
+    device, extra = recipe.model().device, [effect_from(e) for e in recipe.extra]
+    out = []
+    for name in names:
+        model = build_candidate_model(device, name, extra, recipe.effects)
+        if model.key not in _candidates:
+            _candidates[model.key] = compile_candidate(model)
+        out.append(_candidates[model.key])
+    return out
+
+
+_shared: Any = None
+"""In a worker process: what its tasks are about, inherited from the process that started it."""
+
+
+def _share(state: object) -> None:
+    global _shared
+    _shared = state
+
+
+def shared() -> Any:
+    """What the tasks of this worker process are about."""
+    return _shared
+
+
+@contextmanager
+def workers(state: object, jobs: int) -> Iterator[Callable[..., Iterator[Any]]]:
+    """A `map` over processes that inherit ``state``, for `shared` to return."""
+    _share(state)
+    try:
+        if jobs <= 1:
+            yield map
+            return
+        with process_pool(jobs, _share, state) as pool:
+            yield pool.map
+    finally:
+        _share(None)
+
+
+@dataclass(frozen=True)
+class Session:
+    """What every step of a diagnosis works with.
+
+    Attributes:
+        trials: the measured trials.
+        criteria: what it takes for an effect to be called missing.
+        jobs: worker processes; seed: of the noise of replicates.
+    """
+
+    trials: MeasuredTrials
+    criteria: Criteria
+    jobs: int = 1
+    seed: int = 0
+
+    def candidate_names(self, recipe: Recipe, without: Collection[str] = ()) -> tuple[str, ...]:
+        """Effects that the model of ``recipe`` could have and has not."""
+        extra = [effect_from(e) for e in recipe.extra]
+        return list_candidates(recipe.model().device, (*recipe.effects, *without), extra)
+
+    def linearise(self, recipe: Recipe, p: Array, like: Evidence | None = None) -> Evidence:
+        """The model of ``recipe`` at parameters ``p``, (n_p,), on the trials that choose a model."""
+        t = self.trials
+        found = gather_evidence(
+            system_of(recipe), t.motions, t.band, p, t.folds,
+            most_iterations=0, timing=t.timing,
+            like=like,
+        )  # fmt: skip
+        kept = [k for k, group in enumerate(t.folds.groups) if group != HELD_OUT]
+        return found if len(kept) == len(t.motions) else found.subset(kept)
+
+    def replay(self, evidence: Evidence, p: Array, count: int, first: int = 0) -> list[list[Array]]:
+        """Residuals of a model on replays of itself, by trial, each (K, n_q).
+
+        Args:
+            evidence: the model on the measured trials; p: parameters that are replayed, (n_p,).
+            count: of replays, numbered from ``first`` on.
+
+        Raises:
+            Runaway: the simulated motion grows without bounds.
+        """
+        stand_in = StandIn(evidence.system, p, evidence.motions, self.trials.sensors.rate_hz)
+        for trial in range(len(evidence.motions)):
+            stand_in.courses[trial]  # once, before the workers inherit it
+        seeds = [(self.seed, _SEED, k) for k in range(first, first + count)]
+        with workers((self.trials, evidence, stand_in), min(self.jobs, count)) as spread:
+            return list(spread(_residuals_of_replay, seeds))
+
+    def replay_stopping(self, recipe: Recipe, evidence: Evidence) -> list[Array]:
+        """Residual of a model on a replay without noise whose friction truly stops it, by trial.
+
+        How abruptly a machine stops no log says. Zero where the motion is given, and where such a
+        replay runs away.
+        """
+        t, nothing = self.trials, [np.zeros_like(r) for r in evidence.residual]
+        if keep_motion(evidence.fitted):
+            return nothing
+        none = np.zeros(len(evidence.system.coordinates))
+        exact = replace(
+            t.sensors, resolution=none, reading_sd=none, force_sd=np.zeros_like(t.sensors.force_sd)
+        )
+        narrow = system_of(recipe.with_sign_widths(_STOPPING_WIDTH))
+        try:
+            stand_in = StandIn(narrow, evidence.p, evidence.motions, t.sensors.rate_hz)
+            replays = replay_motions(stand_in, exact, t.kinematics, (self.seed,), alone=True)
+        except Runaway:
+            return nothing
+        return residuals_of(evidence, replays)
+
+    def fit(self, recipe: Recipe, start: Array, noise: Noise | None = None) -> Fit:
+        """Fit a model under the likelihood, with noise by replays of itself.
+
+        Args:
+            recipe: the model; start: parameters to start from, (n_p,).
+            noise: by replays of another model; by default of this one, at ``start``.
+
+        Raises:
+            Runaway: the simulated motion grows without bounds.
+        """
+        evidence = self.linearise(recipe, start)
+        c = self.criteria
+        samples = lay_out_samples(evidence, c.block_s)
+        if noise is None:
+            replays = self.replay(evidence, evidence.p, c.replicates)
+            stopping = self.replay_stopping(recipe, evidence)
+            noise = describe_noise(replays, stopping, evidence, samples)
+        likelihood = Likelihood.of(evidence, samples, noise, c.bias_error, c.discrepancy)
+        problem = likelihood.pose(evidence)
+        solved = problem.solve()
+        for _ in range(_STEPS):
+            step = problem.to_parameters @ solved.base
+            for share in _SHARES:
+                p = evidence.p.copy()
+                p[list(evidence.free)] += share * step[: len(evidence.free)]
+                moved = self.linearise(recipe, np.clip(p, *_bounds(evidence.system)), evidence)
+                tried = likelihood.pose(moved)
+                cost = tried.solve()
+                if cost.cost < solved.cost + _CONVERGED:
+                    break
+            else:
+                break
+            fall = solved.cost - cost.cost
+            evidence, problem, solved = moved, tried, cost
+            if fall < _CONVERGED:
+                break
+        return Fit(recipe, evidence, likelihood, problem)
+
+    def try_fit(self, recipe: Recipe, start: Array) -> Fit | None:
+        """`fit`; None where the model cannot be replayed."""
+        try:
+            return self.fit(recipe, start)
+        except Runaway:
+            return None
+
+
+def _bounds(system: System) -> tuple[Array, Array]:
+    return (
+        np.array([q.lower for q in system.parameters]),
+        np.array([q.upper for q in system.parameters]),
+    )
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A model fitted under the likelihood.
+
+    Attributes:
+        recipe: the model; evidence: its residual and slopes there.
+        likelihood: noise and weights; problem: the weighted linear problem.
+    """
+
+    recipe: Recipe
+    evidence: Evidence
+    likelihood: Likelihood
+    problem: Problem
+
+
+def _residuals_of_replay(seed: tuple[int, ...]) -> list[Array]:
+    trials, evidence, stand_in = shared()
+    replays = replay_motions(stand_in, trials.sensors, trials.kinematics, seed, alone=True)
+    return residuals_of(evidence, replays)
+
+
+def residuals_of(evidence: Evidence, replays: Sequence[Motion]) -> list[Array]:
+    """The residual of a model on replays of its trials, by trial, each (K, n_q)."""
+    e = evidence
+    rows = [ModelOnTrial(e.system, e.p, replays, k).residual for k in range(len(replays))]
+    thin = e.band.thin_trials(rows, range(len(e.system.coordinates)))
+    return [values * used for values, used in zip(thin, e.used, strict=True)]
+
+
+def without_members(recipe: Recipe, gone: Collection[str], more: Sequence[str] = ()) -> Recipe:
+    """The model without some of its effects, and with others."""
+    return replace(recipe, effects=(*(e for e in recipe.effects if e not in gone), *more))

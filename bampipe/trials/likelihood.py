@@ -1,0 +1,410 @@
+"""The likelihood of what was measured, given a model: the one by which everything is judged.
+
+Of the samples of an axis that count, in the words of docs/method:
+
+    y = f(motion; theta) + beta b + gamma c + e,   var e = s^2 (v(z) + (tau b)^2 + (delta F)^2)
+
+y is what the fitted model leaves, low-passed; b the mean of replays of the model (what filters do
+to its residual where friction turns, which the measurement shares); c the residual of a replay whose
+friction truly stops the machine where it turns; v what single replays leave around b, by speed; F
+the applied force; s a scale of each axis, which is found with the rest. Parameters have their priors
+and bounds; so have the nuisance parameters: the factors beta and gamma of each axis, and the time by
+which inputs were sampled late.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.physics.effect import BoundEffect
+from bampipe.trials.evidence import Evidence
+from bampipe.trials.motion import Motion
+
+Array = NDArray[np.float64]
+
+_SPEEDS = 12
+"""Classes of speed in which the variance of replays is averaged, finer where an axis is slow."""
+_LEAST = 1e-3
+"""Of the mean variance: no sample weighs more than a thousand average ones."""
+_DETERMINED = 1e-9
+"""Of the largest eigenvalue of the scaled normal equations, below which a direction of the model's
+own parameters is not determined by the trials, and stays."""
+_MOST_STOPPING = 1.5
+"""Largest factor of the residual of a replay that truly stops."""
+_RIDGE = 1e-10
+_PASSES, _REWEIGHTS = 8, 5
+_STEADY = 0.02
+"""Relative change of the weights up to which they are done: the cost changes by its square."""
+
+
+@dataclass(frozen=True)
+class Samples:
+    """The samples of one axis that count, of all trials in order.
+
+    Attributes:
+        rows: their places among the thinned samples of all trials, (n,).
+        trial: number of the trial of each; block: of the stretch of time, both (n,).
+        independent: how many independent ones they are.
+    """
+
+    rows: NDArray[np.int64]
+    trial: NDArray[np.int64]
+    block: NDArray[np.int64]
+    independent: float
+
+
+def lay_out_samples(evidence: Evidence, block_s: float) -> tuple[Samples, ...]:
+    """Return the samples of each axis that count; blocks of ``block_s`` seconds are numbered."""
+    band, sizes = evidence.band, [len(r) for r in evidence.residual]
+    trial = np.repeat(np.arange(len(sizes)), sizes)
+    seconds = np.concatenate([np.arange(n) * band.step / band.rate_hz for n in sizes])
+    within = np.floor(seconds / block_s).astype(np.int64)
+    block = np.unique(trial * (within.max() + 1) + within, return_inverse=True)[1]
+    used = np.concatenate(evidence.used)
+    found = []
+    for axis, share in enumerate(band.independent_share):
+        rows = np.flatnonzero(used[:, axis])
+        found.append(Samples(rows, trial[rows], block[rows], float(share) * rows.size))
+    return tuple(found)
+
+
+def take_samples(values: Sequence[Array], samples: Samples, axis: int) -> Array:
+    """Return the rows of one axis, (n,) or (n, m), of values by trial, each (K, n_q[, m])."""
+    return np.concatenate([v[:, axis] for v in values])[samples.rows]
+
+
+@dataclass(frozen=True)
+class Noise:
+    """What replays of a fitted model leave, which lacks nothing.
+
+    Attributes:
+        bias: their mean at each sample, by axis, each (n,), N.m or N.
+        variance: of what single replays leave around it, smoothed by speed, each (n,).
+        stopping: of a replay without noise whose friction truly stops it, each (n,).
+        residuals: of each replay, by axis, each (replays, n).
+    """
+
+    bias: tuple[Array, ...]
+    variance: tuple[Array, ...]
+    stopping: tuple[Array, ...]
+    residuals: tuple[Array, ...]
+
+    def without(self, replay: int) -> tuple[Array, ...]:
+        """The bias by all replays but one."""
+        n = len(self.residuals[0])
+        return tuple(
+            (n * b - r[replay]) / (n - 1) for b, r in zip(self.bias, self.residuals, strict=True)
+        )
+
+
+def describe_noise(
+    residuals: Sequence[Sequence[Array]],
+    stopping: Sequence[Array],
+    evidence: Evidence,
+    samples: Sequence[Samples],
+) -> Noise:
+    """Return the noise that replays show.
+
+    Args:
+        residuals: of each replay, by trial, each (K, n_q).
+        stopping: the same of a replay whose friction truly stops it.
+        evidence: the model on the measured trials; samples: of it that count.
+    """
+    speeds = _by_row(evidence, lambda motion, kept: np.abs(motion.qd[kept]))
+    biases, variances, by_axis = [], [], []
+    for axis, here in enumerate(samples):
+        left = np.array([take_samples(r, here, axis) for r in residuals])
+        around = left.var(axis=0, ddof=1)
+        speed = take_samples(speeds, here, axis)
+        shares = np.linspace(0.0, 1.0, _SPEEDS + 1)[1:-1] ** 2
+        at = np.searchsorted(np.quantile(speed, shares), speed) if speed.size else np.zeros(0, int)
+        count = np.maximum(np.bincount(at, minlength=_SPEEDS), 1)
+        biases.append(left.mean(axis=0))
+        variances.append((np.bincount(at, around, minlength=_SPEEDS) / count)[at])
+        by_axis.append(left)
+    stops = tuple(take_samples(stopping, here, axis) for axis, here in enumerate(samples))
+    return Noise(tuple(biases), tuple(variances), stops, tuple(by_axis))
+
+
+def _by_row(
+    evidence: Evidence, values: Callable[[Motion, NDArray[np.int64]], Array]
+) -> list[Array]:
+    """Values of each trial at the thinned samples, (K, n_q)."""
+    band = evidence.band
+    return [values(m, band.thinned_rows(len(m.t))) for m in evidence.motions]
+
+
+@dataclass(frozen=True)
+class Likelihood:
+    """Weights of the samples of a session and the nuisance columns of its model.
+
+    Attributes:
+        samples: of each axis that count; noise: of replays.
+        root: one over the standard deviation of each sample, by axis, each (n,).
+        applied: the applied force, by axis, each (n,), N.m or N.
+        slopes: its derivative by each measured force, by axis, each (n, n_forces).
+    """
+
+    samples: tuple[Samples, ...]
+    noise: Noise
+    root: tuple[Array, ...]
+    applied: tuple[Array, ...]
+    slopes: tuple[Array, ...]
+
+    @classmethod
+    def of(
+        cls,
+        evidence: Evidence,
+        samples: tuple[Samples, ...],
+        noise: Noise,
+        bias_error: float,
+        discrepancy: float,
+    ) -> Likelihood:
+        """Weight samples by the noise of replays, the error of their bias, and that of any model."""
+        e, system = evidence, evidence.system
+        axes = range(len(samples))
+        applied = e.band.thin_trials([fitted.applied for fitted in e.fitted], axes)
+        plain = [
+            system.input_map(m.q[kept], m.inputs(system.inputs)[kept], e.p)
+            for m in e.motions
+            for kept in [e.band.thinned_rows(len(m.t))]
+        ]
+        root, force = [], []
+        for axis, here in enumerate(samples):
+            f = take_samples(applied, here, axis)
+            variance = (
+                noise.variance[axis] + (bias_error * noise.bias[axis]) ** 2 + (discrepancy * f) ** 2
+            )
+            least = _LEAST * float(variance.mean()) if variance.size else 0.0
+            root.append(1.0 / np.sqrt(np.maximum(variance, least) + 1e-300))
+            force.append(f)
+        return cls(
+            samples, noise, tuple(root),
+            tuple(force),
+            tuple(take_samples(plain, here, axis) for axis, here in enumerate(samples)),
+        )  # fmt: skip
+
+    def pose(
+        self,
+        evidence: Evidence,
+        residual: Sequence[Array] | None = None,
+        bias: Sequence[Array] | None = None,
+    ) -> Problem:
+        """Weight the residual of a model and join what is known of its parameters beforehand.
+
+        Args:
+            evidence: the model, linearised.
+            residual, bias: of a replay in place of the measured trials, by axis, each (n,).
+        """
+        y = residual or [
+            take_samples(evidence.residual, here, axis) for axis, here in enumerate(self.samples)
+        ]
+        return _pose(self, evidence, y, bias or self.noise.bias)
+
+
+@dataclass(frozen=True)
+class Problem:
+    """The samples of all axes in units of their noise: what is left, and the model's own columns.
+
+    Attributes:
+        likelihood: weights and samples.
+        y: by axis, (n,); base: by axis, (n, P), by the determined combinations of parameters.
+        precision, moment: of what is known of these beforehand, (P, P) and (P,).
+        to_parameters: (n_all, P) from these to the free parameters, nuisance parameters last.
+        lower, upper: bounds of the change of those, (n_all,).
+        absence: of each effect of the model, by the place of each of its strengths among the free
+            parameters, the change that takes it away.
+    """
+
+    likelihood: Likelihood
+    y: tuple[Array, ...]
+    base: tuple[Array, ...]
+    precision: Array
+    moment: Array
+    to_parameters: Array
+    lower: Array
+    upper: Array
+    absence: Mapping[str, Mapping[int, float]] = field(default_factory=dict)
+
+    @property
+    def independent(self) -> Array:
+        """Independent samples of each axis, (n_q,)."""
+        return np.array([s.independent for s in self.likelihood.samples])
+
+    @property
+    def count(self) -> Array:
+        """Samples of each axis, (n_q,), one at least."""
+        return np.array([max(float(len(y)), 1.0) for y in self.y])
+
+    def sums(self) -> tuple[Array, Array, Array]:
+        """Products of the base with itself, with y, and of y with itself, by axis."""
+        return (
+            np.array([b.T @ b for b in self.base]),
+            np.array([b.T @ y for b, y in zip(self.base, self.y, strict=True)]),
+            np.array([float(y @ y) for y in self.y]),
+        )
+
+    def solve(self) -> Solved:
+        """The change of the model's own parameters that is most likely."""
+        return solve_bounded(self, *self.sums())
+
+
+def _pose(
+    likelihood: Likelihood, evidence: Evidence, residual: Sequence[Array], bias: Sequence[Array]
+) -> Problem:
+    samples, n_q = likelihood.samples, len(likelihood.samples)
+    jacobian: Sequence[Array] = evidence.jacobian
+    timing = evidence.timing if evidence.by_timing else ()
+    if timing:
+        pairs = zip(evidence.jacobian, evidence.by_timing, strict=True)
+        jacobian = [np.append(x, by[:, :, None], axis=2) for x, by in pairs]
+    n = jacobian[0].shape[2]
+    full = []
+    for axis, here in enumerate(samples):
+        columns = np.zeros((len(here.rows), n + 2 * n_q))
+        columns[:, :n] = take_samples(jacobian, here, axis)
+        columns[:, n + axis] = -bias[axis]
+        columns[:, n + n_q + axis] = -likelihood.noise.stopping[axis]
+        full.append(columns * likelihood.root[axis][:, None])
+    # A number that lies evenly between two bounds has a standard deviation of 0.29 of their distance.
+    of_timing = [(3.5 / max(timing[1] - timing[0], 1e-12)) ** 2] if timing else []
+    n_timing, none = len(of_timing), np.zeros(n_q)
+    precision = np.concatenate([evidence.precision, of_timing, none + 1.0, none + 1.0])
+    known = np.concatenate([evidence.known, np.zeros(n_timing), none + 1.0, none])
+    lower = np.concatenate([evidence.lower, timing[:1], none - np.inf, none])
+    upper = np.concatenate([evidence.upper, timing[1:], none + np.inf, none + _MOST_STOPPING])
+    y = [r * w for r, w in zip(residual, likelihood.root, strict=True)]
+    weight = [s.independent / max(float(v @ v), 1e-300) for s, v in zip(samples, y, strict=True)]
+    normal = sum(w * (x.T @ x) for w, x in zip(weight, full, strict=True)) + np.diag(precision)
+    size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    values, vectors = np.linalg.eigh(normal / size / size[:, None])
+    kept = values > _DETERMINED * values[-1]
+    to = vectors[:, kept] / np.sqrt(values[kept]) / size[:, None]
+    return Problem(
+        likelihood, tuple(y), tuple(x @ to for x in full),
+        to.T @ (precision[:, None] * to), to.T @ (precision * known), to, lower, upper,
+        {item.name: _absence(evidence, item) for item in evidence.system.model.effects},
+    )  # fmt: skip
+
+
+def _absence(evidence: Evidence, item: BoundEffect) -> dict[int, float]:
+    strengths = {q.name for q in item.parameters if q.strength}
+    return {
+        place: -float(evidence.p[number])
+        for place, number in enumerate(evidence.free)
+        if evidence.system.parameters[number].name in strengths
+    }
+
+
+@dataclass(frozen=True)
+class Solved:
+    """The most likely unknowns of a linear problem.
+
+    Attributes:
+        unknowns: (n,), the first of them of the model's own combinations of parameters.
+        held: which of the others stay at zero, being out of their bounds else, (n - P,).
+        left: sum of squares by axis, (n_q,); weight: of the squares there.
+        cost: half the independent samples times the log of the mean square, over all axes.
+    """
+
+    unknowns: Array
+    held: NDArray[np.bool_]
+    left: Array
+    weight: Array
+    cost: float
+
+    @property
+    def base(self) -> Array:
+        """Those of the model's own parameters."""
+        return self.unknowns[: len(self.unknowns) - len(self.held)]
+
+
+def solve_bounded(
+    problem: Problem,
+    xx: Array,
+    xy: Array,
+    yy: Array,
+    low: Array | None = None,
+    high: Array | None = None,
+    absent: Mapping[int, float] | None = None,
+    weight: Array | None = None,
+) -> Solved:
+    """Minimise the negative log likelihood: weights of the axes and bounds found in turn.
+
+    Args:
+        problem: the model's own columns, which are the first of all.
+        xx, xy, yy: sums of products by axis, (n_q, n, n), (n_q, n), (n_q,).
+        low, high: bounds of the unknowns beyond the model's own, (n - P,).
+        absent: given changes of the model's parameters, by number.
+        weight: of the squares of each axis to start from, (n_q,).
+    """
+    p, n = problem, xx.shape[1]
+    nb, independent = p.to_parameters.shape[1], p.independent
+    low = np.zeros(0) if low is None else low
+    high = np.zeros(0) if high is None else high
+    precision, moment = np.zeros((n, n)), np.zeros(n)
+    precision[:nb, :nb], moment[:nb] = p.precision, p.moment
+    fixed_at = dict(absent or {})
+    held = np.zeros(n - nb, dtype=bool)
+    weight = independent / np.maximum(yy, 1e-300) if weight is None else weight
+    for _ in range(_PASSES):
+        fixed, free = hold_parameters(p.to_parameters, fixed_at, n)
+        chosen = free[:, np.append(np.ones(free.shape[1] - n + nb, dtype=bool), ~held)]
+        for _ in range(_REWEIGHTS):
+            normal = np.tensordot(weight, xx, 1) + precision
+            right = moment - weight @ xy - normal @ fixed
+            b = fixed + chosen @ solve_scaled(chosen.T @ normal @ chosen, chosen.T @ right)
+            left = np.maximum(yy + 2.0 * xy @ b + np.einsum("i,aij,j->a", b, xx, b), 1e-12 * yy)
+            left = left + 1e-300
+            before, weight = weight, independent / left
+            if np.all(np.abs(weight - before) <= _STEADY * before):
+                break
+        out = ~held & ((b[nb:] < low - 1e-12) | (b[nb:] > high + 1e-12))
+        change = p.to_parameters @ b[:nb]
+        slack = 1e-6 * (1.0 + np.abs(change))
+        below, above = change < p.lower - slack, change > p.upper + slack
+        fresh = {*np.flatnonzero(below | above).tolist()} - {*fixed_at}
+        if not out.any() and not fresh:
+            break
+        held |= out
+        fixed_at |= {k: float(p.lower[k] if below[k] else p.upper[k]) for k in fresh}
+    cost = float(independent @ (0.5 * np.log(left / p.count)))
+    off = b[:nb]
+    cost += 0.5 * float(off @ p.precision @ off) - float(p.moment @ off)
+    return Solved(b, held, left, weight, cost)
+
+
+def hold_parameters(
+    to_parameters: Array, values: Mapping[int, float], n: int
+) -> tuple[Array, Array]:
+    """Unknowns (n,) at which parameters have given values, and the directions (n, m) still free.
+
+    Args:
+        to_parameters: (n_all, P) to parameters from the first P unknowns.
+        values: by number of the parameter.
+    """
+    fixed, free = np.zeros(n), np.eye(n)
+    rows = to_parameters[list(values)]
+    if not rows.size:
+        return fixed, free
+    nb = rows.shape[1]
+    u, size, vt = np.linalg.svd(rows)
+    rank = int(np.sum(size > 1e-9 * max(float(size[0]), 1e-300)))
+    fixed[:nb] = vt[:rank].T @ ((u.T @ np.array(list(values.values())))[:rank] / size[:rank])
+    free = np.zeros((n, n - rank))
+    free[:nb, : nb - rank] = vt[rank:].T
+    free[nb:, nb - rank :] = np.eye(n - nb)
+    return fixed, free
+
+
+def solve_scaled(normal: Array, right: Array) -> Array:
+    """Solve a symmetric system whose unknowns have different units; right (n,) or (n, k)."""
+    size = 1.0 / np.sqrt(np.maximum(normal.diagonal(), 1e-300))
+    scaled = normal * size * size[:, None]
+    scaled.flat[:: len(scaled) + 1] += _RIDGE
+    by = size if right.ndim == 1 else size[:, None]
+    return np.asarray(np.linalg.solve(scaled, right * by) * by)
