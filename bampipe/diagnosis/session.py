@@ -189,6 +189,15 @@ class Session:
             stopping = self.replay_stopping(recipe, evidence)
             noise = describe_noise(replays, stopping, evidence, samples)
         likelihood = Likelihood.of(evidence, samples, noise, c.bias_error, c.discrepancy)
+        evidence, problem = self._descend(recipe, evidence, likelihood)
+        likelihood = likelihood.with_heavy_tails(problem, c.tails)
+        evidence, problem = self._descend(recipe, evidence, likelihood)
+        return Fit(recipe, evidence, likelihood, problem)
+
+    def _descend(
+        self, recipe: Recipe, evidence: Evidence, likelihood: Likelihood
+    ) -> tuple[Evidence, Problem]:
+        """Gauss-Newton steps to the most likely parameters, within their bounds."""
         problem = likelihood.pose(evidence)
         solved = problem.solve()
         for _ in range(_STEPS):
@@ -198,16 +207,16 @@ class Session:
                 p[list(evidence.free)] += share * step[: len(evidence.free)]
                 moved = self.linearise(recipe, np.clip(p, *_bounds(evidence.system)), evidence)
                 tried = likelihood.pose(moved)
-                cost = tried.solve()
-                if cost.cost < solved.cost + _CONVERGED:
+                there = tried.solve()
+                if there.cost < solved.cost + _CONVERGED:
                     break
             else:
                 break
-            fall = solved.cost - cost.cost
-            evidence, problem, solved = moved, tried, cost
+            fall = solved.cost - there.cost
+            evidence, problem, solved = moved, tried, there
             if fall < _CONVERGED:
                 break
-        return Fit(recipe, evidence, likelihood, problem)
+        return evidence, problem
 
     def try_fit(self, recipe: Recipe, start: Array) -> Fit | None:
         """`fit`; None where the model cannot be replayed."""

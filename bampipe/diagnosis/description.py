@@ -1,0 +1,160 @@
+"""The shape of a residual in one sentence: what it varies with, where, which way round."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import gamma
+
+from bampipe.discover.settings import Settings
+from bampipe.discover.shape import BINS, Map, Variable, residual_map, variables
+from bampipe.results.rounding import significant
+from bampipe.trials.evidence import Evidence
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class _Sine:
+    """Best sine through scattered values: share of their variance, amplitude, cycles a unit."""
+
+    share: float
+    amplitude: float
+    frequency: float
+
+
+def describe(evidence: Evidence, axis: int, s: Settings) -> str:
+    """The residual's shape in one sentence: what it varies with most, where, which way."""
+    known = [v for v in variables(evidence, axis) if v.name not in ("trial", "direction")]
+    maps = [residual_map(evidence, axis, v, 3 * BINS) for v in known]
+    best = int(np.argmax([m.share for m in maps]))
+    most, variable = maps[best], known[best]
+    unit = evidence.system.torque_units[axis]
+    if most.share < s.variable_share or most.variable == "time":
+        vibration = _vibration(evidence, axis, s.significance)
+        if vibration is not None and vibration.share > max(most.share, s.variable_share):
+            return (
+                f"a vibration of {significant(vibration.amplitude, 2)} {unit} at "
+                f"{vibration.frequency:.3g} Hz in time, whatever the machine does; it carries "
+                f"{100 * vibration.share:.0f} % of the residual's variance"
+            )
+    if most.share < s.variable_share:
+        return (
+            "scattered over all motions; of all that the machine does, "
+            f"{most.variable} explains most of it, {100 * most.share:.0f} %"
+            if most.share >= s.mentioned_share
+            else "scattered over all motions; it follows nothing that the machine does"
+        )
+    carries = f"{most.variable} carries {100 * most.share:.0f} % of the residual's variance"
+    turning = _by_direction(evidence, axis, variable, s.direction_likeness)
+    ripple = _ripple(evidence, axis, variable)
+    if ripple is not None and ripple.share > s.ripple_share * most.share:
+        period = 1.0 / ripple.frequency
+        return (
+            f"a ripple of {significant(ripple.amplitude, 2)} {unit} along {most.variable} that "
+            f"repeats every {period:.3g} {most.unit}, {turning}; {carries}"
+        )
+    return f"{_bumps(most, unit, s)}, {turning}; {carries}"
+
+
+def _bumps(most: Map, torque_unit: str, s: Settings) -> str:
+    unit = f"{torque_unit} near {most.variable}"
+    strong = np.abs(most.mean) > s.bump_height * np.max(np.abs(most.mean))
+    places = []
+    for side in (strong & (most.mean < 0.0), strong & (most.mean > 0.0)):
+        if side.any():
+            weight = np.abs(most.mean[side])
+            middle = float(np.average(most.center[side], weights=weight))
+            peak = most.mean[side][int(np.argmax(weight))]
+            places.append((middle, f"{peak:+.2g} {unit} {middle:.3g} {most.unit}".strip()))
+    places.sort()
+    narrow = strong.sum() <= s.bump_width * len(strong)
+    form = "a bump of" if narrow else "a broad change,"
+    if len(places) == 2:
+        form = "opposite bumps of" if narrow else "a change of sign,"
+    inside = most.center[strong]
+    between = f"{inside.min():.3g} and {inside.max():.3g} {most.unit}".strip()
+    return f"{form} {' and '.join(words for _, words in places)} (between {between})"
+
+
+def _ripple(evidence: Evidence, axis: int, variable: Variable) -> _Sine | None:
+    """A sine along ``variable`` with at least two periods within its range."""
+    use = np.concatenate([u[:, axis] for u in evidence.used]) > 0
+    r = np.concatenate([x[:, axis] for x in evidence.residual])[use]
+    v = np.concatenate(variable.values)[use]
+    low, high = np.quantile(v, [0.01, 0.99])
+    if high <= low:
+        return None
+    return _best_sine([(v, r)], np.arange(2.0, BINS, 0.1) / (high - low))
+
+
+def _vibration(evidence: Evidence, axis: int, significance: float) -> _Sine | None:
+    """A sine in time, of any phase in each trial; None where chance may give one as strong.
+
+    Of noise, the share at one frequency is a sum of exponential variates, one a trial (Lomb 1976).
+    """
+    band = evidence.band
+    trials = []
+    for k, motion in enumerate(evidence.motions):
+        use = evidence.used[k][:, axis] > 0
+        if use.sum() > 2 * BINS:
+            t = motion.t[band.thinned_rows(len(motion.t))][use]
+            trials.append((t, evidence.residual[k][use, axis]))
+    if not trials:
+        return None
+    longest = max(float(np.ptp(t)) for t, _ in trials)
+    tried = np.arange(2.0 / longest, band.cutoff_hz[axis], 0.25 / longest)
+    best = _best_sine(trials, tried)
+    by_chance = gamma.isf(significance / max(len(tried), 1), len(trials))
+    independent = 0.5 * sum(len(r) for _, r in trials) * band.independent_share[axis]
+    return best if best.share * independent > by_chance else None
+
+
+def _best_sine(trials: Sequence[tuple[Array, Array]], frequencies: Array) -> _Sine:
+    """Least-squares sine about the mean, of any phase and size in each trial (Lomb 1976).
+
+    Args:
+        trials: place or time, and residual, (T,) each; frequencies: to try, the best is taken.
+    """
+    centred = [(x, r - r.mean()) for x, r in trials]
+    count = sum(len(r) for _, r in trials)
+    total = max(sum(float(r @ r) for _, r in centred), 1e-30)
+    best = _Sine(0.0, 0.0, 0.0)
+    for frequency in frequencies:
+        taken = squares = 0.0
+        for x, r in centred:
+            phase = 2.0 * np.pi * frequency * x
+            columns = np.column_stack([np.sin(phase), np.cos(phase)])
+            product = columns.T @ r
+            weights = np.linalg.solve(columns.T @ columns + 1e-9 * np.eye(2), product)
+            taken += float(product @ weights)
+            squares += len(r) * float(weights @ weights)
+        if taken > best.share * total:
+            best = _Sine(taken / total, float(np.sqrt(squares / count)), float(frequency))
+    return best
+
+
+def _by_direction(evidence: Evidence, axis: int, variable: Variable, alike: float) -> str:
+    """Whether the residual keeps its sign when the motion turns round, as friction does not."""
+    r = np.concatenate([x[:, axis] for x in evidence.residual])
+    v = np.concatenate(variable.values)
+    kept = [evidence.band.thinned_rows(len(m.t)) for m in evidence.motions]
+    rate = np.concatenate([m.qd[k, axis] for m, k in zip(evidence.motions, kept, strict=True)])
+    edges = np.unique(np.quantile(v, np.linspace(0.0, 1.0, 3 * BINS + 1)))
+    which = np.clip(np.searchsorted(edges, v, side="right") - 1, 0, len(edges) - 2)
+    means = []
+    for b in range(len(edges) - 1):
+        up, down = r[(which == b) & (rate > 0.0)], r[(which == b) & (rate < 0.0)]
+        if len(up) >= 4 and len(down) >= 4:
+            means.append((up.mean(), down.mean()))
+    if len(means) < 4:
+        return "seen in one direction of motion only"
+    likeness = float(np.corrcoef(np.array(means).T)[0, 1])
+    if likeness > alike:
+        return "the same in both directions of motion, as of a spring"
+    if likeness < -alike:
+        return "opposite in the two directions of motion, as of friction"
+    return "different in the two directions of motion"

@@ -1,0 +1,194 @@
+"""Probabilities of sets of effects, of single effects, and of something unknown.
+
+The log evidence of a set near the most probable one is a sum over samples. Blocks of time are drawn
+anew, as in a bootstrap, and the probabilities averaged over the draws: an event that a single block
+shows decides nothing (pseudo-Bayesian model averaging with a bootstrap, after Yao, Vehtari, Simpson
+and Gelman 2018, Bayesian Analysis 13, 917).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import softmax
+
+from bampipe.diagnosis.dictionary import Key
+from bampipe.diagnosis.search import Pool, Search, added, gone
+from bampipe.diagnosis.unknown import Unknown, spline_columns, weigh_unknown
+
+Array = NDArray[np.float64]
+
+_DRAWS = 1000
+_NEAR = 14.0
+"""Log evidence below the best, nats, beyond which a set is none of the alternatives: one in a
+million."""
+_MOST = 40
+_EULER = 0.5772156649015329
+
+
+@dataclass(frozen=True)
+class WeighedSet:
+    """A set of effects.
+
+    Attributes:
+        keys: as changes of the most probable one.
+        effects: that the model then has, beyond those of the model diagnosed.
+        unknown: axis on which something unknown stands beside them; None if nowhere.
+        log_evidence: over that of the most probable set, nats; probability: of the set.
+    """
+
+    keys: tuple[Key, ...]
+    effects: tuple[str, ...]
+    unknown: int | None
+    log_evidence: float
+    probability: float
+
+
+@dataclass(frozen=True)
+class Weighed:
+    """How probable everything is.
+
+    Attributes:
+        sets: the most probable first.
+        effects: probability of each effect of any of them.
+        unknown: probability that an axis lacks something unknown, (n_q,).
+        functions: what that would be, by axis; None where an axis does not move.
+        drops: log evidence lost without each effect of the most probable set, nats.
+    """
+
+    sets: tuple[WeighedSet, ...]
+    effects: Mapping[str, float]
+    unknown: Array
+    functions: tuple[Unknown | None, ...]
+    drops: Mapping[str, float]
+
+
+def weigh_sets(search: Search, pool: Pool, given: Sequence[str], seed: int) -> Weighed:
+    """Weigh the sets of a pool, each member's absence, and unknown functions beside them.
+
+    Args:
+        search: over sets beside the most probable model; pool: sets near it.
+        given: effects of the model diagnosed, which are not in question; seed: of the bootstrap.
+    """
+    none, evidence = search.cost(()), search.dictionary.evidence
+    own = [e for e in search.p.absence if e not in given]
+    near = sorted((c, k) for c, k in pool.values() if c < none + _NEAR and k)[:_MOST]
+    absent = [((f"-{e}", ()),) for e in own]
+    listed: list[tuple[tuple[Key, ...], int | None, float, Array]] = []
+    for keys in dict.fromkeys([(), *(k for _, k in near), *absent]):
+        if np.isfinite(search.cost(keys)):
+            listed.append((keys, None, none - search.cost(keys), _by_block(search, keys, None)))
+    functions: list[Unknown | None] = []
+    for axis in range(len(search.p.y)):
+        columns = spline_columns(evidence, axis)
+        here = weigh_unknown(search, axis, columns)
+        functions.append(here)
+        if here is None or here.size < search.criteria.size or here.cost > none + _NEAR:
+            continue
+        for keys, found in _beside_unknown(search, axis, columns, here, own):
+            cost = found.cost - search.log_prior
+            listed.append((keys, axis, none - cost, _by_block(search, keys, found)))
+    total = np.array([gain for _, _, gain, _ in listed])
+    blocks = np.array([by for _, _, _, by in listed])
+    rng = np.random.default_rng([seed, blocks.shape[1]])
+    counts = rng.multinomial(
+        blocks.shape[1], np.full(blocks.shape[1], 1.0 / blocks.shape[1]), _DRAWS
+    )
+    scores = (counts - 1.0) @ blocks.T + total
+    shares = softmax(scores, axis=1).mean(axis=0)
+    sets = [
+        WeighedSet(keys, _effects(search, keys, given), axis, float(gain), float(share))
+        for (keys, axis, gain, _), share in zip(listed, shares, strict=True)
+    ]
+    effects: dict[str, float] = {}
+    unknown = np.zeros(len(functions))
+    for one in sets:
+        for effect in one.effects:
+            effects[effect] = effects.get(effect, 0.0) + one.probability
+        if one.unknown is not None:
+            unknown[one.unknown] += one.probability
+    first, *others = sets
+    drops = {
+        keys[0][0][1:]: -gain for keys, axis, gain, _ in listed if axis is None and keys in absent
+    }
+    ranked = (first, *sorted(others, key=lambda s: -s.probability))
+    return Weighed(ranked, effects, unknown, tuple(functions), drops)
+
+
+def _beside_unknown(
+    search: Search, axis: int, columns: Sequence[Array], here: Unknown, own: Sequence[str]
+) -> list[tuple[tuple[Key, ...], Unknown]]:
+    """Sets beside an unknown function: the effects that it does not replace, and less each of them.
+
+    An effect whose place an unknown function can take but for less than a size that matters is one
+    that resembles what is missing.
+    """
+    p, size = search.p, search.criteria.size
+    root = p.likelihood.root[axis]
+    force = float(np.sqrt(np.mean(p.likelihood.applied[axis] ** 2)))
+
+    def without(effects: Sequence[str]) -> Unknown:
+        keys = tuple((f"-{e}", ()) for e in sorted(effects))
+        found = weigh_unknown(search, axis, columns, keys)
+        assert found is not None
+        return found
+
+    def replaces(effect: str) -> bool:
+        moved = (without([effect]).residual[axis] - here.residual[axis]) / root
+        return float(np.sqrt(np.mean(moved**2))) < size * force
+
+    beside = [e for e in own if axis in touched_axes(search, e)]
+    gone_all = [e for e in beside if replaces(e)]
+    sets = [gone_all, *([*gone_all, e] for e in beside if e not in gone_all)]
+    return [(tuple((f"-{e}", ()) for e in sorted(one)), without(one)) for one in sets]
+
+
+def touched_axes(search: Search, effect: str) -> tuple[int, ...]:
+    """Axes whose equation an effect of the model changes."""
+    system = search.dictionary.evidence.system
+    item = next(i for i in system.model.effects if i.name == effect)
+    axes = [system.coordinates.index(a) for a in item.axes]
+    return tuple(axes) or tuple(range(len(system.coordinates)))
+
+
+def _effects(search: Search, keys: Sequence[Key], given: Sequence[str]) -> tuple[str, ...]:
+    away = gone(keys)
+    kept = [e for e in search.p.absence if e not in away and e not in given]
+    return (*kept, *(name for name, _ in added(keys)))
+
+
+def _by_block(search: Search, keys: tuple[Key, ...], unknown: Unknown | None) -> Array:
+    """Log likelihood of a set over that of none, nats, by block of time, (n_blocks,)."""
+    p = search.p
+    before = search.residual_rows(())
+    after = list(unknown.residual) if unknown else search.residual_rows(keys)
+    w_before = search.solve(()).weight
+    w_after = unknown.weight if unknown else search.solve(keys).weight
+    volume = search.volume_rows(keys)
+    count = 1 + max((int(s.block.max()) for s in p.likelihood.samples if len(s.block)), default=0)
+    found = np.zeros(count)
+    for axis, here in enumerate(p.likelihood.samples):
+        if not len(here.rows):
+            continue
+        share = here.independent / len(here.rows)
+        scale = 0.5 * np.log(w_after[axis] / w_before[axis])
+        rows = share * scale + 0.5 * (
+            w_before[axis] * before[axis] ** 2 - w_after[axis] * after[axis] ** 2
+        )
+        found += np.bincount(here.block, rows + share * volume[axis], minlength=count)
+    return found
+
+
+def chance_of(gain: float, by_chance: Sequence[float]) -> float:
+    """Probability that chance gives a largest gain of ``gain`` or more, from those of replays.
+
+    By the law of largest values (Gumbel 1935), with the mean and the scatter of those.
+    """
+    values = np.asarray(by_chance, dtype=float)
+    # The evidence of one candidate alone scatters by half a nat a strength.
+    scale = max(float(values.std(ddof=1)) * np.sqrt(6.0) / np.pi, 1.0)
+    mode = float(values.mean()) - _EULER * scale
+    return float(-np.expm1(-np.exp(-(gain - mode) / scale)))

@@ -1,0 +1,182 @@
+"""The shape of a residual: maps of it, worst windows, explainable share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.results.diagnose import WorstWindow
+from bampipe.trials.evidence import Evidence
+from bampipe.trials.measured import trial_of_block
+from bampipe.trials.motion import Motion
+
+Array = NDArray[np.float64]
+
+BINS = 16
+_LEAST = 12
+
+
+@dataclass(frozen=True)
+class Variable:
+    """One quantity that a residual may depend on, at the kept samples of every trial.
+
+    Attributes:
+        name: ``position``, ``velocity``, ...
+        unit: SI unit as text.
+        values: by trial, each (K,).
+    """
+
+    name: str
+    unit: str
+    values: tuple[Array, ...]
+
+
+@dataclass(frozen=True)
+class Map:
+    """Mean residual in bins of one variable, with 95 % confidence bands over independent samples.
+
+    Attributes:
+        variable: its name.
+        unit: its unit.
+        center, mean, low, high: by bin; the residual's are N.m or N.
+        count: samples in each bin.
+        share: share of the residual's variance that the bin means carry.
+    """
+
+    variable: str
+    unit: str
+    center: Array
+    mean: Array
+    low: Array
+    high: Array
+    count: Array
+    share: float
+
+
+def variables(evidence: Evidence, axis: int) -> tuple[Variable, ...]:
+    """What the residual of one axis is mapped against."""
+    system, band = evidence.system, evidence.band
+    coordinate = system.model.device.coordinates[axis]
+    unit = coordinate.unit
+    columns: dict[str, tuple[str, list[Array]]] = {}
+
+    def put(name: str, in_unit: str, values: Array) -> None:
+        columns.setdefault(name, (in_unit, []))[1].append(values)
+
+    for index, motion in enumerate(evidence.motions):
+        kept = band.thinned_rows(len(motion.t))
+        memory = evidence.fitted[index].memory
+        load = evidence.fitted[index].applied[:, axis]
+        since, distance = since_reversal(motion, axis)
+        put("position", unit, motion.q[kept, axis])
+        put("velocity", f"{unit}/s", motion.qd[kept, axis])
+        put("acceleration", f"{unit}/s2", motion.qdd[kept, axis])
+        put("load", coordinate.torque_unit, load[kept])
+        put("direction", "", np.sign(motion.qd[kept, axis]))
+        put("time since reversal", "s", since[kept])
+        put("distance since reversal", unit, distance[kept])
+        for k, other in enumerate(system.model.device.coordinates):
+            if k != axis:
+                put(f"{other.name} position", other.unit, motion.q[kept, k])
+                put(f"{other.name} velocity", f"{other.unit}/s", motion.qd[kept, k])
+        for k, name in enumerate(system.memory_names):
+            effect, _, state = name.rpartition(".")
+            put(f"{state} of {effect}", "", memory[kept, k])
+        put("time", "s", motion.t[kept])
+        put("trial", "", np.full(len(kept), float(index)))
+    return tuple(Variable(name, u, tuple(v)) for name, (u, v) in columns.items())
+
+
+def since_reversal(motion: Motion, axis: int) -> tuple[Array, Array]:
+    """Time (s) and distance travelled since the velocity last changed sign, each (T,)."""
+    sign = motion.qd[:, axis] > 0.0
+    last = np.zeros(len(sign), dtype=int)
+    changes = np.flatnonzero(sign[1:] != sign[:-1]) + 1
+    last[changes] = changes
+    last = np.maximum.accumulate(last)
+    return motion.t - motion.t[last], np.abs(motion.q[:, axis] - motion.q[last, axis])
+
+
+def residual_map(evidence: Evidence, axis: int, variable: Variable, bins: int = BINS) -> Map:
+    """Bin the residual of ``axis`` by ``variable`` into ``bins`` parts of equal count."""
+    use = np.concatenate([u[:, axis] for u in evidence.used]) > 0
+    r = np.concatenate([x[:, axis] for x in evidence.residual])[use]
+    v = np.concatenate(variable.values)[use]
+    levels = np.unique(v)
+    if len(levels) <= bins:
+        which = np.searchsorted(levels, v)
+        count = len(levels)
+    else:
+        edges = np.unique(np.quantile(v, np.linspace(0.0, 1.0, bins + 1)))
+        which = np.clip(np.searchsorted(edges, v, side="right") - 1, 0, len(edges) - 2)
+        count = len(edges) - 1
+    rows = [
+        (v[which == b].mean(), r[which == b].mean(), r[which == b].std(), np.sum(which == b))
+        for b in range(count)
+        if np.sum(which == b) >= _LEAST
+    ]
+    if not rows:
+        none = np.zeros(0)
+        return Map(variable.name, variable.unit, none, none, none, none, none, 0.0)
+    center, mean, sd, n = (np.array(c, dtype=float) for c in zip(*rows, strict=True))
+    independent = n * evidence.band.independent_share[axis]
+    half = 1.96 * sd / np.sqrt(np.maximum(independent, 2.0))
+    share = float(np.sum(n * (mean - r.mean()) ** 2) / max(np.sum((r - r.mean()) ** 2), 1e-30))
+    return Map(variable.name, variable.unit, center, mean, mean - half, mean + half, n, share)
+
+
+def worst_windows(evidence: Evidence, count: int = 10, width_s: float = 0.5) -> list[WorstWindow]:
+    """The stretches with the largest residual relative to the axis' own, over all axes.
+
+    There are ``count``, and the worst of each axis that is not among them.
+    """
+    band, system = evidence.band, evidence.system
+    length = max(2, int(width_s * band.rate_hz / band.step))
+    typical = evidence.rmse()
+    found: list[tuple[float, dict[str, Any]]] = []
+    for k, motion in enumerate(evidence.motions):
+        kept = band.thinned_rows(len(motion.t))
+        for start in range(0, len(kept) - length + 1, length):
+            rows = slice(start, start + length)
+            for axis, name in enumerate(system.coordinates):
+                n = evidence.used[k][rows, axis].sum()
+                if n < 0.5 * length:
+                    continue
+                rmse = float(np.sqrt(np.sum(evidence.residual[k][rows, axis] ** 2) / n))
+                t = motion.t[kept[rows]]
+                doing = _doing(motion, kept[rows], axis, system.coordinate_units[axis])
+                window = {
+                    "axis": name,
+                    "trial_id": trial_of_block(motion.trial_id),
+                    "t_start": t[0],
+                    "t_end": t[-1],
+                    "rmse": rmse,
+                    "unit": system.torque_units[axis],
+                    "doing": doing,
+                }
+                found.append((rmse / max(typical[axis], 1e-12), window))
+    found.sort(key=lambda pair: -pair[0])
+    windows = [WorstWindow(**window) for _, window in found]
+    listed = windows[:count]
+    for other in windows[count:]:
+        if all(other.axis != one.axis for one in listed):
+            listed.append(other)
+    return listed
+
+
+def _doing(motion: Motion, rows: NDArray[np.int64], axis: int, unit: str) -> str:
+    q, qd = motion.q[rows, axis], motion.qd[rows, axis]
+    moved = "reversing" if np.any(qd > 0) and np.any(qd < 0) else (
+        "moving forwards" if qd.mean() > 0 else "moving backwards"
+    )  # fmt: skip
+    return f"{moved} near {_size(q.mean(), unit)} at up to {_size(np.abs(qd).max(), unit)}/s"
+
+
+def _size(value: float, unit: str) -> str:
+    """A position or a speed to two decimals, in mm where metres would show too few."""
+    if unit == "m" and abs(value) < 0.1:
+        value, unit = 1e3 * value, "mm"
+    return f"{round(float(value), 2) + 0.0:.2f} {unit}"
