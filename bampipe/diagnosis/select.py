@@ -71,15 +71,20 @@ class Selection:
 
 @contextmanager
 def open_search(
-    session: Session, fit: Fit, without: Collection[str] = (), known: Search | None = None
+    session: Session,
+    fit: Fit,
+    without: Collection[str] = (),
+    known: Search | None = None,
+    only: Sequence[str] = (),
 ) -> Iterator[Search]:
     """A search over the candidates beside a fitted model, its columns made by several processes.
 
     Args:
         session: the trials; fit: the model; without: effects that are not weighed.
         known: a search beside another model, of which columns that are the same are taken.
+        only: effects that are weighed in place of all.
     """
-    wanted = session.candidate_names(fit.recipe, without)
+    wanted = only or session.candidate_names(fit.recipe, without)
     candidates = {c.name: c for c in candidates_of(fit.recipe, wanted)}
     # The shapes of a candidate are shares of its range, so that this must stay.
     scale = known.dictionary.scale if known else MachineScale.of_trials(fit.evidence)

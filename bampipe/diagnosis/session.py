@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, TypeVar
 
 import numpy as np
@@ -27,11 +28,15 @@ from bampipe.trials.likelihood import (
     Likelihood,
     Noise,
     Problem,
+    Solved,
     describe_noise,
     lay_out_samples,
+    solve_bounded,
+    take_samples,
 )
 from bampipe.trials.measured import MeasuredTrials
 from bampipe.trials.motion import Motion
+from bampipe.trials.noise_floor import NoiseFloor
 from bampipe.trials.replay import StandIn, keep_motion, replay_motions
 from bampipe.trials.residuals import ModelOnTrial
 from bampipe.workers import process_pool
@@ -218,6 +223,16 @@ class Session:
                 break
         return evidence, problem
 
+    def fit_plainly(self, recipe: Recipe, start: Array) -> Fit:
+        """Fit a model with noise that is the same for all samples of an axis: nothing is replayed."""
+        evidence = self.linearise(recipe, start)
+        samples = lay_out_samples(evidence, self.criteria.block_s)
+        nothing = [np.zeros_like(r) for r in evidence.residual]
+        noise = describe_noise([nothing, nothing], nothing, evidence, samples)
+        flat = Likelihood.of(evidence, samples, noise, 0.0, 0.0)
+        evidence, problem = self._descend(recipe, evidence, flat)
+        return Fit(recipe, evidence, flat, problem)
+
     def try_fit(self, recipe: Recipe, start: Array) -> Fit | None:
         """`fit`; None where the model cannot be replayed."""
         try:
@@ -246,6 +261,73 @@ class Fit:
     evidence: Evidence
     likelihood: Likelihood
     problem: Problem
+
+    @cached_property
+    def solved(self) -> Solved:
+        """The solution of its linear problem, next to zero but for the nuisance parameters."""
+        return self.problem.solve()
+
+    @cached_property
+    def bias(self) -> tuple[Array, ...]:
+        """The bias of filters and of friction that stops, with its fitted factors, by axis, (n,)."""
+        noise, n_q = self.likelihood.noise, len(self.likelihood.samples)
+        factors = (self.problem.to_parameters @ self.solved.base)[-2 * n_q :]
+        pairs = zip(noise.bias, noise.stopping, factors[:n_q], factors[n_q:], strict=True)
+        return tuple(beta * b + gamma * c for b, c, beta, gamma in pairs)
+
+    @cached_property
+    def noise_floor(self) -> NoiseFloor:
+        """What a model leaves that is the whole truth, by axis: noise of the sensors, and the bias.
+
+        That of replays, with the factors of the bias that the measurement has.
+        """
+        noise, rms = self.likelihood.noise, []
+        for of_replays, b, bias in zip(noise.residuals, noise.bias, self.bias, strict=True):
+            rows = of_replays - b + bias
+            rms.append(np.sqrt(np.mean(rows**2, axis=1)) if b.size else np.zeros(len(rows)))
+        return NoiseFloor.of_errors(np.array(rms).T)
+
+    @cached_property
+    def rmse_beyond_bias(self) -> Array:
+        """Root mean square of what is left once the bias is taken off, by axis, (n_q,), N.m or N."""
+        rows = zip(self.problem.y, self.problem.base, self.likelihood.root, strict=True)
+        return np.array([rms((y + x @ self.solved.base) / root) for y, x, root in rows])
+
+    @cached_property
+    def held_out_rmse(self) -> Array:
+        """Error on trials that the parameters have not seen, (n_q,), N.m or N, by a linear step.
+
+        With one group of trials only, that of the fit.
+        """
+        e, p, samples = self.evidence, self.problem, self.likelihood.samples
+        group_of = np.array(e.folds.groups)
+        groups = [group_of[here.trial] for here in samples]
+        plain = [take_samples(e.residual, here, axis) for axis, here in enumerate(samples)]
+        slopes = [take_samples(e.jacobian, here, axis) for axis, here in enumerate(samples)]
+        xx, xy, yy = p.sums()
+        squares = np.zeros(len(samples))
+        for group in np.unique(group_of):
+            inside = [g == group for g in groups]
+            if len(np.unique(group_of)) == 1:
+                change = np.zeros(slopes[0].shape[1])
+            else:
+                rows = [(b[i], y[i]) for b, y, i in zip(p.base, p.y, inside, strict=True)]
+                others = solve_bounded(
+                    p,
+                    xx - np.array([b.T @ b for b, _ in rows]),
+                    xy - np.array([b.T @ y for b, y in rows]),
+                    np.maximum(yy - np.array([float(y @ y) for _, y in rows]), 1e-300),
+                    weight=self.solved.weight,
+                )
+                change = (p.to_parameters @ others.base)[: slopes[0].shape[1]]
+            for axis, i in enumerate(inside):
+                squares[axis] += float(np.sum((plain[axis][i] + slopes[axis][i] @ change) ** 2))
+        return np.asarray(np.sqrt(squares / p.count))
+
+
+def rms(values: Array) -> float:
+    """Root mean square; 0 of nothing."""
+    return float(np.sqrt(np.mean(values**2))) if values.size else 0.0
 
 
 def _residuals_of_replay(seed: tuple[int, ...]) -> list[Array]:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from bampipe.diagnosis.probability import chance_of, touched_axes
 from bampipe.diagnosis.select import Selection
-from bampipe.diagnosis.session import Fit, Session, candidates_of
+from bampipe.diagnosis.session import Fit, Session, candidates_of, rms
 from bampipe.results.diagnose import (
     AxisVerdict,
     NullDistribution,
@@ -19,7 +19,6 @@ from bampipe.results.diagnose import (
     WeighedSet,
 )
 from bampipe.results.standing import standing
-from bampipe.trials.noise_floor import NoiseFloor
 
 Array = NDArray[np.float64]
 
@@ -52,9 +51,7 @@ def conclude(session: Session, selection: Selection) -> Conclusion:
         for e, share in weighed.effects.items()
     }
     where = {e: effect_axes(initial, final, e) for e in probability}
-    selected = tuple(
-        e for e in selection.effects if probability.get(e, 0.0) >= 1.0 - c.probability
-    )
+    selected = tuple(e for e in selection.effects if probability.get(e, 0.0) >= 1.0 - c.probability)
     axes = []
     for axis, name in enumerate(final.evidence.system.coordinates):
         here = {e: p for e, p in probability.items() if axis in where[e]}
@@ -84,10 +81,10 @@ def _judge(
     unknown: float,
 ) -> AxisVerdict:
     c, final, initial = session.criteria, selection.final, selection.initial
-    floor = noise_floor(final)
-    before, after = (fit.evidence.held_out_rmse[axis] for fit in (initial, final))
+    floor = final.noise_floor
+    before, after = float(initial.held_out_rmse[axis]), float(final.held_out_rmse[axis])
     level, scatter = float(floor.level[axis]), float(floor.sd[axis])
-    against_floor = standing(float(after), level, scatter)
+    against_floor = standing(after, level, scatter)
     named = tuple(e for e in listed if e in selection.effects)
     sure = [e for e, p in listed.items() if p >= c.probability]
     open_question = [e for e, p in listed.items() if p < c.probability]
@@ -101,13 +98,12 @@ def _judge(
         verdict = "missing"
     else:
         verdict = "unknown_effect" if remains else "nothing_missing"
-    force = float(np.sqrt(np.mean(final.likelihood.applied[axis] ** 2)))
-    excess = before**2 - min(level, before) ** 2
+    force = rms(final.likelihood.applied[axis])
+    excess = max(before**2 - level**2, 0.0)
     left = max(after**2 - level**2, 0.0)
-    rows = final.problem.y[axis] / final.likelihood.root[axis]
-    solved = final.problem.solve()
-    beyond = rows + final.problem.base[axis] @ solved.base / final.likelihood.root[axis]
-    functions = selection.weighed.functions[axis]
+    function = selection.weighed.functions[axis]
+    share = min(max(function.share, 0.0), 1.0) if function else 0.0
+    rest = after**2 * (1.0 - share) / max(before**2, 1e-300)
     return AxisVerdict(
         verdict=verdict,
         effects=named,
@@ -115,25 +111,19 @@ def _judge(
         unknown=unknown,
         rmse_before=before,
         rmse_after=after,
-        rmse_beyond_bias=float(np.sqrt(np.mean(beyond**2))) if beyond.size else 0.0,
+        rmse_beyond_bias=float(final.rmse_beyond_bias[axis]),
         noise_floor=level,
         noise_floor_sd=scatter,
         standing=against_floor,
         unit=final.evidence.system.torque_units[axis],
         force_rms=force,
         explained=max(0.0, 1.0 - (after / max(force, 1e-300)) ** 2),
-        explainable_share=functions.share_before if functions else 0.0,
-        explainable_after=functions.share if functions else 0.0,
+        explainable_share=max(0.0, 1.0 - rest),
+        explainable_after=share,
         explained_by_effects=max(0.0, 1.0 - left / max(excess, 1e-300)) if named else 0.0,
         remains=bool(remains),
         sentence="",
     )
-
-
-def noise_floor(fit: Fit) -> NoiseFloor:
-    """The error of replays of a fitted model, which lacks nothing, by axis, N.m or N."""
-    squares = [np.mean(r**2, axis=1) for r in fit.likelihood.noise.residuals]
-    return NoiseFloor.of_errors(list(np.sqrt(np.array(squares)).T))
 
 
 _BEYOND_MODELS = 3.0
@@ -142,7 +132,7 @@ _BEYOND_MODELS = 3.0
 
 def _exceeds_any_model(fit: Fit, axis: int) -> bool:
     """Whether an axis leaves more than sensors, filters and the discrepancy of any model explain."""
-    solved = fit.problem.solve()
+    solved = fit.solved
     return bool(np.sqrt(solved.left[axis] / fit.problem.count[axis]) > _BEYOND_MODELS)
 
 
@@ -160,3 +150,82 @@ def effect_axes(initial: Fit, final: Fit, effect: str) -> tuple[int, ...]:
         return axes
     alone = candidates_of(initial.recipe, (effect,))[0].system
     return tuple(range(len(system.coordinates))) if alone.moves_sensors else tuple(alone.touched)
+
+
+def rank_effects(
+    selection: Selection, probability: Mapping[str, float], p_values: Mapping[str, float]
+) -> list[RankedEffect]:
+    """Effects of the most probable set, then the others by what each gains alone.
+
+    The error without an effect of the set, beside the others, or with another one alone, follows
+    from the log evidence by the independent samples of the axis.
+    """
+    initial, final = selection.initial, selection.final
+    values = dict(
+        zip((q.name for q in final.evidence.system.parameters), final.evidence.p, strict=True)
+    )
+    others = sorted(
+        (e for e in selection.gains if e not in selection.effects),
+        key=lambda e: -selection.gains[e],
+    )
+    chosen = sorted(selection.effects, key=lambda e: -selection.weighed.drops.get(e, 0.0))
+    rows = []
+    for effect in (*chosen, *others):
+        is_chosen = effect in selection.effects
+        fit = final if is_chosen else initial
+        gain = selection.weighed.drops.get(effect, 0.0) if is_chosen else selection.gains[effect]
+        axes = effect_axes(initial, final, effect)
+        axis = max(
+            axes, key=lambda a: float(initial.problem.independent[a] * initial.solved.left[a])
+        )
+        ratio = float(np.exp(-gain / max(fit.problem.independent[axis], 1.0)))
+        here = float(fit.held_out_rmse[axis])
+        system = fit.evidence.system
+        rows.append(
+            RankedEffect(
+                effect=effect,
+                axis=system.coordinates[axis],
+                held_out_rmse_before=here / ratio if is_chosen else here,
+                held_out_rmse_after=here if is_chosen else here * ratio,
+                unit=system.torque_units[axis],
+                probability=min(probability.get(effect, 0.0), 1.0),
+                p_value=p_values.get(effect, chance_of(gain, selection.chance)),
+                score=gain,
+                parameters={n: float(v) for n, v in values.items() if n in _own(final, effect)},
+                indistinguishable_from=_alike(selection, effect),
+            )
+        )
+    return rows
+
+
+def _own(fit: Fit, effect: str) -> frozenset[str]:
+    found = (i for i in fit.evidence.system.model.effects if i.name == effect)
+    return frozenset(q.name for item in found for q in item.parameters)
+
+
+def _alike(selection: Selection, effect: str) -> tuple[str, ...]:
+    """Effects that take the place of one in a set which is as good as undecided against it."""
+    best = {*selection.effects}
+    found = []
+    for one in selection.weighed.sets[1:]:
+        swapped = {*one.effects} ^ best
+        if len(swapped) == 2 and effect in swapped and one.probability >= 0.1:
+            found += [e for e in swapped if e != effect]
+    return tuple(sorted({*found}))
+
+
+def _sets(selection: Selection) -> tuple[WeighedSet, ...]:
+    listed = [s for s in selection.weighed.sets if s.probability >= 0.001] or list(
+        selection.weighed.sets[:1]
+    )
+    return tuple(
+        WeighedSet(
+            effects=one.effects,
+            unknown=None
+            if one.unknown is None
+            else selection.final.evidence.system.coordinates[one.unknown],
+            probability=min(one.probability, 1.0),
+            log_evidence=one.log_evidence,
+        )
+        for one in sorted(listed, key=lambda s: -s.probability)
+    )

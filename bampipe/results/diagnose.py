@@ -78,6 +78,9 @@ class WeighedSet(Record):
     """A set of effects and how probable it is."""
 
     effects: Names = Field(description="Beyond those of the model diagnosed")
+    unknown: str | None = Field(
+        default=None, description="Axis on which something unknown stands beside them"
+    )
     probability: Share
     log_evidence: float = Field(description="Over that of the first set, nats")
 

@@ -199,7 +199,8 @@ class Likelihood:
                 + (discrepancy * f) ** 2
             )
             least = _LEAST * float(variance.mean()) if variance.size else 0.0
-            root.append(1.0 / np.sqrt(np.maximum(variance, least) + 1e-300))
+            # Where nothing scatters, all samples weigh alike.
+            root.append(1.0 / np.sqrt(np.maximum(variance, least)) if least else np.ones(len(f)))
             force.append(f)
         return cls(
             samples, noise, tuple(root),

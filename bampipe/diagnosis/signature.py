@@ -1,0 +1,200 @@
+"""What an effect leaves in the residual of a model that lacks it, along a standard motion."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.physics import Model, compile_model
+from bampipe.physics.device import INPUT_ORDERS, Coordinate, Device, derivative
+from bampipe.physics.effect import Effect
+from bampipe.physics.parameter import Parameter
+from bampipe.physics.system import System
+
+Array = NDArray[np.float64]
+
+DURATION_S, RATE_HZ = 16.0, 250.0
+SMOOTHING_S = 0.3
+BINS = 24
+BRAKE_DAMPING = 10.0
+"""Damping that the brakes render where an effect shows only with brakes on, N.m.s/rad, N.s/m."""
+
+
+@dataclass(frozen=True)
+class Signature:
+    """The residual that one effect leaves on one axis.
+
+    Attributes:
+        axis: the axis it is largest on, relative to the friction there.
+        unit: of the residual.
+        rms: root mean square of the residual by axis, N.m or N.
+        against: name of what explains most of the residual.
+        against_unit: its unit.
+        share: share of the residual's variance that a curve over ``against`` explains.
+        abscissa: values of ``against``, (T,).
+        residual: residual on ``axis``, (T,), in ``unit``.
+        braked: whether the brakes were on.
+    """
+
+    axis: str
+    unit: str
+    rms: Mapping[str, float]
+    against: str
+    against_unit: str
+    share: float
+    abscissa: Array
+    residual: Array
+    braked: bool
+
+
+def signature(device: Device, effect: Effect, target: str) -> Signature | None:
+    """Return what ``effect`` at its typical size leaves in the residual of the bare device.
+
+    The motion is three sinusoids an axis, 0.1 to 1 Hz, over the middle of the axis' range, with
+    the hand force that the device needs for it, smoothed as a hand's is.
+
+    Args:
+        device: the device.
+        effect: the effect.
+        target: what it acts on, "" for a device-wide effect.
+
+    Returns:
+        The signature; None where the effect leaves nothing.
+    """
+    name = f"{effect.name}:{target}" if target else effect.name
+    bare = compile_model(Model(device))
+    full = compile_model(Model(device, (name,), (effect,)))
+    for braked in (False, True):
+        found = _compute_signature(device, bare, full, braked)
+        if found is not None:
+            return found
+    return None
+
+
+def _compute_signature(
+    device: Device, bare: System, full: System, braked: bool
+) -> Signature | None:
+    t = np.arange(0.0, DURATION_S, 1.0 / RATE_HZ)
+    motion = [_motion(c, device.limits.get(c.name), n, t) for n, c in enumerate(device.coordinates)]
+    q, qd, qdd = (np.column_stack([part[order] for part in motion]) for order in range(3))
+    channels: dict[str, Array] = {"t": t}
+    for number, axis in enumerate(bare.coordinates):
+        if axis in device.brakes:
+            channels[device.brakes[axis]] = braked * BRAKE_DAMPING * np.abs(qd[:, number])
+    channels |= {name: np.ones_like(t) for name in device.channels}
+    p = bare.prior
+    u = _inputs(bare, channels, t)
+    needed = bare.required(q, qd, qdd, bare.memory(q, qd, qdd, u, p, t), u, p)
+    applied = bare.applied(q, qd, qdd, bare.memory(q, qd, qdd, u, p, t), u, p)
+    force = _smooth(bare.least_force(q, needed - applied, u, p))
+    for number, label in enumerate(device.forces):
+        channels[label] = force[:, number]
+        rate = force[:, number]
+        for order in range(1, len(INPUT_ORDERS)):
+            rate = np.gradient(rate, t)
+            channels[derivative(label, order)] = rate
+    left = _residual(bare, q, qd, qdd, channels, t, p)
+    values = np.array([_typical(item) for item in full.parameters])
+    values[: len(p)] = p
+    residual = left - _residual(full, q, qd, qdd, channels, t, values)
+    rms = np.sqrt(np.mean(residual**2, axis=0))
+    scale = np.sqrt(np.mean(needed**2, axis=0)) + 1e-12
+    worst = int(np.argmax(rms / scale))
+    if rms[worst] <= 1e-9 * scale[worst]:
+        return None
+    length = bare.coordinate_units[worst]
+    axis = bare.coordinates[worst]
+    choices = [
+        (f"{other} velocity", f"{unit}/s", qd[:, number])
+        for number, (other, unit) in enumerate(
+            zip(bare.coordinates, bare.coordinate_units, strict=True)
+        )
+    ]
+    choices.sort(key=lambda choice: not choice[0].startswith(axis))
+    choices += [
+        (f"{axis} position", length, q[:, worst]),
+        (f"{axis} acceleration", f"{length}/s2", qdd[:, worst]),
+        (f"load on {axis}", bare.torque_units[worst], needed[:, worst]),
+        *(
+            (f"rate of {label}", f"{device.force_unit}/s", np.gradient(force[:, n], t))
+            for n, label in enumerate(device.forces)
+        ),
+        ("time", "s", t),
+    ]
+    shares = [_explained(abscissa, residual[:, worst]) for _, _, abscissa in choices]
+    best = int(np.argmax(np.round(shares, 2)))
+    return Signature(
+        axis=axis,
+        unit=bare.torque_units[worst],
+        rms=dict(zip(bare.coordinates, rms.tolist(), strict=True)),
+        against=choices[best][0],
+        against_unit=choices[best][1],
+        share=shares[best],
+        abscissa=choices[best][2],
+        residual=residual[:, worst],
+        braked=braked,
+    )
+
+
+def _motion(
+    coordinate: Coordinate, limits: tuple[float, float] | None, number: int, t: Array
+) -> tuple[Array, Array, Array]:
+    lower, upper = limits if limits is not None else (-0.5, 0.5)
+    middle, size = (lower + upper) / 2.0, (upper - lower) / 4.0
+    q, qd, qdd = np.full_like(t, middle), np.zeros_like(t), np.zeros_like(t)
+    # Frequencies that no two axes share, so that axes can be distinguished.
+    for order, frequency in enumerate((0.11, 0.37, 0.83)):
+        w = 2.0 * np.pi * frequency * (1.0 + 0.13 * number)
+        a, phase = size / (1.0 + 2.0 * order), 0.7 * number + order
+        q += a * np.sin(w * t + phase)
+        qd += a * w * np.cos(w * t + phase)
+        qdd -= a * w**2 * np.sin(w * t + phase)
+    return q, qd, qdd
+
+
+def _smooth(force: Array) -> Array:
+    """Return ``force`` without its jumps at reversals: a hand cannot follow them."""
+    window = np.hanning(int(SMOOTHING_S * RATE_HZ) | 1)
+    window /= window.sum()
+    edge = len(window) // 2
+    padded = np.pad(force, ((edge, edge), (0, 0)), mode="edge")
+    return np.column_stack([np.convolve(column, window, "valid") for column in padded.T])
+
+
+def _inputs(system: System, channels: Mapping[str, Array], t: Array) -> Array:
+    return np.column_stack([channels.get(name, np.zeros_like(t)) for name in system.inputs])
+
+
+def _residual(
+    system: System,
+    q: Array,
+    qd: Array,
+    qdd: Array,
+    channels: Mapping[str, Array],
+    t: Array,
+    p: Array,
+) -> Array:
+    u = _inputs(system, channels, t)
+    z = system.memory(q, qd, qdd, u, p, t)
+    return system.applied(q, qd, qdd, z, u, p) - system.required(q, qd, qdd, z, u, p)
+
+
+def _typical(parameter: Parameter) -> float:
+    if parameter.typical is not None:
+        return parameter.typical
+    return parameter.sd if parameter.strength else parameter.prior
+
+
+def _explained(abscissa: Array, residual: Array) -> float:
+    """Share of the variance of ``residual`` that its mean over bins of ``abscissa`` explains."""
+    edges = np.quantile(abscissa, np.linspace(0.0, 1.0, BINS + 1)[1:-1])
+    bins = np.searchsorted(edges, abscissa)
+    count = np.bincount(bins, minlength=BINS)
+    mean = np.bincount(bins, residual, minlength=BINS) / np.maximum(count, 1)
+    total = float(np.var(residual))
+    if total == 0.0:
+        return 1.0
+    return 1.0 - float(np.mean((residual - mean[bins]) ** 2)) / total
