@@ -72,8 +72,8 @@ def test_following_judges_the_model_that_it_starts_from(
             " arbitrary, it is actuator_delay. A lag weakens",
         ),
         (
-            {("a:joint", "b:joint"): 0.7, ("a:joint", "c:joint"): 0.295, (): 0.005},
-            "between b:joint (0.70) and c:joint (0.29) beside a:joint (0.99): which of them is"
+            {("a:joint", "b:joint"): 0.7, ("a:joint", "c:joint"): 0.296, (): 0.004},
+            "between b:joint (0.70) and c:joint (0.30) beside a:joint (> 0.99): which of them is"
             " added is arbitrary, it is b:joint. No trial was found",
         ),
         (
