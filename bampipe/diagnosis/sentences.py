@@ -46,9 +46,9 @@ def _verdict(axis: str, entry: AxisVerdict, result: DiagnoseResult) -> str:
     """What is missing, the error with it, and how much of the force is then explained."""
     before, error = three(entry.rmse_before), three(entry.rmse_after)
     stands = f"{error} {entry.unit}, {phrases.times_floor(entry.rmse_after, entry.noise_floor)}"
-    share = f"explains {phrases.percent_of_force(entry.explained)} of the mean square of the force"
+    share = f"explains {phrases.share_of_force(entry)}"
     whole = f"the held-out error is {stands}, and the model {share}"
-    if entry.effects or before != error:
+    if result.selected and (entry.effects or before != error):
         adding = f"{_adding(entry, result)} takes the held-out error from {before}"
         whole = f"{adding} to {stands}; the model then {share}"
     if entry.verdict == "nothing_missing":
@@ -107,8 +107,7 @@ def _why_none(axis: str, entry: AxisVerdict, result: DiagnoseResult) -> str:
         why = (
             "replays of the model are not like the measurement, so that what chance gives to a"
             f" candidate is not known; the held-out error is {error}, that of replays {floor}, and"
-            f" the model explains {phrases.percent_of_force(entry.explained)} of the mean square of"
-            " the force."
+            f" the model explains {phrases.share_of_force(entry)}."
         )
         windows = [w for w in result.worst_windows if w.axis == axis]
         if windows:

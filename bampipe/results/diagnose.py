@@ -175,6 +175,11 @@ class DiagnoseResult(Result):
         """By axis, in a few words, with what is missing there."""
         return {axis: phrases.verdict(self, axis) for axis in self.axes}
 
+    @property
+    def lacking(self) -> Names:
+        """Axes whose verdict is another one than that nothing is missing."""
+        return tuple(a for a, entry in self.axes.items() if entry.verdict != "nothing_missing")
+
     def sets_on(self, axis: str) -> list[tuple[Names, float]]:
         """What the sets come to on one axis, by probability: the most probable first."""
         known, found = self.axes[axis].probabilities, dict[Names, float]()

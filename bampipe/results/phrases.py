@@ -24,8 +24,13 @@ def probability(value: float) -> str:
 def percent_of_force(share: float) -> str:
     """Return a share of the force in per cent, with the decimals that tell it from all of it."""
     left = 100.0 * abs(1.0 - share)
-    decimals = 1 if left == 0.0 else max(1, math.ceil(-math.log10(left)) + 1)
+    decimals = 1 if left == 0.0 else max(1, math.ceil(-math.log10(left)))
     return f"{100.0 * share:.{min(decimals, 6)}f} %"
+
+
+def share_of_force(entry: AxisVerdict) -> str:
+    """Return what the final model explains of an axis."""
+    return f"{percent_of_force(entry.explained)} of the mean square of the applied force"
 
 
 def times_floor(error: float, floor: float) -> str:

@@ -74,7 +74,7 @@ def _model(
     blocks: list[Block] = [Bullets(sentences), _verdicts(found, names)]
     if found.limits:
         blocks.append(Paragraph(found.limits))
-    lacking = [axis for axis in names if axes[axis].verdict != "nothing_missing"]
+    lacking = [axis for axis in names if axis in found.lacking]
     if found.ranking and lacking:
         blocks += [_ranking(found.ranking), *_sets(found)]
     if lacking:
@@ -146,11 +146,11 @@ def _verdicts(found: DiagnoseResult, names: Sequence[str]) -> Table:
         tuple(rows),
         "llrrrrrlr",
         (0.0, 1.0, *7 * (0.0,)),
-        note="In brackets: probabilities. Explained: share of the mean square of the force, with "
-        "the most probable set of effects. Errors are RMSE on held-out trials; beyond bias: of "
-        "what filters do not leave where friction turns; floor: of replays of the model with the "
-        "set. Explainable: share of the residual now that any smooth function of motion and load "
-        "predicts on unseen trials.",
+        note="In brackets: probabilities. Explained: share of the mean square of the applied "
+        "force, with the most probable set of effects. Errors are RMSE on held-out trials; beyond "
+        "bias: with the set, but for what filters leave where friction turns; floor: of replays of "
+        "the model with the set. Explainable: share of the residual now that any smooth function "
+        "of motion and load predicts on unseen trials.",
     )
 
 
@@ -168,7 +168,7 @@ def _sets(found: DiagnoseResult) -> list[Block]:
         )
         for one in shown[:_RANKED]
     ]
-    heads = ("Effects", "Probability", "Log evidence (nats)")
+    heads = ("Effects", "Probability", "Log evidence over the first (nats)")
     return [Table("Sets of effects, the most probable first", heads, tuple(rows), "lrr"), chance]
 
 
