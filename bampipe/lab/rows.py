@@ -12,6 +12,7 @@ from bampipe.data import lab_tables, store
 from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError
 from bampipe.files import refuse_links
+from bampipe.results import phrases
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.ingest import IngestResult
@@ -129,12 +130,14 @@ def _model(
                 axis=axis,
                 verdict=said.verdict,
                 effects=list(said.effects),
-                named=diagnosis.named(axis),
-                likely=said.by_odds,
+                named=phrases.missing(diagnosis, axis),
+                likely=said.likely,
+                probabilities=[said.probabilities[name] for name in said.likely],
+                unknown=said.unknown,
                 unit=said.unit,
                 sentence=said.sentence,
+                explained=said.explained,
                 explainable_share=said.explainable_share,
-                explainable_chance=said.explainable_chance,
                 rmse_before=said.rmse_before,
                 rmse_after=said.rmse_after,
                 noise_floor=said.noise_floor,

@@ -10,7 +10,7 @@ from bampipe.errors import InputError
 from bampipe.lists import join_names
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.identify import IdentifyResult
-from bampipe.results.next import AS_FORECAST, ExpectedSd, NextResult
+from bampipe.results.next import AS_FORECAST, NOTHING, ExpectedSd, NextResult
 
 _SHOWN = 3
 """Parameters that are compared: those for which the forecast promised most."""
@@ -104,14 +104,15 @@ def compare_forecast(
         if diagnosed is None:
             said.append(f"{forecast_text}; `bampipe diagnose RUN` says what came.")
             continue
-        found = {name for name in pair.between if name in diagnosed.selected}
-        alike = {other for name in found for other in diagnosed.groups.get(name, ())}
-        if not found:
-            said.append(f"{forecast_text}; neither is found.")
-        elif len(found) == 1 and not alike & set(pair.between):
-            said.append(f"{forecast_text}; it is {next(iter(found))}.")
-        else:
+        found = [name for name in pair.between if name in diagnosed.selected]
+        if {*pair.between} - {NOTHING} <= diagnosed.doubted:
             said.append(f"{forecast_text}; the trials still do not distinguish them.")
+        elif not found:
+            none = "it is not found" if NOTHING in pair.between else "neither is found"
+            said.append(f"{forecast_text}; {none}.")
+        else:
+            it = f"it is {found[0]}" if len(found) == 1 else "both are found"
+            said.append(f"{forecast_text}; {it}.")
     return (*said, *_shown(proposed, diagnosed))
 
 

@@ -17,6 +17,10 @@ AS_FORECAST = 1.3
 """Factor within which an uncertainty came as forecast."""
 
 
+NOTHING = "nothing missing"
+"""In a pair of effects that trials are to tell apart, that neither is there."""
+
+
 class Move(Record):
     """Back and forth of one axis."""
 

@@ -340,9 +340,12 @@ def _trial_errors(results: Results) -> Content:
 def _candidates(diagnosis: DiagnoseResult, label: str) -> Content:
     return {
         "title": f"Candidate effects, {label}",
-        "note": "Held-out error without and with each effect; p: chance of such a fall in error "
-        "where the effect is absent.",
-        "head": ["Effect", "Axis", "Without", "With", "Unit", "p", "Indistinguishable from"],
+        "note": "Held-out error without and with each effect; p: chance that replays give any "
+        "candidate as large a gain.",
+        "head": [
+            *("Effect", "Axis", "Without", "With", "Unit", "Probability", "p"),
+            "Indistinguishable from",
+        ],
         "rows": [
             [
                 entry.effect,
@@ -350,6 +353,7 @@ def _candidates(diagnosis: DiagnoseResult, label: str) -> Content:
                 entry.held_out_rmse_before,
                 entry.held_out_rmse_after,
                 wording.unit(entry.unit),
+                entry.probability,
                 entry.p_value,
                 ", ".join(entry.indistinguishable_from),
             ]
