@@ -24,12 +24,6 @@ from bampipe.discover.shape import residual_map, variables, worst_windows
 from bampipe.errors import InputError, NothingToDoError, did_you_mean
 from bampipe.estimate.simulation import Runaway
 from bampipe.identification.terms import effect_text
-from bampipe.next_trial.choice import rank_designs
-from bampipe.next_trial.forecast import NOTHING
-from bampipe.next_trial.motion import Rehearsal
-from bampipe.next_trial.primitives import Envelope
-from bampipe.next_trial.questions import find_ambiguity, make_contest
-from bampipe.next_trial.words import describe
 from bampipe.physics import compile_model, registry
 from bampipe.physics.effect import effect_from
 from bampipe.physics.recipe import Recipe
@@ -38,7 +32,6 @@ from bampipe.results.diagnose import (
     DiagnoseResult,
     RankedEffect,
     ResidualMap,
-    SuggestedTrial,
 )
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.setup import SetupResult
@@ -50,7 +43,6 @@ from bampipe.trials.measured import MeasuredTrials, read_measured_trials, trial_
 
 _DESCRIBED = 12
 """Effects of the ranking whose formulas are stored with it."""
-_SUGGESTED_S = 20.0
 
 SUMMARY = "Find which physical effect the model lacks"
 INPUTS = (*INGESTED, *FILTERED, "filter/setup.json?", *IDENTIFIED_MODEL)
@@ -132,10 +124,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         ) from error
     samples = _map_variables(found)
     write_parquet(out / f"models/{config.model}/map_variables.parquet", samples)
-    progress(0.97, "a trial that would decide what these do not")
-    result = _with_suggestion(
-        _result(found, trials, recipe, config), found, trials, recipe, settings
-    )
+    result = _result(found, trials, recipe, config)
     headline = "; ".join(f"{axis}: {words}" for axis, words in result.verdicts_in_words.items())
     return {"headline": headline, **_summary(result.write(out), result.limits)}
 
@@ -252,67 +241,6 @@ def _map_variables(found: Diagnosis) -> pd.DataFrame:
         for variable in variables(evidence, i):
             columns[f"{axis}.{variable.name}"] = np.concatenate(variable.values)
     return pd.DataFrame(columns)
-
-
-def _with_suggestion(
-    result: DiagnoseResult,
-    found: Diagnosis,
-    trials: MeasuredTrials,
-    recipe: Recipe,
-    settings: Settings,
-) -> DiagnoseResult:
-    """The result with the trial that would tell apart what these trials do not."""
-    asked = find_ambiguity(result)
-    if asked is None:
-        return result
-    system, p = found.initial.system, found.initial.p
-    floor = np.array([axis.noise_floor for axis in found.axes])
-    values = {name: value for row in found.ranking for name, value in row.parameters.items()}
-    contest = make_contest(trials, recipe, p, asked, values, floor)
-    if contest is None:
-        return result
-    seen = Envelope.of_trials(trials.motions, system, p)
-    rehearsal = Rehearsal(system, p, trials.sensors, trials.kinematics, seen, settings.seed)
-    at_hand = contest.sums(trials.weighed)
-    tried = rank_designs(
-        rehearsal,
-        lambda motion: -contest.confusion(contest.contrasts(at_hand + contest.sums([motion]))),
-        _SUGGESTED_S,
-        seen.movable,
-        with_rests=True,
-        with_brakes=True,
-    )[0]
-    now, sums = contest.contrasts(at_hand), [contest.sums([motion]) for motion in tried.usual]
-    then = [contest.contrasts(at_hand + new, new) for new in sums]
-    weights = contest.weights()
-    pair = max(weights, key=lambda pair: weights[pair] * now[pair].confusion)
-    confusion = float(np.median([one[pair].confusion for one in then]))
-    if now[pair].confusion < settings.confused or (
-        confusion > settings.confusion_left * now[pair].confusion
-    ):
-        return result
-    left = np.median([one[pair].left for one in then], axis=0) / floor
-    axis = int(np.argmax(left))
-    first, second = (contest.rivals[k].name or NOTHING for k in pair)
-    design = describe(tried.design, seen, system.model.device)
-    return result.model_copy(
-        update={
-            "suggested_trial": SuggestedTrial(
-                between=(first, second),
-                axis=system.coordinates[axis],
-                design=design,
-                separation=float(left[axis]),
-                separation_now=float(now[pair].left[axis] / floor[axis]),
-                confusion=confusion,
-                confusion_now=now[pair].confusion,
-                sentence=(
-                    f"To tell {first} from {second}, record this: {design} The chance of confusing"
-                    f" them would fall from {100.0 * now[pair].confusion:.0f} to"
-                    f" {100.0 * confusion:.0f} %."
-                ),
-            )
-        }
-    )
 
 
 def _next(found: Diagnosis, model: str) -> str:
