@@ -123,12 +123,13 @@ def weigh_visibility(contest: Contest, sums: Sums, needed: float) -> list[Visibi
         needed: log evidence, nats, see `find_needed`.
     """
     criteria, found = contest.session.criteria, []
+    sure = norm.ppf(criteria.probability)
     for number, (rival, left) in enumerate(
         zip(contest.rivals, contest.left_by_model(sums), strict=True)
     ):
         expected = left.distance(sums.independent, _FACTORS)
         # Noise scatters a log likelihood ratio by the root of twice what is expected of it.
-        surely = expected - norm.ppf(criteria.probability) * np.sqrt(2.0 * expected)
+        surely = expected - sure * np.sqrt(2.0 * expected)
         excess = surely - needed - _find_penalty(contest, sums, number)
         enough = np.flatnonzero(excess >= 0.0)
         factor = float("inf")
@@ -139,7 +140,8 @@ def weigh_visibility(contest: Contest, sums: Sums, needed: float) -> list[Visibi
         # What it adds that the model cannot imitate, where it is most beside the applied force.
         added = sums.added[:, number] / np.maximum(sums.applied, 1e-300)
         size = np.sqrt(float(added.max()) * left.share)
-        factor = max(factor, float(criteria.size / max(size, 1e-300)))
+        scatter = sure / np.sqrt(max(float(left.squares.sum()) + left.prior, 1e-300))
+        factor = max(factor, float(criteria.size / max(size, 1e-300) + scatter))
         factor = factor if factor < HOPELESS else float("inf")
         found.append(Visibility(rival, factor, int(np.argmax(left.squares))))
     return found
