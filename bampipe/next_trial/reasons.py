@@ -130,7 +130,7 @@ def _unseen(
 
 def _decision(best: Proposal, unlimited: Sequence[str]) -> tuple[str, str]:
     pair = max(best.confusion, key=lambda pair: pair.weight * pair.before)
-    before, after = _chance(pair.before), _chance(pair.after)
+    before, after = say_chance(pair.before), say_chance(pair.after)
     expected = (
         f"The chance of confusing them is expected to fall from {before} to {after}."
         if pair.after < LOWERED * pair.before
@@ -197,7 +197,8 @@ def _narrowed(parameter: str, best: Proposal) -> str:
     return f"Expected: {'; '.join(parts)}" + (" (eight cases in ten)." if wide else ".")
 
 
-def _chance(value: float) -> str:
+def say_chance(value: float) -> str:
+    """A chance in per cent."""
     return "below 1 %" if value < 0.01 else f"{100.0 * value:.0f} %"
 
 

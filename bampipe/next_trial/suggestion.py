@@ -16,7 +16,7 @@ from bampipe.next_trial.choice import rank_designs
 from bampipe.next_trial.discrimination import Contest, Rival
 from bampipe.next_trial.motion import Rehearsal
 from bampipe.next_trial.primitives import Envelope
-from bampipe.next_trial.reasons import LOWERED
+from bampipe.next_trial.reasons import LOWERED, say_chance
 from bampipe.next_trial.words import describe
 from bampipe.physics.recipe import Recipe
 from bampipe.results.diagnose import DiagnoseResult, SuggestedTrial
@@ -125,9 +125,12 @@ def suggest_trial(session: Session, final: Fit, result: DiagnoseResult) -> Sugge
     def worth(motion: Motion) -> float:
         return -contest.confusion(contest.contrasts(contest.at_hand + contest.sums([motion])))
 
-    tried = rank_designs(
-        rehearsal, worth, _SUGGESTED_S, seen.movable, with_rests=True, with_brakes=True
-    )[0]
+    # About the axes on which rivals act: elsewhere they all leave the same.
+    acts = {
+        axis for rival in contest.rivals for item in rival.items for axis in item.system.touched
+    }
+    axes = [axis for axis in seen.movable if axis in acts] or seen.movable
+    tried = rank_designs(rehearsal, worth, _SUGGESTED_S, axes, with_rests=True, with_brakes=True)[0]
     sums = [contest.sums([motion]) for motion in tried.usual]
     then = [contest.contrasts(contest.at_hand + new, new) for new in sums]
     weights, before = contest.weights(), contest.confusions(contest.now)
@@ -149,6 +152,6 @@ def suggest_trial(session: Session, final: Fit, result: DiagnoseResult) -> Sugge
         confusion_now=before[pair],
         sentence=(
             f"To tell {first} from {second}, record this: {design} The chance of confusing"
-            f" them would fall from {100.0 * before[pair]:.0f} to {100.0 * confusion:.0f} %."
+            f" them would fall from {say_chance(before[pair])} to {say_chance(confusion)}."
         ),
     )
