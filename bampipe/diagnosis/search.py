@@ -72,8 +72,7 @@ class Search:
         known: Mapping[Key, Atom | None],
     ) -> None:
         self.p, self.dictionary, self.make, self.criteria = problem, dictionary, make, criteria
-        number = max(len(dictionary.candidates), 1)
-        self.log_prior = min(float(np.log(criteria.expected_effects / number)), 0.0)
+        self.log_prior = log_prior(criteria, len(dictionary.candidates))
         p = problem
         self.n_q = len(p.y)
         self.bb, self.by, self.yy = p.sums()
@@ -225,9 +224,8 @@ class Search:
             if min(sizes) < self.least_size:
                 return Solution(np.inf)
             spread = np.array([s for key in keys for s in self.dictionary.spreads(key[0])])
-            wide = np.maximum(spread, np.abs(b[nb:]))[used]
-            penalty += 0.5 * np.linalg.slogdet(np.eye(len(used)) + inside * wide * wide[:, None])[1]
-            penalty += sum(_A_SHAPE * len(key[1]) for key in keys)
+            shapes = sum(len(key[1]) for key in keys)
+            penalty += float(penalise(inside, spread[used], b[nb:][used], shapes))
         cost = solved.cost - float(volume.sum()) + penalty
         return Solution(cost, strengths, b[:nb], scale, volume, penalty, sizes, weight)
 
@@ -580,6 +578,25 @@ _STRENGTH = 4.0
 """The same of a strength."""
 _A_SHAPE = 2.5
 """Half the logarithm of the information on a shape over its range, as it comes out on the whole."""
+
+
+def log_prior(criteria: Criteria, number: int) -> float:
+    """Log of the prior odds of each of so many candidates."""
+    return min(float(np.log(criteria.expected_effects / max(number, 1))), 0.0)
+
+
+def penalise(information: Array, spread: Array, strengths: Array, shapes: int) -> Array:
+    """What the priors of effects take off their log evidence (Laplace), nats, one or (...).
+
+    Args:
+        information: on their strengths, (m, m).
+        spread: of these before any data, (m,); strengths: (..., m).
+        shapes: how many parameters beside them are fitted.
+    """
+    wide = np.maximum(spread, np.abs(strengths))
+    scaled = information * wide[..., :, None] * wide[..., None, :]
+    found = 0.5 * np.linalg.slogdet(np.eye(len(information)) + scaled)[1]
+    return np.asarray(found + _A_SHAPE * shapes)
 
 
 def added(keys: Sequence[Key]) -> tuple[Key, ...]:

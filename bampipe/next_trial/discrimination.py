@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import cached_property, reduce
 from itertools import combinations
+from operator import add
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from bampipe.discover.candidates import Candidate
-from bampipe.discover.columns import added_residual
-from bampipe.discover.settings import Settings
-from bampipe.estimate.least_squares import stacked_residual
-from bampipe.estimate.low_pass import Band
-from bampipe.physics import System
+from bampipe.diagnosis.candidates import Candidate
+from bampipe.diagnosis.columns import added_residual
+from bampipe.diagnosis.session import Fit, Session
+from bampipe.results.next import join_rival
+from bampipe.trials.evidence import Evidence, gather_evidence
+from bampipe.trials.folds import Folds
+from bampipe.trials.likelihood import Likelihood, Noise, lay_out_samples, take_samples
 from bampipe.trials.motion import Motion
-from bampipe.trials.residuals import ModelOnTrial, problem_of
+from bampipe.trials.residuals import ModelOnTrial
 
 Array = NDArray[np.float64]
 
@@ -27,27 +30,24 @@ _STEP = 1e-3
 
 @dataclass(frozen=True)
 class Rival:
-    """An effect that may be what a model lacks.
+    """Effects that may be what a model lacks.
 
     Attributes:
-        item: the candidate; None for none at all.
-        values: its parameters, in the order of its file.
-        odds: that it is this one.
+        items: the candidates; none where nothing is missing.
+        values: the parameters of each, in the order of its file.
+        odds: that it is these.
+        slopes: parameters that are fitted: number of the item, and of the parameter in it.
     """
 
-    item: Candidate | None
-    values: Array
-    odds: float
+    items: tuple[Candidate, ...]
+    values: tuple[Array, ...]
+    odds: float = 0.0
+    slopes: tuple[tuple[int, int], ...] = ()
 
     @property
     def name(self) -> str:
-        """Canonical name of the effect."""
-        return self.item.name if self.item else ""
-
-    @property
-    def free(self) -> list[int]:
-        """Places of its parameters that are fitted."""
-        return [i for i, q in enumerate(self.item.parameters) if not q.fixed] if self.item else []
+        """Canonical names of its effects."""
+        return join_rival(item.name for item in self.items)
 
 
 @dataclass(frozen=True)
@@ -55,109 +55,206 @@ class Sums:
     """Sums of products over the samples of some trials.
 
     Attributes:
-        squares: (n_q, m, m) of all columns: slopes by the free parameters of the model, then what
-            each rival adds, and its slopes by its own parameters.
-        count: (n_q,) samples.
+        squares: (n_q, m, m) of all columns over the standard deviation of the noise, by
+            independent samples: the nuisance and the free parameters of the model, then what each
+            rival adds, and its slopes by its own parameters.
+        independent: (n_q,) samples.
+        added: (n_q, rivals) of what each adds with itself; applied: (n_q,) of the applied force,
+            both of all samples, N.m or N squared.
     """
 
     squares: Array
-    count: Array
+    independent: Array
+    added: Array
+    applied: Array
 
     def __add__(self, other: Sums) -> Sums:
-        return Sums(self.squares + other.squares, self.count + other.count)
+        return Sums(
+            self.squares + other.squares,
+            self.independent + other.independent,
+            self.added + other.added,
+            self.applied + other.applied,
+        )
 
     def scaled(self, factor: float) -> Sums:
         """The sums of trials that are ``factor`` times as long."""
-        return Sums(factor * self.squares, factor * self.count)
+        return Sums(
+            factor * self.squares,
+            factor * self.independent,
+            factor * self.added,
+            factor * self.applied,
+        )
+
+
+@dataclass(frozen=True)
+class Left:
+    """What fitted columns leave of a target.
+
+    Attributes:
+        squares: sum by axis, (n_q,), in variances of the noise.
+        prior: twice what the parameters' departure from what is known of them costs, nats.
+        share: both together, of the sum of squares of the target on all axes.
+    """
+
+    squares: Array
+    prior: float
+    share: float
+
+    def distance(self, independent: Array, factor: Array | float = 1.0) -> Array:
+        """Expected log likelihood ratio of the target times a factor over what is fitted, nats.
+
+        Args:
+            independent: (n_q,) samples; factor: one, or several, (...).
+        """
+        by_axis = np.square(factor)[..., None] * self.squares / np.maximum(independent, 1e-300)
+        return np.asarray(0.5 * (np.log1p(by_axis) @ independent + np.square(factor) * self.prior))
 
 
 @dataclass(frozen=True)
 class Contrast:
-    """How two effects differ on some trials.
+    """How two rivals differ on some trials.
 
     Attributes:
         distance: expected log likelihood ratio of the right one over the wrong one refitted, nats,
             the smaller of both ways.
-        confusion: chance that the wrong one comes out no worse, the mean of both ways.
-        left: (n_q,) root mean square that the wrong one leaves of the right one, N.m or N, the
-            smaller of both ways.
+        left: (n_q,) root mean square that the wrong one leaves of the right one, in standard
+            deviations of the noise, the smaller of both ways.
     """
 
     distance: float
-    confusion: float
     left: Array
 
 
 @dataclass(frozen=True)
 class Contest:
-    """Rival effects on one model.
+    """Rival effects beside one model, under the likelihood of the trials at hand.
 
     Attributes:
-        system, p: the model without any of them, and its fitted parameters.
-        rivals: the effects; band: of residuals.
-        floor: (n_q,) noise floor of each axis, N.m or N.
-        refits: whether rivals are fitted, and not only the model without them.
-        timing_s: by how much the inputs may be sampled late or early, which is fitted beside the
-            model's parameters, last; 0 where it is not.
+        session: the trials, and what decides; fit: the model without any of the rivals.
+        scale: (n_q,) mean square that the model leaves with what it lacks, in the variance of
+            replays.
+        rivals: the effects.
     """
 
-    system: System
-    p: Array
+    session: Session
+    fit: Fit
+    scale: Array
     rivals: tuple[Rival, ...]
-    band: Band
-    floor: Array
-    refits: bool = True
-    timing_s: float = 0.0
+
+    @cached_property
+    def at_hand(self) -> Sums:
+        """The sums over the trials at hand."""
+        return self._sums_of(self.fit.evidence, self.fit.likelihood)
 
     def sums(self, motions: Sequence[Motion]) -> Sums:
-        """The sums over ``motions``."""
-        parts = [self._sums_of(motion) for motion in motions]
-        return Sums(
-            np.sum([part.squares for part in parts], axis=0),
-            np.sum([part.count for part in parts], axis=0),
-        )
+        """The sums over ``motions``, replays of the model through the sensors."""
+        return reduce(add, (self._sums_of(*self._observe(motion)) for motion in motions))
 
-    def _sums_of(self, motion: Motion) -> Sums:
-        problem = problem_of(self.system, [motion], self.band, timing=self.timing_s > 0.0)
-        stacked = stacked_residual(problem, 0, np.append(self.p, 0.0))
-        base = ModelOnTrial(self.system, self.p, [motion])
-        columns = [stacked.slope]
-        n = len(self.system.coordinates)
-        for rival in self.rivals:
-            rows = self._added_by(rival, base)
-            thin = self.band.thin(np.concatenate(rows, axis=1)).reshape(-1, len(rows), n)
-            columns.append(thin.transpose(0, 2, 1) * stacked.used[:, :, None])
-        joined = np.concatenate(columns, axis=2)
-        by_axis = np.ascontiguousarray(joined.transpose(1, 2, 0))
-        squares = by_axis @ by_axis.transpose(0, 2, 1)
-        return Sums(squares, stacked.used.sum(axis=0).astype(float))
+    def _observe(self, motion: Motion) -> tuple[Evidence, Likelihood]:
+        """The model on a replay, whose noise goes with speed as in the trials at hand."""
+        e, c = self.fit.evidence, self.session.criteria
+        name = motion.trial_id
+        seen = gather_evidence(
+            e.system, [motion], e.band, e.p, Folds.of_trials([name], (), [name]),
+            most_iterations=0, timing=e.timing,
+        )  # fmt: skip
+        samples = lay_out_samples(seen, c.block_s)
+        speed = [np.abs(motion.qd[e.band.thinned_rows(len(motion.t))])]
+        bias, variance = [], []
+        for axis, here in enumerate(samples):
+            # One replay is its bias with the noise of one.
+            bias.append(take_samples(seen.residual, here, axis))
+            known = self._variance_by_speed[axis]
+            variance.append(np.interp(take_samples(speed, here, axis), *known))
+        nothing = tuple(np.zeros_like(b) for b in bias)
+        noise = Noise(tuple(bias), tuple(variance), nothing, ())
+        return seen, Likelihood.of(seen, samples, noise, c.bias_error, c.discrepancy)
+
+    @cached_property
+    def _variance_by_speed(self) -> list[tuple[Array, Array]]:
+        e, likelihood, found = self.fit.evidence, self.fit.likelihood, []
+        speeds = [np.abs(m.qd[e.band.thinned_rows(len(m.t))]) for m in e.motions]
+        for axis, here in enumerate(likelihood.samples):
+            speed, variance = take_samples(speeds, here, axis), likelihood.noise.variance[axis]
+            order = np.argsort(speed)
+            # An axis that never moves has none, and counts for nothing.
+            found.append((speed[order], variance[order]) if speed.size else (_ZERO, _ZERO))
+        return found
+
+    def _sums_of(self, evidence: Evidence, likelihood: Likelihood) -> Sums:
+        e, n_q = evidence, len(likelihood.samples)
+        rows = [
+            np.concatenate([row for r in self.rivals for row in self._added_by(r, base)], axis=1)
+            for base in e.fitted
+        ]
+        width = rows[0].shape[1] // n_q
+        by_trial = []
+        for k, values in enumerate(e.band.thin_trials(rows, [*range(n_q)] * width)):
+            columns = values.reshape(len(values), width, n_q).transpose(0, 2, 1)
+            timing = [by[:, :, None] for by in e.by_timing[k : k + 1]]
+            columns = columns * e.used[k][:, :, None]
+            by_trial.append(np.concatenate([e.jacobian[k], *timing, columns], axis=2))
+        squares, plain, applied = [], [], []
+        for axis, here in enumerate(likelihood.samples):
+            x = take_samples(by_trial, here, axis)
+            nuisance = np.zeros((len(x), 2 * n_q))
+            nuisance[:, axis] = likelihood.noise.bias[axis]
+            nuisance[:, n_q + axis] = likelihood.noise.stopping[axis]
+            share = here.independent / (max(len(x), 1) * self.scale[axis])
+            joined = np.concatenate([nuisance, x], axis=1)
+            targets = [target for target, _ in self._places(joined.shape[1])]
+            plain.append(np.sum(joined[:, targets] ** 2, axis=0))
+            applied.append(float(likelihood.applied[axis] @ likelihood.applied[axis]))
+            joined *= likelihood.root[axis][:, None] * np.sqrt(share)
+            squares.append(joined.T @ joined)
+        independent = np.array([here.independent for here in likelihood.samples])
+        return Sums(np.array(squares), independent, np.array(plain), np.array(applied))
 
     def _added_by(self, rival: Rival, base: ModelOnTrial) -> list[Array]:
         """What a rival adds to the residual, and the slopes of that by its parameters, (T, n_q)."""
-        if rival.item is None:
-            return [np.zeros(base.motion.q.shape)]
-        system, count = rival.item.system, len(rival.values)
-        p = np.append(self.p[: len(system.parameters) - count], rival.values)
-        here = added_residual(rival.item, p, base)
-        rows = [here]
-        for i in rival.free if self.refits else ():
-            q, moved = rival.item.parameters[i], p.copy()
-            step = _STEP * max(abs(rival.values[i]), _STEP * q.sd)
-            step = -step if rival.values[i] + step > q.upper else step
-            moved[len(p) - count + i] += step
-            rows.append((added_residual(rival.item, moved, base) - here) / step)
+
+        def residual(number: int, values: Array) -> Array:
+            item = rival.items[number]
+            count = len(item.system.parameters) - len(values)
+            return added_residual(item, np.append(base.p[:count], values), base)
+
+        here = [residual(k, values) for k, values in enumerate(rival.values)]
+        rows = [np.sum(here, axis=0) if here else np.zeros(base.motion.q.shape)]
+        for number, place in rival.slopes:
+            q, moved = rival.items[number].parameters[place], rival.values[number].copy()
+            step = _STEP * max(abs(moved[place]), _STEP * q.sd)
+            step = -step if moved[place] + step > q.upper else step
+            moved[place] += step
+            rows.append((residual(number, moved) - here[number]) / step)
         return rows
 
-    def _places(self, squares: Array) -> list[tuple[int, list[int]]]:
+    def _places(self, width: int) -> list[tuple[int, list[int]]]:
         """For each rival, the column of what it adds and those of its slopes."""
-        widths = [1 + len(rival.free) * self.refits for rival in self.rivals]
-        start = squares.shape[1] - sum(widths)
-        places = []
-        for width in widths:
-            end = start + width
-            places.append((start, list(range(start + 1, end))))
-            start = end
-        return places
+        widths = [1 + len(rival.slopes) for rival in self.rivals]
+        ends = width - sum(widths) + np.cumsum(widths)
+        firsts = [int(end) - w for end, w in zip(ends, widths, strict=True)]
+        return [(k, [*range(k + 1, k + w)]) for k, w in zip(firsts, widths, strict=True)]
+
+    @cached_property
+    def _precision(self) -> Array:
+        """What is known beforehand of the nuisance parameters and of the model's own."""
+        e = self.fit.evidence
+        of_timing = [12.0 / (e.timing[1] - e.timing[0]) ** 2] if e.by_timing else []
+        return np.concatenate([np.ones(2 * len(self.scale)), e.precision, of_timing])
+
+    def left_by_model(self, total: Sums) -> list[Left]:
+        """What the model alone leaves of each rival."""
+        targets = [target for target, _ in self._places(total.squares.shape[1])]
+        return self._left(total, targets, [])
+
+    def information(self, total: Sums, number: int) -> Array:
+        """On the parameters of a rival by which there are slopes, else on a factor of it."""
+        target, slopes = self._places(total.squares.shape[1])[number]
+        columns = slopes or [target]
+        nb = len(self._precision)
+        squares = total.squares.sum(axis=0)
+        taken = squares[:nb, columns].T @ self._fit(total, columns, [])
+        return np.asarray(squares[np.ix_(columns, columns)] - taken)
 
     def contrasts(self, total: Sums, on: Sums | None = None) -> dict[tuple[int, int], Contrast]:
         """How each pair of rivals differs once the trials of ``total`` are fitted.
@@ -166,80 +263,48 @@ class Contest:
             total: of all trials that the fit sees.
             on: of those on which `Contrast.left` is taken; the same by default.
         """
-        places = self._places(total.squares)
-        base = list(range(places[0][0]))
-        on = on or total
+        places, on = self._places(total.squares.shape[1]), on or total
         found = {}
         for i, j in combinations(range(len(self.rivals)), 2):
             ways = []
             for right, wrong in ((i, j), (j, i)):
-                if self.rivals[right].item is None:
-                    continue
-                target, fitted = places[right][0], [*base, *places[wrong][1]]
-                nothing = self._left(total, total, [target], base)[0]
-                left = self._left(total, total, [target], fitted)[0]
-                shown = self._left(total, on, [target], fitted)[0]
-                distance, confusion = self._compare(total, nothing, left)
-                ways.append((distance, confusion, np.sqrt(shown / np.maximum(on.count, 1.0))))
+                if self.rivals[right].items:
+                    target, fitted = places[right][0], places[wrong][1]
+                    (left,) = self._left(total, [target], fitted)
+                    (shown,) = self._left(total, [target], fitted, on)
+                    each = np.sqrt(shown.squares / np.maximum(on.independent, 1e-300))
+                    ways.append((float(left.distance(total.independent)), each))
             found[i, j] = Contrast(
-                min(way[0] for way in ways),
-                float(np.mean([way[1] for way in ways])),
-                min((way[2] for way in ways), key=lambda left: float(np.sum(left / self.floor))),
+                min(way[0] for way in ways), min((way[1] for way in ways), key=lambda w: w.sum())
             )
         return found
 
-    def left_by_model(self, total: Sums) -> list[Array]:
-        """For each rival, the sum of squares that the model alone leaves of it, (n_q,)."""
-        places = self._places(total.squares)
-        base = list(range(places[0][0]))
-        return list(self._left(total, total, [target for target, _ in places], base))
-
-    def timing_of(self, total: Sums) -> list[float]:
-        """For each rival, the timing that the model alone takes it for, s."""
-        places = self._places(total.squares)
-        base = list(range(places[0][0]))
-        return [abs(float(late)) for late in self._fit(total, [t for t, _ in places], base)[-1]]
-
-    def without_timing(self, total: Sums) -> tuple[Contest, Sums]:
-        """The same where no timing is fitted."""
-        last = self._places(total.squares)[0][0] - 1
-        squares = np.delete(np.delete(total.squares, last, axis=1), last, axis=2)
-        return replace(self, timing_s=0.0), replace(total, squares=squares)
-
-    def _left(self, total: Sums, on: Sums, targets: Sequence[int], fitted: Sequence[int]) -> Array:
-        """Sum of squares of each target that ``fitted`` columns leave on some trials, (m, n_q)."""
-        taken, wanted, columns = self._fit(total, targets, fitted), list(targets), list(fitted)
+    def _left(
+        self, total: Sums, targets: Sequence[int], fitted: Sequence[int], on: Sums | None = None
+    ) -> list[Left]:
+        """What the model and ``fitted`` columns leave of each target on some trials."""
+        on, nb = on or total, len(self._precision)
+        taken, columns = self._fit(total, targets, fitted), [*range(nb), *fitted]
         by_fitted = on.squares[:, columns]
-        left = np.diagonal(on.squares, axis1=1, axis2=2)[:, wanted].T.copy()
-        left -= 2.0 * np.einsum("apr,pr->ra", by_fitted[:, :, wanted], taken)
+        whole = np.diagonal(on.squares, axis1=1, axis2=2)[:, list(targets)].T
+        left = whole - 2.0 * np.einsum("apr,pr->ra", by_fitted[:, :, list(targets)], taken)
         left += np.einsum("apr,pr->ra", by_fitted[:, :, columns] @ taken, taken)
-        return np.asarray(np.maximum(left, 0.0))
+        left = np.maximum(left, 0.0)
+        prior = np.einsum("pr,p,pr->r", taken[:nb], self._precision, taken[:nb])
+        share = (left.sum(axis=1) + prior) / np.maximum(whole.sum(axis=1), 1e-300)
+        every = zip(left, prior, share, strict=True)
+        return [Left(squares, float(p), float(s)) for squares, p, s in every]
 
     def _fit(self, total: Sums, targets: Sequence[int], fitted: Sequence[int]) -> Array:
-        """Coefficients with which ``fitted`` columns come closest to each target, (k, m)."""
-        columns = list(fitted)
-        weight, by_fitted = 1.0 / self.floor**2, total.squares[:, columns]
-        normal = np.einsum("apq,a->pq", by_fitted[:, :, columns], weight)
-        moments = np.einsum("apq,a->pq", by_fitted[:, :, list(targets)], weight)
+        """Coefficients with which model and ``fitted`` columns come closest to targets, (k, m)."""
+        squares, nb = total.squares.sum(axis=0), len(self._precision)
+        columns = [*range(nb), *fitted]
+        normal = squares[np.ix_(columns, columns)]
+        normal[range(nb), range(nb)] += self._precision
         scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-300))[:, None]
+        moments = squares[np.ix_(columns, list(targets))]
         solved = np.linalg.lstsq(normal * scale * scale.T, scale * moments, rcond=1e-9)[0]
         return np.asarray(scale * solved)
-
-    def _compare(self, total: Sums, nothing: Array, left: Array) -> tuple[float, float]:
-        """Distance in log likelihood, and the chance that noise and imperfect models hide it.
-
-        Args:
-            total: of the trials; nothing: (n_q,) sum of squares that the right effect adds and the
-                model alone leaves; left: the same with the wrong effect.
-        """
-        s = Settings()
-        count = np.maximum(total.count, 1.0)
-        independent = count * self.band.independent_share
-        floor = self.floor**2
-        right = 0.5 * float(independent @ np.log1p(nothing / count / floor))
-        wrong = 0.5 * float(independent @ np.log1p(left / count / floor))
-        spread = np.sqrt(2.0 * wrong + (s.score_error * right) ** 2 + s.score_sd**2)
-        return wrong, float(ndtr(-wrong / spread))
 
     def weights(self) -> dict[tuple[int, int], float]:
         """Weight of each pair, after Box and Hill (1967): the product of their odds, sum one."""
@@ -248,12 +313,41 @@ class Contest:
         total = sum(products) or 1.0
         return {pair: product / total for pair, product in zip(pairs, products, strict=True)}
 
-    def tells_apart(self, total: Sums) -> bool:
-        """Whether trials distinguish every pair of rivals, were one of them all that is missing."""
-        limit = Settings().confused
-        return all(found.confusion < limit for found in self.contrasts(total).values())
+    @cached_property
+    def now(self) -> dict[tuple[int, int], Contrast]:
+        """How each pair of rivals differs on the trials at hand."""
+        return self.contrasts(self.at_hand)
+
+    def confusions(
+        self, contrasts: Mapping[tuple[int, int], Contrast]
+    ) -> dict[tuple[int, int], float]:
+        """Chance of taking one of each pair of rivals for the other, with more trials."""
+        return {
+            (i, j): chance_of_confusion(
+                self.rivals[i].odds, self.rivals[j].odds, found.distance - self.now[i, j].distance
+            )
+            for (i, j), found in contrasts.items()
+        }
 
     def confusion(self, contrasts: Mapping[tuple[int, int], Contrast]) -> float:
-        """Chance of confusing two rivals, over all pairs."""
+        """The same over all pairs."""
         weights = self.weights()
-        return sum(weights[pair] * contrasts[pair].confusion for pair in contrasts)
+        return sum(weights[pair] * chance for pair, chance in self.confusions(contrasts).items())
+
+
+_ZERO = np.zeros(1)
+
+
+def chance_of_confusion(first: float, second: float, gained: float) -> float:
+    """Chance that the less probable of two is the right one, after more trials.
+
+    Args:
+        first, second: odds as they stand.
+        gained: expected log likelihood ratio by the trials, nats; its variance is twice that.
+    """
+    total = first + second
+    if gained <= 0.0:
+        return min(first, second) / total
+    lead, spread = np.log(first / second), np.sqrt(2.0 * gained)
+    wrong = first * ndtr(-(gained + lead) / spread) + second * ndtr(-(gained - lead) / spread)
+    return float(wrong / total)

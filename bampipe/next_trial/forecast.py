@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.next_trial.choice import Tried
-from bampipe.next_trial.discrimination import Contest, Sums
+from bampipe.next_trial.discrimination import Contest
 from bampipe.next_trial.motion import Rehearsal
 from bampipe.next_trial.precision import Precision
 from bampipe.next_trial.primitives import Primitive, find_beyond
@@ -19,9 +19,6 @@ from bampipe.trials.motion import Motion
 
 Array = NDArray[np.float64]
 
-NOTHING = "nothing missing"
-"""Name of the rival that no effect is missing."""
-
 
 @dataclass(frozen=True)
 class Forecast:
@@ -30,20 +27,18 @@ class Forecast:
     Attributes:
         rehearsal: the fitted model that designs are tried with.
         precision: what is known of its parameters.
-        contest: effects to distinguish, if there are any; at_hand: its sums over the trials.
+        contest: effects to distinguish, if there are any.
     """
 
     rehearsal: Rehearsal
     precision: Precision
     contest: Contest | None = None
-    at_hand: Sums | None = None
 
     def confusion_with(self, motion: Motion) -> float:
         """Chance of confusing the rivals once ``motion`` has been recorded, over all pairs."""
-        assert self.contest is not None and self.at_hand is not None
-        return self.contest.confusion(
-            self.contest.contrasts(self.at_hand + self.contest.sums([motion]))
-        )
+        contest = self.contest
+        assert contest is not None
+        return contest.confusion(contest.contrasts(contest.at_hand + contest.sums([motion])))
 
     def added_by(self, tried: Tried) -> list[Array]:
         """The information (m, m) that each usual version of a design adds on the parameters.
@@ -103,28 +98,27 @@ class Forecast:
         }
 
     def _confusion(self, motions: Sequence[Motion]) -> tuple[ExpectedConfusion, ...]:
-        if self.contest is None or self.at_hand is None:
+        if self.contest is None:
             return ()
         contest, axes = self.contest, self.rehearsal.system.coordinates
-        now = contest.contrasts(self.at_hand)
         sums = [contest.sums([motion]) for motion in motions]
-        then = [contest.contrasts(self.at_hand + new, new) for new in sums]
-        weights = contest.weights()
+        then = [contest.contrasts(contest.at_hand + new, new) for new in sums]
+        weights, confusion = contest.weights(), contest.confusions(contest.now)
+        chances = [contest.confusions(found) for found in then]
         return tuple(
             ExpectedConfusion(
-                between=tuple(contest.rivals[i].name or NOTHING for i in pair),
+                between=tuple(contest.rivals[i].name for i in pair),
                 weight=weights[pair],
-                before=before.confusion,
-                after=float(np.median([found[pair].confusion for found in then])),
+                before=confusion[pair],
+                after=float(np.median([found[pair] for found in chances])),
                 distance_before=before.distance,
                 distance_after=float(np.median([found[pair].distance for found in then])),
                 left={
                     axis: float(np.median([found[pair].left[k] for found in then]))
-                    / float(contest.floor[k])
                     for k, axis in enumerate(axes)
                 },
             )
-            for pair, before in now.items()
+            for pair, before in contest.now.items()
         )
 
 

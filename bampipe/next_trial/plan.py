@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
+from operator import add
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.next_trial.choice import Tried
 from bampipe.next_trial.discrimination import Sums
-from bampipe.next_trial.forecast import NOTHING, Forecast, describe_moves
+from bampipe.next_trial.forecast import Forecast, describe_moves
 from bampipe.next_trial.precision import Expected
 from bampipe.next_trial.primitives import FEWEST_STROKES, Primitive
 from bampipe.next_trial.words import describe
@@ -158,13 +160,11 @@ def _outcome(forecast: Forecast, chosen: Sequence[_Option]) -> _Outcome:
 
 
 def _confusion(forecast: Forecast, chosen: Sequence[_Option]) -> dict[tuple[int, int], float]:
-    contest, sums = forecast.contest, forecast.at_hand
-    if contest is None or sums is None:
+    contest = forecast.contest
+    if contest is None:
         return {}
-    for one in chosen:
-        if one.sums is not None:
-            sums = sums + one.sums
-    return {pair: found.confusion for pair, found in contest.contrasts(sums).items()}
+    sums = reduce(add, (one.sums for one in chosen if one.sums is not None), contest.at_hand)
+    return contest.confusions(contest.contrasts(sums))
 
 
 def _distance(outcome: _Outcome, goal: Goal) -> float:
@@ -181,12 +181,12 @@ def record_plan(forecast: Forecast, goal: Goal, found: TrialPlan) -> Plan:
     seconds = sum(design.seconds for design in found.designs)
     confusion: tuple[PlannedConfusion, ...] = ()
     contest = forecast.contest
-    if contest is not None and forecast.at_hand is not None:
-        now, rivals = contest.contrasts(forecast.at_hand), contest.rivals
+    if contest is not None:
+        now, rivals = contest.confusions(contest.now), contest.rivals
         confusion = tuple(
             PlannedConfusion(
-                between=tuple(rivals[k].name or NOTHING for k in pair),
-                before=now[pair].confusion,
+                between=tuple(rivals[k].name for k in pair),
+                before=now[pair],
                 after=after,
             )
             for pair, after in found.confusion.items()

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from bampipe.discover.settings import Settings
 from bampipe.lists import join_names
 from bampipe.results.next import Detectable, Proposal, Purpose
 
 _SHOWN = 3
 """Parameters or effects that a sentence names."""
-_LIMITS = Settings()
+LOWERED = 0.8
+"""Of a number, above which a trial is not said to lower it: forecasts are a fifth off."""
 _UNTRIED = " This forecast takes the model to hold beyond what the trials at hand have shown."
 
 
@@ -23,41 +23,6 @@ class Reasons:
     expected: str
 
 
-@dataclass(frozen=True)
-class _Unseen:
-    """Which effects the trials at hand would not have shown; see `explain_proposal`."""
-
-    table: Mapping[str, Detectable]
-    unbraked: Sequence[str]
-    unpromised: Sequence[str]
-
-    @property
-    def sentence(self) -> str:
-        table, unbraked, unpromised = self.table, self.unbraked, self.unpromised
-        shown = find_shown(table)
-        hidden = [*shown, *(name for name in _hidden(table) if name not in shown)]
-        never = [name for name in _never(table) if name not in unbraked]
-        if hidden:
-            sizes = [_size(name, table[name]) for name in hidden]
-            why = f"These trials would not have shown {join_names(sizes, _SHOWN)}."
-        else:
-            every = "every other effect" if never or unbraked or unpromised else "every effect"
-            why = f"These trials would have shown {every} of the library at its typical size."
-        if never:
-            one = "one effect stays" if len(never) == 1 else f"{len(never)} effects stay"
-            names = join_names(never, _SHOWN)
-            why += f" In trials like these {one} out of sight at any size ({names})."
-        if unbraked:
-            names = join_names(unbraked, _SHOWN)
-            why += f" What brakes do ({names}) shows in viscous trials, of which there are none."
-        if unpromised:
-            why += (
-                f" Of {join_names(unpromised, _SHOWN)} no size is promised: large enough to show,"
-                " it changes how the motion turns round, or standing still there looks like it."
-            )
-        return why
-
-
 def explain_proposal(
     purpose: Purpose,
     parameter: str,
@@ -66,7 +31,6 @@ def explain_proposal(
     unlimited: Sequence[str],
     lacking: Sequence[str],
     missing: Sequence[str] | None = (),
-    distinguishable: Sequence[str] = (),
     unbraked: Sequence[str] = (),
     unpromised: Sequence[str] = (),
 ) -> Reasons:
@@ -78,12 +42,10 @@ def explain_proposal(
         unlimited: axes of which the device states no range, so that nothing wider was tried.
         lacking: axes whose held-out error is above the noise floor.
         missing: effects that the diagnosis found and the model does not have; None without one.
-        distinguishable: effects that it leaves open, though trials like these tell them apart.
         unbraked: effects of brakes that no trial at hand has on.
         unpromised: effects whose smallest strength is not known; see `Visibility.is_promised`.
     """
-    unseen = _Unseen(table, unbraked, unpromised)
-    why, expected = _explain(purpose, parameter, best, unseen, unlimited)
+    why, expected = _explain(purpose, parameter, best, unlimited, table, unbraked, unpromised)
     if best.brakes:
         why += " Add it to session.toml as a viscous trial."
     if best.farther or best.faster:
@@ -109,12 +71,6 @@ def explain_proposal(
             f" The error of {join_names(lacking, _SHOWN)} is above the noise floor: what the model"
             " lacks there counts as noise in these uncertainties."
         )
-    if distinguishable:
-        why = (
-            f"The diagnosis leaves {join_names(distinguishable)} open, and no trial decides that:"
-            " were it just one of them, these trials would tell which (chance of confusing them"
-            f" {_chance(0.0)}). More is missing than that. {why}"
-        )
     return Reasons(why, expected)
 
 
@@ -122,8 +78,10 @@ def _explain(
     purpose: Purpose,
     parameter: str,
     best: Proposal,
-    unseen: _Unseen,
     unlimited: Sequence[str],
+    table: Mapping[str, Detectable],
+    unbraked: Sequence[str],
+    unpromised: Sequence[str],
 ) -> tuple[str, str]:
     """Why, and what is expected as far as the model goes."""
     if purpose == "decision":
@@ -135,25 +93,47 @@ def _explain(
     )
     narrowed = _narrowed(parameter, best)
     if purpose == "sensitivity":
-        shown = _detected(unseen.table)
+        shown, unseen = _detected(table), _unseen(table, unbraked, unpromised)
         # Nothing tried shows more: then it is for the parameters.
-        return unseen.sentence + ("" if shown else f" This one {most}."), shown or narrowed
+        return unseen + ("" if shown else f" This one {most}."), shown or narrowed
     return f"Of the motions tried, this one {most}.", narrowed
+
+
+def _unseen(
+    table: Mapping[str, Detectable], unbraked: Sequence[str], unpromised: Sequence[str]
+) -> str:
+    """Which effects the trials at hand would not have shown."""
+    shown = find_shown(table)
+    hidden = [*shown, *(name for name in _hidden(table) if name not in shown)]
+    never = [name for name in _never(table) if name not in unbraked]
+    if hidden:
+        sizes = [_size(name, table[name]) for name in hidden]
+        why = f"These trials would not have shown {join_names(sizes, _SHOWN)}."
+    else:
+        every = "every other effect" if never or unbraked or unpromised else "every effect"
+        why = f"These trials would have shown {every} of the library at its typical size."
+    if never:
+        one = "one effect stays" if len(never) == 1 else f"{len(never)} effects stay"
+        names = join_names(never, _SHOWN)
+        why += f" In trials like these {one} out of sight at any size ({names})."
+    if unbraked:
+        names = join_names(unbraked, _SHOWN)
+        why += f" What brakes do ({names}) shows in viscous trials, of which there are none."
+    if unpromised:
+        names = join_names(unpromised, _SHOWN)
+        why += (
+            f" Of {names} no size is promised: large enough to show, it changes how the motion"
+            " turns round."
+        )
+    return why
 
 
 def _decision(best: Proposal, unlimited: Sequence[str]) -> tuple[str, str]:
     pair = max(best.confusion, key=lambda pair: pair.weight * pair.before)
-    before, after = _chance(pair.before), _chance(pair.after)
-    if pair.before < _LIMITS.confused:
-        return (
-            f"The diagnosis leaves {pair.between[0]} or {pair.between[1]} open, though these trials"
-            f" would tell them apart, were it just one of them: the chance of confusing them is"
-            f" {before}. More is missing than that.",
-            "No trial decides that.",
-        )
+    before, after = say_chance(pair.before), say_chance(pair.after)
     expected = (
         f"The chance of confusing them is expected to fall from {before} to {after}."
-        if pair.after < _LIMITS.lowered * pair.before
+        if pair.after < LOWERED * pair.before
         else f"No trial tried tells them apart: the chance would be {after} after this one."
         f" {_remedy(unlimited)}"
     )
@@ -189,7 +169,7 @@ def find_shown(table: Mapping[str, Detectable]) -> tuple[str, ...]:
         for name, entry in table.items()
         if name in hidden
         and entry.with_proposal is not None
-        and (entry.smallest is None or entry.with_proposal < _LIMITS.lowered * entry.smallest)
+        and (entry.smallest is None or entry.with_proposal < LOWERED * entry.smallest)
     }
     return tuple(sorted(sizes, key=lambda name: sizes[name]))
 
@@ -217,9 +197,9 @@ def _narrowed(parameter: str, best: Proposal) -> str:
     return f"Expected: {'; '.join(parts)}" + (" (eight cases in ten)." if wide else ".")
 
 
-def _chance(value: float) -> str:
-    least = _LIMITS.confused
-    return f"below {100.0 * least:.3g} %" if value < least else f"{100.0 * value:.0f} %"
+def say_chance(value: float) -> str:
+    """A chance in per cent."""
+    return "below 1 %" if value < 0.01 else f"{100.0 * value:.0f} %"
 
 
 def _hidden(table: Mapping[str, Detectable]) -> list[str]:

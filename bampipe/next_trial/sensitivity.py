@@ -4,26 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import logit
 from scipy.stats import norm
-from scipy.stats import t as student
 
-from bampipe.discover.candidates import Candidate
-from bampipe.discover.columns import added_residual
-from bampipe.discover.ranges import MachineScale
-from bampipe.discover.settings import Settings
+from bampipe.diagnosis.candidates import Candidate
+from bampipe.diagnosis.columns import added_residual
+from bampipe.diagnosis.criteria import Criteria
+from bampipe.diagnosis.ranges import MachineScale
+from bampipe.diagnosis.search import log_prior, penalise
+from bampipe.diagnosis.session import Fit, Session, candidates_of
 from bampipe.next_trial.discrimination import Contest, Rival, Sums
 from bampipe.physics.parameter import Parameter
-from bampipe.results.standing import AT_FLOOR
 from bampipe.trials.motion import Motion
 from bampipe.trials.residuals import ModelOnTrial
 
 Array = NDArray[np.float64]
 
-PROBABILITY = 0.9
-"""With which the strength would have been revealed."""
 HOPELESS = 100.0
 """Of the typical strength: what shows from there on only shows at no size that a machine has."""
 ROUGHER = 0.15
@@ -32,8 +32,8 @@ the independent simulator, at the strength that was: friction by load (0.07, 0.0
 sessions of four, Stribeck friction (0.24 to 0.53) in none of four."""
 _POSES, _SLIDING = 50, 5.0
 """At which that jump is looked at, and the speed on either side, in widths of the sign."""
-LARGE = 1.0
-"""Of the size at which an effect is clearly there: what goes unnoticed at that size is hidden."""
+_FACTORS = np.geomspace(1e-4, HOPELESS, 241)
+"""Of the typical strength: a factor of 1.06 from one to the next, with straight lines between."""
 
 
 @dataclass(frozen=True)
@@ -46,46 +46,49 @@ class Visibility:
             not excite it.
         axis: where it shows first.
         growth: of the jump of friction as that axis turns round, at the typical strength.
-        imitated: whether it gains more than at ``factor`` on trials of a machine without it that
-            stands still where it turns round.
     """
 
     rival: Rival
     factor: float
     axis: int
     growth: float = 0.0
-    imitated: bool = False
+
+    @property
+    def item(self) -> Candidate:
+        """The effect."""
+        return self.rival.items[0]
 
     @property
     def parameter(self) -> Parameter:
         """The strength that is meant."""
-        assert self.rival.item is not None
-        return self.rival.item.parameters[_strengths(self.rival.item)[0]]
+        return self.item.parameters[_strengths(self.item)[0]]
 
     @property
     def typical(self) -> float:
         """Its typical size, in its unit."""
-        assert self.rival.item is not None
-        return float(abs(self.rival.values[_strengths(self.rival.item)[0]]))
+        return float(abs(self.rival.values[0][_strengths(self.item)[0]]))
 
     @property
     def is_promised(self) -> bool:
-        """Whether the machine would have moved much as it did, and not look like it without it.
+        """Whether the machine would have moved much as it did.
 
         When friction jumps between two samples no log says, and what that leaves grows with the
         jump; while a joint sticks and breaks free, it is not where it was without the effect.
         """
-        known = self.factor * self.growth <= ROUGHER and not self.imitated
-        return self.factor >= HOPELESS or known
+        return self.factor >= HOPELESS or self.factor * self.growth <= ROUGHER
 
     @property
     def is_hidden(self) -> bool:
         """Whether the effect would go unnoticed at its typical size."""
-        return self.factor > LARGE
+        return self.factor > 1.0
 
 
 def _strengths(item: Candidate) -> list[int]:
     return [i for i, q in enumerate(item.parameters) if q.strength and not q.fixed]
+
+
+def _is_linear(item: Candidate) -> bool:
+    return len(item.linear_indices) == len(_strengths(item))
 
 
 def typical_rival(item: Candidate, scale: MachineScale) -> Rival | None:
@@ -104,100 +107,143 @@ def typical_rival(item: Candidate, scale: MachineScale) -> Rival | None:
         elif not q.fixed:
             value = scale.range_of(effect, q).value_like(value)
         values.append(value)
-    return Rival(item, np.array(values), 0.0)
+    several = item.linear_indices if len(item.linear_indices) > 1 else ()
+    return Rival((item,), (np.array(values),), slopes=tuple((0, i) for i in several))
 
 
-@dataclass(frozen=True)
-class Bar:
-    """What a diagnosis asks of an effect.
+def weigh_visibility(contest: Contest, sums: Sums, needed: float) -> list[Visibility]:
+    """From which strength on each rival of ``contest`` would be called missing.
 
-    Attributes:
-        drop: (n_q,) of the log error of an axis that is worth an effect there.
-        tests: number of candidates.
-    """
-
-    drop: Array
-    tests: int
-
-    @classmethod
-    def of_errors(cls, error: Array, floor: Array, floor_sd: Array, tests: int) -> Bar:
-        """What counts is 16 % of an error at its floor, or what lifts it above its floor.
-
-        Args:
-            error: (n_q,) at hand; floor, floor_sd: (n_q,) of the noise, N.m or N.
-            tests: number of candidates.
-        """
-        s = Settings()
-        lift = np.log((AT_FLOOR * floor + s.above_floor_sd * floor_sd) / error)
-        return cls(np.minimum(s.worth_at_floor, np.maximum(s.worth, lift)), tests)
-
-
-def weigh_visibility(contest: Contest, sums: Sums, bar: Bar) -> list[Visibility]:
-    """From which strength on each rival of ``contest`` would be found with `PROBABILITY`.
-
-    The gain in log likelihood must exceed the chance level after Bonferroni's correction, and the
-    error must fall by what is worth an effect. What the timing of the inputs can imitate, it does,
-    as far as it may.
+    Its log evidence, with the penalties of `Search`, must be what is needed, or more, with the
+    probability that an effect must have to be called missing; and its size must matter. What a set
+    takes off the measured quantity is left out: at the smallest strength that shows it is little.
 
     Args:
-        contest: the library's effects at their typical strengths, its floor the error at hand.
-        sums: of the trials; bar: what is asked of an effect.
+        contest: effects at their typical strengths; sums: of the trials.
+        needed: log evidence, nats, see `find_needed`.
     """
-    found = _weigh(contest, sums, bar)
-    if not contest.timing_s:
-        return found
-    sharp = _weigh(*contest.without_timing(sums), bar)
-    late = contest.timing_of(sums)
-    return [
-        one
-        if other.factor >= one.factor or one.factor * late_s <= contest.timing_s
-        else replace(
-            other, factor=beyond_timing(one.factor, other.factor, contest.timing_s / late_s)
-        )
-        for one, other, late_s in zip(found, sharp, np.maximum(late, 1e-300), strict=True)
-    ]
-
-
-def beyond_timing(free: float, sharp: float, most: float) -> float:
-    """The factor at which an effect shows whose imitation by the timing ends at ``most``.
-
-    What shows goes with the square of the strength: of the whole effect what no timing imitates,
-    and of the strength beyond ``most`` the rest as well.
-
-    Args:
-        free, sharp: factors at which it shows with a timing without limits, and without any.
-    """
-    alone = 1.0 / free**2
-    rest = 1.0 / sharp**2 - alone
-    root = np.sqrt(alone + rest - alone * rest * most**2)
-    return float((rest * most + root) / (alone + rest))
-
-
-def _weigh(contest: Contest, sums: Sums, bar: Bar) -> list[Visibility]:
-    s = Settings()
-    count = np.maximum(sums.count, 1.0)
-    independent = np.maximum(count * contest.band.independent_share, 1.0)
-    level = student.isf(min(s.significance / max(bar.tests, 1), 0.5), s.most_replicates - 1)
-    sure = norm.ppf(PROBABILITY)
-    found = []
-    for rival, left in zip(contest.rivals, contest.left_by_model(sums), strict=True):
-        by_chance = 0.5 * len(rival.free)
-        spread = np.hypot(np.sqrt(by_chance), s.replay_error * float(independent.mean()))
-        total = by_chance + level * spread
-        total += sure * np.sqrt(2.0 * total)
-        needed = np.maximum(total / independent, bar.drop)
-        needed += sure * np.sqrt(2.0 * needed / independent)
-        ratio = np.expm1(2.0 * needed) * count * contest.floor**2 / np.maximum(left, 1e-300)
-        axis = int(np.argmin(ratio))
-        excited = left[axis] > 1e-12 * count[axis] * contest.floor[axis] ** 2
-        factor = float(np.sqrt(ratio[axis])) if excited else np.inf
-        found.append(Visibility(rival, factor, axis))
+    criteria, found = contest.session.criteria, []
+    sure = norm.ppf(criteria.probability)
+    for number, (rival, left) in enumerate(
+        zip(contest.rivals, contest.left_by_model(sums), strict=True)
+    ):
+        expected = left.distance(sums.independent, _FACTORS)
+        # Noise scatters a log likelihood ratio by the root of twice what is expected of it.
+        surely = expected - sure * np.sqrt(2.0 * expected)
+        excess = surely - needed - _find_penalty(contest, sums, number)
+        enough = np.flatnonzero(excess >= 0.0)
+        factor = float("inf")
+        if enough.size:
+            k = max(int(enough[0]), 1)
+            share = np.clip(-excess[k - 1] / max(excess[k] - excess[k - 1], 1e-300), 0.0, 1.0)
+            factor = float(_FACTORS[k - 1] * (_FACTORS[k] / _FACTORS[k - 1]) ** share)
+        # What it adds that the model cannot imitate, where it is most beside the applied force.
+        added = sums.added[:, number] / np.maximum(sums.applied, 1e-300)
+        size = np.sqrt(float(added.max()) * left.share)
+        scatter = sure / np.sqrt(max(float(left.squares.sum()) + left.prior, 1e-300))
+        factor = max(factor, float(criteria.size / max(size, 1e-300) + scatter))
+        factor = factor if factor < HOPELESS else float("inf")
+        found.append(Visibility(rival, factor, int(np.argmax(left.squares))))
     return found
 
 
-def refine(
-    contest: Contest, motions: Sequence[Motion], found: Sequence[Visibility], bar: Bar
-) -> list[Visibility]:
+def _find_penalty(contest: Contest, sums: Sums, number: int) -> Array:
+    """What the priors of a rival's parameters take off its log evidence, at each factor, nats."""
+    rival = contest.rivals[number]
+    item, values = rival.items[0], rival.values[0]
+    linear, information = list(item.linear_indices), contest.information(sums, number)
+    typical, spread, factors = np.ones(1), np.ones(1), np.ones_like(_FACTORS)
+    if linear:
+        typical, factors = np.abs(values[linear]), _FACTORS
+        spread = np.array([item.parameters[i].sd for i in linear]) / typical
+    if rival.slopes:
+        information = information * np.outer(values[linear], values[linear])
+    strengths = factors[:, None] * np.ones_like(typical)
+    return penalise(information, spread, strengths, len(item.searched_indices))
+
+
+def find_needed(criteria: Criteria, candidates: int, by_chance: Sequence[float] = ()) -> float:
+    """The log evidence before its penalties that makes an effect probable enough, nats.
+
+    Args:
+        criteria: of the diagnosis; candidates: that are weighed.
+        by_chance: what replays of a model give to any candidate, which it must exceed.
+    """
+    return max([float(logit(criteria.probability)), *by_chance]) - log_prior(criteria, candidates)
+
+
+@dataclass(frozen=True)
+class Blindness:
+    """What the trials at hand would have shown of the library's effects.
+
+    Attributes:
+        contest: every effect at its typical strength.
+        found: from which strength on each would have been found.
+        needed: log evidence, nats.
+    """
+
+    contest: Contest
+    found: tuple[Visibility, ...]
+    needed: float
+
+    @property
+    def hidden(self) -> list[int]:
+        """Numbers of the effects that would go unnoticed at their typical size, worst first."""
+        order = sorted(range(len(self.found)), key=lambda k: -self.found[k].factor)
+        return [k for k in order if self.found[k].is_hidden]
+
+    @property
+    def unpromised(self) -> list[str]:
+        """Names of those of which nothing is said; see `Visibility.is_promised`."""
+        return [one.rival.name for one in self.found if not one.is_promised]
+
+    @property
+    def of_brakes(self) -> list[str]:
+        """Names of the effects that show where brakes are on."""
+        return [one.rival.name for one in self.found if one.item.system.braked]
+
+    def narrowed(self, chosen: Sequence[int]) -> Blindness:
+        """The same for some of the effects."""
+        contest = replace(self.contest, rivals=tuple(self.found[k].rival for k in chosen))
+        return Blindness(contest, tuple(self.found[k] for k in chosen), self.needed)
+
+    def factors_with(self, motions: Sequence[Motion]) -> Array:
+        """From which factor on each effect is found once ``motions`` have been recorded."""
+        now, before = np.array([one.factor for one in self.found]), self._factors_at_hand
+        after = self._factors(self.contest.at_hand + self.contest.sums(motions))
+        # What is not linear in its strength is taken to change alike.
+        ratio = np.ones(len(now))
+        known = np.isfinite(before) & np.isfinite(now)
+        ratio[known] = now[known] / before[known]
+        return np.asarray(after * ratio)
+
+    @cached_property
+    def _factors_at_hand(self) -> Array:
+        return self._factors(self.contest.at_hand)
+
+    def _factors(self, sums: Sums) -> Array:
+        return np.array([v.factor for v in weigh_visibility(self.contest, sums, self.needed)])
+
+
+def find_blindness(session: Session, fit: Fit, by_chance: Sequence[float] = ()) -> Blindness:
+    """What the trials would have shown of every effect of the library that the model lacks.
+
+    Args:
+        session: the trials; fit: the model.
+        by_chance: what replays give to any candidate, nats.
+    """
+    scale, names = MachineScale.of_trials(fit.evidence), session.candidate_names(fit.recipe)
+    typical = (typical_rival(item, scale) for item in candidates_of(fit.recipe, names))
+    rivals = tuple(rival for rival in typical if rival is not None)
+    left = fit.problem.solve().left / fit.problem.count
+    contest = Contest(session, fit, left, rivals)
+    needed = find_needed(session.criteria, len(names), by_chance)
+    found = _refine(contest, weigh_visibility(contest, contest.at_hand, needed), needed)
+    found = [replace(v, factor=_within(v, scale), growth=growth_of_jump(contest, v)) for v in found]
+    return Blindness(contest, tuple(found), needed)
+
+
+def _refine(contest: Contest, found: Sequence[Visibility], needed: float) -> list[Visibility]:
     """The same with each effect at the strength found: it may not be linear in its strength."""
     refined = list(found)
     for _ in range(3):
@@ -205,7 +251,7 @@ def refine(
         if not chosen:
             break
         probe = replace(contest, rivals=tuple(_at_strength_found(refined[k]) for k in chosen))
-        again = weigh_visibility(probe, probe.sums(motions), bar)
+        again = weigh_visibility(probe, probe.at_hand, needed)
         for k, one in zip(chosen, again, strict=True):
             refined[k] = replace(refined[k], factor=refined[k].factor * one.factor, axis=one.axis)
     return refined
@@ -213,58 +259,46 @@ def refine(
 
 def _is_nonlinear(found: Visibility) -> bool:
     """Whether an effect is not linear in its strength, and shows at a strength at all."""
-    item = found.rival.item
-    assert item is not None
-    is_linear = len(item.linear_indices) == len(_strengths(item))
-    return not is_linear and 1e-3 < found.factor < 1e3
+    return not _is_linear(found.item) and 1e-3 < found.factor < HOPELESS
 
 
 def _at_strength_found(found: Visibility) -> Rival:
-    item = found.rival.item
-    assert item is not None
-    values, strengths = found.rival.values.copy(), _strengths(item)
-    own = [item.parameters[i] for i in strengths]
+    values, strengths = found.rival.values[0].copy(), _strengths(found.item)
+    own = [found.item.parameters[i] for i in strengths]
     values[strengths] = np.clip(
         values[strengths] * found.factor, [q.lower for q in own], [q.upper for q in own]
     )
-    return replace(found.rival, values=values)
+    return replace(found.rival, values=(values,))
 
 
-def growth_of_jump(contest: Contest, motions: Sequence[Motion], found: Visibility) -> float:
+def _within(found: Visibility, scale: MachineScale) -> float:
+    """The factor from which on an effect is found where its strength is looked for."""
+    q, effect = found.parameter, found.item.system.model.effects[-1]
+    least = 0.0 if _is_linear(found.item) else scale.range_of(effect, q).low / found.typical
+    return max(found.factor, least) if found.factor * found.typical <= q.upper else float("inf")
+
+
+def growth_of_jump(contest: Contest, found: Visibility) -> float:
     """By which share an effect of typical strength makes friction jump more where motion turns.
 
     0 of an effect with a memory, whose force does not jump.
 
     Args:
-        contest: of the effect; motions: the trials; found: the effect on them.
+        contest: of the effect; found: the effect on the trials at hand.
     """
-    item, values = found.rival.item, found.rival.values
-    assert item is not None
-    if item.system.memory_names != contest.system.memory_names or item.replaces_motion:
+    item, values, e = found.item, found.rival.values[0], contest.fit.evidence
+    if item.system.memory_names != e.system.memory_names or item.replaces_motion:
         return 0.0
-    axis, motion = found.axis, motions[0]
-    p = np.append(contest.p[: len(item.system.parameters) - len(values)], values)
+    axis, motion = found.axis, e.motions[0]
+    p = np.append(e.p[: len(item.system.parameters) - len(values)], values)
     motion = motion.rows(slice(None, None, max(1, len(motion.t) // _POSES)))
-    speed = _SLIDING * contest.system.model.device.coordinates[axis].sign_width
+    speed = _SLIDING * e.system.model.device.coordinates[axis].sign_width
     own = more = 0.0
     for side in (1.0, -1.0):
         qd = np.zeros_like(motion.qd)
         qd[:, axis] = side * speed
         sliding = replace(motion, qd=qd, qdd=np.zeros_like(qd), _columns={})
-        base = ModelOnTrial(contest.system, contest.p, [sliding])
+        base = ModelOnTrial(e.system, e.p, [sliding])
         own += side * float(base.residual[:, axis].mean())
         more += side * float(added_residual(item, p, base)[:, axis].mean())
     return max(more / own, 0.0) if own else 0.0
-
-
-def gain_at(contest: Contest, sums: Sums, found: Visibility, left: Array) -> float:
-    """Log likelihood that an effect gains at the strength at which it is found.
-
-    Args:
-        contest, sums: as for `weigh_visibility`; found: the effect.
-        left: (n_q,) sum of squares that the model leaves of it at its typical strength.
-    """
-    axis = found.axis
-    independent = float(sums.count[axis] * contest.band.independent_share[axis])
-    ratio = left[axis] / (sums.count[axis] * contest.floor[axis] ** 2)
-    return 0.5 * independent * float(np.log1p(found.factor**2 * ratio))

@@ -10,7 +10,7 @@ from bampipe.errors import InputError
 from bampipe.lists import join_names
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.identify import IdentifyResult
-from bampipe.results.next import AS_FORECAST, NOTHING, ExpectedSd, NextResult
+from bampipe.results.next import AS_FORECAST, NOTHING, ExpectedSd, NextResult, split_rival
 
 _SHOWN = 3
 """Parameters that are compared: those for which the forecast promised most."""
@@ -104,16 +104,26 @@ def compare_forecast(
         if diagnosed is None:
             said.append(f"{forecast_text}; `bampipe diagnose RUN` says what came.")
             continue
-        found = [name for name in pair.between if name in diagnosed.selected]
-        if {*pair.between} - {NOTHING} <= diagnosed.doubted:
-            said.append(f"{forecast_text}; the trials still do not distinguish them.")
-        elif not found:
-            none = "it is not found" if NOTHING in pair.between else "neither is found"
-            said.append(f"{forecast_text}; {none}.")
-        else:
-            it = f"it is {found[0]}" if len(found) == 1 else "both are found"
-            said.append(f"{forecast_text}; {it}.")
+        said.append(f"{forecast_text}; {_decided(first, second, diagnosed)}.")
     return (*said, *_shown(proposed, diagnosed))
+
+
+def _decided(first: str, second: str, diagnosed: DiagnoseResult) -> str:
+    """Which of two rivals a diagnosis found, as a clause."""
+    one, other = split_rival(first), split_rival(second)
+    doubted = {
+        name
+        for axis in diagnosed.axes.values()
+        if axis.verdict == "undecided"
+        for name in axis.probabilities
+    }
+    if doubted & (one ^ other):
+        return "the trials still do not distinguish them"
+    there = [name for name in (first, second) if split_rival(name) <= {*diagnosed.selected}]
+    named = max(there, key=lambda name: len(split_rival(name)), default=NOTHING)
+    if split_rival(named):
+        return f"it is {named}"
+    return "neither is found" if one and other else f"{first if one else second} is not found"
 
 
 def _shown(proposed: NextResult, diagnosed: DiagnoseResult | None) -> Iterator[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import ClassVar, Literal
 
 from pydantic import Field
@@ -13,12 +14,20 @@ Purpose = Literal["precision", "decision", "sensitivity"]
 """What a trial is for: smaller uncertainties, one effect distinguished from others, effects shown
 that the trials at hand would not have shown."""
 
+NOTHING = "nothing missing"
+"""Name of the rival that no effect is missing."""
 AS_FORECAST = 1.3
 """Factor within which an uncertainty came as forecast."""
 
 
-NOTHING = "nothing missing"
-"""In a pair of effects that trials are to tell apart, that neither is there."""
+def join_rival(effects: Iterable[str]) -> str:
+    """The name of effects that together are one rival."""
+    return " + ".join(effects) or NOTHING
+
+
+def split_rival(name: str) -> set[str]:
+    """The effects of a rival that is called so by `join_rival`."""
+    return {*name.split(" + ")} - {NOTHING}
 
 
 class Move(Record):
@@ -53,16 +62,16 @@ class ExpectedSd(Record):
 
 
 class ExpectedConfusion(Record):
-    """Chance of taking one effect for another."""
+    """Chance of taking one rival for another."""
 
-    between: Names
+    between: Names = Field(description="Each by its effects, joined by +")
     weight: Share = Field(description="Box-Hill weight of the pair: product of the odds")
-    before: Share
+    before: Share = Field(description="By the probabilities of the diagnosis")
     after: Share = Field(description="Median of those who follow it")
     distance_before: Size = Field(description="Expected log likelihood ratio, nats")
     distance_after: Size
     left: dict[str, Size] = Field(
-        description="By axis: error on the new trial of the wrong one refitted, in noise floors"
+        description="By axis: error on the new trial of the wrong one refitted, over the noise"
     )
 
 
@@ -158,8 +167,7 @@ class NextResult(Result):
     sensitivity: dict[str, Detectable] = Field(default={}, description="By effect of the library")
     unpromised: Names = Field(
         default=(),
-        description="Effects that change the motion too much for such a number, or look like a"
-        " machine without them that stands still where it turns round",
+        description="Effects that change the motion too much for such a number",
     )
     shows: Names = Field(
         default=(), description="Effects that the first proposal is to show, and the trials not"

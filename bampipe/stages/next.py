@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal, get_args
@@ -14,25 +16,25 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 
 from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
 from bampipe.declarations.model_file import IDENTIFIED_MODEL, identified, load_model, read_recipe
-from bampipe.errors import InputError, choose_from
+from bampipe.diagnosis.criteria import Criteria
+from bampipe.diagnosis.session import Session, system_of, without_members
+from bampipe.errors import InputError, NothingToDoError, choose_from
+from bampipe.estimate.simulation import Runaway
 from bampipe.files import digest_content, write_json
 from bampipe.identification.filter_choice import FilterChoice
 from bampipe.identification.sensor_noise import sensor_noise
 from bampipe.next_trial.choice import Tried, Worth, find_best_of_each, rank_designs
+from bampipe.next_trial.discrimination import Contest
 from bampipe.next_trial.forecast import Forecast
 from bampipe.next_trial.motion import TRAJECTORY_HZ, Rehearsal
 from bampipe.next_trial.plan import Goal, plan_trials, record_plan
 from bampipe.next_trial.precision import Precision
 from bampipe.next_trial.primitives import Envelope, imitate_trials
-from bampipe.next_trial.questions import (
-    Blindness,
-    find_ambiguity,
-    find_blindness,
-    make_contest,
-)
 from bampipe.next_trial.reasons import explain_proposal, find_shown
-from bampipe.next_trial.sensitivity import HOPELESS
-from bampipe.physics import compile_model
+from bampipe.next_trial.sensitivity import HOPELESS, Blindness, find_blindness
+from bampipe.next_trial.suggestion import find_ambiguity, make_contest
+from bampipe.physics import System, compile_model
+from bampipe.physics.recipe import Recipe
 from bampipe.progress import Progress
 from bampipe.results.diagnose import AxisVerdict, DiagnoseResult
 from bampipe.results.forecast import find_open, read_forecasts
@@ -41,7 +43,6 @@ from bampipe.results.ingest import IngestResult
 from bampipe.results.next import Detectable, NextResult, Plan, Purpose
 from bampipe.results.validate import JudgedError, ValidateResult
 from bampipe.schema import STRICT, Count
-from bampipe.trials.evidence import Evidence, gather_evidence
 from bampipe.trials.measured import read_measured_trials, trial_of_block
 from bampipe.trials.motion import Motion
 
@@ -84,6 +85,8 @@ class Config:
         sd: what the plan is to bring every standard deviation below, as a share of the estimate.
         confusion: what it is to bring every chance of confusing two effects below.
         seed: of how people differ, and of sensor noise.
+        jobs: worker processes; 0 means one for each processor.
+        criteria: what a diagnosis asks of an effect; as in `diagnose`.
     """
 
     model: str = "base"
@@ -93,6 +96,8 @@ class Config:
     sd: Annotated[float, Field(gt=0, lt=1)] = 0.05
     confusion: Annotated[float, Field(gt=0, lt=0.5)] = 0.05
     seed: Count = 0
+    jobs: Count = 0
+    criteria: Criteria = Criteria()
 
 
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
@@ -119,24 +124,16 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         )
     progress(0.0, "what the trials at hand say")
     trials = read_measured_trials(run, system, every_input=True, timing=found.input_timing)
+    trials = replace(trials, motions=tuple(trials.motions))
     recipe = read_recipe(run, config.model, model)
-    evidence = gather_evidence(system, trials.motions, trials.band, p, trials.folds)
-    floor = _floor(run, config.model, diagnosed, evidence)
+    session = Session(trials, config.criteria, config.jobs or os.cpu_count() or 1, config.seed)
     fitted = [trials.motions[k] for k in trials.folds.fitted_trials]
     noise = sensor_noise(trials.sensors, system, fitted, p, FilterChoice())
     seen = Envelope.of_trials(trials.motions, system, p)
-    rehearsal = Rehearsal(system, p, trials.sensors, trials.kinematics, seen, config.seed)
     precision = Precision.of_trials(system, fitted, trials.band, p, found, noise)
     contest, blindness = None, None
-    asked = find_ambiguity(diagnosed) if diagnosed and purpose in ("auto", "decision") else None
-    if asked is not None and diagnosed is not None:
-        values = {name: v for row in diagnosed.ranking for name, v in row.parameters.items()}
-        contest = make_contest(trials, recipe, p, asked, values, floor)
-    at_hand = contest.sums(trials.weighed) if contest else None
-    distinguishable: tuple[str, ...] = ()
-    if purpose == "auto" and contest and at_hand and contest.tells_apart(at_hand):
-        distinguishable = tuple(rival.name for rival in contest.rivals if rival.name)
-        contest, at_hand = None, None
+    if diagnosed is not None and purpose in ("auto", "decision"):
+        contest = _find_contest(session, recipe, system, p, diagnosed)
     if purpose == "decision" and contest is None:
         raise InputError(
             "the diagnosis left nothing to decide",
@@ -146,9 +143,19 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     chosen = _settle(diagnosed, contest is not None) if purpose == "auto" else purpose
     if chosen == "sensitivity":
         progress(0.1, "what these trials would have shown of each effect")
-        error, spread = _errors(diagnosed, evidence)
-        blindness = find_blindness(evidence, trials, recipe, error, floor, spread)
-    forecast = Forecast(rehearsal, precision, contest, at_hand)
+        blindness = _find_blindness(session, recipe, p, diagnosed)
+    judged = contest or (blindness.contest if blindness is not None else None)
+    evidence = judged.fit.evidence if judged is not None else None
+    # A design is followed with the model beside which effects are weighed on it.
+    rehearsal = Rehearsal(
+        evidence.system if evidence is not None else system,
+        evidence.p if evidence is not None else p,
+        trials.sensors,
+        trials.kinematics,
+        seen,
+        config.seed,
+    )
+    forecast = Forecast(rehearsal, precision, contest)
     worth = _worth(chosen, parameter, forecast, blindness)
     axes = seen.movable
     if not axes:
@@ -199,9 +206,8 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     unbraked = blindness.of_brakes if blindness and not seen.field.any() else ()
     unpromised = tuple(blindness.unpromised) if blindness else ()
     reasons = explain_proposal(
-        chosen, parameter, best, table, unlimited, lacking, missing, distinguishable, unbraked,
-        unpromised,
-    )  # fmt: skip
+        chosen, parameter, best, table, unlimited, lacking, missing, unbraked, unpromised
+    )
     result = NextResult(
         model=config.model,
         purpose=chosen,
@@ -234,8 +240,8 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         from bampipe.report.protocol import protocol_sheet
 
         by_hand = not (model.device.drive or model.device.prescribed)
-        session = run.read(IngestResult).session_id
-        sheet = protocol_sheet(plan, session, config.model, by_hand)
+        name = run.read(IngestResult).session_id
+        sheet = protocol_sheet(plan, name, config.model, by_hand)
         (out / f"models/{config.model}/protocol.pdf").write_bytes(sheet)
     return _summary(result, followed)
 
@@ -269,21 +275,36 @@ def _settle(diagnosed: DiagnoseResult | None, is_open: bool) -> Purpose:
     return "sensitivity" if set(verdicts) == {"nothing_missing"} else "precision"
 
 
-def _floor(
-    run: RunFolder, model: str, diagnosed: DiagnoseResult | None, evidence: Evidence
-) -> Array:
-    """Noise floor of each axis, (n_q,), N.m or N; what the fit leaves where there is none."""
-    left = evidence.rmse()
-    known: Mapping[str, float | None] = {}
-    if diagnosed is not None:
-        known = {axis: entry.noise_floor for axis, entry in diagnosed.axes.items()}
-    elif run.exists(ValidateResult.file(model)):
-        entries = run.read(ValidateResult, model).axes
-        known = {axis: entry.noise_floor for axis, entry in entries.items()}
-    found = [
-        known.get(axis) or float(left[i]) for i, axis in enumerate(evidence.system.coordinates)
-    ]
-    return np.maximum(found, 1e-12)
+def _find_contest(
+    session: Session, recipe: Recipe, system: System, p: Array, diagnosed: DiagnoseResult
+) -> Contest | None:
+    """The rivals that a diagnosis left; None where it decided, or they cannot be replayed."""
+    asked = find_ambiguity(diagnosed, session.criteria)
+    if asked is None:
+        return None
+    final = without_members(recipe, (), diagnosed.selected)
+    known = {name: v for row in diagnosed.ranking for name, v in row.parameters.items()}
+    known |= {q.name: value for q, value in zip(system.parameters, p, strict=True)}
+    start = np.array([known.get(q.name, q.prior) for q in system_of(final).parameters])
+    fit = session.try_fit(final, start)
+    return make_contest(session, fit, asked) if fit is not None else None
+
+
+def _find_blindness(
+    session: Session, recipe: Recipe, p: Array, diagnosed: DiagnoseResult | None
+) -> Blindness:
+    """What the trials would have shown of each effect, were it beside the model as it is."""
+    try:
+        fit = session.fit(recipe, p)
+    except Runaway as error:
+        raise NothingToDoError(
+            f"what these trials would have shown is not known, for the model cannot be replayed:"
+            f" {error.what}",
+            where="next",
+            remedy="ask for precision or for a parameter by name",
+        ) from error
+    chance = diagnosed.chance if diagnosed is not None else None
+    return find_blindness(session, fit, chance.largest if chance is not None else ())
 
 
 def _lacking(run: RunFolder, model: str, diagnosed: DiagnoseResult | None) -> list[str]:
@@ -300,16 +321,6 @@ def _goal(config: Config, estimates: Array, is_complete: bool) -> Goal:
     """What a plan is to reach; no uncertainty of parameters where the model lacks something."""
     asked = np.where(is_complete & (estimates != 0.0), config.sd * np.abs(estimates), np.inf)
     return Goal(asked, config.confusion)
-
-
-def _errors(diagnosed: DiagnoseResult | None, evidence: Evidence) -> tuple[Array, Array]:
-    """Held-out error of each axis, and the scatter of its floor, each (n_q,), N.m or N."""
-    axes = evidence.system.coordinates
-    if diagnosed is None:
-        return np.maximum(evidence.held_out_rmse, 1e-12), np.zeros(len(axes))
-    entries = [diagnosed.axes[axis] for axis in axes]
-    error = np.maximum([entry.rmse_before for entry in entries], 1e-12)
-    return error, np.array([entry.noise_floor_sd for entry in entries])
 
 
 def _worth(
@@ -339,7 +350,7 @@ def _is_braked(motion: Motion, brakes: Mapping[str, str]) -> bool:
 def _sensitivity(blindness: Blindness, best: Tried) -> dict[str, Detectable]:
     """The smallest strength of each effect that shows, without and with the best trial."""
     after = np.median([blindness.factors_with([motion]) for motion in best.usual], axis=0)
-    axes = blindness.contest.system.coordinates
+    axes = blindness.contest.fit.evidence.system.coordinates
     return {
         found.rival.name: Detectable(
             parameter=found.parameter.name,

@@ -1,0 +1,157 @@
+"""What a diagnosis left undecided, and the trial that would decide it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from bampipe.diagnosis.criteria import Criteria
+from bampipe.diagnosis.dictionary import Key
+from bampipe.diagnosis.search import Search
+from bampipe.diagnosis.select import open_search, start_of
+from bampipe.diagnosis.session import Fit, Session, system_of, without_members
+from bampipe.next_trial.choice import rank_designs
+from bampipe.next_trial.discrimination import Contest, Rival
+from bampipe.next_trial.motion import Rehearsal
+from bampipe.next_trial.primitives import Envelope
+from bampipe.next_trial.reasons import LOWERED, say_chance
+from bampipe.next_trial.words import describe
+from bampipe.physics.recipe import Recipe
+from bampipe.results.diagnose import DiagnoseResult, SuggestedTrial
+from bampipe.trials.motion import Motion
+
+_MOST_RIVALS = 4
+_ROUNDS = 4
+"""Steps in which the shapes of a rival are refined."""
+_SUGGESTED_S = 20.0
+
+
+@dataclass(frozen=True)
+class Ambiguity:
+    """Sets of effects between which a diagnosis could not decide.
+
+    Attributes:
+        odds: of the effects in which they differ; of none where one has only the common ones.
+        common: effects of all of them.
+    """
+
+    odds: Mapping[tuple[str, ...], float]
+    common: tuple[str, ...]
+
+
+def find_ambiguity(found: DiagnoseResult, criteria: Criteria) -> Ambiguity | None:
+    """The fewest sets that together are as probable as a verdict asks; None where one is."""
+    if all(axis.verdict != "undecided" for axis in found.axes.values()):
+        return None
+    sets, total = [], 0.0
+    for one in found.sets[:_MOST_RIVALS]:
+        if total < criteria.probability:
+            sets.append(one)
+            total += one.probability
+    common = set.intersection(*({*one.effects} for one in sets)) if sets else set()
+    odds: dict[tuple[str, ...], float] = {}
+    for one in sets:
+        members = tuple(sorted({*one.effects} - common))
+        odds[members] = odds.get(members, 0.0) + one.probability / total
+    return Ambiguity(odds, tuple(sorted(common))) if len(odds) > 1 else None
+
+
+def make_contest(session: Session, final: Fit, asked: Ambiguity) -> Contest | None:
+    """The rivals of ``asked`` as they explain the trials; None where fewer than two can.
+
+    Args:
+        session: the trials; final: the model with its most probable set, fitted.
+    """
+    members = {name for one in asked.odds for name in one}
+    recipe, e = without_members(final.recipe, members), final.evidence
+    known = {q.name: v for q, v in zip(e.system.parameters, e.p, strict=True)}
+    start = np.array([known[q.name] for q in system_of(recipe).parameters])
+    evidence = session.linearise(recipe, start)
+    bare = Fit(recipe, evidence, final.likelihood, final.likelihood.pose(evidence))
+    others = {*session.candidate_names(recipe)} - members
+    with open_search(session, bare, others) as search:
+        found = [_fit_rival(search, recipe, *pair) for pair in asked.odds.items()]
+    rivals = tuple(rival for rival in found if rival is not None)
+    scale = final.problem.solve().left / final.problem.count
+    return Contest(session, bare, scale, rivals) if len(rivals) > 1 else None
+
+
+def _fit_rival(
+    search: Search, recipe: Recipe, members: tuple[str, ...], odds: float
+) -> Rival | None:
+    """A set of effects with its most probable parameters; None where it explains nothing."""
+    keys: tuple[Key, ...] = ()
+    for name in members:
+        places = [key for key in search.places if key[0] == name]
+        if not places:
+            return None
+        keys = (*keys, min(places, key=lambda key: search.cost((*keys, key))))
+    (keys,) = search.refine([keys], _ROUNDS)
+    if not np.isfinite(search.cost(keys)):
+        return None
+    wider = without_members(recipe, (), members)
+    pairs = zip(system_of(wider).parameters, start_of(search, keys, wider), strict=True)
+    start = {q.name: value for q, value in pairs}
+    items = tuple(search.dictionary.candidates[name] for name in members)
+    values = tuple(np.array([start[q.name] for q in item.parameters]) for item in items)
+    slopes = tuple(
+        (number, place)
+        for number, item in enumerate(items)
+        for place, q in enumerate(item.parameters)
+        if not q.fixed
+    )
+    return Rival(items, values, odds, slopes)
+
+
+def suggest_trial(session: Session, final: Fit, result: DiagnoseResult) -> SuggestedTrial | None:
+    """The trial that would decide what a diagnosis did not; None where there is none.
+
+    With it a wrong choice must be as improbable as a verdict asks.
+
+    Args:
+        session: the trials; final: the model with its most probable set, fitted.
+        result: the diagnosis.
+    """
+    asked = find_ambiguity(result, session.criteria)
+    contest = make_contest(session, final, asked) if asked is not None else None
+    if contest is None:
+        return None
+    trials, e = session.trials, contest.fit.evidence
+    seen = Envelope.of_trials(trials.motions, e.system, e.p)
+    rehearsal = Rehearsal(e.system, e.p, trials.sensors, trials.kinematics, seen, session.seed)
+
+    def worth(motion: Motion) -> float:
+        return -contest.confusion(contest.contrasts(contest.at_hand + contest.sums([motion])))
+
+    # About the axes on which rivals act: elsewhere they all leave the same.
+    acts = {
+        axis for rival in contest.rivals for item in rival.items for axis in item.system.touched
+    }
+    axes = [axis for axis in seen.movable if axis in acts] or seen.movable
+    tried = rank_designs(rehearsal, worth, _SUGGESTED_S, axes, with_rests=True, with_brakes=True)[0]
+    sums = [contest.sums([motion]) for motion in tried.usual]
+    then = [contest.contrasts(contest.at_hand + new, new) for new in sums]
+    weights, before = contest.weights(), contest.confusions(contest.now)
+    pair = max(weights, key=lambda pair: weights[pair] * before[pair])
+    confusion = float(np.median([contest.confusions(one)[pair] for one in then]))
+    if confusion > min(1.0 - session.criteria.probability, LOWERED * before[pair]):
+        return None
+    left = np.median([one[pair].left for one in then], axis=0)
+    axis = int(np.argmax(left))
+    first, second = (contest.rivals[k].name for k in pair)
+    design = describe(tried.design, seen, e.system.model.device)
+    return SuggestedTrial(
+        between=(first, second),
+        axis=e.system.coordinates[axis],
+        design=design,
+        separation=float(left[axis]),
+        separation_now=float(contest.now[pair].left[axis]),
+        confusion=confusion,
+        confusion_now=before[pair],
+        sentence=(
+            f"To tell {first} from {second}, record this: {design} The chance of confusing"
+            f" them would fall from {say_chance(before[pair])} to {say_chance(confusion)}."
+        ),
+    )
