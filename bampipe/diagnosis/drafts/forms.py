@@ -12,8 +12,8 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from bampipe.discover.drafts.quantities import Quantity, Span, coordinates
-from bampipe.discover.drafts.shapes import KNOTS, SHAPES, Shape
+from bampipe.diagnosis.drafts.quantities import Quantity, Span, coordinates
+from bampipe.diagnosis.drafts.shapes import KNOTS, SHAPES, Shape
 from bampipe.lists import join_names
 from bampipe.physics.device import Coordinate as Axis
 from bampipe.physics.device import Device
@@ -206,6 +206,11 @@ class Form:
             found["top_acceleration"] = (rounded(self.scale), f"{self.axis.unit}/s2")
         return found
 
+    def constants_at(self, searched: Mapping[str, float], interval: float) -> dict[str, float]:
+        """Searched and fixed constants of its shape, and the time between samples, s."""
+        fixed = {name: value for name, (value, _) in self.fixed().items()}
+        return fixed | {"interval": interval} | dict(searched)
+
     def limits(self) -> dict[str, tuple[float, float, str]]:
         """Lower and upper bound and unit of the searched constants."""
         low, width, unit = self.span.low, self.span.width, self.coordinate.unit
@@ -284,9 +289,9 @@ class Form:
         unit: dict[str, Any] = {"unit": self.coordinate.unit}
         held = {self.axis.kind: unit} if self.is_own else unit
         states = {
-            name: {"rate": self._of_coordinate(rate), "initial": self._of_coordinate(initial)}
-            | held
-            for name, (rate, initial) in self.shape.states.items()
+            name: {key: self._of_coordinate(text) for key, text in of.items()} | held
+            for name, state in self.shape.states.items()
+            for of in [{"rate": state.rate, "initial": state.initial}]
         }
         return {"states": states} if states else {}
 
@@ -321,7 +326,7 @@ def rounded(value: float) -> float:
     return float(f"{value:.6g}")
 
 
-def forms(
+def list_forms(
     device: Device,
     axis: int,
     spans: Mapping[str, Span],

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from bampipe.discover.drafts.forms import rounded
-from bampipe.discover.drafts.search import Term
+from bampipe.diagnosis.drafts.forms import rounded
+from bampipe.diagnosis.drafts.search import Term
 from bampipe.results.rounding import round_with_sd
 
 _PLACE_IN_WIDTHS = 2.0
