@@ -24,7 +24,6 @@ class Criteria:
         tails: degrees of freedom of Student's t distribution, as which errors are distributed.
         block_s: length of the stretches of time that are taken as independent, s: one of them alone
             must not decide.
-        above_floor: error over noise floor from which on a model is said to leave more than noise.
         beam: sets that are pursued side by side.
     """
 
@@ -38,7 +37,6 @@ class Criteria:
     discrepancy: float = 0.003
     tails: float = 4.0
     block_s: float = 2.0
-    above_floor: float = 1.2
     beam: int = 10
 
     def __post_init__(self) -> None:

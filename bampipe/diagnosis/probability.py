@@ -26,6 +26,8 @@ _NEAR = 14.0
 """Log evidence below the best, nats, beyond which a set is none of the alternatives: one in a
 million."""
 _MOST = 40
+LEAST_CHANCE = 1e-4
+"""No chance is known to be smaller from a dozen replays."""
 _EULER = 0.5772156649015329
 
 
@@ -191,4 +193,4 @@ def chance_of(gain: float, by_chance: Sequence[float]) -> float:
     # The evidence of one candidate alone scatters by half a nat a strength.
     scale = max(float(values.std(ddof=1)) * np.sqrt(6.0) / np.pi, 1.0)
     mode = float(values.mean()) - _EULER * scale
-    return float(-np.expm1(-np.exp(-(gain - mode) / scale)))
+    return max(float(-np.expm1(-np.exp(-(gain - mode) / scale))), LEAST_CHANCE)

@@ -10,7 +10,6 @@ from typing import Annotated, Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 from pydantic import Field
 from pydantic.dataclasses import dataclass as checked_dataclass
 
@@ -38,7 +37,6 @@ from bampipe.results.diagnose import (
     DiagnoseResult,
     RankedEffect,
     ResidualMap,
-    SearchStep,
 )
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.setup import SetupResult
@@ -47,8 +45,6 @@ from bampipe.schema import STRICT, Count, Distinct, Positive
 from bampipe.trials.evidence import Evidence
 from bampipe.trials.folds import HELD_OUT
 from bampipe.trials.measured import read_measured_trials, trial_of_block
-
-Array = NDArray[np.float64]
 
 _DESCRIBED = 12
 """Effects of the ranking whose formulas are stored with it."""
@@ -154,7 +150,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     progress(0.95, "the trial that would decide what these do not")
     result = _result(session, selection, recipe, config)
     result = result.model_copy(
-        update={"suggested_trial": suggest_trial(session, selection, result)}
+        update={"suggested_trial": suggest_trial(session, selection.final, result)}
     )
     headline = "; ".join(f"{axis}: {words}" for axis, words in result.verdicts_in_words.items())
     return {"headline": headline, **_summary(result.write(out), result.limits)}
@@ -224,9 +220,6 @@ def _result(
         sets=found.sets,
         chance=found.chance,
         cut_short=selection.cut_short,
-        steps=tuple(
-            _step(fit.recipe.effects, recipe, fit.held_out_rmse, names) for fit in selection.steps
-        ),
         suggested_trial=None,
         maps=_maps(given),
         worst_windows=tuple(worst_windows(given)),
@@ -235,7 +228,9 @@ def _result(
         next=_next(found.axes, names, found.selected, config.model),
     )
     shapes = {
-        axis: describe(selection.final.evidence, i)
+        axis: describe(
+            (selection.final if result.axes[axis].effects else selection.initial).evidence, i
+        )
         for i, axis in enumerate(names)
         if result.axes[axis].remains
     }
@@ -245,11 +240,6 @@ def _result(
         for axis, entry in result.axes.items()
     }
     return result.model_copy(update={"axes": axes, "sentence": " ".join(said.values())})
-
-
-def _step(effects: Sequence[str], recipe: Recipe, error: Array, names: Sequence[str]) -> SearchStep:
-    more = tuple(e for e in effects if e not in recipe.effects)
-    return SearchStep(effects=more, held_out_rmse=dict(zip(names, error.tolist(), strict=True)))
 
 
 def _descriptions(ranking: Sequence[RankedEffect], recipe: Recipe) -> dict[str, EffectText]:
