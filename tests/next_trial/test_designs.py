@@ -8,9 +8,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from discover.sessions import BAND, KINEMATICS, SENSORS, bam
+from diagnosis.sessions import BAND, KINEMATICS, SENSORS, bam
 
-from bampipe.discover.chance import system_of
+from bampipe.diagnosis.session import system_of
 from bampipe.estimate.low_pass import Band
 from bampipe.next_trial.choice import Tried, find_best_of_each, rank_designs
 from bampipe.next_trial.discrimination import Contest, Rival, Sums

@@ -10,10 +10,10 @@ import pytest
 from independent_runs import record_trials
 
 from bampipe.declarations.files import effect_faults
-from bampipe.discover.chance import fit_trials, system_of
-from bampipe.discover.drafts import symbolic
-from bampipe.discover.drafts.effect_file import write_toml
-from bampipe.discover.drafts.screen import Screen
+from bampipe.diagnosis.session import system_of
+from bampipe.diagnosis.drafts import symbolic
+from bampipe.diagnosis.drafts.effect_file import write_toml
+from bampipe.diagnosis.drafts.screen import Screen
 
 
 @pytest.fixture(scope="module")

@@ -15,12 +15,12 @@ import bampipe
 from bampipe.data.run_folder import RunFolder
 from bampipe.declarations.files import effect_faults
 from bampipe.declarations.model_file import load_model
-from bampipe.discover.chance import candidates_of, fit_trials, system_of
-from bampipe.discover.drafts.effect_file import write_toml
-from bampipe.discover.drafts.screen import Screen
-from bampipe.discover.drafts.search import FoundDraft, Option, draft
-from bampipe.discover.scorer import Scorer
-from bampipe.discover.settings import Settings
+from bampipe.diagnosis.session import candidates_of, system_of
+from bampipe.diagnosis.drafts.effect_file import write_toml
+from bampipe.diagnosis.drafts.screen import Screen
+from bampipe.diagnosis.drafts.search import FoundDraft, Option, draft
+from bampipe.diagnosis.scorer import Scorer
+from bampipe.diagnosis.settings import Settings
 from bampipe.errors import InputError, NothingToDoError
 from bampipe.physics import Model, compile_model
 from bampipe.physics.effect import effect_from
