@@ -41,9 +41,9 @@ _WHOLE = {
     "none": "", "ozin": "ozf.in", "kgcm": "kgf.cm", "inlb": "lbf.in", "lbin": "lbf.in",
     "ftlb": "lbf.ft", "lbft": "lbf.ft",
 }  # fmt: skip
-_RATES = {"rpm": "rev/min", "rps": "rev/s", "dps": "deg/s"}
+_RATES = {"rpm": "rev/min", "r/min": "rev/min", "rps": "rev/s", "dps": "deg/s"}
 _SPELLINGS = {
-    "S": "s", "M": "m", "r": "rev", "rot": "rev", "turn": "rev", "degree": "deg", "°": "deg",
+    "rot": "rev", "turn": "rev", "degree": "deg", "°": "deg",
     "º": "deg", "radian": "rad", "revolution": "rev", "rotation": "rev", "second": "s",
     "sec": "s", "minute": "min", "millisecond": "ms", "microsecond": "us", "nanosecond": "ns",
     "milli": "ms", "micro": "us", "nano": "ns", "msec": "ms", "usec": "us", "nsec": "ns",
@@ -87,8 +87,10 @@ def unit(text: str) -> RecordedUnit | None:
     plain = plain.replace("²", "2").replace("³", "3").replace("⁻", "-").replace("¹", "1")
     plain = _WHOLE.get(plain.lower().replace("-", "").replace(".", "") or plain, plain)
     plain = re.sub(
-        r"(?i)(?<![a-z])(rpm|rps|dps)(?![a-z])", lambda rate: _RATES[rate[0].lower()], plain
+        r"(?i)(?<![a-z])(rpm|r/min|rps|dps)(?![a-z])", lambda rate: _RATES[rate[0].lower()], plain
     )
+    if len(plain) == 1 and plain.isupper() and plain not in (*_ORDER, "C"):
+        return None  # (R) and (S) are sides and names
     if plain.lower() in _CELSIUS:
         return RecordedUnit("K", 1.0, 273.15)
     scale, at, sign = 1.0, 0, 1

@@ -31,7 +31,7 @@ __all__ = [
 ]
 
 _READERS: dict[str, ModuleType] = {
-    **dict.fromkeys((".csv", ".tsv", ".txt", ".dat", ".asc", ".log"), text),
+    **dict.fromkeys((".csv", ".tsv", ".txt", ".dat", ".asc", ".log", ".mot", ".sto"), text),
     ".parquet": parquet,
     ".mat": mat,
     **dict.fromkeys((".h5", ".hdf5", ".hdf"), hdf5),

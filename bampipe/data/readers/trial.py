@@ -62,6 +62,8 @@ class RawTrial:
         notes: what was left out, one sentence each.
         remarks: what was found out about the file, one sentence each.
         units: units that the file itself gives to its columns.
+        resumed: after lines that hold no sample, the sample that follows and its row.
+        begun: samples before which the header stands once more, as of another recording.
     """
 
     columns: dict[str, np.ndarray]
@@ -69,6 +71,19 @@ class RawTrial:
     notes: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
     units: Mapping[str, str] = field(default_factory=dict)
+    resumed: tuple[tuple[int, int], ...] = ()
+    begun: tuple[int, ...] = ()
+
+    def __len__(self) -> int:
+        return len(next(iter(self.columns.values())))
+
+    @property
+    def rows(self) -> np.ndarray:
+        """Row in the file of every sample, (T,) int64."""
+        rows = np.arange(self.first_row, self.first_row + len(self), dtype=np.int64)
+        for sample, row in self.resumed:
+            rows[sample:] += row - rows[sample] if sample < len(rows) else 0
+        return rows
 
 
 def check_size(rows: int, wanted: Wanted, name: str) -> None:
