@@ -85,7 +85,7 @@ def read_trial(
     wanted = Wanted(tuple(columns), datetimes or {}, dialect or Dialect(), largest_bytes)
     with _memory_named(name):
         trial: RawTrial = reader.read(path, wanted, name)
-    if len(trial.columns[columns[0]]) == 0:
+    if columns and len(trial) == 0:
         raise InputError("a header but no samples", where=name)
     return trial
 

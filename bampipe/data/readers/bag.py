@@ -23,7 +23,14 @@ import numpy as np
 from bampipe.data.readers import moments
 from bampipe.data.readers.extras import need
 from bampipe.data.readers.nested import MISSING, as_number, find, leaves
-from bampipe.data.readers.trial import LARGEST_BYTES, RawTrial, Wanted, check_columns, check_size
+from bampipe.data.readers.trial import (
+    LARGEST_BYTES,
+    RawTrial,
+    Wanted,
+    check_columns,
+    check_size,
+    interpolated,
+)
 from bampipe.data.readers.unpacking import check_mcap, check_ros1
 from bampipe.errors import InputError
 
@@ -106,7 +113,8 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
         elif field.topic == clock.topic:
             values[column] = np.array(cells[column], dtype=np.float64)
         else:
-            values[column] = _interpolated(base, times[field.topic], cells[column])
+            at, since = ((x - base[0]) / moments.NANOSECONDS for x in (base, times[field.topic]))
+            values[column] = interpolated(at, since, np.array(cells[column], dtype=np.float64))
     for topic in topics:
         if topic != clock.topic:
             gap = float(np.max(np.diff(times[topic]), initial=0)) / moments.NANOSECONDS
@@ -179,15 +187,6 @@ def _times(
             remedy=f"give {clock.topic}:{RECORDED} under [time]",
         )
     return np.array(known, dtype=np.int64)
-
-
-def _interpolated(base: np.ndarray, times: np.ndarray, cells: list[float]) -> np.ndarray:
-    """Values at the times ``base``, NaN before the first and after the last."""
-    order = np.argsort(times, kind="stable")
-    since = (times[order] - base[0]) / moments.NANOSECONDS
-    at = (base - base[0]) / moments.NANOSECONDS
-    values = np.array(cells, dtype=np.float64)[order]
-    return np.asarray(np.interp(at, since, values, left=np.nan, right=np.nan))
 
 
 def _messages(

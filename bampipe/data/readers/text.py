@@ -100,6 +100,7 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
         units,
         tuple(samples.resumed),
         tuple(samples.begun),
+        samples.since,
     )
 
 
@@ -206,6 +207,7 @@ class _Samples:
     notes: list[str] = field(default_factory=list)
     resumed: list[tuple[int, int]] = field(default_factory=list)
     begun: list[int] = field(default_factory=list)
+    since: dict[str, int] = field(default_factory=dict)
 
     def add(self, batch: pa.RecordBatch, first_line: int, name: str) -> None:
         for column in self.wanted.columns:
@@ -230,6 +232,8 @@ class _Samples:
         values = joined({column: self.parts[column] for column in self.wanted.columns})
         self.parts.clear()
         for column in self.wanted.datetimes:
+            known = values[column][values[column] != np.iinfo(np.int64).min]
+            self.since |= {column: int(known[0])} if len(known) else {}
             values[column] = moments.seconds(values[column])
         return values
 

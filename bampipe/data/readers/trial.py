@@ -64,6 +64,7 @@ class RawTrial:
         units: units that the file itself gives to its columns.
         resumed: after lines that hold no sample, the sample that follows and its row.
         begun: samples before which the header stands once more, as of another recording.
+        since: of columns of dates and times, where known, their first moment, ns since 1970.
     """
 
     columns: dict[str, np.ndarray]
@@ -73,9 +74,10 @@ class RawTrial:
     units: Mapping[str, str] = field(default_factory=dict)
     resumed: tuple[tuple[int, int], ...] = ()
     begun: tuple[int, ...] = ()
+    since: Mapping[str, int] = field(default_factory=dict)
 
     def __len__(self) -> int:
-        return len(next(iter(self.columns.values())))
+        return len(next(iter(self.columns.values()), ()))
 
     @property
     def rows(self) -> np.ndarray:
@@ -137,6 +139,18 @@ def aligned(values: dict[str, np.ndarray], name: str, what: str) -> dict[str, np
                 where=f"{name}, {what} '{column}'",
             )
     return {c: np.repeat(v, count) if len(v) == 1 < count else v for c, v in values.items()}
+
+
+def interpolated(at: np.ndarray, times: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Values (T,) at ``at`` (N,), NaN before the first time (T,) and after the last.
+
+    Missing values are bridged; times need not be in order.
+    """
+    known = np.flatnonzero(np.isfinite(times) & np.isfinite(values))
+    if len(known) == 0:
+        return np.full(len(at), np.nan)
+    order = known[np.argsort(times[known], kind="stable")]
+    return np.asarray(np.interp(at, times[order], values[order], left=np.nan, right=np.nan))
 
 
 def joined(parts: dict[str, list[np.ndarray]]) -> dict[str, np.ndarray]:

@@ -74,12 +74,13 @@ def _unit(text: str) -> units.RecordedUnit:
 
 
 def _unit_of(*si: str) -> AfterValidator:
-    """Of a field that holds a unit of one of the SI units ``si``."""
+    """Of a field that holds a unit of one of the SI units ``si``; of volts, V alone."""
 
     def checked(text: str) -> str:
         found = units.unit(text)
         if found is None or found.si not in si or (found.si == "V" and text != "V"):
-            raise fault(f"found {json.dumps(text)}, expected a unit of {', '.join(si)}")
+            listed = f"{', '.join(si[:-1])} or {si[-1]}"
+            raise fault(f'found "{text}", expected a unit of {listed}{did_you_mean(text, si)}')
         return text
 
     return AfterValidator(checked)
