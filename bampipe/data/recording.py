@@ -82,7 +82,7 @@ def read_recording(
             raw = _by_rows(raw, other, entry, part, kept)
         else:
             ticks = SECONDS.get(clock.unit, 1.0), SECONDS.get(unit, 1.0)
-            raw = _by_time(raw, other, part, kept, (clock.column, time), ticks)
+            raw = _by_time(raw, other, entry.file, part, kept, (clock.column, time), ticks)
     raw = replace(raw, columns={column: raw.columns[column] for column in columns})
     return _one_of(raw, entry, clock)
 
@@ -97,7 +97,9 @@ def starts_of(raw: RawTrial, clock: str) -> list[int]:
             begin = max([start for start in starts if start <= at], default=begin)
             passed = t[at - 1] - t[begin]
             turned = -np.diff(t[at - 1 : at + 1])[0] > 0.9 * 2.0**32  # a counter, not a clock
-            if at - begin >= _LEAST and abs(t[at] - t[begin]) <= _BACK * passed and not turned:
+            goes_on = len(t) - at >= _LEAST and bool(np.all(np.diff(t[at : at + _LEAST]) > 0.0))
+            back = abs(t[at] - t[begin]) <= _BACK * passed
+            if at - begin >= _LEAST and back and goes_on and not turned:
                 starts.add(int(at))
     return sorted(starts)
 
@@ -144,6 +146,7 @@ def _by_rows(
 def _by_time(
     raw: RawTrial,
     other: RawTrial,
+    file: str,
     part: Part,
     kept: Sequence[str],
     times: tuple[str, str],
@@ -159,20 +162,19 @@ def _by_time(
     span = min(np.nanmax(at), np.nanmax(stamps)) - max(np.nanmin(at), np.nanmin(stamps))
     if not span > 0.0:
         raise InputError(
-            f"no time in common with the file that it is joined to: it starts {np.nanmin(stamps):.4g} s"
-            " after that",
+            f"no time in common with {file}: it starts {np.nanmin(stamps):.4g} s after that",
             where=part.file,
             remedy='join = "start" where both clocks count from the same moment',
         )
     columns = dict(raw.columns)
     columns |= {name: interpolated(at, stamps, other.columns[name]) for name in kept}
-    said = f"{part.file} interpolated linearly at the times of the file that it is joined to"
+    said = f"{part.file} interpolated linearly at the times of {file}"
     return replace(
         raw,
         columns=columns,
         units={**raw.units, **other.units},
         notes=(*raw.notes, *other.notes),
-        remarks=(*raw.remarks, f"{said} (at most {np.nanmax(np.diff(stamps)):.3g} s between samples)"),
+        remarks=(*raw.remarks, f"{said} (at most {np.nanmax(np.diff(stamps)):.3g} s apart)"),
     )
 
 

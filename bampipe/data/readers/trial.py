@@ -120,7 +120,7 @@ def check_columns(found: Sequence[str], wanted: Sequence[str], name: str) -> Non
 
 
 def aligned(values: dict[str, np.ndarray], name: str, what: str) -> dict[str, np.ndarray]:
-    """The columns, all as long as the first; a single number is a column that does not change.
+    """The columns, all of one length; a single number is a column that does not change.
 
     Args:
         values: (T,) or (1,) a column.
@@ -130,7 +130,7 @@ def aligned(values: dict[str, np.ndarray], name: str, what: str) -> dict[str, np
     Raises:
         InputError: a column is of another length.
     """
-    first = next(iter(values))
+    first = max(values, key=lambda column: len(values[column]) > 1)
     count = len(values[first])
     for column, value in values.items():
         if len(value) not in (1, count):

@@ -7,7 +7,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator
 from functools import cached_property
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple, get_args
 
 import numpy as np
 from pydantic import AfterValidator, Field
@@ -29,6 +29,8 @@ from bampipe.schema import (
 LARGEST_CONDITION = 1e8
 """A calibration matrix with a larger condition number counts as singular."""
 
+TimeUnit = Literal["ns", "us", "ms", "s", "datetime"]
+CLOCK_UNITS: tuple[TimeUnit, ...] = get_args(TimeUnit)
 SECONDS = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0}
 _FORCE_SUFFIXES = ("_nm", "_v", "_n")
 
@@ -90,7 +92,7 @@ class Clock(Declaration):
     """The time column."""
 
     column: str = Field(default="", description="Its name; left out where samples are counted")
-    unit: Literal["ns", "us", "ms", "s", "datetime", "samples"] = Field(
+    unit: TimeUnit | Literal["samples"] = Field(
         description="datetime: dates and times; samples: no column, one sample each"
         " 1/sample_rate_hz"
     )

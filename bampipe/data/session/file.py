@@ -23,6 +23,7 @@ from bampipe.data.session.channels import (
     Clock,
     Encoder,
     Force,
+    TimeUnit,
 )
 from bampipe.data.session.places import inside, is_device_path, lexically_inside
 from bampipe.errors import InputError, did_you_mean
@@ -85,7 +86,7 @@ class Part(Declaration):
         " sample",
     )
     time: str = Field(default="", description="Its time column, if not called as that of the file")
-    time_unit: Literal["", "ns", "us", "ms", "s", "datetime"] = Field(
+    time_unit: TimeUnit | Literal[""] = Field(
         default="", description="Unit of its time column, if not that of the file"
     )
 
