@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,10 +54,10 @@ def likely_unit(si: str, values: np.ndarray) -> str:
 
 def interval_of(name: str, value: float) -> float:
     """Sampling interval, s, that a number beside the samples gives (``Ts``, ``fs``), else 0."""
-    plain = name.lower().replace("_", "")
+    plain = re.sub(r"[\W_]|hz$", "", name.lower())
     if value > 0.0 and plain in ("ts", "dt", "tsample", "sampletime", "samplingtime"):
         return value
-    if value > 0.0 and plain in ("fs", "samplerate", "samplingrate", "fsample"):
+    if value > 0.0 and re.fullmatch("fs(ample)?|sampl(e|ing)(rate|freq|frequency)", plain):
         return 1.0 / value
     return 0.0
 

@@ -79,6 +79,7 @@ class SurveyedColumn:
             or "".
         unit: unit by the file, else by the name, "" where neither says.
         values: (T,) of the first log.
+        by_looks: whether its name says nothing and its role is what it looks like.
     """
 
     name: str
@@ -86,6 +87,7 @@ class SurveyedColumn:
     role: str
     unit: str
     values: np.ndarray
+    by_looks: bool = False
 
     @property
     def conversion(self) -> RecordedUnit | None:
@@ -427,8 +429,9 @@ def _by_looks(
     guessed = f"by what columns without names look like, {said}".replace(
         "a force", "what drives the motion"
     ).replace("a acc", "an acc")
-    found = (replace(c, role=roles[c.name]) if c.name in roles else c for c in columns)
-    return tuple(found), [guessed]
+    return tuple(
+        replace(c, role=roles[c.name], by_looks=True) if c.name in roles else c for c in columns
+    ), [guessed]
 
 
 def _is_numbered(name: str) -> bool:

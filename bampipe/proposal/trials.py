@@ -41,6 +41,8 @@ def trials_tables(
             lines += [f"end_s = {end_s}"] if end_s is not None else []
             lines += [f"part = {quoted(trial.part)}"] if trial.part else []
             for part in trial.parts:
+                if not any(name.startswith(f"{part.name}:") for name in match.used):
+                    continue
                 lines += ["", "[[trials.parts]]"]
                 given = ("file", "name", "join", "time", "time_unit")
                 told = {key: getattr(part, key) for key in given}
