@@ -169,13 +169,15 @@ def _by_time(
     columns = dict(raw.columns)
     columns |= {name: interpolated(at, stamps, other.columns[name]) for name in kept}
     said = f"{part.file} interpolated linearly at the times of {file}"
-    return replace(
+    within = np.flatnonzero((at >= np.nanmin(stamps)) & (at <= np.nanmax(stamps)))
+    joined = replace(
         raw,
         columns=columns,
         units={**raw.units, **other.units},
         notes=(*raw.notes, *other.notes),
         remarks=(*raw.remarks, f"{said} (at most {np.nanmax(np.diff(stamps)):.3g} s apart)"),
     )
+    return joined.between(int(within[0]), int(within[-1]) + 1)
 
 
 def _one_of(raw: RawTrial, entry: TrialEntry, clock: Clock) -> RawTrial:
@@ -194,12 +196,6 @@ def _one_of(raw: RawTrial, entry: TrialEntry, clock: Clock) -> RawTrial:
             if count > 1
             else "leave recording out",
         )
-    start, stop = [*starts, len(raw)][entry.recording - 1 : entry.recording + 1]
-    return replace(
-        raw,
-        columns={name: values[start:stop] for name, values in raw.columns.items()},
-        first_row=int(raw.rows[start]),
-        resumed=tuple((at - start, row) for at, row in raw.resumed if start < at < stop),
-        begun=(),
-        remarks=(*raw.remarks, f"recording {entry.recording} of {count} in the file"),
-    )
+    said = f"recording {entry.recording} of {count} in the file"
+    part = raw.between(*[*starts, len(raw)][entry.recording - 1 : entry.recording + 1])
+    return replace(part, remarks=(*raw.remarks, said))

@@ -26,6 +26,8 @@ _MOST_SCANNED = 1 << 30
 """Bytes of text in which other recordings are looked for; reading them takes some seconds."""
 _WHOLE = 2
 """Of logs that hold both a motion and what drives it."""
+_RISES = 0.95
+"""Share of samples at which a clock rises, if what else it does is an accident."""
 _GENERAL = frozenset(["joint", "axis", "x", "y", "z", "data", "column"])
 """Words in the name of a column that say less of it than the name of its file."""
 _WORDS = {
@@ -375,12 +377,13 @@ class _Logs:
 def _complete_rows(columns: Mapping[str, np.ndarray], clock: str) -> np.ndarray:
     """Rows (T,) in which no column lacks a number, those columns apart that mostly lack one.
 
-    Of a clock that mostly increases, only rows in which it does.
+    Of a clock that nearly always increases, only rows in which it does.
     """
     known = [np.isfinite(values) for values in columns.values()]
     if clock in columns:
         t = np.nan_to_num(columns[clock], nan=-np.inf)
-        known.append(np.concatenate([[True], t[1:] > np.maximum.accumulate(t)[:-1]]))
+        rises = np.concatenate([[True], t[1:] > np.maximum.accumulate(t)[:-1]])
+        known += [rises] if rises.mean() > _RISES else []
     kept = [mask for mask in known if 2 * mask.sum() > len(mask)]
     complete = np.logical_and.reduce(kept) if kept else np.ones(len(known[0]), dtype=bool)
     return complete if 2 * complete.sum() > len(complete) else np.ones_like(complete)

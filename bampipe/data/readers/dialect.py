@@ -225,10 +225,10 @@ def _header(
             row = _names(line.text, delimiter, lines[index + 1 :])
             if set(columns) <= set(row):
                 check_columns(row, columns, f"{name}, row {line.number}")
-                below = _guess(lines[index + 1 :], delimiters)[0] if len(row) > 1 else (0, "")
-                at = index + 1 + below[0]
-                fits = at < len(lines) and len(cells(lines[at].text, below[1])) == len(row)
-                return index, below[1] if fits else delimiter, row
+                first, below = _guess(lines[index + 1 :], delimiters)[0]
+                rows = lines[index + 1 + first :]  # may be separated otherwise than the header
+                fits = len(row) > 1 and rows and len(cells(rows[0].text, below)) == len(row)
+                return index, below if fits else delimiter, row
     guesses = _guess(lines, delimiters)
     found = [(_above(lines, first, delimiter), delimiter) for first, delimiter in guesses]
     index, delimiter = next((each for each in found if each[0] >= 0), (-1, ""))

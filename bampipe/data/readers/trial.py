@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -86,6 +86,16 @@ class RawTrial:
         for sample, row in self.resumed:
             rows[sample:] += row - rows[sample] if sample < len(rows) else 0
         return rows
+
+    def between(self, start: int, stop: int) -> RawTrial:
+        """The samples from ``start`` to before ``stop``."""
+        return replace(
+            self,
+            columns={name: values[start:stop] for name, values in self.columns.items()},
+            first_row=int(self.rows[start]),
+            resumed=tuple((at - start, row) for at, row in self.resumed if start < at < stop),
+            begun=tuple(at - start for at in self.begun if start < at < stop),
+        )
 
 
 def check_size(rows: int, wanted: Wanted, name: str) -> None:
