@@ -327,7 +327,8 @@ class _Logs:
         raw = read_recording(self.folder, trial, ordered, clock, self.dialect)
         sound = _complete_rows(raw.columns, clock.column)
         self.first = trial.file
-        self.remarks += [] if trial.file.lower().endswith(TEXTS) else raw.remarks
+        if not trial.parts and not trial.file.lower().endswith(TEXTS):
+            self.remarks += raw.remarks
         found = []
         for column in ordered:
             said = raw.units.get(column, labels[column])
