@@ -23,6 +23,8 @@ from bampipe.errors import InputError
 
 Columns = Mapping[str, str]
 _AXIS = re.compile(r"(?i)(?<![a-z])(joint|axis|link|servo|motor|dof|j)[ _-]?(\d+)(?!\d)")
+_LONGEST = 40
+"""Letters in the name of a part."""
 _SAME_STAMP = 0.6
 """Of a step: how far stamps of two clocks of the same samples may be apart."""
 _OVERLAP = 0.5
@@ -93,7 +95,10 @@ def join_parts(
     for names in groups.values():
         if len({kinds[name] for name in names}) != len(names) or len(names) < 2:
             continue
-        called = {n: _called(_words(n), own[kinds[n]] - shared, kinds[n].said) for n in names}
+        called: dict[str, str] = {}
+        for n in names:
+            name = _called(_words(n), own[kinds[n]] - shared, kinds[n].said)
+            called[n] = f"{name}_{len(called)}" if name in called.values() else name
         roles = {n: {role(f"{called[n]}:{c}", u) for c, u in found[n].items()} for n in names}
         main = max(names, key=lambda n: ("position" in roles[n], -names.index(n)))
         parts, alike = [], set()
@@ -141,7 +146,7 @@ def _common(names: Iterable[str]) -> frozenset[str]:
 def _called(words: Sequence[str], own: frozenset[str], said: Sequence[str]) -> str:
     """Name of a part: what its kind of file has in its name and other kinds have not."""
     name = "_".join(dict.fromkeys(w for w in words if w in own or w in said))
-    return name if re.match("[a-z]", name) else f"part_{name}".rstrip("_")
+    return name[:_LONGEST] if re.match("[a-z]", name) else f"part_{name}".rstrip("_")[:_LONGEST]
 
 
 def _part(main: str, other: str, called: str, first: FileClock, second: FileClock) -> Part:

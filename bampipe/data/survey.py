@@ -16,6 +16,7 @@ from bampipe.data.readers.trial import Dialect
 from bampipe.data.recording import read_recording, starts_of
 from bampipe.data.session import Clock, TrialEntry
 from bampipe.data.session.channels import CLOCK_UNITS
+from bampipe.data.session.places import lexically_inside
 from bampipe.data.units import RecordedUnit, spelled, unit
 from bampipe.errors import InputError
 
@@ -209,6 +210,7 @@ class _Logs:
         for path in paths:
             name = path.relative_to(self.folder).as_posix()
             try:
+                lexically_inside(name, where="")
                 columns = columns_of(path, name=name, dialect=self.dialect)
                 if not columns:
                     raise InputError("no column of numbers in it")
@@ -262,7 +264,8 @@ class _Logs:
         return [TrialEntry(file=n, kind="free") for n in names], [c for c in stated if c in common]
 
     def _leave_out(self, names: Sequence[str]) -> None:
-        self.passed += [(n, "has other columns") for n in self.found if n not in names]
+        why = "has other columns: it needs a session of its own"
+        self.passed += [(name, why) for name in self.found if name not in names]
 
     def _worth(self, columns: frozenset[str]) -> tuple[int, int, int]:
         """How well files with these columns would do as logs: what they hold, and how much."""

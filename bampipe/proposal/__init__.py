@@ -106,7 +106,9 @@ def propose(folder: Path, device: str = "", names: Sequence[str] = ()) -> Propos
         device=chosen.text,
         fill_in=notes.fill_in,
         check=notes.check,
-        passed=[f"{name}: {reason.removeprefix(f'{name}: ')}" for name, reason in found.passed],
+        passed=[
+            f"{name}: {reason.removeprefix(name).lstrip(':, ')}" for name, reason in found.passed
+        ],
     )
 
 
