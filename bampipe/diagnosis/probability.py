@@ -123,10 +123,10 @@ def weigh_sets(search: Search, pool: Pool, given: Sequence[str], seed: int) -> W
 def _beside_unknown(
     search: Search, axis: int, columns: Sequence[Array], here: Unknown, own: Sequence[str]
 ) -> list[tuple[tuple[Key, ...], Unknown]]:
-    """Sets beside an unknown function: the effects that it does not replace, and less each of them.
+    """Sets beside an unknown function, and less each of their effects.
 
-    An effect whose place an unknown function can take but for less than a size that matters is one
-    that resembles what is missing.
+    Effects that explain less than the function does beyond them may be mere resemblances of what is
+    missing: those whose place it takes, but for less than a size that matters, are left out.
     """
     p, size = search.p, search.criteria.size
     root = p.likelihood.root[axis]
@@ -143,7 +143,9 @@ def _beside_unknown(
         return float(np.sqrt(np.mean(moved**2))) < size * force
 
     beside = [e for e in own if axis in touched_axes(search, e)]
-    gone_all = [e for e in beside if replaces(e)]
+    none, bare = search.cost(()), search.cost(tuple((f"-{e}", ()) for e in sorted(beside)))
+    resembles = none - here.cost > bare - none
+    gone_all = [e for e in beside if resembles and replaces(e)]
     sets = [gone_all, *([*gone_all, e] for e in beside if e not in gone_all)]
     return [(tuple((f"-{e}", ()) for e in sorted(one)), without(one)) for one in sets]
 
