@@ -252,7 +252,7 @@ class FormDictionary:
         pulls = self._pulls[trial][kept]
         if form.factor == READING:
             return np.asarray(np.eye(pulls.shape[2])[[self._component(form)]][:, :, None])
-        return np.asarray(pulls[:, self.axis] * np.sign(self._of(_APPLIED, trial)[kept]))[
+        return np.asarray(pulls[:, self.axis] * np.sign(self._signals[_APPLIED][trial][kept]))[
             :, :, None
         ]
 
