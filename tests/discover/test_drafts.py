@@ -30,6 +30,7 @@ from bampipe.physics.effect import effect_from
 from bampipe.progress import silent
 from bampipe.results.diagnose import AxisVerdict, DiagnoseResult
 from bampipe.results.draft import ChanceOfDraft, DraftResult
+from bampipe.run.models import ensure_base
 from bampipe.stages import draft as draft_stage
 from bampipe.stages import identify
 from bampipe.trials.likelihood import lay_out_samples
@@ -67,6 +68,7 @@ def detent(tmp_path_factory):
     root = tmp_path_factory.mktemp("detent")
     record_trials(root, "joint", 6, "detent:joint")
     run = RunFolder(root / "run")
+    ensure_base(run.root, "", ())
     identify.execute(run, run.root, identify.Config(method="least-squares"), silent)
     unknown_on("joint").write(run.root)
     draft_stage.execute(run, run.root, draft_stage.Config(replicates=6, jobs=1), silent)
@@ -195,12 +197,11 @@ def _hold_against_effect(recipe, evidence, samples, forms, name):
     item = candidates_of(effect, (form.canonical,))[0]
     short = [q.name.rpartition(".")[2] for q in item.parameters]
     exact = Dictionary(evidence, samples, {name: item}, _NoRanges())
-    order = [form.shape.strengths]
     values = np.array([searched[short[i]] for i in item.searched_indices])
     exact.values = lambda key: values
     wanted = exact.make((name, ()))
     columns = [list(form.shape.strengths).index(short[i]) for i in item.linear_indices]
-    assert order and sorted(columns) == list(range(len(form.shape.strengths)))
+    assert sorted(columns) == list(range(len(form.shape.strengths)))
     for axis, found in atom.columns.items():
         off = np.linalg.norm(found[:, columns] - wanted.columns[axis], axis=0)
         # Made at a lower rate: a sharp edge at a reversal costs several per cent.
@@ -243,7 +244,7 @@ def test_hysteresis_of_a_force_sensor_is_found(tmp_path):
     best, *others = search.best_forms(8, 1)
     form, gain = search.forms.candidates[best[0]], search.cost(()) - search.cost((best,))
     assert form.canonical in ("hysteresis_of_reading:x", "two_hystereses_of_reading:x")
-    plain = [k for k in (best, *others) if k[0] == "hysteresis_of_reading:x"][0]
+    plain = next(k for k in (best, *others) if k[0] == "hysteresis_of_reading:x")
     assert search.cost(()) - search.cost((plain,)) > 0.95 * gain
     rest = [k for k in others if "hyst" not in k[0]]
     assert all(search.cost(()) - search.cost((k,)) < 0.4 * gain for k in rest)
